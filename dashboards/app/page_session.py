@@ -15,8 +15,7 @@ from liex_lab.errors import LiexError
 
 from ..report.charts import traces
 from ..report.quality import warnings
-from . import page_corrections as app_correct
-from . import plots
+from . import page_corrections, plots
 from .data import StudyData, colours_of, shown_words
 from .frames import Frames
 from .parts import aria, download, graph
@@ -150,7 +149,7 @@ def session_page(
                 ),
             ],
         ),
-        *([app_correct.panel(session, correcting)] if may_correct else []),
+        *([page_corrections.panel(session, correcting)] if may_correct else []),
         html.H2("Bouts"),
         block(f"bouts/{key}", "Bouts of the session"),
         *_more(data, key, session),

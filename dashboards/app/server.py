@@ -15,11 +15,7 @@ from dash import ALL, MATCH, ClientsideFunction, Dash, Input, Output, State, dcc
 
 from liex_lab.errors import LiexError
 
-from . import page_corrections as app_correct
-from . import page_groups as app_groups
-from . import page_session as app_session
-from . import page_study as app_study
-from . import tables as app_tables
+from . import page_corrections, page_groups, page_session, page_study, tables
 from .data import StudyData
 from .frames import Frames
 from .guard import LOOPBACK, add_downloads, guard
@@ -72,11 +68,11 @@ def make_app(
     )
     app.layout = _shell(data)
     _register(app, data, may_show=show_replay is not None, may_correct=correct is not None)
-    app_study.register(app, data)
-    app_groups.register(app, data)
-    app_session.register(app, data, Frames(), show_replay)
+    page_study.register(app, data)
+    page_groups.register(app, data)
+    page_session.register(app, data, Frames(), show_replay)
     if correct is not None:
-        app_correct.register(app, data, correct)
+        page_corrections.register(app, data, correct)
     hashes: list[str] = []
 
     def policy() -> str:
@@ -158,16 +154,16 @@ def _shell(data: StudyData) -> html.Div:
 def _page(data: StudyData, path: str, search: str, **may: bool) -> list[Any]:
     try:
         if path in ("", "/"):
-            return app_study.sessions_page(data)
+            return page_study.sessions_page(data)
         if path == "/ethograms":
-            return app_study.ethograms_page(data)
+            return page_study.ethograms_page(data)
         if path == "/groups":
-            return app_groups.groups_page(data)
+            return page_groups.groups_page(data)
         if path.startswith("/session/"):
             key = unquote(path.removeprefix("/session/"))
             if key not in {entry.key for entry in data.done}:
-                return app_session.failed_page(data, key)
-            return app_session.session_page(
+                return page_session.failed_page(data, key)
+            return page_session.session_page(
                 data, key, _moment(search), correcting="corrections=" in search, **may
             )
     except LiexError as error:
@@ -209,9 +205,9 @@ def _register(app: Dash, data: StudyData, **may: bool) -> None:
     def fill(words: str | None, order: dict[str, Any], asked: dict[str, str]) -> Any:
         name = asked["table"]
         try:
-            return app_tables.fill(name, app_tables.find(data, name), words or "", order)
+            return tables.fill(name, tables.find(data, name), words or "", order)
         except LiexError as error:
-            return app_tables.sentence(name, str(error))
+            return tables.sentence(name, str(error))
 
     app.clientside_callback(
         ClientsideFunction("liex", "draw"),

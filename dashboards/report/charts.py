@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 from liex_lab.behaviour.around import around_onsets
 from liex_lab.sessions import Session
 
-from . import svg as figures
-from . import svg_matrices as figures_sums
+from . import svg, svg_matrices
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -51,7 +50,7 @@ def charts(session: Session, words: list[str]) -> dict[str, str]:
     frames = session.frames
     bouts = session.bouts
     time_s = frames["time_s"].to_numpy(float)
-    time = figures.time_scale(session.metadata["frames"]["duration_s"])
+    time = svg.time_scale(session.metadata["frames"]["duration_s"])
     spans = list(zip(bouts["start_s"], bouts["stop_s"], bouts["action"], strict=True))
     empty = session.gaps[
         session.gaps["n_frames_missing"] > 0
@@ -60,21 +59,21 @@ def charts(session: Session, words: list[str]) -> dict[str, str]:
     error = frames["predicted_error_mm"]
     drawn = dict.fromkeys(("lanes", "way", "error", "errors", "budget", "matrix", "activity"), "")
     if words or lost:
-        drawn["lanes"] = figures.lanes(spans, words, lost, time)
-    drawn["error"] = figures.curve(time_s, _across_gaps(error, frames), time, "mm", _RED, last=True)
-    drawn["errors"] = figures.histogram(error.to_numpy(float), "mm", _RED)
+        drawn["lanes"] = svg.lanes(spans, words, lost, time)
+    drawn["error"] = svg.curve(time_s, _across_gaps(error, frames), time, "mm", _RED, last=True)
+    drawn["errors"] = svg.histogram(error.to_numpy(float), "mm", _RED)
     if session.has("kinematics.parquet"):
         x_mm = _across_gaps(session.kinematics["x_mm"], frames)
         y_mm = _across_gaps(session.kinematics["y_mm"], frames)
-        drawn["way"] = figures.trajectory(x_mm, y_mm, time_s, outlines(session))
+        drawn["way"] = svg.trajectory(x_mm, y_mm, time_s, outlines(session))
     if session.has("summary.csv"):
         row = session.summary.iloc[0]
         shares = [
-            (word, float(row[f"{word}_share"]), figures.action_colour(k))
+            (word, float(row[f"{word}_share"]), svg.action_colour(k))
             for k, word in enumerate(words)
             if f"{word}_share" in row
         ]
-        drawn["budget"] = figures.budget(shares)
+        drawn["budget"] = svg.budget(shares)
     if session.has("transitions.parquet"):
         drawn["matrix"] = _matrix(session.table("transitions"), words)
     if session.has("activity.parquet"):
@@ -94,7 +93,7 @@ def curves(session: Session) -> list[tuple[str, str, str]]:
     moved = session.kinematics
     bouts = session.bouts
     time_s = frames["time_s"].to_numpy(float)
-    time = figures.time_scale(session.metadata["frames"]["duration_s"])
+    time = svg.time_scale(session.metadata["frames"]["duration_s"])
     rears = bouts.loc[bouts["action"] == "rear", ["start_s", "stop_s"]].to_numpy(float)
     shown = _SWIMMING if "tail_beat_hz" in moved else _WALKING
     made = []
@@ -103,7 +102,7 @@ def curves(session: Session) -> list[tuple[str, str, str]]:
             shaded = [(float(a), float(b)) for a, b in rears] if name == "nose_height_mm" else []
             values = _across_gaps(moved[name], frames)
             made.append(
-                (title, what, figures.curve(time_s, values, time, unit, colour, shaded, from_zero))
+                (title, what, svg.curve(time_s, values, time, unit, colour, shaded, from_zero))
             )
     return made
 
@@ -156,7 +155,7 @@ def around_actions(session: Session, words: list[str]) -> list[tuple[str, str]]:
             continue
         top = max(float(np.nanmax(one.high)) for one in known.values())
         for word, one in known.items():
-            drawn = figures_sums.around(
+            drawn = svg_matrices.around(
                 one.time_s, one.low, one.median, one.high, unit, colour, (0.0, 1.05 * top or 1.0)
             )
             made.append((f"{title} around {word.replace('_', ' ')}, {one.n} bouts", drawn))
@@ -191,12 +190,12 @@ def pictures(session: Session) -> list[tuple[str, str, str, str]]:
         reach_mm = 0.9 * float(
             frames["spine_mm"].median()
         )  # an animal on its feet is about half its length high
-        drawn = figures.picture(
+        drawn = svg.picture(
             np.asarray(depth, np.uint16), uv, bones, entry["left_px"], entry["top_px"], reach_mm
         )
         time_s = float(frames.loc[index, "time_s"])
         word = _word_at(session.bouts, time_s)
-        colour = figures.action_colour(words.index(word)) if word in words else ""
+        colour = svg.action_colour(words.index(word)) if word in words else ""
         made.append((drawn, f"{time_s:.2f} s", word, colour))
     return made
 
@@ -216,7 +215,7 @@ def outlines(session: Session) -> list[tuple[str, Array]]:
         session: the opened session.
     """
     walls = session.arena.outline_mm()
-    known = [(figures.ARENA, walls)] if len(walls) else []
+    known = [(svg.ARENA, walls)] if len(walls) else []
     return known + [(zone.name, zone.outline_mm()) for zone in session.zones]
 
 
@@ -242,18 +241,18 @@ def _matrix(table: pd.DataFrame, words: list[str]) -> str:
     certain = spread(table["p_fdr"] <= _CERTAIN) == 1.0
     probability = spread(table["probability"])
     by_chance = spread(table["by_chance"])
-    return figures_sums.matrix(seen, probability, by_chance, certain, spread(table["n"]))
+    return svg_matrices.matrix(seen, probability, by_chance, certain, spread(table["n"]))
 
 
 def _activity(table: pd.DataFrame, words: list[str]) -> str:
     parts = [
-        (word, table[f"{word}_s"].to_numpy(float), figures.action_colour(k))
+        (word, table[f"{word}_s"].to_numpy(float), svg.action_colour(k))
         for k, word in enumerate(words)
         if f"{word}_s" in table
     ]
     numbers = (table[name].to_numpy(float) for name in ("start_s", "stop_s", "observed_s"))
     start_s, stop_s, observed_s = numbers
-    return figures_sums.activity(start_s, stop_s, parts, observed_s)
+    return svg_matrices.activity(start_s, stop_s, parts, observed_s)
 
 
 def _across_gaps(values: pd.Series[Any], frames: pd.DataFrame) -> Array:

@@ -15,7 +15,7 @@ import numpy as np
 from liex_lab.sessions import Session
 from liex_lab.sessions.failure import write_whole
 
-from . import svg as figures
+from . import svg
 from .charts import FRAMES, KINEMATICS, around_actions, charts, curves, pictures
 from .quality import flip_rows, frame_account, warnings
 
@@ -104,7 +104,7 @@ def action_rows(session: Session, words: list[str]) -> list[tuple[str, str, str,
     return [
         (
             word,
-            figures.action_colour(k),
+            svg.action_colour(k),
             session.metadata["actions"][word],
             str(unresolved.get(word, "")),
         )
@@ -209,7 +209,7 @@ def budget_rows(session: Session, words: list[str]) -> list[tuple[str, str, list
                 f"{value:.1%}" if what == "share" and np.isfinite(value) else _number(value)
                 for value, (what, _) in zip(values, _BUDGET, strict=True)
             ]
-            rows.append((word, figures.action_colour(k), texts))
+            rows.append((word, svg.action_colour(k), texts))
     return rows
 
 

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from liex_lab.body import _skinning_kernels as _skin
+from liex_lab.body import _skinning_kernels as skinning_kernels
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.errors import LiexError
 
@@ -119,14 +119,16 @@ class Capsules:
     @property
     def faces(self) -> NDArray[np.int32]:
         """Triangles (F, 3) int32 of the vertices that `vertices` makes."""
-        return _skin.joined_faces(
-            [(_skin.CAPSULE_RINGS, _skin.CAPSULE_SEGMENTS)] * len(self.joints)
+        return skinning_kernels.joined_faces(
+            [(skinning_kernels.CAPSULE_RINGS, skinning_kernels.CAPSULE_SEGMENTS)] * len(self.joints)
         )
 
     @property
     def n_vertices(self) -> int:
         """Vertices V of one pose's mesh."""
-        return len(self.joints) * (_skin.CAPSULE_RINGS * _skin.CAPSULE_SEGMENTS + 2)
+        return len(self.joints) * (
+            skinning_kernels.CAPSULE_RINGS * skinning_kernels.CAPSULE_SEGMENTS + 2
+        )
 
     def vertices(self, rotations: Array, positions: Array, scale: Array, girth: Array) -> Array:
         """Mesh vertices in many poses.
@@ -142,7 +144,7 @@ class Capsules:
         """
         body = self.broadcast(len(positions))
         out = np.empty((len(positions), self.n_vertices, 3))
-        _skin.skin_capsules(
+        skinning_kernels.skin_capsules(
             rotations, positions, scale, girth, self.joints, body.offsets, body.radii, out
         )
         return out

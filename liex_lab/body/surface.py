@@ -14,8 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from liex_lab.body import _rasterizer_kernels as _render
-from liex_lab.body import _skinning_kernels as _skin
+from liex_lab.body import _rasterizer_kernels as rasterizer_kernels
+from liex_lab.body import _skinning_kernels as skinning_kernels
 from liex_lab.body.capsules import Capsules
 from liex_lab.body.mesh import MeshBody
 from liex_lab.body.pose import Pose
@@ -88,10 +88,12 @@ class Surface:
         if "stations" in table:
             shape = BodyShape.default(skeleton)
             stations = np.array(table["stations"], float)
-            parts = [(len(stations) - 2, _skin.BODY_SEGMENTS)]
-            parts += [(_skin.BLOB_RINGS, _skin.BLOB_SEGMENTS)] * len(shape.blobs)
-            parts += [(_skin.TAIL_RINGS, _skin.TAIL_SEGMENTS)]
-            return Surface(skeleton, _skin.joined_faces(parts), stations, shape, None)
+            parts = [(len(stations) - 2, skinning_kernels.BODY_SEGMENTS)]
+            parts += [(skinning_kernels.BLOB_RINGS, skinning_kernels.BLOB_SEGMENTS)] * len(
+                shape.blobs
+            )
+            parts += [(skinning_kernels.TAIL_RINGS, skinning_kernels.TAIL_SEGMENTS)]
+            return Surface(skeleton, skinning_kernels.joined_faces(parts), stations, shape, None)
         if "vertices_mm" in table:
             mesh = MeshBody.of(skeleton)
             return Surface(skeleton, mesh.faces, np.zeros(0), None, None, mesh)
@@ -107,7 +109,7 @@ class Surface:
     def n_trunk_vertices(self) -> int:
         """The leading vertices that belong to the trunk, without ears, feet and tail."""
         return (
-            (len(self.stations) - 2) * _skin.BODY_SEGMENTS + 2
+            (len(self.stations) - 2) * skinning_kernels.BODY_SEGMENTS + 2
             if self.shape is not None
             else self.n_vertices
         )
@@ -116,7 +118,7 @@ class Surface:
     def n_trunk_faces(self) -> int:
         """The leading faces that belong to the trunk, without ears, feet and tail."""
         return (
-            2 * (len(self.stations) - 2) * _skin.BODY_SEGMENTS
+            2 * (len(self.stations) - 2) * skinning_kernels.BODY_SEGMENTS
             if self.shape is not None
             else len(self.faces)
         )
@@ -203,8 +205,16 @@ class Surface:
         assert self.shape is not None
         out = np.empty((n, self.n_vertices, 3))
         body = (shape if isinstance(shape, BodyShape) else self.shape.bare()).broadcast(n)
-        turns = np.zeros((n, _skin.TAIL_RINGS)) if bends is None else np.asarray(bends, float)
-        skin = _skin.skin_tubes_parallel if parallel and n > 16 else _skin.skin_tubes
+        turns = (
+            np.zeros((n, skinning_kernels.TAIL_RINGS))
+            if bends is None
+            else np.asarray(bends, float)
+        )
+        skin = (
+            skinning_kernels.skin_tubes_parallel
+            if parallel and n > 16
+            else skinning_kernels.skin_tubes
+        )
         skin(
             joints,
             rotations,
@@ -269,7 +279,7 @@ def render_mesh(
     u0, v0, width, height = (0, 0, camera.width, camera.height) if window is None else window
     inverse = np.zeros((height, width))
     depth = np.empty((height, width), np.float32)
-    _render.draw(
+    rasterizer_kernels.draw(
         np.ascontiguousarray(vertices),
         faces,
         T.rotation,
@@ -282,7 +292,7 @@ def render_mesh(
         float(v0),
         inverse,
     )
-    _render.to_depth(inverse, depth)
+    rasterizer_kernels.to_depth(inverse, depth)
     return depth
 
 
@@ -310,7 +320,7 @@ def render_meshes(
         (n, H, W) float32 mm, 0 where the mesh is not.
     """
     depth = np.empty((len(vertices), size[1], size[0]), np.float32)
-    drive = _render.draw_batch_parallel if parallel else _render.draw_batch
+    drive = rasterizer_kernels.draw_batch_parallel if parallel else rasterizer_kernels.draw_batch
     drive(
         vertices,
         faces,

@@ -112,7 +112,7 @@ def bout(
     add one (--action, --from, --to), or take the whole ethogram from a file (--labels). The name
     that it has confirms it.
     """
-    from liex_lab.sessions import correcting as ask
+    from liex_lab.sessions import correcting
 
     opened = _opened(session)
     span = (start_s, stop_s)
@@ -120,15 +120,17 @@ def bout(
         case (None, None, (None, None), False, Path()):
             from liex_lab.pipelines.training.action_model import read_any_labels
 
-            wanted: Sequence[Correction] = ask.labelled_bouts(opened, read_any_labels(labels))
+            wanted: Sequence[Correction] = correcting.labelled_bouts(
+                opened, read_any_labels(labels)
+            )
         case (None, str(), (float(), float()), False, None):
-            wanted = [ask.add_bout(opened, action, *span, new_word=new_word)]
+            wanted = [correcting.add_bout(opened, action, *span, new_word=new_word)]
         case (float(), str(), (None, None), False, None):
-            wanted = [ask.rename_bout(opened, at_s, action, new_word=new_word)]
+            wanted = [correcting.rename_bout(opened, at_s, action, new_word=new_word)]
         case (float(), None, (float(), float()), False, None):
-            wanted = [ask.recut_bout(opened, at_s, *span)]
+            wanted = [correcting.recut_bout(opened, at_s, *span)]
         case (float(), None, (None, None), True, None):
-            wanted = [ask.delete_bout(opened, at_s)]
+            wanted = [correcting.delete_bout(opened, at_s)]
         case _:
             raise SessionError(
                 "one edit at a time: --at S with --action, with --from and --to, or with "

@@ -24,7 +24,7 @@ from liex_lab.body.kinematics import aim
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.body.spheres import Spheres
 from liex_lab.estimation import _feature_kernels as kernels
-from liex_lab.estimation import _residual_kernels as explaining
+from liex_lab.estimation import _residual_kernels as residual_kernels
 from liex_lab.estimation.method import Method
 from liex_lab.forests._kernels import VIEW
 from liex_lab.forests.forest import Forest, Samples, predict
@@ -236,8 +236,8 @@ class Cascade:
         samples = self.samples(images, candidates, list(range(self.skeleton.n_joints)))
         if not self.method.explains:
             return samples
-        fit = np.empty((len(candidates), explaining.N_FIT), np.float32)
-        explaining.explain_all(
+        fit = np.empty((len(candidates), residual_kernels.N_FIT), np.float32)
+        residual_kernels.explain_all(
             images.heights,
             images.crop_cameras,
             images.moments,
@@ -325,13 +325,13 @@ class Cascade:
         return turn * method.joint_lever_mm, keep
 
 
-def body_of(balls: Spheres) -> explaining.SphereModel:
+def body_of(balls: Spheres) -> residual_kernels.SphereModel:
     """The body's spheres as the kernels want them.
 
     Args:
         balls: the sphere model of the body.
     """
-    return explaining.SphereModel(
+    return residual_kernels.SphereModel(
         balls.unit_mm, balls.n_own, balls.joints, balls.offsets, balls.share, balls.radius
     )
 

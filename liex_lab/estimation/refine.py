@@ -23,7 +23,7 @@ from liex_lab.body.pose import Pose
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.body.spheres import Spheres
 from liex_lab.estimation import _refine_kernels as kernels
-from liex_lab.estimation import _residual_kernels as explaining
+from liex_lab.estimation import _residual_kernels as residual_kernels
 from liex_lab.estimation.cascade import ImageSet, body_of
 from liex_lab.geometry import SE3
 
@@ -52,7 +52,7 @@ class Refiner:
 
     skeleton: Skeleton
     tree: kernels.AngleTree
-    body: explaining.SphereModel
+    body: residual_kernels.SphereModel
 
     @staticmethod
     def of(skeleton: Skeleton, balls: Spheres) -> Refiner:
@@ -140,8 +140,8 @@ class Refiner:
             (n, K, N_FIT) residuals, see `_residual_kernels.explain`.
         """
         frames, (n, k), j = pose.frames(self.skeleton), pose.scale.shape, self.skeleton.n_joints
-        out = np.empty((n * k, explaining.N_FIT), np.float32)
-        explaining.explain_all(
+        out = np.empty((n * k, residual_kernels.N_FIT), np.float32)
+        residual_kernels.explain_all(
             heights,
             crop_cameras,
             moments,
@@ -182,5 +182,9 @@ class Refiner:
 
 def _apart(fit: Array) -> Array:
     """Distance (n, K) mm of poses from the readings, out of their residuals (n, K, N_FIT)."""
-    off = (fit[..., explaining.OUT_OF] + fit[..., explaining.APART]) / explaining.MM_UNIT
-    return np.asarray(off + _BESIDE_MM * fit[..., explaining.BESIDE] / explaining.SHARE_UNIT)
+    off = (
+        fit[..., residual_kernels.OUT_OF] + fit[..., residual_kernels.APART]
+    ) / residual_kernels.MM_UNIT
+    return np.asarray(
+        off + _BESIDE_MM * fit[..., residual_kernels.BESIDE] / residual_kernels.SHARE_UNIT
+    )

@@ -16,7 +16,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from liex_lab.foreground import _blob_kernels as segment
+from liex_lab.foreground import _blob_kernels as blob_kernels
 from liex_lab.foreground._blob_kernels import BLOCK, find_root
 
 MAX_SURFACES = 24
@@ -125,7 +125,7 @@ def label_surfaces(blocks, labels, focal2, least_mm2, areas):
                 elif areas[slot] > area:
                     slot = -1
                 else:
-                    segment.forget(labels, slot)
+                    blob_kernels.forget(labels, slot)
             for k in range(top):
                 labels[stack[k, 0], stack[k, 1]] = slot
             if slot >= 0:

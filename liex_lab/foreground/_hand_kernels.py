@@ -13,7 +13,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit, prange
 
-from liex_lab.foreground import _blob_kernels as segment
+from liex_lab.foreground import _blob_kernels as blob_kernels
 from liex_lab.foreground._blob_kernels import BLOCK
 from liex_lab.foreground._geodesic_kernels import (
     AROUND_MM,
@@ -519,19 +519,19 @@ def cut_end(
         raw,
     )
     relabel(labels, box, MAX_SURFACES, slot)
-    segment.keep_largest(raw, np.empty((crop * crop, 5), np.int32))
+    blob_kernels.keep_largest(raw, np.empty((crop * crop, 5), np.int32))
     mm_per_px = step * found[2] / np.sqrt(intrinsics[0] * intrinsics[1])
     radius = min(3, max(1, int(smooth / mm_per_px + 0.5)))
-    segment.smooth_heights(raw, radius, heights[k])
-    segment.blob_moments(
+    blob_kernels.smooth_heights(raw, radius, heights[k])
+    blob_kernels.blob_moments(
         heights[k], origin[k], step, plane, intrinsics, rotation, distance[k], moments[k]
     )
     # the arm tells which way along the long axis the fingers point
     along = rotation @ found[3:6]
-    angle = moments[k, segment.ANGLE]
+    angle = moments[k, blob_kernels.ANGLE]
     if along[0] * np.cos(angle) + along[1] * np.sin(angle) < 0.0:
-        moments[k, segment.ANGLE] += np.pi
-    n_px[k] = int(moments[k, segment.N_PX])
+        moments[k, blob_kernels.ANGLE] += np.pi
+    n_px[k] = int(moments[k, blob_kernels.N_PX])
 
 
 @njit(cache=True)

@@ -12,7 +12,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit, prange
 
-from liex_lab.foreground import _blob_kernels as segment
+from liex_lab.foreground import _blob_kernels as blob_kernels
 
 AREA_FACTOR = 4.0  # a blob this many times larger or smaller than the animal is not the animal
 BRIDGE = 4  # blocks without readings that may lie between the parts of an animal of the camera view
@@ -37,10 +37,12 @@ def blob_areas(depths, limit, on_floor, bridge, mm2_per_px, areas):
     """
     for k in prange(depths.shape[0]):
         labels = np.empty(
-            (depths.shape[1] // segment.BLOCK, depths.shape[2] // segment.BLOCK), np.int32
+            (depths.shape[1] // blob_kernels.BLOCK, depths.shape[2] // blob_kernels.BLOCK), np.int32
         )
-        blobs = np.empty((segment.MAX_BLOBS, 7))
-        for slot in range(segment.label_blobs(depths[k], limit, on_floor, bridge, labels, blobs)):
+        blobs = np.empty((blob_kernels.MAX_BLOBS, 7))
+        for slot in range(
+            blob_kernels.label_blobs(depths[k], limit, on_floor, bridge, labels, blobs)
+        ):
             if blobs[slot, 6] >= _ON_FLOOR_SHARE * blobs[slot, 0]:
                 areas[k, slot] = blob_area(blobs[slot], mm2_per_px)
 
@@ -108,7 +110,7 @@ def parted(depth, limit, labels, blobs, area, mm2_per_px):
     """
     for slot in range(len(blobs)):
         if blob_area(blobs[slot], mm2_per_px) > _MORE * area:
-            cut, near, far = segment.layers(
+            cut, near, far = blob_kernels.layers(
                 depth, limit, labels, slot, blobs[slot], _APART * np.sqrt(area)
             )
             if cut > 0.0:
@@ -132,9 +134,9 @@ def _push_back(depth, labels, slot, cut):
     """Make background of what lies farther than `cut` mm in a component and at its border."""
     for i in range(labels.shape[0]):
         for j in range(labels.shape[1]):
-            if segment.is_animal_block(labels, i, j, slot):
-                for v in range(i * segment.BLOCK, (i + 1) * segment.BLOCK):
-                    for u in range(j * segment.BLOCK, (j + 1) * segment.BLOCK):
+            if blob_kernels.is_animal_block(labels, i, j, slot):
+                for v in range(i * blob_kernels.BLOCK, (i + 1) * blob_kernels.BLOCK):
+                    for u in range(j * blob_kernels.BLOCK, (j + 1) * blob_kernels.BLOCK):
                         if depth[v, u] > cut:
                             depth[v, u] = _FAR
 
@@ -189,16 +191,18 @@ def extract_one(
         n_blobs: (N,) int64, components of about the animal's area, out.
         k: the frame's row.
     """
-    labels = np.empty((depth.shape[0] // segment.BLOCK, depth.shape[1] // segment.BLOCK), np.int32)
-    blobs = np.empty((segment.MAX_BLOBS, 7))
+    labels = np.empty(
+        (depth.shape[0] // blob_kernels.BLOCK, depth.shape[1] // blob_kernels.BLOCK), np.int32
+    )
+    blobs = np.empty((blob_kernels.MAX_BLOBS, 7))
     mm2_per_px = 1.0 / (intrinsics[0] * intrinsics[1])
     bridge = BRIDGE if behind_mm > 0.0 else 0
-    n_found = segment.label_blobs(depth, limit, on_floor, bridge, labels, blobs)
+    n_found = blob_kernels.label_blobs(depth, limit, on_floor, bridge, labels, blobs)
     for _ in range(_LAYERS if parts and area > 0.0 else 0):
         depth, changed = parted(depth, limit, labels, blobs[:n_found], area, mm2_per_px)
         if not changed:
             break
-        n_found = segment.label_blobs(depth, limit, on_floor, bridge, labels, blobs)
+        n_found = blob_kernels.label_blobs(depth, limit, on_floor, bridge, labels, blobs)
     order, n_near = order_blobs(blobs, n_found, area, mm2_per_px)
     for rank in range(n_things):
         row = k + rank * (len(n_px) // n_things)
@@ -273,11 +277,11 @@ def cut_crop(
         k: the row.
     """
     crop = heights.shape[1]
-    v0 = blob[1] * segment.BLOCK
-    v1 = (blob[2] + 1) * segment.BLOCK
-    u0 = blob[3] * segment.BLOCK
-    u1 = (blob[4] + 1) * segment.BLOCK
-    span = max(v1 - v0, u1 - u0) + 2 * segment.BLOCK
+    v0 = blob[1] * blob_kernels.BLOCK
+    v1 = (blob[2] + 1) * blob_kernels.BLOCK
+    u0 = blob[3] * blob_kernels.BLOCK
+    u1 = (blob[4] + 1) * blob_kernels.BLOCK
+    span = max(v1 - v0, u1 - u0) + 2 * blob_kernels.BLOCK
     step = max(1, int(np.ceil(span / (crop - 4))))
     origin[k, 0] = int((u0 + u1) / 2 - step * crop / 2)
     origin[k, 1] = int((v0 + v1) / 2 - step * crop / 2)
@@ -289,19 +293,21 @@ def cut_crop(
     ):  # first from far behind, for the blob's mean depth is that of all that hangs together
         distance[k] = mean_depth + 8.0 * behind_mm
         view_plane = np.array([0.0, 0.0, 1.0 / distance[k]])
-    segment.cut_heights(depth, limit, labels, slot, view_plane, distance[k], origin[k], step, raw)
-    segment.keep_largest(raw, np.empty((crop * crop, 5), np.int32))
+    blob_kernels.cut_heights(
+        depth, limit, labels, slot, view_plane, distance[k], origin[k], step, raw
+    )
+    blob_kernels.keep_largest(raw, np.empty((crop * crop, 5), np.int32))
     if behind_mm > 0.0:
-        distance[k] += segment.level_heights(raw, behind_mm)
+        distance[k] += blob_kernels.level_heights(raw, behind_mm)
         view_plane[2] = 1.0 / distance[k]
     mm_per_px = step * mean_depth / np.sqrt(intrinsics[0] * intrinsics[1])
     radius = min(3, max(1, int(smooth_mm / mm_per_px + 0.5)))
-    segment.smooth_heights(raw, radius, heights[k])
-    segment.blob_moments(
+    blob_kernels.smooth_heights(raw, radius, heights[k])
+    blob_kernels.blob_moments(
         heights[k], origin[k], step, view_plane, intrinsics, rotation, distance[k], moments[k]
     )
     if behind_mm > 0.0:
-        moments[k, segment.SLOPE] = segment.back_slope(
+        moments[k, blob_kernels.SLOPE] = blob_kernels.back_slope(
             heights[k], origin[k], step, intrinsics, distance[k], moments[k]
         )
 

@@ -33,7 +33,7 @@ from liex_lab.sessions.place import check_place, file_facts, part_folder
 from liex_lab.sessions.provenance import Provenance
 from liex_lab.sessions.results import Results
 from liex_lab.sessions.thumbnails import Keepsakes
-from liex_lab.tables import schema as tables
+from liex_lab.tables import schema
 from liex_lab.tables.rows import Rows, rows_only
 from liex_lab.tables.schema import Column
 from liex_lab.tracking.track import Flip, Track, Tracked
@@ -363,8 +363,8 @@ class SessionWriter:
         _check_times(np.array(self._times_ns, np.int64), rows.track)
         results = dict(results or {})
         if "bouts" not in results:
-            results["bouts"] = tables.empty_table(
-                [*tables.BOUTS, *(c for c in columns if c.table == "bouts")]
+            results["bouts"] = schema.empty_table(
+                [*schema.BOUTS, *(c for c in columns if c.table == "bouts")]
             )
         bouts = results["bouts"]
         kinematics = results.setdefault("kinematics", rows_only(rows))

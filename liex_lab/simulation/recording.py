@@ -23,7 +23,7 @@ from liex_lab.errors import LiexError
 from liex_lab.geometry import SE3
 from liex_lab.recordings.frame import Depth, DepthFrame
 from liex_lab.recordings.recording import Recording
-from liex_lab.simulation import _render_kernels as _scene
+from liex_lab.simulation import _render_kernels as render_kernels
 from liex_lab.simulation._sensor_kernels import NORMAL, UNIT
 from liex_lab.simulation.objects import THING_FACES, draw_thing
 from liex_lab.simulation.scene import SimulatedScene, outline_of
@@ -179,7 +179,7 @@ class SyntheticSession(TrueRecording):
         vertices = self.surface.vertices(pose, contents.shape, contents.girth[part], bends)
         out = np.empty((len(vertices), camera.height, camera.width), np.uint16)
         T_camera_arena = self.T_arena_camera.inverse()
-        _scene.frames_parallel(
+        render_kernels.frames_parallel(
             self.scene.still,
             vertices,
             self.surface.faces,

@@ -14,9 +14,7 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 from liex_lab.body.skeleton import Skeleton
-from liex_lab.simulation import generic, locomotion
-from liex_lab.simulation import recording as synthetic
-from liex_lab.simulation import training_patches as windows
+from liex_lab.simulation import generic, locomotion, recording, training_patches
 from liex_lab.simulation.fish import FishSpecies
 from liex_lab.simulation.generic import GenericSpecies
 from liex_lab.simulation.hand.simulator import HandSimulator, find_reference
@@ -116,7 +114,7 @@ class BodySimulator:
     """
 
     species: Species
-    splits: tuple[str, ...] = tuple(synthetic.SPLITS)
+    splits: tuple[str, ...] = tuple(recording.SPLITS)
 
     @property
     def skeleton(self) -> Skeleton:
@@ -149,7 +147,7 @@ class BodySimulator:
         Returns:
             An iterator of sets of patches, one a block.
         """
-        return windows.training_blocks(seed, n_blocks, self.species, **settings)
+        return training_patches.training_blocks(seed, n_blocks, self.species, **settings)
 
     def test_split(
         self, name: str, spine_mm: float | None = None, n_sessions: int = 40
@@ -167,7 +165,7 @@ class BodySimulator:
         Raises:
             LiexError: there is no split of this name.
         """
-        return synthetic.test_split(name, spine_mm, n_sessions, self.species)
+        return recording.test_split(name, spine_mm, n_sessions, self.species)
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ from liex_lab.errors import RecordingError
 from liex_lab.geometry import SE3
 from liex_lab.optics.camera import Camera
 from liex_lab.recordings.frame import DepthFrame
-from liex_lab.simulation import corruptions as hazards
+from liex_lab.simulation import corruptions
 from liex_lab.simulation.corruptions import Event, Loss
 from liex_lab.simulation.hand.simulator import FRAME_NS, NYU_SENSOR, HandSession, HandSimulator
 from liex_lab.simulation.recording import FrameContents, SyntheticSession, TrueRecording
@@ -40,14 +40,14 @@ class Sequence:
         seed: that it is drawn from.
         noise: multiplies the sensor's random errors and its rate of holes.
         erosion_px: stripped off the animal's outline, in px of the picture that is looked at.
-        hazards: whether corruptions happen.
+        corrupted: whether corruptions happen.
     """
 
     n_frames: int
     seed: int
     noise: float
     erosion_px: int
-    hazards: bool
+    corrupted: bool
 
 
 SEQUENCES = {
@@ -178,9 +178,9 @@ def tracking_sequence(
     events: list[Event] = []
     steps = np.ones(n, np.int64)
     pace = np.ones(n, np.int64)
-    if kind.hazards:
-        events, steps = hazards.draw_script(rng, n, step_ns * 1e-9)
-        pace = hazards.pace(rng, events, n)
+    if kind.corrupted:
+        events, steps = corruptions.draw_script(rng, n, step_ns * 1e-9)
+        pace = corruptions.pace(rng, events, n)
     rows = np.cumsum(np.concatenate([[0], (steps * pace)[1:]]))
     base = world.motion(
         own_seed,
@@ -225,20 +225,20 @@ def _hands(
     contents = base.contents[rows]
     hidden = list[Event]()
     if events:
-        arena = hazards.draw_things(
+        arena = corruptions.draw_things(
             rng,
             events,
             base.T_arena_camera.translation,
             base.joints_arena[rows],
             base.spine_mm,
-            hazards.beside_hand,
+            corruptions.beside_hand,
         )
         things = base.T_arena_camera.inverse() @ arena
         contents = replace(
             contents,
             thing=things,
             shown=np.ones(len(rows), np.bool_),
-            thing_faces=hazards.TWO_FACES,
+            thing_faces=corruptions.TWO_FACES,
         )
         hidden = _hidden(base.camera, contents.hand, things, events)
     return HandSession(title, base.skeleton, base.sensor, contents, times), hidden
@@ -262,10 +262,10 @@ def _animals(
     hidden = list[Event]()
 
     def beside(rng: np.random.Generator, joints: Array, length_mm: float) -> Array:
-        return hazards.beside_animal(rng, scene, joints, length_mm, species.things)
+        return corruptions.beside_animal(rng, scene, joints, length_mm, species.things)
 
     if events:
-        things = hazards.draw_things(
+        things = corruptions.draw_things(
             rng,
             events,
             base.T_arena_camera.translation,
@@ -278,7 +278,7 @@ def _animals(
             contents,
             things=things,
             shown=np.ones(len(rows), np.bool_),
-            thing_faces=hazards.TWO_FACES,
+            thing_faces=corruptions.TWO_FACES,
         )
         surface = Surface.of(base.skeleton)
         T_camera_arena = base.T_arena_camera.inverse()
@@ -315,4 +315,6 @@ def _hidden(camera: Camera, body: Array, things: Array, events: list[Event]) -> 
     spans = [np.arange(event.start, event.stop) for event in events if event.kind == "occluder"]
     rows = np.concatenate(spans) if spans else np.zeros(0, np.int64)
     one = things.shape[1] // 2
-    return hazards.hidden_spans(hazards.visible_share(body[:, ::4], things[:, :one], camera, rows))
+    return corruptions.hidden_spans(
+        corruptions.visible_share(body[:, ::4], things[:, :one], camera, rows)
+    )

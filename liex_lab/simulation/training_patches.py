@@ -23,7 +23,7 @@ from liex_lab.body.pose import Pose
 from liex_lab.body.surface import Body, Surface
 from liex_lab.geometry import SE3
 from liex_lab.runtime.threads import threads
-from liex_lab.simulation import _render_kernels as _scene
+from liex_lab.simulation import _render_kernels as render_kernels
 from liex_lab.simulation._sensor_kernels import EROSION, NOISE, NORMAL
 from liex_lab.simulation.objects import PART_FACES, rounded
 from liex_lab.simulation.scene import SceneSpec, draw_views
@@ -357,7 +357,7 @@ def _draw_block(
     depth = np.empty((n, window_px, window_px), np.uint16)
     background = np.empty_like(depth)
     with threads(parallel):
-        _scene.draw_windows(
+        render_kernels.draw_windows(
             vertices,
             surface.faces,
             thing,

@@ -14,14 +14,13 @@ from typing import TypeVar
 
 import numpy as np
 
-from liex_lab.simulation.agents import fish as fish_acts
-from liex_lab.simulation.agents import mouse as mouse_acts
+from liex_lab.simulation.agents import fish, mouse
 
 from .agent_tracks import Scenario
 
 Recorded = TypeVar("Recorded")
 
-WORDS = {"fish": fish_acts.ACTIONS, "mouse": mouse_acts.ACTIONS}
+WORDS = {"fish": fish.ACTIONS, "mouse": mouse.ACTIONS}
 RATE_HZ = {"fish": 50.0, "mouse": 30.0}  # of their cameras
 FAST_HZ = 100.0
 # cut-out sequences, as in the paper, of 5 and 2 fish

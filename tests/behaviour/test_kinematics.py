@@ -13,7 +13,7 @@ from liex_lab.behaviour.columns import kinematics_columns
 from liex_lab.behaviour.kinematics import Joints, kinematics, neighbours, segments, smallest_turn
 from liex_lab.recordings.timestamps import find_gaps, median_step
 from liex_lab.runtime.memory import on_disk
-from liex_lab.tables import schema as tables
+from liex_lab.tables import schema
 from liex_lab.tables.rows import Rows
 from tests.behaviour.swimming_fish import SwimmingFish
 from tests.sessions.walking_mouse import WalkingMouse, steady
@@ -26,7 +26,7 @@ def tables_of(mouse: WalkingMouse) -> tuple[pd.DataFrame, pd.DataFrame]:
         mouse.track(), np.arange(len(times)), "s", "m", find_gaps(times, median_step(times))
     )
     poses = pd.concat(
-        [tables.to_pandas(tables.POSES, block) for block in rows.poses()], ignore_index=True
+        [schema.to_pandas(schema.POSES, block) for block in rows.poses()], ignore_index=True
     )
     return rows.frames_table(), poses
 
@@ -58,7 +58,7 @@ def test_a_table_on_disk_made_in_blocks_is_the_one_in_memory(swims, tmp_path, mo
     in_memory = kinematics(*told, surface_z_mm=90.0)
     monkeypatch.setattr(import_module("liex_lab.behaviour.kinematics"), "_BLOCK", 16)
     on_the_disk = kinematics(*told, surface_z_mm=90.0, allocate=on_disk(tmp_path))
-    tables.release_table(on_the_disk)
+    schema.release_table(on_the_disk)
     pd.testing.assert_frame_equal(on_the_disk, in_memory, check_exact=True)
 
 

@@ -15,8 +15,7 @@ import pandas as pd
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from liex_lab.dashboards.app import plots as app_plots
-from liex_lab.dashboards.app import tables as app_tables
+from liex_lab.dashboards.app import plots, tables
 from liex_lab.dashboards.app.data import GREY, Ethogram, StudyData, colours_of, raster
 from liex_lab.dashboards.app.page_session import moved_to
 from liex_lab.dashboards.app.server import address, make_app
@@ -126,11 +125,11 @@ def test_names_are_text_in_every_figure(data: StudyData) -> None:
     }
     shares = pd.DataFrame({"key": ["<b>s"], "<i>x_share": [0.5], "<i>x_s": [1.0]})
     figures = [
-        app_plots.groups(table, "mean_speed_mm_s", "<u>"),
-        app_plots.ethograms(ones, {"<i>x": "#000"}),
-        app_plots.differences(data.stats("mean_speed_mm_s"), "<u>"),
-        app_plots.time_budgets(shares, {"<i>x": "#000"}),
-        app_plots.whole_session(
+        plots.groups(table, "mean_speed_mm_s", "<u>"),
+        plots.ethograms(ones, {"<i>x": "#000"}),
+        plots.differences(data.stats("mean_speed_mm_s"), "<u>"),
+        plots.time_budgets(shares, {"<i>x": "#000"}),
+        plots.whole_session(
             ones["<b>s"], {"<i>x": "#000"}, [("<u>", np.arange(3.0), np.arange(3.0), "#000")]
         ),
     ]
@@ -150,28 +149,28 @@ def test_the_groups_are_compared_as_liex_compare_does(data: StudyData) -> None:
     row = stats.loc["mean_speed_mm_s"]
     assert abs(row["estimate"]) == pytest.approx(40.0, abs=15.0)
     assert (row["n_animals"], row["n_sessions"]) == (12, 22)
-    assert "measure" in app_tables.STATS
+    assert "measure" in tables.STATS
     assert (
         len(stats) > 3
     )  # the family that p is corrected for is not the one measure that is looked at
 
 
 def test_rows_are_found_by_words_and_sorted_with_the_unknown_last(data: StudyData) -> None:
-    table = app_tables.find(data, "sessions")
-    assert app_tables.arranged(table, "m003 DONE", "", False)["session"].tolist() == [
+    table = tables.find(data, "sessions")
+    assert tables.arranged(table, "m003 DONE", "", False)["session"].tolist() == [
         KEY,
         "sub-m003_ses-02",
     ]
-    rows = app_tables.arranged(table, "", "predicted_error_mm", True)
+    rows = tables.arranged(table, "", "predicted_error_mm", True)
     assert set(rows["state"].tail(2)) == {"failed", "new"}
-    assert app_tables.arranged(table, "nobody", "", False).empty
+    assert tables.arranged(table, "nobody", "", False).empty
 
 
 def test_a_table_in_a_spreadsheet_computes_nothing_and_is_whole() -> None:
     rows = pd.DataFrame(
         {"name": ['=HYPERLINK("http://x")', "-2+3", "plain", None], "=x": [1.5, -2.0, 3.0, np.nan]}
     )
-    found = pd.read_csv(io.StringIO("".join(app_tables.as_csv(rows))))
+    found = pd.read_csv(io.StringIO("".join(tables.as_csv(rows))))
     assert found["name"].tolist()[:3] == ['\'=HYPERLINK("http://x")', "'-2+3", "plain"]
     assert list(found.columns) == ["name", "'=x"]
     assert found["'=x"].tolist()[:3] == [1.5, -2.0, 3.0]
@@ -180,13 +179,13 @@ def test_a_table_in_a_spreadsheet_computes_nothing_and_is_whole() -> None:
 def test_every_table_of_a_session_can_be_had(data: StudyData) -> None:
     browser = make_app(data).server.test_client()
     session = data.session(KEY)
-    for name in app_tables.session_tables(data, KEY):
+    for name in tables.session_tables(data, KEY):
         answer = browser.get(f"/session-csv/{KEY}/{name}.csv")
         assert answer.status_code == 200
         rows = session.summary if name == "summary" else session.table(name)
         assert answer.text.count("\n") == len(rows) + 1
     for name in ("sessions", "summaries", "stats/mean_speed_mm_s", f"bouts/{KEY}"):
-        assert browser.get(app_tables.csv_address(name)).status_code == 200
+        assert browser.get(tables.csv_address(name)).status_code == 200
     beside = f"/session-csv/{KEY}/../session.csv"
     for gone in (beside, "/session-csv/nobody/frames.csv", "/csv/secrets.csv", "/report/x"):
         assert browser.get(gone).status_code == 404
@@ -266,4 +265,4 @@ def test_what_is_not_there_is_told(data: StudyData) -> None:
     with pytest.raises(SessionError, match="no measured session"):
         data.session("sub-m000_ses-02")
     with pytest.raises(SessionError, match="no table"):
-        app_tables.find(data, "nothing")
+        tables.find(data, "nothing")

@@ -25,7 +25,7 @@ from liex_lab.optics.refraction import Water
 from liex_lab.recordings.timestamps import find_gaps, median_step
 from liex_lab.sessions import Session, SessionWriter
 from liex_lab.sessions.rrd import PALETTE
-from liex_lab.tables import schema as tables
+from liex_lab.tables import schema
 from tests.conftest import REPOSITORY
 from tests.sessions.walking_mouse import WalkingMouse, steady, write
 
@@ -117,8 +117,8 @@ def test_warnings_come_before_everything_else_and_say_what_is_wrong(session, pag
 
 
 def test_exchanges_of_head_and_tail_are_warned_of_and_listed(session, monkeypatch):
-    flips = tables.to_pandas(
-        tables.FLIPS,
+    flips = schema.to_pandas(
+        schema.FLIPS,
         {
             "session_id": "circle",
             "individual": "mouse_1",

@@ -12,7 +12,7 @@ import pytest
 from liex_lab.arena.floor import Floor
 from liex_lab.body.skeleton import View
 from liex_lab.estimation.initial import draw_starts, start_poses
-from liex_lab.foreground import _blob_kernels as segment
+from liex_lab.foreground import _blob_kernels as blob_kernels
 from liex_lab.foreground.background import stride_for
 from liex_lab.foreground.background_segmenter import BackgroundSubtraction
 from liex_lab.optics.camera import Camera
@@ -201,6 +201,6 @@ def test_a_large_picture_is_looked_at_as_finely_as_the_smallest_animal_needs():
 def test_levelling_leaves_what_is_background_alone():
     raw = np.full((8, 8), -1.0, np.float32)
     raw[2:6, 2:6], raw[3, 3], raw[7, 7] = 50.0, -2.0, 5.0
-    lift = segment.level_heights(raw, 20.0)
+    lift = blob_kernels.level_heights(raw, 20.0)
     assert lift == pytest.approx(-30.0)
     assert (raw[2, 2], raw[3, 3], raw[7, 7], raw[0, 0]) == (20.0, -2.0, -1.0, -1.0)

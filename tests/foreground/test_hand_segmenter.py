@@ -14,7 +14,7 @@ import pytest
 from liex_lab.arena.floor import Floor
 from liex_lab.body import Skeleton
 from liex_lab.errors import EstimationError
-from liex_lab.foreground import _geodesic_kernels as ends
+from liex_lab.foreground import _geodesic_kernels as geodesic_kernels
 from liex_lab.foreground._blob_kernels import BLOCK
 from liex_lab.foreground.crop_camera import view_of
 from liex_lab.foreground.hand_segmenter import HandSegmenter, sight_rotations
@@ -205,16 +205,16 @@ def test_ends_agree_with_what_a_reader_would_count(seed: int) -> None:
     rng = np.random.default_rng(seed)
     noise = cv2.GaussianBlur(rng.normal(0.0, 1.0, (15, 20)), (0, 0), 1.2)
     blocks = np.where(noise > 0.02, 800.0 + 20.0 * rng.random((15, 20)), 0.0).astype(np.float32)
-    labels, areas = np.empty(blocks.shape, np.int32), np.empty(ends.MAX_SURFACES)
+    labels, areas = np.empty(blocks.shape, np.int32), np.empty(geodesic_kernels.MAX_SURFACES)
     focal, least_mm = 500.0, 2.0 * BLOCK * 800.0 / 500.0
-    n = ends.label_surfaces(blocks, labels, focal * focal, 1.0, areas)
+    n = geodesic_kernels.label_surfaces(blocks, labels, focal * focal, 1.0, areas)
     for slot in range(n):
         position = np.full(blocks.shape, -1, np.int32)
         order, hops = np.empty((blocks.size, 2), np.int32), np.empty(blocks.size, np.int32)
-        size = ends.walk(blocks, labels, slot, position, order, hops)
+        size = geodesic_kernels.walk(blocks, labels, slot, position, order, hops)
         assert size == (labels == slot).sum()
-        tips = np.zeros((ends.MAX_TIPS, 4))
-        found = ends.ends(blocks, order, hops, position, size, focal, least_mm, tips, 0)
+        tips = np.zeros((geodesic_kernels.MAX_TIPS, 4))
+        found = geodesic_kernels.ends(blocks, order, hops, position, size, focal, least_mm, tips, 0)
         expected = ends_by_hand(order[:size], hops[:size], blocks, focal, least_mm)
         assert {tuple(tip[1:3].astype(int)) for tip in tips[:found]} == expected
 

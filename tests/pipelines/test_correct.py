@@ -22,8 +22,7 @@ from liex_lab.body.pose import Pose
 from liex_lab.errors import LiexError, SessionError
 from liex_lab.exchange import export
 from liex_lab.plan import Plan
-from liex_lab.sessions import Session
-from liex_lab.sessions import correcting as ask
+from liex_lab.sessions import Session, correcting
 from liex_lab.sessions.corrections import Correction
 from liex_lab.sessions.tracks import track_of
 from tests.golden.test_golden import golden  # noqa: F401
@@ -68,12 +67,12 @@ def test_a_bout_is_renamed_recut_deleted_and_added_and_every_table_follows(
     session: Session,
 ) -> None:
     before = contents(session.path)
-    one = corrected(session, ask.recut_bout(session, 2.5, 2.2, 3.0))
+    one = corrected(session, correcting.recut_bout(session, 2.5, 2.2, 3.0))
     assert ("rear", 2.2, 3.0, "human") in spans(one)
     two = corrected(
         one,
-        ask.rename_bout(one, 2.5, "stretch_attend", new_word=True),
-        ask.add_bout(one, "run", 4.0, 4.5),
+        correcting.rename_bout(one, 2.5, "stretch_attend", new_word=True),
+        correcting.add_bout(one, "run", 4.0, 4.5),
     )
     assert ("stretch_attend", 2.2, 3.0, "human") in spans(two)
     assert not (two.bouts["action"] == "rear").any()
@@ -84,7 +83,7 @@ def test_a_bout_is_renamed_recut_deleted_and_added_and_every_table_follows(
     summary = two.summary.iloc[0]
     assert (summary["rear_count"], summary["run_count"]) == (0, 1)
     assert summary["stretch_attend_s"] == pytest.approx(0.8, abs=0.01)
-    three = corrected(two, ask.delete_bout(two, 4.2))
+    three = corrected(two, correcting.delete_bout(two, 4.2))
     assert not (three.bouts["action"] == "run").any()
     assert contents(session.path) == before, "the session's own files are as they were"
 
@@ -97,7 +96,7 @@ def test_a_joint_that_is_moved_takes_the_chain_along_and_bones_keep_their_length
         session.poses.loc[100 * 5 + 4, ["x_mm", "y_mm", "z_mm"]].to_numpy(float)
         + np.array([0, 0, 12.0]),
     )
-    found = corrected(session, ask.joint_move(session, row, "nose", target))
+    found = corrected(session, correcting.joint_move(session, row, "nose", target))
     was, now = track_of(session), track_of(found)
     assert np.linalg.norm(now.joints_mm[row, -1] - target) < 1.0
     others = np.delete(np.arange(180), row)
@@ -124,7 +123,7 @@ def test_a_joint_under_a_pixel_lies_as_deep_under_the_skin_as_it_usually_does(
 ) -> None:
     row, chest = 60, 60 * 5 + 2
     uv = session.poses.loc[chest, ["u_px", "v_px"]].to_numpy(float)
-    move = ask.joint_move_at_pixel(session, row, "chest", float(uv[0]), float(uv[1]))
+    move = correcting.joint_move_at_pixel(session, row, "chest", float(uv[0]), float(uv[1]))
     where = session.poses.loc[chest, ["x_mm", "y_mm", "z_mm"]].to_numpy(float)
     assert (
         np.linalg.norm(np.array([move.x_mm, move.y_mm, move.z_mm]) - where) < 6.0
@@ -138,8 +137,8 @@ def test_taken_back_everything_reads_as_measured_and_the_log_says_who_and_when(
     place = raw.loc[4, ["x_mm", "y_mm", "z_mm"]].to_numpy(float)
     found = corrected(
         session,
-        ask.joint_move(session, 0, "nose", place + 5.0),
-        ask.add_bout(session, "run", 4.0, 4.5),
+        correcting.joint_move(session, 0, "nose", place + 5.0),
+        correcting.add_bout(session, "run", 4.0, 4.5),
     )
     assert not found.poses.equals(raw)
     pd.testing.assert_frame_equal(Session.open(session.path, raw=True).poses, raw)
@@ -163,7 +162,7 @@ def test_taken_back_everything_reads_as_measured_and_the_log_says_who_and_when(
 def test_an_edit_of_bouts_alone_leaves_no_copy_of_the_poses_and_measures_as_the_run_did(
     session: Session,
 ) -> None:
-    found = corrected(session, ask.rename_bout(session, 2.5, "rear"))  # which confirms it
+    found = corrected(session, correcting.rename_bout(session, 2.5, "rear"))  # which confirms it
     names = {path.name for path in (session.path / "corrected").iterdir()}
     assert "poses.parquet" not in names
     assert "kinematics.parquet" not in names
@@ -175,7 +174,7 @@ def test_an_edit_of_bouts_alone_leaves_no_copy_of_the_poses_and_measures_as_the_
 def test_a_corrected_session_is_no_damaged_one_and_damage_to_its_corrections_is_told(
     session: Session,
 ) -> None:
-    corrected(session, ask.add_bout(session, "run", 4.0, 4.5))
+    corrected(session, correcting.add_bout(session, "run", 4.0, 4.5))
 
     def said() -> list[tuple[str, str]]:
         return [(f.state, f.sentence) for f in verify_session(session.path, lambda: Path())]
@@ -208,11 +207,11 @@ def test_a_corrected_session_is_no_damaged_one_and_damage_to_its_corrections_is_
 
 
 def test_interrupted_at_any_point_the_session_reads_as_before_or_after(session: Session) -> None:
-    corrected(session, ask.add_bout(session, "run", 4.0, 4.5))
+    corrected(session, correcting.add_bout(session, "run", 4.0, 4.5))
     folder = session.path / "corrected"
     folder.rename(session.path / "corrected.old")  # between the two renames
     assert "run" in set(Session.open(session.path).bouts["action"])
-    again = corrected(Session.open(session.path), ask.add_bout(session, "run", 5.0, 5.3))
+    again = corrected(Session.open(session.path), correcting.add_bout(session, "run", 5.0, 5.3))
     assert (again.bouts["action"] == "run").sum() == 2
     assert not (session.path / "corrected.old").exists()
     (session.path / "corrected.part").mkdir()  # left by one that was killed
@@ -221,7 +220,7 @@ def test_interrupted_at_any_point_the_session_reads_as_before_or_after(session: 
 
 
 def test_exports_and_training_take_what_people_say(session: Session, tmp_path: Path) -> None:
-    found = corrected(session, ask.add_bout(session, "run", 4.0, 4.5))
+    found = corrected(session, correcting.add_bout(session, "run", 4.0, 4.5))
     folder = export(found, "csv", tmp_path)
     assert "run" in set(pd.read_csv(folder / "bouts.csv")["action"])
     (one,) = labelled_sessions([session.path], [])
@@ -230,7 +229,7 @@ def test_exports_and_training_take_what_people_say(session: Session, tmp_path: P
 
 
 def test_a_session_measured_again_keeps_what_people_said(session: Session) -> None:
-    corrected(session, ask.add_bout(session, "run", 4.0, 4.5))
+    corrected(session, correcting.add_bout(session, "run", 4.0, 4.5))
     toml = Plan.load("mouse").to_toml()
     same = write(session.path, MOUSE, plan_toml=toml, overwrite=True)
     assert "run" in set(same.bouts["action"]), "its poses came out the same"
@@ -238,7 +237,7 @@ def test_a_session_measured_again_keeps_what_people_said(session: Session) -> No
     other = write(session.path, faster, plan_toml=toml, overwrite=True)
     assert "run" not in set(other.bouts["action"])
     with pytest.raises(SessionError, match=r"made on another measurement .*liex correct redo"):
-        corrected(other, ask.add_bout(other, "walk", 1.0, 2.0))
+        corrected(other, correcting.add_bout(other, "walk", 1.0, 2.0))
     correct_session(session.path)
     assert "run" in set(Session.open(session.path).bouts["action"])
 
@@ -246,33 +245,48 @@ def test_a_session_measured_again_keeps_what_people_said(session: Session) -> No
 def test_sessions_of_earlier_versions_can_be_corrected(golden: Session) -> None:  # noqa: F811
     nose = golden.poses[golden.poses["joint"] == "nose"].iloc[3]
     place = nose[["x_mm", "y_mm", "z_mm"]].to_numpy(float) + np.array([3.0, 0.0, 0.0])
-    move = ask.joint_move(golden, int(nose["frame_index"]), "nose", place)
-    found = corrected(golden, move, ask.add_bout(golden, "walk", 0.1, 0.3))
+    move = correcting.joint_move(golden, int(nose["frame_index"]), "nose", place)
+    found = corrected(golden, move, correcting.add_bout(golden, "walk", 0.1, 0.3))
     moved = found.poses[found.poses["joint"] == "nose"].iloc[3]
     assert moved["x_mm"] == pytest.approx(place[0], abs=0.5)
     assert ("walk", "human") in {(b[0], b[3]) for b in spans(found)}
 
 
 MISTAKES: dict[str, tuple[Callable[[Session], object], str]] = {
-    "a word that is none": (lambda s: ask.add_bout(s, "raer", 1.0, 2.0), "did you mean 'rear'"),
-    "no word": (lambda s: ask.add_bout(s, "  ", 1.0, 2.0), "an action is a word"),
-    "a span backwards": (lambda s: ask.add_bout(s, "rear", 2.0, 1.0), "from a time to a later one"),
-    "no time": (lambda s: ask.add_bout(s, "rear", float("nan"), 1.0), "from a time to a later one"),
+    "a word that is none": (
+        lambda s: correcting.add_bout(s, "raer", 1.0, 2.0),
+        "did you mean 'rear'",
+    ),
+    "no word": (lambda s: correcting.add_bout(s, "  ", 1.0, 2.0), "an action is a word"),
+    "a span backwards": (
+        lambda s: correcting.add_bout(s, "rear", 2.0, 1.0),
+        "from a time to a later one",
+    ),
+    "no time": (
+        lambda s: correcting.add_bout(s, "rear", float("nan"), 1.0),
+        "from a time to a later one",
+    ),
     "no bout there": (
-        lambda s: ask.rename_bout(s, 99.0, "rear"),
+        lambda s: correcting.rename_bout(s, 99.0, "rear"),
         r"no bout holds 99 s; the nearest are",
     ),
-    "no such frame": (lambda s: ask.joint_move(s, 999, "nose", [0, 0, 0]), "there is no frame 999"),
-    "no such joint": (lambda s: ask.joint_move(s, 1, "snout", [0, 0, 0]), "known are rump"),
-    "no pose": (lambda s: ask.joint_move(s, 20, "nose", [0, 0, 0]), "frame 20 has no pose"),
-    "far away": (lambda s: ask.joint_move(s, 1, "nose", [900, 0, 0]), "the animal is 90 mm long"),
-    "no place": (lambda s: ask.joint_move(s, 1, "nose", [1, 2]), "x, y and z in mm"),
+    "no such frame": (
+        lambda s: correcting.joint_move(s, 999, "nose", [0, 0, 0]),
+        "there is no frame 999",
+    ),
+    "no such joint": (lambda s: correcting.joint_move(s, 1, "snout", [0, 0, 0]), "known are rump"),
+    "no pose": (lambda s: correcting.joint_move(s, 20, "nose", [0, 0, 0]), "frame 20 has no pose"),
+    "far away": (
+        lambda s: correcting.joint_move(s, 1, "nose", [900, 0, 0]),
+        "the animal is 90 mm long",
+    ),
+    "no place": (lambda s: correcting.joint_move(s, 1, "nose", [1, 2]), "x, y and z in mm"),
     "beside the picture": (
-        lambda s: ask.joint_move_at_pixel(s, 1, "nose", -3, 5),
+        lambda s: correcting.joint_move_at_pixel(s, 1, "nose", -3, 5),
         "a pixel is a column and a row",
     ),
     "no frames": (
-        lambda s: ask.flip_span(s, 50, 60),
+        lambda s: correcting.flip_span(s, 50, 60),
         "a span to flip is from a time to a later one",
     ),
     "nothing to do again": (lambda s: correct_session(s.path), "has no corrections to apply"),

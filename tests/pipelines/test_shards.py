@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 from liex_lab.pipelines import session as job
-from liex_lab.pipelines import shards as stretches
+from liex_lab.pipelines import shards
 from liex_lab.pipelines.build import build_provenance, build_recording, build_tracker
 from liex_lab.pipelines.verify import verify_session
 from liex_lab.pipelines.workers import Processes
@@ -48,7 +48,7 @@ class InTurn:
 
 @pytest.fixture(autouse=True)
 def short(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(stretches, "LENGTH", LENGTH)
+    monkeypatch.setattr(shards, "LENGTH", LENGTH)
     monkeypatch.setattr(job, "LENGTH", LENGTH)
 
 
@@ -101,7 +101,7 @@ def test_a_frame_that_cannot_be_read_is_told_and_a_whole_recording_goes_on(
     frame = Recording.frame
 
     def torn(self: Recording, row: int) -> Any:
-        if row == 21 and stretches.CHUNK:
+        if row == 21 and shards.CHUNK:
             raise RecordingError("frame 21 cannot be read; copy the recording again")
         return frame(self, row)
 
@@ -110,11 +110,11 @@ def test_a_frame_that_cannot_be_read_is_told_and_a_whole_recording_goes_on(
             patch.setattr(Recording, "frame", torn)
             return look_at(work)
 
-    look_at = stretches.look_at
-    monkeypatch.setattr(stretches, "look_at", torn_stretch)
+    look_at = shards.look_at
+    monkeypatch.setattr(shards, "look_at", torn_stretch)
     with pytest.raises(RecordingError, match="frame 21"):
         run(folder, tmp_path, crew=InTurn())
-    monkeypatch.setattr(stretches, "look_at", look_at)
+    monkeypatch.setattr(shards, "look_at", look_at)
     assert tables_of(run(folder, tmp_path)) == tables_of(session.path)
 
 
@@ -131,9 +131,9 @@ def test_a_short_recording_and_one_that_is_open_are_looked_at_by_one(
 
 
 def test_cuts_are_at_the_same_places_wherever_the_work_goes_on() -> None:
-    assert list(stretches._cuts(0, 20)) == [(0, 8), (8, 16), (16, 20)]
-    assert list(stretches._cuts(11, 20)) == [(11, 16), (16, 20)]
-    assert list(stretches._cuts(20, 20)) == []
+    assert list(shards._cuts(0, 20)) == [(0, 8), (8, 16), (16, 20)]
+    assert list(shards._cuts(11, 20)) == [(11, 16), (16, 20)]
+    assert list(shards._cuts(20, 20)) == []
 
 
 def test_a_stretch_is_sent_without_its_model_and_arrives_with_it(
@@ -144,6 +144,6 @@ def test_a_stretch_is_sent_without_its_model_and_arrives_with_it(
     with build_recording(mouse, plan) as opened:
         tracker = build_tracker(opened, plan)
         origin = build_provenance(opened, plan, tracker)
-    sent = pickle.dumps(stretches.Shard("recording", plan, tracker, origin, tmp_path, 0, 8))
+    sent = pickle.dumps(shards.Shard("recording", plan, tracker, origin, tmp_path, 0, 8))
     assert len(sent) < 0.2 * len(pickle.dumps(tracker))
     assert pickle.loads(sent).tracker.estimator is tracker.estimator  # of the same process

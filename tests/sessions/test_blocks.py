@@ -11,7 +11,7 @@ import pytest
 from liex_lab.sessions import evidence
 from liex_lab.sessions.evidence import FILE, write_evidence
 from liex_lab.tables import rows as rows_module
-from liex_lab.tables import schema as tables
+from liex_lab.tables import schema
 from liex_lab.tables.rows import Rows
 from liex_lab.tracking.observations import COLUMNS, Observations
 from liex_lab.tracking.offline import Subject
@@ -29,7 +29,7 @@ def test_a_table_made_in_blocks_is_the_one_made_at_once(
     def made() -> dict[str, pd.DataFrame]:
         return {
             name: pd.concat(
-                [tables.to_pandas(tables.TABLES[name], block) for block in blocks],
+                [schema.to_pandas(schema.TABLES[name], block) for block in blocks],
                 ignore_index=True,
             )
             for name, blocks in (("poses", rows.poses()), ("rotations", rows.rotations()))
@@ -49,8 +49,8 @@ def test_a_data_frame_is_written_in_blocks_as_at_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     table = Rows(MOUSE.track(), np.arange(len(MOUSE.times_ns)), "s", "m").frames_table()
-    monkeypatch.setattr(tables, "ROWS_PER_GROUP", 16)
-    tables.write_table(tmp_path / "a.parquet", tables.FRAMES, tables.from_pandas(table), {})
+    monkeypatch.setattr(schema, "ROWS_PER_GROUP", 16)
+    schema.write_table(tmp_path / "a.parquet", schema.FRAMES, schema.from_pandas(table), {})
     pd.testing.assert_frame_equal(pd.read_parquet(tmp_path / "a.parquet"), table, check_exact=True)
 
 

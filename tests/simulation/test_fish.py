@@ -13,7 +13,7 @@ from liex_lab.body.skeleton import Skeleton
 from liex_lab.body.surface import Surface
 from liex_lab.optics.camera import RAYTRIX_R5
 from liex_lab.simulation import _sensor_kernels as k
-from liex_lab.simulation import training_patches as windows
+from liex_lab.simulation import training_patches
 from liex_lab.simulation.fish import KINDS, FishSpecies, draw_bends
 from liex_lab.simulation.locomotion import swimming_session
 from liex_lab.simulation.recording import SyntheticSession
@@ -27,7 +27,7 @@ FISH = Skeleton.load("fish")
 def pictures() -> TrainingPatches:
     """Sixteen training windows of fish."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(windows, "BLOCK", 16)
+        patch.setattr(training_patches, "BLOCK", 16)
         return next(training_blocks(3, 1, FishSpecies(), window_px=272))
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from liex_lab.body import Skeleton
-from liex_lab.simulation.hand import pose_prior as hand_postures
+from liex_lab.simulation.hand import pose_prior
 from liex_lab.simulation.hand.pose_prior import (
     STATISTICS,
     HandPostures,
@@ -59,7 +59,7 @@ def test_statistics_of_what_was_drawn_are_those_it_was_drawn_from(
     angles, turns = draw_seen(np.random.default_rng(3), HAND, 1500)
     text = distil(HAND, angles, turns)
     (tmp_path / "again.toml").write_text(text)
-    monkeypatch.setattr(hand_postures, "STATISTICS", tmp_path / "again.toml")
+    monkeypatch.setattr(pose_prior, "STATISTICS", tmp_path / "again.toml")
     HandPostures.load.cache_clear()
     again, turned = draw_seen(np.random.default_rng(4), HAND, 1500)
     HandPostures.load.cache_clear()

@@ -11,7 +11,7 @@ import pytest
 from liex_lab.body import Skeleton
 from liex_lab.errors import LiexError
 from liex_lab.recordings.formats.images.nyu_labels import N_FIRST_PERSON, NyuReference
-from liex_lab.simulation.hand import simulator as hand_world
+from liex_lab.simulation.hand import simulator
 from liex_lab.simulation.hand.simulator import HandSimulator, find_reference, gesture_session
 from liex_lab.simulation.simulator import world_of
 from liex_lab.simulation.training_patches import TrainingPatches
@@ -21,7 +21,7 @@ HAND = Skeleton.load("hand")
 
 @pytest.fixture(autouse=True)
 def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(hand_world, "BLOCK", 32)
+    monkeypatch.setattr(simulator, "BLOCK", 32)
 
 
 @cache

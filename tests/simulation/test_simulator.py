@@ -12,7 +12,7 @@ from liex_lab.body.surface import Surface
 from liex_lab.catalog import find_sample
 from liex_lab.errors import LiexError
 from liex_lab.foreground.background_segmenter import BackgroundSubtraction
-from liex_lab.simulation import training_patches as windows
+from liex_lab.simulation import training_patches
 from liex_lab.simulation.generic import GenericSpecies, draw_angles, moving_session
 from liex_lab.simulation.recording import SyntheticSession
 from liex_lab.simulation.simulator import GenericSimulator, world_of
@@ -52,7 +52,7 @@ STAR = Skeleton.from_table(
 
 @pytest.mark.parametrize("animal", ["mouse", "fish", "snake"])
 def test_a_block_depends_on_its_seed_and_number_alone(monkeypatch, animal):
-    monkeypatch.setattr(windows, "BLOCK", 16)
+    monkeypatch.setattr(training_patches, "BLOCK", 16)
     world = world_of(SNAKE if animal == "snake" else Skeleton.load(animal))
     both = list(world.training_blocks(5, 2, window_px=200))
     (second,) = world.training_blocks(5, 1, first=1, window_px=200, parallel=False)
@@ -117,7 +117,7 @@ def test_an_animal_of_the_camera_view_hangs_above_the_floor():
 
 
 def test_a_window_holds_the_animal_wherever_it_is(monkeypatch):
-    monkeypatch.setattr(windows, "BLOCK", 32)
+    monkeypatch.setattr(training_patches, "BLOCK", 32)
     for skeleton in (SNAKE, STAR):
         world = world_of(skeleton)
         assert isinstance(world, GenericSimulator)

@@ -16,7 +16,7 @@ from liex_lab.body.pose import Pose
 from liex_lab.body.surface import Body, Surface
 from liex_lab.foreground.height_maps import Patches
 from liex_lab.geometry import SE3
-from liex_lab.simulation import _render_kernels as _scene
+from liex_lab.simulation import _render_kernels as render_kernels
 from liex_lab.simulation._sensor_kernels import NORMAL, UNIT
 from liex_lab.simulation.objects import PART_FACES, rounded
 from liex_lab.simulation.scene import draw_views
@@ -134,7 +134,7 @@ def render_agent(
         depth = np.empty((m, window_px, window_px), np.uint16)
         background = np.empty_like(depth)
         nothing = rounded(np.zeros((m, 3)), np.ones((m, 3)), np.zeros(m), np.full(m, 2.0))
-        _scene.draw_windows(
+        render_kernels.draw_windows(
             vertices,
             surface.faces,
             nothing,
@@ -145,7 +145,7 @@ def render_agent(
             intrinsics,
             np.tile(camera.picture, (m, 1)),
             origin,
-            np.zeros((m, _scene.WALL_COLUMNS)) if walls is None else walls[part],
+            np.zeros((m, render_kernels.WALL_COLUMNS)) if walls is None else walls[part],
             np.zeros(m),
             np.tile(camera.parameters, (m, 1)),
             seeds[part],

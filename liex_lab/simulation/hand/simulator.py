@@ -32,7 +32,7 @@ from liex_lab.recordings.formats.images.nyu_labels import (
 )
 from liex_lab.recordings.frame import Depth, DepthFrame
 from liex_lab.simulation._sensor_kernels import PRIMESENSE_KIND
-from liex_lab.simulation.hand import scene as scene
+from liex_lab.simulation.hand import scene
 from liex_lab.simulation.hand.gestures import draw_gestures
 from liex_lab.simulation.hand.pose_prior import draw_seen, draw_wide
 from liex_lab.simulation.pose_prior import SIZE_RANGE

@@ -12,10 +12,8 @@ from typing import Any
 import numpy as np
 import pytest
 from liex_lab.dashboards.paper.plates import draw_figures
-from liex_lab.pipelines.evaluation import pose as evaluate
-from liex_lab.pipelines.evaluation.paper import cached_results as kept
-from liex_lab.pipelines.evaluation.paper import quick, table_text
-from liex_lab.pipelines.evaluation.paper import run as tables
+from liex_lab.pipelines.evaluation import pose
+from liex_lab.pipelines.evaluation.paper import cached_results, quick, run, table_text
 from liex_lab.pipelines.evaluation.paper.sensitivity import Sweep, chosen_values, with_value
 from liex_lab.pipelines.training.baselines import training_of
 
@@ -28,7 +26,7 @@ from liex_lab.estimation.estimator import PoseEstimator
 from liex_lab.estimation.method import METHODS, method_of
 from liex_lab.forests.grow import GrowthPlan
 from liex_lab.runtime.progress import silent
-from liex_lab.simulation import simulator as worlds
+from liex_lab.simulation import simulator
 from liex_lab.simulation.recording import SyntheticSession
 from liex_lab.simulation.sensors import PRIMESENSE_QVGA_SENSOR
 from liex_lab.simulation.species import MouseSpecies
@@ -44,7 +42,7 @@ FIGURES = [
 ]
 
 
-class SmallWorld(worlds.MouseSimulator):
+class SmallWorld(simulator.MouseSimulator):
     """Two splits of two recordings of ten small frames."""
 
     def __init__(self) -> None:
@@ -85,14 +83,14 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """What `--quick` writes, in a small world with toy models."""
     out = tmp_path_factory.mktemp("tables") / "out"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(worlds, "world_of", lambda skeleton: SmallWorld())
+        patch.setattr(simulator, "world_of", lambda skeleton: SmallWorld())
         patch.setattr(quick, "quick_subject", toy_subject)
         patch.setattr(
             quick, "QUICK_SWEEP", Sweep(512, 512, (("initial poses", (1,)), ("metric trees", (2,))))
         )
-        patch.setattr(tables, "_RATE_FRAMES", 8)
-        patch.setattr(tables, "_RATE_REPEATS", 1)
-        written = tables.make_tables(out, ["mouse"], quick=True, n_frames=20, draw=draw_figures)
+        patch.setattr(run, "_RATE_FRAMES", 8)
+        patch.setattr(run, "_RATE_REPEATS", 1)
+        written = run.make_tables(out, ["mouse"], quick=True, n_frames=20, draw=draw_figures)
     assert all(path.is_file() for path in written)
     return out
 
@@ -106,7 +104,7 @@ def rows_of(path: Path) -> list[dict[str, str]]:
 def test_every_row_is_there_for_every_split_with_its_figures_and_where_it_comes_from(made):
     rows = rows_of(made / "table1.csv")
     assert [(r["split"], r["variant"]) for r in rows] == [
-        (split, variant) for variant in tables.ROWS[:-1] for split in ("clean", "hard")
+        (split, variant) for variant in run.ROWS[:-1] for split in ("clean", "hard")
     ]
     for row in rows:
         assert 0 < float(row["median_joint_error_mm"]) < 60
@@ -118,7 +116,7 @@ def test_every_row_is_there_for_every_split_with_its_figures_and_where_it_comes_
     assert published["default"] == ""
     assert not (made / "table2.csv").exists()  # no hand was asked for
     speed = rows_of(made / "table3.csv")
-    assert [r["variant"] for r in speed] == list(tables.ROWS[:-1])
+    assert [r["variant"] for r in speed] == list(run.ROWS[:-1])
     assert float(speed[0]["ratio_to_default"]) == 1.0
 
 
@@ -173,28 +171,28 @@ def test_numbers_of_the_json_are_those_of_the_frames_and_the_way_of_the_candidat
 def test_kept_rows_are_used_where_training_and_test_frames_are_the_same(
     made, monkeypatch, tmp_path
 ):
-    rows = kept.kept_results("mouse", made / "kept")["rows"]
+    rows = cached_results.kept_results("mouse", made / "kept")["rows"]
     skeleton, world = Skeleton.load("mouse"), SmallWorld()
     tests = {split: world.test_split(split) for split in world.splits}
-    row, wanted = rows["rf"], tables.made_from("rf", skeleton)
-    assert not kept.fits(row, wanted, tests)  # a quick row never fits
+    row, wanted = rows["rf"], run.made_from("rf", skeleton)
+    assert not cached_results.fits(row, wanted, tests)  # a quick row never fits
     row["made"]["from"] = wanted
-    assert kept.fits(row, wanted, tests)
-    assert not kept.fits(row, tables.made_from("cnn", skeleton), tests)
-    assert not kept.fits(row, wanted, {**tests, "clean": tests["hard"]})
-    assert not kept.fits(row, wanted, {**tests, "other-body": tests["hard"]})
+    assert cached_results.fits(row, wanted, tests)
+    assert not cached_results.fits(row, run.made_from("cnn", skeleton), tests)
+    assert not cached_results.fits(row, wanted, {**tests, "clean": tests["hard"]})
+    assert not cached_results.fits(row, wanted, {**tests, "other-body": tests["hard"]})
 
 
 def test_kept_results_of_another_schema_are_refused_in_a_sentence(tmp_path):
-    assert kept.kept_results("mouse", tmp_path) == {"rows": {}, "sensitivity": {}}
+    assert cached_results.kept_results("mouse", tmp_path) == {"rows": {}, "sensitivity": {}}
     for content in ('{"schema": 99}', "no json"):
         (tmp_path / "mouse.json").write_text(content)
         with pytest.raises(LiexError, match=r"mouse\.json") as told:
-            kept.kept_results("mouse", tmp_path)
+            cached_results.kept_results("mouse", tmp_path)
         assert "\n" not in str(told.value)
 
 
-def results_with(means: dict[str, float]) -> tables.Results:
+def results_with(means: dict[str, float]) -> run.Results:
     rows = {
         variant: {
             "splits": {
@@ -204,7 +202,7 @@ def results_with(means: dict[str, float]) -> tables.Results:
         }
         for variant, mean in means.items()
     }
-    return tables.Results("mouse", [], ["clean", "hard"], rows)
+    return run.Results("mouse", [], ["clean", "hard"], rows)
 
 
 def test_words_follow_the_numbers():
@@ -230,18 +228,16 @@ def test_words_follow_the_numbers():
 
 
 def test_every_variant_that_can_be_named_is_known_and_any_other_is_refused(monkeypatch):
-    monkeypatch.setattr(
-        evaluate, "estimator_of", lambda animal, variant, progress: f"{variant} model"
-    )
-    assert evaluate.subject_of("mouse", "paper") == "paper model"
+    monkeypatch.setattr(pose, "estimator_of", lambda animal, variant, progress: f"{variant} model")
+    assert pose.subject_of("mouse", "paper") == "paper model"
     with pytest.raises(PlanError, match=r"no variant 'knn'.*paper-no-metric, rf, cnn"):
-        evaluate.subject_of("mouse", "knn")
+        pose.subject_of("mouse", "knn")
 
 
 def test_the_baselines_learn_from_images_of_the_same_kind_as_our_own_model():
     for animal in bundled_models():
         skeleton = Skeleton.load(animal)
-        ours = tables.made_from("default", skeleton)["recipe"]
+        ours = run.made_from("default", skeleton)["recipe"]
         for variant in ("rf", "cnn"):
             theirs = training_of(variant, skeleton).to_dict()["recipe"]
             assert theirs["degraded_share"] == ours["degraded_share"]
@@ -263,10 +259,10 @@ def test_what_is_kept_says_how_it_was_made_and_is_of_the_training_and_test_frame
 
 def check_kept(path: Path) -> None:
     skeleton = Skeleton.load(path.stem)
-    world, results = worlds.world_of(skeleton), kept.kept_results(path.stem)
+    world, results = simulator.world_of(skeleton), cached_results.kept_results(path.stem)
     tests = {split: world.test_split(split, n_sessions=1) for split in world.splits}
     assert path.stat().st_size < 200_000
-    assert set(results["rows"]) == set(tables.ROWS)
+    assert set(results["rows"]) == set(run.ROWS)
     for variant, row in results["rows"].items():
         made = row["made"]
         assert made["command"].startswith("liex evaluate tables")
@@ -274,7 +270,7 @@ def check_kept(path: Path) -> None:
         assert made["code"]
         assert isinstance(made["from"]["recipe"]["seed"], int)
         assert row["rate"]["frames_per_s"] > 0
-        assert kept.fits(row, tables.made_from(variant, skeleton), tests), (
+        assert cached_results.fits(row, run.made_from(variant, skeleton), tests), (
             f"{variant}: refresh with --fresh"
         )
         for numbers in row["splits"].values():

@@ -12,14 +12,13 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
-from liex_lab.pipelines.evaluation import pose as evaluate
-from liex_lab.pipelines.evaluation import speed
+from liex_lab.pipelines.evaluation import pose, speed
 
 from liex_lab.errors import LiexError
 from liex_lab.estimation.estimator import PoseEstimator
 from liex_lab.plan import Plan
 from liex_lab.runtime.progress import Progress, silent
-from liex_lab.simulation import recording as synthetic
+from liex_lab.simulation import recording
 from liex_lab.simulation.recording import SyntheticSession
 from liex_lab.simulation.sensors import PRIMESENSE_QVGA_SENSOR, PRIMESENSE_SENSOR
 from liex_lab.tracking.track import Track
@@ -78,8 +77,8 @@ def small_world(monkeypatch: pytest.MonkeyPatch) -> list[str]:
             for k in range(min(n_sessions, 2))
         ]
 
-    monkeypatch.setattr(synthetic, "test_split", small_split)
-    monkeypatch.setattr(evaluate, "estimator_of", toy_estimator)
+    monkeypatch.setattr(recording, "test_split", small_split)
+    monkeypatch.setattr(pose, "estimator_of", toy_estimator)
     return asked
 
 
@@ -88,7 +87,7 @@ def test_the_numbers_of_evaluate_pose_are_called_as_they_have_always_been(
     small_world, split, variant
 ):
     told: list[str] = []
-    result = evaluate.evaluate_pose(
+    result = pose.evaluate_pose(
         "mouse", split, variant, progress=lambda done, total, what: told.append(what)
     )
     assert list(result) == POSE_KEYS
@@ -109,21 +108,21 @@ def test_the_numbers_of_evaluate_pose_are_called_as_they_have_always_been(
 def test_evaluating_twice_gives_the_same_numbers_and_fewer_frames_take_whole_recordings(
     small_world,
 ):
-    once, twice = (evaluate.evaluate_pose("mouse") for _ in range(2))
+    once, twice = (pose.evaluate_pose("mouse") for _ in range(2))
     assert once == twice
-    assert evaluate.evaluate_pose("mouse", n_frames=10)["n_frames"] == 10
-    assert evaluate.evaluate_pose("mouse", n_frames=11)["n_frames"] == 20
+    assert pose.evaluate_pose("mouse", n_frames=10)["n_frames"] == 10
+    assert pose.evaluate_pose("mouse", n_frames=11)["n_frames"] == 20
 
 
 def test_a_split_that_does_not_exist_is_refused_before_a_model_is_trained(monkeypatch):
-    monkeypatch.setattr(evaluate, "estimator_of", lambda *_: pytest.fail("a model was asked for"))
+    monkeypatch.setattr(pose, "estimator_of", lambda *_: pytest.fail("a model was asked for"))
     with pytest.raises(LiexError, match="no split 'claen'"):
-        evaluate.evaluate_pose("mouse", "claen", "paper")
+        pose.evaluate_pose("mouse", "claen", "paper")
 
 
 def test_a_variant_that_does_not_exist_is_refused():
     with pytest.raises(LiexError, match="no variant 'papre'"):
-        evaluate.evaluate_pose("mouse", "clean", "papre")
+        pose.evaluate_pose("mouse", "clean", "papre")
 
 
 def test_errors_over_sizes_are_told_in_per_cent_of_the_spine(monkeypatch):
@@ -134,8 +133,8 @@ def test_errors_over_sizes_are_told_in_per_cent_of_the_spine(monkeypatch):
         error = {50.0: 2.0, 80.0: 2.4}[how["spine_mm"]]
         return {"mean_joint_error_mm": error, "n_frames": 7, "protocol": "as told"}
 
-    monkeypatch.setattr(evaluate, "evaluate_pose", measured)
-    result = evaluate.evaluate_sizes("mouse", (50.0, 80.0), n_frames=7)
+    monkeypatch.setattr(pose, "evaluate_pose", measured)
+    result = pose.evaluate_sizes("mouse", (50.0, 80.0), n_frames=7)
     assert asked == [("mouse", "clean", "default", 50.0, 7), ("mouse", "clean", "default", 80.0, 7)]
     assert result["error_percent_of_spine"] == pytest.approx({"50": 4.0, "80": 3.0})
     assert result["ratio_to_best"] == pytest.approx({"50": 4 / 3, "80": 1.0})
@@ -148,7 +147,7 @@ def test_the_numbers_of_evaluate_speed_are_called_as_they_have_always_been(
     def one_of_640(name: str, *how: Any) -> list[SyntheticSession]:
         return [SyntheticSession.draw(3, 6, sensor=PRIMESENSE_SENSOR, name=name)]
 
-    monkeypatch.setattr(synthetic, "test_split", one_of_640)
+    monkeypatch.setattr(recording, "test_split", one_of_640)
     monkeypatch.setattr(speed, "N_FRAMES", 8)
     monkeypatch.setattr(speed, "N_REPEATS", 1)
     result = speed.evaluate_speed("mouse")
@@ -171,8 +170,8 @@ def test_what_is_lost_in_a_rendered_recording_counts_as_lost(small_world, monkey
         return depths
 
     monkeypatch.setattr(SyntheticSession, "depths", without_frame_4)
-    sessions = synthetic.test_split("clean", n_sessions=1)
-    errors = evaluate.pose_errors(
+    sessions = recording.test_split("clean", n_sessions=1)
+    errors = pose.pose_errors(
         toy_estimator("mouse", "default"), sessions, Plan.load("mouse"), silent
     )
     assert np.flatnonzero(np.isnan(errors.error_mm)).tolist() == [4]
@@ -229,7 +228,7 @@ def test_known_offsets_come_out_as_they_went_in(tmp_path, mouse, session, off_de
     reference_of(mouse, (3.0, -4.0), np.radians(off_deg)).to_csv(
         tmp_path / "other.csv", index=False
     )
-    result = evaluate.evaluate_reference(session, tmp_path / "other.csv")
+    result = pose.evaluate_reference(session, tmp_path / "other.csv")
     assert result["n_frames"] == result["n_compared"] == 30
     assert result["n_lost"] == len(LEFT_OUT)
     assert result["n_lost_without_flag"] == 0
@@ -251,7 +250,7 @@ def test_rows_that_the_reference_does_not_trust_and_frames_that_do_not_exist_are
     table.loc[::2, ["centroid_x_px", "angle_rad"]] += 1000.0
     beyond = table.iloc[:4].assign(frame=[-1, 30, 31, 500], reliable=1)
     pd.concat([table, beyond]).to_csv(tmp_path / "other.csv", index=False)
-    result = evaluate.evaluate_reference(session, tmp_path / "other.csv")
+    result = pose.evaluate_reference(session, tmp_path / "other.csv")
     assert result["n_compared"] == 15
     assert result["centroid_median_px"] == pytest.approx(5.0, abs=1e-3)
     assert result["heading_median_deg"] == pytest.approx(np.degrees(0.1), abs=1e-3)
@@ -262,16 +261,16 @@ def test_a_reference_without_its_columns_is_refused(tmp_path, mouse, session):
         tmp_path / "other.csv", index=False
     )
     with pytest.raises(LiexError, match="angle_rad") as error:
-        evaluate.evaluate_reference(session, tmp_path / "other.csv")
+        pose.evaluate_reference(session, tmp_path / "other.csv")
     assert "\n" not in str(error.value)
 
 
 def test_a_reference_that_is_missing_or_empty_is_refused(tmp_path, session):
     with pytest.raises(LiexError, match="absent"):
-        evaluate.evaluate_reference(session, tmp_path / "absent.csv")
+        pose.evaluate_reference(session, tmp_path / "absent.csv")
     (tmp_path / "empty.csv").write_text("")
     with pytest.raises(LiexError, match="empty"):
-        evaluate.evaluate_reference(session, tmp_path / "empty.csv")
+        pose.evaluate_reference(session, tmp_path / "empty.csv")
 
 
 def test_a_reference_that_shares_no_frame_with_the_session_is_refused(tmp_path, mouse, session):
@@ -279,4 +278,4 @@ def test_a_reference_that_shares_no_frame_with_the_session_is_refused(tmp_path, 
         tmp_path / "o.csv", index=False
     )
     with pytest.raises(LiexError, match="frame"):
-        evaluate.evaluate_reference(session, tmp_path / "o.csv")
+        pose.evaluate_reference(session, tmp_path / "o.csv")

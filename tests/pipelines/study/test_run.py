@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
-from liex_lab.pipelines.study import dask_cluster as cohort
+from liex_lab.pipelines.study import dask_cluster
 from liex_lab.pipelines.study.one_session import measure_one
 from liex_lab.pipelines.study.slurm import SlurmTable
 from liex_lab.pipelines.study.status import standing, standings
@@ -137,9 +137,9 @@ def test_workers_share_the_cores(finished: tuple[Path, str, int]) -> None:
 def test_sessions_are_shared_by_all_workers_where_there_are_fewer_than_these(
     finished: tuple[Path, str, int],
 ) -> None:
-    assert [cohort.n_shared(n, 2) for n in range(6)] == [0, 1, 0, 1, 0, 1]
-    assert [cohort.n_shared(n, 4) for n in (3, 4, 11)] == [3, 0, 3]
-    assert cohort.n_shared(3, 0) == 0, "workers that are still to come cannot be counted"
+    assert [dask_cluster.n_shared(n, 2) for n in range(6)] == [0, 1, 0, 1, 0, 1]
+    assert [dask_cluster.n_shared(n, 4) for n in (3, 4, 11)] == [3, 0, 3]
+    assert dask_cluster.n_shared(3, 0) == 0, "workers that are still to come cannot be counted"
     done = [one.session for one in standings(Study.load(finished[0])) if one.state == "done"]
     shared = {
         one.animal.id: json.loads((one.folder / "session.json").read_text())["shared"]
@@ -149,7 +149,7 @@ def test_sessions_are_shared_by_all_workers_where_there_are_fewer_than_these(
 
 
 def test_all_workers_share_the_stretches_of_one_session() -> None:
-    with cohort._client(2, 2, 1, None, None) as client:
+    with dask_cluster._client(2, 2, 1, None, None) as client:
         found = client.submit(shared_task, 6, pure=False).result(timeout=120)
     assert sorted(number for number, _ in found) == list(range(6))
     assert len({process for _, process in found}) == 2, "the worker that steps aside does its share"

@@ -24,7 +24,7 @@ from liex_lab.sessions import Session
 from liex_lab.sessions.applying import edited_bouts
 from liex_lab.sessions.correcting import labelled_bouts
 from liex_lab.sessions.tracks import track_of, wall_of
-from liex_lab.simulation.agents import fish as fish_acts
+from liex_lab.simulation.agents import fish
 from liex_lab.simulation.agents import mouse as mouse_acts
 from tests.sessions.walking_mouse import WalkingMouse, write
 
@@ -114,7 +114,7 @@ def test_sessions_without_labels_are_one_sentence(session: Session) -> None:
 
 
 @pytest.mark.parametrize(
-    ("animal", "words"), [("fish", fish_acts.ACTIONS), ("mouse", mouse_acts.ACTIONS)]
+    ("animal", "words"), [("fish", fish.ACTIONS), ("mouse", mouse_acts.ACTIONS)]
 )
 def test_the_bundled_models_know_their_words_and_are_small(
     animal: str, words: tuple[str, ...]

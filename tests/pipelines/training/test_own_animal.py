@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from liex_lab.pipelines.build import plan_of
 from liex_lab.pipelines.evaluation.pose import evaluate_pose, sizes_of
-from liex_lab.pipelines.training import pose_model as train
+from liex_lab.pipelines.training import pose_model
 
 from liex_lab.api import run_session
 from liex_lab.body.skeleton import Skeleton
@@ -43,7 +43,7 @@ def model(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     )
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(methods.METHODS, "default", small)
-        yield train.train_model(
+        yield pose_model.train_model(
             SNAKE, "default", tmp_path_factory.mktemp("models") / "snake.npz", n_images=1024
         )
 

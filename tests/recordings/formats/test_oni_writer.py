@@ -10,7 +10,7 @@ import pytest
 from liex_lab.errors import RecordingError
 from liex_lab.optics.camera import Camera
 from liex_lab.recordings import open_recording
-from liex_lab.recordings.formats.oni import writer as primesense_writer
+from liex_lab.recordings.formats.oni import writer
 from liex_lab.recordings.formats.oni.writer import Codec, write_oni
 from tests.recordings.writers import (
     SMALL,
@@ -143,7 +143,7 @@ def test_a_place_that_cannot_be_written_is_told(
     def full(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(primesense_writer.OniWriter, "_write", full)
+    monkeypatch.setattr(writer.OniWriter, "_write", full)
     assert "No space left" in sentence(path, STORED)
 
 
@@ -156,7 +156,7 @@ def test_times_before_zero_begin_at_zero(path: Path) -> None:
 
 def test_a_long_file_has_no_seek_table(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     # OpenNI2's player has a buffer of fixed size for it, and refuses the file if it is too long
-    monkeypatch.setattr(primesense_writer, "_MOST_IN_SEEK_TABLE", 5)
+    monkeypatch.setattr(writer, "_MOST_IN_SEEK_TABLE", 5)
     write_oni_file(path, STORED)
     with open_recording(path, strict=True) as recording:
         np.testing.assert_array_equal([frame.depth for frame in recording], STORED)

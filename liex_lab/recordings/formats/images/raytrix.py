@@ -20,7 +20,7 @@ from liex_lab.errors import RecordingError
 from liex_lab.optics.camera import Camera, Lens
 from liex_lab.recordings.camera_file import CAMERA_FILE, CameraFile
 from liex_lab.recordings.depth_units import Stored
-from liex_lab.recordings.formats.images import point_clouds as _clouds
+from liex_lab.recordings.formats.images import point_clouds
 from liex_lab.recordings.formats.images.folder import Folder, list_pictures, natural_key, open_stack
 from liex_lab.recordings.formats.images.raytrix_profile import (
     PROFILE_FILE,
@@ -179,7 +179,9 @@ def _open_clouds(
         path for path in folder.iterdir() if path.is_file() and fnmatch(path.name, profile.pattern)
     ]
     beside = (told.timestamps, CAMERA_FILE, PROFILE_FILE)
-    files = [p for p in inside if p.suffix.lower() in _clouds.SUFFIXES and p.name not in beside]
+    files = [
+        p for p in inside if p.suffix.lower() in point_clouds.SUFFIXES and p.name not in beside
+    ]
     if not files:
         raise RecordingError(
             f"no point cloud (.xyz, .txt, .csv or .ply) in {folder} fits pattern = "
@@ -194,12 +196,12 @@ def _open_clouds(
             "write a camera.toml with fx, fy, cx, cy, width and height in pixels"
         )
     camera = told.camera(width, height, stated)
-    return files, _clouds.open_clouds(
+    return files, point_clouds.open_clouds(
         files, camera, profile.columns, profile_points(profile), progress
     )
 
 
-def profile_points(profile: Profile) -> Callable[[_clouds.Points], _clouds.Points]:
+def profile_points(profile: Profile) -> Callable[[point_clouds.Points], point_clouds.Points]:
     """The function that carries a file's points into the camera frame.
 
     Args:
@@ -211,7 +213,7 @@ def profile_points(profile: Profile) -> Callable[[_clouds.Points], _clouds.Point
     """
     scale = profile.unit_mm * np.array([1.0, -1.0 if profile.up else 1.0, float(profile.sign)])
 
-    def to_camera(points: _clouds.Points) -> _clouds.Points:
+    def to_camera(points: point_clouds.Points) -> point_clouds.Points:
         """Points in the camera frame.
 
         Args:
