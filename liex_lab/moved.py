@@ -11,9 +11,14 @@ import sys
 import warnings
 from collections.abc import Sequence
 from importlib import import_module
-from importlib.abc import Loader, MetaPathFinder
 from importlib.machinery import ModuleSpec
 from types import ModuleType
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from importlib.abc import Loader
+else:  # importlib.abc brings tempfile and random along, for a class that is not asked what it is
+    Loader = object
 
 MOVED = {
     "liex_lab.actions.chain": "liex_lab.actions.semi_markov",
@@ -125,7 +130,7 @@ class _Forward(Loader):
         module.__spec__ = self._own
 
 
-class _MovedModules(MetaPathFinder):
+class _MovedModules:
     """Finds the old paths of `MOVED`, after every other finder has failed to."""
 
     def find_spec(
