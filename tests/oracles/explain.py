@@ -32,7 +32,7 @@ def explained(
     scale: float,
     size: float,
 ) -> np.ndarray:
-    """The eight numbers of `_explain.explain_pose`."""
+    """The eight numbers of `_residual_kernels.explain_pose`."""
     middles, radii = placed(balls, rotations, positions, scale), balls.radius * scale
     own, per_mm = balls.n_own, 1.0 / (size * balls.unit_mm)
     R, distance = look[4:13].reshape(3, 3), look[13]
