@@ -115,7 +115,7 @@ def each_way_it_can_lie(place: Path, work: Callable[[], object]) -> Iterator[boo
         lies = frozenset(
             str(path.relative_to(home))
             for path in home.rglob("*")
-            if not [part for part in path.parts[:-1] if part.endswith(".gone")]
+            if not [part for part in path.parts[:-1] if part.endswith((".gone", "seen"))]
         )
         assert [path for path in home.rglob("corrections.json") if path.stat().st_size], n
         if lies not in ways:
