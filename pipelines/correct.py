@@ -2,12 +2,11 @@
 
 What was measured is never written again. The folder `corrected` holds an append-only log of
 flips, moved joints and edited bouts, and the tables that follow from those that stand; it is
-replaced as a whole by a rename.
+replaced as a whole by a rename, and the one before goes only when the new one is on disk.
 """
 
 from __future__ import annotations
 
-import os
 import shutil
 from collections.abc import Sequence
 from dataclasses import replace
@@ -16,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from liex_lab.errors import SessionError
 from liex_lab.plan import Plan
+from liex_lab.runtime.durable import put_back, put_in_place
 from liex_lab.runtime.progress import Progress, silent
 from liex_lab.sessions.corrections import (
     FOLDER,
@@ -77,6 +77,8 @@ def correct_session(
 
     raw = Session.open(session, raw=True)
     with locked(raw.path / _BUSY, f"{raw.path} is being corrected by another program"):
+        folder, aside = raw.path / FOLDER, raw.path / f"{FOLDER}.old"
+        put_back(folder, aside)  # somebody was killed here
         made_of = basis(raw.path, raw.metadata)
         log = read_log(raw.path)
         if log.entries and log.made_of != made_of and (what or undo):
@@ -99,7 +101,7 @@ def correct_session(
                 progress(0, None, "measuring what was corrected")
                 log = _apply(raw, log, part, blueprint)
             (part / LOG).write_text(log.to_json(), encoding="utf-8")
-            _put(part)
+            put_in_place(part, folder, aside)
         finally:
             shutil.rmtree(part, ignore_errors=True)
     if report is not None:
@@ -182,16 +184,3 @@ def _behaviour(
         actions = {**again.actions, **actions}
     bouts = edited_bouts(bouts, log.corrections(BoutEdit), frames)
     return measure_rows(results.rows, rules, around, bouts=bouts, actions=actions), facts
-
-
-def _put(part: Path) -> None:
-    """Rename the new folder into place; until then readers find the old one (see
-    `corrections.corrected_folder`).
-    """
-    folder = part.with_name(FOLDER)
-    old = part.with_name(f"{FOLDER}.old")
-    if folder.is_dir():
-        shutil.rmtree(old, ignore_errors=True)
-        os.rename(folder, old)
-    os.rename(part, folder)
-    shutil.rmtree(old, ignore_errors=True)

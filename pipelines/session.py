@@ -90,7 +90,8 @@ def measure_session(
     """
     from liex_lab.sessions import SessionWriter
     from liex_lab.sessions.checkpoint import check_free, hash_once
-    from liex_lab.sessions.place import check_place, part_folder
+    from liex_lab.sessions.older import part_folder, put_back_session
+    from liex_lab.sessions.place import check_place
 
     started = time.perf_counter()
     with (
@@ -98,6 +99,7 @@ def measure_session(
         build_recording(recording, plan, progress) as opened,
     ):
         folder = folder or Path(out) / f"{plan.session.name or opened.name}.liex"
+        put_back_session(folder)
         check_place(folder, overwrite)
         check_free(part_folder(folder))
         progress(0, None, "learning the background, the floor and the animal's size")

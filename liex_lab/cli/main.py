@@ -451,7 +451,11 @@ def _fault() -> NoReturn:
 
 
 def _tell_session(session: Path) -> None:
+    from liex_lab.sessions.older import taken_from
+
     typer.echo(f"session: {session}")
+    if copy := taken_from(session):
+        typer.echo(f"note: the corrections of {copy} were taken over; see `liex correct list`")
     report = session / "report.html"
     if report.is_file():
         typer.echo(f"report:  {report}")

@@ -420,6 +420,22 @@ def check_free(folder: Path) -> None:
         held.close()
 
 
+def hold(folder: Path) -> IO[bytes] | None:
+    """Hold an unfinished session, so that nobody else writes it.
+
+    Args:
+        folder: the folder NAME.part.
+
+    Returns:
+        The lock, which goes with `close`; None where another process writes the session, or it
+        became whole just now.
+    """
+    try:
+        return take_lock(folder / _LOCK)
+    except FileNotFoundError:
+        return None
+
+
 def _read_state(path: Path) -> State | None:
     """The state in a file; None where there is none that could be gone on with."""
     try:

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from liex_lab.errors import LiexError
+from liex_lab.runtime.durable import sync_folder
 from liex_lab.sessions.provenance import versions
 
 FAILED_FILE = "failed.json"
@@ -76,7 +77,8 @@ def write_failure(folder: Path, failure: dict[str, Any]) -> None:
 def write_whole(path: Path, text: str) -> None:
     """Write a text file atomically, so that nobody ever reads half of it.
 
-    It is written under another name beside its place, synchronised to disk and renamed.
+    It is written under another name beside its place, synchronised to disk and renamed. After a
+    power cut it is the old one or the new one.
 
     Args:
         path: the file; one that is there is replaced.
@@ -89,6 +91,7 @@ def write_whole(path: Path, text: str) -> None:
             file.flush()
             os.fsync(file.fileno())
         beside.replace(path)
+        sync_folder(path.parent)
     except BaseException:
         beside.unlink(missing_ok=True)
         raise

@@ -1,4 +1,4 @@
-"""Rules for where a session may be written, and the names of unfinished folders."""
+"""Rules for where a session may be written, and what is to be known of its files."""
 
 from __future__ import annotations
 
@@ -12,15 +12,6 @@ from liex_lab.sessions.checkpoint import OWN
 from liex_lab.sessions.failure import FAILED_FILE
 
 _HASHED = {".parquet", ".csv", ".json", ".toml"}
-
-
-def part_folder(path: Path) -> Path:
-    """Folder NAME.part in which a session lies until it is whole.
-
-    Args:
-        path: the session folder to be.
-    """
-    return path.with_name(f"{path.name}.part")
 
 
 def check_place(path: Path, overwrite: bool) -> None:

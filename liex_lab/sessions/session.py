@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from contextlib import suppress
 from functools import cached_property
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any
@@ -21,6 +22,7 @@ from liex_lab.geometry import SE3
 from liex_lab.optics.camera import Camera
 from liex_lab.runtime.memory import trim_heap
 from liex_lab.sessions.corrections import Log, applies, corrected_folder, read_log
+from liex_lab.sessions.older import put_back_session
 from liex_lab.sessions.provenance import SCHEMA_VERSION
 from liex_lab.sessions.reading import reading_from
 from liex_lab.sessions.thumbnails import FOLDER
@@ -89,6 +91,8 @@ class Session:
     def open(path: str | Path, *, raw: bool = False) -> Session:
         """Open the session in a folder, checked for its version and for missing files.
 
+        One that a writer had put aside when it was killed is put back first.
+
         Args:
             path: the session folder.
             raw: as it was measured, without what people corrected (see
@@ -100,6 +104,8 @@ class Session:
         """
         folder = Path(path)
         document = folder / "session.json"
+        with suppress(OSError):  # of a medium that cannot be written
+            put_back_session(folder)
         if not document.is_file():
             what = "is not a folder" if not folder.is_dir() else "holds no session.json"
             raise SessionError(

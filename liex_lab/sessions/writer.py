@@ -16,6 +16,7 @@ from array import array
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -24,12 +25,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.errors import SessionError
+from liex_lab.runtime.durable import put_in_place, sync_tree
 from liex_lab.runtime.memory import Allocator, on_disk, peak_memory_mb, trim_heap
 from liex_lab.sessions.buffer import Columnar, TrackBuffer, columns_of
 from liex_lab.sessions.checkpoint import LOGS, Checkpoint
-from liex_lab.sessions.corrections import FOLDER, corrected_folder
+from liex_lab.sessions.corrections import FOLDER
 from liex_lab.sessions.evidence import write_evidence
-from liex_lab.sessions.place import check_place, file_facts, part_folder
+from liex_lab.sessions.older import (
+    aside_folder,
+    corrections_for,
+    note_taken,
+    part_folder,
+    put_back_held,
+    put_back_session,
+)
+from liex_lab.sessions.place import check_place, file_facts
 from liex_lab.sessions.provenance import Provenance
 from liex_lab.sessions.results import Results
 from liex_lab.sessions.thumbnails import Keepsakes
@@ -91,6 +101,7 @@ class SessionWriter:
         report: ReportMaker | None = None,
     ) -> None:
         path = Path(path)
+        put_back_session(path)
         check_place(path, overwrite)
         self.path = path
         self.origin = origin
@@ -336,6 +347,10 @@ class SessionWriter:
     ) -> Session:
         """Write everything else and put the session in its place; returns it opened.
 
+        Corrections of the session that was there are taken over; where there was none, those of an
+        outdated copy of it (see `liex_lab.sessions.older`), and session.json says so under
+        `corrections_taken_from`.
+
         The report is written last; where that fails the session is kept all the same.
 
         Args:
@@ -389,6 +404,9 @@ class SessionWriter:
         self._seconds += time.perf_counter() - began
         self._document["files"] = file_facts(self._folder, self._checkpoint.logs)
         self._document.update(self._account(of_track, dict(timings_s or {})))
+        made = corrections_for(self.path)
+        if made is not None and made.parent != self.path:
+            self.note(corrections_taken_from=made.parent.name)
         text = json.dumps(self._document, indent=2, default=str, allow_nan=False)
         (self._folder / "session.json").write_text(text + "\n", encoding="utf-8")
         rows.track.release_pages()
@@ -426,28 +444,24 @@ class SessionWriter:
         }
 
     def _publish(self) -> None:
-        """Rename the whole folder into place; an older session goes only after that."""
-        old = self.path.with_name(f"{self.path.name}.old")
+        """Put the whole folder in place; an older session goes only when this one is on disk."""
+        put_back_held(self.path)
         check_place(self.path, self._overwrite)
-        if self.path.exists():
-            made = corrected_folder(self.path)
-            if (
-                made.is_dir()
-            ):  # what people said is not lost; it applies again where the poses came out the same
-                shutil.copytree(made, self._folder / FOLDER)
-            shutil.rmtree(old, ignore_errors=True)
-            self.path.rename(old)
+        sync_tree(self._folder)  # hours may lie there; until it is done the work can go on
+        made = corrections_for(self.path)
+        copy = self._folder / FOLDER
+        shutil.rmtree(copy, ignore_errors=True)
+        if made is not None:  # they apply again where the poses came out the same
+            shutil.copytree(made, copy)
+            sync_tree(copy)
         self._checkpoint.drop_parts()
-        try:
-            self._folder.rename(self.path)
-        except OSError:
-            if old.exists():
-                old.rename(self.path)
-            raise
+        put_in_place(self._folder, self.path, aside_folder(self.path))
         self._done = True
         self._stop_logging()
         self._checkpoint.tidy(self.path)
-        shutil.rmtree(old, ignore_errors=True)
+        if made is not None:
+            with suppress(OSError):  # then they are found to be the same ones
+                note_taken(made, self.path)
 
     def _abandon(self, keep: bool) -> None:
         """Close what is open; keep: what there is a checkpoint of."""

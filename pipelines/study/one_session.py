@@ -12,10 +12,11 @@ from liex_lab.plan import Plan
 from liex_lab.plan.study import PlannedSession
 from liex_lab.runtime.progress import Progress, silent
 from liex_lab.sessions.failure import describe_failure, read_failure, write_failure
+from liex_lab.sessions.older import set_outdated, taken_from
 
 from ..shards import MEASURING
 from ..workers import WorkerPool
-from .status import input_stamp, set_aside
+from .status import input_stamp
 
 
 class RunSession(Protocol):
@@ -66,7 +67,8 @@ def measure_one(
         crew: pool of workers for the session's shards.
 
     Returns:
-        `id`, `state` (`done` or `failed`), `seconds`, and `failure` (None where it is done).
+        `id`, `state` (`done` or `failed`), `seconds`, `failure` (None where it is done), and
+        `corrections_taken_from` (the outdated copy that people had corrected; "" for none).
     """
     if run_id and (ended := _ended(session, run_id)):
         return ended
@@ -106,6 +108,7 @@ def measure_one(
         "state": "failed" if failure else "done",
         "seconds": seconds,
         "failure": failure,
+        "corrections_taken_from": "" if failure else taken_from(session.folder),
     }
 
 
@@ -135,5 +138,5 @@ def quarantine(session: PlannedSession, failure: dict[str, Any]) -> None:
         "plan": session.plan.model_dump(exclude_none=True),
     }
     known["input"] = {"stamp": input_stamp(session.recording)}
-    set_aside(session.folder)
+    set_outdated(session.folder)
     write_failure(session.folder, known)

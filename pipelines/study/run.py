@@ -87,10 +87,12 @@ def _measure(
         def finished(result: dict[str, Any]) -> None:
             """Tell the board how a session went: its `result`."""
             failure = result["failure"]
+            copy = result.get("corrections_taken_from")
+            taken = f", with the corrections of {copy}" if copy else ""
             sentence = (
                 f"failed: {failure['reason']}"
                 if failure
-                else f"is done, in {result['seconds']:.0f} s"
+                else f"is done, in {result['seconds']:.0f} s{taken}"
             )
             shown.ended(result["id"], sentence, failed=failure is not None)
 

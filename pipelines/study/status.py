@@ -17,7 +17,7 @@ from typing import Any, Literal
 from liex_lab.errors import LiexError
 from liex_lab.plan import Plan
 from liex_lab.plan.study import VIRTUAL, PlannedSession, Study
-from liex_lab.sessions.failure import FAILED_FILE, read_failure
+from liex_lab.sessions.failure import read_failure
 from liex_lab.sessions.provenance import SCHEMA_VERSION, package_version
 
 _SAYS = {
@@ -213,20 +213,3 @@ def input_stamp(recording: str) -> str:
         if not path.is_dir():
             break
     return hashlib.sha256(json.dumps(sorted(entries)).encode()).hexdigest()[:32]
-
-
-def set_aside(folder: Path) -> None:
-    """Clear the way for failed.json: older results become NAME.outdated, an older one goes.
-
-    Args:
-        folder: the session folder.
-    """
-    if (folder / "session.json").is_file():
-        older = folder.with_name(f"{folder.name}.outdated")
-        if older.is_dir():
-            import shutil
-
-            shutil.rmtree(older)
-        folder.rename(older)
-    elif (folder / FAILED_FILE).is_file():
-        (folder / FAILED_FILE).unlink()

@@ -1,0 +1,131 @@
+"""Folders put in place of older ones so that neither a kill nor a power cut loses both.
+
+A file that was written is on disk only once it is synchronised (fsync), and a rename only once the
+folder that it happened in is. Systems write the two in any order: a folder renamed into place may
+have empty files in it after a power cut. So what is new is synchronised before it is renamed, and
+what was there before goes only when the rename is on disk, too.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import shutil
+import sys
+from pathlib import Path
+
+# shares and file systems on which this cannot be asked for
+_NOT_HERE = {errno.EINVAL, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS}
+
+
+def sync_tree(folder: Path) -> None:
+    """Synchronise every regular file and every folder in a folder to disk, bottom up.
+
+    Links are not followed.
+
+    Args:
+        folder: the folder, itself the last one to be synchronised.
+
+    Raises:
+        OSError: the disk is full or broken, so that what was written is not on it.
+    """
+    for inside, _, names in os.walk(folder, topdown=False):
+        for name in sorted(names):
+            file = Path(inside, name)
+            if file.is_file() and not file.is_symlink():
+                _sync(file, os.O_RDWR if sys.platform == "win32" else os.O_RDONLY)
+        sync_folder(Path(inside))
+
+
+def sync_folder(folder: Path) -> None:
+    """Synchronise the entries of a folder to disk: which names there are in it.
+
+    Does nothing on Windows, which cannot open folders.
+
+    Args:
+        folder: the folder.
+
+    Raises:
+        OSError: the disk is broken.
+    """
+    if sys.platform != "win32":
+        _sync(folder, os.O_RDONLY)
+
+
+def put_in_place(new: Path, place: Path, aside: Path) -> None:
+    """Rename a folder into place; the one that was there goes when the new one is safe on disk.
+
+    All three lie in the same folder. Killed at any point, either `place` is whole, or it is missing
+    and `aside` is whole, which `put_back` mends.
+
+    Args:
+        new: the folder that was written; synchronised here.
+        place: where it is to be.
+        aside: where the folder that is there waits until then.
+
+    Raises:
+        OSError: it could not be done; what was there before is there again.
+    """
+    sync_tree(new)
+    if place.exists():
+        sync_folder(place.parent)  # a folder that waits there has its replacement in place
+        discard(aside)
+        place.rename(aside)
+    try:
+        new.rename(place)
+    except OSError:
+        put_back(place, aside)
+        raise
+    sync_folder(place.parent)
+    discard(aside)
+
+
+def put_back(place: Path, aside: Path) -> bool:
+    """Rename back what `put_in_place` had put aside when it was killed.
+
+    Args:
+        place: where the folder was.
+        aside: where it may wait.
+
+    Returns:
+        Whether it was renamed; not where something is in the place.
+
+    Raises:
+        OSError: it cannot be renamed.
+    """
+    if place.exists() or not aside.is_dir():
+        return False
+    aside.rename(place)
+    sync_folder(place.parent)
+    return True
+
+
+def discard(folder: Path) -> None:
+    """Remove a folder that nobody needs, so that no part of it is ever taken for the whole.
+
+    It loses its name first. What cannot be removed stays under the other name, NAME.gone, and goes
+    the next time.
+
+    Args:
+        folder: the folder; it need not be there.
+
+    Raises:
+        OSError: it cannot be renamed.
+    """
+    gone = folder.with_name(f"{folder.name}.gone")
+    shutil.rmtree(gone, ignore_errors=True)
+    if folder.is_dir():
+        folder.rename(gone)
+        shutil.rmtree(gone, ignore_errors=True)
+
+
+def _sync(path: Path, flags: int) -> None:
+    """Synchronise a file or folder that can be opened with these flags."""
+    opened = os.open(path, flags)
+    try:
+        os.fsync(opened)
+    except OSError as error:
+        if error.errno not in _NOT_HERE:
+            raise
+    finally:
+        os.close(opened)

@@ -1,0 +1,98 @@
+"""A folder takes the place of another: on disk first, and one of the two always whole."""
+
+from __future__ import annotations
+
+import errno
+import os
+import shutil
+from pathlib import Path
+
+import pytest
+
+from liex_lab.runtime import durable
+from tests.sessions.kills import check_order, killed_at, recorded
+
+WHOLE = {"a.txt", "inner/b.txt"}
+
+
+def fill(folder: Path, text: str) -> Path:
+    for name in WHOLE:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text(text)
+    return folder
+
+
+def read(folder: Path) -> str:
+    """The text of a whole folder."""
+    (text,) = {(folder / name).read_text() for name in WHOLE}
+    return text
+
+
+def test_everything_is_on_disk_before_the_old_one_goes(tmp_path: Path) -> None:
+    place = fill(tmp_path / "place", "old")
+    with recorded() as calls:
+        durable.put_in_place(fill(tmp_path / "new", "new"), place, tmp_path / "aside")
+    check_order(calls, place)
+    assert read(place) == "new"
+    assert list(tmp_path.iterdir()) == [place]
+
+
+def test_killed_at_any_call_one_of_them_is_whole_and_the_next_one_goes_on(tmp_path: Path) -> None:
+    n = 0
+    while True:
+        here = tmp_path / str(n)
+        place, aside = fill(here / "place", "old"), here / "aside"
+        new = fill(here / "new", "new")
+        stopped = killed_at(n, lambda: durable.put_in_place(new, place, aside))  # noqa: B023
+        durable.put_back(place, aside)
+        assert read(place) in ("old", "new"), n
+        shutil.rmtree(new, ignore_errors=True)
+        durable.put_in_place(fill(new, "third"), place, aside)
+        assert read(place) == "third"
+        assert list(here.iterdir()) == [place], n
+        if not stopped:
+            break
+        n += 1
+    assert n > 10
+
+
+def test_what_cannot_be_renamed_leaves_the_old_one_in_its_place(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    place, new = fill(tmp_path / "place", "old"), fill(tmp_path / "new", "new")
+    rename = os.rename
+
+    def refuse(source: Path, target: Path) -> None:
+        if Path(source) == new:
+            raise OSError(errno.EACCES, "refused")
+        rename(source, target)
+
+    monkeypatch.setattr(os, "rename", refuse)
+    with pytest.raises(OSError, match="refused"):
+        durable.put_in_place(new, place, tmp_path / "aside")
+    assert read(place) == "old"
+    assert not (tmp_path / "aside").exists()
+
+
+def test_a_share_that_cannot_synchronise_is_no_error_and_a_broken_disk_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for number, told in ((errno.EINVAL, False), (errno.ENOTSUP, False), (errno.EIO, True)):
+        monkeypatch.setattr(os, "fsync", _Refusing(number))
+        place, new = fill(tmp_path / "place", "old"), fill(tmp_path / "new", "new")
+        if told:
+            with pytest.raises(OSError, match="refused"):
+                durable.put_in_place(new, place, tmp_path / "aside")
+        else:
+            durable.put_in_place(new, place, tmp_path / "aside")
+        assert read(place) == ("old" if told else "new")
+
+
+class _Refusing:
+    """A disk that answers every fsync with one error."""
+
+    def __init__(self, number: int) -> None:
+        self._number = number
+
+    def __call__(self, file: int) -> None:
+        raise OSError(self._number, "refused")
