@@ -51,4 +51,5 @@ def why_full(error: OSError, folder: Path | None = None) -> str:
         folder: on the disk; None where the error itself names the file.
     """
     at = folder or (Path(os.fsdecode(error.filename)) if error.filename else None)
-    return f"the disk{f' that holds {at}' if at else ''} {_WHY.get(error.errno or 0, 'is full')}"
+    which = f"the disk that holds {at}" if at else "the disk"
+    return f"{which} {_WHY.get(error.errno or 0, 'is full')} ({error.strerror})"
