@@ -84,15 +84,19 @@ def test_a_replay_whose_thread_is_dead_is_let_go_within_seconds(
     monkeypatch.setattr(replay, "_TURN_S", 0.2)
     monkeypatch.setattr(replay.atexit, "unregister", lambda _: None)
     writer = SessionWriter(tmp_path / "walk.liex", MOUSE.provenance())
+    writer._replay._stream.disconnect()
+    monkeypatch.setattr(writer._replay, "_stream", _Dead())
+    monkeypatch.setattr(replay, "probe_full", lambda _: FULL)
     began = time.monotonic()
-    with pytest.raises(SessionError, match=r"is full \(No space left on device\)"), writer:
-        frames, track = next(iter(MOUSE.chunks(16)))
-        writer.add(frames, seen=track)
-        writer._drain()
-        writer._replay._stream.disconnect()
-        writer._replay._stream = _Dead()
-        monkeypatch.setattr(replay, "probe_full", lambda _: FULL)
-        writer._take_down()
+
+    def write() -> None:
+        with writer:
+            frames, track = next(iter(MOUSE.chunks(16)))
+            writer.add(frames, seen=track)
+            writer._take_down()
+
+    with pytest.raises(SessionError, match=r"is full \(No space left on device\)"):
+        write()
     assert time.monotonic() - began < 10.0
     writer._replay.abandon()  # at once: nothing waits for it any more
 
