@@ -373,6 +373,7 @@ _KINDS = {
     "leaves": np.float16,
 }
 _PARTS = tuple(_KINDS)
+_TABLES = ("tests", "leaves")
 
 
 def _split(forest: Forest) -> dict[str, NDArray[Any]]:
@@ -400,12 +401,12 @@ def _join(parts: dict[str, NDArray[Any]]) -> Forest:
     their parent splits, the left side of the stack first, so walking the trees again in that order
     gives every pointer back.
     """
+    for name, kind in _KINDS.items():
+        if parts[name].dtype != kind or parts[name].ndim != (2 if name in _TABLES else 1):
+            raise ValueError(f"{name} of a forest is no list of {np.dtype(kind)}")
     n_inner = len(parts["threshold"])
     n_leaves = parts["leaves"].shape[1]
     n_nodes = n_inner + n_leaves
-    for name, kind in _KINDS.items():
-        if parts[name].dtype != kind:
-            raise ValueError(f"{name} of a forest is {parts[name].dtype}, not {np.dtype(kind)}")
     is_leaf = np.unpackbits(parts["is_leaf"], count=n_nodes).astype(bool)
     if len(is_leaf) != n_nodes or int(is_leaf.sum()) != n_leaves:
         raise ValueError(f"a forest does not have the {n_leaves} leaves that it has values of")

@@ -296,7 +296,9 @@ def test_bundled_models_pass_and_keep_their_bytes(animal):
 
 def test_the_expectation_forest_sees_as_many_clues_as_are_checked(model):
     fit = np.zeros((2, 3))
-    pose = Pose(SE3.identity((2,)), np.zeros((2, 5, 3)), np.ones(2))
+    pose = Pose(
+        SE3(np.tile(np.eye(3), (2, 1, 1)), np.zeros((2, 3))), np.zeros((2, 5, 3)), np.ones(2)
+    )
     clues = Chosen(
         pose,
         np.ones((2, 6)),
