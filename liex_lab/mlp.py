@@ -56,6 +56,29 @@ class Network:
         return x.astype(np.float64)
 
 
+def check_layers(network: Network, n_outputs: int) -> None:
+    """Check that the layers of a network that came from a file fit to one another.
+
+    Args:
+        network: the network.
+        n_outputs: logits that it should give.
+
+    Raises:
+        ValueError: what is wrong, as a part of a sentence.
+    """
+    before: tuple[int, ...] = np.shape(network.centre)
+    sound = len(before) == 1 and np.shape(network.scale) == before and len(network.layers) > 0
+    for weights, bias in network.layers:
+        sound = sound and np.ndim(weights) == 2 and np.shape(weights)[:1] == before
+        before = np.shape(bias)
+        sound = sound and np.shape(weights)[1:] == before
+    if not sound or before != (n_outputs,):
+        raise ValueError(f"the layers of a network do not lead to {n_outputs} numbers")
+    numbers = [network.centre, network.scale, *(part for layer in network.layers for part in layer)]
+    if not all(part.dtype.kind == "f" and np.isfinite(part).all() for part in numbers):
+        raise ValueError("a network's weights are not all finite numbers")
+
+
 def descend(
     inputs: NDArray[np.floating],
     labels: NDArray[Any],

@@ -12,15 +12,18 @@ from typing import Any
 import numpy as np
 
 from liex_lab.actions._plain_skops import read_plain, write_plain
+from liex_lab.actions.ethogram import UNLABELLED
 from liex_lab.actions.semi_markov import SemiMarkovModel
 from liex_lab.actions.timeline import TimelineModel
 from liex_lab.catalog import MODELS, sha256
 from liex_lab.errors import ModelError
-from liex_lab.mlp import Network
+from liex_lab.mlp import Network, check_layers
 
 SUFFIX = ".skops"
 _FORMAT = 2
 _WITHOUT_PEAKS = 1
+_LONGEST_S = 3600.0  # of an action; each tick of the shortest one is a state
+_FASTEST_HZ = 1000.0
 
 
 def save_action_model(model: TimelineModel, path: str | Path) -> Path:
@@ -99,7 +102,7 @@ def load_action_model(name: str | Path, folder: Path = MODELS) -> TimelineModel:
             Network(n["centre"], n["scale"], tuple((w, b) for w, b in n["layers"]))
             for n in document["networks"]
         )
-        return TimelineModel(
+        model = TimelineModel(
             document["skeleton"],
             float(document["clock_hz"]),
             tuple(document["words"]),
@@ -112,6 +115,8 @@ def load_action_model(name: str | Path, folder: Path = MODELS) -> TimelineModel:
             document["definitions"],
             {**document["card"], "sha256": sha256(path)},
         )
+        check_timeline(model)
+        return model
     except ModelError:
         raise
     except Exception as error:  # a file that is not ours can fail anywhere in the reader
@@ -119,6 +124,42 @@ def load_action_model(name: str | Path, folder: Path = MODELS) -> TimelineModel:
             f"{path} should be an action model made by `liex train actions`, but: "
             f"{type(error).__name__}: {error}"
         ) from None
+
+
+def check_timeline(model: TimelineModel) -> None:
+    """Check that all parts of a model that came from a file are of its words.
+
+    Args:
+        model: the model as it was read.
+
+    Raises:
+        ValueError: what is wrong, as a part of a sentence.
+    """
+    k = len(model.words)
+    if k < 2 or len(set(model.words)) != k or UNLABELLED not in model.words:
+        raise ValueError("its words are not two or more, each named once, one for what has no name")
+    if not all(isinstance(word, str) for word in (*model.words, model.skeleton)):
+        raise ValueError("its words are not all words")
+    chain = model.chain
+    for name, values, shape in (
+        ("share", model.share, (k,)),
+        ("speeds", model.speeds, (k, 2)),
+        ("peaks", model.peaks, (k,)),
+        ("shortest_s", chain.shortest_s, (k,)),
+        ("mean_s", chain.mean_s, (k,)),
+        ("follow", chain.follow, (k, k)),
+    ):
+        if np.shape(values) != shape or values.dtype.kind != "f" or np.isnan(values).any():
+            raise ValueError(f"its {name} should be numbers of the shape {shape}")
+    durations = np.concatenate([chain.shortest_s, chain.mean_s])
+    if not ((durations >= 0) & (durations <= _LONGEST_S)).all():
+        raise ValueError(f"its actions should last between 0 and {_LONGEST_S:.0f} s")
+    if not 0.0 < model.clock_hz <= _FASTEST_HZ or not np.isfinite(model.sharpness):
+        raise ValueError(f"its clock should tick up to {_FASTEST_HZ:.0f} times a second")
+    if not model.networks:
+        raise ValueError("it holds no network")
+    for network in model.networks:
+        check_layers(network, k)
 
 
 def find_action_model(name: str | Path, folder: Path = MODELS) -> Path:

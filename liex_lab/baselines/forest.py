@@ -36,7 +36,7 @@ from liex_lab.estimation.training import Tell, TrainingSet
 from liex_lab.foreground.crop_camera import in_camera_frame
 from liex_lab.foreground.segmenter import Segmenter
 from liex_lab.forests._kernels import VIEW
-from liex_lab.forests.forest import Forest, Samples
+from liex_lab.forests.forest import Forest, Samples, check_forest
 from liex_lab.forests.grow import GrowthPlan, grow_forest
 from liex_lab.geometry import SE3, so3
 from liex_lab.runtime.threads import threads
@@ -45,6 +45,7 @@ Array = NDArray[np.float64]
 
 _F1 = GrowthPlan(7, 20, 10, 300, 0.5, 0.0, 0.0, 0.63)
 _F2 = GrowthPlan(12, 20, 5, 300, 0.5, 0.0, 0.0, 0.63)
+_N_WHERE = 5  # values of a leaf of F1
 # of the animal's length: a turn about its own axis moves no joint of a straight animal
 _LEAST_LEVER = 0.05
 
@@ -169,6 +170,8 @@ class RegressionForest:
                     Forest(*(archive[f"{name}_{part}"] for part in ("nodes", "roots", "leaves")))
                     for name in ("where", "pose")
                 )
+            check_forest(where, 1, 0, _N_WHERE)
+            check_forest(pose, 1, 0, len(levers(skeleton)))
         except DAMAGE as error:
             raise ModelError(
                 f"{path} is not a whole regression forest ({error}); remove it and train again"

@@ -34,6 +34,7 @@ from liex_lab.cli.options import (
 from liex_lab.cli.results import compare, export, report
 from liex_lab.cli.study import cohort, dashboard, verify
 from liex_lab.errors import LiexError
+from liex_lab.runtime.disk import is_full, why_full
 from liex_lab.runtime.progress import progress_bar
 
 # the exit code of our own faults (EX_SOFTWARE); what the user can put right is 1, a wrong call 2
@@ -41,12 +42,12 @@ FAULT = 70
 _USERS_TO_MEND = {
     errno.EACCES,
     errno.EPERM,
-    errno.ENOSPC,
     errno.EROFS,
-    errno.EDQUOT,
     errno.ENAMETOOLONG,
     errno.ENOTDIR,
 }
+# what Rerun's writer says of a full disk is said by our own sentence
+_RUST_LOG = "warn,re_log_encoding=off,re_sdk=off"
 
 app = typer.Typer(
     name="liex",
@@ -424,11 +425,14 @@ def main() -> None:
     """The command line. What the user can put right is one sentence and exit code 1; a fault of
     ours shows itself.
     """
+    os.environ.setdefault("RUST_LOG", _RUST_LOG)
     try:
         app()
     except LiexError as error:
         _fail(str(error))
     except OSError as error:
+        if is_full(error):
+            _fail(f"{why_full(error)}; make room there and run the same command again")
         if error.errno not in _USERS_TO_MEND:
             _fault()
         where = f" {error.filename}" if error.filename else ""

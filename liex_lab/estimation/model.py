@@ -13,7 +13,7 @@ import io
 import json
 import lzma
 import zipfile
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
@@ -22,12 +22,16 @@ from numpy.typing import NDArray
 
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.errors import ModelError
+from liex_lab.estimation._feature_kernels import N_SCALARS
+from liex_lab.estimation._residual_kernels import N_FIT
 from liex_lab.estimation.cascade import Cascade
 from liex_lab.estimation.method import Method
+from liex_lab.estimation.ridge_correction import N_OTHERS
 from liex_lab.forests._kernels import number_nodes
-from liex_lab.forests.forest import Forest
-from liex_lab.mlp import Network
+from liex_lab.forests.forest import Forest, check_forest, check_roots
+from liex_lab.mlp import Network, check_layers
 
+N_CLUES = 22  # of `scoring.clue_samples`, the residuals apart
 SCHEMA = 3  # of a model that tells which way an animal faces; 2 of one that does not
 # that follow the regressors, as far as a model has them
 _FORESTS = ("metric", "expectation", "pruner", "corrector", "proposals")
@@ -39,6 +43,8 @@ _DAMAGE = (
     AttributeError,
     EOFError,
     NotImplementedError,
+    RecursionError,
+    MemoryError,
     zipfile.BadZipFile,
     lzma.LZMAError,
 )
@@ -200,6 +206,8 @@ class Model:
             ) from None
         skeleton = Skeleton.from_table(table, str(path))
         rounds = [method.rounds_of(joint) for joint in skeleton.solved]
+        if any(type(n) is not int or n < 1 for n in rounds):
+            raise ModelError(f"{path} states {rounds} rounds for its joints; train it again")
         n_regressors = sum(rounds)
         extra = head.get("forests", _FORESTS[: len(forests) - n_regressors])  # schema 1 did not say
         if len(forests) != n_regressors + len(extra) or "metric" not in extra:
@@ -214,7 +222,7 @@ class Model:
         assert metric is not None
         expectation, pruner, corrector, proposals = others
         cascade = Cascade(skeleton, method, each, proposals)
-        return Model(
+        model = Model(
             cascade,
             metric,
             expectation,
@@ -226,12 +234,110 @@ class Model:
             settler,
             facing,
         )
+        try:
+            check_model(model)
+        except _DAMAGE as error:
+            raise ModelError(
+                f"{path} does not hold a model that can be used ({error}); train it again or copy "
+                "it anew"
+            ) from None
+        return model
 
     def digest(self) -> str:
         """SHA-256 of the model file, as hexadecimal digits."""
         return hashlib.sha256(self.to_bytes()).hexdigest()
 
 
+def check_model(model: Model) -> None:
+    """Check every number of a model that came from a file and that arrays are indexed or sized by.
+
+    Args:
+        model: the model as it was read.
+
+    Raises:
+        ValueError: what is wrong, as a part of a sentence.
+    """
+    skeleton = model.skeleton
+    method = model.method
+    j = skeleton.n_joints
+    n_fit = N_FIT if method.explains else 0
+    n_refined = N_FIT if method.refine_steps else 0
+    expected: list[tuple[str, Forest | None, tuple[int, int, int]]] = [
+        (f"of {skeleton.names[joint]}", forest, (1, N_SCALARS, model.cascade.n_values(joint)))
+        for joint, rounds in zip(skeleton.solved, model.cascade.forests, strict=True)
+        for forest in rounds
+    ]
+    if len({forest.n_trees for _, forest, _ in expected if forest is not None}) > 1:
+        raise ValueError("its forests of the joints have different numbers of trees")
+    expected += [
+        ("metric", model.metric, (j, N_SCALARS + n_fit, 1)),
+        ("expectation", model.expectation, (1, N_CLUES + n_refined, 1)),
+        ("pruner", model.pruner, (1, N_SCALARS, 1)),
+        ("corrector", model.corrector, (j, N_SCALARS + 1, 3 * j)),
+        ("proposals", model.proposals, (1, N_SCALARS + 1, _N_PROPOSED)),
+    ]
+    for name, forest, sizes in expected:
+        if forest is not None:
+            try:
+                check_forest(forest, *sizes)
+            except ValueError as error:
+                raise ValueError(f"forest {name}: {error}") from None
+    for where, part in (("method", method), ("calibration", model.calibration)):
+        for one in fields(part):
+            value = getattr(part, one.name)
+            if one.type == "float" and type(value) not in (float, int):
+                raise ValueError(f"{one.name} of its {where} is {value!r}, not a number")
+        _check_numbers(f"its {where}", vars(part))
+    for name, least in _COUNTS.items():
+        count = getattr(method, name)
+        if type(count) is not int or not least <= count <= _MOST:
+            raise ValueError(f"{name} of its method is {count!r}, not {least} to {_MOST}")
+    if len(model.calibration.joint_share) not in (0, j) or len(model.calibration.quantiles) != 2:
+        raise ValueError(f"its calibration is not of {j} joints")
+    settler = model.settler
+    if settler is not None and not (
+        skeleton.is_chain
+        and settler.dtype == np.float64
+        and settler.shape == (2 * j + N_OTHERS, j + 4)
+        and np.isfinite(settler).all()
+    ):
+        raise ValueError("its ridge correction is not of this skeleton")
+    if model.facing is not None:
+        check_layers(model.facing, 1)
+    if method.explains or method.refine_steps:
+        balls = model.cascade.balls.joints
+        if balls.size and (balls.min() < 0 or balls.max() >= j):
+            raise ValueError(f"a sphere of its body lies on none of the {j} joints")
+
+
+def _check_numbers(where: str, values: Any) -> None:
+    """Raise ValueError where there is a number, however deep in tables and lists, that is NaN,
+    infinite or so large that it can mean nothing.
+    """
+    if isinstance(values, float | int) and not abs(values) <= _HUGE:
+        raise ValueError(f"{where} holds the number {values}")
+    inner = getattr(values, "__dict__", values)
+    if isinstance(inner, dict):
+        inner = inner.values()
+    elif not isinstance(inner, list | tuple):
+        return
+    for value in inner:
+        _check_numbers(where, value)
+
+
+_HUGE = 1e12
+_MOST = 10_000
+# how often each is done, or how many there are, at least
+_COUNTS = {
+    "rounds": 1,
+    "n_candidates": 1,
+    "top_k": 1,
+    "survivors": 0,
+    "base_rounds": 0,
+    "refine_steps": 0,
+    "refined": 0,
+}
+_N_PROPOSED = 12  # a rotation matrix and a position
 _LAYER = "facing_"
 
 
@@ -258,7 +364,16 @@ def _network(archive: Any) -> Network:
     return Network(np.zeros(n, np.float32), np.ones(n, np.float32), layers)
 
 
-_PARTS = ("tests", "threshold", "kind", "is_leaf", "roots", "leaves")
+_KINDS = {
+    "tests": np.int8,
+    "threshold": np.int16,
+    "kind": np.uint8,
+    "is_leaf": np.uint8,
+    "roots": np.int32,
+    "leaves": np.float16,
+}
+_PARTS = tuple(_KINDS)
+_TABLES = ("tests", "leaves")
 
 
 def _split(forest: Forest) -> dict[str, NDArray[Any]]:
@@ -286,15 +401,21 @@ def _join(parts: dict[str, NDArray[Any]]) -> Forest:
     their parent splits, the left side of the stack first, so walking the trees again in that order
     gives every pointer back.
     """
+    for name, kind in _KINDS.items():
+        if parts[name].dtype != kind or parts[name].ndim != (2 if name in _TABLES else 1):
+            raise ValueError(f"{name} of a forest is no list of {np.dtype(kind)}")
     n_inner = len(parts["threshold"])
     n_leaves = parts["leaves"].shape[1]
     n_nodes = n_inner + n_leaves
     is_leaf = np.unpackbits(parts["is_leaf"], count=n_nodes).astype(bool)
+    if len(is_leaf) != n_nodes or int(is_leaf.sum()) != n_leaves:
+        raise ValueError(f"a forest does not have the {n_leaves} leaves that it has values of")
+    check_roots(parts["roots"], is_leaf)
     nodes = np.zeros((n_nodes, 4), np.int32)
     words = np.empty((n_inner, 8), np.int8)
     words[:, :6] = parts["tests"].T
     words[:, 6:] = parts["threshold"].view(np.int8).reshape(-1, 2)
     nodes[~is_leaf, :2] = words.view(np.int32)
     nodes[~is_leaf, 3] = parts["kind"]
-    number_nodes(is_leaf, np.append(parts["roots"], n_nodes), nodes)
+    number_nodes(is_leaf, np.append(parts["roots"], n_nodes).astype(np.int64), nodes)
     return Forest(nodes, parts["roots"], np.ascontiguousarray(parts["leaves"].T.astype(np.float32)))

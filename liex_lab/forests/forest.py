@@ -13,14 +13,17 @@ used (`estimation._cascade_kernels.mode_of_votes`).
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
 
-from liex_lab.forests._kernels import descend
+from liex_lab.forests._kernels import ONE_PROBE, SCALAR, TWO_PROBES, descend
 
 Array = NDArray[np.float64]
+
+_LAST_KIND = max(TWO_PROBES, ONE_PROBE, SCALAR)
 
 
 @dataclass(frozen=True)
@@ -83,6 +86,78 @@ class Forest:
         return Forest(
             np.concatenate(nodes), np.concatenate(roots).astype(np.int32), np.concatenate(leaves)
         )
+
+
+def check_roots(roots: NDArray[Any], is_leaf: NDArray[np.bool_]) -> None:
+    """Check where trees begin among nodes that lie tree by tree in the order of growth.
+
+    `_kernels.number_nodes` writes wherever it is sent, so this comes before it: a binary tree of m
+    leaves has m - 1 other nodes.
+
+    Args:
+        roots: (T,) index of each tree's root.
+        is_leaf: (n,) which nodes are leaves.
+
+    Raises:
+        ValueError: what is wrong, as a part of a sentence.
+    """
+    n = len(is_leaf)
+    if roots.ndim != 1 or roots.dtype.kind != "i" or not len(roots):
+        raise ValueError("its roots are no list of whole numbers")
+    starts = np.append(roots.astype(np.int64), n)
+    if starts[0] != 0 or not (np.diff(starts) > 0).all():
+        raise ValueError(f"its roots do not rise from 0 to its {n} nodes")
+    leaves = np.add.reduceat(is_leaf, roots.astype(np.int64), dtype=np.int64)
+    if not np.array_equal(2 * leaves - 1, np.diff(starts)):
+        raise ValueError("its nodes do not make whole trees")
+
+
+def check_forest(forest: Forest, n_views: int, n_scalars: int, n_values: int) -> None:
+    """Check every index in a forest that came from a file, before a kernel follows it.
+
+    Children lie behind their parent, so that each descent ends.
+
+    Args:
+        forest: the forest.
+        n_views: views that its samples have.
+        n_scalars: scalars that they have.
+        n_values: values of a leaf.
+
+    Raises:
+        ValueError: what is wrong, as a part of a sentence.
+    """
+    nodes = forest.nodes
+    roots = forest.roots
+    leaves = forest.leaves
+    shapes = nodes.shape[1:] == (4,) and roots.ndim == 1 and leaves.ndim == 2
+    if not shapes or (nodes.dtype, roots.dtype, leaves.dtype) != (np.int32, np.int32, np.float32):
+        raise ValueError("its nodes, roots and leaves are not of the right kind")
+    if leaves.shape[1] != n_values:
+        raise ValueError(f"its leaves have {leaves.shape[1]} values, not {n_values}")
+    if not np.isfinite(leaves).all():
+        raise ValueError("its leaves are not all finite")
+    if not len(roots) or roots.min() < 0 or roots.max() >= len(nodes):
+        raise ValueError(f"a root is not one of its {len(nodes)} nodes")
+    inner = nodes[:, 2] >= 0
+    at = np.flatnonzero(inner)
+    child = nodes[at, 2].astype(np.int64)
+    if (child <= at).any() or (child + 1 >= len(nodes)).any():
+        raise ValueError("a child does not lie behind its parent among the nodes")
+    if (-1 - nodes[~inner, 2].astype(np.int64) >= len(leaves)).any():
+        raise ValueError(f"a node names a leaf beyond the {len(leaves)} there are")
+    tests = nodes[at, 3]
+    kind = tests & 3
+    channel = tests >> 2
+    if (kind > _LAST_KIND).any():
+        raise ValueError("a test is of no known kind")
+    limit = np.where(kind == SCALAR, n_scalars, n_views)
+    if (tests < 0).any() or (channel >= limit).any():
+        raise ValueError(
+            f"a test asks for more than the {n_views} views and {n_scalars} scalars there are"
+        )
+    offsets = np.ascontiguousarray(nodes[at, :2]).view(np.int8).reshape(-1, 8)[:, :6]
+    if (offsets == np.iinfo(np.int8).min).any():
+        raise ValueError("an offset is below -127")
 
 
 @dataclass(frozen=True)

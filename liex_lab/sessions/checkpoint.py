@@ -13,6 +13,7 @@ import json
 import shutil
 import time
 from collections.abc import Callable, Mapping
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
@@ -113,6 +114,16 @@ class Checkpoint:
         (folder / _SEEN).mkdir(exist_ok=True)
         self.seen = Columns(folder / _SEEN)
         self._last = clock()
+
+    @property
+    def is_saved(self) -> bool:
+        """Whether there is a checkpoint to go on from."""
+        return (self.folder / _STATE).is_file()
+
+    @property
+    def kept_frames(self) -> int:
+        """Frames that need not be measured again, however the work ends."""
+        return self.state.n_frames if self.is_saved else 0
 
     @property
     def due(self) -> bool:
@@ -258,8 +269,9 @@ class Checkpoint:
             keep: leave it there if it has a checkpoint, so that the work can go on later; otherwise
                 nothing stays.
         """
-        self.seen.close()
-        if not (keep and (self.folder / _STATE).is_file()):
+        with suppress(OSError):  # what the disk does not take is behind the checkpoint
+            self.seen.close()
+        if not (keep and self.is_saved):
             shutil.rmtree(self.folder, ignore_errors=True)
         self._held.close()
 
@@ -341,10 +353,15 @@ class Columns:
             file.flush()
 
     def close(self) -> None:
-        """Close the files."""
-        for file in self._files.values():
-            file.close()
-        self._files.clear()
+        """Close the files.
+
+        Raises:
+            OSError: the system refused to write; all are closed even so.
+        """
+        with ExitStack() as closing:
+            for file in self._files.values():
+                closing.callback(file.close)
+            self._files.clear()
 
     def read(self) -> dict[str, NDArray[Any]]:
         """All rows of every column, mapped from the files; empty where none was written.

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from liex_lab.errors import LiexError
+from liex_lab.runtime.disk import is_full, why_full
 from liex_lab.runtime.durable import sync_folder
 from liex_lab.sessions.provenance import versions
 
@@ -40,6 +41,9 @@ def describe_failure(error: BaseException, stage: str, frame: int | None) -> dic
     if isinstance(error, LiexError):
         reason, _, remedy = str(error).rpartition("; ")
         reason, remedy = (reason, remedy) if reason else (remedy, "see `liex doctor`")
+    elif isinstance(error, OSError) and is_full(error):
+        reason = why_full(error)
+        remedy = "make room there and run it again"
     elif isinstance(error, OSError):
         where = f" {error.filename}" if error.filename else ""
         reason = f"the system refused{where}: {error.strerror or error}"
@@ -92,7 +96,9 @@ def write_whole(path: Path, text: str) -> None:
             os.fsync(file.fileno())
         beside.replace(path)
         sync_folder(path.parent)
-    except BaseException:
+    except BaseException as error:
+        if isinstance(error, OSError) and error.filename is None:
+            error.filename = str(path)  # writing does not tell what was written
         beside.unlink(missing_ok=True)
         raise
 

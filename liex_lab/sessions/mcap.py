@@ -285,13 +285,16 @@ class McapWriter:
 
 
 class _WatchedFile:
-    """A file for Foxglove's writer, which goes on without a word when the disk is full: this one
-    remembers.
+    """A file for Foxglove's writer, which prints a line for every message when the disk is full.
+
+    This one remembers the first error for `check`, and only counts what comes after it.
     """
 
     def __init__(self, path: Path) -> None:
         self._file = path.open("wb")
-        self._error: Exception | None = None
+        self._error: OSError | None = None
+        self._at = 0
+        self._end = 0
 
     @property
     def size(self) -> int:
@@ -300,23 +303,32 @@ class _WatchedFile:
 
     def write(self, data: bytes | bytearray) -> int:
         """As a file does."""
-        try:
-            return self._file.write(data)
-        except Exception as error:
-            self._error = self._error or error
-            raise
+        if self._error is None:
+            try:
+                self._file.write(data)
+            except OSError as error:
+                self._error = error
+        self._at += len(data)
+        self._end = max(self._end, self._at)
+        return len(data)
 
     def seek(self, offset: int, whence: int = 0) -> int:
         """As a file does."""
-        return self._file.seek(offset, whence)
+        if self._error is None:
+            try:
+                self._file.seek(offset, whence)
+            except OSError as error:
+                self._error = error
+        self._at = offset + (0, self._at, self._end)[whence]
+        return self._at
 
     def flush(self) -> None:
         """As a file does."""
-        try:
-            self._file.flush()
-        except Exception as error:
-            self._error = self._error or error
-            raise
+        if self._error is None:
+            try:
+                self._file.flush()
+            except OSError as error:
+                self._error = error
 
     def close(self) -> None:
         """As a file does, but what goes wrong is told by `check`."""

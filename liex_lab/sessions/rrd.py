@@ -8,6 +8,10 @@ made of.
 
 from __future__ import annotations
 
+import atexit
+import ctypes
+import threading
+import time
 from collections.abc import Sequence
 from itertools import cycle
 from pathlib import Path
@@ -20,6 +24,7 @@ from numpy.typing import NDArray
 from liex_lab.errors import SessionError
 from liex_lab.geometry import so3
 from liex_lab.recordings.rvl import rvl_message
+from liex_lab.runtime.disk import probe_full
 from liex_lab.runtime.memory import blocks, release_pages
 from liex_lab.sessions.joining import RRD_HEAD, rrd_messages
 from liex_lab.sessions.provenance import Provenance
@@ -57,6 +62,9 @@ _NOISY_PNG = (
 _TOGETHER = 64
 _TOGETHER_BYTES = 1 << 23
 _BLOCK = 8192  # frames of small things sent in one go
+# turns in which a flush is waited for, and how long a file may stand still, where the disk has room
+_TURN_S = 2.0
+_PATIENCE_S = 120.0
 MM_PER_UNIT = 1000.0  # our depth is in mm, the scene in metres
 
 # Colours that stay apart for the colour-blind (Tol's bright and muted sets); action words take them
@@ -117,6 +125,7 @@ class ReplayWriter:
         self._stream: Any = _Renamed(stream) if corrected else stream
         self._path = path
         self._n_sent = 0
+        self._broken = False
         self._checked = 0
         self._n_found = 0
         self._stream.save(path)
@@ -162,7 +171,7 @@ class ReplayWriter:
             self._stream.send_columns(
                 DEPTH, _timeline(np.array(index), np.array(elapsed)), [*columns]
             )
-            self._stream.flush()
+            self._flush()
             self._n_sent += 1
             self._waiting.clear()
 
@@ -187,6 +196,7 @@ class ReplayWriter:
 
         Raises:
             SessionError: the file was not written whole.
+            OSError: the disk is full.
         """
         self._send_depth()
         index = rows.frame_index
@@ -215,7 +225,7 @@ class ReplayWriter:
             for part in blocks(len(index), _BLOCK):
                 columns = rr.Scalars.columns(scalars=values[part])
                 self._stream.send_columns(entity, _timeline(index[part], elapsed[part]), [*columns])
-            self._stream.flush()
+            self._flush()
             release_pages(values)
         self._log_lanes(rows, bouts, words)
         self._log_worst(rows, index, elapsed)
@@ -240,24 +250,75 @@ class ReplayWriter:
 
         Raises:
             SessionError: messages are missing.
+            OSError: the disk is full.
         """
         self._send_depth()
-        self._stream.flush()
+        self._flush()
         size = self._path.stat().st_size
         with self._path.open("rb") as file:
             for at, length in rrd_messages(file, size, self._checked or RRD_HEAD):
                 self._checked = at + length
                 self._n_found = self._n_found + 1
         if self._n_found < self._n_sent:
-            raise SessionError(
-                "the replay was not written whole; make room on the disk and run it again"
-            )
+            raise self._unwritten()
         return size
 
+    def _flush(self) -> None:
+        """Wait until Rerun's thread has written what it was given.
+
+        Where the disk is full the thread dies, and a flush may then wait for ever. So it waits in
+        short turns: it goes on as long as the file grows, and gives up soon where the disk is full.
+
+        Raises:
+            SessionError: the file was not written whole.
+            OSError: the disk is full.
+        """
+        waited = 0.0
+        before = -1
+        while True:
+            began = time.monotonic()
+            try:
+                self._stream.flush(timeout_sec=_TURN_S)
+                return
+            except Exception as error:  # Rerun tells no more than a sentence
+                took = time.monotonic() - began
+                size = self._path.stat().st_size if self._path.is_file() else 0
+                if took < 0.5 * _TURN_S or probe_full(self._path.parent):
+                    raise self._unwritten() from error
+                waited = waited + took if size == before else 0.0
+                before = size
+                if waited > _PATIENCE_S:
+                    raise self._unwritten() from error
+
+    def _unwritten(self) -> Exception:
+        """What to raise where Rerun has not written everything; it writes no more from now on."""
+        if not self._broken:
+            self._broken = True
+            _let_go(self._stream)
+        return probe_full(self._path.parent) or SessionError(
+            f"the replay {self._path} was not written whole; make room on the disk or mend it, and "
+            "run the same command again"
+        )
+
     def abandon(self) -> None:
-        """Close the file, whole or not."""
-        self._stream.flush()
-        self._stream.disconnect()
+        """Close the file, whole or not.
+
+        A file that Rerun failed to write is let go without waiting for it.
+
+        Raises:
+            SessionError: the file was not written whole.
+            OSError: the disk is full.
+        """
+        if self._broken:
+            return
+        self._flush()
+        closing = threading.Thread(target=self._stream.disconnect, daemon=True)
+        closing.start()
+        closing.join(_TURN_S)
+        while closing.is_alive():
+            if probe_full(self._path.parent):
+                raise self._unwritten()
+            closing.join(_TURN_S)
 
     def _log_scene(self) -> None:
         camera = self._origin.camera
@@ -512,6 +573,18 @@ def corrected_entity(entity: str) -> str:
         if entity.startswith(above):
             return f"{above}corrected/{entity.removeprefix(above)}"
     return f"corrected/{entity}"
+
+
+def _let_go(stream: Any) -> None:
+    """Never close a stream whose thread has died, for that would wait for it for ever.
+
+    Neither when nobody uses it any more nor at the end of the process, which closes its file.
+
+    Args:
+        stream: a Rerun stream.
+    """
+    atexit.unregister(rr.rerun_shutdown)
+    ctypes.pythonapi.Py_IncRef(ctypes.py_object(stream))
 
 
 class _Renamed:

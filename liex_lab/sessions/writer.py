@@ -24,7 +24,8 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from liex_lab.errors import SessionError
+from liex_lab.errors import LiexError, SessionError
+from liex_lab.runtime.disk import is_full, probe_full, why_full
 from liex_lab.runtime.durable import put_in_place, sync_tree
 from liex_lab.runtime.memory import Allocator, on_disk, peak_memory_mb, trim_heap
 from liex_lab.sessions.buffer import Columnar, TrackBuffer, columns_of
@@ -156,7 +157,14 @@ class SessionWriter:
     ) -> None:
         if self._done:
             return
+        full = full_disk(self._folder, error)
         self._abandon(keep=error is not None)
+        if full is not None:
+            kept = self._checkpoint.kept_frames
+            raise SessionError(
+                f"{full}; make room there and run the same command again, which "
+                + (f"goes on after the {kept} frames in {self._folder}" if kept else "begins anew")
+            ) from error
         if error is None:
             raise SessionError(
                 "a session left without close() is not kept; call close() at the end of the block"
@@ -472,6 +480,24 @@ class SessionWriter:
             except Exception:  # an error is under way already; it is the one to tell
                 continue
         self._checkpoint.leave(keep)
+
+
+def full_disk(folder: Path, error: BaseException | None) -> str | None:
+    """What to say of an error if it came of a full disk: which disk it is; None if it did not.
+
+    Libraries tell of a full disk in errors of their own, so the disk is asked.
+
+    Args:
+        folder: the folder that is written to.
+        error: the error under way; None for none.
+    """
+    if error is None or isinstance(error, LiexError) or not isinstance(error, Exception):
+        return None
+    if isinstance(error, OSError) and error.errno is not None:
+        found = error if is_full(error) else None
+    else:
+        found = probe_full(folder)
+    return None if found is None else why_full(found, folder.parent)
 
 
 def seen_rows(frames: Sequence[DepthFrame], seen: Columnar) -> dict[str, NDArray[Any]]:

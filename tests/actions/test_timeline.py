@@ -5,10 +5,12 @@ without pickle.
 from __future__ import annotations
 
 import zipfile
+from collections.abc import Callable
 from copy import deepcopy
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -150,6 +152,31 @@ def test_a_model_file_of_the_first_format_asks_for_no_speed(
         earlier.setattr(storage, "_FORMAT", 1)
         path = save_action_model(model, tmp_path / "old.skops")
     assert not load_action_model(path).peaks.any()
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda m: {"words": m.words[:-1]},
+        lambda m: {"words": (*m.words[:-1], m.words[0])},
+        lambda m: {"share": m.share[:-1]},
+        lambda m: {"speeds": m.speeds[:, :1]},
+        lambda m: {"peaks": m.peaks * np.nan},
+        lambda m: {"clock_hz": 1e12},
+        lambda m: {"networks": ()},
+        lambda m: {"chain": replace(m.chain, shortest_s=m.chain.shortest_s - 1e9)},
+        lambda m: {"chain": replace(m.chain, shortest_s=m.chain.shortest_s + 1e9)},
+        lambda m: {"chain": replace(m.chain, follow=m.chain.follow[:, :-1])},
+        lambda m: {"networks": (replace(m.networks[0], layers=m.networks[0].layers[:-1]),)},
+        lambda m: {"networks": (replace(m.networks[0], centre=m.networks[0].centre[:-1]),)},
+    ],
+)
+def test_a_model_file_whose_parts_are_not_of_its_words_is_one_sentence(
+    model: TimelineModel, tmp_path: Path, change: Callable[[TimelineModel], dict[str, Any]]
+) -> None:
+    path = save_action_model(replace(model, **change(model)), tmp_path / "other.skops")
+    with pytest.raises(ModelError, match=r"other\.skops should be an action model"):
+        load_action_model(path)
 
 
 @pytest.mark.parametrize("content", [b"", b"not a model", b"PK\x03\x04" + bytes(40)])

@@ -17,11 +17,15 @@ import numba
 import numpy as np
 import pytest
 
+from liex_lab.body.pose import Pose
+from liex_lab.catalog import MODELS
 from liex_lab.errors import ModelError
 from liex_lab.estimation.calibration import calibrate
 from liex_lab.estimation.estimator import PoseEstimator
-from liex_lab.estimation.model import SCHEMA, Calibration, Model
+from liex_lab.estimation.model import N_CLUES, SCHEMA, Calibration, Model
+from liex_lab.estimation.scoring import Chosen, clue_samples
 from liex_lab.forests.forest import Forest
+from liex_lab.geometry import SE3
 from tests.estimation.toy import SCENE, tiny, toy_mice, train, trained, training_set, unseen
 
 VARIANTS = ["default", "paper"]
@@ -67,6 +71,24 @@ def repacked(content: bytes, change: Callable[[dict[str, Any]], None], without: 
             if not (without and name.startswith(without)):
                 new.writestr(name, data)
     return out.getvalue()
+
+
+def with_array(content: bytes, name: str, values: np.ndarray) -> bytes:
+    """A model file with one array replaced, or put in."""
+    out = io.BytesIO()
+    with zipfile.ZipFile(io.BytesIO(content)) as old, zipfile.ZipFile(out, "w") as new:
+        for other in old.namelist():
+            if other != f"{name}.npy":
+                new.writestr(other, old.read(other))
+        packed = io.BytesIO()
+        np.lib.format.write_array(packed, values)
+        new.writestr(f"{name}.npy", packed.getvalue())
+    return out.getvalue()
+
+
+def array_of(content: bytes, name: str) -> np.ndarray:
+    with np.load(io.BytesIO(content)) as archive:
+        return archive[name]
 
 
 def refusal(folder: Path, content: bytes, name: str = "model.npz") -> str:
@@ -197,6 +219,99 @@ def test_a_file_of_a_method_with_other_fields_is_refused(tmp_path, content):
     refusal(tmp_path, repacked(content, lambda head: head["method"].pop("reach_mm")))
     refusal(tmp_path, repacked(content, lambda head: head["method"].update(spin=3)))
     refusal(tmp_path, repacked(content, lambda head: head["calibration"].update(spin=3)))
+
+
+@pytest.mark.parametrize("root", [2**30, -1, -(2**31), 1, 7])
+@pytest.mark.parametrize("which", ["000", "007"])
+def test_roots_that_lead_outside_of_the_forest_are_refused(tmp_path, content, which, root):
+    roots = array_of(content, f"{which}_roots")
+    for place in (0, len(roots) - 1):
+        changed = roots.copy()
+        changed[place] = root
+        said = refusal(tmp_path, with_array(content, f"{which}_roots", changed))
+        assert "roots" in said or "whole trees" in said
+
+
+@pytest.mark.parametrize("which", ["000", "003", "007"])
+@pytest.mark.parametrize("kind", [3, 4 * 60, 1 + 4 * 60, 2 + 4 * 60])
+def test_a_test_beyond_the_views_and_scalars_is_refused(tmp_path, content, which, kind):
+    kinds = array_of(content, f"{which}_kind").copy()
+    kinds[len(kinds) // 2] = kind
+    assert "a test" in refusal(tmp_path, with_array(content, f"{which}_kind", kinds))
+
+
+@pytest.mark.parametrize("part", ["tests", "threshold", "kind", "is_leaf", "roots", "leaves"])
+def test_arrays_of_a_forest_of_another_size_or_type_are_refused(tmp_path, content, part):
+    name = f"000_{part}"
+    values = array_of(content, name)
+    for changed in (values[..., :-1], values.astype(np.float64), values[None], values[..., :0]):
+        assert "model" in refusal(tmp_path, with_array(content, name, changed))
+
+
+def test_leaves_that_are_not_finite_or_of_another_width_are_refused(tmp_path, content):
+    leaves = array_of(content, "000_leaves")
+    for changed in (leaves * np.float16(np.nan), leaves[:-1]):
+        assert "its leaves" in refusal(tmp_path, with_array(content, "000_leaves", changed))
+
+
+@pytest.mark.parametrize(
+    ("section", "key", "value"),
+    [
+        ("method", "rounds", -1),
+        ("method", "rounds", 2.0),
+        ("method", "n_candidates", 0),
+        ("method", "n_candidates", 10**9),
+        ("method", "top_k", -3),
+        ("method", "survivors", -1),
+        ("method", "reach_mm", float("nan")),
+        ("method", "reach_mm", "far"),
+        ("method", "top_tau", 1e300),
+        ("calibration", "slope", float("inf")),
+        ("calibration", "joint_share", [1.0]),
+        ("calibration", "quantiles", []),
+    ],
+)
+def test_numbers_of_the_method_that_make_no_sense_are_refused(
+    tmp_path, content, section, key, value
+):
+    def change(head):
+        head[section][key] = value
+
+    assert refusal(tmp_path, repacked(content, change))
+
+
+def test_tables_of_another_skeleton_are_refused(tmp_path, content):
+    assert "ridge" in refusal(tmp_path, with_array(content, "settler", np.zeros((3, 3))))
+    layers = with_array(content, "facing_0_bias", np.zeros(4, np.float16))
+    for weights in (np.zeros((5, 3)), np.zeros((5, 4)), np.zeros(4)):
+        whole = with_array(layers, "facing_0_weights", weights.astype(np.float16))
+        assert "layers of a network" in refusal(tmp_path, whole)
+
+
+@pytest.mark.parametrize("animal", ["mouse", "fish", "hand"])
+def test_bundled_models_pass_and_keep_their_bytes(animal):
+    path = MODELS / f"{animal}.npz"
+    assert Model.load(path).to_bytes() == path.read_bytes()
+
+
+def test_the_expectation_forest_sees_as_many_clues_as_are_checked(model):
+    fit = np.zeros((2, 3))
+    pose = Pose(
+        SE3(np.tile(np.eye(3), (2, 1, 1)), np.zeros((2, 3))), np.zeros((2, 5, 3)), np.ones(2)
+    )
+    clues = Chosen(
+        pose,
+        np.ones((2, 6)),
+        np.ones((2, 5, 3)),
+        np.ones((2, 5)),
+        *np.ones((3, 2)),
+        np.ones((2, 4)),
+        fit,
+        *np.ones((2, 2)),
+    )
+    cameras = np.ones((2, 17))
+    samples = clue_samples(clues, model.skeleton, np.ones((2, 9)), cameras, 1.0)
+    assert samples.scalars.shape[1] == N_CLUES + 3
 
 
 def test_a_file_of_a_newer_version_asks_for_an_upgrade(tmp_path, content):

@@ -1,0 +1,169 @@
+"""A forest from a file is checked before a kernel follows it: every index that is wrong is
+refused.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from liex_lab.forests._kernels import ONE_PROBE, SCALAR, number_nodes
+from liex_lab.forests.forest import Forest, check_forest, check_roots
+
+N_VIEWS, N_SCALARS, N_VALUES = 2, 3, 2
+IS_LEAF = np.array([False, False, True, True, True, False, True, True])  # trees of 5 and 3 nodes
+ROOTS = np.array([0, 5], np.int32)
+INNER = np.flatnonzero(~IS_LEAF)
+
+
+def small() -> Forest:
+    """Two small trees, numbered as a model file is."""
+    nodes = np.zeros((len(IS_LEAF), 4), np.int32)
+    nodes[INNER, 3] = [0 + 4 * 1, ONE_PROBE, SCALAR + 4 * 2]
+    number_nodes(IS_LEAF, np.append(ROOTS, len(IS_LEAF)).astype(np.int64), nodes)
+    return Forest(nodes, ROOTS, np.arange(10, dtype=np.float32).reshape(5, 2))
+
+
+def check(forest: Forest) -> None:
+    check_forest(forest, N_VIEWS, N_SCALARS, N_VALUES)
+
+
+def with_node(row: int, word: int, value: int) -> Forest:
+    """The small forest with one word of one node replaced."""
+    forest = small()
+    nodes = forest.nodes.copy()
+    nodes[row, word] = value
+    return replace(forest, nodes=nodes)
+
+
+def test_a_sound_forest_passes():
+    check_roots(ROOTS, IS_LEAF)
+    check(small())
+
+
+@pytest.mark.parametrize("first", [-1, 1, 4, 2**30, -(2**31)])
+@pytest.mark.parametrize("second", [-1, 0, 4, 6, 8, 2**30, -(2**31)])
+def test_roots_that_do_not_begin_whole_trees_are_refused(first, second):
+    for roots in ([first, 5], [0, second], [first, second]):
+        with pytest.raises(ValueError, match=r"roots|whole trees"):
+            check_roots(np.array(roots, np.int32), IS_LEAF)
+
+
+@pytest.mark.parametrize(
+    "roots", [np.zeros(0, np.int32), np.zeros((1, 1), np.int32), np.array([0.0, 5.0]), ROOTS[:1]]
+)
+def test_roots_of_another_kind_are_refused(roots):
+    with pytest.raises(ValueError, match=r"roots|whole trees"):
+        check_roots(roots, IS_LEAF)
+
+
+@given(st.lists(st.booleans(), min_size=1, max_size=15), st.data())
+def test_whatever_passes_is_numbered_within_its_arrays(flags, data):
+    """The kernel that numbers nodes is only asked where each tree fills its nodes exactly."""
+    is_leaf = np.array(flags)
+    roots = data.draw(st.lists(st.integers(-3, 17), min_size=1, max_size=4))
+    try:
+        check_roots(np.array(roots, np.int32), is_leaf)
+    except ValueError:
+        return
+    guarded = np.full((len(is_leaf) + 40, 4), 77, np.int32)
+    nodes = guarded[20 : 20 + len(is_leaf)]
+    number_nodes(is_leaf, np.append(roots, len(is_leaf)).astype(np.int64), nodes)
+    assert (guarded[:20] == 77).all()
+    assert (guarded[20 + len(is_leaf) :] == 77).all()
+
+
+@pytest.mark.parametrize("root", [-1, -(2**31), len(IS_LEAF), 2**30])
+def test_a_root_outside_of_the_nodes_is_refused(root):
+    for place in range(2):
+        roots = ROOTS.copy()
+        roots[place] = root
+        with pytest.raises(ValueError, match="root"):
+            check(replace(small(), roots=roots))
+
+
+@pytest.mark.parametrize("row", INNER)
+def test_a_child_that_goes_back_round_or_beyond_is_refused(row):
+    """Back, onto itself, or past the last: a descent would read elsewhere or never end."""
+    for child in (0, row - 1, row, len(IS_LEAF) - 1, len(IS_LEAF), 2**30, 2**31 - 1):
+        if child >= 0:
+            with pytest.raises(ValueError, match="child"):
+                check(with_node(row, 2, child))
+
+
+def test_nodes_in_a_circle_are_refused():
+    nodes = small().nodes.copy()
+    nodes[[0, 1], 2] = 1, 0
+    with pytest.raises(ValueError, match="child"):
+        check(replace(small(), nodes=nodes))
+
+
+@pytest.mark.parametrize("row", np.flatnonzero(IS_LEAF))
+@pytest.mark.parametrize("leaf", [5, 6, 2**30, 2**31 - 1])
+def test_a_leaf_beyond_the_values_is_refused(row, leaf):
+    with pytest.raises(ValueError, match="leaf"):
+        check(with_node(row, 2, -leaf - 1))
+
+
+@pytest.mark.parametrize("row", INNER)
+@pytest.mark.parametrize(
+    "test",
+    [
+        3,  # of no kind
+        0 + 4 * N_VIEWS,
+        ONE_PROBE + 4 * N_VIEWS,
+        SCALAR + 4 * N_SCALARS,
+        4 * (2**28),
+        -1,
+        -4,
+        ONE_PROBE - 4,
+        SCALAR - 4,
+        -(2**31),
+    ],
+)
+def test_a_test_of_no_kind_or_beyond_the_views_and_scalars_is_refused(row, test):
+    with pytest.raises(ValueError, match="test"):
+        check(with_node(row, 3, test))
+
+
+@pytest.mark.parametrize("at", range(6))
+def test_an_offset_that_growth_never_writes_is_refused(at):
+    nodes = small().nodes.copy()
+    nodes.view(np.int8).reshape(len(nodes), 16)[0, at] = -128
+    with pytest.raises(ValueError, match="offset"):
+        check(replace(small(), nodes=nodes))
+
+
+def test_leaves_of_another_width_or_not_finite_are_refused():
+    forest = small()
+    for leaves in (forest.leaves[:, :1], forest.leaves * np.float32(np.nan), forest.leaves.ravel()):
+        with pytest.raises(ValueError, match="leaves"):
+            check(replace(forest, leaves=leaves))
+    with pytest.raises(ValueError, match="right kind"):
+        check(replace(forest, nodes=forest.nodes.astype(np.int64)))
+
+
+@given(st.integers(0, len(IS_LEAF) - 1), st.integers(2, 3), st.integers(-(2**31), 2**31 - 1))
+def test_whatever_passes_leads_from_every_root_to_a_leaf(row, word, value):
+    """Any single number may be wrong: what passes walks within its arrays, and ends."""
+    forest = with_node(row, word, value)
+    try:
+        check(forest)
+    except ValueError:
+        return
+    waiting = [(int(root), 0) for root in forest.roots]
+    while waiting:
+        at, depth = waiting.pop()
+        assert 0 <= at < len(forest.nodes)
+        assert depth < len(forest.nodes)
+        child = int(forest.nodes[at, 2])
+        if child < 0:
+            assert -child - 1 < len(forest.leaves)
+            continue
+        kind, channel = forest.nodes[at, 3] & 3, forest.nodes[at, 3] >> 2
+        assert 0 <= channel < (N_SCALARS if kind == SCALAR else N_VIEWS)
+        waiting += [(child, depth + 1), (child + 1, depth + 1)]

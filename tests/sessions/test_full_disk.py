@@ -1,0 +1,144 @@
+"""A disk that takes no more ends a session within seconds, in one sentence, and loses nothing that
+a checkpoint was made of.
+
+A limit on the size of files stands for the full disk: it needs no account of its own.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import liex_lab.sessions.rrd as replay
+from liex_lab.errors import SessionError
+from liex_lab.runtime.disk import is_full, why_full
+from liex_lab.sessions import SessionWriter
+from liex_lab.sessions.mcap import _WatchedFile
+from tests.sessions.interrupted import MOUSE, write_session
+
+FULL = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+_LIMITED = """
+import resource, signal, sys
+from liex_lab.errors import LiexError
+from tests.sessions.interrupted import write_session
+import liex_lab.sessions.rrd, liex_lab.sessions.mcap, liex_lab.behaviour, pyarrow.parquet
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[2]), int(sys.argv[2])))
+try:
+    write_session(sys.argv[1])
+except LiexError as error:
+    print(error, file=sys.stderr)
+    sys.exit(1)
+"""
+
+
+@pytest.mark.parametrize("limit", [20_000, 100_000, 300_000])
+def test_a_session_that_meets_a_limit_ends_in_a_sentence_and_goes_on_later(
+    tmp_path: Path, limit: int
+) -> None:
+    place = tmp_path / "walk.liex"
+    done = subprocess.run(
+        [sys.executable, "-c", _LIMITED, str(place), str(limit)],
+        capture_output=True,
+        text=True,
+        timeout=90,
+        env={**os.environ, "RUST_LOG": "off"},
+        check=False,
+    )
+    assert done.returncode == 1, done.stderr
+    assert len(done.stderr.splitlines()) == 1, done.stderr
+    assert str(tmp_path) in done.stderr
+    assert "full" in done.stderr
+    assert "run the same command again" in done.stderr
+    assert not place.exists()
+    kept = (tmp_path / "walk.liex.part").is_dir()
+    assert kept == ("goes on after" in done.stderr)
+    write_session(str(place))
+    assert (place / "session.json").is_file()
+
+
+class _Dead:
+    """A Rerun stream whose thread is dead: a flush waits as long as it may, closing for ever."""
+
+    def flush(self, *, timeout_sec: float = 1e38) -> None:
+        time.sleep(timeout_sec)
+        raise RuntimeError("Flush timed out")
+
+    def disconnect(self) -> None:
+        time.sleep(1e9)
+
+    def __getattr__(self, name: str) -> Any:
+        return lambda *_what, **_how: None
+
+
+def test_a_replay_whose_thread_is_dead_is_let_go_within_seconds(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(replay, "_TURN_S", 0.2)
+    monkeypatch.setattr(replay.atexit, "unregister", lambda _: None)
+    writer = SessionWriter(tmp_path / "walk.liex", MOUSE.provenance())
+    writer._replay._stream.disconnect()
+    monkeypatch.setattr(writer._replay, "_stream", _Dead())
+    monkeypatch.setattr(replay, "probe_full", lambda _: FULL)
+    began = time.monotonic()
+
+    def write() -> None:
+        with writer:
+            frames, track = next(iter(MOUSE.chunks(16)))
+            writer.add(frames, seen=track)
+            writer._take_down()
+
+    with pytest.raises(SessionError, match=r"is full \(No space left on device\)"):
+        write()
+    assert time.monotonic() - began < 10.0
+    writer._replay.abandon()  # at once: nothing waits for it any more
+
+
+def test_a_replay_that_stands_still_on_a_disk_with_room_is_given_up_as_well(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(replay, "_TURN_S", 0.1)
+    monkeypatch.setattr(replay, "_PATIENCE_S", 0.5)
+    monkeypatch.setattr(replay.atexit, "unregister", lambda _: None)
+    writer = replay.ReplayWriter(tmp_path / "session.rrd", MOUSE.provenance())
+    writer._stream.disconnect()
+    writer._stream = _Dead()
+    with pytest.raises(SessionError, match=r"session\.rrd was not written whole"):
+        writer.flushed()
+    writer.abandon()
+
+
+def test_a_watched_file_keeps_the_first_error_to_itself_and_only_counts_after_it(
+    tmp_path: Path,
+) -> None:
+    file = _WatchedFile(tmp_path / "a.mcap")
+    assert file.write(b"12345678") == 8
+
+    class Full:
+        def write(self, data: bytes) -> int:
+            raise FULL
+
+    file._file, whole = Full(), file._file
+    assert file.write(b"1234") == 4
+    assert file.seek(2) == 2
+    assert file.write(b"56") == 2
+    assert file.seek(0, os.SEEK_END) == 12
+    file.flush()
+    with pytest.raises(OSError, match="No space left"):
+        file.check()
+    whole.close()
+
+
+def test_which_errors_tell_of_a_full_disk() -> None:
+    assert is_full(FULL)
+    assert not is_full(PermissionError(errno.EACCES, "no"))
+    assert not is_full(ValueError())
+    said = why_full(OSError(errno.ENOSPC, "No space left on device", "/data/x"))
+    assert said == "the disk that holds /data/x is full (No space left on device)"
