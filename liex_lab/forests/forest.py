@@ -130,8 +130,8 @@ def check_forest(forest: Forest, n_views: int, n_scalars: int, n_values: int) ->
     roots = forest.roots
     leaves = forest.leaves
     shapes = nodes.shape[1:] == (4,) and roots.ndim == 1 and leaves.ndim == 2
-    kinds = nodes.dtype.str[1:], roots.dtype.str[1:], leaves.dtype.str[1:]
-    if not shapes or kinds != ("i4", "i4", "f4"):
+    kinds = nodes.dtype == np.int32 and roots.dtype == np.int32 and leaves.dtype == np.float32
+    if not (shapes and kinds):
         raise ValueError("its nodes, roots and leaves are not of the right kind")
     if leaves.shape[1] != n_values:
         raise ValueError(f"its leaves have {leaves.shape[1]} values, not {n_values}")
