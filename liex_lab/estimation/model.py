@@ -373,6 +373,7 @@ _KINDS = {
     "leaves": np.float16,
 }
 _PARTS = tuple(_KINDS)
+_FARTHEST = 127  # what an offset may be
 _TABLES = ("tests", "leaves")
 
 
@@ -404,6 +405,8 @@ def _join(parts: dict[str, NDArray[Any]]) -> Forest:
     for name, kind in _KINDS.items():
         if parts[name].dtype != kind or parts[name].ndim != (2 if name in _TABLES else 1):
             raise ValueError(f"{name} of a forest is no list of {np.dtype(kind)}")
+    if parts["tests"].min(initial=0) < -_FARTHEST:
+        raise ValueError(f"an offset of a test is below -{_FARTHEST}")
     n_inner = len(parts["threshold"])
     n_leaves = parts["leaves"].shape[1]
     n_nodes = n_inner + n_leaves

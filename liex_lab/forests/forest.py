@@ -130,34 +130,32 @@ def check_forest(forest: Forest, n_views: int, n_scalars: int, n_values: int) ->
     roots = forest.roots
     leaves = forest.leaves
     shapes = nodes.shape[1:] == (4,) and roots.ndim == 1 and leaves.ndim == 2
-    if not shapes or (nodes.dtype, roots.dtype, leaves.dtype) != (np.int32, np.int32, np.float32):
+    kinds = nodes.dtype == np.int32 and roots.dtype == np.int32 and leaves.dtype == np.float32
+    if not (shapes and kinds):
         raise ValueError("its nodes, roots and leaves are not of the right kind")
     if leaves.shape[1] != n_values:
         raise ValueError(f"its leaves have {leaves.shape[1]} values, not {n_values}")
-    if not np.isfinite(leaves).all():
+    if not (leaves.size and np.isfinite(leaves.min()) and np.isfinite(leaves.max())):
         raise ValueError("its leaves are not all finite")
     if not len(roots) or roots.min() < 0 or roots.max() >= len(nodes):
         raise ValueError(f"a root is not one of its {len(nodes)} nodes")
-    inner = nodes[:, 2] >= 0
-    at = np.flatnonzero(inner)
-    child = nodes[at, 2].astype(np.int64)
-    if (child <= at).any() or (child + 1 >= len(nodes)).any():
+    word2 = np.ascontiguousarray(nodes[:, 2])
+    at = np.flatnonzero(word2 >= 0)
+    child = word2[at]
+    if (child <= at).any() or child.max(initial=-1) >= len(nodes) - 1:
         raise ValueError("a child does not lie behind its parent among the nodes")
-    if (-1 - nodes[~inner, 2].astype(np.int64) >= len(leaves)).any():
+    if -1 - int(word2.min()) >= len(leaves):
         raise ValueError(f"a node names a leaf beyond the {len(leaves)} there are")
     tests = nodes[at, 3]
     kind = tests & 3
-    channel = tests >> 2
-    if (kind > _LAST_KIND).any():
+    if kind.max(initial=0) > _LAST_KIND:
         raise ValueError("a test is of no known kind")
-    limit = np.where(kind == SCALAR, n_scalars, n_views)
-    if (tests < 0).any() or (channel >= limit).any():
+    scalar = kind == SCALAR
+    most = [tests.max(where=each, initial=-1) >> 2 for each in (~scalar, scalar)]
+    if tests.min(initial=0) < 0 or most[0] >= n_views or most[1] >= n_scalars:
         raise ValueError(
             f"a test asks for more than the {n_views} views and {n_scalars} scalars there are"
         )
-    offsets = np.ascontiguousarray(nodes[at, :2]).view(np.int8).reshape(-1, 8)[:, :6]
-    if (offsets == np.iinfo(np.int8).min).any():
-        raise ValueError("an offset is below -127")
 
 
 @dataclass(frozen=True)

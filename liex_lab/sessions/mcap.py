@@ -291,6 +291,7 @@ class _WatchedFile:
     """
 
     def __init__(self, path: Path) -> None:
+        self._path = path
         self._file = path.open("wb")
         self._error: OSError | None = None
         self._at = 0
@@ -340,6 +341,8 @@ class _WatchedFile:
     def check(self) -> None:
         """Raise what went wrong so far."""
         if self._error is not None:
+            if self._error.filename is None and self._error.errno is not None:
+                self._error.filename = str(self._path)  # writing does not tell what was written
             raise self._error
 
 

@@ -240,6 +240,12 @@ def test_a_test_beyond_the_views_and_scalars_is_refused(tmp_path, content, which
     assert "a test" in refusal(tmp_path, with_array(content, f"{which}_kind", kinds))
 
 
+def test_an_offset_that_growth_never_writes_is_refused(tmp_path, content):
+    tests = array_of(content, "000_tests").copy()
+    tests[3, -1] = -128
+    assert "an offset" in refusal(tmp_path, with_array(content, "000_tests", tests))
+
+
 @pytest.mark.parametrize("part", ["tests", "threshold", "kind", "is_leaf", "roots", "leaves"])
 def test_arrays_of_a_forest_of_another_size_or_type_are_refused(tmp_path, content, part):
     name = f"000_{part}"

@@ -130,14 +130,6 @@ def test_a_test_of_no_kind_or_beyond_the_views_and_scalars_is_refused(row, test)
         check(with_node(row, 3, test))
 
 
-@pytest.mark.parametrize("at", range(6))
-def test_an_offset_that_growth_never_writes_is_refused(at):
-    nodes = small().nodes.copy()
-    nodes.view(np.int8).reshape(len(nodes), 16)[0, at] = -128
-    with pytest.raises(ValueError, match="offset"):
-        check(replace(small(), nodes=nodes))
-
-
 def test_leaves_of_another_width_or_not_finite_are_refused():
     forest = small()
     for leaves in (forest.leaves[:, :1], forest.leaves * np.float32(np.nan), forest.leaves.ravel()):
