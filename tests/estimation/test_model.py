@@ -310,10 +310,13 @@ def test_the_expectation_forest_sees_as_many_clues_as_are_checked(model):
         np.ones((2, 6)),
         np.ones((2, 5, 3)),
         np.ones((2, 5)),
-        *np.ones((3, 2)),
+        np.ones(2),
+        np.ones(2),
+        np.ones(2),
         np.ones((2, 4)),
         fit,
-        *np.ones((2, 2)),
+        np.ones(2),
+        np.ones(2),
     )
     cameras = np.ones((2, 17))
     samples = clue_samples(clues, model.skeleton, np.ones((2, 9)), cameras, 1.0)

@@ -125,7 +125,8 @@ def test_a_watched_file_keeps_the_first_error_to_itself_and_only_counts_after_it
         def write(self, data: bytes) -> int:
             raise FULL
 
-    file._file, whole = Full(), file._file
+    whole = file._file
+    file._file = Full()  # type: ignore[assignment]
     assert file.write(b"1234") == 4
     assert file.seek(2) == 2
     assert file.write(b"56") == 2
