@@ -119,7 +119,8 @@ def test_a_full_disk_is_a_sentence() -> None:
         code=BREAK.format("raise OSError(28, 'No space left on device', 'a.mcap')"),
     )
     assert ran.returncode == 1
-    assert "a.mcap: No space left" in ran.stderr
+    assert "the disk that holds a.mcap is full (No space left on device)" in ran.stderr
+    assert len(ran.stderr.splitlines()) == 1
     assert "Traceback" not in ran.stderr
 
 
