@@ -11,10 +11,11 @@ import pytest
 
 from liex_lab.body.pose import Pose
 from liex_lab.body.skeleton import Skeleton
+from liex_lab.errors import ModelError
 from liex_lab.estimation import _profile_kernels as kernels
 from liex_lab.estimation.cascade import ImageSet
 from liex_lab.estimation.model import Model
-from liex_lab.estimation.ridge_correction import RidgeCorrection, tangents
+from liex_lab.estimation.ridge_correction import N_OTHERS, RidgeCorrection, tangents
 from liex_lab.geometry import SE3, so3
 from tests.estimation.toy import trained
 
@@ -146,12 +147,18 @@ def test_tangents_follow_the_chain_in_the_pictures_plane():
 
 
 def test_a_model_that_settles_comes_out_of_its_file_as_it_went_in(settler, tmp_path):
-    made = replace(trained("default").model, settler=settler.table)
+    toy = trained("default").model
+    j = toy.skeleton.n_joints
+    table = np.random.default_rng(3).normal(size=(2 * j + N_OTHERS, j + 4))
+    made = replace(toy, settler=table)
     path = tmp_path / "toy.npz"
     path.write_bytes(made.to_bytes())
     again = Model.load(path)
-    np.testing.assert_array_equal(again.settler, settler.table)
+    np.testing.assert_array_equal(again.settler, table)
     assert again.to_bytes() == made.to_bytes()
     plain = replace(made, settler=None)
     path.write_bytes(plain.to_bytes())
     assert Model.load(path).settler is None
+    path.write_bytes(replace(toy, settler=settler.table).to_bytes())
+    with pytest.raises(ModelError, match="ridge correction is not of this skeleton"):
+        Model.load(path)  # a fish's
