@@ -34,7 +34,7 @@ class Window:
             origin,
             np.array([step], np.int32),
             np.ones(1, np.int64),
-            np.zeros((1, 8)),
+            np.zeros((1, 9)),
             np.array([distance]),
             np.ones(1, np.int64),
         )
@@ -113,7 +113,7 @@ def test_a_batch_of_looks_agrees_with_one_look_at_a_time():
     rng = np.random.default_rng(4)
     window, n = WINDOWS[1], 7
     rotations, positions = so3.exp(rng.normal(0, 1, (n, 3, 3))), rng.uniform(-50, 50, (n, 3, 3))
-    moments = rng.uniform(10, 100, (2, 8))
+    moments = rng.uniform(10, 100, (2, 9))
     size, scale, image = (
         rng.uniform(0.8, 1.2, n),
         rng.uniform(0.8, 1.2, n),
