@@ -241,7 +241,38 @@ def run_study(
         only=only,
         dry_run=dry_run,
         board=board,
+        describe=correct_session,
     )
+
+
+def describe_session(
+    session: str | Path,
+    facts: Mapping[str, str],
+    *,
+    author: str = "",
+    progress: Progress = silent,
+) -> Path:
+    """Say who the animal of a session is; table `sessions` and report follow, nothing is measured.
+
+    It is kept in the log of corrections and can be taken back like one.
+
+    Args:
+        session: the session folder.
+        facts: any of subject_id, group, cage, sex, batch and session_start_time (ISO 8601 with a
+            time zone); an empty text is unknown.
+        author: who says so; "" takes who is logged in.
+        progress: told how far the work is.
+
+    Returns:
+        The session folder.
+
+    Raises:
+        SessionError: there is no such fact, or another program is correcting the session.
+        PlanError: a value cannot be used.
+    """
+    from liex_lab.sessions.correcting import descriptions
+
+    return correct_session(session, descriptions(facts), author=author, progress=progress)
 
 
 def serve_dashboard(

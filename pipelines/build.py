@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from liex_lab.tracking.tracker import FrameTracker
 
 
+_RULED = "mouse"  # the animal that the rules were made for
 _SPANS = (
     0.6,
     1.8,
@@ -358,7 +359,9 @@ def build_rules(plan: Plan) -> MouseRules:
 
 
 def build_recogniser(plan: Plan, skeleton: Skeleton) -> TimelineModel | None:
-    """The plan's action recogniser: the named or the bundled one; None where rules name actions.
+    """The plan's action recogniser: the named or the bundled one; None where there is none.
+
+    Then rules name the actions, or nothing does, see `why_nameless`.
 
     Args:
         plan: its setting `actions.model`: a name, a path, `rules`, or None for the animal's bundled
@@ -381,3 +384,21 @@ def build_recogniser(plan: Plan, skeleton: Skeleton) -> TimelineModel | None:
             f"says {skeleton.name}; set actions.model to another one, or to 'rules'"
         )
     return model
+
+
+def why_nameless(plan: Plan, skeleton: Skeleton) -> str:
+    """Why no actions are named where there is no recogniser; '' where rules name them.
+
+    The rules are those of a mouse: a hand does not rear, and a snake does not run.
+
+    Args:
+        plan: its setting `actions.model`; 'rules' asks for the rules, whatever the animal is.
+        skeleton: the animal's skeleton.
+    """
+    if plan.actions.model is not None or skeleton.name == _RULED:
+        return ""
+    return (
+        f"No actions are named: no vocabulary was made for a {skeleton.name}. `liex train actions` "
+        "makes one from what you label; `--set actions.model=rules` names rears, runs, walks and "
+        "pauses as of a mouse."
+    )

@@ -30,12 +30,16 @@ from .build import (
     build_rules,
     build_surroundings,
     build_tracker,
+    why_nameless,
 )
 from .shards import CHUNK, LENGTH, MEASURING, Shard, look_side_by_side
 from .workers import WorkerPool
 
 if TYPE_CHECKING:
-    from liex_lab.actions.timeline import TimelineModel
+    import pandas as pd
+    from numpy.typing import NDArray
+
+    from liex_lab.actions.timeline import Recognised, TimelineModel
     from liex_lab.behaviour.summary import Behaviour
     from liex_lab.recordings.frame import DepthFrame
     from liex_lab.recordings.recording import Recording
@@ -164,7 +168,7 @@ def conclude(writer: SessionWriter, plan: Plan, timings: dict[str, float]) -> Se
     """
     rows = writer.rows
     behaviour, notes = measure_behaviour(rows, plan, writer.origin, writer.allocate)
-    writer.note(**notes)
+    writer.note(**notes, problems=_told_refused(notes))
     rows.track.release_pages()
     trim_heap()
     return writer.close(timings_s=timings, **behaviour.for_session())
@@ -181,35 +185,49 @@ def measure_behaviour(
         origin: skeleton, arena, zones and water.
         allocate: allocator of large arrays, such as one of files on disk.
     """
-    from liex_lab.behaviour.summary import measure_rows
+    from liex_lab.behaviour.summary import measure_rows, moving_rows
+    from liex_lab.tables.schema import BOUTS, empty_table, release_table
 
     recogniser = build_recogniser(plan, origin.skeleton)
-    named, notes = ({}, {}) if recogniser is None else name_actions(recogniser, rows, allocate)
+    rules = build_rules(plan)
+    around = build_surroundings(origin)
+    moved = moving_rows(rows, rules, around, allocate)
+    if recogniser is not None:
+        named, notes = name_actions(recogniser, rows, moved, allocate)
+    elif nameless := why_nameless(plan, origin.skeleton):
+        named = {"bouts": empty_table(BOUTS), "actions": {}}
+        notes = {"no_actions": nameless}
+    else:
+        named, notes = {}, {}
     rows.track.release_pages()
+    release_table(moved)
     trim_heap()
-    return measure_rows(
-        rows, build_rules(plan), build_surroundings(origin), allocate=allocate, **named
-    ), notes
+    return measure_rows(rows, rules, around, moved=moved, allocate=allocate, **named), notes
 
 
 def name_actions(
-    recogniser: TimelineModel, rows: Rows, allocate: Allocator = np.empty
+    recogniser: TimelineModel, rows: Rows, moved: pd.DataFrame, allocate: Allocator = np.empty
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """The ethogram of a track by a recogniser, and notes for session.json.
 
     Args:
         recogniser: names the frames.
         rows: the track as table rows, with the distance of the animal from the nearest wall, mm.
+        moved: the table `kinematics` of the track, which bouts are checked by.
         allocate: allocator of large arrays.
 
     Returns:
         `bouts` and the definitions of `actions`, as `behaviour.measure` takes them; and notes:
-        which recogniser it was, and which actions the frame rate cannot tell.
+        which recogniser it was, which actions the frame rate cannot tell, and which bouts were
+        refused since they contradict their definition.
     """
+    from liex_lab.actions.vocabulary import printed_meanings
+    from liex_lab.behaviour.checking import recognise
     from liex_lab.tables.rows import bout_rows
 
     frames = rows.frames_table(_NAMED_BY)
-    found = recogniser.recognise(rows.track, frames["wall_distance_mm"].to_numpy(float), allocate)
+    wall_mm = frames["wall_distance_mm"].to_numpy(float)
+    found = recognise(recogniser, rows.track, wall_mm, moved, allocate)
     notes = {
         "action_model": {
             "skeleton": recogniser.skeleton,
@@ -217,7 +235,40 @@ def name_actions(
             **recogniser.card,
         },
         "unresolved_actions": found.unresolved,
+        "refused_bouts": {"bouts": _refusals(found, frames["time_ns"].to_numpy())},
     }
-    actions = {word: recogniser.definitions.get(word, "") for word in recogniser.words if word}
+    meanings = printed_meanings(recogniser.skeleton, recogniser.definitions)
+    actions = {word: meanings.get(word, "") for word in recogniser.words if word}
     bouts = bout_rows(found.ethogram, frames, str(recogniser.card.get("sha256", "")))
     return {"bouts": bouts, "actions": actions}, notes
+
+
+def _told_refused(notes: dict[str, Any]) -> list[str]:
+    """That bouts were refused, as a sentence for the session's problems; none where none was."""
+    n = len(notes.get("refused_bouts", {}).get("bouts", []))
+    if not n:
+        return []
+    told = "1 bout" if n == 1 else f"{n} bouts"
+    return [
+        f"{told} as the recogniser first named {'it' if n == 1 else 'them'} contradicted the "
+        "definition of the name, and got another name or none; the report lists "
+        f"{'it' if n == 1 else 'them'}."
+    ]
+
+
+def _refusals(found: Recognised, times_ns: NDArray[np.int64]) -> list[dict[str, Any]]:
+    """The refused bouts for session.json, in order of time; times are s since the first frame."""
+    from liex_lab.actions.ethogram import frame_stops
+
+    start_s = (times_ns - times_ns[:1]) * 1e-9
+    stop_s = (frame_stops(times_ns) - times_ns[:1]) * 1e-9
+    return [
+        {
+            "action": one.action,
+            "start_s": round(float(start_s[one.rows.start]), 6),
+            "stop_s": round(float(stop_s[one.rows.stop - 1]), 6),
+            "named": one.named,
+            "why": one.why,
+        }
+        for one in sorted(found.refused, key=lambda one: one.rows.start)
+    ]

@@ -13,8 +13,9 @@ Ours; the recogniser of Lie-X section 4.3 names cut-out sequences alone (`recogn
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -43,7 +44,7 @@ _SPEED_S = 0.2
 _SLACK = 1.25
 _STILL = 0.1
 _UNSEEN = 6.0
-# how often bouts that are too slow are refused, and what that costs a tick
+# how often bouts that contradict what their word means are refused, and what that costs a tick
 _MOST_DECODED = 6
 _REFUSED = 10.0
 _FRAMES_NEEDED = 3.5  # within a bout for it to be seen at all: fewer than four frames
@@ -136,7 +137,11 @@ class TimelineModel:
         return scores
 
     def recognise(
-        self, track: Track, wall_mm: Array | None = None, allocate: Allocator = np.empty
+        self,
+        track: Track,
+        wall_mm: Array | None = None,
+        allocate: Allocator = np.empty,
+        broken: Broken | None = None,
     ) -> Recognised:
         """The ethogram of a track, and the probability of each word in each of its frames.
 
@@ -144,9 +149,12 @@ class TimelineModel:
             track: one animal's track of n frames.
             wall_mm: (n,) distance of the animal from the nearest wall, mm; None where nobody knows.
             allocate: allocator of large intermediate arrays and of the probabilities.
+            broken: says of the frames [start, stop) what of a word's definition does not hold
+                there, '' for nothing; such a bout is refused and the track decoded again, in the
+                end without a name. None refuses only what is never as fast as its word asks for.
 
         Returns:
-            Ethogram, probabilities, and what the frame rate cannot resolve.
+            Ethogram, probabilities, what the frame rate cannot resolve, and what was refused.
         """
         n = track.n_frames
         probability = allocate((n, len(self.words)), float)
@@ -159,39 +167,92 @@ class TimelineModel:
         time_s = (track.times_ns - track.times_ns[:1]) * 1e-9
         names = channel_names(track.skeleton)
         step = 1.0 / self.clock_hz
+        refused: list[tuple[slice, int, str]] = []
+        broken = None if broken is None else cache(broken)
         for number, stretch in enumerate(stretches_of(track, self.clock_hz, wall_mm, allocate)):
             speed = steady_speed(stretch, names)
             scores = self.scores(stretch, names, speed, allocate)
-            decoded = self._decode(scores, speed, allocate)
-            certain = self.chain.probabilities(scores, step, allocate)
             begin = stretch.times_s[0]
             first, last = np.searchsorted(time_s, [begin - 1e-6, stretch.times_s[-1] + step])
+            tick = np.clip(
+                np.round((time_s[first:last] - begin) / step).astype(int), 0, len(scores) - 1
+            )
+            decoded = self._decode(
+                scores, speed, allocate, _FrameCheck(broken, first, tick), refused
+            )
+            certain = self.chain.probabilities(scores, step, allocate)
             for piece in blocks(last - first, _PIECE):
                 rows = slice(first + piece.start, first + piece.stop)
-                tick = np.clip(
-                    np.round((time_s[rows] - begin) / step).astype(int), 0, len(scores) - 1
-                )
-                told = certain[tick]
-                code[rows] = decoded[tick]
+                told = certain[tick[piece]]
+                code[rows] = decoded[tick[piece]]
                 probability[rows] = told
                 part[rows] = number
                 score[rows] = np.take_along_axis(told, code[rows, None], axis=1)[:, 0]
                 release_pages(certain, probability)
+        if broken is not None and n:
+            self._unname(code, part, broken, refused)
         ethogram = Ethogram.of_words(
             code, track.times_ns, self.definitions, score, part, names=self.words
         )
-        return Recognised(ethogram, self.words, probability, self.unresolved(track.times_ns))
+        return Recognised(
+            ethogram,
+            self.words,
+            probability,
+            self.unresolved(track.times_ns),
+            tuple(
+                Refused(rows, self.words[word], self.words[_commonest(code[rows])], why)
+                for rows, word, why in refused
+            ),
+        )
 
-    def _decode(self, scores: Array, speed: Array, allocate: Allocator) -> NDArray[np.int64]:
-        """The most probable words (m,) of bouts that reach the speed their word asks for.
+    def _unname(
+        self,
+        code: NDArray[np.int64],
+        part: NDArray[np.int64],
+        broken: Broken,
+        refused: list[tuple[slice, int, str]],
+    ) -> None:
+        """Take the name from bouts of frames that contradict it: those that ticks did not show.
 
-        Scores (m, K) of bouts that never do are lowered in place and decoded again, at most six
-        times.
+        A slow camera may have no frame of what lies between two bouts of one word.
         """
-        for _ in range(_MOST_DECODED):
+        nothing = self.words.index(UNLABELLED)
+        starts, stops, _ = runs_of(code + len(self.words) * part)
+        for start, stop in zip(starts.tolist(), stops.tolist(), strict=True):
+            word = int(code[start])
+            if word != nothing and (why := broken(start, stop, self.words[word])):
+                refused.append((slice(start, stop), word, why))
+                code[start:stop] = nothing
+
+    def _decode(
+        self,
+        scores: Array,
+        speed: Array,
+        allocate: Allocator,
+        check: _FrameCheck,
+        refused: list[tuple[slice, int, str]],
+    ) -> NDArray[np.int64]:
+        """The most probable words (m,) of bouts that are what their word asks for.
+
+        Scores (m, K) of bouts that are not are lowered in place and decoded again, at most six
+        times; what contradicts its definition even then loses its name. `refused` gets the frames,
+        word and reason of each bout that contradicted.
+        """
+        nothing = self.words.index(UNLABELLED)
+        for left in reversed(range(_MOST_DECODED)):
             decoded = self.chain.decode(scores, 1.0 / self.clock_hz, allocate)
             starts, stops, words = runs_of(decoded)
-            wrong = np.maximum.reduceat(speed, starts) < self.peaks[words] / _SLACK
+            slow = np.maximum.reduceat(speed, starts) < self.peaks[words] / _SLACK
+            false = np.zeros(len(starts), bool)
+            for k, (start, stop, word) in enumerate(zip(starts, stops, words, strict=True)):
+                rows, why = check.broken(start, stop, self.words[word])
+                if why:
+                    false[k] = True
+                    if not any(word == w and _overlap(rows, other) for other, w, _ in refused):
+                        refused.append((rows, int(word), why))
+                    if not left:
+                        decoded[start:stop] = nothing
+            wrong = slow | false
             if not wrong.any():
                 break
             for start, stop, word in zip(starts[wrong], stops[wrong], words[wrong], strict=True):
@@ -264,12 +325,64 @@ class Recognised:
         words: (K) the vocabulary.
         probability: (n, K) of each word in every frame, NaN where there is no pose.
         unresolved: word -> what the frame rate cannot resolve of it, and why.
+        refused: bouts that were as good as named, but contradict what their word means.
     """
 
     ethogram: Ethogram
     words: tuple[str, ...]
     probability: Array
     unresolved: dict[str, str]
+    refused: tuple[Refused, ...] = ()
+
+
+Broken = Callable[[int, int, str], str]
+
+
+@dataclass(frozen=True)
+class Refused:
+    """A bout that the network and the chain would have named, but that contradicts its definition.
+
+    Attributes:
+        rows: its frames.
+        action: the word that was refused.
+        named: what most of its frames are named instead, '' for nothing.
+        why: what of the definition does not hold.
+    """
+
+    rows: slice
+    action: str
+    named: str
+    why: str
+
+
+class _FrameCheck:
+    """Checks bouts of ticks by their frames.
+
+    Args:
+        broken: says what frames [start, stop) break of a word's definition; None finds nothing.
+        first: row of the first frame of the segment.
+        tick: (r,) tick of each of its frames, ascending.
+    """
+
+    def __init__(self, broken: Broken | None, first: int, tick: NDArray[np.int64]) -> None:
+        self._broken = broken
+        self._first = first
+        self._tick = tick
+
+    def broken(self, start: int, stop: int, word: str) -> tuple[slice, str]:
+        """The frames of a bout of ticks, and what it breaks of its word's definition."""
+        a, b = (self._first + int(k) for k in np.searchsorted(self._tick, [start, stop]))
+        if self._broken is None or word == UNLABELLED or a == b:
+            return slice(a, b), ""
+        return slice(a, b), self._broken(a, b, word)
+
+
+def _overlap(one: slice, other: slice) -> bool:
+    return one.start < other.stop and other.start < one.stop
+
+
+def _commonest(values: NDArray[np.int64]) -> int:
+    return int(np.bincount(values).argmax())
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from rich.console import Console
 from rich.table import Table
 
 import liex_lab
-from liex_lab.cli.correct import correct
+from liex_lab.cli.correct import correct, describe
 from liex_lab.cli.evaluate import evaluate
 from liex_lab.cli.options import (
     JsonFile,
@@ -30,6 +30,7 @@ from liex_lab.cli.options import (
     VariantName,
     tell_numbers,
     to_json,
+    told_scores,
 )
 from liex_lab.cli.results import compare, export, report
 from liex_lab.cli.study import cohort, dashboard, verify
@@ -56,14 +57,12 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
-app.add_typer(evaluate, name="evaluate")
-app.add_typer(correct, name="correct")
-app.command()(cohort)
-app.command()(dashboard)
-app.command()(verify)
-app.command()(compare)
-app.command()(export)
-app.command()(report)
+# the panels of `liex --help`; they come in the order in which their first verbs are added
+_FIRST = "To begin with"
+_RECORDINGS = "Recordings"
+_SESSIONS = "A session afterwards"
+_STUDIES = "Studies and groups"
+_MODELS = "Models and measurements of the method"
 
 
 def _version(wanted: bool) -> None:
@@ -81,7 +80,7 @@ def _options(
     """Depth recordings of animals in; 3D skeletons, a replay and behaviour tables out."""
 
 
-@app.command()
+@app.command(rich_help_panel=_FIRST)
 def demo(out: OutFolder = Path()) -> None:
     """Run the bundled sample recording, to see what comes out."""
     from liex_lab.api import run_demo
@@ -91,7 +90,32 @@ def demo(out: OutFolder = Path()) -> None:
     _tell_session(session)
 
 
-@app.command()
+@app.command(rich_help_panel=_FIRST)
+def doctor(
+    recording: RecordingPath,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the findings as JSON.")] = False,
+    fps: Annotated[
+        float | None, typer.Option("--fps", help="Frames per second, where the file has no times.")
+    ] = None,
+    topic: TopicName = None,
+    plan: PlanName = "mouse",
+    settings: Settings = None,
+) -> None:
+    """Say what is in a recording and what is wrong with it. Needs no model."""
+    from liex_lab.plan import Plan
+
+    chosen = Plan.load(plan).with_settings(settings or [])
+    from liex_lab.pipelines.doctor import examine, print_report
+
+    with progress_bar() as progress:
+        findings = examine(recording, plan=chosen, fps=fps, topic=topic, progress=progress)
+    if as_json:
+        typer.echo(to_json(findings))
+    else:
+        print_report(findings)
+
+
+@app.command(rich_help_panel=_FIRST)
 def run(
     recording: RecordingPath,
     plan: PlanName = "mouse",
@@ -136,32 +160,56 @@ def run(
     _tell_session(session)
 
 
-@app.command()
-def doctor(
-    recording: RecordingPath,
-    as_json: Annotated[bool, typer.Option("--json", help="Print the findings as JSON.")] = False,
-    fps: Annotated[
-        float | None, typer.Option("--fps", help="Frames per second, where the file has no times.")
+@app.command(rich_help_panel=_FIRST)
+def show(
+    session: SessionPath,
+    web: Annotated[
+        bool, typer.Option("--web", help="In the browser, where Rerun calls tel.rerun.io.")
+    ] = False,
+    at_s: Annotated[
+        float | None, typer.Option("--at", metavar="S", min=0.0, help="Open it at this time.")
     ] = None,
-    topic: TopicName = None,
-    plan: PlanName = "mouse",
-    settings: Settings = None,
 ) -> None:
-    """Say what is in a recording and what is wrong with it. Needs no model."""
-    from liex_lab.plan import Plan
+    """Open a session's replay in Rerun."""
+    from liex_lab.sessions import Session
+    from liex_lab.sessions.viewer import has_screen, replays_with, show_replay
 
-    chosen = Plan.load(plan).with_settings(settings or [])
-    from liex_lab.pipelines.doctor import examine, print_report
+    replay = Session.open(session).path / "session.rrd"
+    if at_s is not None:
+        if web:
+            raise typer.BadParameter(
+                "a moment can be shown in a window only; leave out --web or --at"
+            )
+        show_replay(replay, at_s).wait()
+        return
+    if not web and not has_screen():
+        raise LiexError(
+            f"Rerun needs a screen and there is none here; open {replay} on a computer that has "
+            "one, or add --web"
+        )
+    # RERUN_ANALYTICS: what a laboratory looks at is nobody else's business; the viewer in a browser
+    # does not heed it
+    if web:
+        typer.echo(
+            "Rerun's viewer in the browser calls tel.rerun.io, its makers' count of uses; the "
+            "window does not"
+        )
+    shown = [str(file) for file in replays_with(replay)]
+    command = [
+        sys.executable,
+        "-m",
+        "rerun",
+        *shown,
+        "--bind",
+        "127.0.0.1",
+        *(["--web-viewer"] if web else []),
+    ]
+    raise typer.Exit(
+        subprocess.run(command, env={**os.environ, "RERUN_ANALYTICS": "0"}, check=False).returncode
+    )
 
-    with progress_bar() as progress:
-        findings = examine(recording, plan=chosen, fps=fps, topic=topic, progress=progress)
-    if as_json:
-        typer.echo(to_json(findings))
-    else:
-        print_report(findings)
 
-
-@app.command()
+@app.command(rich_help_panel=_RECORDINGS)
 def convert(
     recording: RecordingPath,
     to: Annotated[
@@ -208,7 +256,48 @@ def convert(
         typer.echo(f"note: {sentence}")
 
 
-@app.command()
+@app.command(rich_help_panel=_RECORDINGS)
+def live(
+    source: Annotated[
+        str, typer.Argument(metavar="SOURCE", help="A file or folder being written, or HOST:PORT.")
+    ],
+    plan: PlanName = "mouse",
+    settings: Settings = None,
+    replay: Annotated[
+        bool, typer.Option("--replay", help="Send a whole recording at its own pace.")
+    ] = False,
+    to: Annotated[
+        str, typer.Option("--to", help="viewer, the address of one, or a file .rrd.")
+    ] = "viewer",
+    patience_s: Annotated[
+        float, typer.Option("--patience-s", min=0.1, help="It is over after so long a wait.")
+    ] = 3.0,
+    json_file: JsonFile = None,
+) -> None:
+    """Show skeletons while a recording goes on, in Rerun, and say how late they were."""
+    from liex_lab.plan import Plan
+
+    chosen = Plan.load(plan).with_settings(settings or [])
+    from liex_lab.api import follow_live
+
+    with progress_bar() as progress:
+        result = follow_live(
+            source, chosen, replay=replay, to=to, patience_s=patience_s, progress=progress
+        )
+    tell_numbers(result, json_file)
+
+
+app.add_typer(correct, name="correct", rich_help_panel=_SESSIONS)
+app.command(rich_help_panel=_SESSIONS)(describe)
+app.command(rich_help_panel=_SESSIONS)(report)
+app.command(rich_help_panel=_SESSIONS)(export)
+app.command(rich_help_panel=_SESSIONS)(verify)
+app.command(rich_help_panel=_STUDIES)(cohort)
+app.command(rich_help_panel=_STUDIES)(dashboard)
+app.command(rich_help_panel=_STUDIES)(compare)
+
+
+@app.command(rich_help_panel=_MODELS)
 def train(
     animal: Annotated[
         str,
@@ -269,8 +358,8 @@ def train(
                 pose_model=pose_model,
                 progress=progress,
             )
-        if report:
-            tell_numbers(report, None)
+        for sentence in told_scores(report):
+            typer.echo(sentence)
         typer.echo(f"model: {model}")
         return
     if animal == "tracking":
@@ -292,7 +381,7 @@ def train(
     typer.echo(f"model: {model}")
 
 
-@app.command()
+@app.command(rich_help_panel=_MODELS)
 def suggest(
     session: SessionPath,
     model: Annotated[
@@ -312,91 +401,14 @@ def suggest(
     Console().print(table)
 
 
-@app.command()
-def live(
-    source: Annotated[
-        str, typer.Argument(metavar="SOURCE", help="A file or folder being written, or HOST:PORT.")
-    ],
-    plan: PlanName = "mouse",
-    settings: Settings = None,
-    replay: Annotated[
-        bool, typer.Option("--replay", help="Send a whole recording at its own pace.")
-    ] = False,
-    to: Annotated[
-        str, typer.Option("--to", help="viewer, the address of one, or a file .rrd.")
-    ] = "viewer",
-    patience_s: Annotated[
-        float, typer.Option("--patience-s", min=0.1, help="It is over after so long a wait.")
-    ] = 3.0,
-    json_file: JsonFile = None,
-) -> None:
-    """Show skeletons while a recording goes on, in Rerun, and say how late they were."""
-    from liex_lab.plan import Plan
-
-    chosen = Plan.load(plan).with_settings(settings or [])
-    from liex_lab.api import follow_live
-
-    with progress_bar() as progress:
-        result = follow_live(
-            source, chosen, replay=replay, to=to, patience_s=patience_s, progress=progress
-        )
-    tell_numbers(result, json_file)
-
-
-@app.command()
-def show(
-    session: SessionPath,
-    web: Annotated[
-        bool, typer.Option("--web", help="In the browser, where Rerun calls tel.rerun.io.")
-    ] = False,
-    at_s: Annotated[
-        float | None, typer.Option("--at", metavar="S", min=0.0, help="Open it at this time.")
-    ] = None,
-) -> None:
-    """Open a session's replay in Rerun."""
-    from liex_lab.sessions import Session
-    from liex_lab.sessions.viewer import has_screen, replays_with, show_replay
-
-    replay = Session.open(session).path / "session.rrd"
-    if at_s is not None:
-        if web:
-            raise typer.BadParameter(
-                "a moment can be shown in a window only; leave out --web or --at"
-            )
-        show_replay(replay, at_s).wait()
-        return
-    if not web and not has_screen():
-        raise LiexError(
-            f"Rerun needs a screen and there is none here; open {replay} on a computer that has "
-            "one, or add --web"
-        )
-    # RERUN_ANALYTICS: what a laboratory looks at is nobody else's business; the viewer in a browser
-    # does not heed it
-    if web:
-        typer.echo(
-            "Rerun's viewer in the browser calls tel.rerun.io, its makers' count of uses; the "
-            "window does not"
-        )
-    shown = [str(file) for file in replays_with(replay)]
-    command = [
-        sys.executable,
-        "-m",
-        "rerun",
-        *shown,
-        "--bind",
-        "127.0.0.1",
-        *(["--web-viewer"] if web else []),
-    ]
-    raise typer.Exit(
-        subprocess.run(command, env={**os.environ, "RERUN_ANALYTICS": "0"}, check=False).returncode
-    )
-
-
-@app.command()
+@app.command(rich_help_panel=_MODELS)
 def info(
     plan: Annotated[
         str | None, typer.Option("--plan", help="Print this plan, to copy and change it.")
     ] = None,
+    everything: Annotated[
+        bool, typer.Option("--all", help="Every package, and every line of the models' cards.")
+    ] = False,
 ) -> None:
     """Versions, bundled plans and models; `liex info --plan mouse > my-plan.toml` makes a plan of
     your own.
@@ -410,15 +422,28 @@ def info(
     from liex_lab.sessions.provenance import versions
 
     facts: dict[str, Any] = versions()
+    if not everything:
+        facts = {name: facts[name] for name in ("liex_lab", "python")}
     facts["plans"] = ", ".join(known_plans())
     models = bundled_models()
     facts["models"] = ", ".join(models) or "none"
+    if not everything:
+        facts |= {
+            f"model {name}": f"sha256 {str(card.get('sha256', 'unknown'))[:16]}"
+            for name, card in models.items()
+        }
+        tell_numbers(facts, None)
+        typer.echo("`liex info --all` lists every package and how the models were made")
+        return
     facts |= {
         f"model {name}: {key}": value
         for name, card in models.items()
         for key, value in card.items()
     }
     tell_numbers(facts, None)
+
+
+app.add_typer(evaluate, name="evaluate", rich_help_panel=_MODELS)
 
 
 def main() -> None:

@@ -68,3 +68,27 @@ def to_json(result: Any) -> str:
     from liex_lab.evaluation.pose import plain
 
     return json.dumps(plain(result), indent=2, allow_nan=False, ensure_ascii=False)
+
+
+def told_scores(report: dict[str, Any]) -> list[str]:
+    """Scores of recognised actions (`actions.scores.timeline_scores`) as sentences.
+
+    Args:
+        report: the scores of leave-one-animal-out; empty where there are none.
+    """
+    if not report:
+        return []
+    if "macro_f1" not in report:
+        return [f"{name}: {value}" for name, value in report.items()]
+    told = [
+        "Each animal's actions were recognised by what the others taught: macro F1 of the frames "
+        f"{report['macro_f1']:.2f}, F1 of bouts that overlap by half {report['segment_f1_50']:.2f}."
+    ]
+    for word, one in report["per_action"].items():
+        if "bouts" in one:
+            n = one["bouts"]
+            told.append(
+                f"  {word}: F1 {one['f1']:.2f}, {one['precision']:.0%} of what was called so is, "
+                f"{one['recall']:.0%} of it was found; {n} {'bout' if n == 1 else 'bouts'}"
+            )
+    return told

@@ -10,13 +10,14 @@ import hashlib
 import json
 import os
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
 from liex_lab.errors import LiexError
 from liex_lab.plan import Plan
 from liex_lab.plan.study import VIRTUAL, PlannedSession, Study
+from liex_lab.sessions.corrections import DESCRIBED, START, read_log, with_description
 from liex_lab.sessions.failure import read_failure
 from liex_lab.sessions.provenance import SCHEMA_VERSION, package_version
 
@@ -40,16 +41,19 @@ class SessionStatus:
         state: done, failed, new, begun, changed or excluded.
         reason: why it is to be done, or was not.
         failure: of the last attempt, if it failed.
+        described: what the study says otherwise of the animal than its results; then nothing else
+            changed, and nothing is measured anew.
     """
 
     session: PlannedSession
     state: State
     reason: str = ""
     failure: dict[str, Any] | None = None
+    described: dict[str, str] = field(default_factory=dict)
 
     @property
     def to_do(self) -> bool:
-        """Whether a run of the study measures it: it is new, begun or changed."""
+        """Whether a run of the study has to do with it: it is new, begun or changed."""
         return self.state in ("new", "begun", "changed")
 
 
@@ -79,7 +83,7 @@ def standings(
 
 
 def _asked_again(one: SessionStatus, retry: bool, again: bool) -> SessionStatus:
-    if again and one.state == "done":
+    if again and (one.state == "done" or one.described):
         return SessionStatus(one.session, "changed", "asked for with --again")
     if (retry or again) and one.state == "failed":
         return SessionStatus(one.session, "changed", "it failed, and is tried again", one.failure)
@@ -98,9 +102,13 @@ def standing(session: PlannedSession) -> SessionStatus:
         try:
             document = json.loads((session.folder / "session.json").read_text(encoding="utf-8"))
             why = next(filter(None, (check() for check in _checks(session, document))), "")
+            said = {} if why else _described_anew(session, document)
         except (OSError, ValueError, LiexError, AttributeError, TypeError):
-            why = "its session.json cannot be read"
-        return SessionStatus(session, "changed" if why else "done", why)
+            why, said = "its session.json cannot be read", {}
+        if said:
+            told = ", ".join(f"{key} = {value or 'unknown'}" for key, value in said.items())
+            why = f"described anew: {told}; nothing is measured again"
+        return SessionStatus(session, "changed" if why else "done", why, described=said)
     failure = read_failure(session.folder)
     if failure is not None:
         why = (
@@ -152,9 +160,26 @@ def _plan_changed(plan: Plan, stored: dict[str, Any]) -> str:
         for section in now
         for key in (now[section] if isinstance(now[section], dict) else [""])
         if (now[section][key] != then[section][key] if key else now[section] != then[section])
+        and not (section == "session" and key in DESCRIBED)
     ]
     more = f" and {len(differing) - 3} more" if len(differing) > 3 else ""
     return f"plan changed: {', '.join(differing[:3])}{more}" if differing else ""
+
+
+def _described_anew(session: PlannedSession, document: dict[str, Any]) -> dict[str, str]:
+    """What the plan says otherwise of animal and session than the results; '' takes it back."""
+    stated = session.plan.session.model_dump()
+    then = Plan.from_table(document.get("plan", {})).session.model_dump()
+    described = read_log(session.folder).described
+    now = with_description(document, described)
+    known = {**then, **now.get("subject", {}), **described}
+    known[START] = now.get(START) or known[START]
+    wanted = {
+        key: str(stated[key] or "")
+        for key in DESCRIBED
+        if stated[key] is not None or then[key] is not None
+    }
+    return {key: value for key, value in wanted.items() if value != str(known.get(key) or "")}
 
 
 def _model_changed(plan: Plan, stored: dict[str, Any]) -> str:

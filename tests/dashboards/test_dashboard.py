@@ -19,11 +19,11 @@ from liex_lab.dashboards.app import plots, tables
 from liex_lab.dashboards.app.data import GREY, Ethogram, StudyData, colours_of, raster
 from liex_lab.dashboards.app.page_session import moved_to
 from liex_lab.dashboards.app.server import address, make_app
-from liex_lab.dashboards.report.svg import ACTION_COLOURS, action_colour
 from liex_lab.pipelines.study.listing import list_sessions
 from typer.testing import CliRunner
 
 from liex_lab import api, cli
+from liex_lab.actions.colours import PALETTE, action_colours
 from liex_lab.errors import LiexError, SessionError
 from liex_lab.sessions import Session
 from tests.dashboards import copies
@@ -106,15 +106,15 @@ def test_each_part_of_the_time_has_the_colour_of_what_fills_most_of_it(
 
 
 def test_no_two_actions_share_a_colour_but_the_grey_ones() -> None:
-    n = len(ACTION_COLOURS)
+    n = len(PALETTE)
     colours = list(colours_of([f"w{k}" for k in range(n + 3)]).values())
     assert len(set(colours[:n])) == n
     assert set(colours[n:]) == {GREY}
     words = ["rear", "run", "walk", "pause"]
     assert colours_of(["walk", "rear", "unheard"], words) == {
-        "walk": action_colour(2),
-        "rear": action_colour(0),
-        "unheard": action_colour(1),
+        "walk": action_colours(words)["walk"],
+        "rear": action_colours(words)["rear"],
+        "unheard": PALETTE[0],
     }
 
 

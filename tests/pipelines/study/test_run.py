@@ -22,6 +22,7 @@ from liex_lab import api, cli
 from liex_lab.errors import LiexError, StudyError
 from liex_lab.plan.study import Study
 from liex_lab.runtime.progress import Board
+from liex_lab.sessions.corrections import Description
 from tests.pipelines.pretended import pretended_run, shared_task
 
 BROKEN = ("empty", "torn", "full", "fault", "deadly", "missing")
@@ -191,6 +192,37 @@ def test_a_session_is_done_again_only_when_input_plan_or_version_changed(
     assert why(file) == ("done", ""), "only copied to another place"
     recording.unlink()
     assert why(file) == ("done", ""), "results outlive their recording"
+
+
+def test_who_an_animal_is_changes_without_measuring(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = one_session(tmp_path)
+    text = file.read_text()
+    file.write_text(text.replace('group = "@g"', 'group = "drug"\ncage = "c1"'))
+    state, reason = why(file)
+    assert (state, reason) == (
+        "changed",
+        "described anew: group = drug, cage = c1; nothing is measured again",
+    )
+    described = []
+
+    def describe(session: Path, what: list[Description], **who: str) -> Path:
+        described.append((Path(session), [str(one) for one in what]))
+        return Path(session)
+
+    def never(*_: object, **__: object) -> Path:
+        raise AssertionError("it measured")
+
+    monkeypatch.setattr(api, "correct_session", describe)
+    monkeypatch.setattr(api, "run_session", never)
+    runs = (tmp_path / "good.runs").stat().st_size
+    api.run_study(file, workers=1)
+    folder = Study.load(file).sessions[0].folder
+    assert described == [(folder, ["group is drug", "cage is c1"])]
+    assert (tmp_path / "good.runs").stat().st_size == runs
+    file.write_text(text + "set = { behaviour.rear_height_mm = 41.0 }\n")
+    assert why(file)[1].startswith("plan changed"), "what is measured by still counts"
 
 
 class _Digest:
