@@ -29,8 +29,8 @@ _WHEN = ("session_id", "individual", "frame_index", "time_s", "dt_s")
 Reading = Callable[[BoutReader, int, int], tuple[float, ...]]
 
 
-def _way(*names: str) -> Reading:
-    return lambda bout, a, b: tuple(bout.way(a, b)[name] for name in names)
+def _motion(*names: str) -> Reading:
+    return lambda bout, a, b: tuple(bout.motion(a, b)[name] for name in names)
 
 
 def _turn(name: str, sign: float = 1.0) -> Reading:
@@ -45,15 +45,15 @@ def _median(values: Array) -> float:
 def _beyond_noise(bout: BoutReader, a: int, b: int) -> float:
     """Mean speed less what errors of the pose alone look like, mm/s."""
     noise = _median(bout.column("speed_sd_mm_s", a, b))
-    return max(bout.way(a, b)["mean_speed_mm_s"] - (0.0 if np.isnan(noise) else noise), 0.0)
+    return max(bout.motion(a, b)["mean_speed_mm_s"] - (0.0 if np.isnan(noise) else noise), 0.0)
 
 
 # how each of `actions.vocabulary.MEASURES` is read; where there are two values both have to fit
 _READ: dict[str, Reading] = {
-    "speed_mm_s": _way("mean_speed_mm_s", "median_speed_mm_s"),
-    "peak_speed_mm_s": _way("peak_speed_mm_s"),
+    "speed_mm_s": _motion("mean_speed_mm_s", "median_speed_mm_s"),
+    "peak_speed_mm_s": _motion("peak_speed_mm_s"),
     "quiet_bl_s": lambda bout, a, b: (_beyond_noise(bout, a, b) / bout.length_mm,),
-    "speed_bl_s": lambda bout, a, b: (bout.way(a, b)["mean_speed_mm_s"] / bout.length_mm,),
+    "speed_bl_s": lambda bout, a, b: (bout.motion(a, b)["mean_speed_mm_s"] / bout.length_mm,),
     "duration_s": lambda bout, a, b: (bout.seconds(a, b),),
     "left_turn_rad": _turn("net_turn_rad"),
     "right_turn_rad": _turn("net_turn_rad", -1.0),
@@ -63,7 +63,7 @@ _READ: dict[str, Reading] = {
     "usual_bend_rad": lambda bout, a, b: (_median(np.abs(bout.column("bend_rad", a, b))),),
     "pitch_rad": _turn("mean_pitch_rad"),
     "raised_bl": lambda bout, a, b: (bout.height(a, b)["peak_nose_over_rump_mm"] / bout.length_mm,),
-    "moved_bl": lambda bout, a, b: (bout.way(a, b)["displacement_mm"] / bout.length_mm,),
+    "moved_bl": lambda bout, a, b: (bout.motion(a, b)["displacement_mm"] / bout.length_mm,),
 }
 
 

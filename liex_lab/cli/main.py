@@ -13,8 +13,6 @@ from pathlib import Path
 from typing import Annotated, Any, NoReturn
 
 import typer
-from rich.console import Console
-from rich.table import Table
 
 import liex_lab
 from liex_lab.cli.correct import correct, describe
@@ -33,6 +31,7 @@ from liex_lab.cli.options import (
     told_scores,
 )
 from liex_lab.cli.results import compare, export, report
+from liex_lab.cli.sections import MODELS, RECORDINGS, SESSIONS, START, STUDIES, group_of_verbs
 from liex_lab.cli.study import cohort, dashboard, verify
 from liex_lab.errors import LiexError
 from liex_lab.runtime.disk import is_full, why_full
@@ -50,19 +49,18 @@ _USERS_TO_MEND = {
 # what Rerun's writer says of a full disk is said by our own sentence
 _RUST_LOG = "warn,re_log_encoding=off,re_sdk=off"
 
-app = typer.Typer(
-    name="liex",
-    help="Depth recordings of animals in; 3D skeletons, a replay and behaviour tables out.",
-    no_args_is_help=True,
-    add_completion=False,
-    pretty_exceptions_enable=False,
+app = group_of_verbs(
+    "Depth recordings of animals in; 3D skeletons, a replay and behaviour tables out.", name="liex"
 )
-# the panels of `liex --help`; they come in the order in which their first verbs are added
-_FIRST = "To begin with"
-_RECORDINGS = "Recordings"
-_SESSIONS = "A session afterwards"
-_STUDIES = "Studies and groups"
-_MODELS = "Models and measurements of the method"
+app.add_typer(evaluate, name="evaluate", rich_help_panel=MODELS)
+app.add_typer(correct, name="correct", rich_help_panel=SESSIONS)
+app.command(rich_help_panel=SESSIONS)(describe)
+app.command(rich_help_panel=SESSIONS)(report)
+app.command(rich_help_panel=SESSIONS)(verify)
+app.command(rich_help_panel=SESSIONS)(export)
+app.command(rich_help_panel=STUDIES)(cohort)
+app.command(rich_help_panel=STUDIES)(compare)
+app.command(rich_help_panel=STUDIES)(dashboard)
 
 
 def _version(wanted: bool) -> None:
@@ -80,7 +78,7 @@ def _options(
     """Depth recordings of animals in; 3D skeletons, a replay and behaviour tables out."""
 
 
-@app.command(rich_help_panel=_FIRST)
+@app.command(rich_help_panel=START)
 def demo(out: OutFolder = Path()) -> None:
     """Run the bundled sample recording, to see what comes out."""
     from liex_lab.api import run_demo
@@ -90,32 +88,7 @@ def demo(out: OutFolder = Path()) -> None:
     _tell_session(session)
 
 
-@app.command(rich_help_panel=_FIRST)
-def doctor(
-    recording: RecordingPath,
-    as_json: Annotated[bool, typer.Option("--json", help="Print the findings as JSON.")] = False,
-    fps: Annotated[
-        float | None, typer.Option("--fps", help="Frames per second, where the file has no times.")
-    ] = None,
-    topic: TopicName = None,
-    plan: PlanName = "mouse",
-    settings: Settings = None,
-) -> None:
-    """Say what is in a recording and what is wrong with it. Needs no model."""
-    from liex_lab.plan import Plan
-
-    chosen = Plan.load(plan).with_settings(settings or [])
-    from liex_lab.pipelines.doctor import examine, print_report
-
-    with progress_bar() as progress:
-        findings = examine(recording, plan=chosen, fps=fps, topic=topic, progress=progress)
-    if as_json:
-        typer.echo(to_json(findings))
-    else:
-        print_report(findings)
-
-
-@app.command(rich_help_panel=_FIRST)
+@app.command(rich_help_panel=START)
 def run(
     recording: RecordingPath,
     plan: PlanName = "mouse",
@@ -160,56 +133,32 @@ def run(
     _tell_session(session)
 
 
-@app.command(rich_help_panel=_FIRST)
-def show(
-    session: SessionPath,
-    web: Annotated[
-        bool, typer.Option("--web", help="In the browser, where Rerun calls tel.rerun.io.")
-    ] = False,
-    at_s: Annotated[
-        float | None, typer.Option("--at", metavar="S", min=0.0, help="Open it at this time.")
+@app.command(rich_help_panel=START)
+def doctor(
+    recording: RecordingPath,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the findings as JSON.")] = False,
+    fps: Annotated[
+        float | None, typer.Option("--fps", help="Frames per second, where the file has no times.")
     ] = None,
+    topic: TopicName = None,
+    plan: PlanName = "mouse",
+    settings: Settings = None,
 ) -> None:
-    """Open a session's replay in Rerun."""
-    from liex_lab.sessions import Session
-    from liex_lab.sessions.viewer import has_screen, replays_with, show_replay
+    """Say what is in a recording and what is wrong with it. Needs no model."""
+    from liex_lab.plan import Plan
 
-    replay = Session.open(session).path / "session.rrd"
-    if at_s is not None:
-        if web:
-            raise typer.BadParameter(
-                "a moment can be shown in a window only; leave out --web or --at"
-            )
-        show_replay(replay, at_s).wait()
-        return
-    if not web and not has_screen():
-        raise LiexError(
-            f"Rerun needs a screen and there is none here; open {replay} on a computer that has "
-            "one, or add --web"
-        )
-    # RERUN_ANALYTICS: what a laboratory looks at is nobody else's business; the viewer in a browser
-    # does not heed it
-    if web:
-        typer.echo(
-            "Rerun's viewer in the browser calls tel.rerun.io, its makers' count of uses; the "
-            "window does not"
-        )
-    shown = [str(file) for file in replays_with(replay)]
-    command = [
-        sys.executable,
-        "-m",
-        "rerun",
-        *shown,
-        "--bind",
-        "127.0.0.1",
-        *(["--web-viewer"] if web else []),
-    ]
-    raise typer.Exit(
-        subprocess.run(command, env={**os.environ, "RERUN_ANALYTICS": "0"}, check=False).returncode
-    )
+    chosen = Plan.load(plan).with_settings(settings or [])
+    from liex_lab.pipelines.doctor import examine, print_report
+
+    with progress_bar() as progress:
+        findings = examine(recording, plan=chosen, fps=fps, topic=topic, progress=progress)
+    if as_json:
+        typer.echo(to_json(findings))
+    else:
+        print_report(findings)
 
 
-@app.command(rich_help_panel=_RECORDINGS)
+@app.command(rich_help_panel=RECORDINGS)
 def convert(
     recording: RecordingPath,
     to: Annotated[
@@ -256,48 +205,7 @@ def convert(
         typer.echo(f"note: {sentence}")
 
 
-@app.command(rich_help_panel=_RECORDINGS)
-def live(
-    source: Annotated[
-        str, typer.Argument(metavar="SOURCE", help="A file or folder being written, or HOST:PORT.")
-    ],
-    plan: PlanName = "mouse",
-    settings: Settings = None,
-    replay: Annotated[
-        bool, typer.Option("--replay", help="Send a whole recording at its own pace.")
-    ] = False,
-    to: Annotated[
-        str, typer.Option("--to", help="viewer, the address of one, or a file .rrd.")
-    ] = "viewer",
-    patience_s: Annotated[
-        float, typer.Option("--patience-s", min=0.1, help="It is over after so long a wait.")
-    ] = 3.0,
-    json_file: JsonFile = None,
-) -> None:
-    """Show skeletons while a recording goes on, in Rerun, and say how late they were."""
-    from liex_lab.plan import Plan
-
-    chosen = Plan.load(plan).with_settings(settings or [])
-    from liex_lab.api import follow_live
-
-    with progress_bar() as progress:
-        result = follow_live(
-            source, chosen, replay=replay, to=to, patience_s=patience_s, progress=progress
-        )
-    tell_numbers(result, json_file)
-
-
-app.add_typer(correct, name="correct", rich_help_panel=_SESSIONS)
-app.command(rich_help_panel=_SESSIONS)(describe)
-app.command(rich_help_panel=_SESSIONS)(report)
-app.command(rich_help_panel=_SESSIONS)(export)
-app.command(rich_help_panel=_SESSIONS)(verify)
-app.command(rich_help_panel=_STUDIES)(cohort)
-app.command(rich_help_panel=_STUDIES)(dashboard)
-app.command(rich_help_panel=_STUDIES)(compare)
-
-
-@app.command(rich_help_panel=_MODELS)
+@app.command(rich_help_panel=MODELS)
 def train(
     animal: Annotated[
         str,
@@ -381,7 +289,7 @@ def train(
     typer.echo(f"model: {model}")
 
 
-@app.command(rich_help_panel=_MODELS)
+@app.command(rich_help_panel=SESSIONS)
 def suggest(
     session: SessionPath,
     model: Annotated[
@@ -392,6 +300,9 @@ def suggest(
     """List the stretches of a session most worth labelling next: where the recogniser is least
     sure.
     """
+    from rich.console import Console
+    from rich.table import Table
+
     from liex_lab.pipelines.training.action_model import suggest as job
 
     table = Table("from (s)", "to (s)", "taken for", "or else", "doubt")
@@ -401,7 +312,87 @@ def suggest(
     Console().print(table)
 
 
-@app.command(rich_help_panel=_MODELS)
+@app.command(rich_help_panel=RECORDINGS)
+def live(
+    source: Annotated[
+        str, typer.Argument(metavar="SOURCE", help="A file or folder being written, or HOST:PORT.")
+    ],
+    plan: PlanName = "mouse",
+    settings: Settings = None,
+    replay: Annotated[
+        bool, typer.Option("--replay", help="Send a whole recording at its own pace.")
+    ] = False,
+    to: Annotated[
+        str, typer.Option("--to", help="viewer, the address of one, or a file .rrd.")
+    ] = "viewer",
+    patience_s: Annotated[
+        float, typer.Option("--patience-s", min=0.1, help="It is over after so long a wait.")
+    ] = 3.0,
+    json_file: JsonFile = None,
+) -> None:
+    """Show skeletons while a recording goes on, in Rerun, and say how late they were."""
+    from liex_lab.plan import Plan
+
+    chosen = Plan.load(plan).with_settings(settings or [])
+    from liex_lab.api import follow_live
+
+    with progress_bar() as progress:
+        result = follow_live(
+            source, chosen, replay=replay, to=to, patience_s=patience_s, progress=progress
+        )
+    tell_numbers(result, json_file)
+
+
+@app.command(rich_help_panel=START)
+def show(
+    session: SessionPath,
+    web: Annotated[
+        bool, typer.Option("--web", help="In the browser, where Rerun calls tel.rerun.io.")
+    ] = False,
+    at_s: Annotated[
+        float | None, typer.Option("--at", metavar="S", min=0.0, help="Open it at this time.")
+    ] = None,
+) -> None:
+    """Open a session's replay in Rerun."""
+    from liex_lab.sessions import Session
+    from liex_lab.sessions.viewer import has_screen, replays_with, show_replay
+
+    replay = Session.open(session).path / "session.rrd"
+    if at_s is not None:
+        if web:
+            raise typer.BadParameter(
+                "a moment can be shown in a window only; leave out --web or --at"
+            )
+        show_replay(replay, at_s).wait()
+        return
+    if not web and not has_screen():
+        raise LiexError(
+            f"Rerun needs a screen and there is none here; open {replay} on a computer that has "
+            "one, or add --web"
+        )
+    # RERUN_ANALYTICS: what a laboratory looks at is nobody else's business; the viewer in a browser
+    # does not heed it
+    if web:
+        typer.echo(
+            "Rerun's viewer in the browser calls tel.rerun.io, its makers' count of uses; the "
+            "window does not"
+        )
+    shown = [str(file) for file in replays_with(replay)]
+    command = [
+        sys.executable,
+        "-m",
+        "rerun",
+        *shown,
+        "--bind",
+        "127.0.0.1",
+        *(["--web-viewer"] if web else []),
+    ]
+    raise typer.Exit(
+        subprocess.run(command, env={**os.environ, "RERUN_ANALYTICS": "0"}, check=False).returncode
+    )
+
+
+@app.command(rich_help_panel=MODELS)
 def info(
     plan: Annotated[
         str | None, typer.Option("--plan", help="Print this plan, to copy and change it.")
@@ -441,9 +432,6 @@ def info(
         for key, value in card.items()
     }
     tell_numbers(facts, None)
-
-
-app.add_typer(evaluate, name="evaluate", rich_help_panel=_MODELS)
 
 
 def main() -> None:
