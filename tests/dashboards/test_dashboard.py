@@ -26,6 +26,7 @@ from liex_lab import api, cli
 from liex_lab.actions.colours import PALETTE, action_colours
 from liex_lab.errors import LiexError, SessionError
 from liex_lab.sessions import Session
+from liex_lab.sessions.listed import Entry
 from tests.dashboards import copies
 
 KEY = "sub-m003_ses-01"
@@ -266,3 +267,29 @@ def test_what_is_not_there_is_told(data: StudyData) -> None:
         data.session("sub-m000_ses-02")
     with pytest.raises(SessionError, match="no table"):
         tables.find(data, "nothing")
+
+
+def test_every_ethogram_stands_under_its_own_key(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    entries = [
+        Entry("a", "failed", folder=tmp_path / "a"),
+        Entry("b", "done", folder=tmp_path / "b"),
+        Entry("c", "new"),
+        Entry("d", "done", folder=tmp_path / "d"),
+    ]
+    shown = StudyData("x", lambda: entries)
+    known = {
+        key: Ethogram(np.zeros((0, 2)), [], np.zeros((0, 2)), seconds)
+        for key, seconds in (("b", 2.0), ("d", 4.0))
+    }
+    monkeypatch.setattr(shown, "_of_one", lambda what, read, entry: known[entry.key])
+    found = shown.ethograms(["a", "b", "c", "d", "e"])
+    assert {key: one.duration_s for key, one in found.items()} == {"b": 2.0, "d": 4.0}
+
+
+def test_a_damaged_ethogram_is_a_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    shown = StudyData("x", lambda: [Entry("b", "done", folder=tmp_path / "b")])
+    monkeypatch.setattr(shown, "_of_one", lambda what, read, entry: {"damage": "run it again"})
+    assert shown.ethograms(["b"]) == {}
+    assert shown.damage("b") == "run it again"
