@@ -13,7 +13,7 @@ Ours; the recogniser of Lie-X section 4.3 names cut-out sequences alone (`recogn
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from typing import Any
@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from liex_lab.actions.channels import Segment, channel_names, segments_of
 from liex_lab.actions.ethogram import UNLABELLED, Ethogram, frame_stops, runs_of
 from liex_lab.actions.labels import LabelledTrack
+from liex_lab.actions.refusals import Broken, FrameCheck, Refused, commonest, overlap
 from liex_lab.actions.semi_markov import SemiMarkovModel
 from liex_lab.actions.vocabulary import FASTEST
 from liex_lab.actions.window_features import window_features
@@ -178,7 +179,7 @@ class TimelineModel:
                 np.round((time_s[first:last] - begin) / step).astype(int), 0, len(scores) - 1
             )
             decoded = self._decode(
-                scores, speed, allocate, _FrameCheck(broken, first, tick), refused
+                scores, speed, allocate, FrameCheck(broken, first, tick), refused
             )
             certain = self.chain.probabilities(scores, step, allocate)
             for piece in blocks(last - first, _PIECE):
@@ -200,7 +201,7 @@ class TimelineModel:
             probability,
             self.unresolved(track.times_ns),
             tuple(
-                Refused(rows, self.words[word], self.words[_commonest(code[rows])], why)
+                Refused(rows, self.words[word], self.words[commonest(code[rows])], why)
                 for rows, word, why in refused
             ),
         )
@@ -229,7 +230,7 @@ class TimelineModel:
         scores: Array,
         speed: Array,
         allocate: Allocator,
-        check: _FrameCheck,
+        check: FrameCheck,
         refused: list[tuple[slice, int, str]],
     ) -> NDArray[np.int64]:
         """The most probable words (m,) of bouts that are what their word asks for.
@@ -248,7 +249,7 @@ class TimelineModel:
                 rows, why = check.broken(start, stop, self.words[word])
                 if why:
                     false[k] = True
-                    if not any(word == w and _overlap(rows, other) for other, w, _ in refused):
+                    if not any(word == w and overlap(rows, other) for other, w, _ in refused):
                         refused.append((rows, int(word), why))
                     if not left:
                         decoded[start:stop] = nothing
@@ -333,56 +334,6 @@ class Recognised:
     probability: Array
     unresolved: dict[str, str]
     refused: tuple[Refused, ...] = ()
-
-
-Broken = Callable[[int, int, str], str]
-
-
-@dataclass(frozen=True)
-class Refused:
-    """A bout that the network and the chain would have named, but that contradicts its definition.
-
-    Attributes:
-        rows: its frames.
-        action: the word that was refused.
-        named: what most of its frames are named instead, '' for nothing.
-        why: what of the definition does not hold.
-    """
-
-    rows: slice
-    action: str
-    named: str
-    why: str
-
-
-class _FrameCheck:
-    """Checks bouts of ticks by their frames.
-
-    Args:
-        broken: says what frames [start, stop) break of a word's definition; None finds nothing.
-        first: row of the first frame of the segment.
-        tick: (r,) tick of each of its frames, ascending.
-    """
-
-    def __init__(self, broken: Broken | None, first: int, tick: NDArray[np.int64]) -> None:
-        self._broken = broken
-        self._first = first
-        self._tick = tick
-
-    def broken(self, start: int, stop: int, word: str) -> tuple[slice, str]:
-        """The frames of a bout of ticks, and what it breaks of its word's definition."""
-        a, b = (self._first + int(k) for k in np.searchsorted(self._tick, [start, stop]))
-        if self._broken is None or word == UNLABELLED or a == b:
-            return slice(a, b), ""
-        return slice(a, b), self._broken(a, b, word)
-
-
-def _overlap(one: slice, other: slice) -> bool:
-    return one.start < other.stop and other.start < one.stop
-
-
-def _commonest(values: NDArray[np.int64]) -> int:
-    return int(np.bincount(values).argmax())
 
 
 @dataclass(frozen=True)

@@ -136,7 +136,7 @@ def test_exchanges_of_head_and_tail_are_warned_of_and_listed(session, monkeypatc
     again = Session.open(session.path)
     monkeypatch.setattr(type(again), "flips", flips)
     assert any(
-        "2 stretches of 0.8 s in all; 1 were put right" in sentence for sentence in warnings(again)
+        "2 stretches of 0.8 s in all; 1 was put right" in sentence for sentence in warnings(again)
     )
     assert flip_rows(again) == [
         ("1.00", "1.50", "0.90", "put right"),
