@@ -198,7 +198,8 @@ def measure_behaviour(
         named = {"bouts": empty_table(BOUTS), "actions": {}}
         notes = {"no_actions": nameless}
     else:
-        named, notes = {}, {}
+        named = {}
+        notes = {}
     rows.track.release_pages()
     release_table(moved)
     trim_heap()

@@ -158,7 +158,10 @@ class Description:
 
 Correction = FlipSpan | JointMove | BoutEdit | Description
 _KINDS: dict[str, type[Correction]] = {
-    kind.kind: kind for kind in (FlipSpan, JointMove, BoutEdit, Description)
+    "flip": FlipSpan,
+    "joint": JointMove,
+    "bout": BoutEdit,
+    "description": Description,
 }
 _UNDO = "undo"
 

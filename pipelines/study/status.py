@@ -99,12 +99,14 @@ def standing(session: PlannedSession) -> SessionStatus:
     if session.exclude:
         return SessionStatus(session, "excluded", session.exclude)
     if (session.folder / "session.json").is_file():
+        said: dict[str, str] = {}
         try:
             document = json.loads((session.folder / "session.json").read_text(encoding="utf-8"))
             why = next(filter(None, (check() for check in _checks(session, document))), "")
-            said = {} if why else _described_anew(session, document)
+            if not why:
+                said = _described_anew(session, document)
         except (OSError, ValueError, LiexError, AttributeError, TypeError):
-            why, said = "its session.json cannot be read", {}
+            why = "its session.json cannot be read"
         if said:
             told = ", ".join(f"{key} = {value or 'unknown'}" for key, value in said.items())
             why = f"described anew: {told}; nothing is measured again"

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
+import pandas as pd
 import pytest
 
 from liex_lab.actions.labels import LabelledTrack
@@ -12,6 +15,7 @@ from liex_lab.actions.vocabulary import DEFINITIONS, MEASURES, WORDS
 from liex_lab.behaviour import kinematics, measure_bouts
 from liex_lab.behaviour.bout_reader import BoutReader
 from liex_lab.behaviour.checking import _READ, BoutCheck, recognise
+from liex_lab.behaviour.kinematics import Joints
 from liex_lab.tables.rows import Rows, bout_rows
 from tests.actions.toy import GO, going_and_staying
 from tests.behaviour.test_kinematics import tables_of
@@ -98,15 +102,11 @@ def test_a_recogniser_cannot_name_what_contradicts_its_words(liar: TimelineModel
     assert (before["contradicts"] != "").any()
 
 
-def tables_of_track(rows: Rows) -> tuple[object, object]:
-    from liex_lab.behaviour.kinematics import Joints
-
+def tables_of_track(rows: Rows) -> tuple[pd.DataFrame, Joints]:
     return rows.frames_table(), Joints.of_track(rows.track)
 
 
 def test_words_of_ones_own_are_not_checked(liar: TimelineModel) -> None:
-    from dataclasses import replace
-
     own = replace(liar, definitions={"pause": "my pause", "freeze": ""})
     one = going_and_staying(12)
     assert recognise(own, one.track).refused == ()

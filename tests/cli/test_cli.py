@@ -20,6 +20,7 @@ from typer.testing import CliRunner
 
 import liex_lab
 from liex_lab import api, cli
+from liex_lab.cli.options import told_scores
 from liex_lab.errors import RecordingError
 from liex_lab.plan import Plan
 
@@ -390,8 +391,22 @@ def test_errors_of_a_job_come_through(
 
 def test_info_tells_versions_and_plans_and_prints_a_plan_to_copy() -> None:
     told = CliRunner().invoke(cli.app, ["info"]).output
+    assert all(word in told for word in ("liex_lab", "python", "plans", "mouse", "models"))
+    assert len(told.splitlines()) < 20
+    told = CliRunner().invoke(cli.app, ["info", "--all"]).output
     assert all(word in told for word in ("numba", "rerun-sdk", "plans", "mouse", "models"))
     assert (
         CliRunner().invoke(cli.app, ["info", "--plan", "mouse"]).output
         == Plan.load("mouse").to_toml()
     )
+
+
+def test_scores_of_a_trained_recogniser_are_sentences() -> None:
+    go = {"f1": 0.5, "precision": 0.25, "recall": 1.0, "segment_f1_50": 0.5, "bouts": 1}
+    report = {"animals": 2, "macro_f1": 0.5, "segment_f1_50": 0.5, "per_action": {"go": go}}
+    first, second = told_scores(report)
+    assert "macro F1 of the frames 0.50" in first
+    assert second.endswith("25% of what was called so is, 100% of it was found; 1 bout")
+    alone = told_scores({"animals": 1, "note": "one animal only"})
+    assert alone == ["animals: 1", "note: one animal only"]
+    assert told_scores({}) == []
