@@ -183,67 +183,61 @@ def correct_joint(rotation, axes, values, lever):
 
 
 @njit(cache=True)
-def place_joint(j, parents, offsets, rest, scale, rotations, positions):
+def place_joint(j, tree, scale, rotations, positions):
     """Put a joint where its parent carries it, at its home angle.
 
     Args:
         j: number of the joint.
-        parents: (J,) parent of each joint.
-        offsets: (J, 3) each joint in its parent's frame, mm at home.
-        rest: (J, 3, 3) rotation from the parent's frame to the joint's at home.
+        tree: `KinematicTree` of the skeleton.
         scale: of the bones.
         rotations: (J, 3, 3) joint frames; that of j is filled.
         positions: (J, 3) joints, mm; that of j is filled.
     """
-    p = parents[j]
+    p = tree.parents[j]
     for i in range(3):
         total = positions[p, i]
         for k in range(3):
-            total += scale * rotations[p, i, k] * offsets[j, k]
+            total += scale * rotations[p, i, k] * tree.offsets[j, k]
         positions[j, i] = total
         for k in range(3):
             value = 0.0
             for m in range(3):
-                value += rotations[p, i, m] * rest[j, m, k]
+                value += rotations[p, i, m] * tree.rest[j, m, k]
             rotations[j, i, k] = value
 
 
 @njit(cache=True)
-def place_rest(solved, parents, offsets, rest, scale, rotations, positions):
+def place_rest(solved, tree, scale, rotations, positions):
     """Put every joint without a regressor where its parent carries it.
 
     Args:
         solved: the joints with regressors, which stay.
-        parents: (J,) parent of each joint.
-        offsets: (J, 3) each joint in its parent's frame, mm at home.
-        rest: (J, 3, 3) rotation from the parent's frame to the joint's at home.
+        tree: `KinematicTree` of the skeleton.
         scale: of the bones.
         rotations: (J, 3, 3) joint frames, changed in place.
         positions: (J, 3) joints, mm, changed in place.
     """
-    for j in range(1, parents.size):
+    for j in range(1, tree.parents.size):
         is_solved = False
         for s in solved:
             is_solved |= s == j
         if not is_solved:
-            place_joint(j, parents, offsets, rest, scale, rotations, positions)
+            place_joint(j, tree, scale, rotations, positions)
 
 
 @njit(cache=True, parallel=True)
-def place_all(j, parents, offsets, rest, scale, rotations, positions):
+def place_all(j, tree, scale, rotations, positions):
     """`place_joint` for a batch of candidates.
 
     Args:
         j: number of the joint.
-        parents: (J,) parent of each joint.
-        offsets: (J, 3) each joint in its parent's frame, mm at home.
-        rest: (J, 3, 3) rotation from the parent's frame to the joint's at home.
+        tree: `KinematicTree` of the skeleton.
         scale: (n,) of the bones.
         rotations: (n, J, 3, 3) joint frames, changed in place.
         positions: (n, J, 3) joints, mm, changed in place.
     """
     for s in prange(scale.size):
-        place_joint(j, parents, offsets, rest, scale[s], rotations[s], positions[s])
+        place_joint(j, tree, scale[s], rotations[s], positions[s])
 
 
 @njit(cache=True, parallel=True)
