@@ -6,8 +6,8 @@ transition(a, g; t, h) + missed-detection cost of the frames between, where fram
 and the beam holds the best last links (Viterbi 1967). Transition cost between joints: d^2 / 2 s_1^2
 + b^2 / 2 s_2^2, with d the shift of the joints' mean, b the mean change of posture, s_k^2 =
 error_factor^2 (e_a^2 + e_b^2) + (v_k L dt)^2, v_1 = shift, v_2 = bend; robust by T log(1 + c / T)
-with T = tail. `forward_backward` is the forward-backward algorithm over two states, head and tail as
-on the path or exchanged, and gives the flip posterior.
+with T = tail. `forward_backward` is the forward-backward algorithm over two states, head and tail
+as on the path or exchanged, and gives the flip posterior.
 """
 
 from __future__ import annotations
