@@ -86,7 +86,9 @@ class CascadeSettings(NamedTuple):
         base_rounds: regression rounds of the base joint.
         rounds: regression rounds C of the other joints.
         reach: (J,) how far feature offsets reach from each joint, mm at home size.
-        levers: (3,) lever arms of the base's rotation, the other joints and the log scale, mm.
+        base_lever: lever arm of the base's rotation, mm.
+        joint_lever: lever arm of the other joints' rotations, mm.
+        scale_lever: lever arm of the log scale, mm.
         bandwidth: of the mean shift over tree votes, in label units; 0 takes the mean.
         keep: candidates that are kept after the base joint.
         solved: the joints with regressors, in order, base first.
@@ -95,7 +97,9 @@ class CascadeSettings(NamedTuple):
     base_rounds: int
     rounds: int
     reach: Any
-    levers: Any
+    base_lever: float
+    joint_lever: float
+    scale_lever: float
     bandwidth: float
     keep: int
     solved: Any
@@ -378,11 +382,15 @@ def _solve_joint(joint, j, tree, regressors, tuning, lanes, n, seen, candidates,
             i = lanes.frame[s]
             k = lanes.pose[s]
             if joint > 0:
-                correct_joint(rotations[i, k, joint], tree.axes[joint], values[s], tuning.levers[1])
+                correct_joint(
+                    rotations[i, k, joint], tree.axes[joint], values[s], tuning.joint_lever
+                )
                 continue
             for d in range(3):
-                values[s, d] /= tuning.levers[0]
-            values[s, 6] = values[s, 6] / tuning.levers[2] if regressors.widths[forest] > 6 else 0.0
+                values[s, d] /= tuning.base_lever
+            values[s, 6] = (
+                values[s, 6] / tuning.scale_lever if regressors.widths[forest] > 6 else 0.0
+            )
             scales[i, k] = correct_base(
                 rotations[i, k, 0], positions[i, k, 0], scales[i, k], values[s], seen.size
             )

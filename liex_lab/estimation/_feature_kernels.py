@@ -19,6 +19,13 @@ from numba import njit, prange
 
 from liex_lab.foreground._blob_kernels import unpack_moments
 from liex_lab.foreground._crop_camera_kernels import crop_camera, to_camera
+from liex_lab.forests._kernels import (
+    COLUMN_SLOPE,
+    ROW_SLOPE,
+    VIEW_COLUMN,
+    VIEW_HEIGHT,
+    VIEW_ROW,
+)
 from liex_lab.geometry._so3_kernels import exp_so3
 
 N_SCALARS = 11
@@ -45,16 +52,16 @@ def fill_view(rotation, position, packed_camera, size, reach, view):
     per_px = 1.0 / camera.step
     iu = camera.fx / z * per_px
     iv = camera.fy / z * per_px
-    view[0] = (camera.fx * x / z + camera.cx - camera.u0) * per_px
-    view[1] = (camera.fy * y / z + camera.cy - camera.v0) * per_px
+    view[VIEW_COLUMN] = (camera.fx * x / z + camera.cx - camera.u0) * per_px
+    view[VIEW_ROW] = (camera.fy * y / z + camera.cy - camera.v0) * per_px
     unit = reach * size / 127.0
     for k in range(3):
         ax = camera.r00 * rotation[0, k] + camera.r10 * rotation[1, k] + camera.r20 * rotation[2, k]
         ay = camera.r01 * rotation[0, k] + camera.r11 * rotation[1, k] + camera.r21 * rotation[2, k]
         az = camera.r02 * rotation[0, k] + camera.r12 * rotation[1, k] + camera.r22 * rotation[2, k]
-        view[2 + k] = unit * iu * (ax - x / z * az)
-        view[5 + k] = unit * iv * (ay - y / z * az)
-    view[8] = 16.0 * position[2] / size
+        view[COLUMN_SLOPE + k] = unit * iu * (ax - x / z * az)
+        view[ROW_SLOPE + k] = unit * iv * (ay - y / z * az)
+    view[VIEW_HEIGHT] = 16.0 * position[2] / size
 
 
 @njit(cache=True)

@@ -60,13 +60,18 @@ class ResidualWeights(NamedTuple):
     Attributes:
         robust: readings this far off count a quarter, mm.
         beside: weight of a sphere beside the animal.
-        prior: (4,) cost of a radian of the base, a millimetre of it, a unit of log scale and a
-            radian of a joint away from the start, in squared mm.
+        turn: cost of a radian of the base away from the start, squared mm.
+        place: cost of a millimetre of the base away from the start, squared mm.
+        growth: cost of a unit of log scale away from the start, squared mm.
+        bend: cost of a radian of a joint away from the start, squared mm.
     """
 
     robust: float
     beside: float
-    prior: Any
+    turn: float
+    place: float
+    growth: float
+    bend: float
 
 
 @njit(cache=True)
@@ -365,23 +370,23 @@ def _push(
 
 
 @njit(cache=True)
-def _hold(tree, prior, moved, growth, turned, gradient, curvature):
+def _hold(tree, weights, moved, growth, turned, gradient, curvature):
     """Residuals of the prior: not to leave the start.
 
     It is left by a twist `moved` (6,), log scale `growth` and angles `turned` (J, 3).
     """
     for k in range(3):
-        gradient[k] += prior[0] * moved[k]
-        gradient[3 + k] += prior[1] * moved[3 + k]
-        curvature[k, k] += prior[0]
-        curvature[3 + k, 3 + k] += prior[1]
-    gradient[6] += prior[2] * growth
-    curvature[6, 6] += prior[2]
+        gradient[k] += weights.turn * moved[k]
+        gradient[3 + k] += weights.place * moved[3 + k]
+        curvature[k, k] += weights.turn
+        curvature[3 + k, 3 + k] += weights.place
+    gradient[6] += weights.growth * growth
+    curvature[6, 6] += weights.growth
     for f in range(len(tree.free)):
         j = tree.free[f, 0]
         k = tree.free[f, 1]
-        gradient[_ROOT + f] += prior[3] * turned[j, k]
-        curvature[_ROOT + f, _ROOT + f] += prior[3]
+        gradient[_ROOT + f] += weights.bend * turned[j, k]
+        curvature[_ROOT + f, _ROOT + f] += weights.bend
 
 
 @njit(cache=True)
@@ -489,7 +494,7 @@ def refine_one(
         )
         _hold(
             tree,
-            wishes.prior,
+            wishes,
             moved,
             np.log(scale / first_scale),
             angles - first_angles,

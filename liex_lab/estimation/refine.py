@@ -100,7 +100,7 @@ class Refiner:
         angles = pose.angles.copy()
         scale = pose.scale.copy()
         wishes = kernels.ResidualWeights(
-            _ROBUST_MM * unit, _BESIDE, _PRIOR * np.array([unit**2, 1.0, unit**2, unit**2])
+            _ROBUST_MM * unit, _BESIDE, *(_PRIOR * np.array([unit**2, 1.0, unit**2, unit**2]))
         )
         kernels.refine_all(
             heights,

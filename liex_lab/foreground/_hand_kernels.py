@@ -48,6 +48,16 @@ _BIN_MM = 5.0
 _RIM_MM = 45.0  # pixels beside a block of the hand belong to it within this depth
 
 
+# columns of a point of a surface: x, y, z mm, distance from the middle mm, block row, block column
+_POINT_X = 0
+_POINT_Y = 1
+_POINT_Z = 2
+_POINT_DISTANCE = 3
+_POINT_ROW = 4
+_POINT_COLUMN = 5
+_N_POINT = 6
+
+
 class HandSight(NamedTuple):
     """How a camera looks at a hand, and how heights of it are measured.
 
@@ -117,7 +127,7 @@ def _within(blocks, labels, slot, radius, intrinsics, middle):
     p = np.empty(3)
     box = np.empty(4, np.int64)
     box_around(blocks.shape, middle, radius, intrinsics, box)
-    points = np.empty(((box[1] - box[0] + 1) * (box[3] - box[2] + 1), 6))
+    points = np.empty(((box[1] - box[0] + 1) * (box[3] - box[2] + 1), _N_POINT))
     n = 0
     for i in range(box[0], box[1] + 1):
         for j in range(box[2], box[3] + 1):
@@ -126,12 +136,12 @@ def _within(blocks, labels, slot, radius, intrinsics, middle):
             point_of_block(blocks, i, j, intrinsics, p)
             off2 = (p[0] - middle[0]) ** 2 + (p[1] - middle[1]) ** 2 + (p[2] - middle[2]) ** 2
             if off2 < radius * radius:
-                points[n, 0] = p[0]
-                points[n, 1] = p[1]
-                points[n, 2] = p[2]
-                points[n, 3] = np.sqrt(off2)
-                points[n, 4] = i
-                points[n, 5] = j
+                points[n, _POINT_X] = p[0]
+                points[n, _POINT_Y] = p[1]
+                points[n, _POINT_Z] = p[2]
+                points[n, _POINT_DISTANCE] = np.sqrt(off2)
+                points[n, _POINT_ROW] = i
+                points[n, _POINT_COLUMN] = j
                 n += 1
     return points[:n]
 
@@ -145,9 +155,9 @@ def _away_from_arm(points, size, focal2, middle, fingers):
     for k in range(3):
         fingers[k] = 0.0
     for n in range(len(points)):
-        off = points[n, 3]
+        off = points[n, _POINT_DISTANCE]
         if off > _SHELL * AROUND_MM * size:
-            w = BLOCK * BLOCK * points[n, 2] * points[n, 2] / focal2
+            w = BLOCK * BLOCK * points[n, _POINT_Z] * points[n, _POINT_Z] / focal2
             shell += w
             for k in range(3):
                 fingers[k] -= w * (points[n, k] - middle[k]) / off
@@ -167,7 +177,9 @@ def _wrist(points, size, focal2, middle, fingers):
     along = np.zeros(int(2.0 * around / _BIN_MM) + 2)
     for n in range(len(points)):
         s = _along(points[n], middle, fingers)
-        along[int((s + around) / _BIN_MM)] += BLOCK * BLOCK * points[n, 2] * points[n, 2] / focal2
+        along[int((s + around) / _BIN_MM)] += (
+            BLOCK * BLOCK * points[n, _POINT_Z] * points[n, _POINT_Z] / focal2
+        )
     b = along.size - 1
     tip = 0.0
     while b > 0 and tip < 100.0 * size * size:
@@ -187,13 +199,13 @@ def _beyond(points, middle, fingers, cut, labels, mark):
     z = 0.0
     for n in range(len(points)):
         if _along(points[n], middle, fingers) > cut:
-            w = points[n, 2] * points[n, 2]
+            w = points[n, _POINT_Z] * points[n, _POINT_Z]
             total += w
-            x += w * points[n, 0]
-            y += w * points[n, 1]
-            z += w * points[n, 2]
+            x += w * points[n, _POINT_X]
+            y += w * points[n, _POINT_Y]
+            z += w * points[n, _POINT_Z]
             if mark:
-                labels[int(points[n, 4]), int(points[n, 5])] = MAX_SURFACES
+                labels[int(points[n, _POINT_ROW]), int(points[n, _POINT_COLUMN])] = MAX_SURFACES
     least = max(total, 1e-9)
     middle[0] = x / least
     middle[1] = y / least

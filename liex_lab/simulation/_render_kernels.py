@@ -26,10 +26,28 @@ from liex_lab.simulation._sensor_kernels import (
     smooth_field,
 )
 
-# columns of a wall: its outward normal in the floor (2), distance from the arena's origin, height,
-# depth of the rounding that multiple reflections leave at its foot and how far that reaches, all
-# mm; distance 0 is no wall
-WALL_COLUMNS = 6
+
+class Wall(NamedTuple):
+    """A straight wall, in the order in which its numbers are packed.
+
+    Attributes:
+        normal_x: x of its outward normal in the floor.
+        normal_y: y of its outward normal in the floor.
+        distance: from the arena's origin, mm; 0 is no wall.
+        height: mm.
+        rounding: depth of the rounding that multiple reflections leave at its foot, mm.
+        rounding_reach: how far that reaches, mm.
+    """
+
+    normal_x: Any
+    normal_y: Any
+    distance: Any
+    height: Any
+    rounding: Any
+    rounding_reach: Any
+
+
+WALL_COLUMNS = len(Wall._fields)
 
 
 class SensorNoise(NamedTuple):
@@ -119,6 +137,12 @@ def _meshes_of(meshes, i):
 
 
 @njit(cache=True)
+def _unpack_wall(packed):
+    """The record of one packed wall (WALL_COLUMNS,)."""
+    return Wall(packed[0], packed[1], packed[2], packed[3], packed[4], packed[5])
+
+
+@njit(cache=True)
 def floor_and_wall(u0, v0, picture, intrinsics, rotation, height, wall, uneven, rough, depth, what):
     """Ideal depth and kind of a patch (H, W) on a floor with at most one straight wall.
 
@@ -129,7 +153,7 @@ def floor_and_wall(u0, v0, picture, intrinsics, rotation, height, wall, uneven, 
         intrinsics: (4,) fx, fy, cx, cy, px.
         rotation: (3, 3) of T_arena_camera.
         height: of the camera above the floor, mm.
-        wall: (WALL_COLUMNS,) the wall.
+        wall: the wall.
         uneven: (H, W) heights of the floor, over `rough`.
         rough: mm that a unit of `uneven` raises the floor.
         depth: (H, W) float32 mm, filled, 0 = nothing.
@@ -153,16 +177,16 @@ def floor_and_wall(u0, v0, picture, intrinsics, rotation, height, wall, uneven, 
                 continue
             t = -height / dz
             raised = rough * uneven[r, c]
-            if wall[2] > 0.0:
-                across = wall[0] * dx + wall[1] * dy
-                beyond = across * t - wall[2]
+            if wall.distance > 0.0:
+                across = wall.normal_x * dx + wall.normal_y * dy
+                beyond = across * t - wall.distance
                 if beyond > 0.0:
-                    t = wall[2] / across
-                    if height + t * dz < wall[3]:
+                    t = wall.distance / across
+                    if height + t * dz < wall.height:
                         depth[r, c] = t
                         what[r, c] = STILL
                     continue
-                raised += wall[4] * np.exp(beyond / wall[5])
+                raised += wall.rounding * np.exp(beyond / wall.rounding_reach)
             depth[r, c] = t + raised / dz
             what[r, c] = STILL
 
@@ -290,7 +314,7 @@ def _window(meshes, camera, view, noise, depth_out, background_out):
         intrinsics,
         view.R_arena_camera,
         view.height,
-        view.wall,
+        _unpack_wall(view.wall),
         field,
         view.rough,
         depth,
