@@ -44,13 +44,13 @@ class Doubts(NamedTuple):
         best: the best score.
         opposite: the best score of a candidate that points the other way.
         score_sd: standard deviation of the good scores.
-        apart: mean distance of all candidates from the chosen pose.
+        distance: mean distance of all candidates from the chosen pose.
     """
 
     best: Array
     opposite: Array
     score_sd: Array
-    apart: Array
+    distance: Array
 
 
 @dataclass(frozen=True)
@@ -138,8 +138,8 @@ def choose(
     else:
         pose = mean_pose(skeleton, turned, joints, weight)
         mean = pose.joints(skeleton)
-    off = np.linalg.norm(joints - mean[:, None], axis=-1)
-    variance = np.einsum("nk,nkj->nj", weight, off**2)
+    distance = np.linalg.norm(joints - mean[:, None], axis=-1)
+    variance = np.einsum("nk,nkj->nj", weight, distance**2)
     mean_score = np.sum(weight * score, axis=1)
     spread = np.sqrt(variance.mean(axis=1)) / size
     expected = (
@@ -249,8 +249,8 @@ def _doubts(
     along = positions[:, :, -1] - positions[:, :, 0]
     backwards = np.einsum("nkd,nd->nk", along, mean[:, -1] - mean[:, 0]) < 0
     opposite = np.where(backwards, scores, no_opposite_mm).min(axis=1)
-    off = np.linalg.norm(positions - mean[:, None], axis=-1).mean(axis=(1, 2)) / size
-    return np.stack(Doubts(scores.min(axis=1), opposite, good.std(axis=1), off), axis=1)
+    distance = np.linalg.norm(positions - mean[:, None], axis=-1).mean(axis=(1, 2)) / size
+    return np.stack(Doubts(scores.min(axis=1), opposite, good.std(axis=1), distance), axis=1)
 
 
 def with_expected_error(
