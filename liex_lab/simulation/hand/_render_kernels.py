@@ -42,6 +42,12 @@ class HandMeshes(NamedTuple):
 
 
 @njit(cache=True)
+def _put(vertices, faces, intrinsics, u0, v0, label, depth, what):
+    """Rasterise a mesh of the camera frame over a picture or patch; see `draw_onto`."""
+    draw_onto(vertices, faces, np.eye(3), np.zeros(3), intrinsics, u0, v0, label, depth, what)
+
+
+@njit(cache=True)
 def picture(meshes, wall, camera, noise, out):
     """Render one picture or patch (H, W) of a hand.
 
@@ -68,16 +74,13 @@ def picture(meshes, wall, camera, noise, out):
             there = inverse > 1.0 / 4500.0
             depth[r, c] = 1.0 / inverse + wall[3] * field[r, c] if there else 0.0
             what[r, c] = STILL if there else NOTHING
-    rotation = np.eye(3)
-    translation = np.zeros(3)
     u0 = float(origin[0])
     v0 = float(origin[1])
-    seen = (rotation, translation, intrinsics, u0, v0)
-    draw_onto(meshes.body, meshes.body_faces, *seen, OBJECT, depth, what)
+    _put(meshes.body, meshes.body_faces, intrinsics, u0, v0, OBJECT, depth, what)
     if meshes.has_thing:
-        draw_onto(meshes.thing, meshes.thing_faces, *seen, OBJECT, depth, what)
-    draw_onto(meshes.arm, meshes.arm_faces, *seen, ANIMAL, depth, what)
-    draw_onto(meshes.hand, meshes.hand_faces, *seen, ANIMAL, depth, what)
+        _put(meshes.thing, meshes.thing_faces, intrinsics, u0, v0, OBJECT, depth, what)
+    _put(meshes.arm, meshes.arm_faces, intrinsics, u0, v0, ANIMAL, depth, what)
+    _put(meshes.hand, meshes.hand_faces, intrinsics, u0, v0, ANIMAL, depth, what)
     for r in range(shape[0]):
         for c in range(shape[1]):
             u = origin[0] + c
