@@ -1,4 +1,4 @@
-"""Poses that keep the frames of their joints give what forward kinematics gives, and run it once."""
+"""Poses that keep the frames of their joints give what forward kinematics gives, run once."""
 
 from __future__ import annotations
 
