@@ -58,7 +58,7 @@ class Chosen:
     """One pose for each of n frames, in the view frame of the frame; NaN where no animal was found.
 
     Attributes:
-        pose: (n) poses.
+        pose: (n) poses; as `choose` makes them, with the frames of their joints.
         sd_root: (n, 6) standard deviation of the root over candidates, rad and mm, in its own
             frame.
         sd_angles: (n, J, 3) standard deviation of the joints' rotation vectors over candidates,
@@ -134,9 +134,9 @@ def choose(
     if skeleton.is_chain:
         pose = Pose.from_joints(
             skeleton, mean, np.einsum("nk,nkd->nd", weight, turned[:, :, 0, :, 2])
-        )
+        ).placed(skeleton)
     else:
-        pose = mean_pose(skeleton, turned, joints, weight)
+        pose = mean_pose(skeleton, turned, joints, weight).placed(skeleton)
         mean = pose.joints(skeleton)
     distance = np.linalg.norm(joints - mean[:, None], axis=-1)
     variance = np.einsum("nk,nkj->nj", weight, distance**2)

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.body.skeleton import Skeleton
-from liex_lab.runtime.memory import Allocator, blocks, release_pages
+from liex_lab.runtime.memory import Allocator, blocks
 from liex_lab.tracking import _association_kernels as kernels
 from liex_lab.tracking.observations import Observations
 
@@ -125,7 +125,6 @@ class HypothesisAssociation:
         n_beam = 0
         for rows in blocks(n, _BLOCK):
             n_beam = kernels.extend_all(rows.start, rows.stop, chains, n_beam, frames, self._costs)
-            release_pages(joints, emission, cost, parent)
         path = np.full(n, NONE, np.int64)
         if n_beam:
             kernels.trace_back(chains.beam[0, 0], chains.beam[0, 1], parent, 0, path)
@@ -138,7 +137,6 @@ class HypothesisAssociation:
             cost[rows] = np.minimum(
                 seen.score[rows].astype(float) / self._score_mm, self._tuning.score_most
             )
-            release_pages(cost)
         return cost
 
     def doubt(
@@ -181,7 +179,6 @@ class HypothesisAssociation:
             one[part] = joints[used[part], taken]
             other_way = joints[used[part], taken ^ 1]
             two[part] = np.where(np.isfinite(other_way), other_way, one[part, ::-1])
-            release_pages(joints, one, two)
         error = seen.error_mm[used, path[used]].astype(float)
         at_used = np.empty(len(used))
         kernels.forward_backward(
