@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from liex_lab.plan import Plan
-from liex_lab.runtime.memory import Allocator, trim_heap
+from liex_lab.runtime.memory import Allocator, rest
 from liex_lab.runtime.progress import Progress, silent
 from liex_lab.runtime.threads import in_background, prefetch
 
@@ -47,9 +47,6 @@ if TYPE_CHECKING:
     from liex_lab.sessions.writer import BlueprintMaker, ReportMaker
     from liex_lab.tables.rows import Rows
     from liex_lab.tracking.tracker import FrameTracker
-
-# of the table `frames`, what names of actions go by
-_NAMED_BY = ("session_id", "individual", "frame_index", "time_ns", "wall_distance_mm")
 
 
 def measure_session(
@@ -166,11 +163,9 @@ def conclude(writer: SessionWriter, plan: Plan, timings: dict[str, float]) -> Se
         plan: rules and action model.
         timings: seconds of `prepare` and `track`, for session.json.
     """
-    rows = writer.rows
-    behaviour, notes = measure_behaviour(rows, plan, writer.origin, writer.allocate)
+    behaviour, notes = measure_behaviour(writer.rows, plan, writer.origin, writer.allocate)
     writer.note(**notes, problems=_told_refused(notes))
-    rows.track.release_pages()
-    trim_heap()
+    rest()
     return writer.close(timings_s=timings, **behaviour.for_session())
 
 
@@ -186,7 +181,7 @@ def measure_behaviour(
         allocate: allocator of large arrays, such as one of files on disk.
     """
     from liex_lab.behaviour.summary import measure_rows, moving_rows
-    from liex_lab.tables.schema import BOUTS, empty_table, release_table
+    from liex_lab.tables.schema import BOUTS, empty_table
 
     recogniser = build_recogniser(plan, origin.skeleton)
     rules = build_rules(plan)
@@ -200,9 +195,7 @@ def measure_behaviour(
     else:
         named = {}
         notes = {}
-    rows.track.release_pages()
-    release_table(moved)
-    trim_heap()
+    rest()
     return measure_rows(rows, rules, around, moved=moved, allocate=allocate, **named), notes
 
 
@@ -226,7 +219,7 @@ def name_actions(
     from liex_lab.behaviour.checking import recognise
     from liex_lab.tables.rows import bout_rows
 
-    frames = rows.frames_table(_NAMED_BY)
+    frames = rows.frames_table
     wall_mm = frames["wall_distance_mm"].to_numpy(float)
     found = recognise(recogniser, rows.track, wall_mm, moved, allocate)
     notes = {

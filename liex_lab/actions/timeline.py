@@ -30,7 +30,7 @@ from liex_lab.actions.vocabulary import FASTEST
 from liex_lab.actions.window_features import window_features
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.mlp import Network
-from liex_lab.runtime.memory import Allocator, blocks, release_pages
+from liex_lab.runtime.memory import Allocator, blocks
 from liex_lab.tracking.track import Track
 
 Array = NDArray[np.float64]
@@ -109,7 +109,6 @@ class TimelineModel:
                 Segment(segment.times_s[low:high], segment.values[low:high]), names
             )
             features = features[ticks.start - low : ticks.stop - low]
-            release_pages(segment.values)
             p = np.mean([_softmax(network.logits(features)) for network in self.networks], axis=0)
             now = speed[ticks, None]
             beyond = (now < self.speeds[:, 0] / _SLACK) | (
@@ -134,7 +133,6 @@ class TimelineModel:
         scores = allocate((len(segment.times_s), len(self.words)), float)
         for ticks, log_p in self.log_probabilities(segment, names, speed):
             scores[ticks] = self.sharpness * (log_p - np.log(np.maximum(self.share, 1e-3)))
-            release_pages(scores)
         return scores
 
     def recognise(
@@ -164,7 +162,6 @@ class TimelineModel:
         part = np.full(n, -1)
         for rows in blocks(n, _PIECE):
             probability[rows] = np.nan
-            release_pages(probability)
         time_s = (track.times_ns - track.times_ns[:1]) * 1e-9
         names = channel_names(track.skeleton)
         step = 1.0 / self.clock_hz
@@ -189,7 +186,6 @@ class TimelineModel:
                 probability[rows] = told
                 part[rows] = number
                 score[rows] = np.take_along_axis(told, code[rows, None], axis=1)[:, 0]
-                release_pages(certain, probability)
         if broken is not None and n:
             self._unname(code, part, broken, refused)
         ethogram = Ethogram.of_words(
@@ -258,7 +254,6 @@ class TimelineModel:
                 break
             for start, stop, word in zip(starts[wrong], stops[wrong], words[wrong], strict=True):
                 scores[start:stop, word] -= _REFUSED
-            release_pages(scores)
         return decoded
 
     def unresolved(self, times_ns: NDArray[np.int64]) -> dict[str, str]:

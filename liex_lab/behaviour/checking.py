@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from liex_lab.tracking.track import Track
 
 Array = NDArray[np.float64]
-_WHEN = ("session_id", "individual", "frame_index", "time_s", "dt_s")
 Reading = Callable[[BoutReader, int, int], tuple[float, ...]]
 
 
@@ -114,7 +113,7 @@ def recognise(
         allocate: allocator of large intermediate arrays and of the probabilities.
     """
     if moved is None:
-        frames = Rows(track, np.arange(track.n_frames), "", "").frames_table(_WHEN)
+        frames = Rows(track, np.arange(track.n_frames), "", "").frames_table
         moved = kinematics(frames, Joints.of_track(track), allocate=allocate)
     meanings = printed_meanings(recogniser.skeleton, recogniser.definitions)
     check = BoutCheck(BoutReader(moved), meanings)

@@ -94,7 +94,7 @@ def test_a_recogniser_cannot_name_what_contradicts_its_words(liar: TimelineModel
     assert {refusal.action for refusal in found.refused} >= {"pause"}
     assert all(refusal.why for refusal in found.refused)
     rows = Rows(one.track, np.arange(one.track.n_frames), "toy", "mouse_1")
-    frames = rows.frames_table()
+    frames = rows.frames_table
     moved = kinematics(*tables_of_track(rows))
     bouts = measure_bouts(bout_rows(found.ethogram, frames, "abc"), moved, PRINTED)
     assert set(bouts["contradicts"]) <= {""}
@@ -103,7 +103,7 @@ def test_a_recogniser_cannot_name_what_contradicts_its_words(liar: TimelineModel
 
 
 def tables_of_track(rows: Rows) -> tuple[pd.DataFrame, Joints]:
-    return rows.frames_table(), Joints.of_track(rows.track)
+    return rows.frames_table, Joints.of_track(rows.track)
 
 
 def test_words_of_ones_own_are_not_checked(liar: TimelineModel) -> None:
