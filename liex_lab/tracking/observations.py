@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.body._kernels import place_joints
+from liex_lab.body.kinematic_tree import KinematicTree
 from liex_lab.body.pose import Pose
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.geometry import SE3, so3
@@ -220,10 +221,7 @@ def joints_of(skeleton: Skeleton, pose: Pose) -> Array:
     """
     out = np.empty((len(pose.scale), skeleton.n_joints, 3))
     place_joints(
-        skeleton.parents,
-        skeleton.offsets,
-        skeleton.rest,
-        skeleton.axes.any(axis=1),
+        KinematicTree.of(skeleton),
         pose.root.rotation,
         pose.root.translation,
         pose.angles,
