@@ -219,9 +219,7 @@ def name_actions(
     from liex_lab.behaviour.checking import recognise
     from liex_lab.tables.rows import bout_rows
 
-    frames = rows.frames_table
-    wall_mm = frames["wall_distance_mm"].to_numpy(float)
-    found = recognise(recogniser, rows.track, wall_mm, moved, allocate)
+    found = recognise(recogniser, rows.track, rows.wall_distance_mm, moved, allocate)
     notes = {
         "action_model": {
             "skeleton": recogniser.skeleton,
@@ -229,11 +227,11 @@ def name_actions(
             **recogniser.card,
         },
         "unresolved_actions": found.unresolved,
-        "refused_bouts": {"bouts": _refusals(found, frames["time_ns"].to_numpy())},
+        "refused_bouts": {"bouts": _refusals(found, rows.track.times_ns)},
     }
     meanings = printed_meanings(recogniser.skeleton, recogniser.definitions)
     actions = {word: meanings.get(word, "") for word in recogniser.words if word}
-    bouts = bout_rows(found.ethogram, frames, str(recogniser.card.get("sha256", "")))
+    bouts = bout_rows(found.ethogram, rows.frames_table, str(recogniser.card.get("sha256", "")))
     return {"bouts": bouts, "actions": actions}, notes
 
 

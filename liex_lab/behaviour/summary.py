@@ -188,7 +188,17 @@ def moving_rows(
         around: the water's surface.
         allocate: makes the arrays of the table (an allocator, as `np.empty`).
     """
-    return moving(rows.frames_table, Joints.of_track(rows.track), rules, around, allocate)
+    times_ns = rows.track.times_ns
+    frames = pd.DataFrame(  # no more than is needed: the whole table is made once names are known
+        {
+            "session_id": rows.session_id,
+            "individual": rows.individual,
+            "frame_index": rows.frame_index,
+            "time_s": rows.time_s,
+            "dt_s": np.append(np.nan, np.diff(times_ns) * 1e-9)[: len(times_ns)],
+        }
+    )
+    return moving(frames, Joints.of_track(rows.track), rules, around, allocate)
 
 
 def stated_by(session: SessionTables) -> tuple[MouseRules, Surroundings]:
