@@ -21,7 +21,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from liex_lab.arena.floor import Floor, find_floor, floor_region
+from liex_lab.arena.floor import Floor
 from liex_lab.body.skeleton import MOUSE_VIEW, VIEWS, View
 from liex_lab.errors import EstimationError
 from liex_lab.foreground import _height_map_kernels as kernels
@@ -30,6 +30,7 @@ from liex_lab.foreground.background import learn_background, sample_frames, stri
 from liex_lab.foreground.crop_camera import pack_crop_cameras
 from liex_lab.foreground.height_maps import HeightMaps
 from liex_lab.foreground.segmenter import Segmenter
+from liex_lab.foreground.standing import Standing, find_standing
 from liex_lab.optics.camera import Camera
 from liex_lab.recordings.recording import Recording
 from liex_lab.runtime.threads import threads
@@ -60,6 +61,7 @@ class BackgroundSubtraction(Segmenter):
         view: how such animals are looked at.
         stride: only every so many-th row and column of the picture is looked at; H and W count
             those.
+        standing: how the floor was found, None where it was given.
     """
 
     camera: Camera
@@ -71,6 +73,7 @@ class BackgroundSubtraction(Segmenter):
     volume_mm3: float = 0.0
     view: View = MOUSE_VIEW
     stride: int = 1
+    standing: Standing | None = None
 
     @cached_property
     def grid(self) -> Camera:
@@ -137,14 +140,18 @@ class BackgroundSubtraction(Segmenter):
         background, spread, near = learn_background(sample)
         _check_background(sample, background)
         grid = recording.camera.every(stride)
-        seen = find_floor(background, grid)
+        standing = find_standing(sample, background, spread, grid, spine_mm, min_height_mm, view)
+        if standing.region is not None:  # what lies around is not looked at
+            background = np.where(standing.region, background, np.float32(0))
+            near = np.where(standing.region, near, np.float32(0))
+        seen = standing.floor
         floor = (
             seen
             if stride == 1
             else Floor.from_plane(seen.normal, seen.distance_mm, recording.camera)
         )
         bare = seen.depth(grid.width, grid.height)
-        on_floor = floor_region(background, bare)
+        on_floor = standing.on_floor
         background = np.where((background == 0) & on_floor, bare, background)
         # the rims and walls around the floor flicker between near and far: there, nearer than ever
         # is what counts
@@ -154,7 +161,14 @@ class BackgroundSubtraction(Segmenter):
         stands = view.frame == VIEWS[0]  # one that floats may be seen before anything
         over = on_floor if stands else np.ones_like(on_floor)
         scene = BackgroundSubtraction(
-            recording.camera, floor, background, limit, over, view=view, stride=stride
+            recording.camera,
+            floor,
+            background,
+            limit,
+            over,
+            view=view,
+            stride=stride,
+            standing=standing,
         )
         area, share = scene.usual_area(sample, spine_mm)
         if share < 0.5:  # perhaps it sits in its own background: compare with the floor itself
