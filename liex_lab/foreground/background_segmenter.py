@@ -43,6 +43,12 @@ _AREA_SD = 0.25
 _VOLUME_SD = 0.2
 # of the frames: a lump that the animal touches that often is a part of it that keeps still
 _TOUCH_SHARE = 0.9
+_OTHER = 3.0  # times larger or smaller is another thing
+# what was never seen moving is an animal only if it is no longer than so many largest spines,
+# higher than so many times what stands out at all, and larger than so many of the least areas
+_LONGEST = 2.0
+_HIGHER = 1.4
+_LARGER = 1.5
 
 
 @dataclass(frozen=True)
@@ -170,7 +176,8 @@ class BackgroundSubtraction(Segmenter):
             stride=stride,
             standing=standing,
         )
-        area, share = scene.usual_area(sample, spine_mm)
+        area, share = scene._moving_area(sample, spine_mm)
+        moves = share > 0.0
         if share < 0.5:  # perhaps it sits in its own background: compare with the floor itself
             bare_limit = np.where(
                 on_floor, np.maximum(bare - np.float32(min_height_mm), 0), limit
@@ -179,12 +186,19 @@ class BackgroundSubtraction(Segmenter):
                 scene, limit=bare_limit, background=np.where(on_floor, bare, background)
             )
             still_area, still_share = still.usual_area(sample, spine_mm)
-            if still_share > share:
+            if still_share > share and not (
+                stands and still._stays_beside(scene, sample, still_area, area)
+            ):
                 scene = still
                 area = still_area
                 share = still_share
+                moves = False
         elif stands:
             scene, area = scene.with_its_still_part(sample, spine_mm, min_height_mm, area)
+        # what was not seen moving is an animal only where it is as large and as high as one
+        if stands and not (moves and standing.moves) and share > 0.0:
+            seen_as = replace(scene, area_mm2=area)
+            share = share if seen_as._is_like_an_animal(sample, spine_mm, min_height_mm) else 0.0
         if share == 0.0:
             raise EstimationError(
                 f"no animal was found in {len(sample)} frames spread over the recording: nothing "
@@ -194,6 +208,68 @@ class BackgroundSubtraction(Segmenter):
             )
         scene = replace(scene, area_mm2=area)
         return replace(scene, volume_mm3=scene.usual_volume(sample)), sample
+
+    def _moving_area(
+        self, sample: NDArray[np.float32], spine_mm: tuple[float, float]
+    ) -> tuple[float, float]:
+        """The usual area mm^2, and the share of the frames that show it, see `usual_area`.
+
+        Where that is not the area of what was seen moving clearly, but of specks that come back in
+        more frames, as before an animal came, the area of what moves counts.
+        """
+        area, share = self.usual_area(sample, spine_mm)
+        standing = self.standing
+        if standing is None or not standing.moves or self.view.frame != VIEWS[0]:
+            return area, share
+        if area > 0.0 and abs(np.log(area / standing.thing_mm2)) < np.log(_OTHER):
+            return area, share
+        crops = replace(self, area_mm2=standing.thing_mm2).extract(sample, 1.0)
+        return standing.thing_mm2, float(crops.found.mean())
+
+    def _stays_beside(
+        self,
+        moving: BackgroundSubtraction,
+        sample: NDArray[np.float32],
+        still_area: float,
+        area: float,
+    ) -> bool:
+        """Whether what stands on the bare floor is there beside what moves: another thing.
+
+        Args:
+            moving: the scene in which only what moves is seen.
+            sample: (n, H, W) float32 mm, frames at this scene's stride.
+            still_area: of what stands on the floor, mm^2.
+            area: of what moves, mm^2, 0 where nothing does.
+        """
+        standing = self.standing
+        if area == 0.0 or standing is None or not standing.moves:
+            return False
+        mover = replace(moving, area_mm2=area).extract(sample, 1.0)
+        both = replace(self, area_mm2=still_area).extract(sample, 1.0)
+        seen = mover.found & both.found
+        if not seen.any():
+            return True
+        apart = np.linalg.norm(mover[seen].centroid[:, :2] - both[seen].centroid[:, :2], axis=1)
+        beside = (apart > np.sqrt(still_area)) | (both.n_blobs[seen] > 1)
+        return bool(beside.mean() > 0.5)
+
+    def _is_like_an_animal(
+        self, sample: NDArray[np.float32], spine_mm: tuple[float, float], min_height_mm: float
+    ) -> bool:
+        """Whether what is found in a sample (n, H, W) mm is neither longer than the largest animal,
+        nor as low as an uneven floor.
+        """
+        crops = self.extract(sample, 1.0)
+        if not crops.found.any():
+            return False
+        blobs = crops[crops.found].blobs
+        length = 4.0 * float(np.median(blobs.sd_along))
+        height = float(np.median(blobs.volume_mm3 / blobs.area_mm2))
+        return (
+            length < _LONGEST * spine_mm[1]
+            and height > _HIGHER * min_height_mm
+            and self.area_mm2 > _LARGER * self.view.area[0] * spine_mm[0] ** 2
+        )
 
     def with_its_still_part(
         self,

@@ -50,6 +50,8 @@ class Standing:
         n_things: things of an animal's size that were seen moving in the sampled frames.
         support: share of them, by volume, that stand on this floor, 0 to 1; NaN where none were
             seen.
+        thing_mm2: their median area seen from the camera, mm^2; NaN where none were seen.
+        n_together: how many of them move in one frame, the most that a fifth of those frames show.
         doubt: a sentence about why this floor may be wrong, empty where there is none.
     """
 
@@ -58,7 +60,14 @@ class Standing:
     region: NDArray[np.bool_] | None
     n_things: int
     support: float
+    thing_mm2: float = float("nan")
+    n_together: int = 0
     doubt: str = ""
+
+    @property
+    def moves(self) -> bool:
+        """Whether enough was seen moving to say anything about it."""
+        return self.n_things >= _MIN_THINGS
 
 
 @dataclass(frozen=True)
@@ -68,7 +77,9 @@ class _Thing:
     rows: NDArray[np.int64]
     columns: NDArray[np.int64]
     depth: Array  # of the background, mm
+    area_mm2: float
     volume_mm3: float
+    frame: int
 
     def stands_on(self, floor: Floor) -> bool:
         a, b, c = floor.inverse_depth
@@ -108,6 +119,25 @@ def find_standing(
     areas = (view.area[0] * spine_mm[0] ** 2, view.area[1] * spine_mm[1] ** 2)
     limit = background - np.maximum(np.float32(min_height_mm), 3.0 * spread)
     things = _moving(sample, background, limit, camera, areas)
+    standing = _choose(background, camera, things, spine_mm[1], 4.0 * areas[0])
+    if not things:
+        return standing
+    n_together = np.unique([thing.frame for thing in things], return_counts=True)[1]
+    return replace(
+        standing,
+        thing_mm2=float(np.median([thing.area_mm2 for thing in things])),
+        n_together=int(np.percentile(n_together, 80, method="lower")),
+    )
+
+
+def _choose(
+    background: NDArray[np.float32],
+    camera: Camera,
+    things: list[_Thing],
+    longest_mm: float,
+    least_mm2: float,
+) -> Standing:
+    """The largest plane, or another ground of at least so many mm^2 where that is better."""
     largest = _largest(background, camera, things)
     if (
         isinstance(largest, Standing)
@@ -115,7 +145,7 @@ def find_standing(
         and len(things) >= _MIN_THINGS
     ):
         return largest
-    grounds = flat_grounds(background, camera, 4.0 * areas[0])
+    grounds = flat_grounds(background, camera, least_mm2)
     if len(things) >= _MIN_THINGS:
         least = largest.support if isinstance(largest, Standing) else 0.0
         chosen = _stood_on(grounds, things, least)
@@ -124,10 +154,10 @@ def find_standing(
     if chosen is not None:
         ground, support, doubt = chosen
         # an animal that leans over the edge is still looked at
-        reach = spine_mm[1] * np.sqrt(camera.fx * camera.fy) / ground.floor.distance_mm
+        reach = longest_mm * np.sqrt(camera.fx * camera.fy) / ground.floor.distance_mm
         on_floor = ground.region(0.0)
         region = ground.region(float(reach))
-        return Standing(ground.floor, on_floor, region, len(things), support, doubt)
+        return Standing(ground.floor, on_floor, region, len(things), support, doubt=doubt)
     if isinstance(largest, EstimationError):
         raise largest
     if len(things) < _MIN_THINGS:
@@ -171,9 +201,10 @@ def _moving(
     """
     found = []
     largest = []
-    for depth in sample:
+    for frame in range(len(sample)):
         things = sorted(
-            _of_frame(depth, background, limit, camera, areas), key=lambda thing: -thing.volume_mm3
+            _of_frame(sample, frame, background, limit, camera, areas),
+            key=lambda thing: -thing.volume_mm3,
         )
         found += things[:_A_FRAME]
         largest += [thing.volume_mm3 for thing in things[:1]]
@@ -182,15 +213,17 @@ def _moving(
 
 
 def _of_frame(
-    depth: NDArray[np.float32],
+    sample: NDArray[np.float32],
+    frame: int,
     background: NDArray[np.float32],
     limit: NDArray[np.float32],
     camera: Camera,
     areas: tuple[float, float],
 ) -> Iterator[_Thing]:
-    """All such things of one frame (H, W)."""
+    """All such things of one frame."""
     import cv2
 
+    depth = sample[frame]
     around = np.ones((2 * _AROUND_PX + 1, 2 * _AROUND_PX + 1), np.uint8)
     square = np.ones((3, 3), np.uint8)
     nearer = ((depth > 0) & (depth < limit)).astype(np.uint8)
@@ -217,7 +250,14 @@ def _of_frame(
         near = (cv2.dilate(whole.astype(np.uint8), around) > 0) & (background[cut] > 0)
         rows, columns = np.nonzero(near)
         behind = background[cut][near].astype(float)
-        yield _Thing(rows + cut[0].start, columns + cut[1].start, behind, float((mm2 * rise).sum()))
+        yield _Thing(
+            rows + cut[0].start,
+            columns + cut[1].start,
+            behind,
+            float(mm2.sum()),
+            float((mm2 * rise).sum()),
+            frame,
+        )
 
 
 def _share(things: list[_Thing], chosen: list[bool]) -> float:

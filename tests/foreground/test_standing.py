@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,7 +18,7 @@ from tests.arena.staged import changed, stage, walk
 SPINES = (40.0, 115.0)
 N_FRAMES = 24
 
-STAGES = {
+STAGES: dict[str, dict[str, Any]] = {
     "a small arena in the dark": {
         "half_mm": (95.0, 95.0),
         "height_mm": 900.0,
@@ -56,6 +57,7 @@ def test_the_floor_is_where_the_mouse_walks(name):
     mouse = walk(stage(**STAGES[name]), N_FRAMES)
     scene, sample = BackgroundSubtraction.learn(mouse, SPINES, N_FRAMES)
     check(mouse, mouse, scene, sample)
+    assert scene.standing is not None
     assert scene.standing.support > 0.8
     assert not scene.standing.doubt
 
@@ -65,7 +67,7 @@ def test_an_arena_on_a_table_has_its_own_outline_and_nothing_else_is_looked_at()
     scene, _ = BackgroundSubtraction.learn(mouse, SPINES, N_FRAMES)
     arena = find_arena(scene.background, scene.floor, scene.camera)
     assert arena.kind == "rectangular"
-    np.testing.assert_allclose(arena.half_mm, 150.0, atol=4.0)
+    np.testing.assert_allclose(np.array(arena.half_mm), 150.0, atol=4.0)
     assert arena.edge == "wall"
     assert not scene.limit[0].any()  # the room's floor
 
@@ -88,6 +90,7 @@ def test_in_an_ordinary_scene_the_floor_is_the_largest_plane_to_the_last_bit():
     present = find_floor(learn_background(sample)[0], mouse.camera)
     assert scene.floor.distance_mm == present.distance_mm
     np.testing.assert_array_equal(scene.floor.normal, present.normal)
+    assert scene.standing is not None
     assert scene.standing.region is None
     assert scene.standing.support > 0.9
 
