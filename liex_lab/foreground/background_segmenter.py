@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.arena.floor import Floor
+from liex_lab.arena.scene import Scene, find_fixtures, region_corners, roughness
 from liex_lab.body.skeleton import MOUSE_VIEW, VIEWS, View
 from liex_lab.errors import EstimationError
 from liex_lab.foreground import _height_map_kernels as kernels
@@ -115,6 +116,8 @@ class BackgroundSubtraction(Segmenter):
         n_frames: int = 96,
         min_height_mm: float = 7.0,
         view: View = MOUSE_VIEW,
+        floor: Floor | None = None,
+        region: NDArray[np.bool_] | None = None,
     ) -> tuple[BackgroundSubtraction, NDArray[np.float32]]:
         """The background subtraction of a recording, learned from frames spread over it.
 
@@ -132,6 +135,9 @@ class BackgroundSubtraction(Segmenter):
             min_height_mm: what stands out from the background by less is not the animal.
             view: how such animals are looked at; one that does not stand on the floor may be
                 anywhere.
+            floor: the floor where it is stated; None finds it.
+            region: (height, width) bool of the whole picture, where it is looked at; None
+                everywhere.
 
         Returns:
             The segmenter, and the sample (n, H, W) float32 mm of frames from which it was learned,
@@ -143,10 +149,18 @@ class BackgroundSubtraction(Segmenter):
         """
         stride = stride_for(recording, spine_mm[0])
         sample = sample_frames(recording, n_frames, stride)
+        if region is not None:
+            sample *= region[::stride, ::stride]
         background, spread, near = learn_background(sample)
         _check_background(sample, background)
         grid = recording.camera.every(stride)
-        standing = find_standing(sample, background, spread, grid, spine_mm, min_height_mm, view)
+        stated = None if floor is None else Floor.from_plane(floor.normal, floor.distance_mm, grid)
+        standing = find_standing(
+            sample, background, spread, grid, spine_mm, min_height_mm, view, stated
+        )
+        if region is not None:
+            cut = region[::stride, ::stride]
+            standing = replace(standing, region=cut, on_floor=standing.on_floor & cut)
         if standing.region is not None:  # what lies around is not looked at
             background = np.where(standing.region, background, np.float32(0))
             near = np.where(standing.region, near, np.float32(0))
@@ -377,6 +391,27 @@ class BackgroundSubtraction(Segmenter):
             n_blobs[start : start + 16] = crops.n_blobs
         alone = n_blobs == 1 if (n_blobs == 1).sum() >= 5 else n_blobs > 0
         return float(np.median(volume[alone]))
+
+    def described(self) -> Scene:
+        """The scene as it is written to session.json, without its outline."""
+        floor = self._grid_floor
+        bare = floor.depth(self.grid.width, self.grid.height)
+        rough = roughness(self.background, bare, self.on_floor)
+        fixtures = find_fixtures(self.background, floor, self.grid, self.on_floor)
+        standing = self.standing
+        if standing is None:
+            return Scene(self.floor, roughness_mm=rough, fixtures=fixtures)
+        return Scene(
+            self.floor,
+            standing.origin,
+            standing.support if standing.moves else None,
+            standing.n_things,
+            standing.n_together,
+            rough,
+            region_corners(standing.region, self.stride),
+            fixtures=fixtures,
+            doubts=(standing.doubt,) if standing.doubt else (),
+        )
 
     def every(self, step: int) -> BackgroundSubtraction:
         """The same segmenter for pictures of every `step`-th row and column.

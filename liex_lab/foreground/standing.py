@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from liex_lab.arena.floor import Floor, find_floor, floor_region
 from liex_lab.arena.grounds import Ground, flat_grounds
+from liex_lab.arena.scene import LARGEST, STATED, STOOD_ON, WALLED
 from liex_lab.body.skeleton import View
 from liex_lab.errors import EstimationError
 from liex_lab.optics.camera import Camera
@@ -29,6 +30,7 @@ _ON_MM = 9.0  # what stands on a ground has it this near beneath, in the middle 
 _ON_SHARE = 0.25  # and so much of that must be a part of it
 _MIN_THINGS = 5  # that must be seen moving before they say anything
 _SUPPORTED = 0.5  # of the things that move must stand on a floor
+_UNSUPPORTED = 0.1  # a floor that is stated is wrong where less stands on it
 _BETTER = 0.2  # by which another ground must be supported more
 _ENCLOSED = 0.6  # of a ground's outline must rise, where nothing moves
 _RAISED_MM = 30.0  # and it must lie so far above the largest plane
@@ -52,6 +54,7 @@ class Standing:
             seen.
         thing_mm2: their median area seen from the camera, mm^2; NaN where none were seen.
         n_together: how many of them move in one frame, the most that a fifth of those frames show.
+        origin: how the floor was found, see `arena.scene.Scene.floor_from`.
         doubt: a sentence about why this floor may be wrong, empty where there is none.
     """
 
@@ -62,6 +65,7 @@ class Standing:
     support: float
     thing_mm2: float = float("nan")
     n_together: int = 0
+    origin: str = LARGEST
     doubt: str = ""
 
     @property
@@ -98,6 +102,7 @@ def find_standing(
     spine_mm: tuple[float, float],
     min_height_mm: float,
     view: View,
+    stated: Floor | None = None,
 ) -> Standing:
     """The floor on which what moves stands.
 
@@ -109,17 +114,23 @@ def find_standing(
         spine_mm: lengths of the smallest and the largest animal to expect, mm.
         min_height_mm: what stands out from the background by less does not count.
         view: how such animals are looked at.
+        stated: the floor where a person states it, in the pixels of the camera; None finds it.
 
     Returns:
         The floor, and how well it is known.
 
     Raises:
-        EstimationError: nothing flat faces the camera, or too little of the picture is readable.
+        EstimationError: nothing flat faces the camera, too little of the picture is readable, or
+            nothing stands on the floor that is stated.
     """
     areas = (view.area[0] * spine_mm[0] ** 2, view.area[1] * spine_mm[1] ** 2)
     limit = background - np.maximum(np.float32(min_height_mm), 3.0 * spread)
     things = _moving(sample, background, limit, camera, areas)
-    standing = _choose(background, camera, things, spine_mm[1], 4.0 * areas[0])
+    standing = (
+        _choose(background, camera, things, spine_mm[1], 4.0 * areas[0])
+        if stated is None
+        else _as_stated(stated, background, camera, things)
+    )
     if not things:
         return standing
     n_together = np.unique([thing.frame for thing in things], return_counts=True)[1]
@@ -157,7 +168,10 @@ def _choose(
         reach = longest_mm * np.sqrt(camera.fx * camera.fy) / ground.floor.distance_mm
         on_floor = ground.region(0.0)
         region = ground.region(float(reach))
-        return Standing(ground.floor, on_floor, region, len(things), support, doubt=doubt)
+        origin = WALLED if doubt else STOOD_ON
+        return Standing(
+            ground.floor, on_floor, region, len(things), support, origin=origin, doubt=doubt
+        )
     if isinstance(largest, EstimationError):
         raise largest
     if len(things) < _MIN_THINGS:
@@ -167,6 +181,26 @@ def _choose(
         "plane, and no other ground is better; state arena.floor in the plan"
     )
     return replace(largest, doubt=doubt)
+
+
+def _as_stated(
+    floor: Floor, background: NDArray[np.float32], camera: Camera, things: list[_Thing]
+) -> Standing:
+    """The floor that a person states.
+
+    Raises:
+        EstimationError: what moves does not stand on it, or nothing of it is seen.
+    """
+    bare = floor.depth(camera.width, camera.height)
+    on_floor = floor_region(background, bare)
+    support = _share(things, [thing.stands_on(floor) for thing in things])
+    if not on_floor.any() or (len(things) >= _MIN_THINGS and support < _UNSUPPORTED):
+        raise EstimationError(
+            f"nothing stands on the floor that arena.floor states, {floor.distance_mm:.0f} mm from "
+            "the camera; correct its point and normal, or set arena.floor to 'auto'"
+        )
+    known = support if len(things) >= _MIN_THINGS else float("nan")
+    return Standing(floor, on_floor, None, len(things), known, origin=STATED)
 
 
 def _largest(
