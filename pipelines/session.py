@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from liex_lab.plan import Plan
-from liex_lab.runtime.memory import Allocator, trim_heap
+from liex_lab.runtime.memory import Allocator, rest
 from liex_lab.runtime.progress import Progress, silent
 from liex_lab.runtime.threads import in_background, prefetch
 
@@ -31,7 +31,7 @@ from .build import (
     build_surroundings,
     build_tracker,
 )
-from .shards import CHUNK, LENGTH, MEASURING, Shard, look_side_by_side
+from .shards import CHUNK, LENGTH, MEASURING, Shard, measure_shards
 from .workers import WorkerPool
 
 if TYPE_CHECKING:
@@ -44,9 +44,6 @@ if TYPE_CHECKING:
     from liex_lab.tables.rows import Rows
     from liex_lab.tracking.tracker import FrameTracker
 
-# of the table `frames`, what names of actions go by
-_NAMED_BY = ("session_id", "individual", "frame_index", "time_ns", "wall_distance_mm")
-
 
 def measure_session(
     recording: str | Path | Recording,
@@ -58,7 +55,7 @@ def measure_session(
     notes: Mapping[str, Any] | None = None,
     blueprint: BlueprintMaker | None = None,
     report: ReportMaker | None = None,
-    crew: WorkerPool | None = None,
+    pool: WorkerPool | None = None,
     progress: Progress = silent,
 ) -> Path:
     """Measure every frame of a recording and write the session folder.
@@ -76,7 +73,7 @@ def measure_session(
         notes: what session.json is to hold besides, see `SessionWriter.note`.
         blueprint: makes the layout of the replay, see `SessionWriter`.
         report: makes the report in the folder, see `SessionWriter`.
-        crew: pool of workers for the shards of a long recording.
+        pool: pool of workers for the shards of a long recording.
         progress: told frame by frame.
 
     Returns:
@@ -110,9 +107,9 @@ def measure_session(
         hash_once(opened, part_folder(folder), progress)
         provenance = build_provenance(opened, plan, tracker, progress)
         timings = {"prepare": time.perf_counter() - started, "track": 0.0}
-        if crew is not None and isinstance(recording, str | Path) and len(opened) > 2 * LENGTH:
+        if pool is not None and isinstance(recording, str | Path) and len(opened) > 2 * LENGTH:
             whole = Shard(str(recording), plan, tracker, provenance, folder, 0, len(opened))
-            look_side_by_side(crew, whole, folder, progress)
+            measure_shards(pool, whole, folder, progress)
         with SessionWriter(
             folder, provenance, overwrite=overwrite, blueprint=blueprint, report=report
         ) as writer:
@@ -162,11 +159,9 @@ def conclude(writer: SessionWriter, plan: Plan, timings: dict[str, float]) -> Se
         plan: rules and action model.
         timings: seconds of `prepare` and `track`, for session.json.
     """
-    rows = writer.rows
-    behaviour, notes = measure_behaviour(rows, plan, writer.origin, writer.allocate)
+    behaviour, notes = measure_behaviour(writer.rows, plan, writer.origin, writer.allocate)
     writer.note(**notes)
-    rows.track.release_pages()
-    trim_heap()
+    rest()
     return writer.close(timings_s=timings, **behaviour.for_session())
 
 
@@ -185,8 +180,7 @@ def measure_behaviour(
 
     recogniser = build_recogniser(plan, origin.skeleton)
     named, notes = ({}, {}) if recogniser is None else name_actions(recogniser, rows, allocate)
-    rows.track.release_pages()
-    trim_heap()
+    rest()
     return measure_rows(
         rows, build_rules(plan), build_surroundings(origin), allocate=allocate, **named
     ), notes
@@ -208,7 +202,7 @@ def name_actions(
     """
     from liex_lab.tables.rows import bout_rows
 
-    frames = rows.frames_table(_NAMED_BY)
+    frames = rows.frames_table
     found = recogniser.recognise(rows.track, frames["wall_distance_mm"].to_numpy(float), allocate)
     notes = {
         "action_model": {

@@ -29,6 +29,7 @@ from numpy.typing import NDArray
 
 from liex_lab.baselines import _forest as kernels
 from liex_lab.baselines.baseline import DAMAGE, Guesses, see
+from liex_lab.body.kinematic_tree import KinematicTree
 from liex_lab.body.kinematics import forward_kinematics
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.errors import ModelError
@@ -120,20 +121,11 @@ class RegressionForest:
                 crops.heights,
                 crop_cameras,
                 crops.found,
-                self.plan.n_points,
-                s.length,
-                s.length * np.array(self.plan.bandwidths),
-                self.where.nodes,
-                self.where.roots,
-                self.where.leaves,
-                self.pose.nodes,
-                self.pose.roots,
-                self.pose.leaves,
+                _settings(self.plan, s),
+                _voting(self.where),
+                _voting(self.pose),
                 levers(s),
-                s.parents,
-                s.offsets,
-                s.rest,
-                s.axes,
+                KinematicTree.of(s),
                 joints,
             )
         return Guesses(in_camera_frame(joints, crop_cameras), crops.found, crops)
@@ -201,12 +193,12 @@ def levers(skeleton: Skeleton) -> Array:
         below[skeleton.parents[j]] |= below[j]
     rows: list[float] = []
     for j in skeleton.solved:
-        off = positions[below[j]] - positions[j]
+        offset = positions[below[j]] - positions[j]
         for k in np.flatnonzero(skeleton.axes[j]):
-            moved = np.cross(rotations[j][:, k], off)
+            moved = np.cross(rotations[j][:, k], offset)
             rows.append(float(np.sqrt((moved**2).sum() / skeleton.n_joints)))
         if j == 0:
-            rows += [1.0, 1.0, 1.0, float(np.sqrt((off**2).sum() / skeleton.n_joints))]
+            rows += [1.0, 1.0, 1.0, float(np.sqrt((offset**2).sum() / skeleton.n_joints))]
     lever = np.array(rows)
     lever[3:6] = np.inf
     lever = np.maximum(lever, _LEAST_LEVER * skeleton.length)
@@ -241,6 +233,18 @@ def coordinates(
     return np.concatenate(parts, axis=1) * levers(skeleton)
 
 
+def _settings(plan: ForestPlan, skeleton: Skeleton) -> kernels.VoteSettings:
+    """The numbers of the votes for the kernels."""
+    return kernels.VoteSettings(
+        plan.n_points, skeleton.length, skeleton.length * np.array(plan.bandwidths)
+    )
+
+
+def _voting(forest: Forest) -> kernels.VotingForest:
+    """A forest for the kernels."""
+    return kernels.VotingForest(forest.nodes, forest.roots, forest.leaves)
+
+
 def train_forests(
     data: TrainingSet, skeleton: Skeleton, plan: ForestPlan, rng: np.random.Generator, tell: Tell
 ) -> RegressionForest:
@@ -266,12 +270,8 @@ def train_forests(
         data.images.crop_cameras,
         image,
         rng.random(len(image)),
-        plan.n_points,
-        skeleton.length,
-        plan.bandwidths[0] * skeleton.length,
-        where.nodes,
-        where.roots,
-        where.leaves,
+        _settings(plan, skeleton),
+        _voting(where),
         unseen,
         places,
         headings,

@@ -81,7 +81,8 @@ class BodyResidual:
             The body whose median residual over the frames is least.
         """
         bodies = [BodyResidual(surface, float(girth), camera_view) for girth in _GIRTHS]
-        cost = [np.nanmedian(body.of(pose_arena, crops, scene)) for body in bodies]
+        placed = pose_arena.placed(surface.skeleton)
+        cost = [np.nanmedian(body.of(placed, crops, scene)) for body in bodies]
         return bodies[int(np.argmin(cost))]
 
 
@@ -122,7 +123,7 @@ def _compare(rendered, heights, origin, step, planes, distance, out):
     for i in prange(rendered.shape[0]):
         size = rendered.shape[1]
         plane = planes[i]
-        off = np.empty(size * size)
+        offset = np.empty(size * size)
         n = 0
         for r in range(size):
             v = origin[i, 1] + step[i] * r
@@ -132,6 +133,6 @@ def _compare(rendered, heights, origin, step, planes, distance, out):
                     observed = (1.0 - heights[i, r, c] / 16.0 / distance[i]) / (
                         plane[0] * u + plane[1] * v + plane[2]
                     )
-                    off[n] = abs(rendered[i, r, c] - observed)
+                    offset[n] = abs(rendered[i, r, c] - observed)
                     n += 1
-        out[i] = np.median(off[:n]) if n >= _MIN_OVERLAP_PX else np.nan
+        out[i] = np.median(offset[:n]) if n >= _MIN_OVERLAP_PX else np.nan
