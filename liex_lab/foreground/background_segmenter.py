@@ -191,7 +191,7 @@ class BackgroundSubtraction(Segmenter):
             standing=standing,
         )
         area, share = scene._moving_area(sample, spine_mm)
-        moves = share > 0.0
+        moves = share >= 0.5 or (share > 0.0 and standing.moves)
         if share < 0.5:  # perhaps it sits in its own background: compare with the floor itself
             bare_limit = np.where(
                 on_floor, np.maximum(bare - np.float32(min_height_mm), 0), limit
@@ -200,8 +200,15 @@ class BackgroundSubtraction(Segmenter):
                 scene, limit=bare_limit, background=np.where(on_floor, bare, background)
             )
             still_area, still_share = still.usual_area(sample, spine_mm)
+            rests = replace(still, area_mm2=still_area)
             if still_share > share and not (
-                stands and still._stays_beside(scene, sample, still_area, area)
+                stands
+                and standing.moves
+                and area > 0.0
+                and (
+                    rests._stays_beside(replace(scene, area_mm2=area), sample)
+                    or not rests._is_like_an_animal(sample, spine_mm, min_height_mm)
+                )
             ):
                 scene = still
                 area = still_area
@@ -210,7 +217,7 @@ class BackgroundSubtraction(Segmenter):
         elif stands:
             scene, area = scene.with_its_still_part(sample, spine_mm, min_height_mm, area)
         # what was not seen moving is an animal only where it is as large and as high as one
-        if stands and not (moves and standing.moves) and share > 0.0:
+        if stands and share > 0.0 and not moves:
             seen_as = replace(scene, area_mm2=area)
             share = share if seen_as._is_like_an_animal(sample, spine_mm, min_height_mm) else 0.0
         if share == 0.0:
@@ -240,31 +247,20 @@ class BackgroundSubtraction(Segmenter):
         crops = replace(self, area_mm2=standing.thing_mm2).extract(sample, 1.0)
         return standing.thing_mm2, float(crops.found.mean())
 
-    def _stays_beside(
-        self,
-        moving: BackgroundSubtraction,
-        sample: NDArray[np.float32],
-        still_area: float,
-        area: float,
-    ) -> bool:
+    def _stays_beside(self, moving: BackgroundSubtraction, sample: NDArray[np.float32]) -> bool:
         """Whether what stands on the bare floor is there beside what moves: another thing.
 
         Args:
-            moving: the scene in which only what moves is seen.
+            moving: the scene in which only what moves is seen, with its area.
             sample: (n, H, W) float32 mm, frames at this scene's stride.
-            still_area: of what stands on the floor, mm^2.
-            area: of what moves, mm^2, 0 where nothing does.
         """
-        standing = self.standing
-        if area == 0.0 or standing is None or not standing.moves:
-            return False
-        mover = replace(moving, area_mm2=area).extract(sample, 1.0)
-        both = replace(self, area_mm2=still_area).extract(sample, 1.0)
+        mover = moving.extract(sample, 1.0)
+        both = self.extract(sample, 1.0)
         seen = mover.found & both.found
         if not seen.any():
             return True
         apart = np.linalg.norm(mover[seen].centroid[:, :2] - both[seen].centroid[:, :2], axis=1)
-        beside = (apart > np.sqrt(still_area)) | (both.n_blobs[seen] > 1)
+        beside = (apart > np.sqrt(self.area_mm2)) | (both.n_blobs[seen] > 1)
         return bool(beside.mean() > 0.5)
 
     def _is_like_an_animal(
