@@ -21,7 +21,9 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from liex_lab.actions.timeline import TimelineModel
+    from liex_lab.arena.floor import Floor
     from liex_lab.arena.outline import Arena
+    from liex_lab.arena.scene import Scene
     from liex_lab.arena.zones import DrawnZone, Zone
     from liex_lab.behaviour.bouts import MouseRules
     from liex_lab.behaviour.places import Surroundings
@@ -256,14 +258,48 @@ def build_scene(
 
     animal = plan.animal
     foreground = plan.foreground
+    region, floor = build_stated_scene(recording.camera, plan)
     if skeleton.view.foreground == FOREGROUNDS[1]:
+        if region is not None or floor is not None:
+            raise PlanError(
+                "arena.region and arena.floor are for animals before a still background, and the "
+                f"{skeleton.name} is told by its distance; set foreground.near_mm and far_mm"
+            )
         return HandSegmenter.learn(
             recording, skeleton.view, n_frames, (foreground.near_mm, foreground.far_mm)
         )
     sizes = (animal.spine_min_mm, animal.spine_max_mm)
     return BackgroundSubtraction.learn(
-        recording, sizes, n_frames, foreground.min_height_mm, skeleton.view
+        recording, sizes, n_frames, foreground.min_height_mm, skeleton.view, floor, region
     )
+
+
+def build_stated_scene(camera: Camera, plan: Plan) -> tuple[NDArray[np.bool_] | None, Floor | None]:
+    """The region (H, W) outside of which nothing is looked at, and the floor, as the plan states
+    them.
+
+    Args:
+        camera: the ideal pinhole camera of the recording.
+        plan: its settings `arena.region` and `arena.floor`.
+
+    Returns:
+        None for what is not stated.
+
+    Raises:
+        PlanError: the region is no polygon in the picture, or the floor does not face the camera.
+    """
+    from liex_lab.arena.scene import plane_of, region_mask
+
+    stated = plan.arena
+    region = (
+        None if stated.region is None else region_mask(stated.region, camera.width, camera.height)
+    )
+    floor = (
+        None
+        if isinstance(stated.floor, str)
+        else plane_of(stated.floor.point, stated.floor.normal, camera)
+    )
+    return region, floor
 
 
 def build_provenance(
@@ -300,7 +336,22 @@ def build_provenance(
         },
         arena=arena,
         zones=zones,
+        scene=build_described_scene(tracker.scene, arena),
     )
+
+
+def build_described_scene(segmenter: Segmenter, arena: Arena) -> Scene | None:
+    """What stands still before the camera, for session.json; None for a hand, which has no floor.
+
+    Args:
+        segmenter: the learned segmentation.
+        arena: the outline of its floor.
+    """
+    from liex_lab.foreground.background_segmenter import BackgroundSubtraction
+
+    if not isinstance(segmenter, BackgroundSubtraction):
+        return None
+    return replace(segmenter.described(), outline=arena)
 
 
 def build_arena(scene: Segmenter, plan: Plan) -> tuple[Arena, tuple[Zone, ...]]:

@@ -51,6 +51,7 @@ FINDINGS: Final = {  # key of the JSON: what it says; numbers that cannot be tol
     "floor_tilt_rad": "angle between the optical axis and the floor's perpendicular",
     "water_depth_mm": "of the water over the floor, below the lens",
     "arena": "shape of the floor, mm in the arena frame: see session.json",
+    "scene": "floor, region, fixtures, and how many animals move: see session.json",
     "animal_length_mm": (
         "of its outline from above, four standard deviations along the long axis; median"
     ),
@@ -332,6 +333,7 @@ def lines(findings: dict[str, Any]) -> list[tuple[str, str]]:
             else f"{_text(f['floor_mm'], 'mm')} from the lens, tilted by {degrees} degrees",
         ),
         ("arena", shape or "unknown"),
+        ("scene", _scene_text(f["scene"])),
         (
             "animal",
             "not found"
@@ -342,6 +344,25 @@ def lines(findings: dict[str, Any]) -> list[tuple[str, str]]:
             ),
         ),
     ]
+
+
+def _scene_text(scene: dict[str, Any] | None) -> str:
+    """How the floor was found, its roughness, what stands on it and how many animals move."""
+    if scene is None:
+        return "unknown"
+    floor = scene["floor"]
+    share = floor["support"]
+    support = "nothing moves" if share is None else f"{share:.0%} of what moves stands on it"
+    n_fixtures = len(scene["fixtures"])
+    return ", ".join(
+        [
+            f"floor from {floor['from']} ({support})",
+            f"rough to {_text(floor['roughness_mm'], 'mm', 1)}",
+            f"{n_fixtures} thing{'' if n_fixtures == 1 else 's'} on it",
+            f"at most {scene['n_animals']} moving together",
+            *(["only a region is looked at"] if scene["region_px"] else []),
+        ]
+    )
 
 
 def _text(value: float | None, unit: str, digits: int = 0) -> str:

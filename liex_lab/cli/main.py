@@ -26,6 +26,7 @@ from liex_lab.cli.options import (
     Settings,
     TopicName,
     VariantName,
+    region_setting,
     tell_numbers,
     to_json,
     told_scores,
@@ -141,13 +142,21 @@ def doctor(
         float | None, typer.Option("--fps", help="Frames per second, where the file has no times.")
     ] = None,
     topic: TopicName = None,
+    region: Annotated[
+        str | None,
+        typer.Option(
+            "--region",
+            metavar='"X,Y X,Y ..."',
+            help="Look only inside this polygon, corners in pixels.",
+        ),
+    ] = None,
     plan: PlanName = "mouse",
     settings: Settings = None,
 ) -> None:
     """Say what is in a recording and what is wrong with it. Needs no model."""
     from liex_lab.plan import Plan
 
-    chosen = Plan.load(plan).with_settings(settings or [])
+    chosen = Plan.load(plan).with_settings([*(settings or []), *region_setting(region)])
     from liex_lab.pipelines.doctor import examine, print_report
 
     with progress_bar() as progress:

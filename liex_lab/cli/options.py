@@ -43,6 +43,24 @@ JsonFile = Annotated[
 ]
 
 
+def region_setting(region: str | None) -> list[str]:
+    """The setting of a plan that a region "x,y x,y x,y" stands for; none where none is given."""
+    from liex_lab.errors import PlanError
+
+    if region is None:
+        return []
+    try:
+        corners = [[float(value) for value in corner.split(",")] for corner in region.split()]
+    except ValueError:
+        corners = []
+    if len(corners) < 3 or any(len(corner) != 2 for corner in corners):
+        raise PlanError(
+            "--region takes three or more corners in pixels, as in --region "
+            f"'60,40 260,40 260,200 60,200', got '{region}'"
+        )
+    return [f"arena.region={corners}"]
+
+
 def tell_numbers(result: dict[str, Any], json_file: Path | None) -> None:
     """The numbers as a table on the screen, and as JSON where a file was named."""
     if json_file is not None:

@@ -137,8 +137,33 @@ class WaterSurface(Table):
     )
 
 
+class StatedFloor(Table):
+    """A floor that is stated: a point of the plane and its normal, camera frame."""
+
+    point: Annotated[list[float], Field(min_length=3, max_length=3)]
+    normal: Annotated[list[float], Field(min_length=3, max_length=3)]
+
+
+Corner = Annotated[list[float], Field(min_length=2, max_length=2)]
+
+
 class ArenaFacts(Table):
-    """[arena]: where in the arena the animal is."""
+    """[arena]: where the arena is in the picture, and where in it the animal is."""
+
+    floor: Literal["auto"] | StatedFloor = Field(
+        "auto",
+        description=(
+            "the plane animals stand on: 'auto' finds it, or {point = [x, y, z], normal = [x, y, "
+            "z]}, mm in the camera's frame (x right, y down, z away)"
+        ),
+    )
+    region: list[Corner] | None = Field(
+        None,
+        description=(
+            "corners [x, y], pixels, of a polygon around the arena, outside of which nothing is "
+            "looked at; not set: the whole picture, or what lies around the floor that was found"
+        ),
+    )
 
     zones: str | None = Field(
         None,

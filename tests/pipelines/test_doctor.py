@@ -59,6 +59,7 @@ KEYS = [
     "floor_tilt_rad",
     "water_depth_mm",
     "arena",
+    "scene",
     "animal_length_mm",
     "animal_area_mm2",
     "animal_share",
