@@ -14,6 +14,7 @@ import numpy as np
 
 from liex_lab.sessions import Session
 from liex_lab.sessions.failure import write_whole
+from liex_lab.sessions.verdict import verdict_in
 
 from . import svg
 from .charts import FRAMES, KINEMATICS, around_actions, charts, curves, pictures
@@ -75,6 +76,7 @@ def render(session: Session) -> str:
             f"{name.replace('_', ' ')} {value}"
             for name, value in session.metadata["subject"].items()
         ),
+        verdict=verdict_in(session.metadata),
         warnings=warnings(session),
         account=frame_account(session),
         flips=flip_rows(session),
