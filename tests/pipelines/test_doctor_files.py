@@ -115,3 +115,29 @@ def test_doctor_proposes_the_plan_and_says_what_to_run_next(
     assert "2 animals are in view" in two.problems[0]
     assert next_command("a.mcap", two, []) == "liex run a.mcap"
     assert next_command("a.mcap", Proposal(None, ""), []) == ""
+
+
+DEPTH = (
+    "hand_kinect2",
+    "depth_files/primesense_pcl",
+    "depth_files/realsense_bag/single_depth_color_640x480.bag",
+    "depth_files/xtion_open3d",
+    "depth_files/other_formats",
+    "depth_files/other_formats/NYU_depth.pgm",
+    "depth_files/other_formats/SUN_depth.png",
+    "depth_files/other_formats/TUM_depth.png",
+    "mouse_kinect2/first_frame.png",
+    "mouse_kinect2/background.png",
+    "hand_nyu",
+    "hand_nyu/depth_1_0000001.png",
+)
+
+
+@pytest.mark.parametrize("name", DEPTH)
+def test_every_genuine_file_that_holds_depth_gets_a_diagnosis(
+    reference_data: Path, name: str
+) -> None:
+    found = examine(reference_data / name)
+    assert found["n_frames"] >= 1
+    assert found["depth_max_mm"] is not None
+    assert all("write" in sentence or "choose" in sentence for sentence in found["missing"])
