@@ -117,9 +117,9 @@ def examine(
         stride = stride_for(seen, plan.animal.spine_min_mm)
         sample = sample_frames(seen, _N_SAMPLED, stride)
         depth = _Depths(sample if seen is opened else sample_frames(opened, _N_RAW))
-        look = SceneLook(seen, plan, water, sample, stride)
+        scene = SceneLook(seen, plan, water, sample, stride)
         if depth.median_mm is not None:
-            look.at_scene()
+            scene.at_scene()
         proposal = Proposal(None, "")
         if propose and depth.median_mm is not None:
             progress(0, None, "looking which plan fits")
@@ -133,7 +133,7 @@ def examine(
             "distortion": None if lens.distortion is None else lens.distortion.to_dict(),
             "water": None if water is None else water.to_dict(),
             **depth.facts(),
-            **look.facts,
+            **scene.facts,
             "plan": proposal.plan,
             "plan_says": proposal.says,
             "n_animals": proposal.n_animals,
@@ -142,7 +142,7 @@ def examine(
                 *seen.problems,
                 *_time_problems(opened),
                 *depth.problems(),
-                *look.problems,
+                *scene.problems,
                 *proposal.problems,
             ],
             "next": next_command(path, proposal, missing),

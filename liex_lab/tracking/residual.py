@@ -163,7 +163,7 @@ def _compare(rendered, heights, origin, step, planes, distance, out):
     for i in prange(rendered.shape[0]):
         size = rendered.shape[1]
         plane = planes[i]
-        off = np.empty(size * size)
+        offset = np.empty(size * size)
         n = 0
         n_read = 0
         n_drawn = 0
@@ -177,8 +177,8 @@ def _compare(rendered, heights, origin, step, planes, distance, out):
                     observed = (1.0 - heights[i, r, c] / 16.0 / distance[i]) / (
                         plane[0] * u + plane[1] * v + plane[2]
                     )
-                    off[n] = abs(rendered[i, r, c] - observed)
+                    offset[n] = abs(rendered[i, r, c] - observed)
                     n += 1
-        out[0, i] = np.median(off[:n]) if n >= _MIN_OVERLAP_PX else np.nan
+        out[0, i] = np.median(offset[:n]) if n >= _MIN_OVERLAP_PX else np.nan
         out[1, i] = n / max(n_read, 1)
         out[2, i] = 1.0 - n / max(n_drawn, 1)

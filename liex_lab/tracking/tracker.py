@@ -109,8 +109,8 @@ class FrameTracker:
         )
         limit = doubtful_mm or estimator.model.calibration.doubtful_mm * size
         agreement = body.agreement(pose[used], crops[used], scene)
-        off = agreement.residual_mm[np.isfinite(agreement.residual_mm)]
-        blur = float(np.median(off)) / (home * size) if len(off) else 0.0
+        misfit = agreement.residual_mm[np.isfinite(agreement.residual_mm)]
+        blur = float(np.median(misfit)) / (home * size) if len(misfit) else 0.0
         spread = float(np.log(estimator.sizes_told(estimates)).std())
         ends = None
         if (
