@@ -79,14 +79,13 @@ def open_anyhow(
 
 def _guess_camera(recording: Recording) -> str:
     """Give the recording the likeliest camera for its pictures' size; returns what to write."""
-    width, height = recording.width, recording.height
+    width = recording.width
+    height = recording.height
     names = of_size(width, height)
-    if names:
-        guess = preset(names[0], width, height)
-        focal, like = guess.fx, f"those of a {names[0]}"
-    else:
-        focal, like = round(_USUAL_FOCAL * width, 1), "those of many a depth camera"
-    cx, cy = (width - 1) / 2, (height - 1) / 2
+    focal = preset(names[0], width, height).fx if names else round(_USUAL_FOCAL * width, 1)
+    like = f"those of a {names[0]}" if names else "those of many a depth camera"
+    cx = (width - 1) / 2
+    cy = (height - 1) / 2
     recording.camera = replace(
         recording.camera, fx=focal, fy=focal, cx=cx, cy=cy, source="assumed: not stated"
     )

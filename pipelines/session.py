@@ -111,7 +111,9 @@ def measure_session(
         progress(0, None, "learning the background, the floor and the animal's size")
         unnamed = None if plan else settings
         fitted = fit_plan(opened, first, estimator, settings=unnamed, progress=progress)
-        opened, plan, tracker = fitted.recording, fitted.plan, fitted.tracker
+        opened = fitted.recording
+        plan = fitted.plan
+        tracker = fitted.tracker
         build_recogniser(
             plan, tracker.estimator.skeleton
         )  # a slip in its name is told before any work is done

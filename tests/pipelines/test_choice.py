@@ -153,7 +153,7 @@ def test_a_plan_that_states_the_hand_is_believed(
         ({"beside": 0.7}, "70% of its body lies beside"),
     ],
 )
-def test_each_kind_of_evidence_is_said_by_itself(wrong: dict[str, float], says: str) -> None:
+def test_each_kind_of_evidence_is_said_by_itself(wrong: dict[str, Any], says: str) -> None:
     plan = Plan.load("mouse")
     assert misfits_of(GOOD, plan) == ()
     found = misfits_of(replace(GOOD, **wrong), plan)
