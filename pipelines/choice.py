@@ -125,7 +125,7 @@ def _other_hand(recording: Recording, found: Look, plan: Plan | None) -> tuple[s
     stated = plan is not None and plan.recording.mirrored is not None
     if found.name != "hand" or stated or found.fit is None:
         return ()
-    other = look(mirrored(recording), found.name).fit
+    other = look(mirrored(recording, lent=True), found.name).fit
     if other is None or other.error_mm > _MIRRORED_BELOW * found.fit.error_mm:
         return ()
     return (
@@ -267,7 +267,7 @@ def _right_way_round(found: Fitted, progress: Progress) -> Fitted:
         return found  # it is no hand at all
     progress(0, None, "looking which hand it is")
     handful = plan.with_settings([_HANDFUL])
-    turned = mirrored(found.recording)
+    turned = mirrored(found.recording, lent=True)
     try:
         other = build_tracker(turned, handful).sample_fit
     except EstimationError:

@@ -4,6 +4,7 @@ which hand it is.
 
 from __future__ import annotations
 
+import gc
 from dataclasses import dataclass, replace
 from types import SimpleNamespace
 from typing import Any
@@ -129,6 +130,25 @@ def test_which_hand_it_is_is_found_by_the_error_that_is_half_as_large(
     fitted = fit_plan(RECORDING, Plan.load("hand"))
     assert fitted.plan.recording.mirrored is False
     assert fitted.notes == ()
+
+
+def test_a_recording_is_still_open_after_its_mirror_image_was_looked_at(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    looks(monkeypatch, hand=HAND, hand_mirrored=replace(HAND, error_mm=13.0))
+    closed: list[bool] = []
+    recording = Recording(
+        name="r",
+        format="toy",
+        camera=KINECT_V2,
+        times_ns=np.arange(3),
+        read=lambda _: np.zeros((424, 512), np.float32),
+        close=lambda: closed.append(True),
+    )
+    fit_plan(recording, Plan.load("hand"))
+    gc.collect()
+    assert not closed
+    assert recording.frame(0).depth.shape == (424, 512)
 
 
 @pytest.mark.parametrize("stated", [True, False])
