@@ -85,8 +85,6 @@ class Verdict:
             n_in_view += int(part.known.any(axis=1).sum())
             n_depth += int(part.has_depth.sum())
             n_trusted += int((track[rows].observed & (track.flag[rows] == "")).sum())
-            seen.release_pages()
-            track.release_pages()
         n_posed = int(track.posed.sum())
         errors = track.predicted_error_mm[track.observed]
         doubtful = int((track.flag == "doubtful").sum())

@@ -140,7 +140,6 @@ def track_whole(
     usual_px = float(np.median(shown[path >= 0])) if (path >= 0).any() else 0.0
     for rows in blocks(len(seen), _BLOCK):
         draw(rows)
-        _rest(track, seen)
     for _ in range(_TIMES):
         taken = path == NONE
         for rows in blocks(len(seen), _BLOCK):
@@ -149,7 +148,6 @@ def track_whole(
         for rows in blocks(len(seen), _BLOCK):
             if taken[max(0, rows.start - MARGIN) : rows.stop + MARGIN].any():
                 draw(rows)
-            _rest(track, seen)
     measured = used & (path >= 0)
     bridged = short_gaps(seconds, measured, subject.bridge_s)
     strayed = np.zeros(len(seen), np.bool_)
@@ -162,7 +160,6 @@ def track_whole(
             subject.length_mm,
             usual_px,
         )
-        _rest(track, seen)
     bridged &= ~strayed  # what is in view is measured, or it has no pose
     strayed |= contradicted(seen, path, subject.length_mm)
     for rows in blocks(len(seen), _BLOCK):
@@ -176,16 +173,10 @@ def track_whole(
             bridged[rows],
             strayed[rows],
         )
-        _rest(track, seen)
     flips = _flips(seen, track)
     return Tracked(
         track, tuple(sorted([*flips, *corrections], key=lambda flip: (flip.start, flip.source)))
     )
-
-
-def _rest(track: Track, seen: Observations) -> None:
-    track.release_pages()
-    seen.release_pages()
 
 
 def _turn_round(
@@ -480,10 +471,9 @@ def _flips(seen: Observations, track: Track) -> list[Flip]:
     tip = track.skeleton.tip
     exchanged = np.zeros(len(seen), np.bool_)
     for rows in blocks(len(seen), _BLOCK):
-        ends = seen[rows].joints([0, tip])[:, 0]
+        ends = seen[rows].joints_as(0, [0, tip])
         along = track.joints_mm[rows, tip] - track.joints_mm[rows, 0]
         exchanged[rows] = np.einsum("nd,nd->n", along, ends[:, 1] - ends[:, 0]) < 0
-        _rest(track, seen)
     found = [Flip(a, b, float(1.0 - track.p_flip[a:b].mean()), True) for a, b in spans(exchanged)]
     unsure = ~exchanged & (track.p_flip > _TOLD)
     return found + [Flip(a, b, float(track.p_flip[a:b].mean()), False) for a, b in spans(unsure)]

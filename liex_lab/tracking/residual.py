@@ -114,7 +114,8 @@ class BodyResidual:
             overlaps what was read.
         """
         bodies = [BodyResidual(surface, float(girth), camera_view) for girth in _GIRTHS]
-        cost = [_median(body.of(pose_arena, crops, scene)) for body in bodies]
+        placed = pose_arena.placed(surface.skeleton)
+        cost = [_median(body.of(placed, crops, scene)) for body in bodies]
         return bodies[int(np.argmin(cost))]
 
 
