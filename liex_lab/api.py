@@ -33,6 +33,7 @@ def run_session(
     plan: Plan | None = None,
     out: str | Path = ".",
     *,
+    settings: Sequence[str] = (),
     folder: Path | None = None,
     overwrite: bool = False,
     notes: Mapping[str, Any] | None = None,
@@ -49,8 +50,10 @@ def run_session(
     Args:
         recording: path of a recording, or address of a virtual one, or a recording that is open
             already.
-        plan: all settings of the run; None takes the bundled plan of the mouse.
+        plan: all settings of the run; None takes the bundled plan that fits, that of the mouse
+            where it does.
         out: the folder into which the session folder `<recording's name>.liex` is written.
+        settings: changes of the plan where none is named, texts like 'animal.spine_mm=65'.
         folder: the session folder itself, where it should have another name.
         overwrite: replace a session that is there already.
         notes: further facts for session.json, see `SessionWriter.note`.
@@ -71,7 +74,6 @@ def run_session(
     from liex_lab.pipelines.session import measure_session
     from liex_lab.pipelines.workers import Processes
 
-    plan = plan or Plan.load("mouse")
     if workers > 1 and pool is None:
         pool = Processes(workers)
     with telling_of_compiling(progress) as progress:
@@ -79,6 +81,7 @@ def run_session(
             recording,
             plan,
             out,
+            settings=settings,
             folder=folder,
             overwrite=overwrite,
             notes=notes,

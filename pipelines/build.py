@@ -66,7 +66,10 @@ def build_recording(
 
 
 def open_planned(
-    recording: str | Path | Recording, plan: Plan, progress: Progress = silent
+    recording: str | Path | Recording,
+    plan: Plan,
+    progress: Progress = silent,
+    pattern: str | None = None,
 ) -> Recording:
     """The recording opened as the plan says, its pictures as they are; the plan's camera overrules.
 
@@ -76,6 +79,7 @@ def open_planned(
         recording: a path or address, or a recording that is open already, whose camera is replaced.
         plan: states the camera, and frame rate and topic of recordings that need them.
         progress: told while an archive is unpacked or an index made.
+        pattern: which pictures of a folder to take; None takes those that its camera.toml states.
 
     Raises:
         RecordingError: the recording cannot be opened, or is cut short and the plan does not accept
@@ -90,6 +94,7 @@ def open_planned(
             camera=_stated_lens(plan),
             fps=settings.fps,
             topic=settings.topic,
+            pattern=pattern,
             strict=not settings.accept_truncated,
             progress=progress,
         )
@@ -110,10 +115,12 @@ def build_water(plan: Plan) -> Water | None:
 
 
 def _stated_lens(plan: Plan) -> Lens | None:
-    """The plan's camera where it states all of it."""
+    """The plan's camera where it states all of it, or something to be replaced by its preset."""
     from liex_lab.optics.camera import Lens
 
     stated = {name: getattr(plan.camera, name) for name in ("fx", "fy", "cx", "cy")}
+    if None in stated.values() and plan.camera.preset is not None:
+        return Lens(1.0, 1.0, 0.0, 0.0)  # its numbers follow once the pictures' size is known
     return None if None in stated.values() else Lens(**stated, distortion=_stated_distortion(plan))
 
 
@@ -125,8 +132,12 @@ def _stated_distortion(plan: Plan) -> Distortion | None:
 
 def _overruled(camera: Camera, plan: Plan) -> Camera:
     """The camera with what the plan states put in."""
+    if plan.camera.preset is not None:
+        from liex_lab.optics.presets import preset
+
+        camera = preset(plan.camera.preset, camera.width, camera.height)
     stated: dict[str, Any] = plan.camera.model_dump(
-        exclude_none=True, exclude={"distortion", "distortion_model"}
+        exclude_none=True, exclude={"preset", "distortion", "distortion_model"}
     )
     if plan.camera.distortion is not None:
         stated["distortion"] = _stated_distortion(plan)

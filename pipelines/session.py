@@ -9,7 +9,7 @@ made of all frames at once.
 from __future__ import annotations
 
 import time
-from collections.abc import Generator, Mapping
+from collections.abc import Generator, Mapping, Sequence
 from contextlib import closing
 from functools import partial
 from pathlib import Path
@@ -29,9 +29,9 @@ from .build import (
     build_recording,
     build_rules,
     build_surroundings,
-    build_tracker,
     why_nameless,
 )
+from .choice import USUAL, Fitted, fit_plan
 from .shards import CHUNK, LENGTH, MEASURING, Shard, measure_shards
 from .workers import WorkerPool
 
@@ -44,16 +44,17 @@ if TYPE_CHECKING:
     from liex_lab.recordings.frame import DepthFrame
     from liex_lab.recordings.recording import Recording
     from liex_lab.sessions import Provenance, Session, SessionWriter
+    from liex_lab.sessions.verdict import Verdict
     from liex_lab.sessions.writer import BlueprintMaker, ReportMaker
     from liex_lab.tables.rows import Rows
-    from liex_lab.tracking.tracker import FrameTracker
 
 
 def measure_session(
     recording: str | Path | Recording,
-    plan: Plan,
+    plan: Plan | None,
     out: str | Path,
     *,
+    settings: Sequence[str] = (),
     folder: Path | None = None,
     overwrite: bool = False,
     notes: Mapping[str, Any] | None = None,
@@ -64,14 +65,17 @@ def measure_session(
 ) -> Path:
     """Measure every frame of a recording and write the session folder.
 
-    An unfinished session of the same recording and plan is continued. Where a pool of workers is
+    An unfinished session of the same recording and plan is continued. A plan that the recording
+    does not fit is refused before anything is measured; where none is named the bundled one that
+    fits is used. Where a pool of workers is
     given and the recording is long (more than two shards) and stated by its path, its shards are
     measured side by side; the tables are the same.
 
     Args:
         recording: a path or address, or a recording that is open already.
-        plan: everything that the run depends on.
+        plan: everything that the run depends on; None takes the bundled plan that fits.
         out: folder of the session, which is named after the plan's session or the recording.
+        settings: changes of a plan that was not named, as `Plan.with_settings` takes them.
         folder: the session folder itself, instead of `out/NAME.liex`.
         overwrite: replace a session that is there already, once the new one is whole.
         notes: what session.json is to hold besides, see `SessionWriter.note`.
@@ -87,6 +91,7 @@ def measure_session(
         SessionError: a session is there already, or another process writes it.
         RecordingError: the recording cannot be opened or read.
         PlanError: the plan, or a file that it names, cannot be used.
+        MisfitError: the recording shows something else than the plan's animal.
         EstimationError: no animal is found.
     """
     from liex_lab.sessions import SessionWriter
@@ -95,16 +100,21 @@ def measure_session(
     from liex_lab.sessions.place import check_place
 
     started = time.perf_counter()
+    first = plan or Plan.load(USUAL).with_settings(settings)
     with (
-        in_background(partial(build_estimator, plan)) as estimator,
-        build_recording(recording, plan, progress) as opened,
+        in_background(partial(build_estimator, first)) as estimator,
+        build_recording(recording, first, progress) as opened,
     ):
-        folder = folder or Path(out) / f"{plan.session.name or opened.name}.liex"
+        folder = folder or Path(out) / f"{first.session.name or opened.name}.liex"
         put_back_session(folder)
         check_place(folder, overwrite)
         check_free(part_folder(folder))
         progress(0, None, "learning the background, the floor and the animal's size")
-        tracker = build_tracker(opened, plan, estimator)
+        unnamed = None if plan else settings
+        fitted = fit_plan(opened, first, estimator, settings=unnamed, progress=progress)
+        opened = fitted.recording
+        plan = fitted.plan
+        tracker = fitted.tracker
         build_recogniser(
             plan, tracker.estimator.skeleton
         )  # a slip in its name is told before any work is done
@@ -126,9 +136,9 @@ def measure_session(
                     writer.add(frames, seen=seen)
                     progress(frames[-1].index + 1, len(opened), MEASURING)
             began = time.perf_counter()
-            make_track(writer, tracker)
+            verdict = make_track(writer, fitted)
             timings["track"] += time.perf_counter() - began
-            writer.note(problems=opened.problems, **dict(notes or {}))
+            writer.note(problems=opened.problems, verdict=verdict.to_dict(), **dict(notes or {}))
             session = conclude(writer, plan, timings)
     return session.path
 
@@ -142,17 +152,33 @@ def _read_ahead(opened: Recording, first: int) -> Generator[list[DepthFrame], No
     yield from chunks if opened.format == "synthetic" else prefetch(chunks)
 
 
-def make_track(writer: SessionWriter, tracker: FrameTracker) -> None:
+def make_track(writer: SessionWriter, fitted: Fitted) -> Verdict:
     """Make the track of a session whose frames have all been measured, and hand it to the writer.
 
     Args:
         writer: holds the observations, and allocates the track's arrays.
-        tracker: the tracker that measured the frames.
+        fitted: the plan and its tracker that measured the frames.
+
+    Returns:
+        How it went.
     """
+    from liex_lab.sessions.verdict import Verdict
     from liex_lab.tracking.observations import Observations
 
+    tracker = fitted.tracker
     whole = writer.seen(Observations)
-    writer.take(tracker.track(whole, allocate=writer.allocate), whole, tracker.subject)
+    tracked = tracker.track(whole, allocate=writer.allocate)
+    fit = tracker.sample_fit
+    verdict = Verdict.of(
+        tracked.track,
+        whole,
+        misfits=fitted.misfits,
+        n_animals=1 if fit is None else fit.n_animals,
+        cautions=fitted.notes,
+        accepted=fitted.plan.estimation.accept_misfit,
+    )
+    writer.take(tracked, whole, tracker.subject)
+    return verdict
 
 
 def conclude(writer: SessionWriter, plan: Plan, timings: dict[str, float]) -> Session:

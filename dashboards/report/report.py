@@ -15,6 +15,7 @@ import numpy as np
 from liex_lab.actions.colours import action_colours
 from liex_lab.sessions import Session
 from liex_lab.sessions.failure import write_whole
+from liex_lab.sessions.verdict import verdict_in
 
 from ..units import counted, shown, titled
 from .charts import FRAMES, KINEMATICS, around_actions, charts, curves, pictures
@@ -77,6 +78,7 @@ def render(session: Session) -> str:
             f"{name.replace('_', ' ')} {value}"
             for name, value in session.metadata["subject"].items()
         ),
+        verdict=verdict_in(session.metadata),
         warnings=warnings(session),
         account=frame_account(session),
         flips=flip_rows(session),

@@ -26,6 +26,7 @@ from liex_lab.cli.options import (
     Settings,
     TopicName,
     VariantName,
+    WhichPlan,
     region_setting,
     tell_numbers,
     to_json,
@@ -34,10 +35,11 @@ from liex_lab.cli.options import (
 from liex_lab.cli.results import compare, export, report
 from liex_lab.cli.sections import MODELS, RECORDINGS, SESSIONS, START, STUDIES, group_of_verbs
 from liex_lab.cli.study import cohort, dashboard, verify
-from liex_lab.errors import LiexError
+from liex_lab.errors import LiexError, MisfitError
 from liex_lab.runtime.disk import is_full, why_full
 from liex_lab.runtime.progress import progress_bar
 
+LOOK_AT_IT = 4  # the exit code of a run whose scene does not fit, or of which little was measured
 # the exit code of our own faults (EX_SOFTWARE); what the user can put right is 1, a wrong call 2
 FAULT = 70
 _USERS_TO_MEND = {
@@ -92,7 +94,7 @@ def demo(out: OutFolder = Path()) -> None:
 @app.command(rich_help_panel=START)
 def run(
     recording: RecordingPath,
-    plan: PlanName = "mouse",
+    plan: WhichPlan = None,
     out: OutFolder = Path(),
     topic: TopicName = None,
     settings: Settings = None,
@@ -116,20 +118,35 @@ def run(
             help="Processes that share a long recording; the tables are the same.",
         ),
     ] = 1,
+    accept: Annotated[
+        bool,
+        typer.Option(
+            "--accept", help="Measure it although it does not look like the plan's animal."
+        ),
+    ] = False,
 ) -> None:
-    """Turn a recording into a session folder: poses, behaviour tables, replay, report."""
+    """Turn a recording into a session folder: poses, behaviour tables, replay, report.
+
+    Ends with a line that says how it went, and with exit code 4 where someone has to look at it.
+    """
     from liex_lab.plan import Plan
 
     asked = [] if topic is None else [f"recording.topic={topic}"]
     asked += ["replay.depth=false"] * no_depth + ["replay.candidates=true"] * candidates
-    chosen = Plan.load(plan).with_settings(
-        [*asked, *(settings or [])]
-    )  # first: a wrong plan is told at once
+    asked += [*["estimation.accept_misfit=true"] * accept, *(settings or [])]
+    # first: a wrong plan or setting is told at once
+    chosen = Plan.load(plan or "mouse").with_settings(asked)
     from liex_lab.api import run_session
 
     with progress_bar() as progress:
         session = run_session(
-            recording, chosen, out, overwrite=overwrite, workers=workers, progress=progress
+            recording,
+            chosen if plan else None,
+            out,
+            settings=() if plan else asked,
+            overwrite=overwrite,
+            workers=workers,
+            progress=progress,
         )
     _tell_session(session)
 
@@ -150,17 +167,26 @@ def doctor(
             help="Look only inside this polygon, corners in pixels.",
         ),
     ] = None,
-    plan: PlanName = "mouse",
+    plan: WhichPlan = None,
     settings: Settings = None,
 ) -> None:
-    """Say what is in a recording and what is wrong with it. Needs no model."""
+    """Say what is in a recording, what is wrong with it, and which plan fits."""
     from liex_lab.plan import Plan
 
-    chosen = Plan.load(plan).with_settings([*(settings or []), *region_setting(region)])
+    asked = [*(settings or []), *region_setting(region)]
+    chosen = Plan.load(plan or "mouse").with_settings(asked)
     from liex_lab.pipelines.doctor import examine, print_report
 
     with progress_bar() as progress:
-        findings = examine(recording, plan=chosen, fps=fps, topic=topic, progress=progress)
+        findings = examine(
+            recording,
+            plan=chosen,
+            fps=fps,
+            topic=topic,
+            propose=True,
+            named=plan is not None,
+            progress=progress,
+        )
     if as_json:
         typer.echo(to_json(findings))
     else:
@@ -450,6 +476,8 @@ def main() -> None:
     os.environ.setdefault("RUST_LOG", _RUST_LOG)
     try:
         app()
+    except MisfitError as error:
+        _fail(str(error), LOOK_AT_IT)
     except LiexError as error:
         _fail(str(error))
     except OSError as error:
@@ -477,7 +505,9 @@ def _fault() -> NoReturn:
 
 
 def _tell_session(session: Path) -> None:
+    """Where the session is, and how it went; exit code 4 where someone has to look at it."""
     from liex_lab.sessions.older import taken_from
+    from liex_lab.sessions.verdict import read_verdict
 
     typer.echo(f"session: {session}")
     if copy := taken_from(session):
@@ -486,3 +516,9 @@ def _tell_session(session: Path) -> None:
     if report.is_file():
         typer.echo(f"report:  {report}")
     typer.echo(f"replay:  liex show {session}")
+    verdict = read_verdict(session)
+    if verdict["sentence"]:
+        colour = typer.colors.YELLOW if verdict["look_at_it"] else None
+        typer.secho(f"result:  {verdict['sentence']}", fg=colour)
+    if verdict["look_at_it"] and not verdict["accepted"]:
+        raise typer.Exit(LOOK_AT_IT)

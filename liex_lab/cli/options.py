@@ -17,6 +17,12 @@ SessionPath = Annotated[
 PlanName = Annotated[
     str, typer.Option("--plan", help="A bundled plan (`liex info` lists them), or a .toml file.")
 ]
+WhichPlan = Annotated[
+    str | None,
+    typer.Option(
+        "--plan", help="A bundled plan, or a .toml file; not named: the bundled one that fits."
+    ),
+]
 OutFolder = Annotated[
     Path, typer.Option("--out", metavar="DIR", help="The folder in which NAME.liex is made.")
 ]

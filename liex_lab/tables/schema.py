@@ -239,9 +239,9 @@ FRAMES = columns(
         "flag",
         "string",
         "",
-        "empty when the pose is trusted; doubtful: its predicted error is large; corrected: a "
-        "person placed joints of it; not_found or no_depth: nothing was measured, and there is "
-        "no pose where it is not bridged",
+        "empty when the pose is trusted; doubtful: its predicted error is large, or the picture "
+        "contradicts it; corrected: a person placed joints of it; not_found or no_depth: nothing "
+        "was measured, and there is no pose where it is not bridged",
         "",
         "tracker",
     ),

@@ -110,10 +110,11 @@ def _measure(
             failure = result["failure"]
             copy = result.get("corrections_taken_from")
             taken = f", with the corrections of {copy}" if copy else ""
+            look = f"; {why}" if (why := result.get("look_at_it")) else ""
             sentence = (
                 f"failed: {failure['reason']}"
                 if failure
-                else f"is done, in {result['seconds']:.0f} s{taken}"
+                else f"is done, in {result['seconds']:.0f} s{taken}{look}"
             )
             shown.ended(result["id"], sentence, failed=failure is not None)
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -20,6 +20,7 @@ from liex_lab.plan.study import VIRTUAL, PlannedSession, Study
 from liex_lab.sessions.corrections import DESCRIBED, START, read_log, with_description
 from liex_lab.sessions.failure import read_failure
 from liex_lab.sessions.provenance import SCHEMA_VERSION, package_version
+from liex_lab.sessions.verdict import LOOK_AT_IT, verdict_in
 
 _SAYS = {
     ".toml",
@@ -39,7 +40,7 @@ class SessionStatus:
     Attributes:
         session: the planned session.
         state: done, failed, new, begun, changed or excluded.
-        reason: why it is to be done, or was not.
+        reason: why it is to be done, was not, or is to be looked at although it is done.
         failure: of the last attempt, if it failed.
         described: what the study says otherwise of the animal than its results; then nothing else
             changed, and nothing is measured anew.
@@ -106,11 +107,14 @@ def standing(session: PlannedSession) -> SessionStatus:
             if not why:
                 said = _described_anew(session, document)
         except (OSError, ValueError, LiexError, AttributeError, TypeError):
+            document = {}
             why = "its session.json cannot be read"
         if said:
             told = ", ".join(f"{key} = {value or 'unknown'}" for key, value in said.items())
             why = f"described anew: {told}; nothing is measured again"
-        return SessionStatus(session, "changed" if why else "done", why, described=said)
+        if why:
+            return SessionStatus(session, "changed", why, described=said)
+        return SessionStatus(session, "done", to_look_at(verdict_in(document)))
     failure = read_failure(session.folder)
     if failure is not None:
         why = (
@@ -129,11 +133,23 @@ def standing(session: PlannedSession) -> SessionStatus:
     )
 
 
+def to_look_at(verdict: Mapping[str, Any]) -> str:
+    """Why someone has to look at a session that is done, '' where nobody has to.
+
+    Args:
+        verdict: as `sessions.verdict.read_verdict` gives it.
+    """
+    if not verdict["look_at_it"]:
+        return ""
+    accepted = ", accepted" if verdict["accepted"] else ""
+    return f"{LOOK_AT_IT}{accepted}: {'; '.join(map(str, verdict['reasons']))}"
+
+
 def _checks(session: PlannedSession, document: dict[str, Any]) -> Iterable[Callable[[], str]]:
     """Tests that say why a stored session is not the planned one, '' if it is; cheapest first."""
     return (
         lambda: _version_changed(document),
-        lambda: _plan_changed(session.plan, document.get("plan", {})),
+        lambda: plan_changed(session.plan, document.get("plan", {})),
         lambda: _model_changed(session.plan, document.get("model", {})),
         lambda: _input_changed(session, document.get("input", {})),
     )
@@ -152,9 +168,17 @@ def _version_changed(document: dict[str, Any]) -> str:
     )
 
 
-def _plan_changed(plan: Plan, stored: dict[str, Any]) -> str:
+def plan_changed(plan: Plan, stored: dict[str, Any]) -> str:
+    """What a plan says otherwise than the one that a session was measured by, '' if nothing.
+
+    Args:
+        plan: the plan of today.
+        stored: the plan in session.json.
+    """
     then = Plan.from_table(stored).model_dump()
     now = plan.model_dump()
+    if plan.recording.mirrored is None:  # then it is found, and stored as it was found
+        now["recording"]["mirrored"] = then["recording"]["mirrored"]
     differing = [
         f"{section}.{key} = {now[section][key]}"
         if isinstance(now[section], dict)
