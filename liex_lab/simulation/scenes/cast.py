@@ -34,6 +34,9 @@ _APART = 0.95  # of a spine, between the middles of two animals
 _TRIES = 60
 _TURN_RAD_S = 5.0
 _PAUSE_S = 0.8
+_DOOR_MM = 25.0
+_ARRIVED_MM = 6.0
+_ERRAND = 1.8  # spines a second on the way to a door
 
 
 @dataclass(frozen=True)
@@ -191,7 +194,7 @@ def calm_script(rng: np.random.Generator, n: int) -> tuple[NDArray[np.int64], Ar
 
 
 def visiting(door: Array, inside: Array, spans: tuple[tuple[float, float], ...]) -> Path:
-    """A path that wanders, and goes into a house for some stretches.
+    """A path that wanders from before a house, and goes into it for some stretches.
 
     Args:
         door: (2,) before the house, mm, arena frame.
@@ -209,30 +212,26 @@ def visiting(door: Array, inside: Array, spans: tuple[tuple[float, float], ...])
         position = np.empty((n, 2))
         heading = np.empty(n)
         goals = [free_spot(rng, scene, 0.8 * spine_mm) for _ in range(40)]
-        at = free_spot(rng, scene, 0.9 * spine_mm)
+        at = door + 0.6 * (door - inside)
         way = rng.uniform(-np.pi, np.pi)
-        hidden = False
+        passing = False  # through the door, one way or the other
         for i in range(n):
             wants = any(low <= i / n < high for low, high in spans)
-            goal = goals[(i // 45) % len(goals)]
-            if wants:
-                lined_up = hidden or np.linalg.norm(at - door) < 12.0
-                hidden = bool(lined_up)
-                goal = inside if lined_up else door
-            elif hidden:
-                hidden = bool(np.linalg.norm(at - door) > 14.0)
-                goal = door if hidden else goal
+            at_door = bool(np.linalg.norm(at - door) < _DOOR_MM)
+            passing = passing or at_door if wants else passing and not at_door
+            goal = inside if wants and passing else goals[(i // 45) % len(goals)]
+            if wants != passing:
+                goal = door
             gap = goal - at
-            near = np.linalg.norm(gap) < 4.0
-            if not near:
+            if np.linalg.norm(gap) > _ARRIVED_MM:
+                errand = wants or passing
                 ahead = np.arctan2(gap[1], gap[0])
-                turn = (ahead - way + np.pi) % (2 * np.pi) - np.pi
-                most = _TURN_RAD_S / _RATE_HZ
-                way += float(np.clip(turn, -most, most))
-                run = max(speed[i], 0.8 * spine_mm * (wants or hidden)) / _RATE_HZ
-                facing = max(float(np.cos(ahead - way)), 0.15)
+                most = (2.0 if errand else 1.0) * _TURN_RAD_S / _RATE_HZ
+                way += np.clip((ahead - way + np.pi) % (2 * np.pi) - np.pi, -most, most)
+                run = max(speed[i], _ERRAND * spine_mm * errand) / _RATE_HZ
+                facing = max(float(np.cos(ahead - way)), 0.1)
                 step = run * facing * np.array([np.cos(way), np.sin(way)])
-                if hidden or wants or scene.freedom(at + step) > 0.4 * spine_mm:
+                if errand or scene.freedom(at + step) > 0.4 * spine_mm:
                     at = at + step
             position[i] = at
             heading[i] = way

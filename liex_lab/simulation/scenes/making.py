@@ -33,6 +33,7 @@ Array = NDArray[np.float64]
 
 _EPOCHS = 64  # most still pictures of one recording
 _EPOCH_FRAMES = 12
+_COMMUTATOR_MM = np.array([80.0, 110.0, 300.0])  # from the middle of the arena
 _HAND_FRAMES = 16  # that a hand takes to put something in
 _WARM_UP = 0.35  # of the recording, in which a sensor's drift falls by a factor e
 
@@ -166,7 +167,7 @@ class Making:
         if recipe.fixture == "house":
             place, out = self._house(arenas[0])
             ahead = np.array([np.cos(out), np.sin(out)])
-            path = visiting(place + 105.0 * ahead, place - 6.0 * ahead, ((0.25, 0.5), (0.72, 0.9)))
+            path = visiting(place + 105.0 * ahead, place - 6.0 * ahead, ((0.1, 0.55), (0.72, 0.95)))
             script = calm_script
             still += places.house(arenas[0], place, out)
         animals = []
@@ -224,7 +225,8 @@ class Making:
         sides = worn.HEAD_STAGE_MM if self.recipe.worn == "head stage" else worn.PLUG_MM
         moving = [Moving(*worn.stage_on(mount, sides), animal.present)]
         if self.recipe.worn == "tether":
-            above = np.array([*(arena.centre + rng.normal(0.0, 30.0, 2)), 240.0])
+            spot = arena.centre + _COMMUTATOR_MM[:2] + rng.normal(0.0, 15.0, 2)
+            above = np.array([*spot, _COMMUTATOR_MM[2]])
             parts += worn.holder(above)
             cable = worn.tether(rng, mount, above, float(rng.uniform(3.0, 5.0)))
             moving.append(Moving(*cable, animal.present))

@@ -84,7 +84,7 @@ def tether(
     start = mount.translation + PLUG_MM[2] * mount.rotation[..., 2]
     span = commutator - start
     apart = np.linalg.norm(span, axis=-1)
-    length = float(apart.max()) * rng.uniform(1.03, 1.12)
+    length = float(apart.max()) * rng.uniform(1.03, 1.08)
     bow = 2.0 / np.pi * np.sqrt(apart * (length - apart))
     way = rng.uniform(-np.pi, np.pi) + np.cumsum(smoothed(rng.normal(0.0, 0.12, (n, 1)), 12.0))
     side = np.stack([np.cos(way), np.sin(way), np.full(n, -0.15)], axis=-1)
