@@ -16,11 +16,10 @@ from liex_lab.cli.options import (
     tell_numbers,
     tell_rows,
 )
+from liex_lab.cli.sections import group_of_verbs
 from liex_lab.runtime.progress import progress_bar
 
-evaluate = typer.Typer(
-    help="Measure the method; --json FILE keeps the numbers.", no_args_is_help=True
-)
+evaluate = group_of_verbs("Measure the method; --json FILE keeps the numbers.")
 
 
 @evaluate.command("pose")
