@@ -28,6 +28,7 @@ _KINDS: Final = (*_ANIMALS, "move", *_SEQUENCES, _SCENE)
 _SENSORS: Final = {"walk": ("kinect-v2", "primesense", "primesense-qvga"), "swim": ("raytrix-r5",)}
 _EXAMPLE = "synthetic:walk?seed=3&frames=300&sensor=kinect-v2&spine_mm=65"
 _MOST_FRAMES = 100_000  # an hour; the truth of every frame is held in memory
+_MOST_SCENE_FRAMES = 20_000  # cables and bedding are held in memory, too
 _SIZES = (0.5, 2.9)  # of the home length
 _BUILDS = ("other", "train")  # of animals in scenes: a build that no model was trained on, or one
 
@@ -111,6 +112,11 @@ def _open_scene(address: str, stated: dict[str, str]) -> Recording:
     plan, _ = SCENES[named]
     kind = next(kind for kind, animal in _ANIMALS.items() if animal == plan)
     settings = _settings(kind, Skeleton.load(plan).length)
+    settings["frames"] = (
+        int,
+        lambda n: 1 <= n <= _MOST_SCENE_FRAMES,
+        f"a whole number from 1 to {_MOST_SCENE_FRAMES}",
+    )
     if plan != "mouse":
         settings.pop("sensor", None)
     settings["build"] = (str, lambda build: build in _BUILDS, f"one of {', '.join(_BUILDS)}")

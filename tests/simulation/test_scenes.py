@@ -194,6 +194,7 @@ def test_a_scene_is_a_recording_by_its_address() -> None:
         ("synthetic:scene?name=raise", "nearest one is raised"),
         ("synthetic:scene?name=fish&sensor=kinect-v2", "sensor is no setting"),
         ("synthetic:scene?build=rat", "one of other, train"),
+        ("synthetic:scene?frames=30000", "from 1 to 20000"),
         (f"synthetic:scene?seed={SEALED_FROM}", "are kept for"),
     ],
 )

@@ -277,7 +277,8 @@ def keeping_apart(other: Array, spine_mm: float) -> Path:
             position, heading = free_path(rng, scene, own_mm, speed)
             gap = float(np.linalg.norm(position - other[: len(position)], axis=1).min())
             if gap > best_gap:
-                best, best_gap = (position, heading), gap
+                best = (position, heading)
+                best_gap = gap
             if gap > _APART * 0.5 * (spine_mm + own_mm):
                 break
         assert best is not None

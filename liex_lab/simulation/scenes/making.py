@@ -170,7 +170,7 @@ class Making:
             path = visiting(place + 105.0 * ahead, place - 6.0 * ahead, ((0.1, 0.55), (0.72, 0.95)))
             script = calm_script
             still += places.house(arenas[0], place, out)
-        animals = []
+        animals: list[Animal] = []
         for which in range(max(recipe.n_animals, recipe.n_arenas) if recipe.n_animals else 0):
             arena = arenas[which % len(arenas)]
             if which and recipe.n_arenas == 1:
@@ -204,10 +204,12 @@ class Making:
         """A hand that comes down to a place, lets go of or takes something, and leaves."""
         mesh = draw_thing(self._rng("object"), "hand", 65.0)
         mesh[:, 2] -= mesh[:, 2].min()
-        after = np.arange(self.n_frames) - change
-        height = 45.0 + 22.0 * np.abs(after)
-        vertices = mesh + np.column_stack([np.tile(spot, (self.n_frames, 1)), height])[:, None]
-        return Moving(vertices, THING_FACES, np.abs(after) < _HAND_FRAMES // 2)
+        reach = _HAND_FRAMES // 2
+        height = 45.0 + 22.0 * np.abs(np.arange(-reach, reach + 1))
+        vertices = mesh + np.column_stack([np.tile(spot, (len(height), 1)), height])[:, None]
+        moment = np.arange(self.n_frames) - change + reach
+        there = (moment >= 0) & (moment < len(height))
+        return Moving(vertices, THING_FACES, np.where(there, moment, -1))
 
     def _worn(
         self,
@@ -223,13 +225,13 @@ class Making:
         animal = animals[0]
         mount = worn.on_head(species.skeleton, animal.pose, animal.shape[0], animal.girth)
         sides = worn.HEAD_STAGE_MM if self.recipe.worn == "head stage" else worn.PLUG_MM
-        moving = [Moving(*worn.stage_on(mount, sides), animal.present)]
+        moving = [Moving.always(*worn.stage_on(mount, sides), animal.present)]
         if self.recipe.worn == "tether":
             spot = arena.centre + _COMMUTATOR_MM[:2] + rng.normal(0.0, 15.0, 2)
             above = np.array([*spot, _COMMUTATOR_MM[2]])
             parts += worn.holder(above)
             cable = worn.tether(rng, mount, above, float(rng.uniform(3.0, 5.0)))
-            moving.append(Moving(*cable, animal.present))
+            moving.append(Moving.always(*cable, animal.present))
         return moving
 
     def _stills(
@@ -258,9 +260,9 @@ class Making:
         T_camera_arena = arenas[0].T_arena_camera.inverse()
         changing = bool(beddings) or recipe.glossy
         n_epochs = -(-self.n_frames // self._epoch_frames) if changing else 1
-        base = render_still(
-            [*fixed, *(ground.mesh() for ground in grounds if not beddings)], camera, T_camera_arena
-        )
+        floors = [] if beddings else [ground.mesh() for ground in grounds]
+        base = render_still([*fixed, *floors], camera, T_camera_arena)
+        bare = render_still(floors, camera, T_camera_arena) == base
         stills = np.repeat(base[None], n_epochs, axis=0)
         for e, still in enumerate(stills):
             for bedding in beddings:
@@ -270,7 +272,7 @@ class Making:
                 nearer = (lain > 0) & ((still == 0) | (lain < still))
                 still[nearer] = lain[nearer]
             if recipe.glossy:
-                still[_reflections(self._rng("floor"), rng, camera, still.shape)] = 0.0
+                still[bare & _reflections(self._rng("floor"), rng, camera, still.shape)] = 0.0
         epoch = (
             np.arange(self.n_frames) // self._epoch_frames
             if changing
@@ -301,7 +303,8 @@ def _reflections(
         for r in same.uniform(5.0, 16.0, 7)
     ]
     for at_u, at_v, radius in spots:
-        wide, way = same.uniform(0.8, 2.2), same.uniform(-np.pi, np.pi)
+        wide = same.uniform(0.8, 2.2)
+        way = same.uniform(-np.pi, np.pi)
         x, y = (turned(np.stack([u - at_u, v - at_v], axis=-1), way) / radius).transpose(2, 0, 1)
         strength = np.maximum(strength, 1.0 - np.hypot(x / wide, y * wide))
     rough = own.normal(0.0, 1.0, (shape[0] // 4 + 1, shape[1] // 4 + 1))

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,14 +51,25 @@ class Moving:
     """Something other than an animal that moves: worn, put in, or held in a hand.
 
     Attributes:
-        vertices: (n, V, 3) mm, arena frame.
+        vertices: (m, V, 3) mm, arena frame, at m moments.
         faces: (F, 3) int32.
-        shown: (n,) bool, when it is there.
+        moment: (n,) int64, which of them each frame shows; -1 where it is not there.
     """
 
     vertices: Array
     faces: NDArray[np.int32]
-    shown: NDArray[np.bool_]
+    moment: NDArray[np.int64]
+
+    @staticmethod
+    def always(vertices: Array, faces: NDArray[np.int32], shown: NDArray[np.bool_]) -> Moving:
+        """Something with a moment of its own in every frame.
+
+        Args:
+            vertices: (n, V, 3) mm, arena frame.
+            faces: (F, 3) int32.
+            shown: (n,) bool, when it is there.
+        """
+        return Moving(vertices, faces, np.where(shown, np.arange(len(shown)), -1))
 
     @staticmethod
     def fixed(mesh: Mesh, shown: NDArray[np.bool_]) -> Moving:
@@ -67,9 +79,19 @@ class Moving:
             mesh: it.
             shown: (n,) bool, when it is there.
         """
-        return Moving(
-            np.broadcast_to(mesh.vertices, (len(shown), *mesh.vertices.shape)), mesh.faces, shown
-        )
+        return Moving(mesh.vertices[None], mesh.faces, np.where(shown, 0, -1))
+
+    def placed(self, part: slice) -> Array:
+        """Its vertices in some frames.
+
+        Args:
+            part: which frames.
+
+        Returns:
+            (k, V, 3) mm, arena frame; where it is not there, far behind the camera.
+        """
+        moment = self.moment[part]
+        return self.vertices[moment] + (moment < 0)[:, None, None] * AWAY
 
 
 @dataclass(frozen=True)
@@ -106,11 +128,14 @@ class TrueScene(TrueRecording):
 
     Attributes:
         scene: name of the scene.
-        animals: the truth, animal by animal; () where none is ever there.
     """
 
     scene: str
-    animals: tuple[TrueAnimal, ...]
+
+    @cached_property
+    def animals(self) -> tuple[TrueAnimal, ...]:
+        """The truth, animal by animal; () where none is ever there."""
+        raise NotImplementedError
 
 
 class OneAnimal(TrueScene):
@@ -144,7 +169,11 @@ class OneAnimal(TrueScene):
         across = np.array([-1.0 if mirrored else 1.0, 1.0, 1.0])
         self.joints_camera = filmed.joints_camera * across
         self.joints_arena = self.T_arena_camera @ self.joints_camera
-        self.animals = (TrueAnimal(self.spine_mm, self.joints_camera, np.ones(len(self))),)
+
+    @cached_property
+    def animals(self) -> tuple[TrueAnimal, ...]:
+        """The truth of the one animal."""
+        return (TrueAnimal(self.spine_mm, self.joints_camera, np.ones(len(self))),)
 
     def depths(self, start: int, stop: int) -> NDArray[np.float32]:
         """Depth pictures of a range of frames, made on all threads.
@@ -190,7 +219,6 @@ class SceneRecording(TrueScene):
             float(self.T_arena_camera.translation[2]),
             stage.camera,
         )
-        self.animals = tuple(self._truth(animal) for animal in stage.animals)
         if stage.animals:
             first = stage.animals[0]
             self.spine_mm = first.spine_mm
@@ -200,6 +228,11 @@ class SceneRecording(TrueScene):
             self.pose = Pose.home(self.skeleton, n)
         self.joints_camera = self.pose.joints(self.skeleton)
         self.joints_arena = self.T_arena_camera @ self.joints_camera
+
+    @cached_property
+    def animals(self) -> tuple[TrueAnimal, ...]:
+        """The truth, animal by animal, worked out when it is asked for; () where there is none."""
+        return tuple(self._truth(animal) for animal in self.stage.animals)
 
     def _truth(self, animal: Animal) -> TrueAnimal:
         joints = self.T_arena_camera.inverse() @ animal.pose.joints(self.skeleton)
@@ -223,10 +256,10 @@ class SceneRecording(TrueScene):
             own = whole[top : top + c.height, left : left + c.width]
             before = [
                 render_mesh(
-                    thing.vertices[i], thing.faces, stage.camera, T_camera_mesh=T_camera_arena
+                    thing.placed(part)[0], thing.faces, stage.camera, T_camera_mesh=T_camera_arena
                 )
                 for thing in stage.moving
-                if thing.shown[i]
+                if thing.moment[i] >= 0
             ]
             before += [
                 render_mesh(
@@ -273,7 +306,9 @@ class SceneRecording(TrueScene):
         animals, faces = _together(
             n, [(a.vertices(self.surface, part), self.surface.faces) for a in stage.animals]
         )
-        things, thing_faces = _together(n, [_seen(thing, part) for thing in stage.moving])
+        things, thing_faces = _together(
+            n, [(thing.placed(part), thing.faces) for thing in stage.moving]
+        )
         out = np.empty((n, c.height, c.width), np.uint16)
         T_camera_arena = self.T_arena_camera.inverse()
         render_kernels.frames_parallel(
@@ -297,12 +332,6 @@ class SceneRecording(TrueScene):
             shifted = np.round(depth + offset[:, None, None].astype(np.float32))
             depth = np.where(depth > 0, shifted, 0.0).astype(np.float32)
         return depth
-
-
-def _seen(thing: Moving, part: slice) -> tuple[Array, NDArray[np.int32]]:
-    """A thing's vertices in some frames, far behind the camera where it is not there."""
-    gone = ~thing.shown[part]
-    return thing.vertices[part] + gone[:, None, None] * AWAY, thing.faces
 
 
 def _together(
