@@ -13,6 +13,7 @@ from liex_lab.simulation.scenes.meshes import box, joined, render_still
 from liex_lab.simulation.scenes.places import look_down
 from liex_lab.simulation.scenes.recording import SceneRecording, TrueScene
 from liex_lab.simulation.sensors import KINECT_V2_SENSOR, PRIMESENSE_QVGA_SENSOR
+from liex_lab.simulation.training_patches import BLOCK, PER_SESSION, training_windows
 
 SEED = 41
 N = 12
@@ -175,6 +176,21 @@ def test_a_still_picture_shows_the_nearest_thing() -> None:
     depth = render_still([joined([floor, block])], camera, T.inverse())
     assert depth[119, 159] == pytest.approx(550.0)
     assert depth[10, 10] == pytest.approx(600.0)
+
+
+# training
+
+
+def test_mice_of_training_patches_wear_things_only_where_asked() -> None:
+    bare, worn = (training_windows(17, BLOCK, worn_share=share) for share in (0.0, 0.6))
+    np.testing.assert_array_equal(bare.depth, training_windows(17, BLOCK).depth)
+    np.testing.assert_array_equal(bare.joints_mm, worn.joints_mm)
+    np.testing.assert_array_equal(bare.background, worn.background)
+    nearer = (bare.depth.astype(int) - worn.depth > 12) & (worn.depth > 0)
+    wears = nearer.sum(axis=(1, 2)) > 3
+    by_mouse = wears.reshape(-1, PER_SESSION).mean(axis=1)
+    assert ((by_mouse < 0.3) | (by_mouse > 0.7)).mean() > 0.9, "it is worn in all frames"
+    assert 0.4 < (by_mouse > 0.5).mean() < 0.8
 
 
 # addresses

@@ -150,12 +150,12 @@ def wall(outline: Array, low: float, high: float, thick: float, slope: float = 0
     return Mesh(vertices, np.concatenate(faces).astype(np.int32))
 
 
-def cables(curves: Array, radius: float) -> tuple[Array, NDArray[np.int32]]:
+def cables(curves: Array, radius: Array | float) -> tuple[Array, NDArray[np.int32]]:
     """Tubes along curves, one a frame.
 
     Args:
         curves: (n, R, 3) mm, their midlines.
-        radius: mm.
+        radius: mm, one or (n,).
 
     Returns:
         Vertices (n, V, 3) mm and the faces (F, 3) int32 that they share.
@@ -168,7 +168,8 @@ def cables(curves: Array, radius: float) -> tuple[Array, NDArray[np.int32]]:
     other = np.cross(along, side)
     phi = 2 * np.pi * np.arange(CABLE_SEGMENTS) / CABLE_SEGMENTS
     around = np.cos(phi)[:, None] * side[:, :, None] + np.sin(phi)[:, None] * other[:, :, None]
-    skin = (curves[:, :, None] + radius * around).reshape(n, -1, 3)
+    thick = np.asarray(radius)[..., None, None, None]
+    skin = (curves[:, :, None] + thick * around).reshape(n, -1, 3)
     vertices = np.concatenate([curves[:, :1], skin, curves[:, -1:]], axis=1)
     return vertices, tube_faces(rings, CABLE_SEGMENTS)
 

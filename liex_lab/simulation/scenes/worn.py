@@ -33,7 +33,7 @@ def on_head(skeleton: Skeleton, pose: Pose, shape: BodyShape, girth: Array) -> S
     Args:
         skeleton: of the animal, a chain.
         pose: (n) arena frame.
-        shape: its body.
+        shape: its body, or n bodies.
         girth: (n,) factor of all lengths across the body.
 
     Returns:
@@ -41,7 +41,9 @@ def on_head(skeleton: Skeleton, pose: Pose, shape: BodyShape, girth: Array) -> S
     """
     frames = pose.frames(skeleton)
     stations = np.asarray(skeleton.surface["stations"], float)
-    thick = float(np.interp(_AT_STATION, stations, np.asarray(shape.half_height)))
+    k = int(np.searchsorted(stations, _AT_STATION)) - 1
+    share = (_AT_STATION - stations[k]) / (stations[k + 1] - stations[k])
+    thick = (1.0 - share) * shape.half_height[..., k] + share * shape.half_height[..., k + 1]
     reach = np.linalg.norm(skeleton.offsets[1:], axis=1)
     ahead = (_AT_STATION * reach.sum() - reach[: _NECK + 1].sum()) * pose.scale
     local = np.stack([ahead, np.zeros_like(ahead), thick * girth], axis=-1)
@@ -81,19 +83,76 @@ def tether(
         Vertices (n, V, 3) mm, arena frame, and faces (F, 3).
     """
     n = len(mount.translation)
+    way = rng.uniform(-np.pi, np.pi) + np.cumsum(smoothed(rng.normal(0.0, 0.12, (n, 1)), 12.0))
+    longest = float(np.linalg.norm(commutator - mount.translation, axis=-1).max())
+    length = np.full(n, longest * rng.uniform(1.03, 1.08))
+    return cables(_hanging(mount, commutator, length, way), 0.5 * thick_mm)
+
+
+def _hanging(mount: SE3, commutator: Array, length: Array, way: Array) -> Array:
+    """Midlines (n, R, 3) mm of cables that bow towards `way` (n,) rad; `length` (n,) mm."""
     start = mount.translation + PLUG_MM[2] * mount.rotation[..., 2]
     span = commutator - start
     apart = np.linalg.norm(span, axis=-1)
-    length = float(apart.max()) * rng.uniform(1.03, 1.08)
-    bow = 2.0 / np.pi * np.sqrt(apart * (length - apart))
-    way = rng.uniform(-np.pi, np.pi) + np.cumsum(smoothed(rng.normal(0.0, 0.12, (n, 1)), 12.0))
-    side = np.stack([np.cos(way), np.sin(way), np.full(n, -0.15)], axis=-1)
+    bow = 2.0 / np.pi * np.sqrt(apart * np.maximum(length - apart, 0.0))
+    side = np.stack([np.cos(way), np.sin(way), np.full(len(way), -0.15)], axis=-1)
     s = np.linspace(0.0, 1.0, _RINGS)[:, None]
     straight = start[:, None] + s * span[:, None]
     swing = (bow[:, None] * side)[:, None] * np.sin(np.pi * s)
     # stiff where it leaves the plug: it goes up from the head before it bends over
     stiff = (25.0 * mount.rotation[..., 2])[:, None] * (s * np.exp(-((s / 0.12) ** 2)) / 0.06)
-    return cables(straight + swing + stiff, 0.5 * thick_mm)
+    return np.asarray(straight + swing + stiff)
+
+
+def draw_worn(
+    rng: np.random.Generator,
+    skeleton: Skeleton,
+    pose: Pose,
+    shape: BodyShape,
+    girth: Array,
+    share: float,
+    per_session: int,
+) -> tuple[Array, NDArray[np.int32], NDArray[np.bool_]]:
+    """Head stages and cables of animals in independent postures, for training pictures.
+
+    Half of the animals that wear anything wear a head stage of 6 to 14 mm a side, the others a plug
+    and a cable of 2 to 5 mm to a commutator of their own.
+
+    Args:
+        rng: source of randomness.
+        skeleton: of the animals, a chain.
+        pose: (n) arena frame.
+        shape: (n) their bodies.
+        girth: (n,) factors of all lengths across the bodies.
+        share: of the animals that wear something.
+        per_session: consecutive postures that are of one animal.
+
+    Returns:
+        Vertices (n, V, 3) mm, arena frame, faces (F, 3), and which postures wear them (n,).
+    """
+    n = len(girth)
+    each = np.arange(n) // per_session
+    m = int(each[-1]) + 1
+    wears = rng.random(m) < share
+    tethered = rng.random(m) < 0.5
+    blocks = rng.uniform([7.0, 6.0, 7.0], [14.0, 10.0, 14.0], (m, 3))
+    sides = np.where(tethered[:, None], np.array(PLUG_MM), blocks)[each]
+    mount = on_head(skeleton, pose, shape, girth)
+    block = box([0.0, 0.0, 0.0], [0.5, 0.5, 0.5])
+    local = block.vertices * sides[:, None]
+    local[..., 2] += 0.5 * sides[:, None, 2] - 1.0
+    stage = np.einsum("nij,nvj->nvi", mount.rotation, local) + mount.translation[:, None]
+    away = rng.uniform(0.0, 160.0, m)[each]
+    towards = rng.uniform(-np.pi, np.pi, n)
+    high = rng.uniform(180.0, 320.0, m)[each]
+    above = np.stack([away * np.cos(towards), away * np.sin(towards), high], axis=-1)
+    commutator = mount.translation + above
+    length = np.linalg.norm(above, axis=-1) * rng.uniform(1.0, 1.15, n)
+    curves = _hanging(mount, commutator, length, rng.uniform(-np.pi, np.pi, n))
+    cable, faces = cables(curves, 0.5 * rng.uniform(2.0, 5.0, m)[each])
+    cable = np.where(tethered[each][:, None, None], cable, stage[:, :1])  # one point draws nothing
+    joined_faces = np.concatenate([block.faces, faces + np.int32(len(block.vertices))])
+    return np.concatenate([stage, cable], axis=1), joined_faces.astype(np.int32), wears[each]
 
 
 def holder(commutator: Array) -> list[Mesh]:
