@@ -313,17 +313,13 @@ class SceneRecording(TrueScene):
         T_camera_arena = self.T_arena_camera.inverse()
         render_kernels.frames_parallel(
             stage.stills[epoch],
-            animals,
-            faces,
-            things,
-            thing_faces,
-            np.ones(n, np.bool_),
+            render_kernels.Meshes(animals, faces, things, thing_faces, np.ones(n, np.bool_)),
             np.ascontiguousarray(T_camera_arena.rotation),
             T_camera_arena.translation,
             np.array([c.fx, c.fy, c.cx, c.cy]),
-            np.tile(stage.parameters, (n, 1)),
-            stage.seeds[part],
-            NORMAL,
+            render_kernels.SensorNoise(
+                np.tile(stage.parameters, (n, 1)), stage.seeds[part], NORMAL
+            ),
             out,
         )
         depth = out * np.float32(stage.parameters[UNIT])
