@@ -20,7 +20,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.body.pose import Pose
+from liex_lab.body.shape import BodyShape
 from liex_lab.body.surface import Body, Surface
+from liex_lab.errors import LiexError
 from liex_lab.geometry import SE3
 from liex_lab.runtime.threads import threads
 from liex_lab.simulation import _render_kernels as render_kernels
@@ -378,6 +380,11 @@ def _draw_block(
     )
     thing_faces = PART_FACES
     if wearing[1] > 0.0:
+        if not isinstance(views.shape, BodyShape):
+            raise LiexError(
+                f"head stages and cables stand on a tubular body, which a {skeleton.name} has not; "
+                "leave out worn_share"
+            )
         worn = draw_worn(wearing[0], skeleton, pose, views.shape, girth, wearing[1], PER_SESSION)
         thing, thing_faces, has_thing = _with_worn(thing, has_thing, *worn)
     walls = _draw_walls(rng, trunk, species.setting)
