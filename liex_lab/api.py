@@ -433,6 +433,47 @@ def evaluate_tracking(
     return measure(animal, sequence, model=model, n_frames=n_frames, draw=draw, progress=progress)
 
 
+def evaluate_scenes(
+    only: Sequence[str] = (),
+    *,
+    n_frames: int = 300,
+    n_recordings: int = 1,
+    sealed: bool = False,
+    pictures: Path | None = None,
+    progress: Progress = silent,
+) -> dict[str, Any]:
+    """Measure rendered scenes as a lab's camera would see them, and score the tables.
+
+    Args:
+        only: names of scenes; () takes all.
+        n_frames: length of each recording.
+        n_recordings: of each scene, each of another animal.
+        sealed: measure on the seeds that are not for development.
+        pictures: the folder for drawn frames, one PNG a scene; None draws none.
+        progress: told how far the work is.
+
+    Returns:
+        Table of numbers: `rows` of figures by name, and the protocol as text.
+
+    Raises:
+        LiexError: there is no such scene.
+    """
+    from functools import partial
+
+    from liex_lab.dashboards.paper.scenes import draw_scene
+    from liex_lab.pipelines.evaluation.scenes import evaluate_scenes as measure
+
+    draw = None if pictures is None else partial(draw_scene, folder=pictures)
+    return measure(
+        only,
+        n_frames=n_frames,
+        n_recordings=n_recordings,
+        sealed=sealed,
+        draw=draw,
+        progress=progress,
+    )
+
+
 def evaluate_actions(
     animal: str = "fish",
     *,

@@ -82,6 +82,23 @@ def tell_numbers(result: dict[str, Any], json_file: Path | None) -> None:
     Console().print(table)
 
 
+def tell_rows(rows: dict[str, dict[str, Any]]) -> None:
+    """Rows of figures by name as a Markdown table on the screen, one line a row."""
+    columns = [*dict.fromkeys(name for row in rows.values() for name in row)]
+    lines = [["", *(name.replace("_", " ") for name in columns)], ["---"] * (len(columns) + 1)]
+    lines += [[name, *(_cell(row.get(column)) for column in columns)] for name, row in rows.items()]
+    for line in lines:
+        typer.echo(f"| {' | '.join(line)} |")
+
+
+def _cell(value: Any) -> str:
+    if value is None:
+        return "–"
+    if isinstance(value, list):
+        return "; ".join(value)
+    return f"{value:.3g}" if isinstance(value, float) else str(value)
+
+
 def keep_numbers(result: dict[str, Any], json_file: Path) -> None:
     """Write the numbers as JSON."""
     json_file.parent.mkdir(parents=True, exist_ok=True)

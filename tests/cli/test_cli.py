@@ -26,7 +26,7 @@ from liex_lab.plan import Plan
 from liex_lab.sessions.verdict import Verdict
 
 VERBS = ["demo", "run", "doctor", "convert", "train", "evaluate", "live", "correct", "show", "info"]
-MEASURES = ["pose", "speed", "sizes", "tables", "reference", "tracking"]
+MEASURES = ["pose", "speed", "sizes", "tables", "reference", "tracking", "scenes"]
 
 
 def liex(
@@ -275,6 +275,28 @@ def test_evaluate_pose_writes_its_numbers(monkeypatch: pytest.MonkeyPatch, tmp_p
     assert seen == ["mouse", "hard", "paper", {"model": None, "n_frames": 50, "spine_mm": 65.0}]
     assert json.loads(file.read_text())["curve"] == [0, 1]
     assert "mean over joints [mm]" in result.output, "brackets are text, not markup"
+
+
+def test_evaluate_scenes_tells_one_line_a_scene(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    seen: list[Any] = []
+
+    def evaluate_scenes(only: list[str], **options: Any) -> dict[str, Any]:
+        options.pop("progress")(0, 1, "scene plain")
+        seen.extend([only, options])
+        row = {"found": 0.98765, "hidden_right": None, "said": ["look here", "and here"]}
+        return {"rows": {"plain": row}, "protocol": "found: share"}
+
+    job(monkeypatch, "evaluation.scenes", evaluate_scenes=evaluate_scenes)
+    file = tmp_path / "scenes.json"
+    words = ["--only", "plain, raised", "--frames", "60", "--json", str(file)]
+    result = CliRunner().invoke(cli.app, ["evaluate", "scenes", *words])
+    assert result.exit_code == 0, result.output
+    assert seen[0] == ["plain", "raised"]
+    assert seen[1] == {"n_frames": 60, "n_recordings": 1, "sealed": False, "draw": None}
+    assert "| plain | 0.988 | – | look here; and here |" in result.output
+    assert json.loads(file.read_text())["rows"]["plain"]["hidden_right"] is None
 
 
 def test_the_other_measures_reach_their_jobs(
