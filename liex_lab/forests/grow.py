@@ -56,6 +56,8 @@ class GrowthPlan:
             it.
         bag_share: share of the images that a tree sees, drawn without replacement, all samples of
             an image together (1: every tree sees all).
+        max_leaf: most samples of a leaf above the deepest level: a node with more is split by
+            whatever test separates it; 0 states no such number.
     """
 
     n_trees: int
@@ -66,6 +68,12 @@ class GrowthPlan:
     scalar_share: float
     depth_share: float
     bag_share: float
+    max_leaf: int = 0
+
+    @property
+    def least_to_split(self) -> int:
+        """Fewest samples of a node that is split."""
+        return max(2 * self.min_leaf, self.max_leaf + 1)
 
 
 def grow_forest(
@@ -117,6 +125,7 @@ def grow_forest(
         seeds,
         plan.max_depth,
         plan.min_leaf,
+        plan.least_to_split,
         plan.n_tests,
         plan.one_probe_share,
         plan.scalar_share,
@@ -181,6 +190,7 @@ def _grow_all(
     seeds,
     max_depth,
     min_leaf,
+    least_to_split,
     n_tests,
     one_probe_share,
     scalar_share,
@@ -202,6 +212,7 @@ def _grow_all(
             seeds[t],
             max_depth,
             min_leaf,
+            least_to_split,
             n_tests,
             one_probe_share,
             scalar_share,
@@ -397,6 +408,7 @@ def _grow_tree(
     seed,
     max_depth,
     min_leaf,
+    least_to_split,
     n_tests,
     one_probe_share,
     scalar_share,
@@ -433,7 +445,7 @@ def _grow_tree(
         here = members[first:stop]
         middle = 0
         if (
-            here.size >= 2 * min_leaf
+            here.size >= least_to_split
             and depth < max_depth
             and _find_split(
                 heights,
