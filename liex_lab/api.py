@@ -37,7 +37,7 @@ def run_session(
     overwrite: bool = False,
     notes: Mapping[str, Any] | None = None,
     workers: int = 1,
-    crew: WorkerPool | None = None,
+    pool: WorkerPool | None = None,
     progress: Progress = silent,
 ) -> Path:
     """Measure every frame of a depth recording and write a session folder; returns its path.
@@ -56,7 +56,7 @@ def run_session(
         notes: further facts for session.json, see `SessionWriter.note`.
         workers: processes that look at shards of a long recording side by side; the tables are the
             same for any number of them.
-        crew: a worker pool of the caller's own instead of `workers` processes of this machine.
+        pool: a worker pool of the caller's own instead of `workers` processes of this machine.
         progress: told how far the work is.
 
     Returns:
@@ -72,8 +72,8 @@ def run_session(
     from liex_lab.pipelines.workers import Processes
 
     plan = plan or Plan.load("mouse")
-    if workers > 1 and crew is None:
-        crew = Processes(workers)
+    if workers > 1 and pool is None:
+        pool = Processes(workers)
     with telling_of_compiling(progress) as progress:
         return measure_session(
             recording,
@@ -84,7 +84,7 @@ def run_session(
             notes=notes,
             blueprint=replay_blueprint,
             report=write_views,
-            crew=crew,
+            pool=pool,
             progress=progress,
         )
 

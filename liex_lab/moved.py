@@ -91,6 +91,7 @@ MOVED = {
     "liex_lab.recordings.writing": "liex_lab.recordings.writer",
     "liex_lab.recordings.zones": "liex_lab.arena.zones",
     "liex_lab.sessions.rows": "liex_lab.tables.rows",
+    "liex_lab.sessions.stretches": "liex_lab.sessions.shards",
     "liex_lab.sessions.tables": "liex_lab.tables.schema",
     "liex_lab.study": "liex_lab.plan.study",
     "liex_lab.threads": "liex_lab.runtime.threads",

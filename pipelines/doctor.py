@@ -101,9 +101,9 @@ def examine(
         stride = stride_for(seen, plan.animal.spine_min_mm)
         sample = sample_frames(seen, _N_SAMPLED, stride)
         depth = _Depths(sample if seen is opened else sample_frames(opened, _N_RAW))
-        look = SceneLook(seen, plan, water, sample, stride)
+        scene = SceneLook(seen, plan, water, sample, stride)
         if depth.median_mm is not None:
-            look.at_scene()
+            scene.at_scene()
         lens = opened.camera
         found = {
             **_time_facts(opened),
@@ -113,12 +113,12 @@ def examine(
             "distortion": None if lens.distortion is None else lens.distortion.to_dict(),
             "water": None if water is None else water.to_dict(),
             **depth.facts(),
-            **look.facts,
+            **scene.facts,
             "problems": [
                 *seen.problems,
                 *_time_problems(opened),
                 *depth.problems(),
-                *look.problems,
+                *scene.problems,
             ],
         }
     return {key: found[key] for key in FINDINGS}

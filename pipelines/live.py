@@ -101,9 +101,9 @@ def follow_live(
     keeping_up = False
     for some in _together(_chained(held, frames)):
         keeping_up = keeping_up or some[0].at_s >= worked_until
-        told = tracker.observe([arrival.frame for arrival in some])
+        estimates = tracker.observe([arrival.frame for arrival in some])
         for k, arrival in enumerate(some):
-            seen.append(told[k : k + 1])
+            seen.append(estimates[k : k + 1])
             row: Track | None = online.add(seen[-1])
             if view is not None and row is not None:
                 view.show(arrival.frame, row)

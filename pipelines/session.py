@@ -31,7 +31,7 @@ from .build import (
     build_surroundings,
     build_tracker,
 )
-from .shards import CHUNK, LENGTH, MEASURING, Shard, look_side_by_side
+from .shards import CHUNK, LENGTH, MEASURING, Shard, measure_shards
 from .workers import WorkerPool
 
 if TYPE_CHECKING:
@@ -58,7 +58,7 @@ def measure_session(
     notes: Mapping[str, Any] | None = None,
     blueprint: BlueprintMaker | None = None,
     report: ReportMaker | None = None,
-    crew: WorkerPool | None = None,
+    pool: WorkerPool | None = None,
     progress: Progress = silent,
 ) -> Path:
     """Measure every frame of a recording and write the session folder.
@@ -76,7 +76,7 @@ def measure_session(
         notes: what session.json is to hold besides, see `SessionWriter.note`.
         blueprint: makes the layout of the replay, see `SessionWriter`.
         report: makes the report in the folder, see `SessionWriter`.
-        crew: pool of workers for the shards of a long recording.
+        pool: pool of workers for the shards of a long recording.
         progress: told frame by frame.
 
     Returns:
@@ -110,9 +110,9 @@ def measure_session(
         hash_once(opened, part_folder(folder), progress)
         provenance = build_provenance(opened, plan, tracker, progress)
         timings = {"prepare": time.perf_counter() - started, "track": 0.0}
-        if crew is not None and isinstance(recording, str | Path) and len(opened) > 2 * LENGTH:
+        if pool is not None and isinstance(recording, str | Path) and len(opened) > 2 * LENGTH:
             whole = Shard(str(recording), plan, tracker, provenance, folder, 0, len(opened))
-            look_side_by_side(crew, whole, folder, progress)
+            measure_shards(pool, whole, folder, progress)
         with SessionWriter(
             folder, provenance, overwrite=overwrite, blueprint=blueprint, report=report
         ) as writer:

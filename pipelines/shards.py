@@ -62,24 +62,24 @@ class Shard:
         vars(self).update({**state, "tracker": tracker})
 
 
-def look_at(stretch: Shard) -> Shard:
+def measure_shard(shard: Shard) -> Shard:
     """Measure a shard and write it: the task of a worker. Done twice it does the same.
 
     Args:
-        stretch: the span of frames.
+        shard: the span of frames.
 
     Returns:
         The same shard, when its folder is whole.
     """
-    from liex_lab.sessions.stretches import StretchWriter
+    from liex_lab.sessions.shards import ShardWriter
 
-    opened = _opened(stretch.recording, stretch.plan.to_toml(), stretch.origin.input_sha256)
-    first_ns = int(opened.times_ns[0]) if stretch.start else None
-    with StretchWriter(stretch.folder, stretch.origin, first_ns) as writer:
-        for start in range(stretch.start, stretch.stop, CHUNK):
-            frames = [opened.frame(row) for row in range(start, min(start + CHUNK, stretch.stop))]
-            writer.add(frames, stretch.tracker.observe(frames))
-    return stretch
+    opened = _opened(shard.recording, shard.plan.to_toml(), shard.origin.input_sha256)
+    first_ns = int(opened.times_ns[0]) if shard.start else None
+    with ShardWriter(shard.folder, shard.origin, first_ns) as writer:
+        for start in range(shard.start, shard.stop, CHUNK):
+            frames = [opened.frame(row) for row in range(start, min(start + CHUNK, shard.stop))]
+            writer.add(frames, shard.tracker.observe(frames))
+    return shard
 
 
 @lru_cache(maxsize=1)
@@ -88,14 +88,14 @@ def _opened(recording: str, plan_toml: str, input_sha256: str) -> Recording:
     return build_recording(recording, Plan.from_toml(plan_toml))
 
 
-def look_side_by_side(crew: WorkerPool, whole: Shard, path: Path, progress: Progress) -> None:
+def measure_shards(pool: WorkerPool, whole: Shard, path: Path, progress: Progress) -> None:
     """Measure all frames of a recording that its unfinished session does not have yet.
 
     Afterwards the session goes on as one that was interrupted after its last frame. Whatever
     happens, shards that are whole are kept.
 
     Args:
-        crew: the pool of workers.
+        pool: the pool of workers.
         whole: the recording as one shard; its folder does not matter.
         path: the session folder that is to be; what is unfinished lies beside it.
         progress: told shard by shard.
@@ -103,7 +103,7 @@ def look_side_by_side(crew: WorkerPool, whole: Shard, path: Path, progress: Prog
     Raises:
         SessionError: a worker ended without a word, or another process writes the session.
     """
-    from liex_lab.sessions.stretches import is_whole, stretch_folder, take_over
+    from liex_lab.sessions.shards import is_whole, shard_folder, take_over
     from liex_lab.sessions.writer import unfinished
 
     held = unfinished(path, whole.origin)
@@ -112,14 +112,14 @@ def look_side_by_side(crew: WorkerPool, whole: Shard, path: Path, progress: Prog
         began = time.monotonic()
         done = held.state.n_frames
         planned = [
-            replace(whole, start=start, stop=stop, folder=stretch_folder(held.folder, start, stop))
+            replace(whole, start=start, stop=stop, folder=shard_folder(held.folder, start, stop))
             for start, stop in _cuts(done, whole.stop)
         ]
         waiting = list(planned)
         n_looked_at = whole.stop - done
-        there = [stretch for stretch in planned if is_whole(stretch.folder)]
-        for stretch in _all_of(there, crew, [one for one in planned if one not in there]):
-            n_looked_at -= stretch.stop - stretch.start
+        there = [shard for shard in planned if is_whole(shard.folder)]
+        for shard in _all_of(there, pool, [one for one in planned if one not in there]):
+            n_looked_at -= shard.stop - shard.start
             while waiting and is_whole(waiting[0].folder):
                 one = waiting.pop(0)
                 seconds = held.seconds_before + time.monotonic() - began
@@ -129,10 +129,10 @@ def look_side_by_side(crew: WorkerPool, whole: Shard, path: Path, progress: Prog
         held.leave(keep=True)
 
 
-def _all_of(there: list[Shard], crew: WorkerPool, others: list[Shard]) -> Iterator[Shard]:
+def _all_of(there: list[Shard], pool: WorkerPool, others: list[Shard]) -> Iterator[Shard]:
     """Shards that are there already, and then the others as workers finish them."""
     yield from there
-    yield from crew.each(look_at, others)
+    yield from pool.each(measure_shard, others)
 
 
 def _cuts(first: int, stop: int) -> Iterator[tuple[int, int]]:

@@ -52,7 +52,7 @@ def channel_names(skeleton: Skeleton) -> list[str]:
             heights only of animals that stand on the floor.
 
     Returns:
-        C names, the columns of `stretches_of`'s values.
+        C names, the columns of `segments_of`'s values.
     """
     pitches = [f"pitch_{k}" for k in range(_GROUPS)] if skeleton.axes[1:, 1].any() else []
     floor = (
@@ -79,7 +79,7 @@ def channel_names(skeleton: Skeleton) -> list[str]:
     ]
 
 
-def stretches_of(
+def segments_of(
     track: Track, rate_hz: float, wall_mm: Array | None = None, allocate: Allocator = np.empty
 ) -> list[Segment]:
     """The channels of a track, one unbroken segment after the other.

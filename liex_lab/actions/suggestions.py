@@ -18,7 +18,7 @@ Array = NDArray[np.float64]
 _STEP = 0.5  # of a window: how far apart windows begin
 
 
-def doubtful_stretches(
+def doubtful_segments(
     found: Recognised, times_ns: NDArray[np.int64], n: int, least_s: float
 ) -> list[dict[str, Any]]:
     """The least certain segments, the first of every pair of confused words before any second.

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from liex_lab.actions.channels import Segment, channel_names, stretches_of
+from liex_lab.actions.channels import Segment, channel_names, segments_of
 from liex_lab.actions.ethogram import UNLABELLED, Ethogram, frame_stops, runs_of
 from liex_lab.actions.labels import LabelledTrack
 from liex_lab.actions.semi_markov import SemiMarkovModel
@@ -84,14 +84,14 @@ class TimelineModel:
     card: dict[str, Any] = field(default_factory=dict)
 
     def log_probabilities(
-        self, stretch: Segment, names: Sequence[str], speed: Array
+        self, segment: Segment, names: Sequence[str], speed: Array
     ) -> Iterator[tuple[slice, Array]]:
         """The log probability of each word at each tick by itself, piece by piece.
 
         Words whose speeds do not fit lose 6 nats.
 
         Args:
-            stretch: channels of an unbroken segment of m ticks.
+            segment: channels of an unbroken segment of m ticks.
             names: of its channels.
             speed: (m,) `steady_speed` of the segment.
 
@@ -99,15 +99,15 @@ class TimelineModel:
             A slice of consecutive ticks, and their log probabilities (ticks, K).
         """
         margin = round(_MARGIN_S * self.clock_hz)
-        m = len(stretch.times_s)
+        m = len(segment.times_s)
         for ticks in blocks(m, _PIECE):
             low = max(0, ticks.start - margin)
             high = min(m, ticks.stop + margin)
             features = window_features(
-                Segment(stretch.times_s[low:high], stretch.values[low:high]), names
+                Segment(segment.times_s[low:high], segment.values[low:high]), names
             )
             features = features[ticks.start - low : ticks.stop - low]
-            release_pages(stretch.values)
+            release_pages(segment.values)
             p = np.mean([_softmax(network.logits(features)) for network in self.networks], axis=0)
             now = speed[ticks, None]
             beyond = (now < self.speeds[:, 0] / _SLACK) | (
@@ -116,12 +116,12 @@ class TimelineModel:
             yield ticks, np.log(np.maximum(p, 1e-6)) - _UNSEEN * beyond
 
     def scores(
-        self, stretch: Segment, names: Sequence[str], speed: Array, allocate: Allocator = np.empty
+        self, segment: Segment, names: Sequence[str], speed: Array, allocate: Allocator = np.empty
     ) -> Array:
         """Log scores for the semi-Markov model: what a tick says beyond how frequent each word is.
 
         Args:
-            stretch: channels of an unbroken segment of m ticks.
+            segment: channels of an unbroken segment of m ticks.
             names: of its channels.
             speed: (m,) `steady_speed` of the segment.
             allocate: allocator of the result.
@@ -129,8 +129,8 @@ class TimelineModel:
         Returns:
             (m, K) sharpness times (log probability less log prior).
         """
-        scores = allocate((len(stretch.times_s), len(self.words)), float)
-        for ticks, log_p in self.log_probabilities(stretch, names, speed):
+        scores = allocate((len(segment.times_s), len(self.words)), float)
+        for ticks, log_p in self.log_probabilities(segment, names, speed):
             scores[ticks] = self.sharpness * (log_p - np.log(np.maximum(self.share, 1e-3)))
             release_pages(scores)
         return scores
@@ -159,13 +159,13 @@ class TimelineModel:
         time_s = (track.times_ns - track.times_ns[:1]) * 1e-9
         names = channel_names(track.skeleton)
         step = 1.0 / self.clock_hz
-        for number, stretch in enumerate(stretches_of(track, self.clock_hz, wall_mm, allocate)):
-            speed = steady_speed(stretch, names)
-            scores = self.scores(stretch, names, speed, allocate)
+        for number, segment in enumerate(segments_of(track, self.clock_hz, wall_mm, allocate)):
+            speed = steady_speed(segment, names)
+            scores = self.scores(segment, names, speed, allocate)
             decoded = self._decode(scores, speed, allocate)
             certain = self.chain.probabilities(scores, step, allocate)
-            begin = stretch.times_s[0]
-            first, last = np.searchsorted(time_s, [begin - 1e-6, stretch.times_s[-1] + step])
+            begin = segment.times_s[0]
+            first, last = np.searchsorted(time_s, [begin - 1e-6, segment.times_s[-1] + step])
             for piece in blocks(last - first, _PIECE):
                 rows = slice(first + piece.start, first + piece.stop)
                 tick = np.clip(
@@ -246,8 +246,8 @@ class TimelineModel:
         """
         total = np.zeros(len(self.words))
         names = channel_names(track.skeleton)
-        for stretch in stretches_of(track, self.clock_hz, wall_mm):
-            for _, log_p in self.log_probabilities(stretch, names, steady_speed(stretch, names)):
+        for segment in segments_of(track, self.clock_hz, wall_mm):
+            for _, log_p in self.log_probabilities(segment, names, steady_speed(segment, names)):
                 total += (log_p - np.log(np.maximum(self.share, 1e-3))).sum(axis=0)
         if not total.any():
             return UNLABELLED
@@ -293,11 +293,11 @@ class Examples:
     runs: list[list[tuple[int, float]]]
 
 
-def steady_speed(stretch: Segment, names: Sequence[str]) -> Array:
+def steady_speed(segment: Segment, names: Sequence[str]) -> Array:
     """The speed around each tick, without regard to the direction: a moving average over 0.4 s.
 
     Args:
-        stretch: channels of an unbroken segment of m ticks.
+        segment: channels of an unbroken segment of m ticks.
         names: of its channels, 'speed' among them.
 
     Returns:
@@ -305,10 +305,10 @@ def steady_speed(stretch: Segment, names: Sequence[str]) -> Array:
     """
     from scipy.ndimage import uniform_filter1d
 
-    step = stretch.times_s[1] - stretch.times_s[0]
+    step = segment.times_s[1] - segment.times_s[0]
     width = 2 * max(1, round(_SPEED_S / step)) + 1
     return np.asarray(
-        uniform_filter1d(stretch.values[:, names.index("speed")], width, mode="nearest")
+        uniform_filter1d(segment.values[:, names.index("speed")], width, mode="nearest")
     )
 
 
@@ -347,13 +347,13 @@ def gather(tracks: Sequence[LabelledTrack], words: Sequence[str], clock_hz: floa
         names = channel_names(one.track.skeleton)
         time_s = (one.track.times_ns - one.track.times_ns[:1]) * 1e-9
         code = np.array([place[str(word)] for word in one.words], np.int64)
-        for stretch in stretches_of(one.track, clock_hz, one.wall_mm):
+        for segment in segments_of(one.track, clock_hz, one.wall_mm):
             row = np.clip(
-                np.searchsorted(time_s, stretch.times_s - 0.5 / clock_hz), 0, len(time_s) - 1
+                np.searchsorted(time_s, segment.times_s - 0.5 / clock_hz), 0, len(time_s) - 1
             )
-            features.append(window_features(stretch, names))
+            features.append(window_features(segment, names))
             codes.append(code[row])
-            speeds.append(steady_speed(stretch, names))
+            speeds.append(steady_speed(segment, names))
             animals.append(np.full(len(row), number[one.animal]))
             recordings.append(np.full(len(row), k))
         runs.append(_runs(one.words, one.track.times_ns, place))

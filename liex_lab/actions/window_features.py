@@ -22,21 +22,21 @@ SIDE_WINDOWS_S = ((-0.9, -0.35), (-0.35, -0.08), (0.08, 0.35), (0.35, 0.9))
 RANGE_S = 0.25
 
 
-def window_features(stretch: Segment, names: Sequence[str]) -> NDArray[np.float32]:
+def window_features(segment: Segment, names: Sequence[str]) -> NDArray[np.float32]:
     """Features of every tick of a segment: its channels now, and their mean and spread around it.
 
     Of channels that change sign in a mirror (their names end in ~) the sizes of the means count,
     and their signs in the centred windows only.
 
     Args:
-        stretch: channels (m, C) of an unbroken segment, m at least 2.
+        segment: channels (m, C) of an unbroken segment, m at least 2.
         names: (C) names of the channels.
 
     Returns:
         (m, F) float32.
     """
-    x = stretch.values
-    step = stretch.times_s[1] - stretch.times_s[0]
+    x = segment.values
+    step = segment.times_s[1] - segment.times_s[0]
     signed = np.array([name.endswith("~") for name in names])
     n = x.shape[1]
     n_signed = int(signed.sum())

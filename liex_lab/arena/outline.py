@@ -77,10 +77,10 @@ class Arena:
         xy = np.asarray(xy_mm, float)
         if self.centre_mm is None:
             return np.full(xy.shape[:-1], np.nan)
-        off = xy - np.array(self.centre_mm)
+        offset = xy - np.array(self.centre_mm)
         if self.radius_mm is not None:
-            return np.asarray(self.radius_mm - np.linalg.norm(off, axis=-1))
-        inside = np.array(self.half_mm) - np.abs(off @ _turn(self.yaw_rad or 0.0))
+            return np.asarray(self.radius_mm - np.linalg.norm(offset, axis=-1))
+        inside = np.array(self.half_mm) - np.abs(offset @ _turn(self.yaw_rad or 0.0))
         beyond = np.linalg.norm(np.maximum(-inside, 0.0), axis=-1)
         return np.asarray(np.where(beyond > 0, -beyond, inside.min(axis=-1)))
 
@@ -238,11 +238,13 @@ def fit_circle(points: Array) -> tuple[Array, float, float]:
     twice = twice[usable]
     pp = (p * p).sum(axis=1)
     qq = (q * q).sum(axis=1)
-    off = (
+    offset = (
         np.stack([q[:, 1] * pp - p[:, 1] * qq, p[:, 0] * qq - q[:, 0] * pp], axis=1)
         / twice[:, None]
     )
-    distance = np.linalg.norm(points[:, None] - (a + off), axis=2) - np.linalg.norm(off, axis=1)
+    distance = np.linalg.norm(points[:, None] - (a + offset), axis=2) - np.linalg.norm(
+        offset, axis=1
+    )
     best = np.abs(distance).T[np.median(np.abs(distance), axis=0).argmin()]
     some = points[best <= 3.0 * np.median(best) + 1e-6]
     for _ in range(3):
@@ -276,11 +278,11 @@ def fit_rectangle(points: Array) -> tuple[Array, Array, float, float]:
     for step in (np.radians(1.0), np.radians(0.1), np.radians(0.01)):
         start = first if not np.isfinite(best[0]) else best[1]
         for yaw in start + step * np.arange(-10, 11):
-            off, low, high = _sides(points @ _turn(yaw))
-            if off < best[0]:
-                best = (off, float(yaw), low, high)
-    off, yaw, low, high = best
-    return _turn(yaw) @ ((low + high) / 2.0), (high - low) / 2.0, yaw, off
+            mismatch, low, high = _sides(points @ _turn(yaw))
+            if mismatch < best[0]:
+                best = (mismatch, float(yaw), low, high)
+    mismatch, yaw, low, high = best
+    return _turn(yaw) @ ((low + high) / 2.0), (high - low) / 2.0, yaw, mismatch
 
 
 def _sides(points: Array) -> tuple[float, Array, Array]:

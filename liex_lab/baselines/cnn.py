@@ -238,8 +238,8 @@ class Cnn:
 
         with threads(parallel), torch_threads(parallel), torch.no_grad(), low_precision():
             frames = frames_of(heights, crop_cameras)
-            told = self.net.eval()(_channels(patches_of(heights, crop_cameras, frames)))
-        return joints_of(told.float().numpy(), crop_cameras, frames)
+            output = self.net.eval()(_channels(patches_of(heights, crop_cameras, frames)))
+        return joints_of(output.float().numpy(), crop_cameras, frames)
 
     def to_bytes(self) -> bytes:
         """The weights as the bytes of an .npz without pickle."""
@@ -338,6 +338,6 @@ def _loss(net: torch.nn.Sequential, data: TrainingSet, rows: NDArray[np.int64]) 
         targets_of(in_camera_frame(data.truth.positions[rows], crop_cameras), crop_cameras, frames)
     )
     with low_precision():
-        told = net(_channels(patches_of(heights, crop_cameras, frames)))
-    off = (told.float() - wanted).reshape(len(rows), -1, 3)
-    return torch.sqrt((off**2).sum(-1) + 1e-8).mean()
+        output = net(_channels(patches_of(heights, crop_cameras, frames)))
+    difference = (output.float() - wanted).reshape(len(rows), -1, 3)
+    return torch.sqrt((difference**2).sum(-1) + 1e-8).mean()

@@ -222,12 +222,12 @@ def levers(skeleton: Skeleton) -> Array:
         below[skeleton.parents[j]] |= below[j]
     rows: list[float] = []
     for j in skeleton.solved:
-        off = positions[below[j]] - positions[j]
+        offset = positions[below[j]] - positions[j]
         for k in np.flatnonzero(skeleton.axes[j]):
-            moved = np.cross(rotations[j][:, k], off)
+            moved = np.cross(rotations[j][:, k], offset)
             rows.append(float(np.sqrt((moved**2).sum() / skeleton.n_joints)))
         if j == 0:
-            rows += [1.0, 1.0, 1.0, float(np.sqrt((off**2).sum() / skeleton.n_joints))]
+            rows += [1.0, 1.0, 1.0, float(np.sqrt((offset**2).sum() / skeleton.n_joints))]
     lever = np.array(rows)
     lever[3:6] = np.inf
     lever = np.maximum(lever, _LEAST_LEVER * skeleton.length)

@@ -74,22 +74,24 @@ def targets_of(joints_camera: Array, crop_cameras: Array, frames: Array) -> NDAr
     fx, fy, cx, cy = crop_cameras.T[:4, :, None]
     right = (fx * x / z + cx - u0) / half_px
     down = (fy * y / z + cy - v0) / half_px
-    told = np.stack([right, down, (depth - z) / half_mm], axis=-1)
-    return told.reshape(len(crop_cameras), -1).astype(np.float32)
+    coordinates = np.stack([right, down, (depth - z) / half_mm], axis=-1)
+    return coordinates.reshape(len(crop_cameras), -1).astype(np.float32)
 
 
-def joints_of(told: NDArray[np.float32], crop_cameras: Array, frames: Array) -> Array:
+def joints_of(coordinates: NDArray[np.float32], crop_cameras: Array, frames: Array) -> Array:
     """Joints from outputs of the CNN; the inverse of `targets_of`.
 
     Args:
-        told: (n, 3 J) float32 outputs.
+        coordinates: (n, 3 J) float32 outputs.
         crop_cameras: (n, 17) packed crop cameras of the height maps.
         frames: (n, 5) squares from `frames_of`.
 
     Returns:
         (n, J, 3) joints, mm, camera frame.
     """
-    right, down, nearer = np.moveaxis(told.astype(float).reshape(len(crop_cameras), -1, 3), -1, 0)
+    right, down, nearer = np.moveaxis(
+        coordinates.astype(float).reshape(len(crop_cameras), -1, 3), -1, 0
+    )
     u0, v0, half_px, depth, half_mm = frames.T[:, :, None]
     fx, fy, cx, cy = crop_cameras.T[:4, :, None]
     z = depth - nearer * half_mm

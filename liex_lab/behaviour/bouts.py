@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from liex_lab.behaviour.kinematics import segments
 from liex_lab.behaviour.measures import measure_bouts
-from liex_lab.tables.rows import frame_count, stop_times, stretches
+from liex_lab.tables.rows import constant_runs, frame_count, stop_times
 from liex_lab.tables.schema import BOUTS, to_pandas
 
 ACTIONS = ("rear", "run", "walk", "pause")  # where two claim a frame, the first has it
@@ -171,7 +171,7 @@ def hysteresis(values: Array, enter: float, leave: float, number: NDArray[np.int
     group = np.where(
         inside, number, -1 - number
     )  # a run of equal group lies in one stretch, above `leave` or not
-    for start, stop, which in stretches(group):
+    for start, stop, which in constant_runs(group):
         out[start:stop] = which >= 0 and bool(high[start:stop].any())
     return out
 
@@ -200,7 +200,7 @@ def tidy(
         Rows [start, stop) of each bout, in order of time.
     """
     merged: list[tuple[int, int]] = []
-    for start, stop, which in stretches(np.where(mask, number, -1)):
+    for start, stop, which in constant_runs(np.where(mask, number, -1)):
         if which < 0:
             continue
         if merged:
@@ -229,7 +229,7 @@ def _table(
     runs = np.array([code.get(word, -1) for word in label], np.int64)
     pieces = [
         (start, stop)
-        for start, stop, key in stretches(np.where(runs >= 0, runs + len(code) * number, -1))
+        for start, stop, key in constant_runs(np.where(runs >= 0, runs + len(code) * number, -1))
         if key >= 0
     ]
     rows = [(str(label[a]), time_s[a], stop_s[b - 1], count[a], count[b]) for a, b in pieces]

@@ -139,13 +139,17 @@ class BoutReader:
         path = float(np.nansum(step))
         timed = float(self.hold_s[start:stop][known].sum())
         seen = start + np.flatnonzero(np.isfinite(self.place[start:stop, 0]))
-        off = self.place[seen[-1]] - self.place[seen[0]] if len(seen) else np.full(3, np.nan)
+        displacement = (
+            self.place[seen[-1]] - self.place[seen[0]] if len(seen) else np.full(3, np.nan)
+        )
         top = known[speed[known].argmax()] if len(known) else None
         return {
             "path_mm": path,
             "path_bl": path / self.length_mm,
-            "displacement_mm": float(np.linalg.norm(off if self.swims else off[:2])),
-            "rise_mm": float(off[2]),
+            "displacement_mm": float(
+                np.linalg.norm(displacement if self.swims else displacement[:2])
+            ),
+            "rise_mm": float(displacement[2]),
             "mean_speed_mm_s": path / timed if timed > 0 else np.nan,
             "peak_speed_mm_s": np.nan if top is None else float(speed[top]),
             "peak_speed_sd_mm_s": np.nan
@@ -160,15 +164,15 @@ class BoutReader:
         heading = self._cut("heading_rad", start, stop)
         sd = self._cut("heading_sd_rad", start, stop)
         known = np.isfinite(heading)
-        way = np.append(0.0, np.cumsum(smallest_turn(np.diff(heading[known]))))
+        turned = np.append(0.0, np.cumsum(smallest_turn(np.diff(heading[known]))))
         pitch = self._cut("body_pitch_rad", start, stop)
         bend = self._cut("bend_rad", start, stop)
         some = bool(known.any())
         ends = sd[known][[0, -1]] if some else np.full(2, np.nan)
         return {
-            "net_turn_rad": float(way[-1]) if some else np.nan,
+            "net_turn_rad": float(turned[-1]) if some else np.nan,
             "net_turn_sd_rad": float(np.hypot(*ends)),
-            "heading_range_rad": float(np.ptp(way)) if some else np.nan,
+            "heading_range_rad": float(np.ptp(turned)) if some else np.nan,
             "mean_pitch_rad": _mean(pitch),
             "bend_max_rad": _max(np.abs(bend)),
         }

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.behaviour.posture import Shape
-from liex_lab.tables.rows import stretches
+from liex_lab.tables.rows import constant_runs
 
 Array = NDArray[np.float64]
 
@@ -64,7 +64,7 @@ def tail_beat(shape: Shape, time_s: Array, number: NDArray[np.int64], step_s: fl
     typical = float(np.nanmedian(noise)) if np.isfinite(noise).any() else 0.0
     least = max(_LEAST_SHARE * float(np.median(shape.length_mm[known])), _LEAST_SD * typical)
     slowest_s = 0.5 / SLOWEST_HZ
-    for start, stop, key in stretches(np.where(known, number, -1)):
+    for start, stop, key in constant_runs(np.where(known, number, -1)):
         if key < 0:
             continue
         rows = start + turning_points(swing[start:stop], least)

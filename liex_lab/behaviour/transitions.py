@@ -114,11 +114,11 @@ def by_chance(counts: Counts) -> Array:
         fitted *= np.divide(
             rows, fitted.sum(axis=1), out=np.zeros_like(rows), where=fitted.sum(axis=1) > 0
         )[:, None]
-        off = np.divide(
+        deviation = np.divide(
             columns, fitted.sum(axis=0), out=np.zeros_like(rows), where=fitted.sum(axis=0) > 0
         )
-        fitted *= off
-        if np.abs(off[columns > 0] - 1.0).max(initial=0.0) < 1e-9:
+        fitted *= deviation
+        if np.abs(deviation[columns > 0] - 1.0).max(initial=0.0) < 1e-9:
             break
     total = fitted.sum(axis=1, keepdims=True)
     return np.divide(fitted, total, out=np.full_like(fitted, np.nan), where=total > 0)

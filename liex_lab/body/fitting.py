@@ -86,8 +86,10 @@ def fit_poses(
         held = np.zeros(gradient.shape, bool)  # at a limit and pushed against it
         for c, (j, k) in enumerate(free, start=6):
             at = pose.angles[:, j, k]
-            way = gradient[:, c]
-            held[:, c] = ((at <= lower[j, k]) & (way > 0)) | ((at >= upper[j, k]) & (way < 0))
+            direction = gradient[:, c]
+            held[:, c] = ((at <= lower[j, k]) & (direction > 0)) | (
+                (at >= upper[j, k]) & (direction < 0)
+            )
         step = _step(curvature, gradient, damping, held)
         tried = _moved(pose, step, free, lower, upper)
         tried_cost, tried_residual = _cost(skeleton, tried, points, points_of_joints, middle)

@@ -7,9 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.console import Console
-from rich.table import Table
 
+from liex_lab.cli.sections import group_of_verbs
 from liex_lab.errors import SessionError
 from liex_lab.runtime.progress import progress_bar
 
@@ -17,11 +16,8 @@ if TYPE_CHECKING:
     from liex_lab.sessions import Session
     from liex_lab.sessions.corrections import Correction
 
-correct = typer.Typer(
-    help=(
-        "Correct a session: kept beside it, applied whenever it is read; tables and report follow."
-    ),
-    no_args_is_help=True,
+correct = group_of_verbs(
+    "Correct a session: kept beside it, applied whenever it is read; tables and report follow."
 )
 
 SessionPath = Annotated[
@@ -148,6 +144,9 @@ def list_corrections(session: SessionPath) -> None:
     opened = Session.open(session, raw=True)
     log = read_log(opened.path)
     standing = {entry.number for entry in log.standing}
+    from rich.console import Console
+    from rich.table import Table
+
     table = Table("", "what", "by", "at", "")
     for entry in log.entries:
         what = str(entry.what) if entry.what is not None else f"{entry.undoes} taken back"

@@ -15,12 +15,11 @@ from liex_lab.cli.options import (
     keep_numbers,
     tell_numbers,
 )
+from liex_lab.cli.sections import group_of_verbs
 from liex_lab.pipelines.evaluation.paper.deviations import DEVIATIONS, HAND
 from liex_lab.runtime.progress import progress_bar
 
-evaluate = typer.Typer(
-    help="Measure the method; --json FILE keeps the numbers.", no_args_is_help=True
-)
+evaluate = group_of_verbs("Measure the method; --json FILE keeps the numbers.")
 
 
 @evaluate.command("pose")
@@ -102,7 +101,7 @@ def evaluate_sizes(
     tell_numbers(result, json_file)
 
 
-@evaluate.command("tables", epilog=f"What differs from the paper: {' '.join(DEVIATIONS)} {HAND}")
+@evaluate.command("tables", epilog="\n\n".join(["What differs from the paper:", *DEVIATIONS, HAND]))
 def evaluate_tables(
     out: Annotated[
         Path, typer.Option("--out", metavar="DIR", help="The folder for tables and figures.")

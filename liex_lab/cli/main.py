@@ -13,8 +13,6 @@ from pathlib import Path
 from typing import Annotated, Any, NoReturn
 
 import typer
-from rich.console import Console
-from rich.table import Table
 
 import liex_lab
 from liex_lab.cli.correct import correct
@@ -32,6 +30,7 @@ from liex_lab.cli.options import (
     to_json,
 )
 from liex_lab.cli.results import compare, export, report
+from liex_lab.cli.sections import MODELS, RECORDINGS, SESSIONS, START, STUDIES, group_of_verbs
 from liex_lab.cli.study import cohort, dashboard, verify
 from liex_lab.errors import LiexError
 from liex_lab.runtime.disk import is_full, why_full
@@ -49,21 +48,17 @@ _USERS_TO_MEND = {
 # what Rerun's writer says of a full disk is said by our own sentence
 _RUST_LOG = "warn,re_log_encoding=off,re_sdk=off"
 
-app = typer.Typer(
-    name="liex",
-    help="Depth recordings of animals in; 3D skeletons, a replay and behaviour tables out.",
-    no_args_is_help=True,
-    add_completion=False,
-    pretty_exceptions_enable=False,
+app = group_of_verbs(
+    "Depth recordings of animals in; 3D skeletons, a replay and behaviour tables out.", name="liex"
 )
-app.add_typer(evaluate, name="evaluate")
-app.add_typer(correct, name="correct")
-app.command()(cohort)
-app.command()(dashboard)
-app.command()(verify)
-app.command()(compare)
-app.command()(export)
-app.command()(report)
+app.add_typer(evaluate, name="evaluate", rich_help_panel=MODELS)
+app.add_typer(correct, name="correct", rich_help_panel=SESSIONS)
+app.command(rich_help_panel=SESSIONS)(report)
+app.command(rich_help_panel=SESSIONS)(verify)
+app.command(rich_help_panel=SESSIONS)(export)
+app.command(rich_help_panel=STUDIES)(cohort)
+app.command(rich_help_panel=STUDIES)(compare)
+app.command(rich_help_panel=STUDIES)(dashboard)
 
 
 def _version(wanted: bool) -> None:
@@ -81,7 +76,7 @@ def _options(
     """Depth recordings of animals in; 3D skeletons, a replay and behaviour tables out."""
 
 
-@app.command()
+@app.command(rich_help_panel=START)
 def demo(out: OutFolder = Path()) -> None:
     """Run the bundled sample recording, to see what comes out."""
     from liex_lab.api import run_demo
@@ -91,7 +86,7 @@ def demo(out: OutFolder = Path()) -> None:
     _tell_session(session)
 
 
-@app.command()
+@app.command(rich_help_panel=START)
 def run(
     recording: RecordingPath,
     plan: PlanName = "mouse",
@@ -136,7 +131,7 @@ def run(
     _tell_session(session)
 
 
-@app.command()
+@app.command(rich_help_panel=START)
 def doctor(
     recording: RecordingPath,
     as_json: Annotated[bool, typer.Option("--json", help="Print the findings as JSON.")] = False,
@@ -161,7 +156,7 @@ def doctor(
         print_report(findings)
 
 
-@app.command()
+@app.command(rich_help_panel=RECORDINGS)
 def convert(
     recording: RecordingPath,
     to: Annotated[
@@ -208,7 +203,7 @@ def convert(
         typer.echo(f"note: {sentence}")
 
 
-@app.command()
+@app.command(rich_help_panel=MODELS)
 def train(
     animal: Annotated[
         str,
@@ -292,7 +287,7 @@ def train(
     typer.echo(f"model: {model}")
 
 
-@app.command()
+@app.command(rich_help_panel=SESSIONS)
 def suggest(
     session: SessionPath,
     model: Annotated[
@@ -303,6 +298,9 @@ def suggest(
     """List the stretches of a session most worth labelling next: where the recogniser is least
     sure.
     """
+    from rich.console import Console
+    from rich.table import Table
+
     from liex_lab.pipelines.training.action_model import suggest as job
 
     table = Table("from (s)", "to (s)", "taken for", "or else", "doubt")
@@ -312,7 +310,7 @@ def suggest(
     Console().print(table)
 
 
-@app.command()
+@app.command(rich_help_panel=RECORDINGS)
 def live(
     source: Annotated[
         str, typer.Argument(metavar="SOURCE", help="A file or folder being written, or HOST:PORT.")
@@ -343,7 +341,7 @@ def live(
     tell_numbers(result, json_file)
 
 
-@app.command()
+@app.command(rich_help_panel=START)
 def show(
     session: SessionPath,
     web: Annotated[
@@ -392,7 +390,7 @@ def show(
     )
 
 
-@app.command()
+@app.command(rich_help_panel=MODELS)
 def info(
     plan: Annotated[
         str | None, typer.Option("--plan", help="Print this plan, to copy and change it.")

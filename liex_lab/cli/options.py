@@ -7,9 +7,6 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.console import Console
-from rich.table import Table
-from rich.text import Text
 
 RecordingPath = Annotated[
     Path, typer.Argument(metavar="RECORDING", help="A file, a folder, or synthetic:walk.")
@@ -50,6 +47,10 @@ def tell_numbers(result: dict[str, Any], json_file: Path | None) -> None:
     """The numbers as a table on the screen, and as JSON where a file was named."""
     if json_file is not None:
         keep_numbers(result, json_file)
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
     table = Table(show_header=False)
     for name, value in result.items():
         said = to_json(value) if isinstance(value, dict) else str(value)

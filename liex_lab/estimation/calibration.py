@@ -146,12 +146,12 @@ def run_on(model: Model, data: TrainingSet, rng: np.random.Generator) -> Trial:
     ):
         picked = group.chosen
         images = group.images
-        off = np.linalg.norm(
+        joint_error = np.linalg.norm(
             picked.pose.joints(skeleton) - data.truth.positions[group.rows], axis=-1
         )
         scores_of.append(picked.score)
         spreads.append(picked.spread)
-        joint_errors.append(off / group.size)
+        joint_errors.append(joint_error / group.size)
         blank = clue_samples(picked, skeleton, images.moments, images.crop_cameras, group.size)
         clues.append(blank.scalars)
     scalars = np.concatenate(clues)
@@ -188,8 +188,10 @@ def with_corrector(model: Model, data: TrainingSet, rng: np.random.Generator) ->
     moves = []
     for group in _choices(model, data, rng):
         true = data.truth.positions[group.rows]
-        off = np.linalg.norm(group.chosen.pose.joints(model.skeleton) - true, axis=-1).mean(axis=1)
-        near = np.flatnonzero(off < worst * group.size)
+        joint_error = np.linalg.norm(group.chosen.pose.joints(model.skeleton) - true, axis=-1).mean(
+            axis=1
+        )
+        near = np.flatnonzero(joint_error < worst * group.size)
         samples = pose_samples(group.chosen.pose, model, group.images, group.size)
         samples = Samples(
             data.images.heights,

@@ -347,8 +347,8 @@ class Cascade:
         else:
             turn = so3.log(np.swapaxes(estimate.rotation, 1, 2) @ true.rotation)
         turn = turn[:, self.skeleton.axes[joint]]
-        off = np.linalg.norm(true.translation - estimate.translation, axis=1) / candidates.size
-        keep = (np.linalg.norm(turn, axis=1) < method.keep_bent) & (off < method.keep_off_mm)
+        distance = np.linalg.norm(true.translation - estimate.translation, axis=1) / candidates.size
+        keep = (np.linalg.norm(turn, axis=1) < method.keep_bent) & (distance < method.keep_off_mm)
         return turn * method.joint_lever_mm, keep
 
 

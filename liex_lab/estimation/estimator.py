@@ -553,10 +553,10 @@ class PoseEstimator:
         crops = first.crops, second.crops
         if self.model.method.camera_view:  # likeness is told by what the scene's own view shows
             crops = scene.extract_both(depths, size)
-        likeness = [weight * scene.misfit(crop) for crop in crops]
+        misfits = [weight * scene.misfit(crop) for crop in crops]
         if not self.model.method.metric_on_own:
-            return likeness[1] < likeness[0]
-        return second.scores.min(axis=1) + likeness[1] < first.scores.min(axis=1) + likeness[0]
+            return misfits[1] < misfits[0]
+        return second.scores.min(axis=1) + misfits[1] < first.scores.min(axis=1) + misfits[0]
 
     def find_size(self, sample: NDArray[np.float32], scene: Segmenter) -> float:
         """Estimate the animal's size from a sample of frames of the recording.

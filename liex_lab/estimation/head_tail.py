@@ -153,8 +153,8 @@ def both_ways(
     """
     rows = np.arange(len(scores))
     best = scores.argmin(axis=1)
-    way = positions[:, :, tip] - positions[:, :, 0]
-    away = np.einsum("nkd,nd->nk", way, way[rows, best]) < 0
+    direction = positions[:, :, tip] - positions[:, :, 0]
+    away = np.einsum("nkd,nd->nk", direction, direction[rows, best]) < 0
     other = np.where(away, scores, np.inf)
     opposite = other.argmin(axis=1)
     with np.errstate(invalid="ignore"):

@@ -68,9 +68,9 @@ def views_along_axis(
         views,
         scalars,
     )
-    told = np.column_stack([scalars, ways])
+    rows = np.column_stack([scalars, ways])
     return (
-        Samples(images.heights, image, (1.0 / each).astype(np.float32), views, told),
+        Samples(images.heights, image, (1.0 / each).astype(np.float32), views, rows),
         rotation,
         position,
     )
@@ -105,8 +105,8 @@ def train_proposals(
     samples, frame, centre = views_along_axis(images, guess, method.proposal_reach_mm)
     i = samples.image
     turned = np.swapaxes(frame, 1, 2) @ rotations[i]
-    off = np.einsum("nji,nj->ni", frame, positions[i] - centre) / guess[i][:, None]
-    labels = np.concatenate([method.base_lever_mm * turned.reshape(-1, 9), off], axis=1).astype(
+    offset = np.einsum("nji,nj->ni", frame, positions[i] - centre) / guess[i][:, None]
+    labels = np.concatenate([method.base_lever_mm * turned.reshape(-1, 9), offset], axis=1).astype(
         np.float32
     )
     forest, in_bag = grow_forest(samples, labels, keep[i], method.proposals, rng)
@@ -132,8 +132,8 @@ def propose(forest: Forest, images: ImageSet, size: Array, method: Method) -> tu
     votes = predict_each(forest, samples).astype(float)
     turned = so3.nearest_rotation(votes[..., :9].reshape(*votes.shape[:2], 3, 3))
     rotation = frame[:, None] @ turned
-    off = np.einsum("nij,ntj->nti", frame, votes[..., 9:]) * size[samples.image][:, None, None]
-    position = centre[:, None] + off
+    offset = np.einsum("nij,ntj->nti", frame, votes[..., 9:]) * size[samples.image][:, None, None]
+    position = centre[:, None] + offset
 
     def in_order(values: Array) -> Array:
         """`values` (2 m, T, ...) reordered to (m, 2 T, ...), the tree varying more slowly."""

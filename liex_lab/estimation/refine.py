@@ -182,9 +182,9 @@ class Refiner:
 
 def _apart(fit: Array) -> Array:
     """Distance (n, K) mm of poses from the readings, out of their residuals (n, K, N_FIT)."""
-    off = (
+    distance = (
         fit[..., residual_kernels.OUT_OF] + fit[..., residual_kernels.APART]
     ) / residual_kernels.MM_UNIT
     return np.asarray(
-        off + _BESIDE_MM * fit[..., residual_kernels.BESIDE] / residual_kernels.SHARE_UNIT
+        distance + _BESIDE_MM * fit[..., residual_kernels.BESIDE] / residual_kernels.SHARE_UNIT
     )

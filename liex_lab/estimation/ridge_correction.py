@@ -88,11 +88,11 @@ class RidgeCorrection:
         joints = pose.joints(skeleton)
         features = clues(skeleton, pose, joints, images, size)
         length = skeleton.length * size
-        off = (true_joints - joints) / length[:, None, None]
-        slide = np.sum(off * tangents(joints), axis=-1).mean(axis=1)
+        error = (true_joints - joints) / length[:, None, None]
+        slide = np.sum(error * tangents(joints), axis=-1).mean(axis=1)
         grown = np.log(true_size / size)
-        labels = np.column_stack([off[..., 2], slide, grown])
-        good = (np.linalg.norm(off, axis=-1).mean(axis=1) < _SLID_SHARE) & (
+        labels = np.column_stack([error[..., 2], slide, grown])
+        good = (np.linalg.norm(error, axis=-1).mean(axis=1) < _SLID_SHARE) & (
             np.abs(grown) < _SIZE_LOG
         )
         x = features[good]
@@ -118,15 +118,15 @@ class RidgeCorrection:
         n = len(pose.scale)
         joints = pose.joints(skeleton)
         seen = clues(skeleton, pose, joints, images, np.full(n, size))
-        told = (np.clip(seen, self.table[:, 0], self.table[:, 1]) @ self.table[:, 2:]).round(
+        correction = (np.clip(seen, self.table[:, 0], self.table[:, 1]) @ self.table[:, 2:]).round(
             _DECIMALS
         )
         length = skeleton.length * size
-        moved = joints + length * told[:, -2, None, None] * tangents(joints)
-        moved[..., 2] += length * told[:, :-2]
+        moved = joints + length * correction[:, -2, None, None] * tangents(joints)
+        moved[..., 2] += length * correction[:, :-2]
         return CorrectedRidge(
             Pose.from_joints(skeleton, moved, pose.root.rotation[..., 2]),
-            told[:, -1],
+            correction[:, -1],
             far_end_seen(seen),
         )
 
@@ -188,9 +188,9 @@ def tangents(joints: Array) -> Array:
     Returns:
         (n, J, 3) unit vectors from base to tip with z = 0.
     """
-    way = np.gradient(joints, axis=1)
-    way[..., 2] = 0.0
-    return np.asarray(way / np.maximum(np.linalg.norm(way, axis=-1, keepdims=True), 1e-9))
+    tangent = np.gradient(joints, axis=1)
+    tangent[..., 2] = 0.0
+    return np.asarray(tangent / np.maximum(np.linalg.norm(tangent, axis=-1, keepdims=True), 1e-9))
 
 
 def clues(skeleton: Skeleton, pose: Pose, joints: Array, images: ImageSet, size: Array) -> Array:

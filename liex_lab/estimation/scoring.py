@@ -123,8 +123,8 @@ def choose(
     else:
         pose = mean_pose(skeleton, turned, joints, weight)
         mean = pose.joints(skeleton)
-    off = np.linalg.norm(joints - mean[:, None], axis=-1)
-    variance = np.einsum("nk,nkj->nj", weight, off**2)
+    distance = np.linalg.norm(joints - mean[:, None], axis=-1)
+    variance = np.einsum("nk,nkj->nj", weight, distance**2)
     mean_score = np.sum(weight * score, axis=1)
     spread = np.sqrt(variance.mean(axis=1)) / size
     expected = (
@@ -234,8 +234,8 @@ def _doubts(
     along = positions[:, :, -1] - positions[:, :, 0]
     backwards = np.einsum("nkd,nd->nk", along, mean[:, -1] - mean[:, 0]) < 0
     opposite = np.where(backwards, scores, no_opposite_mm).min(axis=1)
-    off = np.linalg.norm(positions - mean[:, None], axis=-1).mean(axis=(1, 2)) / size
-    return np.stack([scores.min(axis=1), opposite, good.std(axis=1), off], axis=1)
+    distance = np.linalg.norm(positions - mean[:, None], axis=-1).mean(axis=(1, 2)) / size
+    return np.stack([scores.min(axis=1), opposite, good.std(axis=1), distance], axis=1)
 
 
 def with_expected_error(

@@ -261,8 +261,8 @@ def joint_error(candidates: Candidates, truth: Truth) -> Array:
     Returns:
         (n,) mm at home size.
     """
-    off = np.linalg.norm(candidates.positions - truth.positions[candidates.image], axis=2)
-    return off.mean(axis=1) / candidates.size
+    distance = np.linalg.norm(candidates.positions - truth.positions[candidates.image], axis=2)
+    return distance.mean(axis=1) / candidates.size
 
 
 def perturbed_truth(
@@ -288,9 +288,11 @@ def perturbed_truth(
     image = np.repeat(np.flatnonzero(data.animal).astype(np.int32), n_each)
     size = np.ones(len(image)) if not cascade.method.session_size else data.size[image]
     strength = rng.uniform(0.0, 1.0, len(image))[:, None]
-    off = 8.0 * skeleton.relative_size
+    shift_mm = 8.0 * skeleton.relative_size
     twist = (
-        rng.standard_normal((len(image), 6)) * np.array([0.4, 0.4, 0.9, off, off, off]) * strength
+        rng.standard_normal((len(image), 6))
+        * np.array([0.4, 0.4, 0.9, shift_mm, shift_mm, shift_mm])
+        * strength
     )
     base = SE3(data.truth.rotations[image, 0], data.truth.positions[image, 0]) @ SE3.exp(twist)
     candidates = Candidates.start(

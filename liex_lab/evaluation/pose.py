@@ -145,8 +145,8 @@ def angle_between_axes(a: Array, b: Array) -> Array:
     Returns:
         (n,) rad in [0, pi / 2].
     """
-    off = np.mod(a - b, np.pi)
-    return np.minimum(off, np.pi - off)
+    difference = np.mod(a - b, np.pi)
+    return np.minimum(difference, np.pi - difference)
 
 
 def count_reversals(heading: Array) -> int:

@@ -110,8 +110,8 @@ def in_camera_frame(points: Array, crop_cameras: Array) -> Array:
     Returns:
         (n, ..., 3) mm, camera frames.
     """
-    off = points - _camera_centre(points, crop_cameras)
-    return np.einsum("nji,n...j->n...i", _rotations(crop_cameras), off)
+    offset = points - _camera_centre(points, crop_cameras)
+    return np.einsum("nji,n...j->n...i", _rotations(crop_cameras), offset)
 
 
 def in_view_frame(points: Array, crop_cameras: Array) -> Array:

@@ -172,12 +172,16 @@ class Distortion:
         down = np.array([0.0, 1e-6])
         for _ in range(8):
             bent = self.distort(ideal)
-            off = bent - seen
+            residual = bent - seen
             along_x = (self.distort(ideal + right) - bent) / 1e-6
             along_y = (self.distort(ideal + down) - bent) / 1e-6
             determinant = along_x[..., 0] * along_y[..., 1] - along_x[..., 1] * along_y[..., 0]
-            move_x = (off[..., 0] * along_y[..., 1] - off[..., 1] * along_y[..., 0]) / determinant
-            move_y = (along_x[..., 0] * off[..., 1] - along_x[..., 1] * off[..., 0]) / determinant
+            move_x = (
+                residual[..., 0] * along_y[..., 1] - residual[..., 1] * along_y[..., 0]
+            ) / determinant
+            move_y = (
+                along_x[..., 0] * residual[..., 1] - along_x[..., 1] * residual[..., 0]
+            ) / determinant
             ideal = ideal - np.stack([move_x, move_y], axis=-1)
         wrong = ~(np.linalg.norm(self.distort(ideal) - seen, axis=-1, keepdims=True) < 1e-9)
         return np.where(wrong, np.nan, ideal)

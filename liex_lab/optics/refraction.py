@@ -97,13 +97,13 @@ class Water:
             camera: the real one, with a straight lens.
         """
         n = self.refractive_index
-        way = self.law(np.zeros(2))[7:]
+        bent = self.law(np.zeros(2))[7:]
         return replace(
             camera,
             fx=n * camera.fx,
             fy=n * camera.fy,
-            cx=camera.cx - n * camera.fx * float(way[0] / way[2]),
-            cy=camera.cy - n * camera.fy * float(way[1] / way[2]),
+            cx=camera.cx - n * camera.fx * float(bent[0] / bent[2]),
+            cy=camera.cy - n * camera.fy * float(bent[1] / bent[2]),
         )
 
     def law(self, rays: ArrayLike) -> Array:
@@ -135,9 +135,10 @@ class Water:
         cos_air = np.maximum(cos_air, _STEEPEST)
         cos_water = np.sqrt(1.0 - (1.0 - cos_air**2) / n**2)
         surface = ray * (h / cos_air)[..., None]
-        way = ray / n + (cos_water - cos_air / n)[..., None] * down
+        bent = ray / n + (cos_water - cos_air / n)[..., None] * down
         law = np.concatenate(
-            [self._depth_law(ray, cos_air, cos_water), surface, way / cos_water[..., None]], axis=-1
+            [self._depth_law(ray, cos_air, cos_water), surface, bent / cos_water[..., None]],
+            axis=-1,
         )
         law[..., 3] = np.where(reaches, cos_air / (ray[..., 2] * h), 0.0)
         return law

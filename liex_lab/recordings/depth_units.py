@@ -141,10 +141,10 @@ def metres(depth: Depth) -> tuple[NDArray[np.float32], int]:
         (H, W) float32 m, and for how many pixels there is no exact number.
     """
     scaled = depth / np.float32(1000.0)
-    off = scaled * np.float32(1000.0) != depth
+    inexact = scaled * np.float32(1000.0) != depth
     for direction in (np.float32(np.inf), np.float32(0.0)):
-        other = np.nextafter(scaled[off], direction)
-        fits = other * np.float32(1000.0) == depth[off]
-        scaled[off] = np.where(fits, other, scaled[off])
-        off[off] = ~fits
-    return scaled, int(off.sum())
+        other = np.nextafter(scaled[inexact], direction)
+        fits = other * np.float32(1000.0) == depth[inexact]
+        scaled[inexact] = np.where(fits, other, scaled[inexact])
+        inexact[inexact] = ~fits
+    return scaled, int(inexact.sum())

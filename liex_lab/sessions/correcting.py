@@ -64,10 +64,10 @@ def joint_move(session: Session, frame: int, joint: str, place_mm: Any) -> Joint
             f"a joint's place is x, y and z in mm of the arena frame, got {place_mm}"
         )
     length = float(session.frames["spine_mm"].iloc[row])
-    off = float(np.linalg.norm(place - was))
-    if off > length:
+    distance = float(np.linalg.norm(place - was))
+    if distance > length:
         raise SessionError(
-            f"{joint} of frame {frame} cannot be {off:.0f} mm from where it was found, at "
+            f"{joint} of frame {frame} cannot be {distance:.0f} mm from where it was found, at "
             f"({was[0]:.1f}, {was[1]:.1f}, {was[2]:.1f}) mm, for the animal is {length:.0f} mm "
             "long; check the place"
         )
@@ -171,8 +171,8 @@ def bout_at(session: Session, at_s: float) -> dict[str, Any]:
     inside = bouts[(bouts["start_s"] <= at_s + _ROUNDED_S) & (bouts["stop_s"] > at_s + _ROUNDED_S)]
     if len(inside) == 0:
         starts, stops = (bouts[name].to_numpy(float) for name in ("start_s", "stop_s"))
-        off = np.maximum(starts - at_s, at_s - stops)
-        near = bouts.iloc[np.sort(np.argsort(off)[:2])]
+        distance = np.maximum(starts - at_s, at_s - stops)
+        near = bouts.iloc[np.sort(np.argsort(distance)[:2])]
         told = " and ".join(
             f"{b.action} from {b.start_s:.3f} to {b.stop_s:.3f} s" for b in near.itertuples()
         )

@@ -112,10 +112,10 @@ class Provenance:
             plan: all settings of the run; what it states goes before what the recording states.
             **more: further fields, or others than these.
         """
-        told = recording.metadata
+        entries = recording.metadata
         stated = plan.session
         subject = {
-            "subject_id": stated.subject_id or told.get("subject_id"),
+            "subject_id": stated.subject_id or entries.get("subject_id"),
             "group": stated.group,
             "cage": stated.cage,
             "sex": stated.sex,
@@ -130,14 +130,16 @@ class Provenance:
             "input_sha256": recording.digest(),
             "plan_toml": plan.to_toml(),
             "format": recording.format,
-            "profile": dict(told.get("profile", {})),
+            "profile": dict(entries.get("profile", {})),
             "individual": stated.individual,
             "n_frames": len(recording),
             "gaps": [*recording.gaps, *recording.faults],
             "problems": list(recording.problems),
             "truncated": recording.truncated,
             "subject": {name: str(value) for name, value in subject.items() if value},
-            "session_start_time": stated.session_start_time or told.get("session_start_time") or "",
+            "session_start_time": stated.session_start_time
+            or entries.get("session_start_time")
+            or "",
             "optics": recording.optics,
             "replay_depth": plan.replay.depth,
             "replay_candidates": plan.replay.candidates,

@@ -29,7 +29,7 @@ from liex_lab.runtime.memory import blocks, release_pages
 from liex_lab.sessions.joining import RRD_HEAD, rrd_messages
 from liex_lab.sessions.provenance import Provenance
 from liex_lab.sessions.rrd_body import log_body, send_body
-from liex_lab.tables.rows import Rows, frame_count, stop_times, stretches
+from liex_lab.tables.rows import Rows, constant_runs, frame_count, stop_times
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -528,7 +528,7 @@ class ReplayWriter:
         stop = stop_times(rows.time_s)
         marked = [
             (int(count[a]), int(count[b]), float(time[a]), float(stop[b - 1]), str(flag))
-            for a, b, flag in stretches(rows.track.flag)
+            for a, b, flag in constant_runs(rows.track.flag)
             if flag
         ]
         self._log_lane(TRACKING, marked, _FLAG_COLOURS, end)

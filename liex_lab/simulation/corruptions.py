@@ -166,14 +166,20 @@ def _passing(
     target = joints[len(joints) // 2].mean(axis=0)
     share = (eye[2] - height) / (eye[2] - target[2])  # on the ray from the lens to the animal
     over = eye[:2] + (target[:2] - eye[:2]) * share
-    way = rng.uniform(-np.pi, np.pi)
+    direction = rng.uniform(-np.pi, np.pi)
     half = rng.uniform(*_BAR_HALF) * length_mm * share
     s = np.linspace(-1.0, 1.0, len(joints))
     centre = np.zeros((N_PARTS, 3))
     radii = np.zeros((N_PARTS, 3))
     radii[0] = [half, _BAR_LONG * length_mm * share, 0.1 * length_mm]
-    mesh = rounded(centre, radii, np.full(N_PARTS, way), np.full(N_PARTS, 8.0)).reshape(-1, 3)
-    along = s[:, None] * _BAR_FROM * length_mm * share * np.array([np.cos(way), np.sin(way)])
+    mesh = rounded(centre, radii, np.full(N_PARTS, direction), np.full(N_PARTS, 8.0)).reshape(-1, 3)
+    along = (
+        s[:, None]
+        * _BAR_FROM
+        * length_mm
+        * share
+        * np.array([np.cos(direction), np.sin(direction)])
+    )
     place = np.concatenate([over + along, np.full((len(s), 1), height)], axis=1)
     return mesh + place[:, None]
 
@@ -201,13 +207,13 @@ def beside_animal(
         (n, V, 3) mm, arena frame, the same in every frame.
     """
     mesh = draw_thing(rng, str(rng.choice(kinds)), length_mm)
-    way = joints[..., :2].reshape(-1, 2)
+    path = joints[..., :2].reshape(-1, 2)
     best = np.zeros(2)
     best_cost = np.inf
     for _ in range(60):
         place = joints[rng.integers(len(joints)), 0, :2] + rng.normal(0.0, 1.6, 2) * length_mm
         reach = np.abs(mesh[:, :2]).max()
-        free = np.linalg.norm(way - place, axis=1).min() - reach
+        free = np.linalg.norm(path - place, axis=1).min() - reach
         cost = (
             abs(free - 0.5 * length_mm)
             + max(0.0, reach - float(scene.wall_clearance(place)))
@@ -237,8 +243,8 @@ def beside_hand(rng: np.random.Generator, joints: Array, length_mm: float) -> Ar
     mesh = rounded(centre, radii, np.full(N_PARTS, rng.uniform(-np.pi, np.pi)), power).reshape(
         -1, 3
     )
-    way = rng.uniform(-np.pi, np.pi)
-    toward = np.array([np.cos(way), np.sin(way)])
+    direction = rng.uniform(-np.pi, np.pi)
+    toward = np.array([np.cos(direction), np.sin(direction)])
     reach = (
         (joints[..., :2] @ toward).max()
         + np.hypot(*radii[0, :2])

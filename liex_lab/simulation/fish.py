@@ -135,7 +135,7 @@ def draw_bends(rng: np.random.Generator, skeleton: Skeleton, kind: NDArray[np.in
         (n, J) rad.
     """
     n = len(kind)
-    way = rng.choice([-1.0, 1.0], n)
+    side = rng.choice([-1.0, 1.0], n)
     slight = rng.normal(0.0, 1.0, (2, n)) * [[0.6], [1.2]]
     strong = rng.uniform(0.0, 1.0, (2, n))
     front = np.choose(
@@ -144,8 +144,8 @@ def draw_bends(rng: np.random.Generator, skeleton: Skeleton, kind: NDArray[np.in
             slight[0],
             1.2 * slight[0],
             1.2 * slight[0],
-            way * (2 + 7 * strong[0]),
-            way * (1.5 + 5 * strong[0]),
+            side * (2 + 7 * strong[0]),
+            side * (1.5 + 5 * strong[0]),
         ],
     )
     hind = np.choose(
@@ -153,9 +153,9 @@ def draw_bends(rng: np.random.Generator, skeleton: Skeleton, kind: NDArray[np.in
         [
             slight[1],
             1.5 * slight[1],
-            way * (2.5 + 6.5 * strong[1]),
-            way * (1.5 + 9 * strong[1]),
-            -way * (2 + 6.5 * strong[1]),
+            side * (2.5 + 6.5 * strong[1]),
+            side * (1.5 + 9 * strong[1]),
+            -side * (2 + 6.5 * strong[1]),
         ],
     )
     amplitude = np.choose(

@@ -200,21 +200,23 @@ def _path(
     position = np.empty((n, 2))
     heading = np.empty(n)
     at = home + rng.normal(0.0, 0.2 * margin, 2)
-    way = rng.uniform(-np.pi, np.pi)
+    azimuth = rng.uniform(-np.pi, np.pi)
     rate = 0.0
     for i in range(n):
         rate = 0.93 * rate + rng.normal(0.0, 0.25)
         back = np.arctan2(home[1] - at[1], home[0] - at[0])
-        away = (back - way + np.pi) % (2 * np.pi) - np.pi
+        away = (back - azimuth + np.pi) % (2 * np.pi) - np.pi
         close = np.clip(1.0 - (scene.freedom(at) - margin) / (0.8 * spine_mm), 0.0, 1.0)
         # it turns back faster the faster it goes, and stays within a mouse's turning rate
         pull = 6.0 * close * np.clip(away, -1.0, 1.0) * min(speed[i] / spine_mm, 1.0)
-        way += np.clip(rate * (0.2 + min(speed[i] / spine_mm, 1.0)) + pull, -7.0, 7.0) / _RATE_HZ
-        step = speed[i] / _RATE_HZ * np.array([np.cos(way), np.sin(way)])
+        azimuth += (
+            np.clip(rate * (0.2 + min(speed[i] / spine_mm, 1.0)) + pull, -7.0, 7.0) / _RATE_HZ
+        )
+        step = speed[i] / _RATE_HZ * np.array([np.cos(azimuth), np.sin(azimuth)])
         if scene.freedom(at + step) > margin or scene.freedom(at + step) > scene.freedom(at):
             at = at + step
         position[i] = at
-        heading[i] = way
+        heading[i] = azimuth
     return position, heading
 
 
@@ -385,20 +387,20 @@ def wander(
     position = np.empty((n, 3))
     headings = np.empty(n)
     xy = home + rng.normal(0.0, 0.1 * length, 2)
-    way = rng.uniform(-np.pi, np.pi)
+    azimuth = rng.uniform(-np.pi, np.pi)
     for i in range(n):
         back = np.arctan2(home[1] - xy[1], home[0] - xy[0])
-        away = (back - way + np.pi) % (2 * np.pi) - np.pi
+        away = (back - azimuth + np.pi) % (2 * np.pi) - np.pi
         close = np.clip(1.0 - (scene.freedom(xy, z) - margin) / (0.8 * length), 0.0, 1.0)
-        way += (turning[i] + 8.0 * close * np.clip(away, -1.0, 1.0)) * step_s
+        azimuth += (turning[i] + 8.0 * close * np.clip(away, -1.0, 1.0)) * step_s
         run = speed[i] * length * step_s
-        step = run * np.cos(pitch[i]) * np.array([np.cos(way), np.sin(way)])
+        step = run * np.cos(pitch[i]) * np.array([np.cos(azimuth), np.sin(azimuth)])
         free = scene.freedom(xy + step, z)
         if free > margin or free > scene.freedom(xy, z):
             xy = xy + step
         z = float(np.clip(z + run * np.sin(pitch[i]), low, high))
         position[i] = [*xy, z]
-        headings[i] = way
+        headings[i] = azimuth
     return position, headings
 
 

@@ -140,8 +140,8 @@ class SimulatedScene:
         outline = []
         for _ in range(rng.choice([0, 1, 2], p=[0.65, 0.25, 0.10])):
             mesh = draw_thing(rng, str(rng.choice(setting.clutter)), 0.8 * spine_mm)
-            way = rng.uniform(-np.pi, np.pi)
-            local = 0.8 * self.half * [np.cos(way), np.sin(way)]
+            azimuth = rng.uniform(-np.pi, np.pi)
+            local = 0.8 * self.half * [np.cos(azimuth), np.sin(azimuth)]
             mesh[:, :2] += self.centre + self._turned(local, self.yaw)
             thing = render_mesh(mesh, THING_FACES, self.camera, T_camera_mesh=T_camera_arena)
             still = np.where((thing > 0) & ((still == 0) | (thing < still)), thing, still)
@@ -363,9 +363,9 @@ def _unevenness(rng: np.random.Generator, ground: Array, scale: float) -> Array:
     """
     waves = np.zeros(ground.shape[:-1])
     for _ in range(4):
-        way = rng.uniform(-np.pi, np.pi)
+        azimuth = rng.uniform(-np.pi, np.pi)
         length = rng.uniform(70.0, 350.0) * scale
-        along = ground @ np.array([np.cos(way), np.sin(way)])
+        along = ground @ np.array([np.cos(azimuth), np.sin(azimuth)])
         waves += (
             rng.uniform(0.0, 0.7)
             * scale

@@ -453,8 +453,8 @@ def _draw_neighbours(
     """
     n = len(trunk)
     radii = spine_mm[:, None] * rng.uniform(0.12, 0.5, (n, 3))
-    way = rng.uniform(-np.pi, np.pi, n)
-    toward = np.stack([np.cos(way), np.sin(way)], axis=-1)
+    azimuth = rng.uniform(-np.pi, np.pi, n)
+    toward = np.stack([np.cos(azimuth), np.sin(azimuth)], axis=-1)
     reach = np.einsum("nvk,nk->nv", trunk[..., :2], toward).max(axis=1)
     middle = trunk[..., :2].mean(axis=1)
     clear = reach - np.sum(middle * toward, axis=-1) + np.hypot(radii[:, 0], radii[:, 1])
@@ -478,8 +478,8 @@ def _draw_walls(rng: np.random.Generator, trunk: Array, setting: SceneSpec) -> A
     n = len(trunk)
     scale = setting.scale
     middle = trunk[..., :2].mean(axis=1)
-    way = np.arctan2(middle[:, 1], middle[:, 0]) + rng.normal(0.0, 0.7, n)
-    outward = np.stack([np.cos(way), np.sin(way)], axis=-1)
+    azimuth = np.arctan2(middle[:, 1], middle[:, 0]) + rng.normal(0.0, 0.7, n)
+    outward = np.stack([np.cos(azimuth), np.sin(azimuth)], axis=-1)
     distance = np.einsum("nvk,nk->nv", trunk[..., :2], outward).max(axis=1) + scale * rng.uniform(
         1.0, 60.0, n
     )

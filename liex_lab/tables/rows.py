@@ -178,7 +178,7 @@ class Rows:
         found = self._camera_gaps()
         lost = np.where(self.track.observed, "", np.where(self.track.flag == "no_depth", *LOST))
         stops = stop_times(time)
-        for start, stop, reason in stretches(lost):
+        for start, stop, reason in constant_runs(lost):
             if reason:
                 span = (time[start], stops[stop - 1], int(count[start]), int(count[stop]))
                 found.append((*span, stop - start, str(reason)))
@@ -357,7 +357,7 @@ def frame_count(frame_index: NDArray[np.int64]) -> NDArray[np.int64]:
     return np.append(frame_index, frame_index[-1:] + 1)
 
 
-def stretches(labels: NDArray[Any]) -> list[tuple[int, int, Any]]:
+def constant_runs(labels: NDArray[Any]) -> list[tuple[int, int, Any]]:
     """Runs of equal labels, see `runs_of`.
 
     Args:

@@ -94,16 +94,16 @@ class OcclusionCorrection:
         sight = self._sight(pose, crops, depths)
         shown, covered, aside, begins, ends = sight.T
         most = _SLIDE * np.clip(1.0 - shown, 0.0, 1.0)
-        way = np.where(
+        direction = np.where(
             aside > 0,
             np.clip(begins - self.begins, 0.0, most),
             np.clip(ends - self.ends, -most, 0.0),
         )
-        way[(covered == 0) | (np.abs(aside) < _ASIDE) | (shown > _WHOLE)] = 0.0
+        direction[(covered == 0) | (np.abs(aside) < _ASIDE) | (shown > _WHOLE)] = 0.0
         joints = joints_of(self.skeleton, pose)
         along = joints[:, self.skeleton.tip] - joints[:, 0]
         return replace(
-            pose, root=SE3(pose.root.rotation, pose.root.translation + way[:, None] * along)
+            pose, root=SE3(pose.root.rotation, pose.root.translation + direction[:, None] * along)
         )
 
     def _sight(self, pose: Pose, crops: HeightMaps, depths: NDArray[np.float32]) -> Array:

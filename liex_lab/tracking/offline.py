@@ -222,11 +222,11 @@ def _admit(
         joints = joints_of(subject.skeleton, seen.pose(np.full(len(seen), h))[rows])
         unseen = _UNSEEN * subject.length_mm * np.maximum(1.0 - shown[rows], 0.0)
         said = np.hypot(seen.error_mm[rows, h], unseen)
-        off = np.linalg.norm(joints - track.joints_mm[rows], axis=-1).mean(axis=1)
-        off /= np.hypot(said, track.predicted_error_mm[rows])
-        better = off < best[rows]
+        distance = np.linalg.norm(joints - track.joints_mm[rows], axis=-1).mean(axis=1)
+        distance /= np.hypot(said, track.predicted_error_mm[rows])
+        better = distance < best[rows]
         path[rows[better]] = h
-        best[rows[better]] = off[better]
+        best[rows[better]] = distance[better]
         error[rows[better]] = said[better]
 
 

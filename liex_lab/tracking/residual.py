@@ -122,7 +122,7 @@ def _compare(rendered, heights, origin, step, planes, distance, out):
     for i in prange(rendered.shape[0]):
         size = rendered.shape[1]
         plane = planes[i]
-        off = np.empty(size * size)
+        offset = np.empty(size * size)
         n = 0
         for r in range(size):
             v = origin[i, 1] + step[i] * r
@@ -132,6 +132,6 @@ def _compare(rendered, heights, origin, step, planes, distance, out):
                     observed = (1.0 - heights[i, r, c] / 16.0 / distance[i]) / (
                         plane[0] * u + plane[1] * v + plane[2]
                     )
-                    off[n] = abs(rendered[i, r, c] - observed)
+                    offset[n] = abs(rendered[i, r, c] - observed)
                     n += 1
-        out[i] = np.median(off[:n]) if n >= _MIN_OVERLAP_PX else np.nan
+        out[i] = np.median(offset[:n]) if n >= _MIN_OVERLAP_PX else np.nan

@@ -102,9 +102,9 @@ class FrameTracker:
             Surface.of(estimator.skeleton), pose[used], crops[used], scene, camera_view
         )
         limit = doubtful_mm or estimator.model.calibration.doubtful_mm * size
-        off = body.of(pose[used], crops[used], scene)
-        off = off[np.isfinite(off)]
-        blur = float(np.median(off)) / (home * size) if len(off) else 0.0
+        misfit = body.of(pose[used], crops[used], scene)
+        misfit = misfit[np.isfinite(misfit)]
+        blur = float(np.median(misfit)) / (home * size) if len(misfit) else 0.0
         spread = float(np.log(estimator.sizes_told(estimates)).std())
         ends = None
         if (

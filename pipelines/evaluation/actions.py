@@ -367,16 +367,16 @@ def speed_only(
 
 
 def _speeds(tracks: Sequence[LabelledTrack], clock_hz: float) -> tuple[Array, NDArray[np.str_]]:
-    from liex_lab.actions.channels import channel_names, stretches_of
+    from liex_lab.actions.channels import channel_names, segments_of
 
     speeds = []
     words = []
     for one in tracks:
         time_s = one.track.times_ns * 1e-9
         column = channel_names(one.track.skeleton).index("speed")
-        for stretch in stretches_of(one.track, clock_hz):
-            row = np.searchsorted(time_s, stretch.times_s - 0.5 / clock_hz).clip(0, len(time_s) - 1)
-            speeds.append(stretch.values[:, [column]])
+        for segment in segments_of(one.track, clock_hz):
+            row = np.searchsorted(time_s, segment.times_s - 0.5 / clock_hz).clip(0, len(time_s) - 1)
+            speeds.append(segment.values[:, [column]])
             words.append(one.words[row])
     return np.concatenate(speeds), np.concatenate(words)
 

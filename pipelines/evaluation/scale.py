@@ -30,7 +30,7 @@ from liex_lab.plan.study import Study
 from liex_lab.runtime.progress import Progress, silent
 
 from ..build import build_provenance, build_recording, build_tracker, kept_estimator
-from ..shards import CHUNK, Shard, look_side_by_side
+from ..shards import CHUNK, Shard, measure_shards
 from ..workers import Done, Processes, Work, WorkerPool
 from .long_sessions import looped
 
@@ -166,8 +166,8 @@ def _stages(run: RunSession, recording: Path, folder: Path) -> dict[str, Any]:
 class _Timed:
     """A worker pool that takes down when each shard came, and how many frames it has."""
 
-    def __init__(self, crew: WorkerPool) -> None:
-        self._crew = crew
+    def __init__(self, pool: WorkerPool) -> None:
+        self._crew = pool
         self.came: list[tuple[float, int]] = []
 
     def each(self, do: Callable[[Work], Done], works: Sequence[Work]) -> Iterator[Done]:
@@ -203,10 +203,10 @@ def _side_by_side(recording: Path, folder: Path) -> dict[str, Any]:
             len(opened),
         )
     for name, (count, n_cores) in _CREWS.items():
-        crew = _Timed(Processes(count, threads=1))
+        pool = _Timed(Processes(count, threads=1))
         with _on_cores(n_cores):
-            look_side_by_side(crew, whole, folder / f"stretches {name}.liex", silent)
-        (begun, _), later = crew.came[count - 1], crew.came[count:]
+            measure_shards(pool, whole, folder / f"stretches {name}.liex", silent)
+        (begun, _), later = pool.came[count - 1], pool.came[count:]
         found[name] = sum(n for _, n in later) / (later[-1][0] - begun)
     return {
         "looking_frames_per_s": found,

@@ -30,7 +30,7 @@ class RunSession(Protocol):
         folder: Path,
         overwrite: bool,
         notes: dict[str, Any],
-        crew: WorkerPool | None,
+        pool: WorkerPool | None,
         progress: Progress,
     ) -> Path:
         """Measure a recording, write the session folder `folder`, and return it.
@@ -41,7 +41,7 @@ class RunSession(Protocol):
             folder: the session folder.
             overwrite: replace a session that is there already.
             notes: what session.json is to hold besides.
-            crew: pool of workers for the shards of a long recording; None measures it in this
+            pool: pool of workers for the shards of a long recording; None measures it in this
                 process.
             progress: told frame by frame.
         """
@@ -52,7 +52,7 @@ def measure_one(
     run: RunSession,
     progress: Progress = silent,
     run_id: str = "",
-    crew: WorkerPool | None = None,
+    pool: WorkerPool | None = None,
 ) -> dict[str, Any]:
     """Measure a session, or quarantine it, and tell how it went.
 
@@ -64,7 +64,7 @@ def measure_one(
         run: measures the recording.
         progress: told frame by frame.
         run_id: of the study's run; a session that it has ended already is not measured again.
-        crew: pool of workers for the session's shards.
+        pool: pool of workers for the session's shards.
 
     Returns:
         `id`, `state` (`done` or `failed`), `seconds`, `failure` (None where it is done), and
@@ -96,7 +96,7 @@ def measure_one(
             folder=session.folder,
             overwrite=True,
             notes={"input": {"stamp": stamp}, "run_id": run_id},
-            crew=crew,
+            pool=pool,
             progress=watch,
         )
     except Exception as error:

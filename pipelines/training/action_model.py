@@ -229,12 +229,12 @@ def suggest(
     """
     import pandas as pd
 
-    from liex_lab.actions.suggestions import doubtful_stretches
+    from liex_lab.actions.suggestions import doubtful_segments
 
     opened, recogniser = _session_and_model(session, model)
     track = track_of(opened)
     found = recogniser.recognise(track, wall_of(opened))
-    rows = doubtful_stretches(found, track.times_ns, n, least_s)
+    rows = doubtful_segments(found, track.times_ns, n, least_s)
     return pd.DataFrame(rows, columns=["start_s", "stop_s", "guess", "or_else", "uncertainty"])
 
 

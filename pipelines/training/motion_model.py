@@ -142,7 +142,7 @@ def train_tracking(
     tuning = search(
         measured, TrackingParameters.of(animal), n_tries, np.random.default_rng(0), progress
     )
-    tuning = honest_about_roots(measured, honest_about_joints(measured, tuning))
+    tuning = calibrate_roots(measured, calibrate_joints(measured, tuning))
     out.write_text(tunings_with(animal, tuning), encoding="utf-8")
     return out
 
@@ -305,7 +305,7 @@ class _Claim:
         said: (n,) stated mean joint error.
         sd: (n, J) stated standard deviation of each joint.
         away: (n, J) standard deviation that a stretch of 1 gives each joint, see `stretch_of`.
-        off: (n, J, 3) how far off the joints are.
+        deviation: (n, J, 3) how far off the joints are.
     """
 
     blur: float
@@ -313,7 +313,7 @@ class _Claim:
     said: Array
     sd: Array
     away: Array
-    off: Array
+    deviation: Array
 
     def stretch_sd(self, per_blur: float, per_spread: float) -> float:
         """The sequence's `Subject.stretch_sd` at coefficients `per_blur` and `per_spread`."""
@@ -330,10 +330,10 @@ class _Claim:
             np.log(self.said), *np.array([(np.log(said), factor) for said, factor in knots]).T
         )
         sd = np.hypot(factor[:, None] * self.sd, self.stretch_sd(*stretch) * self.away)
-        return np.asarray(self.off / sd[..., None])
+        return np.asarray(self.deviation / sd[..., None])
 
 
-def honest_about_joints(measured: Sequence[Seen], tuning: TrackingParameters) -> TrackingParameters:
+def calibrate_joints(measured: Sequence[Seen], tuning: TrackingParameters) -> TrackingParameters:
     """The same tuning with factors and stretch by which the joints' 90 % intervals hold 90 %.
 
     Over a grid of both stretch coefficients (`_PER_BLUR` x `_PER_SPREAD`) the factors are fitted to
@@ -349,7 +349,7 @@ def honest_about_joints(measured: Sequence[Seen], tuning: TrackingParameters) ->
     best = (0.0, 0.0)
     least = np.inf
     for stretch in product(_PER_BLUR.tolist(), _PER_SPREAD.tolist()):
-        knots = honesty(claims, stretch)
+        knots = calibration_knots(claims, stretch)
         apart = float(
             np.mean([np.log(_nine_in_ten(claim.over(knots, stretch))) ** 2 for claim in claims])
         )
@@ -358,7 +358,10 @@ def honest_about_joints(measured: Sequence[Seen], tuning: TrackingParameters) ->
             least = apart
     usual = float(np.median([claim.stretch_sd(*best) for claim in claims]))
     return with_motion(
-        tuning, calibration=honesty(claims, best), stretch=best, usual_stretch=round(usual, 4)
+        tuning,
+        calibration=calibration_knots(claims, best),
+        stretch=best,
+        usual_stretch=round(usual, 4),
     )
 
 
@@ -378,7 +381,7 @@ def _claim(each: Seen, plain: TrackingParameters) -> _Claim:
     )
 
 
-def honesty(claims: Sequence[_Claim], stretch: tuple[float, float]) -> Knots:
+def calibration_knots(claims: Sequence[_Claim], stretch: tuple[float, float]) -> Knots:
     """Calibration factors at three levels of the stated error, by bisection; see
     `Motion.calibration`.
 
@@ -392,7 +395,7 @@ def honesty(claims: Sequence[_Claim], stretch: tuple[float, float]) -> Knots:
     Returns:
         (median stated error over the length, factor) for each group, in rising order.
     """
-    said, sd, off = (
+    said, sd, deviation = (
         np.concatenate([getattr(claim, name) for claim in claims]) for name in ("said", "sd", "off")
     )
     away = np.concatenate([claim.stretch_sd(*stretch) * claim.away for claim in claims])
@@ -400,7 +403,7 @@ def honesty(claims: Sequence[_Claim], stretch: tuple[float, float]) -> Knots:
     for rows in np.array_split(np.argsort(said, kind="stable"), min(_BINS, len(said))):
 
         def too_wide(factor: float, rows: NDArray[np.int64] = rows) -> bool:
-            inside = off[rows] <= _Z90 * np.hypot(factor * sd[rows], away[rows])[..., None]
+            inside = deviation[rows] <= _Z90 * np.hypot(factor * sd[rows], away[rows])[..., None]
             return bool(inside.mean() > 0.9)
 
         least, most = _FACTORS
@@ -413,7 +416,7 @@ def honesty(claims: Sequence[_Claim], stretch: tuple[float, float]) -> Knots:
     return tuple(knots)
 
 
-def honest_about_roots(measured: Sequence[Seen], tuning: TrackingParameters) -> TrackingParameters:
+def calibrate_roots(measured: Sequence[Seen], tuning: TrackingParameters) -> TrackingParameters:
     """The same tuning with factors by which 90 % intervals of root and bends hold 90 %.
 
     The root's error is the twist log(g_est^-1 g_true), rotation and then translation in its own
@@ -430,11 +433,12 @@ def honest_about_roots(measured: Sequence[Seen], tuning: TrackingParameters) -> 
         track = _track(each, plain)
         there = track.posed
         true = each.pose
-        off = SE3(track.root_rotation[there], track.root_mm[there]).inverse() @ SE3(
+        deviation = SE3(track.root_rotation[there], track.root_mm[there]).inverse() @ SE3(
             true.root.rotation[there], true.root.translation[there]
         )
         roots.append(
-            np.concatenate([so3.log(off.rotation), off.translation], axis=1) / track.sd_root[there]
+            np.concatenate([so3.log(deviation.rotation), deviation.translation], axis=1)
+            / track.sd_root[there]
         )
         with np.errstate(invalid="ignore", divide="ignore"):
             bends.append(

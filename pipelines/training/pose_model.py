@@ -433,13 +433,13 @@ def with_truth(
         )
     middle = joints.mean(axis=1)
     blob = crops.blobs
-    off = np.linalg.norm(np.stack([blob.x, blob.y], axis=1) - middle[:, :2], axis=1)
+    distance = np.linalg.norm(np.stack([blob.x, blob.y], axis=1) - middle[:, :2], axis=1)
     if method.camera_view:  # what is beside it in depth is another thing as well
-        off = np.maximum(
-            off, np.abs(blob.volume_mm3 / np.maximum(blob.area_mm2, 1e-9) - middle[:, 2])
+        distance = np.maximum(
+            distance, np.abs(blob.volume_mm3 / np.maximum(blob.area_mm2, 1e-9) - middle[:, 2])
         )
-    animal = off < 0.4 * windows.spine_mm
-    other = off > 0.8 * windows.spine_mm
+    animal = distance < 0.4 * windows.spine_mm
+    other = distance > 0.8 * windows.spine_mm
     good = crops.found & (
         animal | other
     )  # in between the two have run together, which teaches nothing

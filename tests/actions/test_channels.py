@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from liex_lab.actions.channels import channel_names, stretches_of
+from liex_lab.actions.channels import channel_names, segments_of
 from liex_lab.actions.descriptors import position_descriptor, tangent_descriptor
 from liex_lab.actions.labels import some_rows
 from liex_lab.actions.window_features import window_features
@@ -26,9 +26,9 @@ def test_speed_and_turning_are_the_same_at_every_frame_rate(animal: str, rate_hz
     clock, length = np.arange(0.0, 4.0, 1.0 / rate_hz), Skeleton.load(animal).length
     track = straight_track(animal, clock, 2.0 * length * clock, 0.5 * clock)
     names = channel_names(track.skeleton)
-    (stretch,) = stretches_of(track, 50.0)
-    middle = stretch.values[20:-20]
-    assert stretch.values.shape[1] == len(names)
+    (segment,) = segments_of(track, 50.0)
+    middle = segment.values[20:-20]
+    assert segment.values.shape[1] == len(names)
     assert np.median(middle[:, names.index("forward")]) == pytest.approx(2.0, rel=0.02)
     assert np.median(middle[:, names.index("yaw_rate~")]) == pytest.approx(0.5, rel=0.02)
     assert np.ptp(middle[:, names.index("straightness")]) < 0.01
@@ -38,9 +38,9 @@ def test_a_long_gap_parts_the_track_and_a_short_one_is_bridged() -> None:
     clock = np.arange(0.0, 6.0, 1.0 / 30.0)
     track = straight_track("mouse", clock, 100.0 * clock)
     track.joints_mm[60:66] = np.nan
-    assert len(stretches_of(track, 30.0)) == 1
+    assert len(segments_of(track, 30.0)) == 1
     track.joints_mm[100:130] = np.nan
-    first, second = stretches_of(track, 30.0)
+    first, second = segments_of(track, 30.0)
     assert first.times_s[-1] < 100 / 30.0
     assert second.times_s[0] >= 130 / 30.0 - 1e-9
 
@@ -50,28 +50,28 @@ def test_a_body_that_points_backwards_for_a_moment_is_left_out() -> None:
     track = straight_track("mouse", clock, 100.0 * clock)
     column = channel_names(track.skeleton).index("yaw_rate~")
     track.joints_mm[50] = track.joints_mm[50, ::-1].copy()
-    assert np.abs(stretches_of(track, 30.0)[0].values[:, column]).max() < 0.1
+    assert np.abs(segments_of(track, 30.0)[0].values[:, column]).max() < 0.1
 
 
 def test_a_camera_that_errs_more_throughout_changes_no_channel() -> None:
     clock = np.arange(0.0, 4.0, 1.0 / 30.0)
     track = straight_track("mouse", clock, 100.0 * clock)
     track.predicted_error_mm[:] = np.random.default_rng(3).uniform(1.0, 4.0, track.n_frames)
-    values = stretches_of(track, 30.0)[0].values.copy()
+    values = segments_of(track, 30.0)[0].values.copy()
     track.predicted_error_mm[:] *= 2.5
-    np.testing.assert_allclose(stretches_of(track, 30.0)[0].values, values, atol=1e-9)
+    np.testing.assert_allclose(segments_of(track, 30.0)[0].values, values, atol=1e-9)
     assert np.ptp(values[:, channel_names(track.skeleton).index("doubt")]) > 0.5
 
 
 def test_no_pose_at_all_gives_no_stretch() -> None:
-    assert stretches_of(Track.empty(Skeleton.load("mouse"), np.arange(9) * 10**7), 30.0) == []
+    assert segments_of(Track.empty(Skeleton.load("mouse"), np.arange(9) * 10**7), 30.0) == []
 
 
 def test_window_features_are_finite_and_as_many_for_short_stretches() -> None:
     clock = np.arange(0.0, 6.0, 1.0 / 30.0)
     track = straight_track("mouse", clock, 100.0 * clock)
     names = channel_names(track.skeleton)
-    (long,), (short,) = stretches_of(track, 30.0), stretches_of(some_rows(track, slice(0, 3)), 30.0)
+    (long,), (short,) = segments_of(track, 30.0), segments_of(some_rows(track, slice(0, 3)), 30.0)
     a, b = window_features(long, names), window_features(short, names)
     assert np.isfinite(a).all()
     assert np.isfinite(b).all()
@@ -98,7 +98,7 @@ def test_channels_made_piece_by_piece_are_those_made_at_once(
     rng, clock = np.random.default_rng(1), np.arange(0.0, 6.0, 1.0 / rate_hz)
     track = straight_track("mouse", clock, 100.0 * clock, 0.5 * clock)
     track.joints_mm[:] += rng.normal(size=track.joints_mm.shape)
-    (whole,) = stretches_of(track, 30.0)
+    (whole,) = segments_of(track, 30.0)
     monkeypatch.setattr("liex_lab.actions.channels._PIECE", 7)
-    (pieces,) = stretches_of(track, 30.0, allocate=on_disk(tmp_path))
+    (pieces,) = segments_of(track, 30.0, allocate=on_disk(tmp_path))
     assert pieces.values.tobytes() == whole.values.tobytes()

@@ -23,7 +23,7 @@ from liex_lab.actions.labels import LabelledTrack, read_labels, some_rows, words
 from liex_lab.actions.learning import learn, leave_one_animal_out
 from liex_lab.actions.scores import timeline_scores
 from liex_lab.actions.storage import load_action_model, save_action_model
-from liex_lab.actions.suggestions import doubtful_stretches
+from liex_lab.actions.suggestions import doubtful_segments
 from liex_lab.actions.timeline import TimelineModel
 from liex_lab.errors import LiexError, ModelError
 from liex_lab.mlp import Network
@@ -206,7 +206,7 @@ def test_the_stretches_suggested_do_not_overlap_and_lie_in_the_recording(
     model: TimelineModel,
 ) -> None:
     one = going_and_staying(15)
-    rows = doubtful_stretches(model.recognise(one.track), one.track.times_ns, 6, 0.5)
+    rows = doubtful_segments(model.recognise(one.track), one.track.times_ns, 6, 0.5)
     assert rows
     spans = sorted((row["start_s"], row["stop_s"]) for row in rows)
     assert all(a[1] <= b[0] + 1e-6 for a, b in pairwise(spans))

@@ -27,7 +27,7 @@ def pretended_run(
     folder: Path,
     overwrite: bool,
     notes: dict[str, Any],
-    crew: object,
+    pool: object,
     progress: Progress,
 ) -> Path:
     """Stands in for `run_session`."""
@@ -69,7 +69,7 @@ def pretended_run(
         "frames_per_s": 100.0,
         "peak_memory_mb": 500.0,
         "threads": os.environ.get("NUMBA_NUM_THREADS"),
-        "shared": crew is not None,
+        "shared": pool is not None,
     }
     (folder / "session.json").write_text(json.dumps(document))
     return folder
@@ -85,6 +85,6 @@ def shared_task(n: int) -> list[tuple[int, int]]:
 
 
 def stretch(number: int) -> tuple[int, int]:
-    """Stands in for `stretches.look_at`."""
+    """Stands in for `shards.measure_shard`."""
     time.sleep(0.2)
     return number, os.getpid()

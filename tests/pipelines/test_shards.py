@@ -28,7 +28,7 @@ LENGTH = 8  # frames of a stretch here
 
 
 class InTurn:
-    """A crew of this process alone, which takes the last stretch first and may meet with an
+    """A pool of this process alone, which takes the last stretch first and may meet with an
     accident.
     """
 
@@ -63,7 +63,7 @@ def test_tables_do_not_depend_on_the_number_of_workers(
     folder: Path,  # noqa: F811
     tmp_path: Path,
 ) -> None:
-    shared = run(folder, tmp_path, crew=Processes(n))
+    shared = run(folder, tmp_path, pool=Processes(n))
     assert tables_of(shared) == tables_of(session.path)
     assert depth_messages(shared) == depth_messages(session.path)
     assert Session.open(shared).metadata["interruptions"] == 0
@@ -73,7 +73,7 @@ def test_tables_do_not_depend_on_the_number_of_workers(
     assert not [one.sentence for one in verify_session(shared, run_session) if one.state == "wrong"]
 
 
-@pytest.mark.parametrize("then", ["with a crew", "alone"])
+@pytest.mark.parametrize("then", ["with a pool", "alone"])
 def test_after_an_accident_what_is_whole_is_not_done_again(
     then: str,
     session: Session,  # noqa: F811
@@ -81,12 +81,12 @@ def test_after_an_accident_what_is_whole_is_not_done_again(
     tmp_path: Path,
 ) -> None:
     with pytest.raises(SessionError, match="without a word"):
-        run(folder, tmp_path, crew=InTurn(accident_after=3))
+        run(folder, tmp_path, pool=InTurn(accident_after=3))
     assert not list(tmp_path.glob("*.liex"))
     n_stretches = -(-(N_RENDERED - 3) // LENGTH)
-    crew = InTurn()
-    done = run(folder, tmp_path, crew=crew if then == "with a crew" else None)
-    assert crew.n_done == (n_stretches - 3 if then == "with a crew" else 0)
+    pool = InTurn()
+    done = run(folder, tmp_path, pool=pool if then == "with a pool" else None)
+    assert pool.n_done == (n_stretches - 3 if then == "with a pool" else 0)
     assert tables_of(done) == tables_of(session.path)
     assert depth_messages(done) == depth_messages(session.path)
     assert not list(tmp_path.glob("*.part"))
@@ -105,16 +105,16 @@ def test_a_frame_that_cannot_be_read_is_told_and_a_whole_recording_goes_on(
             raise RecordingError("frame 21 cannot be read; copy the recording again")
         return frame(self, row)
 
-    def torn_stretch(work: Any) -> Any:
+    def torn_shard(work: Any) -> Any:
         with monkeypatch.context() as patch:
             patch.setattr(Recording, "frame", torn)
-            return look_at(work)
+            return measure_shard(work)
 
-    look_at = shards.look_at
-    monkeypatch.setattr(shards, "look_at", torn_stretch)
+    measure_shard = shards.measure_shard
+    monkeypatch.setattr(shards, "measure_shard", torn_shard)
     with pytest.raises(RecordingError, match="frame 21"):
-        run(folder, tmp_path, crew=InTurn())
-    monkeypatch.setattr(shards, "look_at", look_at)
+        run(folder, tmp_path, pool=InTurn())
+    monkeypatch.setattr(shards, "measure_shard", measure_shard)
     assert tables_of(run(folder, tmp_path)) == tables_of(session.path)
 
 
@@ -125,9 +125,9 @@ def test_a_short_recording_and_one_that_is_open_are_looked_at_by_one(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(job, "LENGTH", 1000)
-    crew = InTurn()
-    assert tables_of(run(folder, tmp_path, crew=crew)) == tables_of(session.path)
-    assert crew.n_done == 0
+    pool = InTurn()
+    assert tables_of(run(folder, tmp_path, pool=pool)) == tables_of(session.path)
+    assert pool.n_done == 0
 
 
 def test_cuts_are_at_the_same_places_wherever_the_work_goes_on() -> None:

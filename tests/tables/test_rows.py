@@ -10,7 +10,7 @@ import pytest
 
 from liex_lab.geometry import so3
 from liex_lab.recordings.timestamps import find_faults, find_gaps, make_monotone, median_step
-from liex_lab.tables.rows import Rows, nearness, stop_times, stretches
+from liex_lab.tables.rows import Rows, constant_runs, nearness, stop_times
 from liex_lab.tables.schema import GAPS, ROTATIONS, to_pandas
 from tests.sessions.walking_mouse import SD_ROOT, WalkingMouse, steady
 
@@ -89,12 +89,12 @@ def test_the_score_is_the_share_of_gaussian_points_within_the_radius():
 
 def test_stretches_are_the_runs_a_reader_would_count():
     labels = np.array(["a", "a", "", "b", "b", "b"])
-    assert [(a, b, str(w)) for a, b, w in stretches(labels)] == [
+    assert [(a, b, str(w)) for a, b, w in constant_runs(labels)] == [
         (0, 2, "a"),
         (2, 3, ""),
         (3, 6, "b"),
     ]
-    assert stretches(np.array([])) == []
+    assert constant_runs(np.array([])) == []
 
 
 def test_a_frame_stands_for_the_time_to_the_next_one_but_not_for_a_gap():

@@ -80,7 +80,7 @@ class Individual:
         side = rng.uniform(-0.5, 0.5)
         return Individual(size=float(size), **factors, restless=float(restless), side=float(side))
 
-    def way(self, rng: np.random.Generator) -> float:
+    def turn_side(self, rng: np.random.Generator) -> float:
         """A direction to turn in, left (1) or right (-1), by the side it prefers.
 
         Args:

@@ -242,13 +242,13 @@ class FishActor:
 
     def _j_turn(self, rng: np.random.Generator) -> Array:
         t, c = self._blank(rng, self._seconds(rng, 0.3, 1.4))
-        way = self.fish.way(rng)
+        side = self.fish.turn_side(rng)
         rate = self.fish.tempo * rng.uniform(2.2, 5.0)
         beats = 0.5 - 0.5 * np.cos(2 * np.pi * np.minimum(rate, 2.0 / t[-1] + rate) * t)
-        c[:, _HIND] = way * self.fish.bend * rng.uniform(1.9, 4.6) * (0.25 + 0.75 * beats)
+        c[:, _HIND] = side * self.fish.bend * rng.uniform(1.9, 4.6) * (0.25 + 0.75 * beats)
         c[:, _FRONT] = 0.12 * c[:, _HIND] + rng.normal(0.0, 0.2)
         turn = np.radians(rng.uniform(8.0, 42.0))
-        c[:, TURN] = way * turn / t[-1] * (0.3 + 1.4 * beats)
+        c[:, TURN] = side * turn / t[-1] * (0.3 + 1.4 * beats)
         c[:, SPEED] = self.fish.vigour * rng.uniform(0.1, 1.1)
         c[:, _WAVE] = rng.uniform(0.1, 0.7)
         c[:, _BEAT] = rate
@@ -275,13 +275,13 @@ class FishActor:
 
     def _r_turn(self, rng: np.random.Generator) -> Array:
         t, c = self._blank(rng, self._seconds(rng, 0.25, 0.95))
-        way = self.fish.way(rng)
+        side = self.fish.turn_side(rng)
         total = float(np.clip(self.fish.bend * rng.normal(72.0, 17.0), 44.0, 112.0))
         length = t[-1] * rng.uniform(0.75, 1.0)
         shape = bump(t, length, rng.uniform(0.3, 0.5))
-        self._bent(rng, t, c, way * shape, total, 0.02)
+        self._bent(rng, t, c, side * shape, total, 0.02)
         c[:, TURN] = (
-            way * np.radians(total * rng.uniform(0.5, 1.1)) * shape / (shape.sum() * STEP_S)
+            side * np.radians(total * rng.uniform(0.5, 1.1)) * shape / (shape.sum() * STEP_S)
         )
         pace = self.fish.vigour * rng.uniform(0.3, 2.8)
         c[:, SPEED] = pace * (0.5 + 0.5 * t / t[-1])
@@ -291,16 +291,16 @@ class FishActor:
 
     def _c_turn(self, rng: np.random.Generator) -> Array:
         t, c = self._blank(rng, self._seconds(rng, 0.16, 0.7))
-        way = self.fish.way(rng)
+        side = self.fish.turn_side(rng)
         total = float(np.clip(self.fish.bend * rng.normal(132.0, 22.0), 88.0, 178.0))
         first = rng.uniform(0.05, 0.10)
         back = rng.uniform(0.06, 0.11)
         bend = bump(t, first + back, first / (first + back))
         counter = bump(t - first - 0.6 * back, 1.6 * back) * (t > first + 0.6 * back)
-        self._bent(rng, t, c, way * (bend - rng.uniform(0.15, 0.45) * counter), total, 0.012)
+        self._bent(rng, t, c, side * (bend - rng.uniform(0.15, 0.45) * counter), total, 0.012)
         shape = bump(t, 1.4 * first + 0.5 * back)
         c[:, TURN] = (
-            way * np.radians(total * rng.uniform(0.55, 1.0)) * shape / (shape.sum() * STEP_S)
+            side * np.radians(total * rng.uniform(0.55, 1.0)) * shape / (shape.sum() * STEP_S)
         )
         pace = self.fish.vigour * rng.uniform(2.5, 9.0)
         glide = np.exp(-np.maximum(t - first - 0.1, 0.0) / rng.uniform(0.2, 0.5))
@@ -310,10 +310,10 @@ class FishActor:
         c[:, CLIMB] = np.radians(rng.normal(0.0, 9.0))
         return c
 
-    def _climb(self, rng: np.random.Generator, way: float) -> Array:
+    def _climb(self, rng: np.random.Generator, side: float) -> Array:
         t, c = self._blank(rng, self._seconds(rng, 0.5, 2.6))
         pace = self.fish.vigour * rng.uniform(0.6, 2.6)
-        c[:, CLIMB] = way * np.radians(rng.uniform(15.0, 45.0)) * np.minimum(1.0, (t + 0.1) / 0.3)
+        c[:, CLIMB] = side * np.radians(rng.uniform(15.0, 45.0)) * np.minimum(1.0, (t + 0.1) / 0.3)
         c[:, SPEED] = pace
         self._swim(rng, t, c, pace)
         c[:, TURN] = (
@@ -325,15 +325,15 @@ class FishActor:
     def _zigzag(self, rng: np.random.Generator) -> Array:
         t, c = self._blank(rng, self._seconds(rng, 0.8, 2.6))
         at = 0.0
-        way = self.fish.way(rng)
+        side = self.fish.turn_side(rng)
         while at < t[-1]:
             length = rng.uniform(0.16, 0.36) / self.fish.tempo
             shape = bump(t - at, length, 0.4) * (t >= at)
             turn = np.radians(rng.uniform(65.0, 140.0))
-            c[:, TURN] += way * turn * shape / max(shape.sum() * STEP_S, 0.5 * length)
-            self._bent(rng, t, c, way * shape, self.fish.bend * rng.uniform(40.0, 105.0), 0.02)
+            c[:, TURN] += side * turn * shape / max(shape.sum() * STEP_S, 0.5 * length)
+            self._bent(rng, t, c, side * shape, self.fish.bend * rng.uniform(40.0, 105.0), 0.02)
             at = at + length * rng.uniform(0.8, 1.3)
-            way = -way
+            side = -side
         pace = self.fish.vigour * rng.uniform(1.2, 4.5)
         c[:, SPEED] = pace * (0.8 + 0.25 * slow_noise(rng, len(t), 0.25)[:, 0])
         self._swim(rng, t, c, 0.5 * pace)
@@ -389,12 +389,12 @@ class FishActor:
             c[:, _BEAT] = self.fish.tempo * rng.uniform(1.5, 3.5)
             c[:, _HIND] = 0.6 * slow_noise(rng, len(t), 0.4)[:, 0]
         elif kind == 2:
-            way = self.fish.way(rng)
+            side = self.fish.turn_side(rng)
             total = rng.uniform(10.0, 40.0)
             shape = bump(t, t[-1])
-            self._bent(rng, t, c, way * shape, total, 0.03)
+            self._bent(rng, t, c, side * shape, total, 0.03)
             c[:, TURN] += (
-                way * np.radians(total * rng.uniform(0.6, 1.0)) * shape / (shape.sum() * STEP_S)
+                side * np.radians(total * rng.uniform(0.6, 1.0)) * shape / (shape.sum() * STEP_S)
             )
             c[:, SPEED] = vigour * rng.uniform(0.2, 1.2)
             c[:, _WAVE] = rng.uniform(0.1, 0.5)

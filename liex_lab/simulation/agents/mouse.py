@@ -416,7 +416,7 @@ class MouseActor:
             c[:, SPEED] = -rng.uniform(25.0, 90.0)
             c[:, TURN] = np.radians(rng.normal(0.0, 20.0))
         else:
-            flank = self.mouse.way(rng) * np.radians(rng.uniform(16.0, 34.0))
+            flank = self.mouse.turn_side(rng) * np.radians(rng.uniform(16.0, 34.0))
             c[:, _BEND] += flank * shape[:, None] ** 0.6 * [0.7, 1.0, 1.4]
             c[:, SPEED] = rng.uniform(0.0, 25.0)
         return c

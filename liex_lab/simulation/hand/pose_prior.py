@@ -270,8 +270,8 @@ def distil(skeleton: Skeleton, angles: Array, turns: Array) -> str:
     for k in range(_N_TURNS):
         group = turns[kind == k]
         mean = so3.mean(group)
-        off = so3.log(mean.T @ group)
-        _, sd, axes = np.linalg.svd(off, full_matrices=False)
+        deviation = so3.log(mean.T @ group)
+        _, sd, axes = np.linalg.svd(deviation, full_matrices=False)
         lines += [
             "[[turns]]",
             f"share = {len(group) / len(turns):.4f}",

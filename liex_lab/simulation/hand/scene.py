@@ -272,16 +272,19 @@ def _things(rng: np.random.Generator, hand: Array, share: float) -> tuple[Array,
     """
     n = len(hand)
     radii = rng.uniform(15.0, 60.0, (n, 3))
-    way = rng.uniform(-np.pi, np.pi, n)
-    toward = np.stack([np.cos(way), np.sin(way)], axis=-1)
+    direction = rng.uniform(-np.pi, np.pi, n)
+    toward = np.stack([np.cos(direction), np.sin(direction)], axis=-1)
     reach = np.einsum("nvk,nk->nv", hand[..., :2], toward).max(axis=1)
     middle = hand.mean(axis=1)
     clear = reach - np.sum(middle[:, :2] * toward, axis=1) + np.hypot(radii[:, 0], radii[:, 1])
-    off = (clear + rng.uniform(10.0, 80.0, n))[:, None] * toward
+    offset = (clear + rng.uniform(10.0, 80.0, n))[:, None] * toward
     depth = np.maximum(middle[:, 2] + rng.uniform(-30.0, 160.0, n), 300.0)
     # farther away it must stand further aside to appear beside the hand and not behind it
     centre = np.column_stack(
-        [(middle[:, :2] + off) * (np.maximum(depth, middle[:, 2]) / middle[:, 2])[:, None], depth]
+        [
+            (middle[:, :2] + offset) * (np.maximum(depth, middle[:, 2]) / middle[:, 2])[:, None],
+            depth,
+        ]
     )
     power = np.where(rng.random(n) < 0.5, 2.0, 8.0)
     return rounded(centre, radii, rng.uniform(-np.pi, np.pi, n), power), rng.random(n) < share

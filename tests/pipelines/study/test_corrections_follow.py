@@ -24,7 +24,7 @@ MOUSE = WalkingMouse(np.arange(12) / 30.0)
 
 
 def run(
-    recording: str, plan: Plan, *, folder: Path, overwrite: bool, crew: object, **more: Any
+    recording: str, plan: Plan, *, folder: Path, overwrite: bool, pool: object, **more: Any
 ) -> Path:
     """Stands in for `run_session`: a small session, unless the recording is torn."""
     if Path(recording).read_bytes() == b"torn":

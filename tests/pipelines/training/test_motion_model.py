@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from liex_lab.pipelines.training.motion_model import (
     Seen,
+    calibrate_joints,
+    calibrate_roots,
     changed,
-    honest_about_joints,
-    honest_about_roots,
     search,
     train_tracking,
 )
@@ -94,7 +94,7 @@ def covered(measured: list[Seen], tuning: TrackingParameters) -> list[float]:
 
 def test_an_honest_track_covers_nine_in_ten(measured):
     wrong = replace(TrackingParameters.of("mouse").motion, calibration=((0.03, 0.3),))
-    tuning = honest_about_joints(
+    tuning = calibrate_joints(
         measured, TrackingParameters(TrackingParameters.of("mouse").chain, wrong)
     )
     knots = tuning.motion.calibration
@@ -111,8 +111,8 @@ def test_who_is_taken_for_smaller_has_wider_intervals_and_who_is_not_has_none(me
         sequences.append(
             replace(each, pose=pose, truth=truth, size_spread=0.0 if size == 1.0 else spread)
         )
-    tuning = honest_about_joints(sequences, TrackingParameters.of("mouse"))
-    alike = honest_about_joints(
+    tuning = calibrate_joints(sequences, TrackingParameters.of("mouse"))
+    alike = calibrate_joints(
         [replace(each, size_spread=0.0) for each in sequences], TrackingParameters.of("mouse")
     )
     assert tuning.motion.stretch[1] > 0
@@ -132,7 +132,7 @@ def test_the_table_is_the_same_on_one_thread_and_on_two(tmp_path):
 
 
 def test_roots_and_bends_are_covered_as_well(measured):
-    tuning = honest_about_roots(measured, TrackingParameters.of("mouse"))
+    tuning = calibrate_roots(measured, TrackingParameters.of("mouse"))
     turned, placed, bent = [], [], []
     for each in measured:
         track = track_whole(each.subject, each.seen, (), tuning).track

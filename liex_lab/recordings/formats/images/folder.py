@@ -155,12 +155,16 @@ def open_images(
         RecordingError: there is no depth, or the camera or the times are not known.
     """
     folder = path if path.is_dir() else path.parent
-    told = CameraFile.read(folder / CAMERA_FILE)
-    kind, files = list_pictures(path, told.pattern) if path.is_dir() else (_kind(path), [path])
+    camera_toml = CameraFile.read(folder / CAMERA_FILE)
+    kind, files = (
+        list_pictures(path, camera_toml.pattern) if path.is_dir() else (_kind(path), [path])
+    )
     if kind == "PCLZF":
-        told = _with_xml(told, files[0])
-    stack = open_stack(kind, files, told, progress)
-    return Folder(path, files, told, stack, told.decode).recording("images", camera, fps)
+        camera_toml = _with_xml(camera_toml, files[0])
+    stack = open_stack(kind, files, camera_toml, progress)
+    return Folder(path, files, camera_toml, stack, camera_toml.decode).recording(
+        "images", camera, fps
+    )
 
 
 @dataclass(frozen=True)
@@ -170,7 +174,7 @@ class Folder:
     Attributes:
         path: what was asked for, a folder or one file.
         files: the files of the pictures.
-        told: what the folder's camera.toml says.
+        camera_toml: what the folder's camera.toml says.
         stack: the stored pictures.
         decode: stored values to depth (H, W) float32 mm.
         beside: further files that say how to read the pictures.
@@ -178,7 +182,7 @@ class Folder:
 
     path: Path
     files: list[Path]
-    told: CameraFile
+    camera_toml: CameraFile
     stack: Stack
     decode: Callable[[Stored], Depth]
     beside: Sequence[Path] = ()
@@ -206,12 +210,12 @@ class Folder:
     def _recording(self, format: str, camera: Lens | None, fps: float | None) -> Recording:
         path = self.path
         stack = self.stack
-        told = self.told
-        the_camera = told.camera(stack.width, stack.height, camera)
-        problems = [*told.problems, *stack.problems, *_say_cut(stack)]
+        camera_toml = self.camera_toml
+        the_camera = camera_toml.camera(stack.width, stack.height, camera)
+        problems = [*camera_toml.problems, *stack.problems, *_say_cut(stack)]
         monotone, start = self._times(fps, problems)
-        _refuse_negative(stack, self.decode, told)
-        stated_in = [self.folder / CAMERA_FILE, self.folder / told.timestamps, *self.beside]
+        _refuse_negative(stack, self.decode, camera_toml)
+        stated_in = [self.folder / CAMERA_FILE, self.folder / camera_toml.timestamps, *self.beside]
         return Recording(
             name=path.resolve().stem if path.is_file() else path.resolve().name,
             format=format,
@@ -222,7 +226,7 @@ class Folder:
             problems=problems,
             truncated=stack.truncated,
             n_whole=sum(stack.whole[: len(monotone.times_ns)]),
-            metadata=({"session_start_time": start} if start else {}) | told.metadata,
+            metadata=({"session_start_time": start} if start else {}) | camera_toml.metadata,
             close=stack.close,
             faults=monotone.faults,
         )
@@ -238,10 +242,10 @@ class Folder:
 
         From the stamp file, or else from the names of the pictures, or else from a stated rate.
         """
-        path = self.folder / self.told.timestamps
+        path = self.folder / self.camera_toml.timestamps
         n = len(self.stack)
         if path.is_file():
-            times = read_csv_times(path, self.told.time_column, self.told.time_unit)
+            times = read_csv_times(path, self.camera_toml.time_column, self.camera_toml.time_unit)
             n, counts = match_counts(n, times, self.folder.name, path.name)
             if not n:
                 raise RecordingError(
@@ -256,7 +260,7 @@ class Folder:
         ):
             times, moment = named
         else:
-            hz = rate(fps, "the call") or self.told.fps
+            hz = rate(fps, "the call") or self.camera_toml.fps
             if hz is None:
                 raise self._no_times()
             problems.append(f"there are no time stamps, so a constant {hz:g} frames/s was assumed")
@@ -269,9 +273,9 @@ class Folder:
     def _no_times(self) -> RecordingError:
         return RecordingError(
             f"the times of the pictures in {self.folder} are not known; write "
-            f"{self.told.timestamps} with a line time_ns (or time_s) and then one time per "
+            f"{self.camera_toml.timestamps} with a line time_ns (or time_s) and then one time per "
             "picture, or state a constant rate with fps = 30.0 under [camera] in camera.toml"
-            + ("" if self.told.path.is_file() else f" ({WHAT_TO_WRITE})")
+            + ("" if self.camera_toml.path.is_file() else f" ({WHAT_TO_WRITE})")
         )
 
 

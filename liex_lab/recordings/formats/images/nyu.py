@@ -88,18 +88,18 @@ def open_nyu(
         RecordingError: there are no such pictures, or they are damaged.
     """
     folder = path if path.is_dir() else path.parent
-    told = CameraFile.read(folder / CAMERA_FILE)
+    camera_toml = CameraFile.read(folder / CAMERA_FILE)
     files = _pictures(folder, view) if path.is_dir() else [path]
     stack = open_pngs(files, progress, colour=True)
-    told = replace(
-        told,
+    camera_toml = replace(
+        camera_toml,
         encoding=COLOUR,
-        fps=told.fps or _NOMINAL_HZ,
-        intrinsics=told.intrinsics
+        fps=camera_toml.fps or _NOMINAL_HZ,
+        intrinsics=camera_toml.intrinsics
         or {name: getattr(NYU_CAMERA, name) for name in ("fx", "fy", "cx", "cy")},
-        source=told.source if told.intrinsics else NYU_CAMERA.source,
+        source=camera_toml.source if camera_toml.intrinsics else NYU_CAMERA.source,
     )
-    return Folder(path, files, told, stack, told.decode).recording("nyu", camera, fps)
+    return Folder(path, files, camera_toml, stack, camera_toml.decode).recording("nyu", camera, fps)
 
 
 def frame_numbers(folder: Path, view: int = VIEW) -> list[int]:

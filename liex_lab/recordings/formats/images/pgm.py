@@ -64,12 +64,12 @@ def open_pgms(files: list[Path], progress: Progress, byte_order: str | None = No
     asked = whole[:: max(1, len(whole) // _N_ASKED)][:_N_ASKED]
     if 2 * sum(_is_little(path) for path in asked) <= len(asked):
         return stack
-    told = (
+    claimed = (
         f"the pixels of {whole[0].name} make sense with the low byte first only, although PGM has "
         "the high byte first, "
         'so they were read so; state byte_order = "little" or "big" under [camera] in camera.toml'
     )
-    return replace(stack, decode=partial(_decode, dtype=_DTYPES["little"]), problems=[told])
+    return replace(stack, decode=partial(_decode, dtype=_DTYPES["little"]), problems=[claimed])
 
 
 def _header(head: bytes) -> _Header | None:

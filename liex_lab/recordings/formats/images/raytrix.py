@@ -58,26 +58,26 @@ def open_raytrix(
     """
     path = folder / PROFILE_FILE
     profile = read_profile(path)
-    told = CameraFile.read(folder / CAMERA_FILE)
+    camera_toml = CameraFile.read(folder / CAMERA_FILE)
     problems = () if profile.doubt is None else (profile.doubt,)
-    told = replace(told, problems=(*told.problems, *problems))
+    camera_toml = replace(camera_toml, problems=(*camera_toml.problems, *problems))
     _refuse_virtual(folder, profile)
     stack: Stack
     decode: Callable[[Stored], Depth]
     if profile.kind == "points":
-        files, stack = _open_clouds(folder, profile, told, camera, progress)
+        files, stack = _open_clouds(folder, profile, camera_toml, camera, progress)
         decode = profile.within
     else:
         kind, files = list_pictures(folder, profile.pattern)
-        stack = open_stack(kind, files, told, progress)
-        told = _with_lens(told, profile, stack, path)
+        stack = open_stack(kind, files, camera_toml, progress)
+        camera_toml = _with_lens(camera_toml, profile, stack, path)
         decode = profile.decode
         try:
             _check(stack, profile, path)
         except BaseException:
             stack.close()
             raise
-    recording = Folder(folder, files, told, stack, decode, (path,)).recording(
+    recording = Folder(folder, files, camera_toml, stack, decode, (path,)).recording(
         "raytrix", camera, fps
     )
     recording.metadata["profile"] = profile.facts()
@@ -122,10 +122,10 @@ def no_profile_error(folder: Path) -> RecordingError:
     )
 
 
-def _with_lens(told: CameraFile, profile: Profile, stack: Stack, path: Path) -> CameraFile:
+def _with_lens(camera_toml: CameraFile, profile: Profile, stack: Stack, path: Path) -> CameraFile:
     """Intrinsics from the lens and the sensor, where no camera.toml states measured ones."""
-    if told.intrinsics or profile.focal_mm is None or profile.pitch_mm is None:
-        return told
+    if camera_toml.intrinsics or profile.focal_mm is None or profile.pitch_mm is None:
+        return camera_toml
     f_px = profile.focal_mm / (profile.pitch_mm * profile.resolution_divisor)
     centre = {"cx": (stack.width - 1) / 2.0, "cy": (stack.height - 1) / 2.0}
     told_once = (
@@ -134,10 +134,10 @@ def _with_lens(told: CameraFile, profile: Profile, stack: Stack, path: Path) -> 
         "and state fx and fy in camera.toml"
     )
     return replace(
-        told,
+        camera_toml,
         intrinsics={"fx": f_px, "fy": f_px, **centre},
         source=path.name,
-        problems=(*told.problems, told_once),
+        problems=(*camera_toml.problems, told_once),
     )
 
 
@@ -173,12 +173,12 @@ def _check(stack: Stack, profile: Profile, path: Path) -> None:
 
 
 def _open_clouds(
-    folder: Path, profile: Profile, told: CameraFile, stated: Lens | None, progress: Progress
+    folder: Path, profile: Profile, camera_toml: CameraFile, stated: Lens | None, progress: Progress
 ) -> tuple[list[Path], Stack]:
     inside = [
         path for path in folder.iterdir() if path.is_file() and fnmatch(path.name, profile.pattern)
     ]
-    beside = (told.timestamps, CAMERA_FILE, PROFILE_FILE)
+    beside = (camera_toml.timestamps, CAMERA_FILE, PROFILE_FILE)
     files = [
         p for p in inside if p.suffix.lower() in point_clouds.SUFFIXES and p.name not in beside
     ]
@@ -188,14 +188,14 @@ def _open_clouds(
             f"{profile.pattern!r} of {PROFILE_FILE}; correct it"
         )
     files.sort(key=lambda path: natural_key(path.name))
-    width = stated.width if isinstance(stated, Camera) else told.width
-    height = stated.height if isinstance(stated, Camera) else told.height
+    width = stated.width if isinstance(stated, Camera) else camera_toml.width
+    height = stated.height if isinstance(stated, Camera) else camera_toml.height
     if not (width and height):
         raise RecordingError(
             f"a point cloud has no pixels, so state the camera that shall see those in {folder}: "
             "write a camera.toml with fx, fy, cx, cy, width and height in pixels"
         )
-    camera = told.camera(width, height, stated)
+    camera = camera_toml.camera(width, height, stated)
     return files, point_clouds.open_clouds(
         files, camera, profile.columns, profile_points(profile), progress
     )

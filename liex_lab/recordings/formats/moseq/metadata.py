@@ -132,9 +132,15 @@ def _stated_camera(document: dict[str, Any]) -> tuple[str | None, str]:
     """Which camera the metadata name, and in which words: programs that record for MoSeq have no
     common key for it.
     """
-    told = {key.lower().replace("_", "").replace(" ", ""): value for key, value in document.items()}
+    entries = {
+        key.lower().replace("_", "").replace(" ", ""): value for key, value in document.items()
+    }
     name = next(
-        (told[key] for key in _CAMERA_KEYS if isinstance(told.get(key), str) and told[key].strip()),
+        (
+            entries[key]
+            for key in _CAMERA_KEYS
+            if isinstance(entries.get(key), str) and entries[key].strip()
+        ),
         None,
     )
     if name is None:

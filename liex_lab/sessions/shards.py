@@ -28,7 +28,7 @@ _SIZES = "stretch.json"
 _SEEN = "seen"
 
 
-def stretch_folder(unfinished: Path, start: int, stop: int) -> Path:
+def shard_folder(unfinished: Path, start: int, stop: int) -> Path:
     """Path where a shard of an unfinished session lies when it is whole.
 
     Args:
@@ -66,7 +66,7 @@ def take_over(held: Checkpoint, folder: Path, n_frames: int, seconds: float) -> 
     shutil.rmtree(folder, ignore_errors=True)
 
 
-class StretchWriter:
+class ShardWriter:
     """Writer of a shard: depth of consecutive frames and their observations.
 
     In a `with` block the shard is whole at its end, or not there.
@@ -94,7 +94,7 @@ class StretchWriter:
         if first_ns is not None:
             self._replay.go_on(first_ns)
 
-    def __enter__(self) -> StretchWriter:
+    def __enter__(self) -> ShardWriter:
         return self
 
     def add(self, frames: Sequence[DepthFrame], seen: Columnar) -> None:
