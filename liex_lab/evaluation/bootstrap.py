@@ -8,6 +8,7 @@ and the bounds are the 2.5 % and 97.5 % quantiles of the statistic over the draw
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +21,7 @@ _SEED = 20170703
 def interval95(
     error: Array,
     recording: NDArray[np.int64],
-    statistic: Callable[[Array], np.floating] = np.median,
+    statistic: Callable[[Array], Any] = np.median,
     n_draws: int = 1_000,
 ) -> tuple[float, float] | None:
     """The 95 % interval of a statistic of frame errors, recordings drawn with replacement.

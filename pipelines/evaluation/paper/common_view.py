@@ -72,8 +72,8 @@ def common_view(
     second = chooser.second_is_animal(frames, scene, size)
     crops, crop_cameras = chosen(frames, scene, 1.0, second, True)
     told = hashlib.sha256(frames.tobytes())
-    for part in (crops.heights, crops.n_px.astype(np.int64), second, f"{size:.6f}".encode()):
-        told.update(part)
+    for part in (crops.heights, crops.n_px.astype(np.int64), second, np.round([size], 6)):
+        told.update(part.tobytes())
     wrong = is_other(crops, crop_cameras, recording)
     alone = second_is_likelier(frames, scene)
     wrong_alone = is_other(*chosen(frames, scene, 1.0, alone, True), recording)
