@@ -172,7 +172,7 @@ def _behaviour(
     from liex_lab.sessions.applying import edited_bouts, spliced_bouts
 
     rules, around = stated_by(raw)
-    frames = results.rows.frames_table()
+    frames = results.rows.frames_table
     bouts = raw.bouts
     actions = dict(raw.metadata.get("actions") or {})
     facts: dict[str, Any] = {}

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from liex_lab.plan import Plan
-from liex_lab.runtime.memory import Allocator, trim_heap
+from liex_lab.runtime.memory import Allocator, rest
 from liex_lab.runtime.progress import Progress, silent
 from liex_lab.runtime.threads import in_background, prefetch
 
@@ -43,9 +43,6 @@ if TYPE_CHECKING:
     from liex_lab.sessions.writer import BlueprintMaker, ReportMaker
     from liex_lab.tables.rows import Rows
     from liex_lab.tracking.tracker import FrameTracker
-
-# of the table `frames`, what names of actions go by
-_NAMED_BY = ("session_id", "individual", "frame_index", "time_ns", "wall_distance_mm")
 
 
 def measure_session(
@@ -162,11 +159,9 @@ def conclude(writer: SessionWriter, plan: Plan, timings: dict[str, float]) -> Se
         plan: rules and action model.
         timings: seconds of `prepare` and `track`, for session.json.
     """
-    rows = writer.rows
-    behaviour, notes = measure_behaviour(rows, plan, writer.origin, writer.allocate)
+    behaviour, notes = measure_behaviour(writer.rows, plan, writer.origin, writer.allocate)
     writer.note(**notes)
-    rows.track.release_pages()
-    trim_heap()
+    rest()
     return writer.close(timings_s=timings, **behaviour.for_session())
 
 
@@ -185,8 +180,7 @@ def measure_behaviour(
 
     recogniser = build_recogniser(plan, origin.skeleton)
     named, notes = ({}, {}) if recogniser is None else name_actions(recogniser, rows, allocate)
-    rows.track.release_pages()
-    trim_heap()
+    rest()
     return measure_rows(
         rows, build_rules(plan), build_surroundings(origin), allocate=allocate, **named
     ), notes
@@ -208,7 +202,7 @@ def name_actions(
     """
     from liex_lab.tables.rows import bout_rows
 
-    frames = rows.frames_table(_NAMED_BY)
+    frames = rows.frames_table
     found = recogniser.recognise(rows.track, frames["wall_distance_mm"].to_numpy(float), allocate)
     notes = {
         "action_model": {

@@ -60,6 +60,32 @@ def test_every_function_states_its_types(folder: str) -> None:
     assert not untyped, "\n".join(untyped)
 
 
+def kernels_of(path: Path) -> list[ast.FunctionDef]:
+    """The functions of a file that numba compiles."""
+    return [
+        node
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(node, ast.FunctionDef)
+        and any("njit" in ast.unparse(decorator) for decorator in node.decorator_list)
+    ]
+
+
+def test_no_kernel_takes_more_than_twelve_arguments() -> None:
+    """Past that a record is missing whose fields they are."""
+    kernels = [
+        (path, kernel)
+        for path in sorted((REPOSITORY / "liex_lab").rglob("*.py"))
+        for kernel in kernels_of(path)
+    ]
+    assert len(kernels) > 200
+    crowded = [
+        f"{path}:{kernel.lineno} {kernel.name}"
+        for path, kernel in kernels
+        if len(kernel.args.args) > 12
+    ]
+    assert not crowded, "\n".join(crowded)
+
+
 def test_the_formatter_would_change_nothing() -> None:
     ran = run_module("ruff", "format", "--check", ".")
     assert ran.returncode == 0, ran.stdout

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.body.skeleton import VIEWS, Skeleton
-from liex_lab.runtime.memory import Allocator, blocks, release_pages
+from liex_lab.runtime.memory import Allocator, blocks
 from liex_lab.tracking.track import Track
 
 Array = NDArray[np.float64]
@@ -151,7 +151,6 @@ def _reversed(track: Track, good: NDArray[np.int64], time_s: Array) -> NDArray[n
     for some in blocks(len(good), _PIECE):
         axis[some] = track.joints_mm[good[some], front] - track.joints_mm[good[some], rear]
         axis[some] /= np.maximum(np.linalg.norm(axis[some], axis=1, keepdims=True), 1e-9)
-        track.release_pages()
     np.cumsum(axis, axis=0, out=total[1:])
     times = time_s[good]
     against = np.empty(len(good), np.bool_)
@@ -262,7 +261,6 @@ def _stretch(
     steep = np.empty(m, np.bool_)
     for piece in blocks(m, _PIECE):
         heading[piece], steep[piece] = _direction(track.skeleton, found.at(piece)[0])
-        track.release_pages()
     heading = np.unwrap(heading)
     # a body that stands upright has no heading: it keeps the last one
     heading = heading[np.maximum.accumulate(np.where(steep, 0, np.arange(m)))]
@@ -273,8 +271,6 @@ def _stretch(
         around = slice(max(0, piece.start - 2), min(m, piece.stop + 2))
         channels = _channels(track.skeleton, units_mm, step, heading[around], *found.at(around))
         values[piece] = channels[piece.start - around.start : piece.stop - around.start]
-        track.release_pages()
-        release_pages(values)
     return Segment(clock, values)
 
 

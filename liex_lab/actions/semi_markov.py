@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.actions import _semi_markov_kernels as kernels
-from liex_lab.runtime.memory import Allocator, blocks, release_pages
+from liex_lab.runtime.memory import Allocator, blocks
 
 Array = NDArray[np.float64]
 
@@ -96,7 +96,6 @@ class SemiMarkovModel:
         stayed = allocate(scores.shape, np.bool_)
         for ticks in blocks(len(scores), _PIECE):
             kernels.go_on(ticks.start, ticks.stop, scores, *terms, value, came_from, stayed)
-            release_pages(scores, came_from, stayed)
         kernels.trace_back(terms[0], value, came_from, stayed, label)
         return label
 
@@ -122,5 +121,4 @@ class SemiMarkovModel:
             piece = np.empty((high - low, scores.shape[1]))
             kernels.probabilities(np.ascontiguousarray(scores[low:high]), *terms, piece)
             out[ticks] = piece[ticks.start - low : ticks.stop - low]
-            release_pages(scores, out)
         return out

@@ -28,7 +28,7 @@ from liex_lab.actions.vocabulary import FASTEST
 from liex_lab.actions.window_features import window_features
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.mlp import Network
-from liex_lab.runtime.memory import Allocator, blocks, release_pages
+from liex_lab.runtime.memory import Allocator, blocks
 from liex_lab.tracking.track import Track
 
 Array = NDArray[np.float64]
@@ -107,7 +107,6 @@ class TimelineModel:
                 Segment(segment.times_s[low:high], segment.values[low:high]), names
             )
             features = features[ticks.start - low : ticks.stop - low]
-            release_pages(segment.values)
             p = np.mean([_softmax(network.logits(features)) for network in self.networks], axis=0)
             now = speed[ticks, None]
             beyond = (now < self.speeds[:, 0] / _SLACK) | (
@@ -132,7 +131,6 @@ class TimelineModel:
         scores = allocate((len(segment.times_s), len(self.words)), float)
         for ticks, log_p in self.log_probabilities(segment, names, speed):
             scores[ticks] = self.sharpness * (log_p - np.log(np.maximum(self.share, 1e-3)))
-            release_pages(scores)
         return scores
 
     def recognise(
@@ -155,7 +153,6 @@ class TimelineModel:
         part = np.full(n, -1)
         for rows in blocks(n, _PIECE):
             probability[rows] = np.nan
-            release_pages(probability)
         time_s = (track.times_ns - track.times_ns[:1]) * 1e-9
         names = channel_names(track.skeleton)
         step = 1.0 / self.clock_hz
@@ -176,7 +173,6 @@ class TimelineModel:
                 probability[rows] = told
                 part[rows] = number
                 score[rows] = np.take_along_axis(told, code[rows, None], axis=1)[:, 0]
-                release_pages(certain, probability)
         ethogram = Ethogram.of_words(
             code, track.times_ns, self.definitions, score, part, names=self.words
         )
@@ -196,7 +192,6 @@ class TimelineModel:
                 break
             for start, stop, word in zip(starts[wrong], stops[wrong], words[wrong], strict=True):
                 scores[start:stop, word] -= _REFUSED
-            release_pages(scores)
         return decoded
 
     def unresolved(self, times_ns: NDArray[np.int64]) -> dict[str, str]:

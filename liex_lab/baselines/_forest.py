@@ -6,6 +6,8 @@ mean-shift mode of the votes is taken (Lie-X section 5.2).
 
 from __future__ import annotations
 
+from typing import Any, NamedTuple
+
 import numpy as np
 from numba import njit, prange
 
@@ -17,6 +19,35 @@ from liex_lab.forests._kernels import VIEW, descend
 _BINS = 72  # of the circle in which headings are counted: 5 degrees each
 _SMOOTH = 3  # bins to either side that a vote for a heading also counts in
 _SETTLE = 2  # times the few mean-shift steps of `mode_of_votes`
+
+
+class VotingForest(NamedTuple):
+    """A forest whose leaves are votes.
+
+    Attributes:
+        nodes: (N, 4) int32 packed nodes.
+        roots: (T,) roots of its trees.
+        leaves: (n_leaves, D) votes: of F1 the offset to the base, mm, and heading times a length
+            (D = 5); of F2 coordinates in lever units.
+    """
+
+    nodes: Any
+    roots: Any
+    leaves: Any
+
+
+class VoteSettings(NamedTuple):
+    """The numbers of the votes.
+
+    Attributes:
+        n_points: number of pixels that vote.
+        reach: how far offsets reach, mm.
+        bandwidths: (2,) of the mean shifts of F1 and F2, mm.
+    """
+
+    n_points: int
+    reach: float
+    bandwidths: Any
 
 
 @njit(cache=True)
@@ -124,9 +155,7 @@ def heading_of(votes):
 
 
 @njit(cache=True)
-def locate(
-    heights, packed_camera, phase, n_points, reach, bandwidth, nodes, roots, leaves, used, place
-):
+def locate(heights, packed_camera, phase, settings, forest, used, place):
     """Position and heading of the animal, as F1's trees vote.
 
     Only votes whose own heading agrees with the chosen one take part in the position: a pixel that
@@ -136,31 +165,30 @@ def locate(
         heights: (S, S) int16 height map, 1/16 mm, 0 where there is no animal.
         packed_camera: (17,) packed crop camera.
         phase: in [0, 1), chooses which pixels vote.
-        n_points: number of pixels that vote.
-        reach: how far offsets reach, mm.
-        bandwidth: of the mean shift over positions, mm.
-        nodes: (N, 4) int32 packed nodes of F1.
-        roots: (T,) roots of its trees.
-        leaves: (n_leaves, 5) offset to the base, mm, and heading times a length.
+        settings: the numbers of the votes.
+        forest: F1.
         used: (T,) bool, the trees that vote.
         place: (3,) filled with the base's position, mm, view frame.
 
     Returns:
         The heading, rad.
     """
+    n_points = settings.n_points
+    n_trees = forest.roots.size
     points = np.empty((n_points, 3))
     animal_points(heights, packed_camera, phase, points)
     view = np.empty((1, VIEW), np.float32)
     none = np.zeros(1, np.float32)
     upright = np.eye(3)
-    votes = np.empty((roots.size * n_points, 5))
+    votes = np.empty((n_trees * n_points, 5))
     n = 0
     for p in range(n_points):
-        fill_view(upright, points[p], packed_camera, 1.0, reach, view[0])
-        for t in range(roots.size):
+        fill_view(upright, points[p], packed_camera, 1.0, settings.reach, view[0])
+        for t in range(n_trees):
             if not used[t]:
                 continue
-            leaf = leaves[descend(nodes, roots[t], heights, np.float32(1.0), view, none)]
+            at = descend(forest.nodes, forest.roots[t], heights, np.float32(1.0), view, none)
+            leaf = forest.leaves[at]
             for i in range(3):
                 votes[n, i] = points[p, i] + leaf[i]
             votes[n, 3] = leaf[3]
@@ -178,26 +206,12 @@ def locate(
             m += 1
     place /= max(m, 1)
     for _ in range(_SETTLE):
-        mode_of_votes(votes[:m, :3], bandwidth, place)
+        mode_of_votes(votes[:m, :3], settings.bandwidths[0], place)
     return heading
 
 
 @njit(cache=True, parallel=True)
-def locate_all(
-    heights,
-    crop_cameras,
-    image,
-    phases,
-    n_points,
-    reach,
-    bandwidth,
-    nodes,
-    roots,
-    leaves,
-    used,
-    places,
-    headings,
-):
+def locate_all(heights, crop_cameras, image, phases, settings, forest, used, places, headings):
     """`locate` for a batch of images, in parallel.
 
     Args:
@@ -205,12 +219,8 @@ def locate_all(
         crop_cameras: (m, 17) packed crop cameras of the height maps.
         image: (n,) index of each sample's height map.
         phases: (n,) in [0, 1).
-        n_points: number of pixels that vote.
-        reach: how far offsets reach, mm.
-        bandwidth: of the mean shift over positions, mm.
-        nodes: (N, 4) int32 packed nodes of F1.
-        roots: (T,) roots of its trees.
-        leaves: (n_leaves, 5) leaf values of F1.
+        settings: the numbers of the votes.
+        forest: F1.
         used: (n, T) bool, the trees that vote.
         places: (n, 3) filled, mm, view frame.
         headings: (n,) filled, rad.
@@ -220,19 +230,15 @@ def locate_all(
             heights[image[s]],
             crop_cameras[image[s]],
             phases[s],
-            n_points,
-            reach,
-            bandwidth,
-            nodes,
-            roots,
-            leaves,
+            settings,
+            forest,
             used[s],
             places[s],
         )
 
 
 @njit(cache=True)
-def unfold(values, levers, place, heading, parents, offsets, rest, axes, rotations, positions):
+def unfold(values, levers, place, heading, tree, rotations, positions):
     """Joint frames of the pose at F2's coordinates, from where F1 put it.
 
     Args:
@@ -240,10 +246,7 @@ def unfold(values, levers, place, heading, parents, offsets, rest, axes, rotatio
         levers: (D,) lever arms.
         place: (3,) base position from F1, mm.
         heading: heading from F1, rad.
-        parents: (J,) parent of each joint.
-        offsets: (J, 3) each joint in its parent's frame, mm at home.
-        rest: (J, 3, 3) rotation from the parent's frame to the joint's at home.
-        axes: (J, 3) bool, the free axes.
+        tree: `KinematicTree` of the skeleton.
         rotations: (J, 3, 3) filled.
         positions: (J, 3) filled, mm.
 
@@ -258,95 +261,62 @@ def unfold(values, levers, place, heading, parents, offsets, rest, axes, rotatio
     scale = correct_base(rotations[0], positions[0], 1.0, twist, 1.0)
     turns = np.zeros(3)
     at = 7
-    for j in range(1, parents.size):
-        place_joint(j, parents, offsets, rest, scale, rotations, positions)
+    for j in range(1, tree.parents.size):
+        place_joint(j, tree, scale, rotations, positions)
         n = 0
         for k in range(3):
-            if axes[j, k]:
+            if tree.axes[j, k]:
                 turns[n] = values[at] / levers[at]
                 n = n + 1
                 at = at + 1
         if n > 0:
-            correct_joint(rotations[j], axes[j], turns, 1.0)
+            correct_joint(rotations[j], tree.axes[j], turns, 1.0)
     return scale
 
 
 @njit(cache=True, parallel=True)
-def guess_all(
-    heights,
-    crop_cameras,
-    found,
-    n_points,
-    reach,
-    bandwidths,
-    nodes,
-    roots,
-    leaves,
-    pose_nodes,
-    pose_roots,
-    pose_leaves,
-    levers,
-    parents,
-    offsets,
-    rest,
-    axes,
-    positions,
-):
+def guess_all(heights, crop_cameras, found, settings, where, pose, levers, tree, positions):
     """Joints of the frames in which an animal was found, in parallel.
 
     Args:
         heights: (n, S, S) int16 height maps, 1/16 mm, 0 where there is no animal.
         crop_cameras: (n, 17) packed crop cameras of the height maps.
         found: (n,) bool, where there is an animal.
-        n_points: number of pixels that vote.
-        reach: how far offsets reach, mm.
-        bandwidths: (2,) of the mean shifts of F1 and F2, mm.
-        nodes: (N, 4) int32 packed nodes of F1.
-        roots: (T,) roots of F1's trees.
-        leaves: (n_leaves, 5) leaf values of F1.
-        pose_nodes: packed nodes of F2.
-        pose_roots: roots of F2's trees.
-        pose_leaves: (n_leaves, D) leaf values of F2.
+        settings: the numbers of the votes.
+        where: F1.
+        pose: F2.
         levers: (D,) lever arms of F2's coordinates.
-        parents: (J,) parent of each joint.
-        offsets: (J, 3) each joint in its parent's frame, mm at home.
-        rest: (J, 3, 3) rotation from the parent's frame to the joint's at home.
-        axes: (J, 3) bool, the free axes.
+        tree: `KinematicTree` of the skeleton.
         positions: (n, J, 3) joints, mm, view frame; filled where an animal was found.
     """
+    n_joints = tree.parents.size
     for i in prange(heights.shape[0]):
         if not found[i]:
             continue
         place = np.empty(3)
-        n_trees = pose_roots.size
-        width = pose_leaves.shape[1]
+        n_trees = pose.roots.size
+        width = pose.leaves.shape[1]
         heading = locate(
             heights[i],
             crop_cameras[i],
             0.5,
-            n_points,
-            reach,
-            bandwidths[0],
-            nodes,
-            roots,
-            leaves,
-            np.ones(roots.size, np.bool_),
+            settings,
+            where,
+            np.ones(where.roots.size, np.bool_),
             place,
         )
         turned = np.empty((3, 3))
         view = np.empty((1, VIEW), np.float32)
         none = np.zeros(1, np.float32)
         turn_to(heading, turned)
-        fill_view(turned, place, crop_cameras[i], 1.0, reach, view[0])
+        fill_view(turned, place, crop_cameras[i], 1.0, settings.reach, view[0])
         votes = np.empty((n_trees, width))
         values = np.zeros(width)
         for t in range(n_trees):
-            leaf = descend(pose_nodes, pose_roots[t], heights[i], np.float32(1.0), view, none)
+            leaf = descend(pose.nodes, pose.roots[t], heights[i], np.float32(1.0), view, none)
             for d in range(width):
-                votes[t, d] = pose_leaves[leaf, d]
+                votes[t, d] = pose.leaves[leaf, d]
                 values[d] += votes[t, d] / n_trees
-        mode_of_votes(votes, bandwidths[1], values)
-        rotations = np.empty((parents.size, 3, 3))
-        unfold(
-            values, levers, place, heading, parents, offsets, rest, axes, rotations, positions[i]
-        )
+        mode_of_votes(votes, settings.bandwidths[1], values)
+        rotations = np.empty((n_joints, 3, 3))
+        unfold(values, levers, place, heading, tree, rotations, positions[i])

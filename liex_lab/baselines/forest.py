@@ -29,6 +29,7 @@ from numpy.typing import NDArray
 
 from liex_lab.baselines import _forest as kernels
 from liex_lab.baselines.baseline import DAMAGE, Guesses, see
+from liex_lab.body.kinematic_tree import KinematicTree
 from liex_lab.body.kinematics import forward_kinematics
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.errors import ModelError
@@ -141,20 +142,11 @@ class RegressionForest:
                 crops.heights,
                 crop_cameras,
                 crops.found,
-                self.plan.n_points,
-                s.length,
-                s.length * np.array(self.plan.bandwidths),
-                self.where.nodes,
-                self.where.roots,
-                self.where.leaves,
-                self.pose.nodes,
-                self.pose.roots,
-                self.pose.leaves,
+                _settings(self.plan, s),
+                _voting(self.where),
+                _voting(self.pose),
                 levers(s),
-                s.parents,
-                s.offsets,
-                s.rest,
-                s.axes,
+                KinematicTree.of(s),
                 joints,
             )
         return Guesses(in_camera_frame(joints, crop_cameras), crops.found, crops)
@@ -262,6 +254,18 @@ def coordinates(
     return np.concatenate(parts, axis=1) * levers(skeleton)
 
 
+def _settings(plan: ForestPlan, skeleton: Skeleton) -> kernels.VoteSettings:
+    """The numbers of the votes for the kernels."""
+    return kernels.VoteSettings(
+        plan.n_points, skeleton.length, skeleton.length * np.array(plan.bandwidths)
+    )
+
+
+def _voting(forest: Forest) -> kernels.VotingForest:
+    """A forest for the kernels."""
+    return kernels.VotingForest(forest.nodes, forest.roots, forest.leaves)
+
+
 def train_forests(
     data: TrainingSet, skeleton: Skeleton, plan: ForestPlan, rng: np.random.Generator, tell: Tell
 ) -> RegressionForest:
@@ -287,12 +291,8 @@ def train_forests(
         data.images.crop_cameras,
         image,
         rng.random(len(image)),
-        plan.n_points,
-        skeleton.length,
-        plan.bandwidths[0] * skeleton.length,
-        where.nodes,
-        where.roots,
-        where.leaves,
+        _settings(plan, skeleton),
+        _voting(where),
         unseen,
         places,
         headings,

@@ -23,7 +23,7 @@ from liex_lab.behaviour.body import BodyAxis
 from liex_lab.behaviour.columns import kinematics_columns
 from liex_lab.behaviour.posture import Posture, Shape
 from liex_lab.behaviour.tail import tail_beat
-from liex_lab.runtime.memory import Allocator, blocks, release_pages
+from liex_lab.runtime.memory import Allocator, blocks
 from liex_lab.tables.rows import gap_follows, median_step, stop_times
 from liex_lab.tables.schema import to_pandas
 from liex_lab.tracking.track import Track
@@ -191,8 +191,6 @@ def _frame_by_frame(
         shape.put(rows, Posture.of(body, xyz, sd))
         if not body.swims:
             _put(heights, rows, _walking(body, xyz, sd))
-        shape.release_pages()
-        release_pages(*heights.values())
     return shape, heights
 
 
@@ -200,7 +198,6 @@ def _put_away(column: pd.Series[Any], allocate: Allocator) -> NDArray[Any]:
     """A copy (n,) of a column in an array of the allocator."""
     values = allocate((len(column),), column.dtype)
     values[:] = column.to_numpy()
-    release_pages(values)
     return values
 
 
@@ -246,8 +243,6 @@ def _moving(
                 "body_pitch_sd_rad": shape.pitch_sd_rad[rows],
             },
         )
-        shape.release_pages()
-        release_pages(*columns.values())
     for rows in blocks(len(hold_s), _BLOCK):  # now that those of the neighbours are known
         here = spans[rows]
         _put(
@@ -260,7 +255,6 @@ def _moving(
                 "yaw_rate_sd_rad_s": here.sd(heading_sd),
             },
         )
-        release_pages(*columns.values())
     return columns
 
 
@@ -353,7 +347,6 @@ class Joints:
             part = track[rows]
             xyz = np.where(part.bridged[:, None, None], np.nan, part.joints_mm)
             sd = part.sd_mm.copy()
-            track.release_pages()
             return _apart(list(np.moveaxis(xyz, -1, 0))), sd
 
         return Joints(list(track.skeleton.names), track.n_frames, at)

@@ -17,9 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.behaviour.body import BodyAxis
-from liex_lab.runtime.memory import Allocator, release_pages
+from liex_lab.runtime.memory import Allocator, blocks
 
 Array = NDArray[np.float64]
+
+_BLOCK = 16_384  # frames that are filled at a time
 
 
 @dataclass(frozen=True)
@@ -214,14 +216,10 @@ class Shape:
         """
         more = {"centre": (n, 3), "thirds_rad": (n, 3)}
         shape = Shape(*(allocate(more.get(one.name, (n,)), float) for one in fields(Shape)))
-        for column in vars(shape).values():
-            column[:] = np.nan
-            release_pages(column)
+        for rows in blocks(n, _BLOCK):
+            for column in vars(shape).values():
+                column[rows] = np.nan
         return shape
-
-    def release_pages(self) -> None:
-        """Release the memory of columns that lie on disk, until they are looked at again."""
-        release_pages(*vars(self).values())
 
     def put(self, rows: slice, posture: Posture) -> None:
         """Write the measures of a posture into some frames.

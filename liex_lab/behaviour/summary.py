@@ -31,7 +31,7 @@ from liex_lab.behaviour.summary_columns import Vocabulary, summary_columns
 from liex_lab.behaviour.transitions import transitions
 from liex_lab.runtime.memory import Allocator
 from liex_lab.tables.rows import stop_times
-from liex_lab.tables.schema import GAPS, empty_table, release_table, to_pandas
+from liex_lab.tables.schema import GAPS, empty_table, to_pandas
 
 if TYPE_CHECKING:
     from liex_lab.tables.rows import Rows
@@ -40,17 +40,6 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 # of the table `frames`, what behaviour is measured by
-_FRAMES = (
-    "session_id",
-    "individual",
-    "frame_index",
-    "time_s",
-    "dt_s",
-    "wall_distance_mm",
-    "zone",
-    "spine_mm",
-    "flag",
-)
 TABLES = ("kinematics", "bouts", "summary", "transitions", "activity", "zones")
 
 
@@ -135,9 +124,7 @@ def measure(
     actions |= dict.fromkeys(sorted(set(named["action"]) - set(actions)), "")
     words = Vocabulary(tuple(actions), tuple(around.zones), "tail_angle_rad" in moved)
     gaps = empty_table(GAPS) if gaps is None else gaps
-    release_table(moved)
     summary = summarise(frames, moved, named, words, around)
-    release_table(moved)
     behaviour = Behaviour(
         moved,
         named,
@@ -149,7 +136,6 @@ def measure(
         words,
         actions,
     )
-    release_table(moved)
     return behaviour
 
 
@@ -164,9 +150,8 @@ def measure_rows(
         around: arena, zones and water; None where nothing is known.
         **how: bouts, actions and room of `measure`.
     """
-    frames = rows.frames_table(_FRAMES)
     gaps = to_pandas(GAPS, rows.gaps())
-    return measure(frames, Joints.of_track(rows.track), rules, around, gaps, **how)
+    return measure(rows.frames_table, Joints.of_track(rows.track), rules, around, gaps, **how)
 
 
 def stated_by(session: SessionTables) -> tuple[MouseRules, Surroundings]:

@@ -77,6 +77,14 @@ class Pose:
         """
         return forward_kinematics(skeleton, self.root, self.angles, self.scale)[1]
 
+    def placed(self, skeleton: Skeleton) -> PlacedPose:
+        """The same poses with the frames of their joints, for all who ask for these.
+
+        Args:
+            skeleton: whose pose it is.
+        """
+        return PlacedPose(self.root, self.angles, self.scale, self.frames(skeleton))
+
     def moved(self, T_new_old: SE3) -> Pose:
         """The same posture in another frame.
 
@@ -121,3 +129,46 @@ class Pose:
             skeleton, np.asarray(joints, float), np.asarray(up, float)
         )
         return Pose(root, angles, scale)
+
+
+@dataclass(frozen=True)
+class PlacedPose(Pose):
+    """Poses that keep the frames of their joints: forward kinematics has been run, once.
+
+    Its arrays are not written to, or the frames would be those of other poses. In another frame
+    (`moved`) it is a `Pose` again.
+
+    Attributes:
+        T_frame_joint: (..., J) frames of the joints, mm.
+    """
+
+    T_frame_joint: SE3
+
+    def __getitem__(
+        self, index: NDArray[np.bool_] | NDArray[np.int64] | slice | int | tuple[Any, ...]
+    ) -> PlacedPose:
+        """Some poses out of a batch, see `Pose`."""
+        some = super().__getitem__(index)
+        placed = self.T_frame_joint
+        return PlacedPose(
+            some.root,
+            some.angles,
+            some.scale,
+            SE3(placed.rotation[index], placed.translation[index]),
+        )
+
+    def frames(self, skeleton: Skeleton) -> SE3:
+        """T_frame_joint of every joint, a batch (..., J), mm.
+
+        Args:
+            skeleton: whose pose it is.
+        """
+        return self.T_frame_joint
+
+    def joints(self, skeleton: Skeleton) -> Array:
+        """Joint positions (..., J, 3) mm in the pose's frame.
+
+        Args:
+            skeleton: whose pose it is.
+        """
+        return self.T_frame_joint.translation

@@ -31,22 +31,34 @@ FRAMES = 8
 _SHIFTS = 4  # mean-shift steps; the mode of ten votes settles within these
 
 
-class KinematicTree(NamedTuple):
-    """A kinematic tree.
+class SeenFrames(NamedTuple):
+    """The height maps of n frames.
 
     Attributes:
-        parents: (J,) parent of each joint.
-        offsets: (J, 3) each joint in its parent's frame, mm at home.
-        rest: (J, 3, 3) rotation from the parent's frame to the joint's at home.
-        axes: (J, 3) bool, the free axes.
-        solved: the joints with regressors, in order, base first.
+        heights: (n, S, S) int16 height maps, 1/16 mm, 0 where there is no animal.
+        crop_cameras: (n, 17) packed crop cameras of the height maps.
+        moments: (n, 9) moments of the height maps.
+        size: the animal's size over home size.
     """
 
-    parents: Any
-    offsets: Any
-    rest: Any
-    axes: Any
-    solved: Any
+    heights: Any
+    crop_cameras: Any
+    moments: Any
+    size: float
+
+
+class CandidatePoses(NamedTuple):
+    """K candidates in each of n frames, changed in place.
+
+    Attributes:
+        rotations: (n, K, J, 3, 3) joint frames, view frame.
+        positions: (n, K, J, 3) joints, mm, view frame.
+        scales: (n, K) of the bones.
+    """
+
+    rotations: Any
+    positions: Any
+    scales: Any
 
 
 class Trees(NamedTuple):
@@ -74,18 +86,24 @@ class CascadeSettings(NamedTuple):
         base_rounds: regression rounds of the base joint.
         rounds: regression rounds C of the other joints.
         reach: (J,) how far feature offsets reach from each joint, mm at home size.
-        levers: (3,) lever arms of the base's rotation, the other joints and the log scale, mm.
+        base_lever: lever arm of the base's rotation, mm.
+        joint_lever: lever arm of the other joints' rotations, mm.
+        scale_lever: lever arm of the log scale, mm.
         bandwidth: of the mean shift over tree votes, regressors' and metric's, in label units; 0
             takes the mean.
         keep: candidates that are kept after the base joint.
+        solved: the joints with regressors, in order, base first.
     """
 
     base_rounds: int
     rounds: int
     reach: Any
-    levers: Any
+    base_lever: float
+    joint_lever: float
+    scale_lever: float
     bandwidth: float
     keep: int
+    solved: Any
 
 
 class _Lanes(NamedTuple):
@@ -218,8 +236,11 @@ def _write_scalars(lanes, k, first, scalars):
 
 
 @njit(cache=True)
-def _see(lanes, n, joint, crop_cameras, moments, size, reach, rotations, positions, scales):
+def _see(lanes, n, joint, seen, reach, candidates):
     """Fill the lanes' only view, as seen from one joint, and their scalars."""
+    rotations = candidates.rotations
+    positions = candidates.positions
+    size = seen.size
     n_lanes = lanes.base.size
     view = np.empty(VIEW, np.float32)
     scalars = np.empty(N_SCALARS, np.float32)
@@ -229,7 +250,7 @@ def _see(lanes, n, joint, crop_cameras, moments, size, reach, rotations, positio
         fill_view(
             rotations[i, k, joint],
             positions[i, k, joint],
-            crop_cameras[i],
+            seen.crop_cameras[i],
             size,
             reach[joint],
             view,
@@ -237,16 +258,23 @@ def _see(lanes, n, joint, crop_cameras, moments, size, reach, rotations, positio
         for c in range(VIEW):
             lanes.views[c * n_lanes + s] = view[c]
         fill_scalars(
-            rotations[i, k, joint], positions[i, k, joint], scales[i, k], moments[i], size, scalars
+            rotations[i, k, joint],
+            positions[i, k, joint],
+            candidates.scales[i, k],
+            seen.moments[i],
+            size,
+            scalars,
         )
         _write_scalars(lanes, s, 0, scalars)
 
 
 @njit(cache=True)
-def _see_all(
-    lanes, n, heights, crop_cameras, moments, size, reach, body, rotations, positions, scales
-):
+def _see_all(lanes, n, seen, reach, body, candidates):
     """Fill the lanes' views from all joints, their scalars, and the residuals of the posed body."""
+    rotations = candidates.rotations
+    positions = candidates.positions
+    scales = candidates.scales
+    size = seen.size
     n_joints = positions.shape[2]
     view = np.empty(VIEW, np.float32)
     scalars = np.empty(N_SCALARS, np.float32)
@@ -258,7 +286,7 @@ def _see_all(
             fill_view(
                 rotations[i, k, joint],
                 positions[i, k, joint],
-                crop_cameras[i],
+                seen.crop_cameras[i],
                 size,
                 reach[joint],
                 view,
@@ -266,14 +294,14 @@ def _see_all(
             for c in range(VIEW):
                 lanes.views[(s * n_joints + joint) * VIEW + c] = view[c]
         fill_scalars(
-            rotations[i, k, 0], positions[i, k, 0], scales[i, k], moments[i], size, scalars
+            rotations[i, k, 0], positions[i, k, 0], scales[i, k], seen.moments[i], size, scalars
         )
         _write_scalars(lanes, s, 0, scalars)
         if body.radius.size > 0:
             explain_pose(
-                heights[i],
-                crop_cameras[i],
-                moments[i, ANGLE],
+                seen.heights[i],
+                seen.crop_cameras[i],
+                seen.moments[i, ANGLE],
                 rotations[i, k],
                 positions[i, k],
                 scales[i, k],
@@ -353,122 +381,62 @@ def choose_survivors(rotations, scores, chosen):
 
 
 @njit(cache=True)
-def _solve_joint(
-    joint,
-    j,
-    chain,
-    regressors,
-    tuning,
-    lanes,
-    n,
-    side,
-    crop_cameras,
-    moments,
-    size,
-    rotations,
-    positions,
-    scales,
-    values,
-):
+def _solve_joint(joint, j, tree, regressors, tuning, lanes, n, seen, candidates, values):
     """All regression rounds of one joint, the j-th solved one, for n lanes."""
+    rotations = candidates.rotations
+    positions = candidates.positions
+    scales = candidates.scales
+    side = seen.heights.shape[1]
     for s in range(n):
         if joint > 0:
             i = lanes.frame[s]
             k = lanes.pose[s]
-            place_joint(
-                joint,
-                chain.parents,
-                chain.offsets,
-                chain.rest,
-                scales[i, k],
-                rotations[i, k],
-                positions[i, k],
-            )
+            place_joint(joint, tree, scales[i, k], rotations[i, k], positions[i, k])
     first = 0 if j == 0 else tuning.base_rounds + (j - 1) * tuning.rounds
     for c in range(tuning.base_rounds if j == 0 else tuning.rounds):
         forest = first + c
-        _see(
-            lanes, n, joint, crop_cameras, moments, size, tuning.reach, rotations, positions, scales
-        )
+        _see(lanes, n, joint, seen, tuning.reach, candidates)
         _predict(regressors, forest, lanes, n, np.int64(0), side, tuning.bandwidth, values)
         for s in range(n):
             i = lanes.frame[s]
             k = lanes.pose[s]
             if joint > 0:
                 correct_joint(
-                    rotations[i, k, joint], chain.axes[joint], values[s], tuning.levers[1]
+                    rotations[i, k, joint], tree.axes[joint], values[s], tuning.joint_lever
                 )
                 continue
             for d in range(3):
-                values[s, d] /= tuning.levers[0]
-            values[s, 6] = values[s, 6] / tuning.levers[2] if regressors.widths[forest] > 6 else 0.0
+                values[s, d] /= tuning.base_lever
+            values[s, 6] = (
+                values[s, 6] / tuning.scale_lever if regressors.widths[forest] > 6 else 0.0
+            )
             scales[i, k] = correct_base(
-                rotations[i, k, 0], positions[i, k, 0], scales[i, k], values[s], size
+                rotations[i, k, 0], positions[i, k, 0], scales[i, k], values[s], seen.size
             )
 
 
 @njit(cache=True)
 def _estimate_block(
-    heights,
-    crop_cameras,
-    moments,
-    frames,
-    size,
-    chain,
-    regressors,
-    pruner,
-    metric,
-    tuning,
-    body,
-    starts,
-    poses,
+    seen, frames, tree, regressors, pruner, metric, tuning, body, starts, poses, scores
 ):
     """Run the candidates of a few frames through cascade, pruner and metric.
 
-    `starts` (rotations, positions, scales) holds their bases and is changed; `poses` gets the
-    surviving candidates and their scores.
+    `starts` holds their bases and is changed; `poses` gets the surviving candidates and `scores`
+    theirs.
     """
-    start_rotations, start_positions, start_scales = starts
-    rotations, positions, scales, scores = poses
+    heights = seen.heights
     side = heights.shape[1]
-    n_joints = positions.shape[2]
-    n_starts = start_scales.shape[1]
-    lanes = _lanes_for(heights, frames, n_starts, 1, size)
+    n_joints = poses.positions.shape[2]
+    n_starts = starts.scales.shape[1]
+    lanes = _lanes_for(heights, frames, n_starts, 1, seen.size)
     n = frames.size * n_starts
     values = np.empty((lanes.base.size, 7))
     # typed as numbers: a kernel is compiled anew for every literal
     first = np.int64(0)
     no_view = np.int64(0)
-    _solve_joint(
-        chain.solved[0],
-        first,
-        chain,
-        regressors,
-        tuning,
-        lanes,
-        n,
-        side,
-        crop_cameras,
-        moments,
-        size,
-        start_rotations,
-        start_positions,
-        start_scales,
-        values,
-    )
+    _solve_joint(tuning.solved[0], first, tree, regressors, tuning, lanes, n, seen, starts, values)
     if tuning.keep < n_starts:
-        _see(
-            lanes,
-            n,
-            0,
-            crop_cameras,
-            moments,
-            size,
-            tuning.reach,
-            start_rotations,
-            start_positions,
-            start_scales,
-        )
+        _see(lanes, n, 0, seen, tuning.reach, starts)
         _predict(pruner, first, lanes, n, no_view, side, 0.0, values)
     chosen = np.arange(tuning.keep)
     early = np.empty(n_starts)
@@ -477,58 +445,25 @@ def _estimate_block(
         if tuning.keep < n_starts:
             for k in range(n_starts):
                 early[k] = values[m * n_starts + k, 0]
-            choose_survivors(start_rotations[i, :, 0], early, chosen)
+            choose_survivors(starts.rotations[i, :, 0], early, chosen)
         for p in range(tuning.keep):
-            scales[i, p] = start_scales[i, chosen[p]]
+            start = chosen[p]
+            poses.scales[i, p] = starts.scales[i, start]
             for a in range(3):
-                positions[i, p, 0, a] = start_positions[i, chosen[p], 0, a]
+                poses.positions[i, p, 0, a] = starts.positions[i, start, 0, a]
                 for b in range(3):
-                    rotations[i, p, 0, a, b] = start_rotations[i, chosen[p], 0, a, b]
-    lanes = _lanes_for(heights, frames, tuning.keep, n_joints, size)
+                    poses.rotations[i, p, 0, a, b] = starts.rotations[i, start, 0, a, b]
+    lanes = _lanes_for(heights, frames, tuning.keep, n_joints, seen.size)
     n = frames.size * tuning.keep
-    for j in range(1, chain.solved.size):
-        _solve_joint(
-            chain.solved[j],
-            j,
-            chain,
-            regressors,
-            tuning,
-            lanes,
-            n,
-            side,
-            crop_cameras,
-            moments,
-            size,
-            rotations,
-            positions,
-            scales,
-            values,
-        )
+    for j in range(1, tuning.solved.size):
+        _solve_joint(tuning.solved[j], j, tree, regressors, tuning, lanes, n, seen, poses, values)
     for s in range(n):
         i = lanes.frame[s]
         k = lanes.pose[s]
         place_rest(
-            chain.solved,
-            chain.parents,
-            chain.offsets,
-            chain.rest,
-            scales[i, k],
-            rotations[i, k],
-            positions[i, k],
+            tuning.solved, tree, poses.scales[i, k], poses.rotations[i, k], poses.positions[i, k]
         )
-    _see_all(
-        lanes,
-        n,
-        heights,
-        crop_cameras,
-        moments,
-        size,
-        tuning.reach,
-        body,
-        rotations,
-        positions,
-        scales,
-    )
+    _see_all(lanes, n, seen, tuning.reach, body, poses)
     _predict(metric, first, lanes, n, n_joints, side, tuning.bandwidth, values)
     for s in range(n):
         scores[lanes.frame[s], lanes.pose[s]] = values[s, 0]
@@ -536,49 +471,29 @@ def _estimate_block(
 
 @njit(cache=True, parallel=True, nogil=True)
 def estimate_all(
-    heights,
-    crop_cameras,
-    moments,
-    seen,
-    size,
-    chain,
-    regressors,
-    pruner,
-    metric,
-    tuning,
-    body,
-    starts,
-    poses,
+    seen, frames, tree, regressors, pruner, metric, tuning, body, starts, poses, scores
 ):
     """Run Lie-X Algorithm 1 for all frames in which an animal was found, in parallel.
 
     Args:
-        heights: (n, S, S) int16 height maps, 1/16 mm, 0 where there is no animal.
-        crop_cameras: (n, 17) packed crop cameras of the height maps.
-        moments: (n, 9) moments of the height maps.
-        seen: (m,) the frames in which an animal was found.
-        size: the animal's size over home size.
-        chain: the kinematic tree.
+        seen: `SeenFrames`.
+        frames: (m,) the frames in which an animal was found.
+        tree: `KinematicTree` of the skeleton.
         regressors: one forest per solved joint and round, in order.
         pruner: one forest, which scores candidates by the base joint alone.
         metric: one forest, the learned metric.
         tuning: the method's numbers.
         body: sphere model whose residuals the metric sees; empty where it does not.
-        starts: base rotations (n, K, 1, 3, 3), positions (n, K, 1, 3) mm and scales (n, K); changed
-            in place.
-        poses: rotations (n, P, J, 3, 3), positions (n, P, J, 3) mm, scales (n, P) and scores (n, P)
-            of the P kept candidates; filled, except in frames not seen.
+        starts: `CandidatePoses` of the K bases alone (J = 1); changed in place.
+        poses: `CandidatePoses` of the P kept candidates; filled, except in frames not seen.
+        scores: (n, P) of the kept candidates; filled likewise.
     """
-    n_blocks = (seen.size + FRAMES - 1) // FRAMES
+    n_blocks = (frames.size + FRAMES - 1) // FRAMES
     for b in prange(n_blocks):
-        frames = seen[b * FRAMES : (b + 1) * FRAMES]
         _estimate_block(
-            heights,
-            crop_cameras,
-            moments,
-            frames,
-            size,
-            chain,
+            seen,
+            frames[b * FRAMES : (b + 1) * FRAMES],
+            tree,
             regressors,
             pruner,
             metric,
@@ -586,4 +501,5 @@ def estimate_all(
             body,
             starts,
             poses,
+            scores,
         )

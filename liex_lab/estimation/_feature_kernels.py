@@ -19,6 +19,13 @@ from numba import njit, prange
 
 from liex_lab.foreground._blob_kernels import unpack_moments
 from liex_lab.foreground._crop_camera_kernels import crop_camera, to_camera
+from liex_lab.forests._kernels import (
+    COLUMN_SLOPE,
+    ROW_SLOPE,
+    VIEW_COLUMN,
+    VIEW_HEIGHT,
+    VIEW_ROW,
+)
 from liex_lab.geometry._so3_kernels import exp_so3
 
 N_SCALARS = 11
@@ -45,16 +52,16 @@ def fill_view(rotation, position, packed_camera, size, reach, view):
     per_px = 1.0 / camera.step
     iu = camera.fx / z * per_px
     iv = camera.fy / z * per_px
-    view[0] = (camera.fx * x / z + camera.cx - camera.u0) * per_px
-    view[1] = (camera.fy * y / z + camera.cy - camera.v0) * per_px
+    view[VIEW_COLUMN] = (camera.fx * x / z + camera.cx - camera.u0) * per_px
+    view[VIEW_ROW] = (camera.fy * y / z + camera.cy - camera.v0) * per_px
     unit = reach * size / 127.0
     for k in range(3):
         ax = camera.r00 * rotation[0, k] + camera.r10 * rotation[1, k] + camera.r20 * rotation[2, k]
         ay = camera.r01 * rotation[0, k] + camera.r11 * rotation[1, k] + camera.r21 * rotation[2, k]
         az = camera.r02 * rotation[0, k] + camera.r12 * rotation[1, k] + camera.r22 * rotation[2, k]
-        view[2 + k] = unit * iu * (ax - x / z * az)
-        view[5 + k] = unit * iv * (ay - y / z * az)
-    view[8] = 16.0 * position[2] / size
+        view[COLUMN_SLOPE + k] = unit * iu * (ax - x / z * az)
+        view[ROW_SLOPE + k] = unit * iv * (ay - y / z * az)
+    view[VIEW_HEIGHT] = 16.0 * position[2] / size
 
 
 @njit(cache=True)
@@ -183,67 +190,61 @@ def correct_joint(rotation, axes, values, lever):
 
 
 @njit(cache=True)
-def place_joint(j, parents, offsets, rest, scale, rotations, positions):
+def place_joint(j, tree, scale, rotations, positions):
     """Put a joint where its parent carries it, at its home angle.
 
     Args:
         j: number of the joint.
-        parents: (J,) parent of each joint.
-        offsets: (J, 3) each joint in its parent's frame, mm at home.
-        rest: (J, 3, 3) rotation from the parent's frame to the joint's at home.
+        tree: `KinematicTree` of the skeleton.
         scale: of the bones.
         rotations: (J, 3, 3) joint frames; that of j is filled.
         positions: (J, 3) joints, mm; that of j is filled.
     """
-    p = parents[j]
+    p = tree.parents[j]
     for i in range(3):
         total = positions[p, i]
         for k in range(3):
-            total += scale * rotations[p, i, k] * offsets[j, k]
+            total += scale * rotations[p, i, k] * tree.offsets[j, k]
         positions[j, i] = total
         for k in range(3):
             value = 0.0
             for m in range(3):
-                value += rotations[p, i, m] * rest[j, m, k]
+                value += rotations[p, i, m] * tree.rest[j, m, k]
             rotations[j, i, k] = value
 
 
 @njit(cache=True)
-def place_rest(solved, parents, offsets, rest, scale, rotations, positions):
+def place_rest(solved, tree, scale, rotations, positions):
     """Put every joint without a regressor where its parent carries it.
 
     Args:
         solved: the joints with regressors, which stay.
-        parents: (J,) parent of each joint.
-        offsets: (J, 3) each joint in its parent's frame, mm at home.
-        rest: (J, 3, 3) rotation from the parent's frame to the joint's at home.
+        tree: `KinematicTree` of the skeleton.
         scale: of the bones.
         rotations: (J, 3, 3) joint frames, changed in place.
         positions: (J, 3) joints, mm, changed in place.
     """
-    for j in range(1, parents.size):
+    for j in range(1, tree.parents.size):
         is_solved = False
         for s in solved:
             is_solved |= s == j
         if not is_solved:
-            place_joint(j, parents, offsets, rest, scale, rotations, positions)
+            place_joint(j, tree, scale, rotations, positions)
 
 
 @njit(cache=True, parallel=True)
-def place_all(j, parents, offsets, rest, scale, rotations, positions):
+def place_all(j, tree, scale, rotations, positions):
     """`place_joint` for a batch of candidates.
 
     Args:
         j: number of the joint.
-        parents: (J,) parent of each joint.
-        offsets: (J, 3) each joint in its parent's frame, mm at home.
-        rest: (J, 3, 3) rotation from the parent's frame to the joint's at home.
+        tree: `KinematicTree` of the skeleton.
         scale: (n,) of the bones.
         rotations: (n, J, 3, 3) joint frames, changed in place.
         positions: (n, J, 3) joints, mm, changed in place.
     """
     for s in prange(scale.size):
-        place_joint(j, parents, offsets, rest, scale[s], rotations[s], positions[s])
+        place_joint(j, tree, scale[s], rotations[s], positions[s])
 
 
 @njit(cache=True, parallel=True)

@@ -28,26 +28,30 @@ _MOST_GROWTH = 0.1
 _MOST_TURN = 0.5
 
 
-class AngleTree(NamedTuple):
-    """A kinematic tree with its free angles.
+class FreeAngles(NamedTuple):
+    """What the F free angles of a kinematic tree do.
 
     Attributes:
-        parents: (J,) parent of each joint.
-        offsets: (J, 3) each joint in its parent's frame, mm at home.
-        rest: (J, 3, 3) rotation from the parent's frame to the joint's at home.
-        free: (F, 2) joint and axis of every free angle.
         limits: (F, 2) least and most of each angle, rad.
         moves: (J, F) bool, which angles turn which joint.
         turns: (B, M) the angles that move each sphere, in order, -1 where there are no more.
     """
 
-    parents: Any
-    offsets: Any
-    rest: Any
-    free: Any
     limits: Any
     moves: Any
     turns: Any
+
+
+class Readings(NamedTuple):
+    """The readings of one frame.
+
+    Attributes:
+        points: (n, 3) every `_STRIDE`-th of them, mm, view frame.
+        nearest: (S, S, 2) int32, memory of `nearest_reading`; changed in place.
+    """
+
+    points: Any
+    nearest: Any
 
 
 class ResidualWeights(NamedTuple):
@@ -56,13 +60,18 @@ class ResidualWeights(NamedTuple):
     Attributes:
         robust: readings this far off count a quarter, mm.
         beside: weight of a sphere beside the animal.
-        prior: (4,) cost of a radian of the base, a millimetre of it, a unit of log scale and a
-            radian of a joint away from the start, in squared mm.
+        turn: cost of a radian of the base away from the start, squared mm.
+        place: cost of a millimetre of the base away from the start, squared mm.
+        growth: cost of a unit of log scale away from the start, squared mm.
+        bend: cost of a radian of a joint away from the start, squared mm.
     """
 
     robust: float
     beside: float
-    prior: Any
+    turn: float
+    place: float
+    growth: float
+    bend: float
 
 
 @njit(cache=True)
@@ -198,7 +207,7 @@ def turning_axes(free, angles, rotations, axes):
 
 
 @njit(cache=True)
-def ball_slope(b, ball, body, tree, axes, rotations, positions, scale, slope):
+def ball_slope(b, ball, body, tree, free_angles, axes, rotations, positions, scale, slope):
     """Jacobian of a sphere's centre by base twist, log scale and free angles.
 
     Args:
@@ -206,6 +215,7 @@ def ball_slope(b, ball, body, tree, axes, rotations, positions, scale, slope):
         ball: (3,) its centre, mm.
         body: the sphere model.
         tree: the kinematic tree.
+        free_angles: what its free angles do.
         axes: (F, 3) axes of the free angles, from `turning_axes`.
         rotations: (J, 3, 3) joint frames.
         positions: (J, 3) joints, mm.
@@ -255,11 +265,11 @@ def ball_slope(b, ball, body, tree, axes, rotations, positions, scale, slope):
             + rotations[j, 2, 1] * v
             + rotations[j, 2, 2] * w
         )
-        for m in range(tree.turns.shape[1]):
-            f = tree.turns[b, m]
+        for m in range(free_angles.turns.shape[1]):
+            f = free_angles.turns[b, m]
             if f < 0:
                 break
-            if tree.moves[j, f]:
+            if free_angles.moves[j, f]:
                 a = tree.free[f, 0]
                 x = ex - positions[a, 0]
                 y = ey - positions[a, 1]
@@ -360,27 +370,27 @@ def _push(
 
 
 @njit(cache=True)
-def _hold(tree, prior, moved, growth, turned, gradient, curvature):
+def _hold(tree, weights, moved, growth, turned, gradient, curvature):
     """Residuals of the prior: not to leave the start.
 
     It is left by a twist `moved` (6,), log scale `growth` and angles `turned` (J, 3).
     """
     for k in range(3):
-        gradient[k] += prior[0] * moved[k]
-        gradient[3 + k] += prior[1] * moved[3 + k]
-        curvature[k, k] += prior[0]
-        curvature[3 + k, 3 + k] += prior[1]
-    gradient[6] += prior[2] * growth
-    curvature[6, 6] += prior[2]
+        gradient[k] += weights.turn * moved[k]
+        gradient[3 + k] += weights.place * moved[3 + k]
+        curvature[k, k] += weights.turn
+        curvature[3 + k, 3 + k] += weights.place
+    gradient[6] += weights.growth * growth
+    curvature[6, 6] += weights.growth
     for f in range(len(tree.free)):
         j = tree.free[f, 0]
         k = tree.free[f, 1]
-        gradient[_ROOT + f] += prior[3] * turned[j, k]
-        curvature[_ROOT + f, _ROOT + f] += prior[3]
+        gradient[_ROOT + f] += weights.bend * turned[j, k]
+        curvature[_ROOT + f, _ROOT + f] += weights.bend
 
 
 @njit(cache=True)
-def _go(step, tree, root_rotation, root_position, angles, scale):
+def _go(step, tree, limits, root_rotation, root_position, angles, scale):
     """Take a step (P,) in place, angles and scale limited; returns the new scale."""
     turn = np.empty((3, 3))
     exp_so3(step[0], step[1], step[2], turn)
@@ -395,7 +405,7 @@ def _go(step, tree, root_rotation, root_position, angles, scale):
         j = tree.free[f, 0]
         k = tree.free[f, 1]
         turned = angles[j, k] + min(max(step[_ROOT + f], -_MOST_TURN), _MOST_TURN)
-        angles[j, k] = min(max(turned, tree.limits[f, 0]), tree.limits[f, 1])
+        angles[j, k] = min(max(turned, limits[f, 0]), limits[f, 1])
     return scale * np.exp(min(max(step[6], -_MOST_GROWTH), _MOST_GROWTH))
 
 
@@ -417,9 +427,9 @@ def _readings(heights, packed_camera):
 def refine_one(
     heights,
     packed_camera,
-    known,
-    points,
+    readings,
     tree,
+    free_angles,
     body,
     wishes,
     n_steps,
@@ -433,9 +443,9 @@ def refine_one(
     Args:
         heights: (S, S) int16 height map, 1/16 mm, 0 where there is no animal.
         packed_camera: (17,) packed crop camera.
-        known: (S, S, 2) memory of `nearest_reading`.
-        points: (n, 3) readings, mm, view frame, from `_readings`.
+        readings: `Readings` of the height map.
         tree: the kinematic tree.
+        free_angles: what its free angles do.
         body: the sphere model.
         wishes: weights of the residuals.
         n_steps: number of steps; fewer are taken where the system is not definite.
@@ -463,15 +473,17 @@ def refine_one(
         place_balls(rotations, positions, scale, body, balls)
         turning_axes(tree.free, angles, rotations, axes)
         for b in range(body.n_own):
-            ball_slope(b, balls[b], body, tree, axes, rotations, positions, scale, slopes[b])
+            ball_slope(
+                b, balls[b], body, tree, free_angles, axes, rotations, positions, scale, slopes[b]
+            )
         gradient = np.zeros(n_values)
         curvature = np.zeros((n_values, n_values))
         radius = body.radius * scale
-        _pull(points, balls, radius, slopes, wishes.robust, gradient, curvature)
+        _pull(readings.points, balls, radius, slopes, wishes.robust, gradient, curvature)
         _push(
             heights,
             packed_camera,
-            known,
+            readings.nearest,
             balls,
             radius,
             slopes,
@@ -482,7 +494,7 @@ def refine_one(
         )
         _hold(
             tree,
-            wishes.prior,
+            wishes,
             moved,
             np.log(scale / first_scale),
             angles - first_angles,
@@ -494,7 +506,7 @@ def refine_one(
         if not _solve(curvature, gradient, step):
             return scale
         moved += step[:6]
-        scale = _go(step, tree, root_rotation, root_position, angles, scale)
+        scale = _go(step, tree, free_angles.limits, root_rotation, root_position, angles, scale)
     return scale
 
 
@@ -503,6 +515,7 @@ def refine_all(
     heights,
     crop_cameras,
     tree,
+    free_angles,
     body,
     wishes,
     n_steps,
@@ -517,6 +530,7 @@ def refine_all(
         heights: (n, S, S) int16 height maps, 1/16 mm, 0 where there is no animal.
         crop_cameras: (n, 17) packed crop cameras of the height maps.
         tree: the kinematic tree.
+        free_angles: what its free angles do.
         body: the sphere model.
         wishes: weights of the residuals.
         n_steps: number of steps.
@@ -526,15 +540,17 @@ def refine_all(
         scales: (n, K), changed in place.
     """
     for i in prange(len(scales)):
-        known = np.full((heights.shape[1], heights.shape[1], 2), -1, np.int32)
-        points = _readings(heights[i], crop_cameras[i])
+        readings = Readings(
+            _readings(heights[i], crop_cameras[i]),
+            np.full((heights.shape[1], heights.shape[1], 2), -1, np.int32),
+        )
         for k in range(scales.shape[1]):
             scales[i, k] = refine_one(
                 heights[i],
                 crop_cameras[i],
-                known,
-                points,
+                readings,
                 tree,
+                free_angles,
                 body,
                 wishes,
                 n_steps,

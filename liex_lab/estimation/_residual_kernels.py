@@ -17,10 +17,15 @@ from liex_lab.foreground._blob_kernels import ANGLE
 from liex_lab.foreground._crop_camera_kernels import crop_camera, to_pixel, to_point
 
 N_FIT = 8
-# of the fit: see `explain`
+# columns of the fit, see `explain`
 BESIDE = 0
+OFF = 1
 OUT_OF = 2
+HIDDEN = 3
 APART = 4
+FAR = 5
+WITHIN = 6
+ALONG = 7
 # thresholds are integers
 SHARE_UNIT = 1000.0
 MM_UNIT = 50.0
@@ -150,10 +155,10 @@ def explain(heights, packed_camera, balls, radius, n_own, size, unit_mm, out):
         out_of += min(max(-above, 0.0), _MOST_MM)
         hidden += above > _HIDDEN_MM
     seen = max(n - beside, 1.0)
-    out[0] = SHARE_UNIT * beside / n
-    out[1] = MM_UNIT * off / seen
-    out[2] = MM_UNIT * out_of / seen
-    out[3] = SHARE_UNIT * hidden / n
+    out[BESIDE] = SHARE_UNIT * beside / n
+    out[OFF] = MM_UNIT * off / seen
+    out[OUT_OF] = MM_UNIT * out_of / seen
+    out[HIDDEN] = SHARE_UNIT * hidden / n
     n_read = 0
     far = 0.0
     apart = 0.0
@@ -175,9 +180,9 @@ def explain(heights, packed_camera, balls, radius, n_own, size, unit_mm, out):
             apart += min(max(nearest, 0.0), _MOST_MM)
             within += min(max(-nearest, 0.0), _MOST_MM)
     many = max(n_read, 1)
-    out[4] = MM_UNIT * apart / many
-    out[5] = SHARE_UNIT * far / many
-    out[6] = MM_UNIT * within / many
+    out[APART] = MM_UNIT * apart / many
+    out[FAR] = SHARE_UNIT * far / many
+    out[WITHIN] = MM_UNIT * within / many
 
 
 @njit(cache=True)
@@ -201,7 +206,9 @@ def explain_pose(heights, packed_camera, axis, rotations, positions, scale, size
     balls = np.empty((len(body.joints), 3))
     place_balls(rotations, positions, scale, body, balls)
     explain(heights, packed_camera, balls, body.radius * scale, body.n_own, size, body.unit_mm, out)
-    out[7] = SHARE_UNIT * (np.cos(axis) * rotations[0, 0, 0] + np.sin(axis) * rotations[0, 1, 0])
+    out[ALONG] = SHARE_UNIT * (
+        np.cos(axis) * rotations[0, 0, 0] + np.sin(axis) * rotations[0, 1, 0]
+    )
 
 
 @njit(cache=True, parallel=True)

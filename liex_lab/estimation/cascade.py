@@ -20,6 +20,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from liex_lab.body.kinematic_tree import KinematicTree
 from liex_lab.body.kinematics import aim
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.body.spheres import Spheres
@@ -143,12 +144,9 @@ class Cascade:
             candidates: the candidates, which are changed in place.
             joint: number of the joint; its parent must be in place.
         """
-        s = self.skeleton
         kernels.place_all(
             joint,
-            s.parents,
-            s.offsets,
-            s.rest,
+            KinematicTree.of(self.skeleton),
             candidates.scale,
             candidates.rotations,
             candidates.positions,

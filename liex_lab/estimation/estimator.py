@@ -22,6 +22,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from liex_lab.body.kinematic_tree import KinematicTree
 from liex_lab.body.pose import Pose
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.catalog import find_model
@@ -220,12 +221,9 @@ class PoseEstimator:
         return _pack(regressors), _pack([model.pruner or model.metric]), _pack([model.metric])
 
     @cached_property
-    def _chain(self) -> kernels.KinematicTree:
+    def _tree(self) -> KinematicTree:
         """The kinematic tree as the kernels want it."""
-        s = self.skeleton
-        return kernels.KinematicTree(
-            s.parents, s.offsets, s.rest, s.axes, np.array(s.solved[: self.n_joints or None])
-        )
+        return KinematicTree.of(self.skeleton)
 
     def _tuning(self, n_starts: int) -> kernels.CascadeSettings:
         """The method's numbers as the kernels want them."""
@@ -235,9 +233,12 @@ class PoseEstimator:
             method.rounds_of(0),
             method.rounds,
             method.reaches(self.skeleton.n_joints),
-            np.array([method.base_lever_mm, method.joint_lever_mm, method.scale_lever_mm]),
+            float(method.base_lever_mm),
+            float(method.joint_lever_mm),
+            float(method.scale_lever_mm),
             method.mean_shift_mm,
             min(keep or n_starts, n_starts),
+            np.array(self.skeleton.solved[: self.n_joints or None]),
         )
 
     @cached_property
@@ -302,35 +303,36 @@ class PoseEstimator:
                 self.model.cascade.proposals, images, sizes[:, 0], method
             )
         tuning = self._tuning(k)
-        starts = (
+        starts = kernels.CandidatePoses(
             np.ascontiguousarray(base_rotation[:, :, None]),
             base_position[:, :, None].copy(),
             scales,
         )
-        rotations = np.zeros((n, tuning.keep, skeleton.n_joints, 3, 3))
-        positions = np.zeros((n, tuning.keep, skeleton.n_joints, 3))
-        poses = rotations, positions, np.zeros((n, tuning.keep)), np.full((n, tuning.keep), np.inf)
+        poses = kernels.CandidatePoses(
+            np.zeros((n, tuning.keep, skeleton.n_joints, 3, 3)),
+            np.zeros((n, tuning.keep, skeleton.n_joints, 3)),
+            np.zeros((n, tuning.keep)),
+        )
+        scores = np.full((n, tuning.keep), np.inf)
         with threads(parallel):
             kernels.estimate_all(
-                crops.heights,
-                crop_cameras,
-                crops.moments,
+                kernels.SeenFrames(crops.heights, crop_cameras, crops.moments, size),
                 np.flatnonzero(crops.found),
-                size,
-                self._chain,
+                self._tree,
                 *self._packed,
                 tuning,
                 self._body,
                 starts,
                 poses,
+                scores,
             )
             if self.model.facing is None or not n:
-                return poses
+                return *poses, scores
             facing = HeadTailClassifier(skeleton, self.model.facing)
             scores = facing.judged(
-                ImageSet(crops.heights, crop_cameras, crops.moments), poses[1], poses[3], size
+                ImageSet(crops.heights, crop_cameras, crops.moments), poses.positions, scores, size
             )
-        return *poses[:3], scores
+        return *poses, scores
 
     def estimate(
         self, depths: NDArray[np.float32], scene: Segmenter, size: float, parallel: bool = True

@@ -19,6 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from liex_lab.body.kinematic_tree import KinematicTree
 from liex_lab.body.pose import Pose
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.body.spheres import Spheres
@@ -47,11 +48,13 @@ class Refiner:
     Attributes:
         skeleton: the animal's skeleton.
         tree: the kinematic tree as the kernels want it.
+        free_angles: what its free angles do, as the kernels want it.
         body: the sphere model as the kernels want it.
     """
 
     skeleton: Skeleton
-    tree: kernels.AngleTree
+    tree: KinematicTree
+    free_angles: kernels.FreeAngles
     body: residual_kernels.SphereModel
 
     @staticmethod
@@ -63,10 +66,8 @@ class Refiner:
             balls: the sphere model of its body.
         """
         s = skeleton
-        free = np.array(
-            [(j, k) for j in range(1, s.n_joints) for k in range(3) if s.axes[j, k]], np.int64
-        )
-        free = free.reshape(-1, 2)
+        tree = KinematicTree.of(s)
+        free = tree.free
         above = np.eye(s.n_joints, dtype=bool)  # [j, a]: a is j or one of its ancestors
         for parent, child in s.edges:
             above[child] |= above[parent]
@@ -76,11 +77,7 @@ class Refiner:
         turns = np.full((len(movers), max(map(len, movers), default=0)), -1, np.int64)
         for row, some in zip(turns, movers, strict=True):
             row[: len(some)] = some
-        return Refiner(
-            s,
-            kernels.AngleTree(s.parents, s.offsets, s.rest, free, limits, moves, turns),
-            body_of(balls),
-        )
+        return Refiner(s, tree, kernels.FreeAngles(limits, moves, turns), body_of(balls))
 
     def refine(
         self, pose: Pose, heights: NDArray[np.int16], crop_cameras: Array, size: float, n_steps: int
@@ -103,12 +100,13 @@ class Refiner:
         angles = pose.angles.copy()
         scale = pose.scale.copy()
         wishes = kernels.ResidualWeights(
-            _ROBUST_MM * unit, _BESIDE, _PRIOR * np.array([unit**2, 1.0, unit**2, unit**2])
+            _ROBUST_MM * unit, _BESIDE, *(_PRIOR * np.array([unit**2, 1.0, unit**2, unit**2]))
         )
         kernels.refine_all(
             heights,
             crop_cameras,
             self.tree,
+            self.free_angles,
             self.body,
             wishes,
             n_steps,

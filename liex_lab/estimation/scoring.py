@@ -13,6 +13,7 @@ spread and the posture (the "expectation forest", ours).
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,12 +37,28 @@ LEAST_MM = 0.1
 _NO_OPPOSITE_MM = 40.0
 
 
+class Doubts(NamedTuple):
+    """What speaks against the chosen poses (n,), mm at home size, in the order of `Chosen.doubts`.
+
+    Attributes:
+        best: the best score.
+        opposite: the best score of a candidate that points the other way.
+        score_sd: standard deviation of the good scores.
+        distance: mean distance of all candidates from the chosen pose.
+    """
+
+    best: Array
+    opposite: Array
+    score_sd: Array
+    distance: Array
+
+
 @dataclass(frozen=True)
 class Chosen:
     """One pose for each of n frames, in the view frame of the frame; NaN where no animal was found.
 
     Attributes:
-        pose: (n) poses.
+        pose: (n) poses; as `choose` makes them, with the frames of their joints.
         sd_root: (n, 6) standard deviation of the root over candidates, rad and mm, in its own
             frame.
         sd_angles: (n, J, 3) standard deviation of the joints' rotation vectors over candidates,
@@ -50,9 +67,7 @@ class Chosen:
         error_mm: (n,) expected mean joint error, mm.
         score: (n,) weighted mean of the scores, mm at home size.
         spread: (n,) spread of the averaged candidates about the chosen pose, mm at home size.
-        doubts: (n, 4) mm at home size: best score, the best score of a candidate that points the
-            other way, the standard deviation of the good scores, and the mean distance of all
-            candidates from the chosen pose.
+        doubts: (n, 4) the columns of `Doubts`.
         fit: (n, F) residuals of the pose against the height map where the method asks, F = 0
             otherwise, see `_residual_kernels.explain`.
         told_scale: (n,) the animal's size over home size as this frame alone estimates it.
@@ -119,9 +134,9 @@ def choose(
     if skeleton.is_chain:
         pose = Pose.from_joints(
             skeleton, mean, np.einsum("nk,nkd->nd", weight, turned[:, :, 0, :, 2])
-        )
+        ).placed(skeleton)
     else:
-        pose = mean_pose(skeleton, turned, joints, weight)
+        pose = mean_pose(skeleton, turned, joints, weight).placed(skeleton)
         mean = pose.joints(skeleton)
     distance = np.linalg.norm(joints - mean[:, None], axis=-1)
     variance = np.einsum("nk,nkj->nj", weight, distance**2)
@@ -235,7 +250,7 @@ def _doubts(
     backwards = np.einsum("nkd,nd->nk", along, mean[:, -1] - mean[:, 0]) < 0
     opposite = np.where(backwards, scores, no_opposite_mm).min(axis=1)
     distance = np.linalg.norm(positions - mean[:, None], axis=-1).mean(axis=(1, 2)) / size
-    return np.stack([scores.min(axis=1), opposite, good.std(axis=1), distance], axis=1)
+    return np.stack(Doubts(scores.min(axis=1), opposite, good.std(axis=1), distance), axis=1)
 
 
 def with_expected_error(

@@ -26,6 +26,32 @@ _SLOPE_PASSES = 5
 _LEVEL_PASSES = 3
 
 
+class Blob(NamedTuple):
+    """The counts of one component, in the order in which they are packed.
+
+    Attributes:
+        n_px: foreground pixels.
+        first_row: first row of blocks.
+        last_row: last row of blocks.
+        first_column: first column of blocks.
+        last_column: last column of blocks.
+        depth_sum: sum of the depths of its pixels, mm.
+        n_on_floor: how many of its pixels lie on the floor.
+    """
+
+    n_px: Any
+    first_row: Any
+    last_row: Any
+    first_column: Any
+    last_column: Any
+    depth_sum: Any
+    n_on_floor: Any
+
+
+N_BLOB = len(Blob._fields)
+_BLOB_N_PX = Blob._fields.index("n_px")
+
+
 class BlobMoments(NamedTuple):
     """The moments of one component, or columns (n,) of many, in the order in which they are packed.
 
@@ -65,6 +91,24 @@ SLOPE = BlobMoments._fields.index("slope")
 
 
 @njit(cache=True)
+def unpack_blob(packed):
+    """The record of one component's packed counts (N_BLOB,)."""
+    return Blob(packed[0], packed[1], packed[2], packed[3], packed[4], packed[5], packed[6])
+
+
+@njit(cache=True)
+def pack_blob(blob, packed):
+    """Write a component's record into its row (N_BLOB,) of the packed counts."""
+    packed[0] = blob.n_px
+    packed[1] = blob.first_row
+    packed[2] = blob.last_row
+    packed[3] = blob.first_column
+    packed[4] = blob.last_column
+    packed[5] = blob.depth_sum
+    packed[6] = blob.n_on_floor
+
+
+@njit(cache=True)
 def unpack_moments(packed):
     """The record of one component's packed moments (N_MOMENTS,)."""
     return BlobMoments(
@@ -93,8 +137,7 @@ def label_blobs(depth, limit, on_floor, bridge, labels, blobs):
         on_floor: (H, W) bool, the floor.
         bridge: blocks without readings that may lie between the parts of one component.
         labels: (H // BLOCK, W // BLOCK) int32, out: the component of each block, -1 for none.
-        blobs: (MAX_BLOBS, 7), out: pixels, first and last block row, first and last block column,
-            the sum of depths mm, and the pixels on the floor.
+        blobs: (MAX_BLOBS, N_BLOB), out: a packed `Blob` for each component.
 
     Returns:
         The number of components, the largest ones where there are more than fit.
@@ -121,12 +164,13 @@ def label_blobs(depth, limit, on_floor, bridge, labels, blobs):
             if labels[i, j] != -2:
                 continue
             if n_blobs == MAX_BLOBS:
-                slot = int(np.argmin(blobs[:, 0]))
+                slot = int(np.argmin(blobs[:, _BLOB_N_PX]))
                 forget(labels, slot)
             else:
                 slot = n_blobs
                 n_blobs += 1
-            _flood(depth, limit, on_floor, bridge, labels, i, j, slot, stack, blobs[slot])
+            blob = _flood(depth, limit, on_floor, bridge, labels, i, j, slot, stack)
+            pack_blob(blob, blobs[slot])
     return n_blobs
 
 
@@ -142,7 +186,7 @@ def layers(depth, limit, labels, slot, blob, apart):
         limit: (H, W) mm; a reading below it is foreground.
         labels: (H // BLOCK, W // BLOCK) int32, component of each block.
         slot: the component.
-        blob: (7,) as `label_blobs` fills it.
+        blob: the component's counts.
         apart: least width of the gap, mm.
 
     Returns:
@@ -152,8 +196,8 @@ def layers(depth, limit, labels, slot, blob, apart):
     found = np.empty(labels.size, np.float32)
     values = np.empty(BLOCK * BLOCK, np.float32)
     n = 0
-    for i in range(int(blob[1]), int(blob[2]) + 1):
-        for j in range(int(blob[3]), int(blob[4]) + 1):
+    for i in range(int(blob.first_row), int(blob.last_row) + 1):
+        for j in range(int(blob.first_column), int(blob.last_column) + 1):
             if labels[i, j] != slot:
                 continue
             m = 0
@@ -200,15 +244,15 @@ def _is_unread(depth, row, column):
 
 
 @njit(cache=True)
-def _flood(depth, limit, on_floor, bridge, labels, i, j, slot, stack, blob):
-    """Flood fill: blocks connected with (i, j) get the label `slot`, `blob` (7,) the counts."""
-    blob[0] = 0
-    blob[1] = i
-    blob[2] = i
-    blob[3] = j
-    blob[4] = j
-    blob[5] = 0.0
-    blob[6] = 0
+def _flood(depth, limit, on_floor, bridge, labels, i, j, slot, stack):
+    """Flood fill: blocks connected with (i, j) get the label `slot`; their counts, a `Blob`."""
+    n_px = 0
+    first_row = i
+    last_row = i
+    first_column = j
+    last_column = j
+    depth_sum = 0.0
+    n_on_floor = 0
     top = 1
     stack[0, 0] = i
     stack[0, 1] = j
@@ -220,15 +264,17 @@ def _flood(depth, limit, on_floor, bridge, labels, i, j, slot, stack, blob):
         column = stack[top, 1]
         gone = stack[top, 2]
         if gone == 0:
-            blob[1], blob[2] = min(blob[1], row), max(blob[2], row)
-            blob[3], blob[4] = min(blob[3], column), max(blob[4], column)
+            first_row = min(first_row, row)
+            last_row = max(last_row, row)
+            first_column = min(first_column, column)
+            last_column = max(last_column, column)
         for v in range(row * BLOCK, row * BLOCK + BLOCK):
             for u in range(column * BLOCK, column * BLOCK + BLOCK):
                 z = depth[v, u]
                 if z > 0 and z < limit[v, u]:
-                    blob[0] += 1
-                    blob[5] += z
-                    blob[6] += on_floor[v, u]
+                    n_px += 1
+                    depth_sum += float(z)
+                    n_on_floor += on_floor[v, u]
         for di in range(-1, 2):
             for dj in range(-1, 2):
                 a = row + di
@@ -242,6 +288,7 @@ def _flood(depth, limit, on_floor, bridge, labels, i, j, slot, stack, blob):
                     stack[top, 1] = b
                     stack[top, 2] = 0 if on else gone + 1
                     top += 1
+    return Blob(n_px, first_row, last_row, first_column, last_column, depth_sum, n_on_floor)
 
 
 @njit(cache=True)

@@ -60,6 +60,28 @@ class CropCamera(NamedTuple):
     step: Any
 
 
+class CropRows(NamedTuple):
+    """The rows of a batch of height maps, as a segmenter's kernels fill them.
+
+    Attributes:
+        heights: (N, S, S) int16, 1/16 mm.
+        origin: (N, 2) int32, picture pixel (u, v) of crop pixel (0, 0).
+        step: (N,) int32, picture pixels a crop pixel.
+        n_px: (N,) int64, readings on the animal, 0 where it was not found.
+        moments: (N, N_MOMENTS), each a packed `BlobMoments`.
+        distance: (N,) mm of the view's origin from the camera.
+        n_blobs: (N,) int64, components of about the animal's size.
+    """
+
+    heights: Any
+    origin: Any
+    step: Any
+    n_px: Any
+    moments: Any
+    distance: Any
+    n_blobs: Any
+
+
 @njit(cache=True)
 def crop_camera(packed):
     """The record of one packed crop camera (17,)."""

@@ -33,6 +33,13 @@ _WORTH_MM = 60.0
 _MOST_OUT = 3.0
 _APART = 0.6  # of that radius: ends that lie nearer to each other show the same hand
 _MARGIN = 2  # blocks: many cameras read nothing along the borders of their pictures
+# columns of a geodesic extremum: depth mm, less for what sticks out far, by which they are ranked;
+# block row; block column; depth mm
+N_END = 4
+END_RANK = 0
+END_ROW = 1
+END_COLUMN = 2
+END_DEPTH = 3
 
 
 @njit(cache=True)
@@ -246,8 +253,7 @@ def ends(blocks, order, hops, position, n, focal, least_mm, tips, n_tips):
         n: blocks of the walk.
         focal: px.
         least_mm: by how much an extremum stands out, mm.
-        tips: (MAX_TIPS, 4), out: depth mm, less for what sticks out far; block row; block column;
-            depth mm.
+        tips: (MAX_TIPS, N_END), out: the extrema, columns END_RANK to END_DEPTH.
         n_tips: rows that are filled already.
 
     Returns:
@@ -290,10 +296,10 @@ def _note(tips, n_tips, z, out, block):
     """Add an extremum at depth z mm that sticks out `out` times as far as one must."""
     if n_tips == MAX_TIPS:
         return n_tips
-    tips[n_tips, 0] = z - _WORTH_MM * min(out, _MOST_OUT)
-    tips[n_tips, 1] = block[0]
-    tips[n_tips, 2] = block[1]
-    tips[n_tips, 3] = z
+    tips[n_tips, END_RANK] = z - _WORTH_MM * min(out, _MOST_OUT)
+    tips[n_tips, END_ROW] = block[0]
+    tips[n_tips, END_COLUMN] = block[1]
+    tips[n_tips, END_DEPTH] = z
     return n_tips + 1
 
 
@@ -311,7 +317,7 @@ def nearest_ends(blocks, labels, n_surfaces, size, intrinsics, chosen):
         n_surfaces: surfaces that are labelled.
         size: the hand's length over the skeleton's home length.
         intrinsics: (4,) fx, fy, cx, cy px.
-        chosen: (m, 4), out: rows as in `ends`, at least 0.6 of the hand's sphere apart.
+        chosen: (m, N_END), out: rows as in `ends`, at least 0.6 of the hand's sphere apart.
 
     Returns:
         The number of rows filled, at most m.
@@ -321,7 +327,7 @@ def nearest_ends(blocks, labels, n_surfaces, size, intrinsics, chosen):
     position = np.full(blocks.shape, -1, np.int32)
     order = np.empty((n_blocks, 2), np.int32)
     hops = np.empty(n_blocks, np.int32)
-    tips = np.empty((MAX_TIPS, 4))
+    tips = np.empty((MAX_TIPS, N_END))
     n_tips = 0
     for slot in range(n_surfaces):
         n = walk(blocks, labels, slot, position, order, hops)
@@ -338,21 +344,23 @@ def nearest_ends(blocks, labels, n_surfaces, size, intrinsics, chosen):
         n_tips = _note(tips, n_tips, blocks[i, j], 0.5, order[nearest])
         n = walk_from(blocks, labels, slot, last_i, last_j, position, order, hops)
         n_tips = ends(blocks, order, hops, position, n, focal, _STICKS_OUT_MM * size, tips, n_tips)
-    ranked = np.argsort(tips[:n_tips, 0])
+    ranked = np.argsort(tips[:n_tips, END_RANK])
     p = np.empty(3)
     q = np.empty(3)
     n_chosen = 0
     for t in ranked:
         if n_chosen == len(chosen):
             break
-        point_of_block(blocks, int(tips[t, 1]), int(tips[t, 2]), intrinsics, p)
+        tip = tips[t]
+        point_of_block(blocks, int(tip[END_ROW]), int(tip[END_COLUMN]), intrinsics, p)
         own = True
         for c in range(n_chosen):
-            point_of_block(blocks, int(chosen[c, 1]), int(chosen[c, 2]), intrinsics, q)
+            end = chosen[c]
+            point_of_block(blocks, int(end[END_ROW]), int(end[END_COLUMN]), intrinsics, q)
             off = np.sqrt((p[0] - q[0]) ** 2 + (p[1] - q[1]) ** 2 + (p[2] - q[2]) ** 2)
             own &= off > _APART * AROUND_MM * size
         if own:
-            chosen[n_chosen] = tips[t]
+            chosen[n_chosen] = tip
             n_chosen += 1
     return n_chosen
 

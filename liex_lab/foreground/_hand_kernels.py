@@ -10,6 +10,8 @@ blocks and labels are those of `_geodesic_kernels`.
 
 from __future__ import annotations
 
+from typing import Any, NamedTuple
+
 import numpy as np
 from numba import njit, prange
 
@@ -17,7 +19,10 @@ from liex_lab.foreground import _blob_kernels as blob_kernels
 from liex_lab.foreground._blob_kernels import BLOCK
 from liex_lab.foreground._geodesic_kernels import (
     AROUND_MM,
+    END_COLUMN,
+    END_ROW,
     MAX_SURFACES,
+    N_END,
     block_depths,
     box_around,
     label_surfaces,
@@ -25,7 +30,7 @@ from liex_lab.foreground._geodesic_kernels import (
     point_of_block,
     relabel,
 )
-from liex_lab.foreground._hand_score_kernels import unlikeness
+from liex_lab.foreground._hand_score_kernels import HandFind, unlikeness
 
 # of a home-sized hand: this much of the end of a surface is where it is first taken to be
 _TIP_MM = 60.0
@@ -41,12 +46,43 @@ _SHELL = 0.75  # the outer part of the sphere around it, where only the arm is
 _SHELL_MM2 = 900.0
 _BIN_MM = 5.0
 _RIM_MM = 45.0  # pixels beside a block of the hand belong to it within this depth
-# of a find: middle x y z, direction of the fingers x y z, where along it the arm is cut, area
-FIELDS = 8
+
+
+# columns of a point of a surface: x, y, z mm, distance from the middle mm, block row, block column
+_POINT_X = 0
+_POINT_Y = 1
+_POINT_Z = 2
+_POINT_DISTANCE = 3
+_POINT_ROW = 4
+_POINT_COLUMN = 5
+_N_POINT = 6
+
+
+class HandSight(NamedTuple):
+    """How a camera looks at a hand, and how heights of it are measured.
+
+    Attributes:
+        near: least depth at which a hand is looked for, mm.
+        far: largest depth at which a hand is looked for, mm.
+        size: the hand's length over the skeleton's home length.
+        behind: of the reference plane behind the hand's middle, mm.
+        smooth: width over which heights are averaged, mm.
+        intrinsics: (4,) fx, fy, cx, cy px.
+        along_axis: whether heights are measured along the optical axis, else along the line of
+            sight.
+    """
+
+    near: Any
+    far: Any
+    size: Any
+    behind: Any
+    smooth: Any
+    intrinsics: Any
+    along_axis: Any
 
 
 @njit(cache=True)
-def locate(blocks, labels, tip, size, intrinsics, found):
+def locate(blocks, labels, tip, size, intrinsics):
     """Where the hand at an extremum of a surface is; its blocks get the label MAX_SURFACES.
 
     What leaves the sphere around it is the arm; the hand is what lies at the other end, one hand's
@@ -55,16 +91,19 @@ def locate(blocks, labels, tip, size, intrinsics, found):
     Args:
         blocks: (h, w) float32 mm.
         labels: (h, w) int32; the hand's blocks are marked in it.
-        tip: (4,) the extremum, a row of `_geodesic_kernels.ends`.
+        tip: (N_END,) the extremum, a row of `_geodesic_kernels.ends`.
         size: the hand's length over the skeleton's home length.
         intrinsics: (4,) fx, fy, cx, cy px.
-        found: (FIELDS,), out: middle x, y, z mm; direction of the fingers x, y, z (0 without an
-            arm); where along it the arm is cut, mm from the camera; area mm^2.
+
+    Returns:
+        A `HandFind`.
     """
     middle = np.empty(3)
     fingers = np.zeros(3)
-    slot = labels[int(tip[1]), int(tip[2])]
-    point_of_block(blocks, int(tip[1]), int(tip[2]), intrinsics, middle)
+    row = int(tip[END_ROW])
+    column = int(tip[END_COLUMN])
+    slot = labels[row, column]
+    point_of_block(blocks, row, column, intrinsics, middle)
     _mean_shift(blocks, labels, slot, _TIP_MM * size, intrinsics, middle)
     around = AROUND_MM * size
     focal2 = intrinsics[0] * intrinsics[1]
@@ -77,11 +116,7 @@ def locate(blocks, labels, tip, size, intrinsics, found):
         cut = _wrist(points, size, focal2, middle, fingers) if has_arm else -1e9
         base = middle[0] * fingers[0] + middle[1] * fingers[1] + middle[2] * fingers[2]
         area = BLOCK * BLOCK * _beyond(points, middle, fingers, cut, labels, step == 2) / focal2
-    for k in range(3):
-        found[k] = middle[k]
-        found[3 + k] = fingers[k]
-    found[6] = cut + base
-    found[7] = area
+    return HandFind(middle, fingers, cut + base, area)
 
 
 @njit(cache=True)
@@ -92,7 +127,7 @@ def _within(blocks, labels, slot, radius, intrinsics, middle):
     p = np.empty(3)
     box = np.empty(4, np.int64)
     box_around(blocks.shape, middle, radius, intrinsics, box)
-    points = np.empty(((box[1] - box[0] + 1) * (box[3] - box[2] + 1), 6))
+    points = np.empty(((box[1] - box[0] + 1) * (box[3] - box[2] + 1), _N_POINT))
     n = 0
     for i in range(box[0], box[1] + 1):
         for j in range(box[2], box[3] + 1):
@@ -101,12 +136,12 @@ def _within(blocks, labels, slot, radius, intrinsics, middle):
             point_of_block(blocks, i, j, intrinsics, p)
             off2 = (p[0] - middle[0]) ** 2 + (p[1] - middle[1]) ** 2 + (p[2] - middle[2]) ** 2
             if off2 < radius * radius:
-                points[n, 0] = p[0]
-                points[n, 1] = p[1]
-                points[n, 2] = p[2]
-                points[n, 3] = np.sqrt(off2)
-                points[n, 4] = i
-                points[n, 5] = j
+                points[n, _POINT_X] = p[0]
+                points[n, _POINT_Y] = p[1]
+                points[n, _POINT_Z] = p[2]
+                points[n, _POINT_DISTANCE] = np.sqrt(off2)
+                points[n, _POINT_ROW] = i
+                points[n, _POINT_COLUMN] = j
                 n += 1
     return points[:n]
 
@@ -120,9 +155,9 @@ def _away_from_arm(points, size, focal2, middle, fingers):
     for k in range(3):
         fingers[k] = 0.0
     for n in range(len(points)):
-        off = points[n, 3]
+        off = points[n, _POINT_DISTANCE]
         if off > _SHELL * AROUND_MM * size:
-            w = BLOCK * BLOCK * points[n, 2] * points[n, 2] / focal2
+            w = BLOCK * BLOCK * points[n, _POINT_Z] * points[n, _POINT_Z] / focal2
             shell += w
             for k in range(3):
                 fingers[k] -= w * (points[n, k] - middle[k]) / off
@@ -142,7 +177,9 @@ def _wrist(points, size, focal2, middle, fingers):
     along = np.zeros(int(2.0 * around / _BIN_MM) + 2)
     for n in range(len(points)):
         s = _along(points[n], middle, fingers)
-        along[int((s + around) / _BIN_MM)] += BLOCK * BLOCK * points[n, 2] * points[n, 2] / focal2
+        along[int((s + around) / _BIN_MM)] += (
+            BLOCK * BLOCK * points[n, _POINT_Z] * points[n, _POINT_Z] / focal2
+        )
     b = along.size - 1
     tip = 0.0
     while b > 0 and tip < 100.0 * size * size:
@@ -162,13 +199,13 @@ def _beyond(points, middle, fingers, cut, labels, mark):
     z = 0.0
     for n in range(len(points)):
         if _along(points[n], middle, fingers) > cut:
-            w = points[n, 2] * points[n, 2]
+            w = points[n, _POINT_Z] * points[n, _POINT_Z]
             total += w
-            x += w * points[n, 0]
-            y += w * points[n, 1]
-            z += w * points[n, 2]
+            x += w * points[n, _POINT_X]
+            y += w * points[n, _POINT_Y]
+            z += w * points[n, _POINT_Z]
             if mark:
-                labels[int(points[n, 4]), int(points[n, 5])] = MAX_SURFACES
+                labels[int(points[n, _POINT_ROW]), int(points[n, _POINT_COLUMN])] = MAX_SURFACES
     least = max(total, 1e-9)
     middle[0] = x / least
     middle[1] = y / least
@@ -218,17 +255,16 @@ def compare_ends(blocks, labels, ends, size, intrinsics, unlike):
     Args:
         blocks: (h, w) float32 mm.
         labels: (h, w) int32; comes back as it was.
-        ends: (n, 4) rows of `_geodesic_kernels.ends`.
+        ends: (n, N_END) rows of `_geodesic_kernels.ends`.
         size: the hand's length over the skeleton's home length.
         intrinsics: (4,) fx, fy, cx, cy px.
         unlike: (n,), out: the less, the more alike.
     """
     depth = np.empty(len(unlike))
-    found = np.empty(FIELDS)
     nearest = 1e9
     for k in range(len(unlike)):
-        slot = labels[int(ends[k, 1]), int(ends[k, 2])]
-        locate(blocks, labels, ends[k], size, intrinsics, found)
+        slot = labels[int(ends[k, END_ROW]), int(ends[k, END_COLUMN])]
+        found = locate(blocks, labels, ends[k], size, intrinsics)
         depth[k], unlike[k] = unlikeness(
             blocks, labels, slot, MAX_SURFACES, found, size, intrinsics
         )
@@ -295,7 +331,7 @@ def cut_heights(
         depth: (H, W) mm, 0 where unread.
         blocks: (h, w) float32 mm.
         labels: (h, w) int32, the hand's blocks labelled MAX_SURFACES.
-        found: (FIELDS,) as `locate` fills it.
+        found: `HandFind` of the hand.
         plane: (3,) a, b, c of the plane behind the hand, 1 / z = a u + b v + c.
         distance: of the camera from it, mm.
         intrinsics: (4,) fx, fy, cx, cy px.
@@ -332,7 +368,7 @@ def cut_heights(
                 continue
             x = (u - intrinsics[2]) / intrinsics[0] * z
             y = (v - intrinsics[3]) / intrinsics[1] * z
-            if x * found[3] + y * found[4] + z * found[5] <= found[6]:
+            if x * found.fingers[0] + y * found.fingers[1] + z * found.fingers[2] <= found.cut:
                 continue
             above = distance * (1.0 - z * (plane[0] * u + plane[1] * v + plane[2]))
             if above > 0.0:
@@ -353,25 +389,7 @@ def _reach(blocks, labels, row, column):
 
 
 @njit(cache=True)
-def extract_one(
-    depth,
-    near,
-    far,
-    n_things,
-    size,
-    behind,
-    smooth,
-    intrinsics,
-    along_axis,
-    heights,
-    origin,
-    n_steps,
-    n_px,
-    moments,
-    distance,
-    n_blobs,
-    k,
-):
+def extract_one(depth, n_things, sight, crops, k):
     """Find the hand in one frame and fill its row of the batch; see `HandSegmenter.extract`.
 
     Where n_things is 2, the batch has twice as many rows as there are frames, and the second half
@@ -380,30 +398,19 @@ def extract_one(
 
     Args:
         depth: (H, W) mm, 0 where unread.
-        near: least depth at which a hand is looked for, mm.
-        far: largest depth at which a hand is looked for, mm.
         n_things: candidates a frame, 1 or 2.
-        size: the hand's length over the skeleton's home length.
-        behind: of the reference plane behind the hand's middle, mm.
-        smooth: width over which heights are averaged, mm.
-        intrinsics: (4,) fx, fy, cx, cy px.
-        along_axis: whether heights are measured along the optical axis, else along the line of
-            sight.
-        heights: (N, S, S) int16, 1/16 mm, out; N rows of the batch.
-        origin: (N, 2) int32 px, out.
-        n_steps: (N,) int32, picture pixels a crop pixel, out.
-        n_px: (N,) int64, pixels of the height map, out.
-        moments: (N, N_MOMENTS), out; the long axis points away from the arm where one is seen.
-        distance: (N,) mm of the view's origin from the camera, out.
-        n_blobs: (N,) int64, candidates, out.
+        sight: `HandSight` of the picture.
+        crops: `CropRows`, out; the long axis points away from the arm where one is seen.
         k: the frame's row.
     """
+    size = sight.size
+    intrinsics = sight.intrinsics
     blocks = np.empty((depth.shape[0] // BLOCK, depth.shape[1] // BLOCK), np.float32)
     labels = np.empty(blocks.shape, np.int32)
     areas = np.empty(MAX_SURFACES)
-    ends = np.empty((_MOST_ENDS, 4))
+    ends = np.empty((_MOST_ENDS, N_END))
     focal2 = intrinsics[0] * intrinsics[1]
-    block_depths(depth, near, far, blocks)
+    block_depths(depth, sight.near, sight.far, blocks)
     n_surfaces = label_surfaces(blocks, labels, focal2, _LEAST_MM2 * size * size, areas)
     n_ends = nearest_ends(blocks, labels, n_surfaces, size, intrinsics, ends)
     unlike = np.empty(n_ends)
@@ -413,96 +420,53 @@ def extract_one(
     if n_ends > 1 and unlike[ranked[1]] > unlike[ranked[0]] + _AS_LIKE:
         n_alike = 1
     for rank in range(n_things):
-        row = k + rank * (len(n_px) // n_things)
-        n_blobs[row] = n_alike
+        row = k + rank * (len(crops.n_px) // n_things)
+        crops.n_blobs[row] = n_alike
         if rank < n_alike:
-            cut_end(
-                depth,
-                near,
-                far,
-                blocks,
-                labels,
-                ends[ranked[rank]],
-                size,
-                behind,
-                smooth,
-                intrinsics,
-                along_axis,
-                heights,
-                origin,
-                n_steps,
-                n_px,
-                moments,
-                distance,
-                row,
-            )
+            cut_end(depth, blocks, labels, ends[ranked[rank]], sight, crops, row)
 
 
 @njit(cache=True)
-def cut_end(
-    depth,
-    near,
-    far,
-    blocks,
-    labels,
-    end,
-    size,
-    behind,
-    smooth,
-    intrinsics,
-    along_axis,
-    heights,
-    origin,
-    n_steps,
-    n_px,
-    moments,
-    distance,
-    k,
-):
+def cut_end(depth, blocks, labels, end, sight, crops, k):
     """The height map of the hand at an extremum, and its moments; labels stay as they are.
 
     Args:
         depth: (H, W) mm, 0 where unread.
-        near: least depth of a hand, mm.
-        far: largest depth of a hand, mm.
         blocks: (h, w) float32 mm.
         labels: (h, w) int32.
-        end: (4,) the extremum.
-        size: the hand's length over the skeleton's home length.
-        behind: of the reference plane behind the hand's middle, mm.
-        smooth: width over which heights are averaged, mm.
-        intrinsics: (4,) fx, fy, cx, cy px.
-        along_axis: whether heights are measured along the optical axis.
-        heights: (N, S, S) int16, 1/16 mm, out.
-        origin: (N, 2) int32 px, out.
-        n_steps: (N,) int32, out.
-        n_px: (N,) int64, out.
-        moments: (N, N_MOMENTS), out.
-        distance: (N,) mm, out.
+        end: (N_END,) the extremum.
+        sight: `HandSight` of the picture.
+        crops: `CropRows`, out.
         k: the row.
     """
-    found = np.empty(FIELDS)
+    intrinsics = sight.intrinsics
     box = np.empty(4, np.int64)
-    slot = labels[int(end[1]), int(end[2])]
-    locate(blocks, labels, end, size, intrinsics, found)
+    slot = labels[int(end[END_ROW]), int(end[END_COLUMN])]
+    found = locate(blocks, labels, end, sight.size, intrinsics)
     box_of(labels, MAX_SURFACES, box)
     if box[1] < 0:
         return
-    crop = heights.shape[1]
+    heights = crops.heights[k]
+    origin = crops.origin[k]
+    moments = crops.moments[k]
+    crop = heights.shape[0]
     span = BLOCK * (max(box[1] - box[0], box[3] - box[2]) + 3)
     step = max(1, int(np.ceil(span / (crop - 4))))
     middle_u = 0.5 * BLOCK * (box[2] + box[3] + 1)
     middle_v = 0.5 * BLOCK * (box[0] + box[1] + 1)
-    origin[k, 0] = int(middle_u - step * crop / 2)
-    origin[k, 1] = int(middle_v - step * crop / 2)
-    n_steps[k] = step
+    origin[0] = int(middle_u - step * crop / 2)
+    origin[1] = int(middle_v - step * crop / 2)
+    crops.step[k] = step
     rotation = np.empty((3, 3))
-    x, y = view_axis(origin[k], step, crop, intrinsics, along_axis)
+    x, y = view_axis(origin, step, crop, intrinsics, sight.along_axis)
     sight_rotation(x, y, rotation)
-    distance[k] = behind - (
-        rotation[2, 0] * found[0] + rotation[2, 1] * found[1] + rotation[2, 2] * found[2]
+    distance = sight.behind - (
+        rotation[2, 0] * found.middle[0]
+        + rotation[2, 1] * found.middle[1]
+        + rotation[2, 2] * found.middle[2]
     )
-    plane = view_plane(rotation, distance[k], intrinsics)
+    crops.distance[k] = distance
+    plane = view_plane(rotation, distance, intrinsics)
     raw = np.empty((crop, crop), np.float32)
     cut_heights(
         depth,
@@ -510,28 +474,26 @@ def cut_end(
         labels,
         found,
         plane,
-        distance[k],
+        distance,
         intrinsics,
-        origin[k],
+        origin,
         step,
-        near,
-        far,
+        sight.near,
+        sight.far,
         raw,
     )
     relabel(labels, box, MAX_SURFACES, slot)
     blob_kernels.keep_largest(raw, np.empty((crop * crop, 5), np.int32))
-    mm_per_px = step * found[2] / np.sqrt(intrinsics[0] * intrinsics[1])
-    radius = min(3, max(1, int(smooth / mm_per_px + 0.5)))
-    blob_kernels.smooth_heights(raw, radius, heights[k])
-    blob_kernels.blob_moments(
-        heights[k], origin[k], step, plane, intrinsics, rotation, distance[k], moments[k]
-    )
+    mm_per_px = step * found.middle[2] / np.sqrt(intrinsics[0] * intrinsics[1])
+    radius = min(3, max(1, int(sight.smooth / mm_per_px + 0.5)))
+    blob_kernels.smooth_heights(raw, radius, heights)
+    blob_kernels.blob_moments(heights, origin, step, plane, intrinsics, rotation, distance, moments)
     # the arm tells which way along the long axis the fingers point
-    along = rotation @ found[3:6]
-    angle = moments[k, blob_kernels.ANGLE]
+    along = rotation @ found.fingers
+    angle = moments[blob_kernels.ANGLE]
     if along[0] * np.cos(angle) + along[1] * np.sin(angle) < 0.0:
-        moments[k, blob_kernels.ANGLE] += np.pi
-    n_px[k] = int(moments[k, blob_kernels.N_PX])
+        moments[blob_kernels.ANGLE] += np.pi
+    crops.n_px[k] = int(moments[blob_kernels.N_PX])
 
 
 @njit(cache=True)
@@ -571,65 +533,27 @@ def view_plane(rotation, distance, intrinsics):
 
 
 @njit(cache=True, parallel=True)
-def extract_all(
-    depths,
-    near,
-    far,
-    n_things,
-    size,
-    behind,
-    smooth,
-    intrinsics,
-    along_axis,
-    heights,
-    origin,
-    n_steps,
-    n_px,
-    moments,
-    distance,
-    n_blobs,
-):
+def extract_all(depths, n_things, sights, crops):
     """Find the hand in every picture and fill the batch, pictures in parallel.
 
     Args:
         depths: (n, H, W) mm, 0 where unread.
-        near: least depth at which a hand is looked for, mm.
-        far: largest depth at which a hand is looked for, mm.
         n_things: candidates a picture; the batch has N = n_things n rows, best candidates first.
-        size: (n,) lengths of the hands over the skeleton's home length.
-        behind: (n,) mm of the reference plane behind the hand's middle.
-        smooth: (n,) mm, widths over which heights are averaged.
-        intrinsics: (n, 4) fx, fy, cx, cy px.
-        along_axis: whether heights are measured along the optical axis, else along the line of
-            sight.
-        heights: (N, S, S) int16, 1/16 mm, out.
-        origin: (N, 2) int32 px, out.
-        n_steps: (N,) int32, picture pixels a crop pixel, out.
-        n_px: (N,) int64, pixels of the height map, out.
-        moments: (N, N_MOMENTS), out.
-        distance: (N,) mm of the view's origin from the camera, out.
-        n_blobs: (N,) int64, candidates, out.
+        sights: `HandSight` of the pictures: size, behind, smooth and intrinsics with a leading axis
+            (n,).
+        crops: `CropRows`, out.
     """
     for k in prange(depths.shape[0]):
-        extract_one(
-            depths[k],
-            near,
-            far,
-            n_things,
-            size[k],
-            behind[k],
-            smooth[k],
-            intrinsics[k],
-            along_axis,
-            heights,
-            origin,
-            n_steps,
-            n_px,
-            moments,
-            distance,
-            n_blobs,
-            k,
+        sight = HandSight(
+            sights.near,
+            sights.far,
+            sights.size[k],
+            sights.behind[k],
+            sights.smooth[k],
+            sights.intrinsics[k],
+            sights.along_axis,
         )
+        extract_one(depths[k], n_things, sight, crops, k)
 
 
 @njit(cache=True)

@@ -10,6 +10,8 @@ blocks and labels are those of `_geodesic_kernels`.
 
 from __future__ import annotations
 
+from typing import Any, NamedTuple
+
 import numpy as np
 from numba import njit
 
@@ -33,6 +35,22 @@ _WITHIN = 2.0
 _ACROSS = ((-1, 0), (1, 0), (0, -1), (0, 1))
 
 
+class HandFind(NamedTuple):
+    """Where a hand is, camera frame.
+
+    Attributes:
+        middle: (3,) mm.
+        fingers: (3,) direction of the fingers, 0 without an arm.
+        cut: where along `fingers` the arm is cut, mm from the camera.
+        area_mm2: area of what lies beyond the cut, mm^2.
+    """
+
+    middle: Any
+    fingers: Any
+    cut: Any
+    area_mm2: Any
+
+
 @njit(cache=True)
 def unlikeness(blocks, labels, slot, mark, found, size, intrinsics):
     """Mean depth of the blocks labelled `mark`, and how unlike a hand they are.
@@ -42,7 +60,7 @@ def unlikeness(blocks, labels, slot, mark, found, size, intrinsics):
         labels: (h, w) int32; changed in place.
         slot: the label of the rest of the surface, which the blocks get back.
         mark: the label of the blocks.
-        found: (FIELDS,) as `_hand_kernels.locate` fills it.
+        found: `HandFind` of the hand.
         size: the hand's length over the skeleton's home length.
         intrinsics: (4,) fx, fy, cx, cy px.
 
@@ -50,7 +68,7 @@ def unlikeness(blocks, labels, slot, mark, found, size, intrinsics):
         The mean depth, mm, and the score: the less, the more alike.
     """
     box = np.empty(4, np.int64)
-    box_around(labels.shape, found, _WITHIN * AROUND_MM * size, intrinsics, box)
+    box_around(labels.shape, found.middle, _WITHIN * AROUND_MM * size, intrinsics, box)
     n_rows, n_columns = labels.shape
     focal = np.sqrt(intrinsics[0] * intrinsics[1])
     area = 0.0
@@ -99,7 +117,8 @@ def _behind_cut(blocks, i, j, found, size, intrinsics):
     p = np.empty(3)
     off = 0.0
     point_of_block(blocks, i, j, intrinsics, p)
-    along = p[0] * found[3] + p[1] * found[4] + p[2] * found[5] - found[6]
+    fingers = found.fingers
+    along = p[0] * fingers[0] + p[1] * fingers[1] + p[2] * fingers[2] - found.cut
     for k in range(3):
-        off += (p[k] - found[k]) ** 2
+        off += (p[k] - found.middle[k]) ** 2
     return -_WRIST_MM * size < along <= 0.0 and off < (1.4 * AROUND_MM * size) ** 2

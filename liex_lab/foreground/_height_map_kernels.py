@@ -9,6 +9,8 @@ largest gap in depth.
 
 from __future__ import annotations
 
+from typing import Any, NamedTuple
+
 import numpy as np
 from numba import njit, prange
 
@@ -21,6 +23,25 @@ _APART = 2.0  # roots of the animal's area: what lies farther before the animal 
 _LAYERS = 3  # so often: before the animal a bar, behind it a speck
 _FAR = 65_535  # mm: behind everything
 _ON_FLOOR_SHARE = 0.3  # of an animal that leans out over the edge of the floor still covers it
+
+
+class Sight(NamedTuple):
+    """How a camera looks at the floor, and how heights above it are measured.
+
+    Attributes:
+        intrinsics: (4,) fx, fy, cx, cy px.
+        plane: (3,) the floor, 1 / z = a u + b v + c.
+        rotation: (3, 3) of T_view_camera.
+        behind_mm: 0 measures heights above the floor, else along the optical axis from so far
+            behind the mean depth.
+        smooth_mm: width over which heights are averaged, mm.
+    """
+
+    intrinsics: Any
+    plane: Any
+    rotation: Any
+    behind_mm: Any
+    smooth_mm: Any
 
 
 @njit(cache=True, parallel=True, nogil=True)
@@ -39,12 +60,13 @@ def blob_areas(depths, limit, on_floor, bridge, mm2_per_px, areas):
         labels = np.empty(
             (depths.shape[1] // blob_kernels.BLOCK, depths.shape[2] // blob_kernels.BLOCK), np.int32
         )
-        blobs = np.empty((blob_kernels.MAX_BLOBS, 7))
+        blobs = np.empty((blob_kernels.MAX_BLOBS, blob_kernels.N_BLOB))
         for slot in range(
             blob_kernels.label_blobs(depths[k], limit, on_floor, bridge, labels, blobs)
         ):
-            if blobs[slot, 6] >= _ON_FLOOR_SHARE * blobs[slot, 0]:
-                areas[k, slot] = blob_area(blobs[slot], mm2_per_px)
+            blob = blob_kernels.unpack_blob(blobs[slot])
+            if blob.n_on_floor >= _ON_FLOOR_SHARE * blob.n_px:
+                areas[k, slot] = blob_area(blob, mm2_per_px)
 
 
 @njit(cache=True)
@@ -52,10 +74,10 @@ def blob_area(blob, mm2_per_px):
     """Area mm^2, seen from the camera, of a component at its mean depth.
 
     Args:
-        blob: (7,) as `label_blobs` fills it.
+        blob: the component's counts.
         mm2_per_px: 1 / (fx fy).
     """
-    return blob[0] * (blob[5] / blob[0]) ** 2 * mm2_per_px
+    return blob.n_px * (blob.depth_sum / blob.n_px) ** 2 * mm2_per_px
 
 
 @njit(cache=True)
@@ -65,7 +87,7 @@ def order_blobs(blobs, n_blobs, area, mm2_per_px):
     While `area` is 0 the largest comes first.
 
     Args:
-        blobs: (MAX_BLOBS, 7) as `label_blobs` fills it.
+        blobs: (MAX_BLOBS, N_BLOB) as `label_blobs` fills it.
         n_blobs: how many of the rows are filled.
         area: the animal's usual area, mm^2, 0 while unknown.
         mm2_per_px: 1 / (fx fy).
@@ -77,9 +99,10 @@ def order_blobs(blobs, n_blobs, area, mm2_per_px):
     distances = np.full(n_blobs, np.inf)
     n_near = 0
     for slot in range(n_blobs):
-        if blobs[slot, 6] < _ON_FLOOR_SHARE * blobs[slot, 0]:
+        blob = blob_kernels.unpack_blob(blobs[slot])
+        if blob.n_on_floor < _ON_FLOOR_SHARE * blob.n_px:
             continue
-        here = blob_area(blobs[slot], mm2_per_px)
+        here = blob_area(blob, mm2_per_px)
         distances[slot] = abs(np.log(here / area)) if area > 0 else 1.0 / here
         if area > 0 and distances[slot] > np.log(AREA_FACTOR):
             distances[slot] = np.inf
@@ -101,7 +124,7 @@ def parted(depth, limit, labels, blobs, area, mm2_per_px):
         depth: (H, W) mm, 0 where unread.
         limit: (H, W) mm; a reading below it is foreground.
         labels: (H // BLOCK, W // BLOCK) int32, component of each block.
-        blobs: (n_blobs, 7) as `label_blobs` fills it.
+        blobs: (n_blobs, N_BLOB) as `label_blobs` fills it.
         area: the animal's usual area, mm^2.
         mm2_per_px: 1 / (fx fy).
 
@@ -109,9 +132,10 @@ def parted(depth, limit, labels, blobs, area, mm2_per_px):
         The picture, a copy where it changed, and whether it did.
     """
     for slot in range(len(blobs)):
-        if blob_area(blobs[slot], mm2_per_px) > _MORE * area:
+        blob = blob_kernels.unpack_blob(blobs[slot])
+        if blob_area(blob, mm2_per_px) > _MORE * area:
             cut, near, far = blob_kernels.layers(
-                depth, limit, labels, slot, blobs[slot], _APART * np.sqrt(area)
+                depth, limit, labels, slot, blob, _APART * np.sqrt(area)
             )
             if cut > 0.0:
                 behind = abs(np.log(far * mm2_per_px / area)) < abs(
@@ -142,27 +166,7 @@ def _push_back(depth, labels, slot, cut):
 
 
 @njit(cache=True)
-def extract_one(
-    depth,
-    limit,
-    on_floor,
-    area,
-    n_things,
-    parts,
-    smooth_mm,
-    intrinsics,
-    plane,
-    rotation,
-    behind_mm,
-    heights,
-    origin,
-    n_steps,
-    n_px,
-    moments,
-    distance,
-    n_blobs,
-    k,
-):
+def extract_one(depth, limit, on_floor, area, n_things, parts, sight, crops, k):
     """Find the animal in one frame and fill its row of the batch.
 
     Where n_things is 2, the batch has twice as many rows as there are frames, and the second half
@@ -176,27 +180,16 @@ def extract_one(
         n_things: candidates a frame, 1 or 2.
         parts: whether what hangs together with the animal in the picture alone is told apart by its
             depth, see `parted`.
-        smooth_mm: width over which heights are averaged, mm.
-        intrinsics: (4,) fx, fy, cx, cy px.
-        plane: (3,) the floor, 1 / z = a u + b v + c.
-        rotation: (3, 3) of T_view_camera.
-        behind_mm: 0 measures heights above the floor, else along the optical axis from so far
-            behind the mean depth.
-        heights: (N, S, S) int16, 1/16 mm, out; N rows of the batch.
-        origin: (N, 2) int32 px, out.
-        n_steps: (N,) int32, picture pixels a crop pixel, out.
-        n_px: (N,) int64, pixels of the component, out.
-        moments: (N, N_MOMENTS), out.
-        distance: (N,) mm of the view's origin from the camera; comes in as the floor's.
-        n_blobs: (N,) int64, components of about the animal's area, out.
+        sight: `Sight` of the picture.
+        crops: `CropRows`, out.
         k: the frame's row.
     """
     labels = np.empty(
         (depth.shape[0] // blob_kernels.BLOCK, depth.shape[1] // blob_kernels.BLOCK), np.int32
     )
-    blobs = np.empty((blob_kernels.MAX_BLOBS, 7))
-    mm2_per_px = 1.0 / (intrinsics[0] * intrinsics[1])
-    bridge = BRIDGE if behind_mm > 0.0 else 0
+    blobs = np.empty((blob_kernels.MAX_BLOBS, blob_kernels.N_BLOB))
+    mm2_per_px = 1.0 / (sight.intrinsics[0] * sight.intrinsics[1])
+    bridge = BRIDGE if sight.behind_mm > 0.0 else 0
     n_found = blob_kernels.label_blobs(depth, limit, on_floor, bridge, labels, blobs)
     for _ in range(_LAYERS if parts and area > 0.0 else 0):
         depth, changed = parted(depth, limit, labels, blobs[:n_found], area, mm2_per_px)
@@ -205,134 +198,75 @@ def extract_one(
         n_found = blob_kernels.label_blobs(depth, limit, on_floor, bridge, labels, blobs)
     order, n_near = order_blobs(blobs, n_found, area, mm2_per_px)
     for rank in range(n_things):
-        row = k + rank * (len(n_px) // n_things)
-        n_blobs[row] = n_near
+        row = k + rank * (len(crops.n_px) // n_things)
+        crops.n_blobs[row] = n_near
         if rank < n_near:
             slot = order[rank]
-            blob = blobs[slot]
-            cut_crop(
-                depth,
-                limit,
-                labels,
-                slot,
-                blob,
-                blob[5] / blob[0],
-                smooth_mm,
-                intrinsics,
-                plane,
-                rotation,
-                behind_mm,
-                heights,
-                origin,
-                n_steps,
-                moments,
-                distance,
-                row,
-            )
-            n_px[row] = int(blob[0])
+            blob = blob_kernels.unpack_blob(blobs[slot])
+            cut_crop(depth, limit, labels, slot, blob, sight, crops, row)
+            crops.n_px[row] = int(blob.n_px)
 
 
 @njit(cache=True)
-def cut_crop(
-    depth,
-    limit,
-    labels,
-    slot,
-    blob,
-    mean_depth,
-    smooth_mm,
-    intrinsics,
-    plane,
-    rotation,
-    behind_mm,
-    heights,
-    origin,
-    n_steps,
-    moments,
-    distance,
-    k,
-):
+def cut_crop(depth, limit, labels, slot, blob, sight, crops, k):
     """The height map of one component, smoothed, and its moments, into row k of the batch.
 
     The crop is a square around the component in steps of whole pixels. Where heights are measured
-    along the optical axis, distance[k] moves to behind_mm behind the animal.
+    along the optical axis, the row's distance moves to behind_mm behind the animal.
 
     Args:
         depth: (H, W) mm, 0 where unread.
         limit: (H, W) mm; a reading below it is foreground.
         labels: (H // BLOCK, W // BLOCK) int32, component of each block.
         slot: the component.
-        blob: (7,) as `label_blobs` fills it.
-        mean_depth: of the component, mm.
-        smooth_mm: width over which heights are averaged, mm.
-        intrinsics: (4,) fx, fy, cx, cy px.
-        plane: (3,) the floor, 1 / z = a u + b v + c.
-        rotation: (3, 3) of T_view_camera.
-        behind_mm: 0 measures heights above the floor, else along the optical axis.
-        heights: (N, S, S) int16, 1/16 mm, out.
-        origin: (N, 2) int32 px, out.
-        n_steps: (N,) int32, picture pixels a crop pixel, out.
-        moments: (N, N_MOMENTS), out.
-        distance: (N,) mm of the view's origin from the camera.
+        blob: its counts.
+        sight: `Sight` of the picture.
+        crops: `CropRows`, out.
         k: the row.
     """
-    crop = heights.shape[1]
-    v0 = blob[1] * blob_kernels.BLOCK
-    v1 = (blob[2] + 1) * blob_kernels.BLOCK
-    u0 = blob[3] * blob_kernels.BLOCK
-    u1 = (blob[4] + 1) * blob_kernels.BLOCK
+    crop = crops.heights.shape[1]
+    v0 = blob.first_row * blob_kernels.BLOCK
+    v1 = (blob.last_row + 1) * blob_kernels.BLOCK
+    u0 = blob.first_column * blob_kernels.BLOCK
+    u1 = (blob.last_column + 1) * blob_kernels.BLOCK
     span = max(v1 - v0, u1 - u0) + 2 * blob_kernels.BLOCK
     step = max(1, int(np.ceil(span / (crop - 4))))
-    origin[k, 0] = int((u0 + u1) / 2 - step * crop / 2)
-    origin[k, 1] = int((v0 + v1) / 2 - step * crop / 2)
-    n_steps[k] = step
+    mean_depth = blob.depth_sum / blob.n_px
+    heights = crops.heights[k]
+    origin = crops.origin[k]
+    origin[0] = int((u0 + u1) / 2 - step * crop / 2)
+    origin[1] = int((v0 + v1) / 2 - step * crop / 2)
+    crops.step[k] = step
     raw = np.empty((crop, crop), np.float32)
-    view_plane = plane
+    view_plane = sight.plane
     if (
-        behind_mm > 0.0
+        sight.behind_mm > 0.0
     ):  # first from far behind, for the blob's mean depth is that of all that hangs together
-        distance[k] = mean_depth + 8.0 * behind_mm
-        view_plane = np.array([0.0, 0.0, 1.0 / distance[k]])
+        crops.distance[k] = mean_depth + 8.0 * sight.behind_mm
+        view_plane = np.array([0.0, 0.0, 1.0 / crops.distance[k]])
     blob_kernels.cut_heights(
-        depth, limit, labels, slot, view_plane, distance[k], origin[k], step, raw
+        depth, limit, labels, slot, view_plane, crops.distance[k], origin, step, raw
     )
     blob_kernels.keep_largest(raw, np.empty((crop * crop, 5), np.int32))
-    if behind_mm > 0.0:
-        distance[k] += blob_kernels.level_heights(raw, behind_mm)
-        view_plane[2] = 1.0 / distance[k]
-    mm_per_px = step * mean_depth / np.sqrt(intrinsics[0] * intrinsics[1])
-    radius = min(3, max(1, int(smooth_mm / mm_per_px + 0.5)))
-    blob_kernels.smooth_heights(raw, radius, heights[k])
+    if sight.behind_mm > 0.0:
+        crops.distance[k] += blob_kernels.level_heights(raw, sight.behind_mm)
+        view_plane[2] = 1.0 / crops.distance[k]
+    mm_per_px = step * mean_depth / np.sqrt(sight.intrinsics[0] * sight.intrinsics[1])
+    radius = min(3, max(1, int(sight.smooth_mm / mm_per_px + 0.5)))
+    blob_kernels.smooth_heights(raw, radius, heights)
+    distance = crops.distance[k]
+    moments = crops.moments[k]
     blob_kernels.blob_moments(
-        heights[k], origin[k], step, view_plane, intrinsics, rotation, distance[k], moments[k]
+        heights, origin, step, view_plane, sight.intrinsics, sight.rotation, distance, moments
     )
-    if behind_mm > 0.0:
-        moments[k, blob_kernels.SLOPE] = blob_kernels.back_slope(
-            heights[k], origin[k], step, intrinsics, distance[k], moments[k]
+    if sight.behind_mm > 0.0:
+        moments[blob_kernels.SLOPE] = blob_kernels.back_slope(
+            heights, origin, step, sight.intrinsics, distance, moments
         )
 
 
 @njit(cache=True, parallel=True, nogil=True)
-def extract_all(
-    depths,
-    limit,
-    on_floor,
-    area,
-    n_things,
-    parts,
-    smooth_mm,
-    intrinsics,
-    plane,
-    rotation,
-    behind_mm,
-    heights,
-    origin,
-    n_steps,
-    n_px,
-    moments,
-    distance,
-    n_blobs,
-):
+def extract_all(depths, limit, on_floor, area, n_things, parts, sight, crops):
     """Find the animal in every frame of one camera and fill the batch, frames in parallel.
 
     Args:
@@ -342,64 +276,15 @@ def extract_all(
         area: the animal's usual area, mm^2, 0 while unknown.
         n_things: candidates a frame; the batch has N = n_things n rows, best candidates first.
         parts: whether layers far apart in depth are told apart, see `parted`.
-        smooth_mm: width over which heights are averaged, mm.
-        intrinsics: (4,) fx, fy, cx, cy px.
-        plane: (3,) the floor, 1 / z = a u + b v + c.
-        rotation: (3, 3) of T_view_camera.
-        behind_mm: 0 measures heights above the floor, else along the optical axis from so far
-            behind the mean depth.
-        heights: (N, S, S) int16, 1/16 mm, out.
-        origin: (N, 2) int32 px, out.
-        n_steps: (N,) int32, picture pixels a crop pixel, out.
-        n_px: (N,) int64, pixels of the component, out.
-        moments: (N, N_MOMENTS), out.
-        distance: (N,) mm of the view's origin from the camera; comes in as the floor's.
-        n_blobs: (N,) int64, components of about the animal's area, out.
+        sight: `Sight` of all pictures.
+        crops: `CropRows`, out.
     """
     for k in prange(depths.shape[0]):
-        extract_one(
-            depths[k],
-            limit,
-            on_floor,
-            area,
-            n_things,
-            parts,
-            smooth_mm,
-            intrinsics,
-            plane,
-            rotation,
-            behind_mm,
-            heights,
-            origin,
-            n_steps,
-            n_px,
-            moments,
-            distance,
-            n_blobs,
-            k,
-        )
+        extract_one(depths[k], limit, on_floor, area, n_things, parts, sight, crops, k)
 
 
 @njit(cache=True, parallel=True, nogil=True)
-def extract_windows(
-    depths,
-    background,
-    margin,
-    area,
-    n_things,
-    smooth_mm,
-    intrinsics,
-    plane,
-    rotation,
-    behind_mm,
-    heights,
-    origin,
-    n_steps,
-    n_px,
-    moments,
-    distance,
-    n_blobs,
-):
+def extract_windows(depths, background, margin, area, n_things, sights, crops):
     """Find the animal in patches of pictures from many cameras and fill the batch, in parallel.
 
     The limit of each patch is its background, or the floor where that is unread, less its margin;
@@ -411,47 +296,26 @@ def extract_windows(
         margin: (n,) mm by which the animal stands out at least.
         area: (n,) usual areas of the animals, mm^2.
         n_things: candidates a patch; the batch has N = n_things n rows, best candidates first.
-        smooth_mm: (n,) widths over which heights are averaged, mm.
-        intrinsics: (n, 4) fx, fy, cx, cy, pixels of the patches.
-        plane: (n, 3) the floors, 1 / z = a u + b v + c, in pixels of the patches.
-        rotation: (n, 3, 3) of T_view_camera.
-        behind_mm: (n,) 0 measures heights above the floor, else along the optical axis.
-        heights: (N, S, S) int16, 1/16 mm, out.
-        origin: (N, 2) int32 px, out.
-        n_steps: (N,) int32, pixels a crop pixel, out.
-        n_px: (N,) int64, pixels of the component, out.
-        moments: (N, N_MOMENTS), out.
-        distance: (N,) mm of the view's origin from the camera; comes in as the floor's.
-        n_blobs: (N,) int64, components of about the animal's area, out.
+        sights: `Sight` of the patches, each field with a leading axis (n,), in pixels of the
+            patches.
+        crops: `CropRows`, out.
     """
     for k in prange(depths.shape[0]):
+        plane = sights.plane[k]
         limit = np.empty(depths.shape[1:], np.float32)
         everywhere = np.ones(depths.shape[1:], np.bool_)
         for v in range(limit.shape[0]):
             for u in range(limit.shape[1]):
                 behind = float(background[k, v, u])
                 if behind == 0.0:
-                    inverse = plane[k, 0] * u + plane[k, 1] * v + plane[k, 2]
+                    inverse = plane[0] * u + plane[1] * v + plane[2]
                     behind = 1.0 / inverse if inverse > 1e-6 else 0.0
                 limit[v, u] = max(behind - margin[k], 0.0)
-        extract_one(
-            depths[k],
-            limit,
-            everywhere,
-            area[k],
-            n_things,
-            False,
-            smooth_mm[k],
-            intrinsics[k],
-            plane[k],
-            rotation[k],
-            behind_mm[k],
-            heights,
-            origin,
-            n_steps,
-            n_px,
-            moments,
-            distance,
-            n_blobs,
-            k,
+        sight = Sight(
+            sights.intrinsics[k],
+            plane,
+            sights.rotation[k],
+            sights.behind_mm[k],
+            sights.smooth_mm[k],
         )
+        extract_one(depths[k], limit, everywhere, area[k], n_things, False, sight, crops, k)

@@ -421,18 +421,14 @@ class BackgroundSubtraction(Segmenter):
                 self.area_mm2,
                 n_things,
                 camera_view,
-                self.view.smooth_mm * size,
-                np.array([grid.fx, grid.fy, grid.cx, grid.cy]),
-                self._grid_floor.inverse_depth,
-                self.view_rotation(camera_view),
-                self.view.behind_mm if camera_view else 0.0,
-                crops.heights,
-                crops.origin,
-                crops.step,
-                crops.n_px,
-                crops.moments,
-                crops.distance,
-                crops.n_blobs,
+                kernels.Sight(
+                    np.array([grid.fx, grid.fy, grid.cx, grid.cy]),
+                    self._grid_floor.inverse_depth,
+                    self.view_rotation(camera_view),
+                    behind_mm=self.view.behind_mm if camera_view else 0.0,
+                    smooth_mm=self.view.smooth_mm * size,
+                ),
+                crops.rows,
             )
         if self.stride > 1:  # told in pixels of the picture
             for values, factor in ((crops.origin, 1), (crops.step, 1), (crops.n_px, self.stride)):

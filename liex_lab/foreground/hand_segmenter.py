@@ -93,13 +93,13 @@ class HandSegmenter(Segmenter):
                 f"a hand's size lies between {range_mm[0]:g} and {range_mm[1]:g} mm; check the "
                 "depth unit, foreground.near_mm and far_mm"
             )
-        seen = crops.moments[crops.found]
+        seen = crops[crops.found].blobs
         floor = Floor.from_plane(_FLAT, float(np.median(crops.distance[crops.found])), camera)
         return replace(
             scene,
             floor=floor,
-            area_mm2=float(np.median(seen[:, 1])),
-            volume_mm3=float(np.median(seen[:, 2])),
+            area_mm2=float(np.median(seen.area_mm2)),
+            volume_mm3=float(np.median(seen.volume_mm3)),
         ), sample
 
     def misfit(self, crops: HeightMaps) -> Array:
@@ -279,23 +279,15 @@ def cut_nearest(
         n or 2 n height maps.
     """
     crops = HeightMaps.blank(n_things * len(depths), 1000.0)
-    kernels.extract_all(
-        depths,
+    sights = kernels.HandSight(
         *range_mm,
-        n_things,
-        size,
-        size * view.behind_mm,
-        size * view.smooth_mm,
-        intrinsics,
-        camera_view,
-        crops.heights,
-        crops.origin,
-        crops.step,
-        crops.n_px,
-        crops.moments,
-        crops.distance,
-        crops.n_blobs,
+        size=size,
+        behind=size * view.behind_mm,
+        smooth=size * view.smooth_mm,
+        intrinsics=intrinsics,
+        along_axis=camera_view,
     )
+    kernels.extract_all(depths, n_things, sights, crops.rows)
     return crops
 
 

@@ -24,6 +24,7 @@ from liex_lab.arena.floor import Floor
 from liex_lab.body.skeleton import MOUSE_VIEW, View
 from liex_lab.foreground import _height_map_kernels as kernels
 from liex_lab.foreground._blob_kernels import N_MOMENTS, BlobMoments
+from liex_lab.foreground._crop_camera_kernels import CropRows
 from liex_lab.foreground.crop_camera import pack_crop_cameras
 from liex_lab.optics.camera import Camera
 
@@ -112,6 +113,11 @@ class HeightMaps:
         """
         for field in fields(self):
             getattr(self, field.name)[rows] = getattr(other, field.name)
+
+    @property
+    def rows(self) -> CropRows:
+        """The arrays themselves, as kernels fill them."""
+        return CropRows(*(getattr(self, field) for field in CropRows._fields))
 
     @property
     def found(self) -> NDArray[np.bool_]:
@@ -223,18 +229,14 @@ class Patches:
             margin,
             area_mm2,
             n_things,
-            self.view.smooth_mm * size,
-            intrinsics,
-            plane,
-            rotation,
-            np.full(n, self.view.behind_mm if camera_view else 0.0),
-            crops.heights,
-            crops.origin,
-            crops.step,
-            crops.n_px,
-            crops.moments,
-            crops.distance,
-            crops.n_blobs,
+            kernels.Sight(
+                intrinsics,
+                plane,
+                rotation,
+                behind_mm=np.full(n, self.view.behind_mm if camera_view else 0.0),
+                smooth_mm=self.view.smooth_mm * size,
+            ),
+            crops.rows,
         )
         packed = pack_crop_cameras(
             np.tile(intrinsics, (n_things, 1)),

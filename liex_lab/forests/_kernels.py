@@ -30,6 +30,12 @@ TWO_PROBES = 0
 ONE_PROBE = 1
 SCALAR = 2
 VIEW = 9
+# columns of a view, see above; each of the two slopes takes three
+VIEW_COLUMN = 0
+VIEW_ROW = 1
+COLUMN_SLOPE = 2
+ROW_SLOPE = 5
+VIEW_HEIGHT = 8
 
 
 @njit(cache=True, inline="always")
@@ -54,8 +60,16 @@ def probe(heights, view, a, b, c):
     y = np.float32(b)
     z = np.float32(c)
     half = np.float32(0.5)
-    column = int(((view[0] + half) + view[2] * x) + view[3] * y + view[4] * z)
-    row = int(((view[1] + half) + view[5] * x) + view[6] * y + view[7] * z)
+    column = int(
+        ((view[VIEW_COLUMN] + half) + view[COLUMN_SLOPE] * x)
+        + view[COLUMN_SLOPE + 1] * y
+        + view[COLUMN_SLOPE + 2] * z
+    )
+    row = int(
+        ((view[VIEW_ROW] + half) + view[ROW_SLOPE] * x)
+        + view[ROW_SLOPE + 1] * y
+        + view[ROW_SLOPE + 2] * z
+    )
     column = min(max(column, 0), limit)
     row = min(max(row, 0), limit)
     return heights[row, column]
@@ -90,7 +104,7 @@ def response(heights, inverse_size, views, scalars, word0, word1, word3):
     view = views[channel]
     first = probe(heights, view, byte(word0, 0), byte(word0, 1), byte(word0, 2)) * inverse_size
     if kind == ONE_PROBE:
-        return first - view[8]
+        return first - view[VIEW_HEIGHT]
     return (
         first - probe(heights, view, byte(word0, 3), byte(word1, 0), byte(word1, 1)) * inverse_size
     )

@@ -14,6 +14,7 @@ Stochastic gradient boosting, 2002).
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit, prange
@@ -76,6 +77,37 @@ class GrowthPlan:
         return max(2 * self.min_leaf, self.max_leaf + 1)
 
 
+class _SampleArrays(NamedTuple):
+    """`Samples` and their labels (N, D) for the kernels."""
+
+    heights: Any
+    image: Any
+    inverse_size: Any
+    views: Any
+    scalars: Any
+    labels: Any
+
+
+class _Growth(NamedTuple):
+    """What of a `GrowthPlan` the kernels read."""
+
+    max_depth: int
+    min_leaf: int
+    least_to_split: int
+    n_tests: int
+    one_probe_share: float
+    scalar_share: float
+    depth_share: float
+
+
+class _Scratch(NamedTuple):
+    """Room for the samples that a test is tried on: their rows, responses and running sums."""
+
+    chosen: Any
+    values: Any
+    sums: Any
+
+
 def grow_forest(
     samples: Samples,
     labels: NDArray[np.float32],
@@ -114,22 +146,18 @@ def grow_forest(
     counts = np.zeros((plan.n_trees, 2), np.int64)
     seeds = rng.integers(0, 2**63, plan.n_trees, dtype=np.uint64)
     _grow_all(
-        samples.heights,
-        samples.image,
-        samples.inverse_size,
-        samples.views,
-        samples.scalars,
-        labels,
+        _SampleArrays(
+            samples.heights,
+            samples.image,
+            samples.inverse_size,
+            samples.views,
+            samples.scalars,
+            labels,
+        ),
+        _Growth(*(getattr(plan, name) for name in _Growth._fields)),
         order,
         starts,
         seeds,
-        plan.max_depth,
-        plan.min_leaf,
-        plan.least_to_split,
-        plan.n_tests,
-        plan.one_probe_share,
-        plan.scalar_share,
-        plan.depth_share,
         nodes,
         leaves,
         counts,
@@ -178,45 +206,14 @@ def boost_forest(
 
 
 @njit(cache=True, parallel=True)
-def _grow_all(
-    heights,
-    image,
-    inverse_size,
-    views,
-    scalars,
-    labels,
-    order,
-    starts,
-    seeds,
-    max_depth,
-    min_leaf,
-    least_to_split,
-    n_tests,
-    one_probe_share,
-    scalar_share,
-    depth_share,
-    nodes,
-    leaves,
-    counts,
-):
+def _grow_all(samples, growth, order, starts, seeds, nodes, leaves, counts):
     """Grow all trees in parallel: tree t on the samples order[starts[t] : starts[t + 1]]."""
     for t in prange(seeds.size):
         _grow_tree(
-            heights,
-            image,
-            inverse_size,
-            views,
-            scalars,
-            labels,
+            samples,
+            growth,
             order[starts[t] : starts[t + 1]],
             seeds[t],
-            max_depth,
-            min_leaf,
-            least_to_split,
-            n_tests,
-            one_probe_share,
-            scalar_share,
-            depth_share,
             nodes[t],
             leaves[t],
             counts[t],
@@ -224,19 +221,19 @@ def _grow_all(
 
 
 @njit(cache=True)
-def _draw_test(state, n_views, n_scalars, one_probe_share, scalar_share, depth_share, test):
+def _draw_test(state, n_views, n_scalars, growth, test):
     """A random test into `test` (3,) int32: words 0, 1 and 3 of a node, threshold still 0."""
     kind_draw = (next_random(state) >> np.uint64(11)) * (1.0 / 9007199254740992.0)
     kind = TWO_PROBES
     channel = random_below(state, n_views)
-    if kind_draw < scalar_share and n_scalars > 0:
+    if kind_draw < growth.scalar_share and n_scalars > 0:
         kind = SCALAR
         channel = random_below(state, n_scalars)
-    elif kind_draw < scalar_share + one_probe_share:
+    elif kind_draw < growth.scalar_share + growth.one_probe_share:
         kind = ONE_PROBE
     u = np.empty(3, np.int64)
     v = np.empty(3, np.int64)
-    deep = max(1, int(127 * depth_share))
+    deep = max(1, int(127 * growth.depth_share))
     for k in range(3):
         reach = deep if k == 2 else 127
         u[k] = random_below(state, 2 * reach + 1) - reach
@@ -300,35 +297,31 @@ def _best_threshold(values, n, chosen, labels, min_share, sums, result):
 
 
 @njit(cache=True)
-def _look(heights, image, inverse_size, views, scalars, chosen, n, test, values):
-    """Compute the responses of the samples `chosen` (n,) to a test into `values`."""
-    for i in range(n):
-        s = chosen[i]
-        values[i] = response(
-            heights[image[s]], inverse_size[s], views[s], scalars[s], test[0], test[1], test[2]
-        )
+def _response(samples, s, test):
+    """The response of sample s to a test, words 0, 1 and 3 of a node."""
+    return response(
+        samples.heights[samples.image[s]],
+        samples.inverse_size[s],
+        samples.views[s],
+        samples.scalars[s],
+        test[0],
+        test[1],
+        test[2],
+    )
 
 
 @njit(cache=True)
-def _find_split(
-    heights,
-    image,
-    inverse_size,
-    views,
-    scalars,
-    labels,
-    members,
-    state,
-    min_leaf,
-    n_tests,
-    one_probe_share,
-    scalar_share,
-    depth_share,
-    chosen,
-    values,
-    sums,
-    best,
-):
+def _try_test(samples, n, test, least_share, scratch, result):
+    """Gain and threshold of a test on the first n of the chosen samples into `result` (2,)."""
+    for i in range(n):
+        scratch.values[i] = _response(samples, scratch.chosen[i], test)
+    _best_threshold(
+        scratch.values, n, scratch.chosen, samples.labels, least_share, scratch.sums, result
+    )
+
+
+@njit(cache=True)
+def _find_split(samples, growth, members, state, scratch, best):
     """Find the test that a node keeps.
 
     All tests are ranked on at most 96 of the node's samples, the best 12 of them again on at most
@@ -336,7 +329,10 @@ def _find_split(
     no test separates the samples.
     """
     n = members.size
+    n_tests = growth.n_tests
     n_tried = n_tests if n >= 128 else min(n_tests, max(20, n_tests * n // 128))
+    chosen = scratch.chosen
+    least_share = growth.min_leaf / n
     n_first = min(n, _N_FIRST)
     for i in range(n_first):
         chosen[i] = members[i] if n <= _N_FIRST else members[random_below(state, n)]
@@ -344,17 +340,8 @@ def _find_split(
     gains = np.empty(n_tried)
     result = np.empty(2)
     for k in range(n_tried):
-        _draw_test(
-            state,
-            views.shape[1],
-            scalars.shape[1],
-            one_probe_share,
-            scalar_share,
-            depth_share,
-            tests[k],
-        )
-        _look(heights, image, inverse_size, views, scalars, chosen, n_first, tests[k], values)
-        _best_threshold(values, n_first, chosen, labels, min_leaf / n, sums, result)
+        _draw_test(state, samples.views.shape[1], samples.scalars.shape[1], growth, tests[k])
+        _try_test(samples, n_first, tests[k], least_share, scratch, result)
         gains[k] = -result[0]
     n_second = min(n, _N_SECOND)
     for i in range(n_second):
@@ -366,8 +353,7 @@ def _find_split(
         k = ranked[r]
         if gains[k] > 0.0:
             break
-        _look(heights, image, inverse_size, views, scalars, chosen, n_second, tests[k], values)
-        _best_threshold(values, n_second, chosen, labels, min_leaf / n, sums, result)
+        _try_test(samples, n_second, tests[k], least_share, scratch, result)
         if result[0] > best_gain:
             found = True
             best_gain = result[0]
@@ -379,16 +365,12 @@ def _find_split(
 
 
 @njit(cache=True)
-def _part(heights, image, inverse_size, views, scalars, members, best):
+def _part(samples, members, best):
     """Partition `members` in place so that those that go left come first; returns how many do."""
     left = 0
     right = members.size - 1
     while left <= right:
-        s = members[left]
-        value = response(
-            heights[image[s]], inverse_size[s], views[s], scalars[s], best[0], best[1], best[2]
-        )
-        if value >= best[3]:
+        if _response(samples, members[left], best) >= best[3]:
             members[left], members[right] = members[right], members[left]
             right -= 1
         else:
@@ -397,38 +379,25 @@ def _part(heights, image, inverse_size, views, scalars, members, best):
 
 
 @njit(cache=True)
-def _grow_tree(
-    heights,
-    image,
-    inverse_size,
-    views,
-    scalars,
-    labels,
-    members,
-    seed,
-    max_depth,
-    min_leaf,
-    least_to_split,
-    n_tests,
-    one_probe_share,
-    scalar_share,
-    depth_share,
-    nodes,
-    leaves,
-    counts,
-):
+def _grow_tree(samples, growth, members, seed, nodes, leaves, counts):
     """Grow one tree on the samples `members` into nodes and leaves, depth first.
 
     counts (2,) gets how many nodes and leaves there are. `members` is reordered.
     """
     state = np.empty(1, np.uint64)
     state[0] = seed
+    labels = samples.labels
+    min_leaf = growth.min_leaf
     n_labels = labels.shape[1]
-    chosen = np.empty(max(_N_FIRST, _N_SECOND), np.int32)
-    values = np.empty(max(_N_FIRST, _N_SECOND), np.float32)
-    sums = np.empty((_N_THRESHOLDS + 1, n_labels + 1))
+    scratch = _Scratch(
+        np.empty(max(_N_FIRST, _N_SECOND), np.int32),
+        np.empty(max(_N_FIRST, _N_SECOND), np.float32),
+        np.empty((_N_THRESHOLDS + 1, n_labels + 1)),
+    )
     best = np.empty(4, np.int32)
-    stack = np.empty((4 * max_depth + 8, 4), np.int64)  # node, first member, past the last, depth
+    stack = np.empty(
+        (4 * growth.max_depth + 8, 4), np.int64
+    )  # node, first member, past the last, depth
     stack[0, 0] = 0
     stack[0, 1] = 0
     stack[0, 2] = members.size
@@ -445,29 +414,11 @@ def _grow_tree(
         here = members[first:stop]
         middle = 0
         if (
-            here.size >= least_to_split
-            and depth < max_depth
-            and _find_split(
-                heights,
-                image,
-                inverse_size,
-                views,
-                scalars,
-                labels,
-                here,
-                state,
-                min_leaf,
-                n_tests,
-                one_probe_share,
-                scalar_share,
-                depth_share,
-                chosen,
-                values,
-                sums,
-                best,
-            )
+            here.size >= growth.least_to_split
+            and depth < growth.max_depth
+            and _find_split(samples, growth, here, state, scratch, best)
         ):
-            middle = _part(heights, image, inverse_size, views, scalars, here, best)
+            middle = _part(samples, here, best)
             if middle < min_leaf or here.size - middle < min_leaf:
                 middle = 0
         if middle == 0:

@@ -1,6 +1,8 @@
-"""Memory of a process: its peak, trimming of the heap, and disk-backed arrays (memory maps).
+"""Memory of a process: its peak, and disk-backed arrays (memory maps) that rest while not in use.
 
-Arrays that lie on disk let hours of recording take no more memory than minutes.
+Arrays that lie on disk let hours of recording take no more memory than minutes. Whoever works on
+long columns goes through them by `blocks`: after each block the pages of all arrays on disk are
+given back, so nobody else need think of memory.
 """
 
 from __future__ import annotations
@@ -11,6 +13,8 @@ import os
 import shutil
 import sys
 import tempfile
+import threading
+import weakref
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import IO, Any
@@ -20,6 +24,9 @@ from numpy.typing import NDArray
 
 _ZEROS = 1 << 20  # bytes written at once
 _FULL = (errno.ENOSPC, getattr(errno, "EDQUOT", errno.ENOSPC))
+# the maps of all arrays on disk that are in use, and what guards them
+_maps: weakref.WeakSet[mmap.mmap] = weakref.WeakSet()
+_lock = threading.Lock()
 Allocator = Callable[
     [tuple[int, ...], Any], NDArray[Any]
 ]  # shape and dtype -> an array to be filled, as np.empty
@@ -46,12 +53,13 @@ def peak_memory_mb() -> float | None:
     return float(peak) / (2**20 if sys.platform == "darwin" else 2**10)
 
 
-def trim_heap() -> None:
-    """Trim the heap: hand memory that is not used any more back to the system.
+def rest() -> None:
+    """Hand memory that is not in use back to the system: pages of arrays on disk, and free heap.
 
-    It would be kept for later otherwise: glibc keeps what lies between arrays still in use, and
-    Arrow what tables took; after hours of recording it is much.
+    The heap would be kept for later otherwise: glibc keeps what lies between arrays still in use,
+    and Arrow what tables took; after hours of recording it is much.
     """
+    _release_pages()
     if "pyarrow" in sys.modules:
         sys.modules["pyarrow"].default_memory_pool().release_unused()
     if sys.platform == "linux":
@@ -87,13 +95,46 @@ def on_disk(folder: Path) -> Allocator:
         try:
             with tempfile.TemporaryFile(dir=folder) as file:
                 _reserve(file, size)
-                return np.memmap(file, dtype, "r+", shape=shape).view(np.ndarray)
+                return _registered(np.memmap(file, dtype, "r+", shape=shape))
         except OSError as error:
             if error.errno in _FULL:
                 raise
             return np.empty(shape, dtype)
 
     return allocate
+
+
+def mapped(path: Path, dtype: np.dtype[Any]) -> NDArray[Any]:
+    """The numbers in a file, read when they are looked at; they rest like arrays of `on_disk`.
+
+    Args:
+        path: the file, which is not empty.
+        dtype: of its numbers.
+
+    Returns:
+        (n,) not to be written to: what is written would be lost.
+    """
+    return _registered(np.memmap(path, dtype, "c"))
+
+
+def _registered(array: NDArray[Any]) -> NDArray[Any]:
+    """A plain array of a map, whose pages are released from now on when others rest."""
+    base: Any = array
+    while not isinstance(base, mmap.mmap):
+        base = base.base
+    with _lock:
+        _maps.add(base)
+    return array.view(np.ndarray)
+
+
+def _release_pages() -> None:
+    """Release the pages of all arrays on disk; they are read again when wanted."""
+    if sys.platform != "linux":
+        return
+    with _lock:
+        maps = list(_maps)
+    for one in maps:
+        one.madvise(mmap.MADV_DONTNEED)
 
 
 def _reserve(file: IO[bytes], size: int) -> None:
@@ -107,27 +148,17 @@ def _reserve(file: IO[bytes], size: int) -> None:
 
 
 def blocks(n: int, size: int) -> Iterator[slice]:
-    """Consecutive blocks of the rows of something long, as slices.
+    """Consecutive blocks of the rows of something long, as slices; what lies on disk then rests.
+
+    After each block the pages of all arrays on disk are released (see `on_disk`, `mapped`), and
+    after several the heap is trimmed, too.
 
     Args:
         n: rows.
         size: rows of a block; the last has fewer.
     """
-    return (slice(start, min(start + size, n)) for start in range(0, n, size))
-
-
-def release_pages(*arrays: NDArray[Any]) -> None:
-    """Release the pages of arrays that are mapped from files; they are read again when wanted.
-
-    Only for what is shared with its file (`on_disk`) or never written to: changes of a private copy
-    would be lost.
-
-    Args:
-        *arrays: any arrays, or views of them; those that are not mapped stay as they are.
-    """
-    for array in arrays:
-        base: Any = array
-        while base is not None and not isinstance(base, mmap.mmap):
-            base = getattr(base, "base", None)
-        if base is not None and sys.platform == "linux":
-            base.madvise(mmap.MADV_DONTNEED)
+    for start in range(0, n, size):
+        yield slice(start, min(start + size, n))
+        _release_pages()
+    if n > size:
+        rest()

@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.errors import SessionError
+from liex_lab.runtime.memory import mapped
 from liex_lab.sessions.failure import write_whole
 from liex_lab.sessions.lock import take_lock
 
@@ -366,11 +367,11 @@ class Columns:
     def read(self) -> dict[str, NDArray[Any]]:
         """All rows of every column, mapped from the files; empty where none was written.
 
-        The arrays are private copies on write; the system may take their memory back.
+        The arrays are not to be written to, see `mapped`.
         """
         self.flush()
         return {
-            name: np.memmap(self._folder / f"{name}.bin", np.dtype(kind), "c").reshape(-1, *shape)
+            name: mapped(self._folder / f"{name}.bin", np.dtype(kind)).reshape(-1, *shape)
             for name, (kind, shape) in self._kinds.items()
             if (self._folder / f"{name}.bin").stat().st_size
         }

@@ -16,7 +16,7 @@ import numpy as np
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.errors import SessionError
 from liex_lab.recordings.timestamps import Gap
-from liex_lab.runtime.memory import blocks, release_pages
+from liex_lab.runtime.memory import blocks
 from liex_lab.sessions.provenance import Provenance
 from liex_lab.sessions.reading import reading_from
 from liex_lab.tables.rows import LOST
@@ -63,7 +63,6 @@ def write_evidence(folder: Path, seen: Observations, subject: Subject) -> None:
                 np.lib.format.write_array_header_1_0(file, head)
                 for rows in blocks(len(values), _BLOCK):
                     file.write(np.ascontiguousarray(values[rows]).tobytes())
-                    release_pages(values)
 
 
 def read_skeleton(session: Session) -> Skeleton | None:

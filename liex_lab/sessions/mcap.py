@@ -142,7 +142,6 @@ class McapWriter:
         track = rows.track
         for part in blocks(track.n_frames, _BLOCK):
             self._log_track(track[part])
-            track.release_pages()
         self._log_actions(rows, bouts, words)
         if len(track.times_ns):
             self._log_notes(int(track.times_ns[0]), problems)

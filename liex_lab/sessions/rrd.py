@@ -25,7 +25,7 @@ from liex_lab.errors import SessionError
 from liex_lab.geometry import so3
 from liex_lab.recordings.rvl import rvl_message
 from liex_lab.runtime.disk import probe_full
-from liex_lab.runtime.memory import blocks, release_pages
+from liex_lab.runtime.memory import blocks
 from liex_lab.sessions.joining import RRD_HEAD, rrd_messages
 from liex_lab.sessions.provenance import Provenance
 from liex_lab.sessions.rrd_body import log_body, send_body
@@ -226,10 +226,8 @@ class ReplayWriter:
                 columns = rr.Scalars.columns(scalars=values[part])
                 self._stream.send_columns(entity, _timeline(index[part], elapsed[part]), [*columns])
             self._flush()
-            release_pages(values)
         self._log_lanes(rows, bouts, words)
         self._log_worst(rows, index, elapsed)
-        rows.track.release_pages()
         for problem in problems:
             self._stream.log("log", rr.TextLog(problem, level=rr.TextLogLevel.WARN), static=True)
         self._stream.send_property(
@@ -417,7 +415,6 @@ class ReplayWriter:
                 OVERLAY, when, track.uv_px[part][seen] + 0.5, seen, rr.Points2D, rr.LineStrips2D
             )
             self._stream.flush()  # or hours of it wait in memory
-            track.release_pages()
 
     def _send_points(
         self,
@@ -477,7 +474,6 @@ class ReplayWriter:
                 translation=track.root_mm[where] / 1000.0, quaternion=xyzw
             )
             self._stream.send_columns(ROOT, _timeline(index[where], elapsed[where]), [*columns])
-            track.release_pages()
 
     def _log_candidates(
         self, seen: Observations, index: NDArray[np.int64], elapsed: NDArray[np.int64]
@@ -490,13 +486,12 @@ class ReplayWriter:
             self._stream.log(entity, look, static=True)
             for part in blocks(len(seen), _BLOCK):
                 known = seen.known[part, h]
-                joints = seen[part].joints(range(seen.skeleton.n_joints))[known, h] / MM_PER_UNIT
+                joints = seen[part].joints_as(h, range(seen.skeleton.n_joints))[known] / MM_PER_UNIT
                 strips = rr.LineStrips3D.columns(strips=joints[:, edges].reshape(-1, 2, 3))
                 when = _timeline(index[part], elapsed[part])
                 self._stream.send_columns(
                     entity, when, [*strips.partition(np.where(known, len(edges), 0))]
                 )
-                seen.release_pages()
 
     def _log_worst(self, rows: Rows, index: NDArray[np.int64], elapsed: NDArray[np.int64]) -> None:
         """The frames with the largest predicted error, as notes to jump to."""

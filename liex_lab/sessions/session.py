@@ -20,7 +20,7 @@ from liex_lab.arena.zones import Zone
 from liex_lab.errors import SessionError
 from liex_lab.geometry import SE3
 from liex_lab.optics.camera import Camera
-from liex_lab.runtime.memory import trim_heap
+from liex_lab.runtime.memory import rest
 from liex_lab.sessions.corrections import Log, applies, corrected_folder, read_log
 from liex_lab.sessions.older import put_back_session
 from liex_lab.sessions.provenance import SCHEMA_VERSION
@@ -309,7 +309,7 @@ def _narrow(path: Path, columns: list[str]) -> pd.DataFrame:
         read = file.read(columns, use_threads=False)
     table: pd.DataFrame = read.to_pandas(split_blocks=True, self_destruct=True, use_threads=False)
     del read
-    trim_heap()
+    rest()
     return table
 
 
@@ -327,7 +327,7 @@ def _rows_of(path: Path, columns: list[str] | None, frame_index: list[int]) -> p
             for k in range(file.num_row_groups)
         )
         found = [group[group["frame_index"].isin(frame_index)] for group in groups]
-    trim_heap()
+    rest()
     rows = pd.concat(found, ignore_index=True)
     return rows if columns is None else rows[columns]
 

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from liex_lab.errors import LiexError, SessionError
 from liex_lab.runtime.disk import is_full, probe_full, why_full
 from liex_lab.runtime.durable import put_in_place, sync_tree
-from liex_lab.runtime.memory import Allocator, on_disk, peak_memory_mb, trim_heap
+from liex_lab.runtime.memory import Allocator, on_disk, peak_memory_mb, rest
 from liex_lab.sessions.buffer import Columnar, TrackBuffer, columns_of
 from liex_lab.sessions.checkpoint import LOGS, Checkpoint
 from liex_lab.sessions.corrections import FOLDER
@@ -112,6 +112,7 @@ class SessionWriter:
         self._started = time.perf_counter()
         self._seconds = 0.0
         self._held = TrackBuffer(origin.skeleton, 0)
+        self._rows: Rows | None = None
         self._flips: Sequence[Flip] = ()
         self._candidates: Observations | None = None
         self._keepsakes = Keepsakes()
@@ -226,6 +227,7 @@ class SessionWriter:
             self._logging.append(messages.submit(self._mcap.add, times[part], depth))
             for image in depth:
                 self._keepsakes.add(image)
+        self._rows = None
         self._index.extend(index)
         self._times_ns.extend(times)
         if seen is not None:
@@ -293,6 +295,7 @@ class SessionWriter:
         """
         _check_times(np.array(self._times_ns, np.int64), track)
         self._held = TrackBuffer.of(track)
+        self._rows = None
 
     def take(self, tracked: Tracked, seen: Observations, subject: Subject) -> None:
         """Take the track of all frames so far, and write what it was made of to observations.npz.
@@ -304,25 +307,25 @@ class SessionWriter:
         """
         self.track = tracked.track
         self._flips = tracked.flips
-        trim_heap()  # hours of recording leave much behind
+        rest()  # hours of recording leave much behind
         self._candidates = seen if self.origin.replay_candidates else None
         write_evidence(self._folder, seen, subject)
-        seen.release_pages()
 
     @property
     def rows(self) -> Rows:
-        """The track as the tables see it."""
-        origin = self.origin
-        index = np.array(self._index, np.int64)
-        return Rows(
-            self.track,
-            index,
-            origin.name,
-            origin.individual,
-            origin.gaps,
-            origin.arena,
-            origin.zones,
-        )
+        """The track as the tables see it; the same rows until frames or a track are added."""
+        if self._rows is None:
+            origin = self.origin
+            self._rows = Rows(
+                self.track,
+                np.array(self._index, np.int64),
+                origin.name,
+                origin.individual,
+                origin.gaps,
+                origin.arena,
+                origin.zones,
+            )
+        return self._rows
 
     def note(self, **sections: Any) -> None:
         """Add facts found on the way to session.json.
@@ -390,12 +393,13 @@ class SessionWriter:
                 [*schema.BOUTS, *(c for c in columns if c.table == "bouts")]
             )
         bouts = results["bouts"]
-        kinematics = results.setdefault("kinematics", rows_only(rows))
+        if "kinematics" not in results:
+            results["kinematics"] = rows_only(rows)
+        kinematics = results["kinematics"]
         of_track = Results(self.origin, rows, self._flips)
         of_track.write_track(self._folder)
-        rows.track.release_pages()
         of_track.write_measured(self._folder, results, columns)
-        trim_heap()
+        rest()
         words = [
             *(actions or {}),
             *sorted({str(word) for word in bouts["action"]} - set(actions or {})),
@@ -417,8 +421,9 @@ class SessionWriter:
             self.note(corrections_taken_from=made.parent.name)
         text = json.dumps(self._document, indent=2, default=str, allow_nan=False)
         (self._folder / "session.json").write_text(text + "\n", encoding="utf-8")
-        rows.track.release_pages()
-        trim_heap()
+        del rows, of_track
+        self._rows = None  # the report reads the folder
+        rest()
         try:
             if self._report is not None:
                 self._report(self._folder)

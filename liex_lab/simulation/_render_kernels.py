@@ -8,6 +8,8 @@ pictures.
 
 from __future__ import annotations
 
+from typing import Any, NamedTuple
+
 import numpy as np
 from numba import njit, prange
 
@@ -24,10 +26,120 @@ from liex_lab.simulation._sensor_kernels import (
     smooth_field,
 )
 
-# columns of a wall: its outward normal in the floor (2), distance from the arena's origin, height,
-# depth of the rounding that multiple reflections leave at its foot and how far that reaches, all
-# mm; distance 0 is no wall
-WALL_COLUMNS = 6
+
+class Wall(NamedTuple):
+    """A straight wall, in the order in which its numbers are packed.
+
+    Attributes:
+        normal_x: x of its outward normal in the floor.
+        normal_y: y of its outward normal in the floor.
+        distance: from the arena's origin, mm; 0 is no wall.
+        height: mm.
+        rounding: depth of the rounding that multiple reflections leave at its foot, mm.
+        rounding_reach: how far that reaches, mm.
+    """
+
+    normal_x: Any
+    normal_y: Any
+    distance: Any
+    height: Any
+    rounding: Any
+    rounding_reach: Any
+
+
+WALL_COLUMNS = len(Wall._fields)
+
+
+class SensorNoise(NamedTuple):
+    """A sensor and its noise; of many pictures, parameters and seed have a leading axis (n,).
+
+    Attributes:
+        parameters: (N_PARAMETERS,) of the sensor.
+        seed: uint64 of the noise, not 0.
+        table: (2^13,) float32 normal quantiles.
+    """
+
+    parameters: Any
+    seed: Any
+    table: Any
+
+
+class PatchCamera(NamedTuple):
+    """The camera of a picture or of a patch of it; of many, all with a leading axis (n,).
+
+    Attributes:
+        intrinsics: (4,) fx, fy, cx, cy, px.
+        picture: (2,) int64 width and height of the whole picture, px; outside it nothing is read.
+        origin: (2,) int64 pixel (u, v) of the whole picture that comes to lie at (0, 0).
+    """
+
+    intrinsics: Any
+    picture: Any
+    origin: Any
+
+
+class Meshes(NamedTuple):
+    """An animal and perhaps an object; of many pictures, all but faces with a leading axis (n,).
+
+    Attributes:
+        animal: (V, 3) mesh of the animal, mm, arena frame.
+        faces: (F, 3) int32 its triangles.
+        thing: (W, 3) mesh of the object beside it, mm, arena frame.
+        thing_faces: (G, 3) int32 its triangles.
+        has_thing: whether the object is there.
+    """
+
+    animal: Any
+    faces: Any
+    thing: Any
+    thing_faces: Any
+    has_thing: Any
+
+
+class ArenaView(NamedTuple):
+    """A camera above a floor with at most one wall; of many patches, all with a leading axis (n,).
+
+    Attributes:
+        R_arena_camera: (3, 3) rotation of the camera.
+        height: of the camera above the floor, mm.
+        wall: (WALL_COLUMNS,) the wall.
+        rough: unevenness of the floor, mm.
+    """
+
+    R_arena_camera: Any
+    height: Any
+    wall: Any
+    rough: Any
+
+
+@njit(cache=True)
+def noise_of(noises, i):
+    """The `SensorNoise` of picture i."""
+    return SensorNoise(noises.parameters[i], noises.seed[i], noises.table)
+
+
+@njit(cache=True)
+def camera_of(cameras, i):
+    """The `PatchCamera` of picture i."""
+    return PatchCamera(cameras.intrinsics[i], cameras.picture[i], cameras.origin[i])
+
+
+@njit(cache=True)
+def _meshes_of(meshes, i):
+    """The `Meshes` of picture i."""
+    return Meshes(
+        meshes.animal[i],
+        meshes.faces,
+        meshes.thing[i],
+        meshes.thing_faces,
+        meshes.has_thing[i],
+    )
+
+
+@njit(cache=True)
+def _unpack_wall(packed):
+    """The record of one packed wall (WALL_COLUMNS,)."""
+    return Wall(packed[0], packed[1], packed[2], packed[3], packed[4], packed[5])
 
 
 @njit(cache=True)
@@ -41,7 +153,7 @@ def floor_and_wall(u0, v0, picture, intrinsics, rotation, height, wall, uneven, 
         intrinsics: (4,) fx, fy, cx, cy, px.
         rotation: (3, 3) of T_arena_camera.
         height: of the camera above the floor, mm.
-        wall: (WALL_COLUMNS,) the wall.
+        wall: the wall.
         uneven: (H, W) heights of the floor, over `rough`.
         rough: mm that a unit of `uneven` raises the floor.
         depth: (H, W) float32 mm, filled, 0 = nothing.
@@ -65,16 +177,16 @@ def floor_and_wall(u0, v0, picture, intrinsics, rotation, height, wall, uneven, 
                 continue
             t = -height / dz
             raised = rough * uneven[r, c]
-            if wall[2] > 0.0:
-                across = wall[0] * dx + wall[1] * dy
-                beyond = across * t - wall[2]
+            if wall.distance > 0.0:
+                across = wall.normal_x * dx + wall.normal_y * dy
+                beyond = across * t - wall.distance
                 if beyond > 0.0:
-                    t = wall[2] / across
-                    if height + t * dz < wall[3]:
+                    t = wall.distance / across
+                    if height + t * dz < wall.height:
                         depth[r, c] = t
                         what[r, c] = STILL
                     continue
-                raised += wall[4] * np.exp(beyond / wall[5])
+                raised += wall.rounding * np.exp(beyond / wall.rounding_reach)
             depth[r, c] = t + raised / dz
             what[r, c] = STILL
 
@@ -153,28 +265,44 @@ def draw_onto(vertices, faces, rotation, translation, intrinsics, u0, v0, label,
 
 
 @njit(cache=True)
-def _window(
-    animal,
-    faces,
-    thing,
-    thing_faces,
-    has_thing,
-    R_arena_camera,
-    height,
-    intrinsics,
-    picture,
-    origin,
-    wall,
-    rough,
-    sensor,
-    seed,
-    table,
-    depth_out,
-    background_out,
-):
+def _draw_meshes(meshes, rotation, translation, intrinsics, u0, v0, depth, what):
+    """Rasterise the animal and, where it is there, the object over a picture or patch."""
+    draw_onto(
+        meshes.animal,
+        meshes.faces,
+        rotation,
+        translation,
+        intrinsics,
+        u0,
+        v0,
+        ANIMAL,
+        depth,
+        what,
+    )
+    if meshes.has_thing:
+        draw_onto(
+            meshes.thing,
+            meshes.thing_faces,
+            rotation,
+            translation,
+            intrinsics,
+            u0,
+            v0,
+            OBJECT,
+            depth,
+            what,
+        )
+
+
+@njit(cache=True)
+def _window(meshes, camera, view, noise, depth_out, background_out):
     """One training patch: still scene, its learned background, animal, perhaps an object, noise."""
     shape = depth_out.shape
-    state = np.array([seed], np.uint64)
+    intrinsics = camera.intrinsics
+    origin = camera.origin
+    sensor = noise.parameters
+    table = noise.table
+    state = np.array([noise.seed], np.uint64)
     field = np.empty(shape, np.float32)
     depth = np.empty(shape, np.float32)
     what = np.empty(shape, np.uint8)
@@ -182,13 +310,13 @@ def _window(
     floor_and_wall(
         origin[0],
         origin[1],
-        picture,
+        camera.picture,
         intrinsics,
-        R_arena_camera,
-        height,
-        wall,
+        view.R_arena_camera,
+        view.height,
+        _unpack_wall(view.wall),
         field,
-        rough,
+        view.rough,
         depth,
         what,
     )
@@ -201,20 +329,16 @@ def _window(
             background_out[r, c] = (
                 int((depth[r, c] + error) / sensor[UNIT] + 0.5) if depth[r, c] > 0.0 else 0
             )
-    rotation = np.ascontiguousarray(R_arena_camera.T)
-    translation = -height * rotation[:, 2]
+    rotation = np.ascontiguousarray(view.R_arena_camera.T)
+    translation = -view.height * rotation[:, 2]
     u0 = float(origin[0])
     v0 = float(origin[1])
-    draw_onto(animal, faces, rotation, translation, intrinsics, u0, v0, ANIMAL, depth, what)
-    if has_thing:
-        draw_onto(
-            thing, thing_faces, rotation, translation, intrinsics, u0, v0, OBJECT, depth, what
-        )
+    _draw_meshes(meshes, rotation, translation, intrinsics, u0, v0, depth, what)
     for r in range(shape[0]):
         for c in range(shape[1]):
             u = origin[0] + c
             v = origin[1] + r
-            if u < 0 or v < 0 or u >= picture[0] or v >= picture[1]:
+            if u < 0 or v < 0 or u >= camera.picture[0] or v >= camera.picture[1]:
                 depth[r, c] = 0.0
     sense(
         depth,
@@ -231,161 +355,81 @@ def _window(
 
 
 @njit(cache=True, parallel=True)
-def draw_windows(
-    animal,
-    faces,
-    thing,
-    thing_faces,
-    has_thing,
-    R_arena_camera,
-    height,
-    intrinsics,
-    picture,
-    origin,
-    wall,
-    rough,
-    sensor,
-    seed,
-    table,
-    depth_out,
-    background_out,
-):
+def draw_windows(meshes, cameras, views, noises, depth_out, background_out):
     """Render n training patches and their learned backgrounds, one thread a patch.
 
     Args:
-        animal: (n, V, 3) meshes of the animals, mm, arena frame.
-        faces: (F, 3) int32 their triangles.
-        thing: (n, W, 3) meshes of the objects beside them, mm, arena frame.
-        thing_faces: (G, 3) int32 their triangles.
-        has_thing: (n,) bool, which objects are there.
-        R_arena_camera: (n, 3, 3) rotations of the cameras.
-        height: (n,) of the cameras above the floor, mm.
-        intrinsics: (n, 4) fx, fy, cx, cy, px.
-        picture: (n, 2) int64 width and height of the whole pictures, px.
-        origin: (n, 2) int64 picture pixel (u, v) of each patch's first.
-        wall: (n, WALL_COLUMNS) walls.
-        rough: (n,) unevenness of the floors, mm.
-        sensor: (n, N_PARAMETERS) of the sensors.
-        seed: (n,) uint64 of the noise, not 0.
-        table: (2^13,) float32 normal quantiles.
+        meshes: `Meshes` of the patches.
+        cameras: `PatchCamera` of the patches.
+        views: `ArenaView` of the patches.
+        noises: `SensorNoise` of the patches.
         depth_out: (n, S, S) uint16 in steps of the sensor's unit, filled, 0 = unread.
         background_out: (n, S, S) uint16 likewise, the still scene as learned from many frames.
     """
-    for i in prange(len(animal)):
+    for i in prange(len(depth_out)):
+        view = ArenaView(views.R_arena_camera[i], views.height[i], views.wall[i], views.rough[i])
         _window(
-            animal[i],
-            faces,
-            thing[i],
-            thing_faces,
-            has_thing[i],
-            R_arena_camera[i],
-            height[i],
-            intrinsics[i],
-            picture[i],
-            origin[i],
-            wall[i],
-            rough[i],
-            sensor[i],
-            seed[i],
-            table,
+            _meshes_of(meshes, i),
+            camera_of(cameras, i),
+            view,
+            noise_of(noises, i),
             depth_out[i],
             background_out[i],
         )
 
 
 @njit(cache=True)
-def frame(
-    still,
-    animal,
-    faces,
-    thing,
-    thing_faces,
-    has_thing,
-    rotation,
-    translation,
-    intrinsics,
-    sensor,
-    seed,
-    table,
-    out,
-):
+def frame(still, meshes, rotation, translation, intrinsics, noise, out):
     """Render one full frame: the still scene, the animal, perhaps an object, and the sensor.
 
     Args:
         still: (H, W) float32 mm, the ideal still scene, 0 = nothing.
-        animal: (V, 3) mesh, mm, arena frame.
-        faces: (F, 3) int32 its triangles.
-        thing: (W, 3) mesh of the object, mm, arena frame.
-        thing_faces: (G, 3) int32 its triangles.
-        has_thing: whether the object is there.
+        meshes: `Meshes` of the frame.
         rotation: (3, 3) of T_camera_arena.
         translation: (3,) of T_camera_arena, mm.
         intrinsics: (4,) fx, fy, cx, cy, px.
-        sensor: (N_PARAMETERS,) of the sensor.
-        seed: uint64 of the noise, not 0.
-        table: (2^13,) float32 normal quantiles.
+        noise: `SensorNoise` of the frame.
         out: (H, W) uint16 in steps of the sensor's unit, filled, 0 = unread.
     """
-    state = np.array([seed], np.uint64)
+    state = np.array([noise.seed], np.uint64)
     depth = still.copy()
     what = np.where(still > 0, np.uint8(STILL), np.uint8(NOTHING))
-    draw_onto(animal, faces, rotation, translation, intrinsics, 0.0, 0.0, ANIMAL, depth, what)
-    if has_thing:
-        draw_onto(
-            thing, thing_faces, rotation, translation, intrinsics, 0.0, 0.0, OBJECT, depth, what
-        )
+    _draw_meshes(meshes, rotation, translation, intrinsics, 0.0, 0.0, depth, what)
     field = np.empty(depth.shape, np.float32)
     sense(
-        depth, what, sensor, intrinsics[0], intrinsics[2], intrinsics[3], state, table, field, out
+        depth,
+        what,
+        noise.parameters,
+        intrinsics[0],
+        intrinsics[2],
+        intrinsics[3],
+        state,
+        noise.table,
+        field,
+        out,
     )
 
 
 @njit(cache=True, parallel=True)
-def frames_parallel(
-    still,
-    animal,
-    faces,
-    thing,
-    thing_faces,
-    has_thing,
-    rotation,
-    translation,
-    intrinsics,
-    sensor,
-    seed,
-    table,
-    out,
-):
+def frames_parallel(still, meshes, rotation, translation, intrinsics, noises, out):
     """Render n full frames of one scene, one thread a frame; see `frame`.
 
     Args:
         still: (H, W) float32 mm, shared.
-        animal: (n, V, 3) meshes, mm, arena frame.
-        faces: (F, 3) int32, shared.
-        thing: (n, W, 3) meshes of the objects, mm, arena frame.
-        thing_faces: (G, 3) int32, shared.
-        has_thing: (n,) bool.
+        meshes: `Meshes` of the frames.
         rotation: (3, 3) of T_camera_arena, shared.
         translation: (3,) of T_camera_arena, mm, shared.
         intrinsics: (4,) fx, fy, cx, cy, px, shared.
-        sensor: (n, N_PARAMETERS).
-        seed: (n,) uint64, not 0.
-        table: (2^13,) float32 normal quantiles.
+        noises: `SensorNoise` of the frames.
         out: (n, H, W) uint16 in steps of the sensor's unit, filled, 0 = unread.
     """
-    for i in prange(len(animal)):
+    for i in prange(len(out)):
         frame(
             still,
-            animal[i],
-            faces,
-            thing[i],
-            thing_faces,
-            has_thing[i],
+            _meshes_of(meshes, i),
             rotation,
             translation,
             intrinsics,
-            sensor[i],
-            seed[i],
-            table,
+            noise_of(noises, i),
             out[i],
         )

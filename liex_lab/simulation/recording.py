@@ -188,17 +188,17 @@ class SyntheticSession(TrueRecording):
         T_camera_arena = self.T_arena_camera.inverse()
         render_kernels.frames_parallel(
             self.scene.still,
-            vertices,
-            self.surface.faces,
-            contents.things[part],
-            contents.thing_faces,
-            contents.shown[part],
+            render_kernels.Meshes(
+                vertices,
+                self.surface.faces,
+                contents.things[part],
+                contents.thing_faces,
+                contents.shown[part],
+            ),
             np.ascontiguousarray(T_camera_arena.rotation),
             T_camera_arena.translation,
             np.array([camera.fx, camera.fy, camera.cx, camera.cy]),
-            contents.parameters[part],
-            contents.seeds[part],
-            NORMAL,
+            render_kernels.SensorNoise(contents.parameters[part], contents.seeds[part], NORMAL),
             out,
         )
         unit = float(contents.parameters[0, UNIT])

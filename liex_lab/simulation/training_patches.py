@@ -358,21 +358,15 @@ def _draw_block(
     background = np.empty_like(depth)
     with threads(parallel):
         render_kernels.draw_windows(
-            vertices,
-            surface.faces,
-            thing,
-            PART_FACES,
-            has_thing,
-            views.T_arena_camera.rotation,
-            views.T_arena_camera.translation[:, 2].copy(),
-            views.intrinsics,
-            views.picture,
-            origin,
-            walls,
-            views.rough,
-            views.parameters,
-            seeds,
-            NORMAL,
+            render_kernels.Meshes(vertices, surface.faces, thing, PART_FACES, has_thing),
+            render_kernels.PatchCamera(views.intrinsics, views.picture, origin),
+            render_kernels.ArenaView(
+                views.T_arena_camera.rotation,
+                views.T_arena_camera.translation[:, 2].copy(),
+                walls,
+                views.rough,
+            ),
+            render_kernels.SensorNoise(views.parameters, seeds, NORMAL),
             depth,
             background,
         )

@@ -8,8 +8,9 @@ described in `schema`.
 
 from __future__ import annotations
 
-from collections.abc import Container, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -19,7 +20,7 @@ from liex_lab.actions.ethogram import Ethogram, runs_of
 from liex_lab.arena.outline import UNKNOWN, Arena
 from liex_lab.arena.zones import Zone, zone_names
 from liex_lab.geometry import so3
-from liex_lab.runtime.memory import blocks, trim_heap
+from liex_lab.runtime.memory import blocks
 from liex_lab.tables.schema import FRAMES, ROOT_COVARIANCES, ROWS_PER_GROUP, Block, Words, to_pandas
 from liex_lab.tracking.track import Flip, Track
 
@@ -36,7 +37,6 @@ _Found = tuple[
     float, float, int, int, int, str
 ]  # start_s, stop_s, start_frame, stop_frame, frames missing, reason
 LOST = ("no_depth", "tracker_lost")  # reasons of gaps that are not the camera's
-_ALL = frozenset(column.name for column in FRAMES)
 _NEAR = 0.1  # of the spine: how near a joint must be to count in its score
 
 
@@ -69,24 +69,12 @@ class Rows:
 
     def frames(self) -> Iterator[Block]:
         """The table `frames`, in blocks of 100 000 rows."""
-        missing = self.missing_before()
-        return (self._frame_rows(part, missing[part]) for part in self._parts(1))
+        return (_some_rows(self._frame_columns, part) for part in self._parts(1))
 
-    def frames_table(self, names: Container[str] = _ALL) -> pd.DataFrame:
-        """The table `frames` in memory, or some of its columns.
-
-        Args:
-            names: the columns that are wanted.
-
-        Returns:
-            A data frame of n rows, columns in the schema's order.
-        """
-        import pandas as pd
-
-        schema = [column for column in FRAMES if column.name in names]
-        table = pd.concat([to_pandas(schema, block) for block in self.frames()], ignore_index=True)
-        trim_heap()
-        return table
+    @cached_property
+    def frames_table(self) -> pd.DataFrame:
+        """The table `frames`, a data frame of n rows; columns of the track are not copied."""
+        return to_pandas(FRAMES, self._frame_columns, copy=False)
 
     def poses(self) -> Iterator[Block]:
         """The table `poses`, one row per frame and joint, in blocks of about 100 000 rows."""
@@ -99,26 +87,42 @@ class Rows:
         """
         return (self._rotation_rows(part) for part in self._parts(self.track.skeleton.n_joints + 1))
 
-    def _frame_rows(self, part: slice, missing: NDArray[np.int64]) -> Block:
-        track = self.track[part]
+    @cached_property
+    def _frame_columns(self) -> Block:
+        """The columns (n,) of the table `frames`, made once for all who read or write it."""
+        track = self.track
+        wall, zone = self._in_arena()
         return {
             **self._who,
-            **self._when(part, 1),
+            **self._when(slice(0, track.n_frames), 1),
             "time_ns": track.times_ns,
-            "gap_before": missing,
+            "gap_before": self.missing_before(),
             "predicted_error_mm": track.predicted_error_mm,
             "residual_mm": track.residual_mm,
             "n_foreground_px": track.n_foreground_px,
             **{f"centroid_{a}_mm": track.centroid_mm[:, k] for k, a in enumerate("xyz")},
             **{f"centroid_{a}_px": track.centroid_px[:, k] for k, a in enumerate("uv")},
-            "wall_distance_mm": self.arena.wall_distance_mm(track.centroid_mm[:, :2]),
-            "zone": zone_names(self.zones, track.centroid_mm[:, :2]),
+            "wall_distance_mm": wall,
+            "zone": zone,
             "spine_mm": track.spine_mm,
             "scale": track.scale,
             "p_flip": track.p_flip,
             "bridged": track.bridged,
             "flag": track.flag,
         }
+
+    def _in_arena(self) -> tuple[Array, Words]:
+        """Distance (n,) mm of each frame's centroid from the nearest wall, and its zones."""
+        wall = np.empty(self.track.n_frames)
+        codes = np.empty(self.track.n_frames, np.int64)
+        known: dict[str, int] = {}
+        for part in self._parts(1):
+            xy = self.track.centroid_mm[part, :2]
+            wall[part] = self.arena.wall_distance_mm(xy)
+            codes[part] = [
+                known.setdefault(name, len(known)) for name in zone_names(self.zones, xy)
+            ]
+        return wall, Words(codes, tuple(known))
 
     def _pose_rows(self, part: slice) -> Block:
         track = self.track[part]
@@ -256,9 +260,16 @@ class Rows:
         return {name: np.repeat(column, repeat) for name, column in columns.items()}
 
     def _parts(self, rows_per_frame: int) -> Iterator[slice]:
-        for part in blocks(max(self.track.n_frames, 1), max(1, ROWS_PER_GROUP // rows_per_frame)):
-            yield part
-            self.track.release_pages()
+        """Blocks of frames that give about 100 000 rows."""
+        return blocks(max(self.track.n_frames, 1), max(1, ROWS_PER_GROUP // rows_per_frame))
+
+
+def _some_rows(columns: Block, part: slice) -> Block:
+    """Some rows of a block; what stands for all rows stands for these."""
+    return {
+        name: column if isinstance(column, str) else column[part]
+        for name, column in columns.items()
+    }
 
 
 def _xyz(name: str, values: Array) -> dict[str, Array]:
@@ -380,7 +391,7 @@ def rows_only(rows: Rows) -> pd.DataFrame:
     Returns:
         The first five columns of the table `frames`.
     """
-    return rows.frames_table([column.name for column in FRAMES[:5]])
+    return rows.frames_table.iloc[:, :5]
 
 
 def bout_rows(ethogram: Ethogram, frames: pd.DataFrame, model_hash: str) -> pd.DataFrame:

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.errors import SessionError
-from liex_lab.runtime.memory import blocks, release_pages, trim_heap
+from liex_lab.runtime.memory import blocks
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -541,7 +541,6 @@ def write_table(
             n_rows += batch.num_rows
             writer.write_table(batch, row_group_size=ROWS_PER_GROUP)
             del block, batch  # before the next one is made
-    trim_heap()
     return n_rows
 
 
@@ -613,6 +612,10 @@ class Words:
 
     def __len__(self) -> int:
         return len(self.codes)
+
+    def __getitem__(self, rows: slice) -> Words:
+        """Some consecutive rows."""
+        return Words(self.codes[rows], self.words)
 
 
 def harmless(value: Any) -> Any:
@@ -694,16 +697,6 @@ def from_pandas(table: pd.DataFrame) -> Iterator[Block]:
     """
     for part in blocks(max(len(table), 1), ROWS_PER_GROUP):
         yield {str(name): table[name].iloc[part].to_numpy() for name in table.columns}
-        release_table(table)
-
-
-def release_table(table: pd.DataFrame) -> None:
-    """Release the memory pages of a table's columns that lie on disk, until they are read again.
-
-    Args:
-        table: a data frame; columns of text are left alone.
-    """
-    release_pages(*(table[name].to_numpy() for name in table.columns if table[name].dtype != "str"))
 
 
 def _pandas_dtype(column: Column) -> str:

@@ -5,12 +5,14 @@ A chain visits at most one hypothesis of each frame and costs, in nats, sum of e
 transition(a, g; t, h) + missed-detection cost of the frames between, where frames may be passed by
 and the beam holds the best last links (Viterbi 1967). Transition cost between joints: d^2 / 2 s_1^2
 + b^2 / 2 s_2^2, with d the shift of the joints' mean, b the mean change of posture, s_k^2 =
-(levels[0])^2 (e_a^2 + e_b^2) + (levels[k] L dt)^2; robust by T log(1 + c / T), T = levels[3].
-`forward_backward` is the forward-backward algorithm over two states, head and tail as on the path
-or exchanged, and gives the flip posterior.
+error_factor^2 (e_a^2 + e_b^2) + (v_k L dt)^2, v_1 = shift, v_2 = bend; robust by T log(1 + c / T)
+with T = tail. `forward_backward` is the forward-backward algorithm over two states, head and tail
+as on the path or exchanged, and gives the flip posterior.
 """
 
 from __future__ import annotations
+
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
@@ -18,13 +20,63 @@ from numba import njit
 NONE = -1
 
 
+class TransitionCosts(NamedTuple):
+    """What a transition costs.
+
+    Attributes:
+        error_factor: poses are measured to this many of the predicted errors.
+        shift: standard deviation of the middle, lengths a second.
+        bend: standard deviation of the posture about it, lengths a second.
+        tail: costs above this grow as logarithms, nats.
+        ceiling: the most that a transition costs, nats.
+        length: spine length of the animal, mm.
+    """
+
+    error_factor: float
+    shift: float
+    bend: float
+    tail: float
+    ceiling: float
+    length: float
+
+
+class Hypotheses(NamedTuple):
+    """H pose hypotheses in each of n frames.
+
+    Attributes:
+        times: (n,) s.
+        joints: (n, H, J, 3) mm.
+        error: (n, H) predicted mean joint error, mm.
+        emission: (n, H) cost of each hypothesis by itself, nats; not finite where there is none.
+        missed_cost: (n + 1,) missed-detection cost of all frames before each, cumulative, nats.
+    """
+
+    times: Any
+    joints: Any
+    error: Any
+    emission: Any
+    missed_cost: Any
+
+
+class Chains(NamedTuple):
+    """The best chains so far; all is filled in place.
+
+    Attributes:
+        beam: (B, 2) the beam, frame and hypothesis of the best chains' last links.
+        cost: (n, H) cost of the best chain that ends there, nats; infinite without one.
+        parent: (n, H, 2) frame and hypothesis before, `NONE` where the chain begins.
+    """
+
+    beam: Any
+    cost: Any
+    parent: Any
+
+
 @njit(cache=True)
-def transition_cost(joints_a, joints_b, error_a, error_b, dt, length, levels, ceiling):
+def transition_cost(joints_a, joints_b, error_a, error_b, dt, costs):
     """Transition cost, nats: how unlikely an animal gets from joints (J, 3) mm to others in dt s.
 
-    The middle and the posture about it move by standard deviations of levels[1] and levels[2]
-    lengths a second, and are measured to levels[0] of the predicted errors. Animals seldom dart,
-    but they do: costs above levels[3] nats grow as logarithms.
+    Animals seldom dart, but they do: costs above the tail grow as logarithms.
 
     Args:
         joints_a: (J, 3) mm, before.
@@ -32,12 +84,10 @@ def transition_cost(joints_a, joints_b, error_a, error_b, dt, length, levels, ce
         error_a: predicted mean joint error before, mm.
         error_b: the same after, mm.
         dt: time between, s.
-        length: spine length of the animal, mm.
-        levels: (4,) error factor, shift and bend in lengths a second, tail in nats.
-        ceiling: the most that a transition costs, nats.
+        costs: `TransitionCosts`.
 
     Returns:
-        Nats, from 0 to `ceiling`.
+        Nats, from 0 to the ceiling.
     """
     n = joints_a.shape[0]
     shift = 0.0
@@ -53,87 +103,67 @@ def transition_cost(joints_a, joints_b, error_a, error_b, dt, length, levels, ce
         for k in range(3):
             off += (joints_b[j, k] - joints_a[j, k] - middle[k]) ** 2
         bend += np.sqrt(off) / n
-    seen = levels[0] ** 2 * (error_a * error_a + error_b * error_b)
-    cost = 0.5 * shift / (seen + (levels[1] * length * dt) ** 2)
-    cost += 0.5 * bend * bend / (seen + (levels[2] * length * dt) ** 2)
-    return min(levels[3] * np.log1p(cost / levels[3]), ceiling)
+    seen = costs.error_factor**2 * (error_a * error_a + error_b * error_b)
+    cost = 0.5 * shift / (seen + (costs.shift * costs.length * dt) ** 2)
+    cost += 0.5 * bend * bend / (seen + (costs.bend * costs.length * dt) ** 2)
+    return min(costs.tail * np.log1p(cost / costs.tail), costs.ceiling)
 
 
 @njit(cache=True)
-def extend(
-    t,
-    beam,
-    n_beam,
-    times,
-    joints,
-    error,
-    emission,
-    missed_cost,
-    levels,
-    length,
-    ceiling,
-    cost,
-    parent,
-):
+def extend(t, chains, n_beam, seen, costs):
     """One Viterbi step: add frame t and its hypotheses to the beam; returns the beam's size.
 
     A chain may begin at any frame and passes a frame by at its missed-detection price.
 
     Args:
         t: index of the frame.
-        beam: (B, 2) the beam, frame and hypothesis of the best chains' last links; updated in
-            place.
-        n_beam: how many rows of it are in use.
-        times: (n,) s.
-        joints: (n, H, J, 3) mm.
-        error: (n, H) predicted mean joint error, mm.
-        emission: (n, H) cost of each hypothesis by itself, nats; not finite where there is none.
-        missed_cost: (n + 1,) missed-detection cost of all frames before each, cumulative, nats.
-        levels: see `transition_cost`.
-        length: spine length of the animal, mm.
-        ceiling: see `transition_cost`.
-        cost: (n, H) output at t, cost of the best chain that ends there, nats; infinite without
-            one.
-        parent: (n, H, 2) output at t, frame and hypothesis before, `NONE` where the chain begins.
+        chains: `Chains`, updated in place.
+        n_beam: how many rows of the beam are in use.
+        seen: `Hypotheses`.
+        costs: `TransitionCosts`.
 
     Returns:
-        How many rows of `beam` are in use afterwards.
+        How many rows of the beam are in use afterwards.
     """
-    for h in range(joints.shape[1]):
+    cost = chains.cost
+    parent = chains.parent
+    missed_cost = seen.missed_cost
+    for h in range(seen.joints.shape[1]):
         cost[t, h] = np.inf
         parent[t, h, 0] = NONE
         parent[t, h, 1] = NONE
-        if not np.isfinite(emission[t, h]):
+        if not np.isfinite(seen.emission[t, h]):
             continue
         best = missed_cost[t]  # the chain begins here
         for k in range(n_beam):
-            a = beam[k, 0]
-            g = beam[k, 1]
+            a = chains.beam[k, 0]
+            g = chains.beam[k, 1]
             so_far = cost[a, g] + missed_cost[t] - missed_cost[a + 1]
             if so_far >= best and parent[t, h, 0] != NONE:
                 continue
             transition = transition_cost(
-                joints[a, g],
-                joints[t, h],
-                error[a, g],
-                error[t, h],
-                times[t] - times[a],
-                length,
-                levels,
-                ceiling,
+                seen.joints[a, g],
+                seen.joints[t, h],
+                seen.error[a, g],
+                seen.error[t, h],
+                seen.times[t] - seen.times[a],
+                costs,
             )
             if so_far + transition < best:
                 best = so_far + transition
                 parent[t, h, 0] = a
                 parent[t, h, 1] = g
-        cost[t, h] = best + emission[t, h]
-    return _keep_best(t, beam, n_beam, missed_cost, cost, joints.shape[1])
+        cost[t, h] = best + seen.emission[t, h]
+    return _keep_best(t, chains, n_beam, missed_cost)
 
 
 @njit(cache=True)
-def _keep_best(t, beam, n_beam, missed_cost, cost, n_hypotheses):
-    """Prune: the best chains after frame t into `beam`, best first; returns how many."""
+def _keep_best(t, chains, n_beam, missed_cost):
+    """Prune: the best chains after frame t into the beam, best first; returns how many."""
+    beam = chains.beam
+    cost = chains.cost
     size = beam.shape[0]
+    n_hypotheses = cost.shape[1]
     all_of = np.empty((n_beam + n_hypotheses, 2), np.int64)
     costs = np.empty(n_beam + n_hypotheses)
     n = 0
@@ -157,59 +187,22 @@ def _keep_best(t, beam, n_beam, missed_cost, cost, n_hypotheses):
 
 
 @njit(cache=True)
-def extend_all(
-    start,
-    stop,
-    beam,
-    n_beam,
-    times,
-    joints,
-    error,
-    emission,
-    missed_cost,
-    levels,
-    length,
-    ceiling,
-    cost,
-    parent,
-):
+def extend_all(start, stop, chains, n_beam, seen, costs):
     """Viterbi over frames start to stop: `extend` for each; returns the beam's size.
 
     Args:
         start: first frame.
         stop: frame after the last.
-        beam: (B, 2) the beam, updated in place.
-        n_beam: how many rows of it are in use.
-        times: (n,) s.
-        joints: (n, H, J, 3) mm.
-        error: (n, H) predicted mean joint error, mm.
-        emission: (n, H) nats.
-        missed_cost: (n + 1,) cumulative missed-detection cost, nats.
-        levels: see `transition_cost`.
-        length: spine length of the animal, mm.
-        ceiling: see `transition_cost`.
-        cost: (n, H) output.
-        parent: (n, H, 2) output.
+        chains: `Chains`, updated in place.
+        n_beam: how many rows of the beam are in use.
+        seen: `Hypotheses`.
+        costs: `TransitionCosts`.
 
     Returns:
-        How many rows of `beam` are in use afterwards.
+        How many rows of the beam are in use afterwards.
     """
     for t in range(start, stop):
-        n_beam = extend(
-            t,
-            beam,
-            n_beam,
-            times,
-            joints,
-            error,
-            emission,
-            missed_cost,
-            levels,
-            length,
-            ceiling,
-            cost,
-            parent,
-        )
+        n_beam = extend(t, chains, n_beam, seen, costs)
     return n_beam
 
 
@@ -231,7 +224,7 @@ def trace_back(frame, hypothesis, parent, first, path):
 
 
 @njit(cache=True)
-def forward_backward(times, one, two, error, evidence, levels, length, ceiling, doubt):
+def forward_backward(times, one, two, error, evidence, costs, doubt):
     """Forward-backward over two states: fill the flip posterior of each frame.
 
     Transitions within and between the two states cost what `transition_cost` says of their joints;
@@ -244,9 +237,7 @@ def forward_backward(times, one, two, error, evidence, levels, length, ceiling, 
         error: (n,) predicted mean joint error, mm.
         evidence: (n,) log likelihood ratio of the frame by itself, nats, positive for the first
             way.
-        levels: see `transition_cost`.
-        length: spine length of the animal, mm.
-        ceiling: see `transition_cost`.
+        costs: `TransitionCosts`.
         doubt: (n,) output, posterior probability of the second way.
     """
     n = times.size
@@ -254,18 +245,12 @@ def forward_backward(times, one, two, error, evidence, levels, length, ceiling, 
     transition = np.empty((n, 2))
     for t in range(1, n):
         dt = times[t] - times[t - 1]
-        stay[t, 0] = transition_cost(
-            one[t - 1], one[t], error[t - 1], error[t], dt, length, levels, ceiling
-        )
-        stay[t, 1] = transition_cost(
-            two[t - 1], two[t], error[t - 1], error[t], dt, length, levels, ceiling
-        )
-        transition[t, 0] = transition_cost(
-            one[t - 1], two[t], error[t - 1], error[t], dt, length, levels, ceiling
-        )
-        transition[t, 1] = transition_cost(
-            two[t - 1], one[t], error[t - 1], error[t], dt, length, levels, ceiling
-        )
+        before = error[t - 1]
+        after = error[t]
+        stay[t, 0] = transition_cost(one[t - 1], one[t], before, after, dt, costs)
+        stay[t, 1] = transition_cost(two[t - 1], two[t], before, after, dt, costs)
+        transition[t, 0] = transition_cost(one[t - 1], two[t], before, after, dt, costs)
+        transition[t, 1] = transition_cost(two[t - 1], one[t], before, after, dt, costs)
     # logarithms of what the past says of each way
     first = np.zeros(n)
     second = np.zeros(n)

@@ -17,11 +17,61 @@ velocity. In the code `tau` is τ, `process_variance` and `q` the process varian
 
 from __future__ import annotations
 
+from typing import Any, NamedTuple
+
 import numpy as np
 from numba import njit
 
 from liex_lab.geometry._cholesky_kernels import cholesky, substitute
 from liex_lab.geometry._so3_kernels import exp_so3, log_so3
+
+
+class Gains(NamedTuple):
+    """How the coordinates of a group are moved over n frames; one axis, or (3, ...) of three.
+
+    Attributes:
+        decay: (n,) decay a of the step that leads to each frame.
+        gain_dt: (n,) g of each step, s.
+        kalman_gain: (n, 2) Kalman gain of value and velocity.
+        rts_gain: (n, 2, 2) RTS gain; not filled at the last frame.
+    """
+
+    decay: Any
+    gain_dt: Any
+    kalman_gain: Any
+    rts_gain: Any
+
+
+class Covariances(NamedTuple):
+    """Covariances of a group's value and velocity over n frames.
+
+    Attributes:
+        filtered: (n, 2, 2) after each measurement.
+        predicted: (n, 2, 2) before it.
+        smoothed: (n, 2, 2) given all measurements.
+    """
+
+    filtered: Any
+    predicted: Any
+    smoothed: Any
+
+
+@njit(cache=True)
+def blank_gains(n):
+    """The `Gains` (3, ...) of three axes over n frames, not filled yet."""
+    return Gains(np.zeros((3, n)), np.zeros((3, n)), np.zeros((3, n, 2)), np.zeros((3, n, 2, 2)))
+
+
+@njit(cache=True)
+def axis_gains(gain, a):
+    """The `Gains` of one of three axes; views."""
+    return Gains(gain.decay[a], gain.gain_dt[a], gain.kalman_gain[a], gain.rts_gain[a])
+
+
+@njit(cache=True)
+def blank_covariances(n):
+    """The `Covariances` over n frames, not filled yet."""
+    return Covariances(np.zeros((n, 2, 2)), np.zeros((n, 2, 2)), np.zeros((n, 2, 2)))
 
 
 @njit(cache=True)
@@ -42,9 +92,7 @@ def steps(times, tau, decay, gain_dt):
 
 
 @njit(cache=True)
-def gains(
-    times, r, q, tau, start, decay, gain_dt, kalman_gain, rts_gain, filtered, predicted, smoothed
-):
+def gains(times, r, q, tau, start, gain, covariances):
     """Fill Kalman gains, RTS gains and covariances of one scalar coordinate over n frames.
 
     The prior at `start` is the measurement, with the velocity's stationary variance q τ / 2.
@@ -55,15 +103,17 @@ def gains(
         q: process variance, the density of the noise on the velocity.
         tau: decay time τ, s.
         start: index of the first frame that was measured; frames before it are not filled.
-        decay: (n,) output, the decay a of each step.
-        gain_dt: (n,) output, g of each step, s.
-        kalman_gain: (n, 2) output, Kalman gain of value and velocity.
-        rts_gain: (n, 2, 2) output, RTS gain; not filled at the last frame.
-        filtered: (n, 2, 2) output, covariance after each measurement.
-        predicted: (n, 2, 2) output, covariance before it.
-        smoothed: (n, 2, 2) output, covariance given all measurements.
+        gain: `Gains`, output.
+        covariances: `Covariances`, output.
     """
     n = times.size
+    decay = gain.decay
+    gain_dt = gain.gain_dt
+    kalman_gain = gain.kalman_gain
+    rts_gain = gain.rts_gain
+    filtered = covariances.filtered
+    predicted = covariances.predicted
+    smoothed = covariances.smoothed
     p = np.empty((2, 2))
     steps(times, tau, decay, gain_dt)
     for t in range(start, n):
@@ -127,20 +177,21 @@ def _value_variance(dt, tau):
 
 
 @njit(cache=True)
-def smooth_values(y, known, start, decay, gain_dt, kalman_gain, rts_gain, out, rate):
+def smooth_values(y, known, start, gain, out, rate):
     """Filter and smooth one scalar coordinate with the gains of `gains`.
 
     Args:
         y: (n,) measured values; not read where `known` is False.
         known: (n,) bool, measured.
         start: index of the first measured frame; `out` is constant before it.
-        decay: (n,) decay of each step.
-        gain_dt: (n,) g of each step, s.
-        kalman_gain: (n, 2) Kalman gains.
-        rts_gain: (n, 2, 2) RTS gains.
+        gain: `Gains` of the coordinate's group.
         out: (n,) output, smoothed values.
         rate: (n,) output, smoothed velocities per second, from `start` on.
     """
+    decay = gain.decay
+    gain_dt = gain.gain_dt
+    kalman_gain = gain.kalman_gain
+    rts_gain = gain.rts_gain
     n = y.size
     out[start] = y[start]
     rate[start] = 0.0
@@ -331,7 +382,7 @@ def _between(a, b, out):
 
 
 @njit(cache=True)
-def smooth_rotations(y, known, start, decay, gain_dt, kalman_gain, rts_gain, out, rate):
+def smooth_rotations(y, known, start, gain, out, rate):
     """Filter and smooth rotations by the left-invariant error: `smooth_values` on SO(3).
 
     The velocity is the body's own angular velocity, rad/s, and the error a rotation vector on the
@@ -341,13 +392,14 @@ def smooth_rotations(y, known, start, decay, gain_dt, kalman_gain, rts_gain, out
         y: (n, 3, 3) measured rotations.
         known: (n,) bool, measured.
         start: index of the first measured frame; `out` is constant before it.
-        decay: (3, n) decay of each step.
-        gain_dt: (3, n) g of each step, s.
-        kalman_gain: (3, n, 2) Kalman gains.
-        rts_gain: (3, n, 2, 2) RTS gains.
+        gain: `Gains` (3, ...) of the three axes.
         out: (n, 3, 3) output, smoothed rotations.
         rate: (n, 3) output, smoothed angular velocities, rad/s.
     """
+    decay = gain.decay
+    gain_dt = gain.gain_dt
+    kalman_gain = gain.kalman_gain
+    rts_gain = gain.rts_gain
     n = known.size
     w = np.empty(3)
     off = np.empty(3)

@@ -19,6 +19,9 @@ from numpy.typing import NDArray
 
 from liex_lab.body._kernels import place_joints
 from liex_lab.tracking._kalman_kernels import (
+    axis_gains,
+    blank_covariances,
+    blank_gains,
     gains,
     smooth_positions,
     smooth_rotations,
@@ -26,28 +29,6 @@ from liex_lab.tracking._kalman_kernels import (
 )
 
 _PASSES = 4
-
-
-class KinematicTree(NamedTuple):
-    """A skeleton for the kernels, see `place_joints`.
-
-    Attributes:
-        parents: (J,) parent of each joint.
-        offsets: (J, 3) mm, bones at home.
-        rest: (J, 3, 3) rest rotation of each joint relative to its parent.
-        moves: (J,) bool, joints that turn.
-        free: (m, 2) joint and axis of each free angle.
-        length_mm: spine length of the animal, mm.
-        tip: joint whose direction from the base says which way the animal lies.
-    """
-
-    parents: NDArray[np.int64]
-    offsets: NDArray[np.float64]
-    rest: NDArray[np.float64]
-    moves: NDArray[np.bool_]
-    free: NDArray[np.int64]
-    length_mm: float
-    tip: int
 
 
 class Moves(NamedTuple):
@@ -109,7 +90,7 @@ class Spread(NamedTuple):
 
 
 @njit(cache=True)
-def smooth_poses(times, seen, error, known, body, moves, made, spread, used):
+def smooth_poses(times, seen, error, known, body, length, moves, made, spread, used):
     """Fill `made` and `spread` with the smoothed curve, and `used` with the frames that it goes by.
 
     Where the gate leaves no frame at all, every measured one is used again. At least one frame must
@@ -120,7 +101,8 @@ def smooth_poses(times, seen, error, known, body, moves, made, spread, used):
         seen: measured poses of n frames, arena frame.
         error: (n,) predicted mean joint error, mm.
         known: (n,) bool, measured.
-        body: the skeleton.
+        body: `KinematicTree` of the skeleton.
+        length: spine length of the animal, mm.
         moves: motion and error parameters.
         made: output, smoothed poses.
         spread: output, their posterior spread; without the correlated share.
@@ -159,11 +141,11 @@ def smooth_poses(times, seen, error, known, body, moves, made, spread, used):
                     n_used += used[t]
             if n_used == 0:
                 used[:] = known
-        _pass(times, seen, middle, frame, error, weight, body, moves, made, spread, used)
+        _pass(times, seen, middle, frame, error, weight, body, length, moves, made, spread, used)
 
 
 @njit(cache=True)
-def _pass(times, seen, middle, frame, error, weight, body, moves, made, spread, used):
+def _pass(times, seen, middle, frame, error, weight, body, length, moves, made, spread, used):
     """One filter and smoother pass, each measurement's variance divided by its weight."""
     n = error.size
     m = body.free.shape[0]
@@ -185,138 +167,41 @@ def _pass(times, seen, middle, frame, error, weight, body, moves, made, spread, 
                             * moves.position_error[a] ** 2
                         )
     out = np.empty((n, 3))
-    process_variance = moves.position_variance * body.length_mm**2
+    process_variance = moves.position_variance * length**2
     smooth_positions(
         times, middle, r, used, start, process_variance, moves.position_decay_s, out, spread.middle
     )
-    decay = np.zeros((3, n))
-    gain_dt = np.zeros((3, n))
-    kalman_gain = np.zeros((3, n, 2))
-    rts_gain = np.zeros((3, n, 2, 2))
-    filtered = np.zeros((n, 2, 2))
-    predicted = np.zeros((n, 2, 2))
-    smoothed = np.zeros((n, 2, 2))
+    gain = blank_gains(n)
+    first = axis_gains(gain, 0)
+    covariances = blank_covariances(n)
     rate = np.zeros(n)
     value = np.zeros(n)
     for a in range(3):
-        _gains_of(
-            times,
-            variance,
-            moves.turn[a],
-            body.length_mm,
-            start,
-            decay[a],
-            gain_dt[a],
-            kalman_gain[a],
-            rts_gain[a],
-            filtered,
-            predicted,
-            smoothed,
-            spread.turn[:, a],
-        )
-    smooth_rotations(
-        seen.rotation,
-        used,
-        start,
-        decay,
-        gain_dt,
-        kalman_gain,
-        rts_gain,
-        made.rotation,
-        np.zeros((n, 3)),
-    )
+        of_axis = axis_gains(gain, a)
+        left = spread.turn[:, a]
+        _gains_of(times, variance, moves.turn[a], length, start, of_axis, covariances, left)
+    smooth_rotations(seen.rotation, used, start, gain, made.rotation, np.zeros((n, 3)))
     for a in range(3):
-        _gains_of(
-            times,
-            variance,
-            moves.bend[a],
-            body.length_mm,
-            start,
-            decay[a],
-            gain_dt[a],
-            kalman_gain[a],
-            rts_gain[a],
-            filtered,
-            predicted,
-            smoothed,
-            spread.bend[:, a],
-        )
+        of_axis = axis_gains(gain, a)
+        left = spread.bend[:, a]
+        _gains_of(times, variance, moves.bend[a], length, start, of_axis, covariances, left)
     for i in range(m):
         j, a = body.free[i]
-        smooth_values(
-            seen.angles[:, j, a].copy(),
-            used,
-            start,
-            decay[a],
-            gain_dt[a],
-            kalman_gain[a],
-            rts_gain[a],
-            value,
-            rate,
-        )
+        measured = seen.angles[:, j, a].copy()
+        smooth_values(measured, used, start, axis_gains(gain, a), value, rate)
         made.angles[:, j, a] = value
-    _gains_of(
-        times,
-        variance,
-        moves.size,
-        body.length_mm,
-        start,
-        decay[0],
-        gain_dt[0],
-        kalman_gain[0],
-        rts_gain[0],
-        filtered,
-        predicted,
-        smoothed,
-        rate,
-    )
-    smooth_values(
-        seen.log_scale,
-        used,
-        start,
-        decay[0],
-        gain_dt[0],
-        kalman_gain[0],
-        rts_gain[0],
-        made.log_scale,
-        rate,
-    )
+    _gains_of(times, variance, moves.size, length, start, first, covariances, rate)
+    smooth_values(seen.log_scale, used, start, first, made.log_scale, rate)
     _place(body, out, made)
 
 
 @njit(cache=True)
-def _gains_of(
-    times,
-    variance,
-    moves,
-    length,
-    start,
-    decay,
-    gain_dt,
-    kalman_gain,
-    rts_gain,
-    filtered,
-    predicted,
-    smoothed,
-    left,
-):
-    """The gains of a group with these `moves`, and its posterior variance (n,)."""
-    gains(
-        times,
-        (moves[0] / length) ** 2 * variance,
-        moves[1],
-        moves[2],
-        start,
-        decay,
-        gain_dt,
-        kalman_gain,
-        rts_gain,
-        filtered,
-        predicted,
-        smoothed,
-    )
+def _gains_of(times, variance, moves, length, start, gain, covariances, left):
+    """The gains of a group with these `moves`, and its posterior variance (n,) into `left`."""
+    measured = (moves[0] / length) ** 2 * variance
+    gains(times, measured, moves[1], moves[2], start, gain, covariances)
     for t in range(times.size):
-        left[t] = smoothed[max(t, start), 0, 0]
+        left[t] = covariances.smoothed[max(t, start), 0, 0]
 
 
 @njit(cache=True)
@@ -325,10 +210,7 @@ def _place(body, middle, made):
     n_joints = body.parents.size
     made.place[:] = 0.0
     place_joints(
-        body.parents,
-        body.offsets,
-        body.rest,
-        body.moves,
+        body,
         made.rotation,
         made.place,
         made.angles,

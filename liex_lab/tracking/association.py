@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.body.skeleton import Skeleton
-from liex_lab.runtime.memory import Allocator, blocks, release_pages
+from liex_lab.runtime.memory import Allocator, blocks
 from liex_lab.tracking import _association_kernels as kernels
 from liex_lab.tracking.observations import Observations
 
@@ -67,12 +67,18 @@ class HypothesisAssociation:
     """
 
     def __init__(self, skeleton: Skeleton, length_mm: float, tuning: AssociationCosts) -> None:
-        self._length = length_mm
         self._tuning = tuning
         self._score_mm = tuning.score_mm * skeleton.relative_size
         n = skeleton.n_joints
         self._joints = sorted({round(k) for k in np.linspace(0, n - 1, min(n, _JOINTS))})
-        self._levels = np.array([tuning.error_factor, tuning.shift, tuning.bend, tuning.tail])
+        self._costs = kernels.TransitionCosts(
+            float(tuning.error_factor),
+            float(tuning.shift),
+            float(tuning.bend),
+            float(tuning.tail),
+            float(tuning.ceiling),
+            float(length_mm),
+        )
 
     def joints(self, seen: Observations, allocate: Allocator = np.empty) -> NDArray[np.float32]:
         """Positions of the k joints that transition costs are measured by.
@@ -113,31 +119,15 @@ class HypothesisAssociation:
         )
         cost = allocate((n, h), float)
         parent = allocate((n, h, 2), np.int64)
-        beam = np.zeros((_BEAM, 2), np.int64)
         joints = self.joints(seen) if joints is None else joints
-        seconds = seen.seconds
+        chains = kernels.Chains(np.zeros((_BEAM, 2), np.int64), cost, parent)
+        frames = kernels.Hypotheses(seen.seconds, joints, seen.error_mm, emission, missed_cost)
         n_beam = 0
         for rows in blocks(n, _BLOCK):
-            n_beam = kernels.extend_all(
-                rows.start,
-                rows.stop,
-                beam,
-                n_beam,
-                seconds,
-                joints,
-                seen.error_mm,
-                emission,
-                missed_cost,
-                self._levels,
-                self._length,
-                self._tuning.ceiling,
-                cost,
-                parent,
-            )
-            release_pages(joints, emission, cost, parent)
+            n_beam = kernels.extend_all(rows.start, rows.stop, chains, n_beam, frames, self._costs)
         path = np.full(n, NONE, np.int64)
         if n_beam:
-            kernels.trace_back(beam[0, 0], beam[0, 1], parent, 0, path)
+            kernels.trace_back(chains.beam[0, 0], chains.beam[0, 1], parent, 0, path)
         return path
 
     def _emission(self, seen: Observations, allocate: Allocator) -> Array:
@@ -147,7 +137,6 @@ class HypothesisAssociation:
             cost[rows] = np.minimum(
                 seen.score[rows].astype(float) / self._score_mm, self._tuning.score_most
             )
-            release_pages(cost)
         return cost
 
     def doubt(
@@ -190,7 +179,6 @@ class HypothesisAssociation:
             one[part] = joints[used[part], taken]
             other_way = joints[used[part], taken ^ 1]
             two[part] = np.where(np.isfinite(other_way), other_way, one[part, ::-1])
-            release_pages(joints, one, two)
         error = seen.error_mm[used, path[used]].astype(float)
         at_used = np.empty(len(used))
         kernels.forward_backward(
@@ -199,9 +187,7 @@ class HypothesisAssociation:
             two,
             error,
             evidence[used],
-            self._levels,
-            self._length,
-            self._tuning.ceiling,
+            self._costs,
             at_used,
         )
         doubt[:] = np.interp(rows, used, at_used)

@@ -14,10 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.body._kernels import place_joints
+from liex_lab.body.kinematic_tree import KinematicTree
 from liex_lab.body.pose import Pose
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.geometry import SE3, so3
-from liex_lab.runtime.memory import Allocator, release_pages
+from liex_lab.runtime.memory import Allocator, blocks
 
 Array = NDArray[np.float64]
 Small = NDArray[np.float32]
@@ -133,10 +134,6 @@ class Observations:
         """The number of frames n."""
         return len(self.times_ns)
 
-    def release_pages(self) -> None:
-        """Release the memory pages of columns that lie on disk, until they are read again."""
-        release_pages(*(getattr(self, name) for name in COLUMNS))
-
     @property
     def seconds(self) -> Array:
         """(n,) s since the first frame."""
@@ -188,16 +185,27 @@ class Observations:
             (n, H, k, 3) mm, float32, arena frame; NaN where there is no hypothesis.
         """
         out = allocate((*self.score.shape, len(joints), 3), np.float32)
-        for start in range(0, len(self), _BLOCK):
-            out[start : start + _BLOCK] = np.nan
-            part = self[start : start + _BLOCK]
+        for rows in blocks(len(self), _BLOCK):
+            part = self[rows]
             for h in range(self.score.shape[1]):
-                rows = np.flatnonzero(part.known[:, h])
-                if len(rows):
-                    pose = part.pose(np.full(len(part), h))[rows]
-                    out[start + rows, h] = joints_of(self.skeleton, pose)[:, list(joints)]
-            release_pages(out)
-            self.release_pages()
+                out[rows, h] = part.joints_as(h, joints)
+        return out
+
+    def joints_as(self, h: int, joints: Sequence[int]) -> Small:
+        """Positions of some joints in one of the hypotheses, by forward kinematics.
+
+        Args:
+            h: index of the hypothesis.
+            joints: indices of k joints.
+
+        Returns:
+            (n, k, 3) mm, float32, arena frame; NaN where there is no such hypothesis.
+        """
+        out = np.full((len(self), len(joints), 3), np.nan, np.float32)
+        rows = np.flatnonzero(self.known[:, h])
+        if len(rows):
+            pose = self.pose(np.full(len(self), h))[rows]
+            out[rows] = joints_of(self.skeleton, pose)[:, list(joints)]
         return out
 
 
@@ -213,10 +221,7 @@ def joints_of(skeleton: Skeleton, pose: Pose) -> Array:
     """
     out = np.empty((len(pose.scale), skeleton.n_joints, 3))
     place_joints(
-        skeleton.parents,
-        skeleton.offsets,
-        skeleton.rest,
-        skeleton.axes.any(axis=1),
+        KinematicTree.of(skeleton),
         pose.root.rotation,
         pose.root.translation,
         pose.angles,

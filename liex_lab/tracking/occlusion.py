@@ -73,7 +73,7 @@ class OcclusionCorrection:
             the animal whole.
         """
         ends = OcclusionCorrection(skeleton, scene)
-        sight = ends._sight(pose, crops, depths)
+        sight = ends._sight(joints_of(skeleton, pose), crops, depths)
         whole = (sight[:, 0] > _WHOLE) & (sight[:, 1] == 0)
         if not whole.any():
             return ends
@@ -91,7 +91,8 @@ class OcclusionCorrection:
         Returns:
             (n) poses, camera frame; unchanged where nothing is hidden or nobody knows which end is.
         """
-        sight = self._sight(pose, crops, depths)
+        joints = joints_of(self.skeleton, pose)
+        sight = self._sight(joints, crops, depths)
         shown, covered, aside, begins, ends = sight.T
         most = _SLIDE * np.clip(1.0 - shown, 0.0, 1.0)
         direction = np.where(
@@ -100,15 +101,16 @@ class OcclusionCorrection:
             np.clip(ends - self.ends, -most, 0.0),
         )
         direction[(covered == 0) | (np.abs(aside) < _ASIDE) | (shown > _WHOLE)] = 0.0
-        joints = joints_of(self.skeleton, pose)
         along = joints[:, self.skeleton.tip] - joints[:, 0]
         return replace(
             pose, root=SE3(pose.root.rotation, pose.root.translation + direction[:, None] * along)
         )
 
-    def _sight(self, pose: Pose, crops: HeightMaps, depths: NDArray[np.float32]) -> Array:
-        """What is seen (n, 5) of each animal, see `_look`, with its area over the usual one."""
-        joints = joints_of(self.skeleton, pose)
+    def _sight(self, joints: Array, crops: HeightMaps, depths: NDArray[np.float32]) -> Array:
+        """What is seen (n, 5) of each animal, see `_look`, with its area over the usual one.
+
+        Its joints (n, J, 3) mm are in the camera frame.
+        """
         ends = self.scene.camera.project(joints[:, [0, self.skeleton.tip]])
         out = np.zeros((len(ends), 5))
         before = _BEFORE * float(np.sqrt(self.scene.area_mm2))

@@ -137,7 +137,6 @@ def track_whole(
     usual_px = float(np.median(shown[path >= 0])) if (path >= 0).any() else 0.0
     for rows in blocks(len(seen), _BLOCK):
         draw(rows)
-        _rest(track, seen)
     for _ in range(_TIMES):
         taken = path == NONE
         for rows in blocks(len(seen), _BLOCK):
@@ -146,23 +145,16 @@ def track_whole(
         for rows in blocks(len(seen), _BLOCK):
             if taken[max(0, rows.start - MARGIN) : rows.stop + MARGIN].any():
                 draw(rows)
-            _rest(track, seen)
     measured = used & (path >= 0)
     bridged = short_gaps(seconds, measured, subject.bridge_s)
     for rows in blocks(len(seen), _BLOCK):
         _mask_and_flag(
             subject, track[rows], seen[rows], path[rows], doubt[rows], measured[rows], bridged[rows]
         )
-        _rest(track, seen)
     flips = _flips(seen, track)
     return Tracked(
         track, tuple(sorted([*flips, *corrections], key=lambda flip: (flip.start, flip.source)))
     )
-
-
-def _rest(track: Track, seen: Observations) -> None:
-    track.release_pages()
-    seen.release_pages()
 
 
 def _turn_round(
@@ -444,10 +436,9 @@ def _flips(seen: Observations, track: Track) -> list[Flip]:
     tip = track.skeleton.tip
     exchanged = np.zeros(len(seen), np.bool_)
     for rows in blocks(len(seen), _BLOCK):
-        ends = seen[rows].joints([0, tip])[:, 0]
+        ends = seen[rows].joints_as(0, [0, tip])
         along = track.joints_mm[rows, tip] - track.joints_mm[rows, 0]
         exchanged[rows] = np.einsum("nd,nd->n", along, ends[:, 1] - ends[:, 0]) < 0
-        _rest(track, seen)
     found = [Flip(a, b, float(1.0 - track.p_flip[a:b].mean()), True) for a, b in spans(exchanged)]
     unsure = ~exchanged & (track.p_flip > _TOLD)
     return found + [Flip(a, b, float(track.p_flip[a:b].mean()), False) for a, b in spans(unsure)]

@@ -81,7 +81,8 @@ class BodyResidual:
             The body whose median residual over the frames is least.
         """
         bodies = [BodyResidual(surface, float(girth), camera_view) for girth in _GIRTHS]
-        cost = [np.nanmedian(body.of(pose_arena, crops, scene)) for body in bodies]
+        placed = pose_arena.placed(surface.skeleton)
+        cost = [np.nanmedian(body.of(placed, crops, scene)) for body in bodies]
         return bodies[int(np.argmin(cost))]
 
 

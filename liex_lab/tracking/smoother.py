@@ -17,6 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from liex_lab.body.kinematic_tree import KinematicTree
 from liex_lab.body.pose import Pose
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.geometry import SE3
@@ -201,31 +202,11 @@ def smooth(
     made = kernels.Poses(*(np.zeros(values.shape) for values in seen))
     spread = kernels.Spread(np.zeros((n, 3, 3)), np.zeros((n, 3)), np.zeros((n, 3)))
     used = np.zeros(n, np.bool_)
-    body = body_of(skeleton, length_mm)
-    kernels.smooth_poses(seconds, seen, error_mm, known, body, motion.packed, made, spread, used)
+    tree = KinematicTree.of(skeleton)
+    length = float(length_mm)
+    moves = motion.packed
+    kernels.smooth_poses(seconds, seen, error_mm, known, tree, length, moves, made, spread, used)
     return _curve(seconds, error_mm, length_mm, motion, made, spread, used)
-
-
-def body_of(skeleton: Skeleton, length_mm: float) -> kernels.KinematicTree:
-    """A skeleton as arrays for the numba kernels.
-
-    Args:
-        skeleton: kinematic tree of the animal.
-        length_mm: spine length of the animal, mm.
-
-    Returns:
-        The arrays, with the (m, 2) joint and axis of each free angle beyond the base.
-    """
-    free = np.argwhere(skeleton.axes)
-    return kernels.KinematicTree(
-        skeleton.parents,
-        skeleton.offsets,
-        skeleton.rest,
-        np.asarray(skeleton.axes.any(axis=1)),
-        free[free[:, 0] > 0],
-        float(length_mm),
-        skeleton.tip,
-    )
 
 
 def _curve(

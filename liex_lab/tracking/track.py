@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.geometry import SE3
-from liex_lab.runtime.memory import Allocator, blocks, release_pages
+from liex_lab.runtime.memory import Allocator, blocks
 
 Array = NDArray[np.float64]
 
@@ -111,8 +111,8 @@ class Track:
                 *shape: of one row.
             """
             made = allocate((n, *shape), dtype)
-            made[...] = value
-            release_pages(made)
+            for rows in blocks(n, _BLOCK):
+                made[rows] = value
             return made
 
         def unknown(*shape: int) -> Array:
@@ -158,10 +158,6 @@ class Track:
         """Some consecutive frames; what is written into them is written into the whole."""
         return Track(self.skeleton, *(getattr(self, name)[rows] for name in _columns()))
 
-    def release_pages(self) -> None:
-        """Release the memory pages of columns that lie on disk, until they are read again."""
-        release_pages(*(getattr(self, name) for name in _columns()))
-
     @property
     def n_frames(self) -> int:
         """Number of frames n of the recording, measured or not."""
@@ -173,7 +169,6 @@ class Track:
         there = np.empty(self.n_frames, np.bool_)
         for rows in blocks(self.n_frames, _BLOCK):
             there[rows] = np.isfinite(self.joints_mm[rows, 0, 0])
-            release_pages(self.joints_mm)
         return there
 
     @property

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from liex_lab.plan import Plan
-from liex_lab.runtime.memory import peak_memory_mb, trim_heap
+from liex_lab.runtime.memory import peak_memory_mb, rest
 
 from ..build import build_provenance, build_tracker
 from ..session import conclude
@@ -88,7 +88,7 @@ def write_long(
     plan = Plan.load("mouse")
     n = int(minutes * 60 * FPS)
     short = _look_at_short(plan)
-    trim_heap()
+    rest()
     told("began")
     began = time.perf_counter()
     with SessionWriter(

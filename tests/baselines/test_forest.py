@@ -21,6 +21,7 @@ from liex_lab.baselines.forest import (
     levers,
     train_forests,
 )
+from liex_lab.body.kinematic_tree import KinematicTree
 from liex_lab.body.pose import Pose
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.errors import ModelError
@@ -92,10 +93,7 @@ def test_the_true_coordinates_unfold_to_the_true_pose():
             levers(skeleton),
             places[k],
             headings[k],
-            skeleton.parents,
-            skeleton.offsets,
-            skeleton.rest,
-            skeleton.axes,
+            KinematicTree.of(skeleton),
             rotations,
             positions,
         )

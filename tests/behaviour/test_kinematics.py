@@ -12,7 +12,7 @@ from liex_lab.behaviour.body import BodyAxis
 from liex_lab.behaviour.columns import kinematics_columns
 from liex_lab.behaviour.kinematics import Joints, kinematics, neighbours, segments, smallest_turn
 from liex_lab.recordings.timestamps import find_gaps, median_step
-from liex_lab.runtime.memory import on_disk
+from liex_lab.runtime.memory import on_disk, rest
 from liex_lab.tables import schema
 from liex_lab.tables.rows import Rows
 from tests.behaviour.swimming_fish import SwimmingFish
@@ -28,7 +28,7 @@ def tables_of(mouse: WalkingMouse) -> tuple[pd.DataFrame, pd.DataFrame]:
     poses = pd.concat(
         [schema.to_pandas(schema.POSES, block) for block in rows.poses()], ignore_index=True
     )
-    return rows.frames_table(), poses
+    return rows.frames_table, poses
 
 
 def test_an_animal_on_a_circle_has_the_speed_and_the_turn_it_walks_with():
@@ -58,7 +58,7 @@ def test_a_table_on_disk_made_in_blocks_is_the_one_in_memory(swims, tmp_path, mo
     in_memory = kinematics(*told, surface_z_mm=90.0)
     monkeypatch.setattr(import_module("liex_lab.behaviour.kinematics"), "_BLOCK", 16)
     on_the_disk = kinematics(*told, surface_z_mm=90.0, allocate=on_disk(tmp_path))
-    schema.release_table(on_the_disk)
+    rest()
     pd.testing.assert_frame_equal(on_the_disk, in_memory, check_exact=True)
 
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from liex_lab.arena.floor import Floor
+from liex_lab.body.kinematic_tree import KinematicTree
 from liex_lab.body.kinematics import forward_kinematics
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.estimation import _feature_kernels as kernels
@@ -246,7 +247,7 @@ def test_joints_placed_and_turned_one_after_the_other_give_the_forward_kinematic
     expected = forward_kinematics(skeleton, root, angles, np.array(scale))
     rotations, positions = np.zeros((skeleton.n_joints, 3, 3)), np.zeros((skeleton.n_joints, 3))
     rotations[0], positions[0] = root.rotation, root.translation
-    home = (skeleton.parents, skeleton.offsets, skeleton.rest, scale, rotations, positions)
+    home = (KinematicTree.of(skeleton), scale, rotations, positions)
     for joint in skeleton.solved[1:]:
         kernels.place_joint(joint, *home)
         kernels.correct_joint(

@@ -224,7 +224,16 @@ def test_slopes_are_those_of_small_steps(k: int) -> None:
     slope = np.empty((3, 7 + len(free)))
     for b in range(BALLS.n_own):
         kernels.ball_slope(
-            b, balls[b], REFINER.body, REFINER.tree, axes, rotations, positions, 1.0, slope
+            b,
+            balls[b],
+            REFINER.body,
+            REFINER.tree,
+            REFINER.free_angles,
+            axes,
+            rotations,
+            positions,
+            1.0,
+            slope,
         )
         np.testing.assert_allclose(slope, numeric[b], atol=2e-3)
 
@@ -256,8 +265,8 @@ def test_small_systems_are_solved() -> None:
 def test_a_chain_is_refined_as_well() -> None:
     mouse = Skeleton.load("mouse")
     refiner = Refiner.of(mouse, Spheres.of(mouse))
-    assert refiner.tree.moves.shape == (mouse.n_joints, mouse.dof - 6)
-    assert refiner.tree.moves[-1].all()  # every joint turns the tip
+    assert refiner.free_angles.moves.shape == (mouse.n_joints, mouse.dof - 6)
+    assert refiner.free_angles.moves[-1].all()  # every joint turns the tip
     turned = so3.exp(np.zeros((2, 3)))
     pose = Pose(SE3(turned, np.zeros((2, 3))), np.zeros((2, mouse.n_joints, 3)), np.ones(2))
     empty = np.zeros((2, 96, 96), np.int16)

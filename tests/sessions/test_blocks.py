@@ -8,11 +8,13 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from liex_lab.arena.outline import Arena
+from liex_lab.arena.zones import Zone
 from liex_lab.sessions import evidence
 from liex_lab.sessions.evidence import FILE, write_evidence
 from liex_lab.tables import rows as rows_module
 from liex_lab.tables import schema
-from liex_lab.tables.rows import Rows
+from liex_lab.tables.rows import Rows, seconds
 from liex_lab.tracking.observations import COLUMNS, Observations
 from liex_lab.tracking.offline import Subject
 from tests.sessions.walking_mouse import WalkingMouse, steady, write
@@ -24,31 +26,39 @@ MOUSE = WalkingMouse(np.delete(steady(3.0), slice(30, 36)), lost=(40, 41, 70))
 def test_a_table_made_in_blocks_is_the_one_made_at_once(
     size: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    rows = Rows(MOUSE.track(), 5 + np.arange(len(MOUSE.times_ns)), "s", "m")
+    zones = [Zone("side", (150.0, 0.0, 60.0)), Zone("all", (0.0, 0.0, 1e4))]
+    arena = Arena("round", (0.0, 0.0), radius_mm=200.0)
 
     def made() -> dict[str, pd.DataFrame]:
+        rows = Rows(MOUSE.track(), 5 + np.arange(len(MOUSE.times_ns)), "s", "m", (), arena, zones)
         return {
             name: pd.concat(
                 [schema.to_pandas(schema.TABLES[name], block) for block in blocks],
                 ignore_index=True,
             )
-            for name, blocks in (("poses", rows.poses()), ("rotations", rows.rotations()))
-        } | {"frames": rows.frames_table()}
+            for name, blocks in (
+                ("frames", rows.frames()),
+                ("poses", rows.poses()),
+                ("rotations", rows.rotations()),
+            )
+        } | {"at once": rows.frames_table}
 
     at_once = made()
     monkeypatch.setattr(rows_module, "ROWS_PER_GROUP", size)
     in_blocks = made()
     for name, table in at_once.items():
         pd.testing.assert_frame_equal(in_blocks[name], table, check_exact=True)
-    np.testing.assert_array_equal(at_once["frames"]["time_s"], rows.time_s)
-    np.testing.assert_allclose(at_once["frames"]["dt_s"][1:], np.diff(rows.time_s), atol=1e-12)
+    pd.testing.assert_frame_equal(in_blocks["frames"], in_blocks["at once"], check_exact=True)
+    time_s = seconds(np.array(MOUSE.times_ns))
+    np.testing.assert_array_equal(at_once["frames"]["time_s"], time_s)
+    np.testing.assert_allclose(at_once["frames"]["dt_s"][1:], np.diff(time_s), atol=1e-12)
     assert np.isnan(at_once["frames"]["dt_s"][0])
 
 
 def test_a_data_frame_is_written_in_blocks_as_at_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    table = Rows(MOUSE.track(), np.arange(len(MOUSE.times_ns)), "s", "m").frames_table()
+    table = Rows(MOUSE.track(), np.arange(len(MOUSE.times_ns)), "s", "m").frames_table
     monkeypatch.setattr(schema, "ROWS_PER_GROUP", 16)
     schema.write_table(tmp_path / "a.parquet", schema.FRAMES, schema.from_pandas(table), {})
     pd.testing.assert_frame_equal(pd.read_parquet(tmp_path / "a.parquet"), table, check_exact=True)

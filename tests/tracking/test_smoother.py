@@ -15,16 +15,12 @@ Q, FADE = 40.0, 0.3
 
 
 def gains(times, r, q):
-    """A group's gains and what is left: keep, go, forward, back, the first measured frame,
-    covariances.
-    """
+    """A group's gains and what is left: the first measured frame, gains; covariances."""
     n = len(times)
-    keep, go = np.zeros((2, n))
-    forward, back = np.zeros((n, 2)), np.zeros((n, 2, 2))
-    filtered, predicted, after = np.zeros((3, n, 2, 2))
+    gain, covariances = kernels.axis_gains(kernels.blank_gains(n), 0), kernels.blank_covariances(n)
     start = int(np.argmax(np.isfinite(r)))
-    kernels.gains(times, r, q, FADE, start, keep, go, forward, back, filtered, predicted, after)
-    return (start, keep, go, forward, back), after
+    kernels.gains(times, r, q, FADE, start, gain, covariances)
+    return (start, gain), covariances.smoothed
 
 
 def smoothed(times, y, r, q):
@@ -123,10 +119,10 @@ def test_rotations_about_one_axis_are_smoothed_as_their_angles_are():
     out, _, _ = smoothed(TIMES, angle, r, 5.0)
     axis = np.array([1.0, 2.0, -2.0]) / 3.0
     y = so3.exp(angle[:, None] * axis)
-    (start, keep, go, forward, back), _ = gains(TIMES, r, 5.0)
-    each = [np.stack([values] * 3) for values in (keep, go, forward, back)]
+    (start, gain), _ = gains(TIMES, r, 5.0)
+    each = kernels.Gains(*(np.stack([values] * 3) for values in gain))
     turned, rate = np.zeros(y.shape), np.zeros((len(y), 3))
-    kernels.smooth_rotations(y, np.isfinite(r), start, *each, turned, rate)
+    kernels.smooth_rotations(y, np.isfinite(r), start, each, turned, rate)
     np.testing.assert_allclose(turned, so3.exp(out[:, None] * axis), atol=1e-9)
 
 

@@ -135,21 +135,17 @@ def render_agent(
         background = np.empty_like(depth)
         nothing = rounded(np.zeros((m, 3)), np.ones((m, 3)), np.zeros(m), np.full(m, 2.0))
         render_kernels.draw_windows(
-            vertices,
-            surface.faces,
-            nothing,
-            PART_FACES,
-            np.zeros(m, np.bool_),
-            T.rotation,
-            T.translation[:, 2].copy(),
-            intrinsics,
-            np.tile(camera.picture, (m, 1)),
-            origin,
-            np.zeros((m, render_kernels.WALL_COLUMNS)) if walls is None else walls[part],
-            np.zeros(m),
-            np.tile(camera.parameters, (m, 1)),
-            seeds[part],
-            NORMAL,
+            render_kernels.Meshes(
+                vertices, surface.faces, nothing, PART_FACES, np.zeros(m, np.bool_)
+            ),
+            render_kernels.PatchCamera(intrinsics, np.tile(camera.picture, (m, 1)), origin),
+            render_kernels.ArenaView(
+                T.rotation,
+                T.translation[:, 2].copy(),
+                np.zeros((m, render_kernels.WALL_COLUMNS)) if walls is None else walls[part],
+                np.zeros(m),
+            ),
+            render_kernels.SensorNoise(np.tile(camera.parameters, (m, 1)), seeds[part], NORMAL),
             depth,
             background,
         )

@@ -20,6 +20,7 @@ from liex_lab.body.skeleton import Skeleton
 from liex_lab.foreground.hand_segmenter import sight_rotations
 from liex_lab.geometry import SE3
 from liex_lab.runtime.threads import threads
+from liex_lab.simulation._render_kernels import PatchCamera, SensorNoise
 from liex_lab.simulation._sensor_kernels import NORMAL
 from liex_lab.simulation.hand import _render_kernels as kernels
 from liex_lab.simulation.objects import PART_FACES, SPHERE, rounded
@@ -104,22 +105,20 @@ class HandFrameContents:
         out = np.empty((len(self.seeds), *shape), np.uint16)
         with threads(parallel):
             kernels.pictures(
-                self.hand,
-                faces,
-                self.arm,
-                ARM_FACES,
-                self.body,
-                BODY_FACES,
-                self.thing,
-                self.thing_faces,
-                self.shown,
+                kernels.HandMeshes(
+                    self.hand,
+                    faces,
+                    self.arm,
+                    ARM_FACES,
+                    self.body,
+                    BODY_FACES,
+                    self.thing,
+                    self.thing_faces,
+                    self.shown,
+                ),
                 self.wall,
-                intrinsics,
-                size,
-                origin,
-                self.parameters,
-                self.seeds,
-                NORMAL,
+                PatchCamera(intrinsics, size, origin),
+                SensorNoise(self.parameters, self.seeds, NORMAL),
                 out,
             )
         return out
