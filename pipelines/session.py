@@ -202,8 +202,7 @@ def name_actions(
     """
     from liex_lab.tables.rows import bout_rows
 
-    frames = rows.frames_table
-    found = recogniser.recognise(rows.track, frames["wall_distance_mm"].to_numpy(float), allocate)
+    found = recogniser.recognise(rows.track, rows.wall_distance_mm, allocate)
     notes = {
         "action_model": {
             "skeleton": recogniser.skeleton,
@@ -213,5 +212,5 @@ def name_actions(
         "unresolved_actions": found.unresolved,
     }
     actions = {word: recogniser.definitions.get(word, "") for word in recogniser.words if word}
-    bouts = bout_rows(found.ethogram, frames, str(recogniser.card.get("sha256", "")))
+    bouts = bout_rows(found.ethogram, rows.frames_table, str(recogniser.card.get("sha256", "")))
     return {"bouts": bouts, "actions": actions}, notes

@@ -71,6 +71,11 @@ class Rows:
         """The table `frames`, in blocks of 100 000 rows."""
         return (_some_rows(self._frame_columns, part) for part in self._parts(1))
 
+    @property
+    def wall_distance_mm(self) -> Array:
+        """(n,) distance of the animal from the nearest wall, mm, as in the table `frames`."""
+        return np.asarray(self._frame_columns["wall_distance_mm"])
+
     @cached_property
     def frames_table(self) -> pd.DataFrame:
         """The table `frames`, a data frame of n rows; columns of the track are not copied."""
