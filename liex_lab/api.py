@@ -519,6 +519,8 @@ def run_tables(
     n_frames: int | None = None,
     quick: bool = False,
     fresh: bool = False,
+    rows: Sequence[str] = (),
+    sealed: bool = False,
     progress: Progress = silent,
 ) -> list[Path]:
     """Make every row of Tables 1-3 of the Lie-X paper and its figures; returns the files written.
@@ -526,9 +528,12 @@ def run_tables(
     Args:
         out: the folder that tables and figures are written into.
         animals: names of animals; () takes those with a bundled model.
-        n_frames: only so many frames of each split; None takes all.
+        n_frames: only so many frames of each split, of which every row is measured, none kept;
+            None takes all.
         quick: a few minutes' run whose numbers say only that everything runs.
-        fresh: nothing kept is used; every variant is trained again, which takes hours.
+        fresh: nothing kept is used; every variant is trained again, which takes long.
+        rows: only these rows are trained and measured anew, the others kept; () is all.
+        sealed: measure the sealed split, which is done once, when an issue ends.
         progress: told how far the work is.
     """
     from liex_lab.catalog import bundled_models
@@ -540,7 +545,9 @@ def run_tables(
         animals or list(bundled_models()),
         n_frames=n_frames,
         quick=quick,
-        fresh=fresh,
+        fresh=fresh or bool(rows),
+        rows=rows,
+        sealed=sealed,
         draw=draw_figures,
         progress=progress,
     )

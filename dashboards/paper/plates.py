@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 
 _METHODS = {  # variant: (name in the legend, colour, line)
     "default": ("liex_lab", "#AA3377", "-"),
-    "paper": ("Lie-X as in the paper", "#4477AA", "-"),
+    "paper": ("Lie-X, the paper's variant", "#4477AA", "-"),
     "paper-one-pose": ("one initial pose", "#4477AA", ":"),
     "paper-no-metric": ("no learned metric", "#4477AA", "--"),
     "rf": ("RF", "#228833", "-"),
@@ -36,7 +36,7 @@ _MOST_STAGES = 8
 
 
 def draw_figures(results: Mapping[str, Mapping[str, Any]], folder: Path) -> list[Path]:
-    """Write all figures of some animals.
+    """Write all figures of some animals; Fig. 7 where there are curves for it.
 
     Args:
         results: animal -> `vars` of its `Results`.
@@ -45,8 +45,10 @@ def draw_figures(results: Mapping[str, Mapping[str, Any]], folder: Path) -> list
     Returns:
         Paths of the figures.
     """
-    written = [
-        _save(_sensitivity(results), folder / "fig07_sensitivity.png"),
+    written = []
+    if any(one["sensitivity"] for one in results.values()):
+        written.append(_save(_sensitivity(results), folder / "fig07_sensitivity.png"))
+    written += [
         _save(_cumulative(results), folder / "fig08_cumulative_error.png"),
         _save(_joint_errors(results), folder / "error_per_joint.png"),
     ]
@@ -111,6 +113,8 @@ def _joint_errors(results: Mapping[str, Mapping[str, Any]]) -> Figure:
         joints = np.arange(len(one["joints"]))
         for panel, split in zip(line, one["splits"], strict=False):
             for variant, row in one["rows"].items():
+                if not row["splits"][split]["joint_mm"]:
+                    continue
                 name, colour, style = _METHODS[variant]
                 panel.plot(
                     joints,

@@ -3,7 +3,7 @@
     x_j = 1/K sum_k x_j^(k)        for each joint j over the K candidates.
 
 The other ablation, without multiple initial poses, needs no code of its own: it is
-`PoseEstimator(model, 1)`.
+`PoseEstimator(model, 1, start_seed=k)`, which has one initial pose, drawn from the seed k.
 """
 
 from __future__ import annotations
@@ -13,11 +13,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from liex_lab.baselines.baseline import Guesses, see
+from liex_lab.baselines.baseline import Guesses, chosen, second_is_likelier
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.estimation.estimator import PoseEstimator
 from liex_lab.foreground.crop_camera import in_camera_frame
+from liex_lab.foreground.height_maps import HeightMaps
 from liex_lab.foreground.segmenter import Segmenter
+
+Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -37,8 +40,13 @@ class PlainMean:
         """The animal's skeleton."""
         return self.estimator.skeleton
 
+    @property
+    def takes_size(self) -> bool:
+        """Whether the animal's size is handed to the estimator."""
+        return self.estimator.model.method.session_size
+
     def find_size(self, sample: NDArray[np.float32], scene: Segmenter) -> float:
-        """Size of the animal as the estimator finds it; the home size for the paper's variant.
+        """Size of the animal as the estimator finds it.
 
         Args:
             sample: (n, H, W) float32 frames, mm, 0 where unread.
@@ -60,7 +68,23 @@ class PlainMean:
         Returns:
             The joints in the camera frame; bones do not keep their lengths.
         """
-        crops, crop_cameras = see(depths, scene, parallel)
+        second = second_is_likelier(depths, scene, parallel)
+        return self.guesses(*chosen(depths, scene, size, second, True, parallel), size, parallel)
+
+    def guesses(
+        self, crops: HeightMaps, crop_cameras: Array, size: float, parallel: bool = True
+    ) -> Guesses:
+        """Estimate the joints of objects that were cut out already.
+
+        Args:
+            crops: height maps of n frames, along the optical axis.
+            crop_cameras: (n, 17) crop cameras of the height maps.
+            size: the animal's size over home size.
+            parallel: use all cores rather than one.
+
+        Returns:
+            The joints in the camera frame.
+        """
         _, positions, _, _ = self.estimator.candidates(crops, crop_cameras, size, parallel)
         joints = in_camera_frame(positions.mean(axis=1), crop_cameras)
         joints[~crops.found] = np.nan

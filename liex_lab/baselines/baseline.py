@@ -51,6 +51,10 @@ class Baseline(Protocol):
     def skeleton(self) -> Skeleton:
         """The animal's skeleton."""
 
+    @property
+    def takes_size(self) -> bool:
+        """Whether the animal's size is handed to it; else it measures every animal alike."""
+
     def find_size(self, sample: NDArray[np.float32], scene: Segmenter) -> float:
         """Estimate the animal's size from a sample of frames.
 
@@ -78,13 +82,27 @@ class Baseline(Protocol):
             The joints in the camera frame.
         """
 
+    def guesses(
+        self, crops: HeightMaps, crop_cameras: Array, size: float, parallel: bool = True
+    ) -> Guesses:
+        """Estimate the joints of objects that were cut out already, as by `chosen`.
+
+        Args:
+            crops: height maps of n frames, along the optical axis.
+            crop_cameras: (n, 17) crop cameras of the height maps.
+            size: the animal's size, as from `find_size`.
+            parallel: use all cores rather than one.
+
+        Returns:
+            The joints in the camera frame.
+        """
+
 
 def see(depths: NDArray[np.float32], scene: Segmenter, parallel: bool) -> tuple[HeightMaps, Array]:
     """Segment the animal of each frame as the paper's features see it.
 
-    Heights are measured along the optical axis, and no size is known. Where two components have
-    about the animal's area, the one that is more like it in area and volume is taken, as for the
-    paper's own variant of the method.
+    Heights are measured along the optical axis, and no size is known. Of two components of about
+    the animal's area `second_is_likelier` chooses.
 
     Args:
         depths: (n, H, W) float32 mm, 0 where unread.
@@ -94,13 +112,60 @@ def see(depths: NDArray[np.float32], scene: Segmenter, parallel: bool) -> tuple[
     Returns:
         The height maps, and their packed crop cameras (n, 17).
     """
-    crops, second = scene.extract_both(depths, 1.0, parallel, camera_view=True)
-    unsure = np.flatnonzero(crops.n_blobs > 1)
+    return chosen(depths, scene, 1.0, second_is_likelier(depths, scene, parallel), True, parallel)
+
+
+def second_is_likelier(
+    depths: NDArray[np.float32], scene: Segmenter, parallel: bool = True
+) -> NDArray[np.bool_]:
+    """Choose between two components of about the animal's area without knowing any pose.
+
+    The one that is more like the animal in area and volume is taken, as by the paper's own variant
+    of the method.
+
+    Args:
+        depths: (n, H, W) float32 mm, 0 where unread.
+        scene: the segmenter that was fitted to the recording.
+        parallel: use all cores rather than one.
+
+    Returns:
+        (n,) bool, whether the second one is taken.
+    """
+    likelier = np.zeros(len(depths), np.bool_)
+    n_blobs = scene.extract_both(depths, 1.0, parallel, camera_view=True)[0].n_blobs
+    unsure = np.flatnonzero(n_blobs > 1)
     if len(unsure):
-        misfits = [
+        first, second = (
             scene.misfit(above_floor)
             for above_floor in scene.extract_both(depths[unsure], 1.0, parallel)
-        ]
-        better = unsure[misfits[1] < misfits[0]]
-        crops.put(better, second[better])
-    return crops, scene.crop_cameras(crops, camera_view=True)
+        )
+        likelier[unsure] = second < first
+    return likelier
+
+
+def chosen(
+    depths: NDArray[np.float32],
+    scene: Segmenter,
+    size: float,
+    second: NDArray[np.bool_],
+    camera_view: bool,
+    parallel: bool = True,
+) -> tuple[HeightMaps, Array]:
+    """Cut one chosen component out of each frame, the same one for whoever measures it.
+
+    Args:
+        depths: (n, H, W) float32 mm, 0 where unread.
+        scene: the segmenter that was fitted to the recording.
+        size: the animal's spine over the home length; scales the smoothing.
+        second: (n,) bool, whether the second of two components is taken.
+        camera_view: heights are measured along the optical axis.
+        parallel: use all cores rather than one.
+
+    Returns:
+        The height maps, and their packed crop cameras (n, 17).
+    """
+    crops, others = scene.extract_both(depths, size, parallel, camera_view)
+    rows = np.flatnonzero(second)
+    if len(rows):
+        crops.put(rows, others[rows])
+    return crops, scene.crop_cameras(crops, camera_view)

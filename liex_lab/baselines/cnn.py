@@ -32,6 +32,7 @@ from liex_lab.body.skeleton import Skeleton
 from liex_lab.errors import MissingPackageError, ModelError
 from liex_lab.estimation.training import Tell, TrainingSet
 from liex_lab.foreground.crop_camera import in_camera_frame
+from liex_lab.foreground.height_maps import HeightMaps
 from liex_lab.foreground.segmenter import Segmenter
 from liex_lab.runtime.threads import threads
 
@@ -168,6 +169,11 @@ class Cnn:
     skeleton: Skeleton
     net: torch.nn.Sequential
 
+    @property
+    def takes_size(self) -> bool:
+        """False: the paper's baselines know nothing of size."""
+        return False
+
     def find_size(self, sample: NDArray[np.float32], scene: Segmenter) -> float:
         """Always 1: the network knows nothing of size.
 
@@ -191,7 +197,22 @@ class Cnn:
         Returns:
             The joints in the camera frame.
         """
-        crops, crop_cameras = see(depths, scene, parallel)
+        return self.guesses(*see(depths, scene, parallel), size, parallel)
+
+    def guesses(
+        self, crops: HeightMaps, crop_cameras: Array, size: float, parallel: bool = True
+    ) -> Guesses:
+        """Estimate the joints of objects that were cut out already.
+
+        Args:
+            crops: height maps of n frames, along the optical axis.
+            crop_cameras: (n, 17) crop cameras of the height maps.
+            size: not used.
+            parallel: use all cores rather than one.
+
+        Returns:
+            The joints in the camera frame.
+        """
         joints = np.full((len(crop_cameras), self.skeleton.n_joints, 3), np.nan)
         rows = np.flatnonzero(crops.found)
         for start in range(0, len(rows), _BATCH):

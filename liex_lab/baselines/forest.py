@@ -35,6 +35,7 @@ from liex_lab.body.skeleton import Skeleton
 from liex_lab.errors import ModelError
 from liex_lab.estimation.training import Tell, TrainingSet
 from liex_lab.foreground.crop_camera import in_camera_frame
+from liex_lab.foreground.height_maps import HeightMaps
 from liex_lab.foreground.segmenter import Segmenter
 from liex_lab.forests._kernels import VIEW
 from liex_lab.forests.forest import Forest, Samples, check_forest
@@ -89,6 +90,11 @@ class RegressionForest:
     where: Forest
     pose: Forest
 
+    @property
+    def takes_size(self) -> bool:
+        """False: the paper's baselines know nothing of size."""
+        return False
+
     def find_size(self, sample: NDArray[np.float32], scene: Segmenter) -> float:
         """Always 1: the paper's forests know nothing of size.
 
@@ -112,7 +118,22 @@ class RegressionForest:
         Returns:
             The joints in the camera frame.
         """
-        crops, crop_cameras = see(depths, scene, parallel)
+        return self.guesses(*see(depths, scene, parallel), size, parallel)
+
+    def guesses(
+        self, crops: HeightMaps, crop_cameras: Array, size: float, parallel: bool = True
+    ) -> Guesses:
+        """Estimate the joints of objects that were cut out already.
+
+        Args:
+            crops: height maps of n frames, along the optical axis.
+            crop_cameras: (n, 17) crop cameras of the height maps.
+            size: not used.
+            parallel: use all cores rather than one.
+
+        Returns:
+            The joints in the camera frame.
+        """
         s = self.skeleton
         n = len(crop_cameras)
         joints = np.full((n, s.n_joints, 3), np.nan)

@@ -89,7 +89,8 @@ class CascadeSettings(NamedTuple):
         base_lever: lever arm of the base's rotation, mm.
         joint_lever: lever arm of the other joints' rotations, mm.
         scale_lever: lever arm of the log scale, mm.
-        bandwidth: of the mean shift over tree votes, in label units; 0 takes the mean.
+        bandwidth: of the mean shift over tree votes, regressors' and metric's, in label units; 0
+            takes the mean.
         keep: candidates that are kept after the base joint.
         solved: the joints with regressors, in order, base first.
     """
@@ -146,6 +147,24 @@ def mode_of_votes(votes, bandwidth, out):
             return
         for k in range(d):
             out[k] = shifted[k] / total
+
+
+@njit(cache=True, parallel=True)
+def modes_of_votes(votes, bandwidth, modes):
+    """Mean-shift modes of the votes of n samples, each from the mean of its own.
+
+    Args:
+        votes: (n, T, D) votes.
+        bandwidth: of the kernel, in units of the votes.
+        modes: (n, D) float64, filled.
+    """
+    for k in prange(len(votes)):
+        for d in range(votes.shape[2]):
+            modes[k, d] = 0.0
+            for t in range(votes.shape[1]):
+                modes[k, d] += votes[k, t, d]
+            modes[k, d] /= votes.shape[1]
+        mode_of_votes(votes[k], bandwidth, modes[k])
 
 
 @njit(cache=True)
@@ -445,7 +464,7 @@ def _estimate_block(
             tuning.solved, tree, poses.scales[i, k], poses.rotations[i, k], poses.positions[i, k]
         )
     _see_all(lanes, n, seen, tuning.reach, body, poses)
-    _predict(metric, first, lanes, n, n_joints, side, 0.0, values)
+    _predict(metric, first, lanes, n, n_joints, side, tuning.bandwidth, values)
     for s in range(n):
         scores[lanes.frame[s], lanes.pose[s]] = values[s, 0]
 

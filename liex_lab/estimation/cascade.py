@@ -26,9 +26,10 @@ from liex_lab.body.skeleton import Skeleton
 from liex_lab.body.spheres import Spheres
 from liex_lab.estimation import _feature_kernels as kernels
 from liex_lab.estimation import _residual_kernels as residual_kernels
+from liex_lab.estimation._cascade_kernels import modes_of_votes
 from liex_lab.estimation.method import Method
 from liex_lab.forests._kernels import VIEW
-from liex_lab.forests.forest import Forest, Samples, predict
+from liex_lab.forests.forest import Forest, Samples, predict, predict_each
 from liex_lab.geometry import SE3, so3
 
 Array = NDArray[np.float64]
@@ -168,10 +169,36 @@ class Cascade:
                 self.place(candidates, joint)
             for c, forest in enumerate(rounds):
                 self.apply(
-                    candidates, joint, predict(forest, self.samples(images, candidates, [joint]))
+                    candidates,
+                    joint,
+                    self.predict(forest, self.samples(images, candidates, [joint])),
                 )
                 yield joint, c
         self.place_ends(candidates)
+
+    def predict(
+        self, forest: Forest, samples: Samples, in_bag: NDArray[np.bool_] | None = None
+    ) -> NDArray[np.float32]:
+        """What a forest of this method says of samples, in training as in estimation.
+
+        It is the mean-shift mode of the trees' votes where the method has a bandwidth, as the
+        paper's regressors and metric have, else their mean.
+
+        Args:
+            forest: a regressor or the learned metric.
+            samples: n samples.
+            in_bag: (T, n_images) bool, which images each tree was grown on, to leave such trees
+                out; None asks all trees, as a mode always does.
+
+        Returns:
+            (n, D) float32 predictions.
+        """
+        if self.method.mean_shift_mm <= 0:
+            return predict(forest, samples, in_bag)
+        votes = predict_each(forest, samples)
+        modes = np.empty((len(samples), votes.shape[2]))
+        modes_of_votes(votes, self.method.mean_shift_mm, modes)
+        return modes.astype(np.float32)
 
     def place_ends(self, candidates: Candidates) -> None:
         """Put every joint without a regressor where its parent carries it.

@@ -184,12 +184,14 @@ class PoseEstimator:
         unpruned: run all candidates through the whole kinematic tree instead of pruning them after
             the base joint.
         n_joints: move only so many joints, to see what each costs; 0: all that can be.
+        start_seed: the initial poses are drawn from it, once for all frames.
     """
 
     model: Model
     n_candidates: int = 0  # 0: as the model's method says
     unpruned: bool = False  # all candidates run the whole chain
     n_joints: int = 0  # only so many joints are moved, to see what each costs; 0: all that can be
+    start_seed: int = _START_SEED
 
     @staticmethod
     def load(name: str | Path = "mouse") -> PoseEstimator:
@@ -259,7 +261,7 @@ class PoseEstimator:
         k = self.n_candidates or self.model.method.n_candidates
         if self.model.cascade.proposals is not None:
             k = N_WAYS * self.model.cascade.proposals.n_trees
-        return draw_starts(np.random.default_rng(_START_SEED), 1, k)
+        return draw_starts(np.random.default_rng(self.start_seed), 1, k)
 
     def candidates(
         self, crops: HeightMaps, crop_cameras: Array, size: float, parallel: bool = True
@@ -368,7 +370,24 @@ class PoseEstimator:
             without such a hypothesis are not found.
         """
         size = size if self.model.method.session_size else 1.0
-        return self._ways(self._look(depths, scene, size, parallel), size, parallel)
+        return self._ways(self._look(depths, scene, size, parallel)[:2], size, parallel)
+
+    def second_is_animal(
+        self, depths: NDArray[np.float32], scene: Segmenter, size: float, parallel: bool = True
+    ) -> NDArray[np.bool_]:
+        """Whether the animal is the second component of a frame, not the first; see `estimate`.
+
+        Args:
+            depths: (n, H, W) float32 mm, 0 where unread.
+            scene: the segmenter that was fitted to the recording.
+            size: the animal's spine over the home length; ignored by methods of fixed size.
+            parallel: use all cores rather than one.
+
+        Returns:
+            (n,) bool, of the two components that `Segmenter.extract_both` gives.
+        """
+        size = size if self.model.method.session_size else 1.0
+        return self._look(depths, scene, size, parallel)[2]
 
     def best_of(
         self, crops: HeightMaps, crop_cameras: Array, size: float, parallel: bool = True
@@ -430,12 +449,16 @@ class PoseEstimator:
 
     def _look(
         self, depths: NDArray[np.float32], scene: Segmenter, size: float, parallel: bool
-    ) -> tuple[Detection, Detection]:
-        """Detect the animal with its candidates, and the next likely component; see `estimate`."""
+    ) -> tuple[Detection, Detection, NDArray[np.bool_]]:
+        """Detect the animal with its candidates, and the next likely component; see `estimate`.
+
+        Last comes whether (n,) the animal is the second component.
+        """
         camera_view = self.model.method.camera_view
         crops, others = scene.extract_both(depths, size, parallel, camera_view)
         first = self._sighted(crops, scene.crop_cameras(crops, camera_view), size, parallel)
         second = first.nothing()
+        turned = np.zeros(len(depths), np.bool_)
         unsure = np.flatnonzero(crops.n_blobs > 1)
         if len(unsure):
             others = others[unsure]
@@ -446,7 +469,8 @@ class PoseEstimator:
             kept = first[rows]
             first.put(rows, other[better])
             second.put(rows, kept)
-        return first, second
+            turned[rows] = True
+        return first, second, turned
 
     def _estimates(self, sight: Detection, size: float, parallel: bool) -> Estimates:
         """The chosen poses of a detection, in the camera frame."""

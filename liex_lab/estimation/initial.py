@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import ndtr
 
 from liex_lab.body.skeleton import REFERENCE_MM
 from liex_lab.foreground.height_maps import moment_columns
@@ -29,6 +30,7 @@ _JITTER = (
 )  # rad: spread of the headings of a long thin animal, and what a round one adds
 _JITTER_RISE = 0.03  # rad, at most
 _JITTER_MM = 2.0  # of the places, for an animal of the reference length
+_SCALED_BY = 0.1  # the paper scales all bones of a start by up to this, either way
 
 
 def draw_starts(rng: np.random.Generator, n_images: int, n_candidates: int) -> Array:
@@ -63,8 +65,8 @@ def start_poses(
 
     Along the long axis, every other start points the other way, and the headings are the more
     spread out the rounder the animal looks (METHOD lesson 8). The paper's start has any heading in
-    (-pi, pi), the base at the centroid and at the animal's mean height, and bones scaled by 0.9 to
-    1.1.
+    (-pi, pi), the base at the centroid and at the animal's mean height, and bones scaled by a
+    factor uniform in [0.9, 1.1].
 
     Args:
         moments: (n, 9) moments of the height map, see `HeightMaps`.
@@ -104,7 +106,8 @@ def start_poses(
         position[..., 2] = mean_height - _LOW * home_length * scale if camera_view else high
     else:
         heading = np.pi * starts[..., 3]
-        scale = size * (1.0 + 0.1 * np.clip(starts[..., 1] / 2.0, -1.0, 1.0))
+        # the quantile of a standard normal number is uniform
+        scale = size * (1.0 + _SCALED_BY * (2.0 * ndtr(starts[..., 1]) - 1.0))
         position[..., :2] = centre
         position[..., 2] = mean_height
     rotation = np.zeros((n, k, 3, 3))

@@ -47,7 +47,8 @@ class Method:
         metric_on_own: train the metric on the cascade's own candidates [6]; else on perturbed
             truth.
         metric_shrinkage: shrinkage of the metric's boosting; 0 grows a plain forest.
-        mean_shift_mm: bandwidth of the mode over tree votes, mm; 0 averages them.
+        mean_shift_mm: bandwidth of the mode over tree votes, mm, of regressors and metric, in
+            training and in estimation; 0 averages them.
         top_k: number of candidates that are averaged [3]; 1 takes the best one.
         top_tau: averaging weights decay with the predicted error by this, mm.
         top_radius_mm: only candidates within this of the best one are averaged, mm.
@@ -151,7 +152,7 @@ class Method:
         Fields that only some animals have are left out where they are unset.
         """
         return {
-            name: value
+            name: _plain_plan(value) if name in _PLANS and value else value
             for name, value in asdict(self).items()
             if name not in _UNSET or value != _UNSET[name]
         }
@@ -164,13 +165,19 @@ class Method:
             values: plain values, as from `to_dict`.
         """
         plain = dict(values)
-        plain["regressors"] = GrowthPlan(**plain["regressors"])
-        plain["metric"] = GrowthPlan(**plain["metric"])
         plain["home_turn"] = tuple(plain.get("home_turn", _UNSET["home_turn"]))
-        for name in ("pruner", "corrector", "proposals"):
+        for name in _PLANS:
             if plain.get(name):
                 plain[name] = GrowthPlan(**plain[name])
         return Method(**plain)
+
+
+_PLANS = ("regressors", "metric", "pruner", "corrector", "proposals")
+
+
+def _plain_plan(plan: dict[str, Any]) -> dict[str, Any]:
+    """A plan's fields, without a largest leaf where none is stated."""
+    return {name: value for name, value in plan.items() if name != "max_leaf" or value}
 
 
 _UNSET: dict[str, Any] = {
@@ -218,13 +225,14 @@ METHODS = {
         variant="paper",
         rounds=3,
         n_candidates=40,
-        training_candidates=6,
-        regressors=GrowthPlan(10, 24, 5, 100, 0.0, 0.0, 0.3, 0.63),
-        metric=GrowthPlan(20, 15, 5, 100, 0.0, 0.0, 0.3, 0.63),
+        training_candidates=2,
+        # leaves of 5 examples at most: the paper's l_n
+        regressors=GrowthPlan(10, 24, 1, 100, 0.0, 0.0, 0.3, 0.63, max_leaf=5),
+        metric=GrowthPlan(20, 15, 1, 100, 0.0, 0.0, 0.3, 0.63, max_leaf=5),
         reach_mm=50.0,
         axis_start=False,
         camera_view=True,
-        session_size=False,
+        session_size=True,  # fixed bones "with proper scaling"
         regress_scale=False,
         point_at=False,
         keep_turned=_FULL_TURN,
@@ -294,13 +302,13 @@ _OWN: dict[tuple[str, str], dict[str, Any]] = {
     ("fish", "paper"): {
         "rounds": 7,
         "reach_mm": 12.5,
-        "regressors": GrowthPlan(3, 24, 5, 100, 0.0, 0.0, 0.3, 0.63),
+        "regressors": GrowthPlan(3, 24, 1, 100, 0.0, 0.0, 0.3, 0.63, max_leaf=5),
     },
     ("hand", "default"): _HAND,
     ("hand", "paper"): {
         "n_candidates": 20,
         "reach_mm": 50.0,
-        "metric": GrowthPlan(20, 20, 5, 100, 0.0, 0.0, 0.3, 0.63),
+        "metric": GrowthPlan(20, 20, 1, 100, 0.0, 0.0, 0.3, 0.63, max_leaf=5),
         "home_turn": (3.1416, 0.0, 0.0),  # the palm is shown
     },
 }

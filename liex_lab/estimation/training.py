@@ -23,7 +23,7 @@ from liex_lab.estimation.cascade import Candidates, Cascade, ImageSet, Truth
 from liex_lab.estimation.initial import draw_starts, start_poses
 from liex_lab.estimation.method import Method
 from liex_lab.estimation.proposals import N_WAYS, propose, train_proposals
-from liex_lab.forests.forest import Forest, predict
+from liex_lab.forests.forest import Forest
 from liex_lab.forests.grow import boost_forest, grow_forest
 from liex_lab.geometry import SE3, so3
 
@@ -228,9 +228,8 @@ def train_cascade(
             rows = np.ascontiguousarray(labels, np.float32)
             forest, in_bag = grow_forest(samples, rows, keep, method.regressors, rng)
             forest = quantised(forest)
-            cascade.apply(
-                candidates, joint, predict(forest, samples, in_bag if method.out_of_bag else None)
-            )
+            told = cascade.predict(forest, samples, in_bag if method.out_of_bag else None)
+            cascade.apply(candidates, joint, told)
             rounds.append(forest)
         cascade.forests.append(rounds)
         n_done += len(rounds)

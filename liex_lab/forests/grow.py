@@ -57,6 +57,8 @@ class GrowthPlan:
             it.
         bag_share: share of the images that a tree sees, drawn without replacement, all samples of
             an image together (1: every tree sees all).
+        max_leaf: most samples of a leaf above the deepest level: a node with more is split by
+            whatever test separates it; 0 states no such number.
     """
 
     n_trees: int
@@ -67,6 +69,12 @@ class GrowthPlan:
     scalar_share: float
     depth_share: float
     bag_share: float
+    max_leaf: int = 0
+
+    @property
+    def least_to_split(self) -> int:
+        """Fewest samples of a node that is split."""
+        return max(2 * self.min_leaf, self.max_leaf + 1)
 
 
 class _SampleArrays(NamedTuple):
@@ -85,6 +93,7 @@ class _Growth(NamedTuple):
 
     max_depth: int
     min_leaf: int
+    least_to_split: int
     n_tests: int
     one_probe_share: float
     scalar_share: float
@@ -405,7 +414,7 @@ def _grow_tree(samples, growth, members, seed, nodes, leaves, counts):
         here = members[first:stop]
         middle = 0
         if (
-            here.size >= 2 * min_leaf
+            here.size >= growth.least_to_split
             and depth < growth.max_depth
             and _find_split(samples, growth, here, state, scratch, best)
         ):

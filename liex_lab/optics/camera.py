@@ -343,3 +343,7 @@ RAYTRIX_R5 = Camera(2363.0, 2363.0, 511.5, 511.5, 1024, 1024, source="typical Ra
 PRIMESENSE_QVGA = Camera(
     287.9, 287.9, 159.5, 119.5, 320, 240, source="typical PrimeSense at 320 x 240"
 )
+AZURE_KINECT = Camera(504.0, 504.0, 319.5, 287.5, 640, 576, source="typical Azure Kinect, narrow")
+REALSENSE_D435 = Camera(425.0, 425.0, 423.5, 239.5, 848, 480, source="typical RealSense D435")
+RAYTRIX_R5_WIDE = Camera(1800.0, 1800.0, 511.5, 511.5, 1024, 1024, source="R5, shorter lens")
+RAYTRIX_R5_LONG = Camera(2900.0, 2900.0, 639.5, 639.5, 1280, 1280, source="R5, longer lens")

@@ -12,7 +12,17 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from liex_lab.optics.camera import KINECT_V2, PRIMESENSE, PRIMESENSE_QVGA, RAYTRIX_R5, Camera
+from liex_lab.optics.camera import (
+    AZURE_KINECT,
+    KINECT_V2,
+    PRIMESENSE,
+    PRIMESENSE_QVGA,
+    RAYTRIX_R5,
+    RAYTRIX_R5_LONG,
+    RAYTRIX_R5_WIDE,
+    REALSENSE_D435,
+    Camera,
+)
 from liex_lab.simulation import _sensor_kernels as k
 
 Array = NDArray[np.float64]
@@ -142,3 +152,23 @@ BY_NAME = {
     sensor.name.lower().replace(" ", "-"): sensor
     for sensor in (KINECT_V2_SENSOR, PRIMESENSE_SENSOR, PRIMESENSE_QVGA_SENSOR, RAYTRIX_R5_SENSOR)
 }
+# of each noise model, cameras whose focal length and resolution no training picture has: those are
+# within 3 % of the makes in `SENSORS`, of the Raytrix R5 above or of the NYU camera
+_UNSEEN = {
+    k.PRIMESENSE_KIND: (Sensor("RealSense D435", REALSENSE_D435, k.PRIMESENSE_KIND),),
+    k.KINECT_V2_KIND: (Sensor("Azure Kinect", AZURE_KINECT, k.KINECT_V2_KIND),),
+    k.LIGHT_FIELD_KIND: (
+        Sensor("Raytrix R5 wide", RAYTRIX_R5_WIDE, k.LIGHT_FIELD_KIND, unit_mm=0.02, stride=2),
+        Sensor("Raytrix R5 long", RAYTRIX_R5_LONG, k.LIGHT_FIELD_KIND, unit_mm=0.02, stride=2),
+    ),
+}
+
+
+def unseen(sensors: tuple[Sensor, ...]) -> tuple[Sensor, ...]:
+    """Sensors that err as the given ones do, with cameras that no model was trained on.
+
+    Args:
+        sensors: makes that training pictures are drawn from.
+    """
+    kinds = dict.fromkeys(sensor.kind for sensor in sensors)
+    return tuple(sensor for kind in kinds for sensor in _UNSEEN[kind])

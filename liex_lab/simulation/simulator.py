@@ -155,7 +155,8 @@ class BodySimulator:
         """The recordings of a split; see `recording.test_split`.
 
         Args:
-            name: 'clean', 'hard' or 'other-body'.
+            name: 'clean', 'hard', 'other-body', 'other-camera', or 'sealed', see
+                `recording.SEALED`.
             spine_mm: length of every animal, mm; None draws it.
             n_sessions: how many recordings to make, from the first on.
 

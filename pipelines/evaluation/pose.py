@@ -1,9 +1,10 @@
 """Evaluation of single-frame poses: mean joint error on fixed splits of rendered recordings.
 
 `liex evaluate pose` measures the protocol of Lie-X (section 5.2, Tables 1 and 2) on rendered test
-splits, `clean`, `hard` (twice the noise, other objects in view) and `other-body` (unseen family of
-shapes), 40 recordings of 50 frames each for mouse and fish; none was trained on. As in a run,
-background, floor and animal's size are found by the product. Numbers, over all measured frames:
+splits, `clean`, `hard` (twice the noise, other objects in view), `other-body` (unseen family of
+shapes) and `other-camera` (unseen focal lengths and resolutions), 40 recordings of 50 frames each;
+none was trained on. As in a run, background, floor and animal's size are found by the product.
+Numbers, over all measured frames:
 
 - mean, median and 95 % quantile of the frame error e = mean_j |x_j - x_j^true|, mm;
 - flip rate (base-to-tip direction more than 90 degrees off) and share of frames without a pose;
@@ -42,7 +43,11 @@ _SIZES = (0.75, 1.0, 1.25, 1.5)  # of other animals, over their home length
 
 
 def estimator_of(
-    animal: str, variant: str, progress: Progress = silent, model: str | Path | None = None
+    animal: str,
+    variant: str,
+    progress: Progress = silent,
+    model: str | Path | None = None,
+    draw: int = 0,
 ) -> PoseEstimator:
     """The pose estimator of a model file or of a variant of the method.
 
@@ -52,6 +57,7 @@ def estimator_of(
             or taken from the cache.
         progress: told how far the training is, where there is one.
         model: name or path of a model file, which comes before the variant.
+        draw: number of the draw of a model that is trained, see `make_model`.
 
     Raises:
         ModelError: there is no such model, or its file is damaged.
@@ -64,7 +70,7 @@ def estimator_of(
 
     if model is not None or (variant == "default" and animal in bundled_models()):
         return PoseEstimator(Model.load(find_model(model or animal)))
-    return PoseEstimator(Model.load(cached_model(animal, variant, progress)))
+    return PoseEstimator(Model.load(cached_model(animal, variant, progress, draw)))
 
 
 def subject_of(
@@ -215,6 +221,10 @@ def evaluate_pose(
     from liex_lab.simulation.simulator import world_of
 
     world = world_of(Skeleton.load(animal))
+    if split not in world.splits:
+        raise LiexError(
+            f"there is no split '{split}' to measure poses on; known are {', '.join(world.splits)}"
+        )
     sessions = world.test_split(split, spine_mm=spine_mm)
     subject = subject_of(animal, variant, progress, model)
     if n_frames is not None:

@@ -183,7 +183,6 @@ def _one_by_one(paper: PoseEstimator, footage: _Footage) -> Array:
     from liex_lab.estimation.cascade import Candidates, ImageSet
     from liex_lab.estimation.initial import draw_starts, start_poses
     from liex_lab.estimation.training import base_at_front
-    from liex_lab.forests.forest import predict
 
     method = paper.model.method
     skeleton = paper.skeleton
@@ -215,7 +214,7 @@ def _one_by_one(paper: PoseEstimator, footage: _Footage) -> Array:
     )
     for _ in cascade.steps(images, poses):
         pass
-    return predict(paper.model.metric, cascade.metric_samples(images, poses))
+    return cascade.predict(paper.model.metric, cascade.metric_samples(images, poses))
 
 
 def _ms(job: Callable[[], Any]) -> float:

@@ -1,8 +1,7 @@
 """Training of the paper's baselines RF and CNN (Lie-X section 5.2), kept in the user's cache.
 
 RF is a pair of regression forests, CNN an AlexNet that regresses all joints. Both learn when they
-are first asked for, from rendered images like those of our own models, half of them degraded; the
-number of images is fixed here, so that a baseline stays what it is when our models learn from more.
+are first asked for, from the rendered pictures that the paper's variant learns from (`recipe_of`).
 """
 
 from __future__ import annotations
@@ -52,21 +51,15 @@ class Training:
 
 
 BASELINES: dict[str, ForestPlan | CnnPlan] = {"rf": ForestPlan(), "cnn": CnnPlan()}
-# about as many images as our own model of the animal learns from; the CNN sees as many in all,
-# whatever their number
-_N_IMAGES = {"mouse": 40_960, "hand": 20_480}
-_N_OTHERS = 16_384
-_SEEN = 122_880
-_DEGRADED = 0.5
+_SEEN = 122_880  # views of the CNN in all, whatever the number of images
 
 
 def training_of(variant: str, skeleton: Skeleton) -> Training:
-    """The training of a baseline: images as our own model learns from, half of them degraded.
+    """The training of a baseline: the pictures that the paper's variant learns from.
 
-    All animals are near home size since, like the paper's variant, the baselines are told nothing
-    of an animal's size. The number of images is the baseline's own (40,960 for the mouse, 20,480
-    for the hand, 16,384 for others); the CNN sees about 122,880 in all, over as many epochs as that
-    takes.
+    They are the same in number, noise and sizes (40,960 for the mouse, 20,480 for the hand, 16,384
+    for others, half of them degraded); the CNN sees about 122,880 in all, over as many epochs as
+    that takes.
 
     Args:
         variant: `rf` or `cnn`, a key of `BASELINES`.
@@ -74,13 +67,10 @@ def training_of(variant: str, skeleton: Skeleton) -> Training:
     """
     from .pose_model import recipe_of
 
-    n_images = _N_IMAGES.get(skeleton.name, _N_OTHERS)
-    recipe = replace(
-        recipe_of("paper", skeleton), n_images=n_images, n_calibration=0, degraded_share=_DEGRADED
-    )
+    recipe = replace(recipe_of("paper", skeleton), n_calibration=0)
     plan = BASELINES[variant]
     if isinstance(plan, CnnPlan):
-        plan = replace(plan, epochs=round(_SEEN / n_images))
+        plan = replace(plan, epochs=round(_SEEN / recipe.n_images))
     return Training(recipe, plan)
 
 
@@ -147,9 +137,9 @@ def train_baseline(
     from .pose_model import rendered_set
 
     recipe = training.recipe
-    data = rendered_set(
-        skeleton, method_of("paper", skeleton), recipe, 0, recipe.n_images, progress
-    )
+    # the paper's view of an animal whose size nobody knows
+    method = replace(method_of("paper", skeleton), session_size=False)
+    data = rendered_set(skeleton, method, recipe, 0, recipe.n_images, progress)
     began = time.perf_counter()
 
     def tell(share: float, what: str) -> None:

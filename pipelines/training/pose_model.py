@@ -75,6 +75,7 @@ class Recipe:
 # numbers of their own random numbers, so that each can be made again by itself
 _CALIBRATION = 1
 _CORRECTION = 2
+_DRAW = 3
 # of the images that an animal's predicted error is calibrated on show bodies that vary as
 # individuals do; intervals for bodies that vary far more, as the others do, are wider than most
 # animals need
@@ -83,9 +84,11 @@ _AREAS_MM2 = {
     "mouse": 1070.0
 }  # of home-sized animals seen from above, where it is not that of the home pose
 
+# the paper's variant and the baselines learn from the same pictures, noise and sizes: of animals
+# near home size, with as much noise as the default's
 RECIPES = {
     "default": Recipe(),
-    "paper": Recipe(n_images=10_240, n_correction=0, degraded_share=0.0, sizes=((0.0, 144),)),
+    "paper": Recipe(n_images=40_960, n_correction=0, n_calibration=4_096, sizes=((0.0, 144),)),
 }
 _AMOUNTS = ("n_images", "n_correction", "n_calibration", "degraded_share")
 _OWN_SIZES = (1.0, 0.8, 1.0, 1.25)  # of an animal of the user's own, over its home length
@@ -96,18 +99,13 @@ _OWN: dict[tuple[str, str], Recipe] = {
         seed=31, n_images=16_384, n_correction=4_096, n_calibration=4_096, sizes=_FISH_SIZES
     ),
     ("fish", "paper"): Recipe(
-        seed=31,
-        n_images=6_144,
-        n_correction=0,
-        n_calibration=2_048,
-        degraded_share=0.0,
-        sizes=((0.0, 272),),
+        seed=31, n_images=16_384, n_correction=0, n_calibration=2_048, sizes=((0.0, 272),)
     ),
     ("hand", "default"): Recipe(
         n_images=20_480, n_correction=0, n_calibration=4_096, sizes=((0.0, 320),)
     ),
     ("hand", "paper"): Recipe(
-        n_images=8_192, n_correction=0, n_calibration=2_048, degraded_share=0.0, sizes=((0.0, 320),)
+        n_images=20_480, n_correction=0, n_calibration=2_048, sizes=((0.0, 320),)
     ),
 }
 
@@ -146,6 +144,7 @@ def train_model(
     *,
     workers: int = 0,
     n_images: int | None = None,
+    draw: int = 0,
     progress: Progress = silent,
 ) -> Path:
     """Train an animal's pose model and write it with its card beside it (`.json`).
@@ -160,6 +159,8 @@ def train_model(
         workers: threads of the kernels, at most those of the machine; 0 takes all of them.
         n_images: images to train on instead of what the recipe says, and a quarter of that each for
             the correction and for the calibration.
+        draw: number of the draw of everything random in training but the pictures, see
+            `make_model`.
         progress: told how far the job is.
 
     Returns:
@@ -178,7 +179,7 @@ def train_model(
         recipe = replace(
             recipe, n_images=n_images, n_correction=n_images // 4, n_calibration=n_images // 4
         )
-    model = make_model(skeleton, method_of(variant, skeleton), recipe, progress)
+    model = make_model(skeleton, method_of(variant, skeleton), recipe, progress, draw)
     path = Path(out)
     path.parent.mkdir(parents=True, exist_ok=True)
     content = model.to_bytes()
@@ -193,7 +194,9 @@ def train_model(
 
 
 @serial_products()
-def make_model(skeleton: Skeleton, method: Method, recipe: Recipe, progress: Progress) -> Model:
+def make_model(
+    skeleton: Skeleton, method: Method, recipe: Recipe, progress: Progress, draw: int = 0
+) -> Model:
     """A trained model: cascade, learned metric, and what held-out images teach of its choices.
 
     The cascade and the metric are Algorithm 2 of Lie-X. Images that no tree has seen then teach the
@@ -206,6 +209,9 @@ def make_model(skeleton: Skeleton, method: Method, recipe: Recipe, progress: Pro
         method: the variant's numbers: rounds, candidates, growth of the forests.
         recipe: how many images of what.
         progress: told how far the job is.
+        draw: number of the draw of all that is random in growing the forests: initial poses, bags
+            and tests; the pictures are the same. Models of several draws tell how much of an
+            error is luck.
 
     Returns:
         The model with its card, in memory.
@@ -216,7 +222,7 @@ def make_model(skeleton: Skeleton, method: Method, recipe: Recipe, progress: Pro
     from liex_lab.foreground.height_maps import moment_columns
     from liex_lab.simulation.simulator import world_of
 
-    rng = np.random.default_rng(recipe.seed)
+    rng = np.random.default_rng([recipe.seed, _DRAW, draw] if draw else recipe.seed)
     data = rendered_set(skeleton, method, recipe, 0, recipe.n_images, progress)
     steps = len(skeleton.solved) * method.rounds + 2
 
@@ -236,6 +242,7 @@ def make_model(skeleton: Skeleton, method: Method, recipe: Recipe, progress: Pro
         "made_by": "liex train",
         "recipe": vars(recipe),
         "images": world_of(skeleton).sources,
+        **({"draw": draw} if draw else {}),
     }
     model = Model(cascade, metric, None, skeleton.table, Calibration(area_mm2=area), card, pruner)
     if recipe.n_correction and (method.corrector is not None or method.settle):
@@ -458,7 +465,7 @@ def home_area_mm2(skeleton: Skeleton) -> float:
     return _AREAS_MM2.get(skeleton.name) or Surface.of(skeleton).area_mm2
 
 
-def cached_model(animal: str, variant: str, progress: Progress = silent) -> Path:
+def cached_model(animal: str, variant: str, progress: Progress = silent, draw: int = 0) -> Path:
     """The path of a model that is not bundled: trained once, kept in the user's cache folder.
 
     Its name holds a hash of the program's version, method, recipe and skeleton; where one of these
@@ -468,9 +475,24 @@ def cached_model(animal: str, variant: str, progress: Progress = silent) -> Path
         animal: a bundled animal's name, or the path of a skeleton's TOML.
         variant: `default` or `paper`.
         progress: told how far the training is, where there is one.
+        draw: number of the draw, see `make_model`.
 
     Returns:
         The path of the model (.npz).
+    """
+    path = cache_path(animal, variant, draw)
+    if path.is_file():
+        return path
+    return train_model(animal, variant, path, draw=draw, progress=progress)
+
+
+def cache_path(animal: str, variant: str, draw: int = 0) -> Path:
+    """Where the cache keeps a model that is not bundled, whether or not it is there yet.
+
+    Args:
+        animal: a bundled animal's name, or the path of a skeleton's TOML.
+        variant: `default` or `paper`.
+        draw: number of the draw, see `make_model`.
     """
     from liex_lab.body.skeleton import Skeleton
     from liex_lab.estimation.method import method_of
@@ -487,8 +509,8 @@ def cached_model(animal: str, variant: str, progress: Progress = silent) -> Path
     key = hashlib.sha256(
         json.dumps([package_version("liex_lab"), made_from], sort_keys=True).encode()
     ).hexdigest()[:12]
-    path = cache_folder() / f"{skeleton.name}-{variant}-{key}.npz"
-    return path if path.is_file() else train_model(animal, variant, path, progress=progress)
+    number = f"-{draw}" if draw else ""
+    return cache_folder() / f"{skeleton.name}-{variant}-{key}{number}.npz"
 
 
 def cache_folder() -> Path:

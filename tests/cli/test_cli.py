@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from liex_lab.pipelines.evaluation.paper.deviations import DEVIATIONS
 from typer.testing import CliRunner
 
 import liex_lab
@@ -358,7 +359,18 @@ def test_evaluate_tables_names_what_it_wrote(
     ]
     result = CliRunner().invoke(cli.app, ["evaluate", "tables", *words])
     assert result.output == f"{tmp_path / 'tables.md'}\n"
-    assert seen == [tmp_path, ["mouse", "fish"], {"n_frames": 50, "quick": True, "fresh": False}]
+    fewer = {"n_frames": 50, "quick": True, "fresh": False, "rows": (), "sealed": False}
+    assert seen == [tmp_path, ["mouse", "fish"], fewer]
+    seen.clear()
+    CliRunner().invoke(cli.app, ["evaluate", "tables", *words[:4], "--row", "rf", "--sealed"])
+    sealed = {"n_frames": None, "quick": False, "fresh": False, "rows": ["rf"], "sealed": True}
+    assert seen == [tmp_path, ["mouse"], sealed]
+
+
+def test_the_help_of_the_tables_says_in_what_they_differ_from_the_paper() -> None:
+    told = " ".join(CliRunner().invoke(cli.app, ["evaluate", "tables", "--help"]).output.split())
+    for sentence in DEVIATIONS:
+        assert sentence in told
 
 
 def test_evaluate_speed_measures_recordings_where_asked(

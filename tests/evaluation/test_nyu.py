@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from liex_lab.pipelines.evaluation import nyu
 
 from liex_lab.evaluation.nyu import nyu_errors
 from liex_lab.recordings.formats.images.nyu_labels import PALM, POINTS, NyuReference
@@ -89,3 +90,15 @@ def test_lost_frames_are_told_and_not_averaged() -> None:
     found = nyu_errors(answer, truth)
     assert (found["lost_rate"], found["root_estimated_mm_14"]) == pytest.approx((0.1, 2.0))
     assert nyu_errors(np.full_like(truth, np.nan), truth) == {"n_frames": 10, "lost_rate": 1.0}
+
+
+def test_what_comes_from_test_labels_stands_beside_every_score(folder: Path) -> None:
+    told = nyu.labels_used(np.array([1, 2440, 2441]))
+    assert "55 %" in told
+    assert "frames 1 to 2440" in told
+    assert told.endswith("measured on: 2 of 3.")
+    truth = NyuReference.load(folder)
+    numbers = nyu._frame_numbers(folder, len(truth.truth))
+    assert numbers.tolist() == [1]
+    same = nyu_errors(truth.answers["liex"][numbers - 1], truth.truth[numbers - 1])
+    assert same["root_given_mm_14"] == pytest.approx(7.8645, abs=5e-4)

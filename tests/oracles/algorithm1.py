@@ -9,6 +9,7 @@ is shared with `oracles.forest`.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import erf
 
 import numpy as np
 from numpy.typing import NDArray
@@ -132,7 +133,8 @@ def start(model: Model, moments: Array, number: int, drawn: Array, size: float) 
             0.2 * length * size,
         ]
     else:
-        heading, scale = np.pi * drawn[3], size * (1 + 0.1 * min(max(drawn[1] / 2, -1), 1))
+        # uniform in [0.9, 1.1]: what share of a bell lies below the number that was drawn
+        heading, scale = np.pi * drawn[3], size * (1 + 0.1 * erf(drawn[1] / np.sqrt(2)))
         place = [x, y, volume / max(area, 1)]
     base = motion.exp([0, 0, heading, 0, 0, 0])
     base[:3, 3] = place
@@ -207,5 +209,8 @@ def solve(model: Model, picture: Picture, candidate: Candidate) -> Candidate:
             picture.size,
         )
         scalars = np.append(scalars, np.floor(np.clip(fit, -32768, 32767)).astype(np.float32))
-    candidate.score = float(votes_of(model.metric, picture, views, scalars).mean())
+    told = votes_of(model.metric, picture, views, scalars)
+    candidate.score = float(
+        mode(told, method.mean_shift_mm)[0] if method.mean_shift_mm else told.mean()
+    )
     return candidate

@@ -16,8 +16,16 @@ from liex_lab.optics.camera import Camera
 from liex_lab.simulation import _sensor_kernels as k
 from liex_lab.simulation.locomotion import walking_session
 from liex_lab.simulation.pose_prior import KINDS, sample_postures
-from liex_lab.simulation.recording import SyntheticSession, test_split
+from liex_lab.simulation.recording import (
+    _SEALED_SEED,
+    SEALED,
+    SPLITS,
+    SyntheticSession,
+    split_of,
+    test_split,
+)
 from liex_lab.simulation.sensors import KINECT_V2_SENSOR, PRIMESENSE_SENSOR, SENSORS
+from liex_lab.simulation.simulator import world_of
 from liex_lab.simulation.training_patches import (
     BLOCK,
     PER_SESSION,
@@ -327,8 +335,29 @@ def test_the_splits_are_fixed_halved_between_sensors_and_apart() -> None:
     assert 0.3 < np.mean([s.contents.shown.mean() for s in hard]) < 0.65
     assert len({s.spine_mm for s in clean + hard}) == 8
     assert test_split("clean", spine_mm=80.0, n_sessions=1)[0].spine_mm == 80.0
-    with pytest.raises(LiexError, match="known are clean, hard, other-body"):
+    with pytest.raises(LiexError, match="known are clean, hard, other-body, other-camera"):
         test_split("easy")
+
+
+@pytest.mark.parametrize("animal", ["mouse", "fish", "hand"])
+def test_cameras_of_a_split_have_a_focal_length_that_no_training_picture_has(animal):
+    world = world_of(Skeleton.load(animal))
+    (learned,) = world.training_blocks(5, 1)
+    focal = np.unique(learned.intrinsics[:, 0])
+    for recording in world.test_split("other-camera", n_sessions=2):
+        whole = recording.camera.fx
+        for seen in (focal, focal * 2.0):  # a light field is read at every second pixel
+            assert np.abs(np.log(seen / whole)).min() > 0.06
+    assert {r.camera.fx for r in world.test_split("other-camera", n_sessions=2)} != {
+        r.camera.fx for r in world.test_split("clean", n_sessions=2)
+    }
+
+
+def test_the_sealed_split_has_all_kinds_of_recordings_and_a_seed_of_its_own():
+    assert SEALED not in SPLITS
+    assert _SEALED_SEED not in {seed for seed, *_ in SPLITS.values()}
+    assert [split_of(SEALED, k) for k in range(5)] == [*SPLITS, "clean"]
+    assert split_of("hard", 3) == "hard"
 
 
 def test_another_object_never_touches_the_animal_in_the_picture() -> None:

@@ -27,6 +27,7 @@ _N_POSTURES = 8
 _N_TURNS = 8
 _N_AXES = 6
 _FREE_SHARE = 0.45  # of the training postures are what a hand can do, not what was seen
+SEEN_SHARE = 1.0 - _FREE_SHARE  # come from the labelled points of NYU test frames
 _FAN_DEG = {
     "index": 10.0,
     "middle": 1.0,

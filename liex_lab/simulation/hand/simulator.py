@@ -36,8 +36,8 @@ from liex_lab.simulation.hand import scene
 from liex_lab.simulation.hand.gestures import draw_gestures
 from liex_lab.simulation.hand.pose_prior import draw_seen, draw_wide
 from liex_lab.simulation.pose_prior import SIZE_RANGE
-from liex_lab.simulation.recording import TrueRecording
-from liex_lab.simulation.sensors import KINECT_V2_SENSOR, Sensor
+from liex_lab.simulation.recording import OTHER_CAMERA, SEALED, TrueRecording, split_of
+from liex_lab.simulation.sensors import KINECT_V2_SENSOR, Sensor, unseen
 from liex_lab.simulation.training_patches import BLOCK, PER_SESSION, TrainingPatches, _degrade
 
 Array = NDArray[np.float64]
@@ -52,7 +52,9 @@ SPLITS = {
     "clean": (81_001, "train", 1.0, 0, 0.0),
     "hard": (82_001, "train", 2.0, 1, 0.5),
     "other-body": (84_001, "other", 1.0, 0, 0.0),
+    OTHER_CAMERA: (85_001, "train", 1.0, 0, 0.0),
 }
+_SEALED_SEED = 980_413  # of the split that is measured once, see `recording.SEALED`
 # training pictures: (sensor, pixels of it that one pixel stands for, nearest and farthest hand,
 # share)
 _KINDS = (
@@ -304,7 +306,8 @@ class HandSimulator:
         """The recordings of a split: 40 of 50 independent frames, each of another person.
 
         Args:
-            name: 'clean', 'hard' or 'other-body'.
+            name: 'clean', 'hard', 'other-body', 'other-camera', or 'sealed', see
+                `recording.SEALED`.
             spine_mm: length of every hand, mm; None draws it.
             n_sessions: takes only the first so many.
 
@@ -314,20 +317,34 @@ class HandSimulator:
         Raises:
             LiexError: there is no split of this name.
         """
-        if name not in SPLITS:
+        if name not in (*SPLITS, SEALED):
             raise LiexError(f"there is no split '{name}'; known are {', '.join(SPLITS)}")
-        seed, family, noise, erosion_px, thing_share = SPLITS[name]
-        return [
-            self._session(
-                [seed, k], f"{name}-{k:02d}", family, noise, erosion_px, thing_share, spine_mm
+        others = unseen((NYU_SENSOR, KINECT_V2_SENSOR))
+        sessions = []
+        for k in range(n_sessions):
+            kind = split_of(name, k)
+            seed, family, noise, erosion_px, thing_share = SPLITS[kind]
+            turn = k if name != SEALED else k // len(SPLITS)
+            sensor = others[turn % len(others)] if kind == OTHER_CAMERA else NYU_SENSOR
+            sessions.append(
+                self._session(
+                    [seed if name != SEALED else _SEALED_SEED, k],
+                    f"{name}-{k:02d}",
+                    sensor,
+                    family,
+                    noise,
+                    erosion_px,
+                    thing_share,
+                    spine_mm,
+                )
             )
-            for k in range(n_sessions)
-        ]
+        return sessions
 
     def _session(
         self,
         seed: list[int],
         name: str,
+        sensor: Sensor,
         family: str,
         noise: float,
         erosion_px: int,
@@ -337,7 +354,7 @@ class HandSimulator:
         """Independent frames of one person."""
         rng = np.random.default_rng(seed)
         n = N_FRAMES
-        camera = NYU_SENSOR.camera
+        camera = sensor.camera
         drawn = float(rng.uniform(*SIZE_RANGE))
         size = np.full(n, drawn if spine_mm is None else spine_mm / self.skeleton.length)
         shape = _same(draw_hands(rng, self.skeleton, family, 1), n)
@@ -355,11 +372,11 @@ class HandSimulator:
             size,
             scene.draw_places(rng, intrinsics, picture.astype(float), low, high),
         )
-        parameters = np.repeat(NYU_SENSOR.draw(rng, 1, np.zeros(1), noise, erosion_px), n, axis=0)
+        parameters = np.repeat(sensor.draw(rng, 1, np.zeros(1), noise, erosion_px), n, axis=0)
         contents = scene.assemble(
             rng, self.skeleton, pose, shape, size, intrinsics, parameters, thing_share, 1
         )
-        return HandSession(name, self.skeleton, NYU_SENSOR, contents)
+        return HandSession(name, self.skeleton, sensor, contents)
 
     def _test_postures(self, rng: np.random.Generator, n: int) -> tuple[Array, Array]:
         """Angles (n, J, 3) and T_view_palm (n, 3, 3) that no training picture was drawn after,

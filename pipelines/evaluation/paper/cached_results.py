@@ -1,7 +1,8 @@
 """Cache of evaluation results whose models take long to train: JSON in `datasets/kept_results`.
 
-Each row is kept with how it was made (recipe, method, command, version) and with the true joints of
-each split's first frame; it is used again only where both agree with what would be measured now.
+Each row is kept with how it was made (recipe, method, command, version) and with hashes of code,
+training pictures, models, test pictures and foreground; it is used again only where all of them
+agree with what would be measured now, and refused with the reason where one does not.
 """
 
 from __future__ import annotations
@@ -11,16 +12,14 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from liex_lab.catalog import kept_results_folder
 from liex_lab.errors import LiexError
 
 if TYPE_CHECKING:
-    from liex_lab.simulation.recording import TrueRecording
+    from .common_view import CommonView
 
-SCHEMA = 1
-_SAME_MM = 0.05  # joints of the same test frame differ by less than this between machines
+SCHEMA = 2
+_HASHED = {"learning_code": "code", "training_pictures": "training pictures"}
 
 
 def kept_results(animal: str, folder: Path | None = None) -> dict[str, Any]:
@@ -79,33 +78,35 @@ def keep_results(
     return path
 
 
-def fits(
+def why_refused(
     row: Mapping[str, Any],
     made_from: Mapping[str, Any],
-    tests: Mapping[str, Sequence[TrueRecording]],
-) -> bool:
-    """Whether a kept row is of the same training and the same test frames as would be measured now.
+    hashes: Mapping[str, Any],
+    views: Mapping[str, Sequence[CommonView]],
+) -> str:
+    """Why a kept row must not stand for what would be measured now; empty where it may.
 
     Args:
         row: the kept row.
         made_from: how the row's model would be trained now.
-        tests: recordings by split; each split's first frame has to agree within 0.05 mm.
+        hashes: of today's code, training pictures and, where they are at hand, models; see
+            `run.hashes_of`.
+        views: what every row is given now, by split and recording; a kept row of more recordings
+            does not fit.
     """
-    if row["made"]["from"] != json.loads(json.dumps(made_from)):
-        return False
-    for split, sessions in tests.items():
-        known = row["splits"].get(split)
-        if known is None or not np.allclose(
-            known["first_joints_mm"], first_joints(sessions), atol=_SAME_MM
-        ):
-            return False
-    return True
-
-
-def first_joints(sessions: Sequence[TrueRecording]) -> list[list[float]]:
-    """True joints (J, 3), mm, camera frame, of a split's first frame, by which it is recognised.
-
-    Args:
-        sessions: recordings of the split with their truth.
-    """
-    return [[round(float(x), 3) for x in joint] for joint in sessions[0].joints_camera[0]]
+    made = row["made"]
+    if made["from"] != json.loads(json.dumps(made_from)):
+        return "the kept row is of another training or method"
+    for name, what in _HASHED.items():
+        if made.get(name) != hashes[name]:
+            return f"the kept row is of other {what}"
+    known = made.get("models", [])
+    if len(known) != len(hashes["models"]) or any(
+        now is not None and now != then for now, then in zip(hashes["models"], known, strict=True)
+    ):
+        return "the kept row is of another model file"
+    for split, ours in views.items():
+        prints = row["splits"].get(split, {}).get("fingerprints")
+        if prints != [one.fingerprint for one in ours]:
+            return f"the kept row is of other test pictures or another foreground on {split}"
+    return ""

@@ -143,10 +143,8 @@ def _follow(
 
 def _scores(model: Model, data: TrainingSet, candidates: Candidates) -> Array:
     """What the learned metric says of finished candidates (n K,), mm at home size."""
-    from liex_lab.forests.forest import predict
-
     samples = model.cascade.metric_samples(data.images, candidates)
-    return predict(model.metric, samples)[:, 0].astype(float)
+    return model.cascade.predict(model.metric, samples)[:, 0].astype(float)
 
 
 def _rank_correlation(scores: Array, errors: Array) -> float:

@@ -20,6 +20,8 @@ if TYPE_CHECKING:
     from liex_lab.estimation.estimator import PoseEstimator
     from liex_lab.estimation.training import TrainingSet
 
+    from .rows import Subject
+
 _N_PAPER = 1_024
 _N_BASELINE = 2_048
 QUICK_SWEEP = Sweep(
@@ -35,10 +37,8 @@ QUICK_SWEEP = Sweep(
 )
 
 
-def quick_subject(
-    animal: str, variant: str, progress: Progress = silent
-) -> PoseEstimator | Baseline:
-    """As `pose.subject_of`, from next to no training; the default is the bundled model.
+def quick_runs(animal: str, variant: str, progress: Progress = silent) -> list[Subject]:
+    """As `rows.runs_of`, from next to no training; the default is the bundled model.
 
     Args:
         animal: a bundled animal's name, or the path of a skeleton's TOML.
@@ -48,19 +48,14 @@ def quick_subject(
     Raises:
         MissingPackageError: the CNN is asked for and torch is not installed.
     """
-    from liex_lab.baselines.ablations import PlainMean
-    from liex_lab.estimation.estimator import PoseEstimator
-
     from ..pose import estimator_of
+    from .rows import runs_of_models
 
     if variant == "default":
-        return estimator_of(animal, "default")
+        return [estimator_of(animal, "default")]
     if variant in ("rf", "cnn"):
-        return _quick_baseline(animal, variant)
-    paper = _quick_paper(animal)
-    if variant == "paper-no-metric":
-        return PlainMean(paper)
-    return PoseEstimator(paper.model, 1) if variant == "paper-one-pose" else paper
+        return [_quick_baseline(animal, variant)]
+    return runs_of_models(variant, [_quick_paper(animal)])
 
 
 @cache
@@ -105,4 +100,5 @@ def _quick_set(animal: str) -> TrainingSet:
 
     skeleton = Skeleton.load(animal)
     recipe = training_of("rf", skeleton).recipe
-    return rendered_set(skeleton, method_of("paper", skeleton), recipe, 0, _N_BASELINE, silent)
+    method = replace(method_of("paper", skeleton), session_size=False)
+    return rendered_set(skeleton, method, recipe, 0, _N_BASELINE, silent)

@@ -14,8 +14,9 @@ class Results:
         animal: name of the skeleton.
         joints: names of its joints.
         splits: names of the test splits.
-        rows: figures by variant, see `run.measured_rows`.
-        missing: by variant, why its row is not there.
+        rows: figures by variant, see `rows.measured_rows`.
+        missing: by variant, why its row is not there; by figure and variant, why its curve is not.
+        sealed: the split is the one that is measured once.
         sensitivity: curves by variant, see `sensitivity.sensitivity`.
         illustration: of the default, see `illustrations.illustrate`.
     """
@@ -25,5 +26,6 @@ class Results:
     splits: list[str]
     rows: dict[str, dict[str, Any]] = field(default_factory=dict)
     missing: dict[str, str] = field(default_factory=dict)
+    sealed: bool = False
     sensitivity: dict[str, Any] = field(default_factory=dict)
     illustration: dict[str, Any] = field(default_factory=dict)

@@ -2,11 +2,12 @@
 
 `liex evaluate tables` measures six rows on an animal's test splits (40 recordings each): our
 default, Lie-X as the paper has it, its ablations without multiple initial poses and without the
-learned metric, and the baselines RF and CNN. All see the same frames, cut out by the product's own
-foreground. Numbers: the figures of `liex evaluate pose`, error of each joint and 101 quantiles of
-the error distribution (Fig 8), mm; frames/s on at most two cores; sensitivity to five parameters
-(Fig 7); candidates and convergence of one image (Fig 13 to 16). Rows whose models take long to
-train may be taken from kept results, if they fit the same training and the same frames.
+learned metric, and the baselines RF and CNN. All see the same frames and, in each, the same object
+with the same size (`common_view`). Numbers: those of `rows`, 101 quantiles of the error (Fig 8),
+frames/s on at most two cores, sensitivity to five parameters (Fig 7), candidates and convergence of
+one image (Fig 13 to 16). Rows whose models take long to train come from kept results where these
+are of today's code, training and test pictures; a row of which they are not is left out, and the
+command that measures it anew stands in its place.
 """
 
 from __future__ import annotations
@@ -16,51 +17,80 @@ import platform
 import shlex
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
-import numpy as np
-
 from liex_lab.catalog import MODELS
-from liex_lab.errors import MissingPackageError
-from liex_lab.evaluation.pose import PoseErrors, plain
+from liex_lab.errors import MissingPackageError, PlanError
+from liex_lab.evaluation.pose import plain
 from liex_lab.runtime.progress import Progress, silent
 
-from ...build import plan_of
 from .results import Results
+from .rows import ROWS, TRAINING_DRAWS
 
 if TYPE_CHECKING:
-    from liex_lab.baselines.baseline import Baseline
     from liex_lab.body.skeleton import Skeleton
     from liex_lab.estimation.estimator import PoseEstimator
     from liex_lab.simulation.recording import TrueRecording
 
-ROWS = ("default", "paper", "paper-one-pose", "paper-no-metric", "rf", "cnn")
+    from .common_view import CommonView
+    from .rows import Subject
+
 SWEPT = ("paper", "default")  # variants whose sensitivity is drawn
-_RATE_FRAMES = 128
-_RATE_REPEATS = 3
 _N_SESSIONS = 40
 _QUICK_FRAMES = 100
-_QUANTILES = 101
 Draw = Callable[[Mapping[str, Any], Path], list[Path]]
 
 
 @dataclass(frozen=True)
 class Budget:
-    """How much is measured.
+    """How much is measured, and of what.
 
     Attributes:
         n_frames: frames of each split, rounded up to whole recordings; None takes all.
-        kept: results that fit are taken from datasets/kept_results.
+        fresh: rows that are trained and measured now; the others come from datasets/kept_results.
+        kept: results that fit are taken from there.
         quick: every row is trained on next to nothing, to see that everything runs.
+        sealed: the sealed split is measured instead of the others.
         n_illustrated: images behind the figures of candidates and convergence.
     """
 
     n_frames: int | None = None
+    fresh: tuple[str, ...] = ()
     kept: bool = True
     quick: bool = False
+    sealed: bool = False
     n_illustrated: int = 128
+
+    @staticmethod
+    def of(
+        n_frames: int | None, quick: bool, fresh: bool, rows: Sequence[str], sealed: bool
+    ) -> Budget:
+        """What the options of the command line ask for.
+
+        Args:
+            n_frames: frames of each split; with any, nothing kept is used.
+            quick: every row is trained on next to nothing.
+            fresh: the rows are trained and measured now.
+            rows: names of rows; () takes all.
+            sealed: the sealed split; with it, nothing kept is used.
+
+        Raises:
+            PlanError: there is no such row.
+        """
+        if unknown := [row for row in rows if row not in ROWS]:
+            raise PlanError(f"there is no row '{unknown[0]}'; known are {', '.join(ROWS)}")
+        wanted = tuple(row for row in ROWS if not rows or row in rows or row == "default")
+        if quick:
+            return Budget(n_frames or _QUICK_FRAMES, wanted, False, True, sealed, 16)
+        whole = n_frames is None and not sealed
+        return Budget(
+            n_frames,
+            wanted if fresh or not whole else ("default",),
+            whole and not (fresh and not rows),
+            False,
+            sealed,
+        )
 
 
 def make_tables(
@@ -70,6 +100,8 @@ def make_tables(
     n_frames: int | None = None,
     quick: bool = False,
     fresh: bool = False,
+    rows: Sequence[str] = (),
+    sealed: bool = False,
     draw: Draw | None = None,
     progress: Progress = silent,
 ) -> list[Path]:
@@ -78,23 +110,26 @@ def make_tables(
     Args:
         out: the folder; it is made where it is missing.
         animals: names of bundled animals.
-        n_frames: frames of each split; None takes all.
+        n_frames: frames of each split, of which every row is then measured; None takes all.
         quick: few frames, every row trained on next to nothing; its numbers say only that
             everything runs.
-        fresh: nothing kept is used.
+        fresh: rows are trained and measured now, not taken from kept results.
+        rows: only these rows are, beside the default; () takes all.
+        sealed: measure the sealed split instead of the others, as is done once when an issue ends.
         draw: makes the figures from what `results` holds, by animal, in the folder.
         progress: told how far the job is.
 
     Returns:
         The paths of all files that were written.
+
+    Raises:
+        PlanError: there is no such row.
     """
     from .cached_results import keep_results
     from .table_text import write_tables
 
-    budget = Budget(n_frames, kept=not fresh)
-    if quick:
-        budget = Budget(n_frames or _QUICK_FRAMES, kept=False, quick=True, n_illustrated=16)
-    command = _command(animals, n_frames, quick, fresh)
+    budget = Budget.of(n_frames, quick, fresh, rows, sealed)
+    command = _command(animals, n_frames, quick, fresh, rows, sealed)
     folder = Path(out)
     folder.mkdir(parents=True, exist_ok=True)
     all_results = [results_of(animal, budget, command, progress) for animal in animals]
@@ -108,11 +143,23 @@ def make_tables(
     return written
 
 
-def _command(animals: Sequence[str], n_frames: int | None, quick: bool, fresh: bool) -> str:
+def _command(
+    animals: Sequence[str],
+    n_frames: int | None,
+    quick: bool,
+    fresh: bool,
+    rows: Sequence[str] = (),
+    sealed: bool = False,
+) -> str:
     """The command line that makes the same numbers."""
     words = ["liex", "evaluate", "tables", *(f"--animal={animal}" for animal in animals)]
     words += [f"--frames={n_frames}"] if n_frames else []
-    return shlex.join([*words, *(["--quick"] if quick else []), *(["--fresh"] if fresh else [])])
+    words += [
+        name
+        for name, given in (("--quick", quick), ("--fresh", fresh), ("--sealed", sealed))
+        if given
+    ]
+    return shlex.join([*words, *(f"--row={row}" for row in rows)])
 
 
 def _unmarked(rows: Mapping[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
@@ -132,53 +179,100 @@ def results_of(animal: str, budget: Budget, command: str, progress: Progress) ->
         progress: told how far the job is.
     """
     from liex_lab.body.skeleton import Skeleton
-    from liex_lab.simulation.simulator import world_of
 
-    from .cached_results import fits, kept_results
     from .illustrations import illustrate
+    from .rows import common_views, measured_rows
 
     skeleton = Skeleton.load(animal)
+    tests = _tests(skeleton, budget)
+    results = Results(skeleton.name, list(skeleton.names), list(tests), sealed=budget.sealed)
+    default = _subjects(animal, ["default"], budget, results, progress)
+    chooser = cast("PoseEstimator", default["default"][0])
+    views = common_views(animal, chooser, tests, progress)
+    kept = _kept(skeleton, budget, views, results)
+    wanted = [name for name in budget.fresh if name != "default"]
+    runs = default | _subjects(animal, wanted, budget, results, progress)
+    for name, row in measured_rows(animal, runs, tests, views, progress).items():
+        made = {"quick": True} if budget.quick else made_from(name, skeleton)
+        known = {} if budget.quick else hashes_of(animal, name)
+        n_models = 1 if budget.quick else TRAINING_DRAWS.get(name, 1)
+        results.rows[name] = {
+            "origin": "measured",
+            "made": {
+                "from": made,
+                "command": command,
+                "seeds": list(range(n_models)),
+                **known,
+                **_made_by(),
+            },
+            **row,
+        }
+    results.rows = {name: results.rows[name] for name in ROWS if name in results.rows}
+    results.sensitivity = _sensitivities(skeleton, kept, budget, command, results, progress)
+    progress(0, None, f"{skeleton.name}: candidates and convergence")
+    results.illustration = illustrate(chooser.model, budget.n_illustrated)
+    return results
+
+
+def _tests(skeleton: Skeleton, budget: Budget) -> dict[str, Sequence[TrueRecording]]:
+    """The recordings by split."""
+    from liex_lab.simulation.recording import SEALED
+    from liex_lab.simulation.simulator import world_of
+
     world = world_of(skeleton)
     n_sessions = _N_SESSIONS
     if budget.n_frames is not None:
         n_sessions = -(-budget.n_frames // len(world.test_split(world.splits[0], n_sessions=1)[0]))
-    tests = {split: world.test_split(split, n_sessions=n_sessions) for split in world.splits}
-    results = Results(skeleton.name, list(skeleton.names), list(world.splits))
-    kept = kept_results(skeleton.name) if budget.kept else {"rows": {}, "sensitivity": {}}
-    for name in ROWS[1:]:
+    splits = (SEALED,) if budget.sealed else world.splits
+    return {split: world.test_split(split, n_sessions=n_sessions) for split in splits}
+
+
+def _kept(
+    skeleton: Skeleton,
+    budget: Budget,
+    views: Mapping[str, Sequence[CommonView]],
+    results: Results,
+) -> Mapping[str, Any]:
+    """Kept rows that fit go into the results, why another does not into `missing`; the curves."""
+    from .cached_results import kept_results, why_refused
+
+    if not budget.kept:
+        for name in ROWS:
+            if name not in budget.fresh:
+                results.missing[name] = "it was not asked for"
+        return {}
+    kept = kept_results(skeleton.name)
+    for name in ROWS:
+        if name in budget.fresh:
+            continue
         row = kept["rows"].get(name)
-        if row is not None and fits(row, made_from(name, skeleton), tests):
+        why = "no row is kept"
+        if row is not None:
+            made = made_from(name, skeleton)
+            why = why_refused(row, made, hashes_of(skeleton.name, name), views)
+        if row is None or why:
+            results.missing[name] = f"{why}; {_anew(skeleton.name, name)} measures it"
+        else:
             results.rows[name] = {**row, "origin": "kept"}
-    subjects = _subjects(
-        animal, [name for name in ROWS if name not in results.rows], budget, results, progress
-    )
-    for name, row in measured_rows(animal, subjects, tests, progress).items():
-        made = {"quick": True} if budget.quick else made_from(name, skeleton)
-        results.rows[name] = {
-            "origin": "measured",
-            "made": {"from": made, "command": command, **_made_by()},
-            **row,
-        }
-    results.rows = {name: results.rows[name] for name in ROWS if name in results.rows}
-    results.sensitivity = _sensitivities(skeleton, kept["sensitivity"], budget, command, progress)
-    progress(0, None, f"{skeleton.name}: candidates and convergence")
-    results.illustration = illustrate(
-        cast("PoseEstimator", subjects["default"]).model, budget.n_illustrated
-    )
-    return results
+    return cast("Mapping[str, Any]", kept["sensitivity"])
+
+
+def _anew(animal: str, row: str) -> str:
+    """The command that measures one row anew."""
+    return f"`{_command([animal], None, False, True, [row])} --out DIR`"
 
 
 def _subjects(
     animal: str, names: Sequence[str], budget: Budget, results: Results, progress: Progress
-) -> dict[str, PoseEstimator | Baseline]:
+) -> dict[str, list[Subject]]:
     """What has to be measured; why a row cannot be goes into `results.missing`."""
-    from ..pose import subject_of
-    from .quick import quick_subject
+    from .quick import quick_runs
+    from .rows import runs_of
 
     subjects = {}
     for name in names:
         try:
-            subjects[name] = (quick_subject if budget.quick else subject_of)(animal, name, progress)
+            subjects[name] = (quick_runs if budget.quick else runs_of)(animal, name, progress)
         except MissingPackageError as error:
             results.missing[name] = str(error)
     return subjects
@@ -208,6 +302,22 @@ def made_from(variant: str, skeleton: Skeleton) -> dict[str, Any]:
     }
 
 
+def hashes_of(animal: str, variant: str) -> dict[str, Any]:
+    """Hashes of what a row was made with today, see `fingerprints`.
+
+    Args:
+        animal: the animal's name.
+        variant: a name of `ROWS`.
+    """
+    from .fingerprints import learning_code, model_digests, training_pictures
+
+    return {
+        "learning_code": learning_code(variant),
+        "training_pictures": training_pictures(variant, animal),
+        "models": model_digests(animal, variant, TRAINING_DRAWS.get(variant, 1)),
+    }
+
+
 def _made_by() -> dict[str, str]:
     """The program and the machine."""
     from liex_lab.sessions.provenance import package_version
@@ -223,106 +333,20 @@ def _made_by() -> dict[str, str]:
     }
 
 
-def measured_rows(
-    animal: str,
-    subjects: Mapping[str, PoseEstimator | Baseline],
-    tests: Mapping[str, Sequence[TrueRecording]],
-    progress: Progress,
-) -> dict[str, dict[str, Any]]:
-    """The measured figures of each subject: `splits` and `rate`.
-
-    Args:
-        animal: a bundled animal's name, or the path of a skeleton's TOML.
-        subjects: estimators and baselines by variant; `default` is among them.
-        tests: recordings with their truth by split.
-        progress: told recording by recording.
-    """
-    from ..pose import errors_of
-    from .cached_results import first_joints
-
-    rows: dict[str, dict[str, Any]] = {name: {"splits": {}} for name in subjects}
-    for split, sessions in tests.items():
-        for name, errors in errors_of(subjects, sessions, plan_of(animal), progress).items():
-            rows[name]["splits"][split] = {
-                **_numbers(errors),
-                "first_joints_mm": first_joints(sessions),
-            }
-    progress(0, None, "timing")
-    for name, rate in rates_of(animal, subjects, next(iter(tests.values()))).items():
-        rows[name]["rate"] = rate
-    return rows
-
-
-def _numbers(errors: PoseErrors) -> dict[str, Any]:
-    """What is kept of the errors of one split: the figures, the error of each joint, and the
-    distribution.
-    """
-    seen = np.isfinite(errors.error_mm)
-    quantiles = (
-        np.quantile(errors.error_mm[seen], np.linspace(0, 1, _QUANTILES))
-        if seen.any()
-        else np.array([])
-    )
-    return {
-        **plain(errors.summary()),
-        "n_frames": len(errors.error_mm),
-        "joint_mm": [round(float(x), 3) for x in errors.joint_mm[seen].mean(axis=0)],
-        "error_quantiles_mm": [round(float(x), 3) for x in quantiles],
-    }
-
-
-def rates_of(
-    animal: str, subjects: Mapping[str, PoseEstimator | Baseline], sessions: Sequence[TrueRecording]
-) -> dict[str, dict[str, Any]]:
-    """Frames per second of each subject on at most two cores, foreground included.
-
-    All are timed on the same 128 frames in memory, of the recording with the wider pictures of the
-    split's first two, the best of 3 repeats.
-
-    Args:
-        animal: a bundled animal's name, or the path of a skeleton's TOML.
-        subjects: estimators and baselines by variant; `default` is among them.
-        sessions: recordings of a split.
-
-    Returns:
-        By variant `frames_per_s`, `ratio_to_default`, `cores` and `picture`.
-    """
-    import numba
-
-    from ...build import build_scene
-    from ..speed import best_seconds
-
-    recording = max(sessions[:2], key=lambda session: session.width)
-    plan = plan_of(animal)
-    scene, sample = build_scene(recording, plan, next(iter(subjects.values())).skeleton, 96)
-    frames = recording.depths(0, min(len(recording), _RATE_FRAMES))
-    frames = frames[np.arange(_RATE_FRAMES) % len(frames)]
-    cores = min(2, numba.config.NUMBA_NUM_THREADS)
-    before = numba.get_num_threads()
-    numba.set_num_threads(cores)
-    rates = {}
-    for name, subject in subjects.items():
-        size = subject.find_size(sample, scene)
-        rates[name] = _RATE_FRAMES / best_seconds(
-            partial(subject.estimate, frames, scene, size), _RATE_REPEATS
-        )
-    numba.set_num_threads(before)
-    picture = f"{recording.width} x {recording.height}"
-    return {
-        name: {
-            "frames_per_s": rate,
-            "ratio_to_default": rate / rates["default"],
-            "cores": cores,
-            "picture": picture,
-        }
-        for name, rate in rates.items()
-    }
-
-
 def _sensitivities(
-    skeleton: Skeleton, kept: Mapping[str, Any], budget: Budget, command: str, progress: Progress
+    skeleton: Skeleton,
+    kept: Mapping[str, Any],
+    budget: Budget,
+    command: str,
+    results: Results,
+    progress: Progress,
 ) -> dict[str, Any]:
-    """Fig. 7 of the paper's variant and of ours, kept or measured now."""
+    """Fig. 7 of the paper's variant and of ours, kept or measured now.
+
+    A curve is measured where its row is asked for anew; a kept one that is of another method,
+    training or code is left out.
+    """
+    from .fingerprints import learning_code
     from .quick import QUICK_SWEEP
     from .sensitivity import Sweep, sensitivity
 
@@ -331,14 +355,25 @@ def _sensitivities(
         sweep = QUICK_SWEEP if budget.quick else Sweep()
         made = {**made_from(variant, skeleton), "sweep": plain(vars(sweep))}
         made["method"].pop("tells_facing", None)  # no model of a sweep does
+        code = learning_code(variant)
         known = kept.get(variant)
-        if known is not None and known["made"]["from"] == made:
+        if known is not None and (
+            known["made"]["from"] == made and known["made"].get("learning_code") == code
+        ):
             curves[variant] = {**known, "origin": "kept"}
+            continue
+        if not budget.quick and (
+            budget.kept or budget.sealed or variant not in budget.fresh or budget.n_frames
+        ):
+            results.missing[f"Fig. 7, {variant}"] = (
+                "no curve is kept of today's method and code; "
+                f"`{_command([skeleton.name], None, False, True)} --out DIR` measures it"
+            )
             continue
         curve = sensitivity(skeleton, variant, sweep, progress)
         curves[variant] = {
             **curve,
-            "made": {"from": made, "command": command, **_made_by()},
+            "made": {"from": made, "command": command, "learning_code": code, **_made_by()},
             "origin": "measured",
         }
     return curves

@@ -13,11 +13,19 @@ import numpy as np
 import pytest
 from liex_lab.dashboards.paper.plates import draw_figures
 from liex_lab.pipelines.evaluation import pose
-from liex_lab.pipelines.evaluation.paper import cached_results, quick, run, table_text
+from liex_lab.pipelines.evaluation.paper import (
+    cached_results,
+    common_view,
+    fingerprints,
+    quick,
+    rows,
+    run,
+    table_text,
+)
+from liex_lab.pipelines.evaluation.paper.deviations import DEVIATIONS
 from liex_lab.pipelines.evaluation.paper.sensitivity import Sweep, chosen_values, with_value
 from liex_lab.pipelines.training.baselines import training_of
 
-from liex_lab.baselines.ablations import PlainMean
 from liex_lab.baselines.forest import ForestPlan, train_forests
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.catalog import bundled_models, kept_results_folder
@@ -67,15 +75,13 @@ def toy_rf() -> Any:
     )
 
 
-def toy_subject(animal: str, variant: str, progress: Any = silent) -> Any:
+def toy_runs(animal: str, variant: str, progress: Any = silent) -> Any:
     if variant == "cnn":
         raise MissingPackageError("the CNN baseline needs torch, which is not installed")
     if variant == "rf":
-        return toy_rf()
+        return [toy_rf()]
     base = PoseEstimator(trained("default" if variant == "default" else "paper").model)
-    if variant == "paper-no-metric":
-        return PlainMean(base)
-    return PoseEstimator(base.model, 1) if variant == "paper-one-pose" else base
+    return [base] if variant == "default" else rows.runs_of_models(variant, [base])
 
 
 @pytest.fixture(scope="module")
@@ -84,12 +90,12 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("tables") / "out"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(simulator, "world_of", lambda skeleton: SmallWorld())
-        patch.setattr(quick, "quick_subject", toy_subject)
+        patch.setattr(quick, "quick_runs", toy_runs)
         patch.setattr(
             quick, "QUICK_SWEEP", Sweep(512, 512, (("initial poses", (1,)), ("metric trees", (2,))))
         )
-        patch.setattr(run, "_RATE_FRAMES", 8)
-        patch.setattr(run, "_RATE_REPEATS", 1)
+        patch.setattr(rows, "_RATE_FRAMES", 8)
+        patch.setattr(rows, "_RATE_REPEATS", 1)
         written = run.make_tables(out, ["mouse"], quick=True, n_frames=20, draw=draw_figures)
     assert all(path.is_file() for path in written)
     return out
@@ -102,16 +108,16 @@ def rows_of(path: Path) -> list[dict[str, str]]:
 
 @pytest.mark.slow
 def test_every_row_is_there_for_every_split_with_its_figures_and_where_it_comes_from(made):
-    rows = rows_of(made / "table1.csv")
-    assert [(r["split"], r["variant"]) for r in rows] == [
+    table = rows_of(made / "table1.csv")
+    assert [(r["split"], r["variant"]) for r in table] == [
         (split, variant) for variant in run.ROWS[:-1] for split in ("clean", "hard")
     ]
-    for row in rows:
+    for row in table:
         assert 0 < float(row["median_joint_error_mm"]) < 60
         assert 0 <= float(row["flip_rate"]) <= 1
         assert int(row["n_frames"]) == N_SESSIONS * N_FRAMES
         assert (row["origin"], row["command"][:20]) == ("measured", "liex evaluate tables")
-    published = {r["variant"]: r["published_mean_joint_error_mm"] for r in rows}
+    published = {r["variant"]: r["published_mean_joint_error_mm"] for r in table}
     assert published["rf"] == "12.24"
     assert published["default"] == ""
     assert not (made / "table2.csv").exists()  # no hand was asked for
@@ -168,19 +174,91 @@ def test_numbers_of_the_json_are_those_of_the_frames_and_the_way_of_the_candidat
 
 
 @pytest.mark.slow
-def test_kept_rows_are_used_where_training_and_test_frames_are_the_same(
-    made, monkeypatch, tmp_path
-):
-    rows = cached_results.kept_results("mouse", made / "kept")["rows"]
-    skeleton, world = Skeleton.load("mouse"), SmallWorld()
-    tests = {split: world.test_split(split) for split in world.splits}
-    row, wanted = rows["rf"], run.made_from("rf", skeleton)
-    assert not cached_results.fits(row, wanted, tests)  # a quick row never fits
-    row["made"]["from"] = wanted
-    assert cached_results.fits(row, wanted, tests)
-    assert not cached_results.fits(row, run.made_from("cnn", skeleton), tests)
-    assert not cached_results.fits(row, wanted, {**tests, "clean": tests["hard"]})
-    assert not cached_results.fits(row, wanted, {**tests, "other-body": tests["hard"]})
+def test_tables_json_has_every_figure_by_split_and_method(made):
+    flat = json.loads((made / "tables.json").read_text())["mouse"]
+    assert list(flat) == ["clean", "hard"]
+    for split in flat.values():
+        assert list(split) == list(run.ROWS[:-1])
+        shares = {(row["wrong_object"], row["wrong_object_alone"]) for row in split.values()}
+        assert len(shares) == 1  # every row measured the same objects
+        for row in split.values():
+            low, high = row["interval95"]
+            assert low <= row["median_mm"] <= high
+            assert row["mean_interval95"][0] <= row["mean_mm"] <= row["mean_interval95"][1]
+            assert (row["n_frames"], row["n_recordings"]) == (N_SESSIONS * N_FRAMES, N_SESSIONS)
+            assert {"training_images", "seeds"} <= set(row)
+        assert len(split["paper-one-pose"]["run_median_mm"]) == rows.START_DRAWS
+        assert len(set(split["paper-one-pose"]["run_median_mm"])) > 1  # draws are not one draw
+
+
+def view_of_one(fingerprint: str) -> common_view.CommonView:
+    none = np.zeros(3, np.bool_)
+    return common_view.CommonView(1.0, none, none, none, fingerprint)
+
+
+def test_a_kept_row_is_refused_for_every_reason_by_its_name():
+    made = {"recipe": {"n_images": 3}}
+    hashes = {"learning_code": "a", "training_pictures": "b", "models": ["c", None]}
+    row = {
+        "made": {"from": made, **hashes, "models": ["c", "d"]},
+        "splits": {"clean": {"fingerprints": ["x", "y"]}},
+    }
+    views = {"clean": [view_of_one("x"), view_of_one("y")]}
+    why = cached_results.why_refused
+    assert why(row, made, hashes, views) == ""
+    assert "another training" in why(row, {"recipe": {"n_images": 4}}, hashes, views)
+    assert "other code" in why(row, made, hashes | {"learning_code": "z"}, views)
+    pictures = hashes | {"training_pictures": "z"}
+    assert "other training pictures" in why(row, made, pictures, views)
+    assert "another model" in why(row, made, hashes | {"models": ["z", None]}, views)
+    assert "another model" in why(row, made, hashes | {"models": ["c"]}, views)
+    fewer = {"clean": views["clean"][:1]}  # `--frames` never mixes with kept rows
+    turned = {"clean": views["clean"][::-1]}
+    for other in (fewer, turned, views | {"hard": views["clean"]}):
+        assert "other test pictures or another foreground" in why(row, made, hashes, other)
+
+
+def test_with_fewer_frames_or_the_sealed_split_nothing_kept_is_used():
+    assert run.Budget.of(None, False, False, (), False).fresh == ("default",)
+    assert run.Budget.of(None, False, False, (), False).kept
+    for budget in (
+        run.Budget.of(100, False, False, (), False),
+        run.Budget.of(None, False, False, (), True),
+        run.Budget.of(None, False, True, (), False),
+    ):
+        assert not budget.kept
+        assert budget.fresh == run.ROWS
+    one = run.Budget.of(None, False, True, ("rf",), False)
+    assert one.kept
+    assert one.fresh == ("default", "rf")
+    with pytest.raises(PlanError, match="no row 'knn'"):
+        run.Budget.of(None, False, True, ("knn",), False)
+
+
+def test_the_hash_of_code_is_of_what_it_does_not_of_how_it_is_told():
+    told = '"""Module."""\n\ndef f(x):\n    """Double."""\n    return 2 * x  # twice\n'
+    plain = "def f(x):\n    return 2 * x\n"
+    assert fingerprints.bare_source(told) == fingerprints.bare_source(plain)
+    assert fingerprints.bare_source(plain) != fingerprints.bare_source(plain.replace("2", "3"))
+    assert fingerprints.bare_source('x = "# no comment"\n') == 'x="#nocomment"'
+    for variant in run.ROWS:
+        assert len(fingerprints.learning_code(variant)) == 16
+    assert fingerprints.learning_code("rf") != fingerprints.learning_code("cnn")
+
+
+@pytest.mark.slow
+def test_every_row_measures_the_object_that_the_default_chooses():
+    from liex_lab.pipelines.build import plan_of
+
+    recording = SmallWorld().test_split("hard")[0]
+    chooser = PoseEstimator.load("mouse")
+    scene, frames, view = common_view.common_view(recording, plan_of("mouse"), chooser)
+    assert not view.wrong.any()
+    told, *_ = common_view.measured(chooser, frames, scene, view, {})
+    alone = chooser.estimate(frames, scene, view.size).chosen.pose.joints(chooser.skeleton)
+    np.testing.assert_array_equal(told, alone)
+    again = common_view.common_view(recording, plan_of("mouse"), chooser)[2]
+    assert again.fingerprint == view.fingerprint
 
 
 def test_kept_results_of_another_schema_are_refused_in_a_sentence(tmp_path):
@@ -192,17 +270,15 @@ def test_kept_results_of_another_schema_are_refused_in_a_sentence(tmp_path):
         assert "\n" not in str(told.value)
 
 
-def results_with(means: dict[str, float]) -> run.Results:
-    rows = {
-        variant: {
-            "splits": {
-                "clean": {"mean_joint_error_mm": mean},
-                "hard": {"mean_joint_error_mm": mean + 1},
-            }
-        }
-        for variant, mean in means.items()
+def results_with(medians: dict[str, float], half: float = 0.2) -> run.Results:
+    def numbers(median: float) -> dict[str, Any]:
+        return {"median_mm": median, "interval95": [median - half, median + half]}
+
+    told = {
+        variant: {"splits": {"clean": numbers(median), "hard": numbers(median + 1)}}
+        for variant, median in medians.items()
     }
-    return run.Results("mouse", [], ["clean", "hard"], rows)
+    return run.Results("mouse", [], ["clean", "hard"], told)
 
 
 def test_words_follow_the_numbers():
@@ -215,16 +291,39 @@ def test_words_follow_the_numbers():
         "paper-one-pose": 7.0,
     }
     (sentence,) = table_text._words(results_with(order), quick=False)
-    assert sentence == "The methods come out in the paper's order on every split."
+    assert "in another order" in sentence
     (turned,) = table_text._words(results_with(order | {"rf": 4.5}), quick=False)
+    assert "on the same object" in turned
     assert (
-        "here, RF is ahead on clean (4.50 against 5.00 mm), hard (5.50 against 6.00 mm)." in turned
+        "RF is ahead on clean (median 4.50 against 5.00 mm), hard (median 5.50 against 6.00 mm)."
+        in turned
     )
     ahead, *others = table_text._words(results_with(order | {"cnn": 1.5}), quick=False)
     assert ahead == (
-        "CNN is ahead of the default on clean (1.50 against 2.00 mm), hard (2.50 against 3.00 mm)."
+        "CNN is ahead of the default on clean (median 1.50 against 2.00 mm), hard (median 2.50 "
+        "against 3.00 mm)."
     )
     assert len(others) == 1  # and of the paper's variant
+    (unsure,) = table_text._words(results_with(order | {"rf": 4.5}, half=0.6), quick=False)
+    assert "ahead" not in unsure  # the intervals overlap
+
+
+def test_what_differs_from_the_paper_is_what_the_methods_say():
+    told = " ".join(DEVIATIONS)
+    for animal in ("fish", "mouse", "hand"):
+        skeleton = Skeleton.load(animal)
+        method = method_of("paper", skeleton)
+        recipe = run.made_from("paper", skeleton)["recipe"]
+        assert f"K: {method.training_candidates} " in told
+        assert f"m: {method.regressors.n_tests};" in told
+        assert f"{recipe['n_images']:,} ({animal})" in told
+        for plan in (method.regressors, method.metric):
+            assert (plan.max_leaf, plan.min_leaf) == (5, 1)
+        assert (method.rounds, method.n_candidates) == {
+            "fish": (7, 40),
+            "mouse": (3, 40),
+            "hand": (3, 20),
+        }[animal]
 
 
 def test_every_variant_that_can_be_named_is_known_and_any_other_is_refused(monkeypatch):
@@ -234,14 +333,16 @@ def test_every_variant_that_can_be_named_is_known_and_any_other_is_refused(monke
         pose.subject_of("mouse", "knn")
 
 
-def test_the_baselines_learn_from_images_of_the_same_kind_as_our_own_model():
+def test_all_that_learns_beside_ours_learns_from_the_same_pictures_with_our_noise():
     for animal in bundled_models():
         skeleton = Skeleton.load(animal)
         ours = run.made_from("default", skeleton)["recipe"]
+        papers = run.made_from("paper", skeleton)["recipe"]
+        assert papers["degraded_share"] == ours["degraded_share"]
+        assert papers["n_images"] >= 0.8 * ours["n_images"]
         for variant in ("rf", "cnn"):
             theirs = training_of(variant, skeleton).to_dict()["recipe"]
-            assert theirs["degraded_share"] == ours["degraded_share"]
-            assert theirs["n_images"] >= 0.8 * ours["n_images"]
+            assert theirs | {"n_calibration": 0} == papers | {"n_calibration": 0}
 
 
 def test_a_sweep_changes_one_number_of_a_method_and_nothing_else():
@@ -252,27 +353,27 @@ def test_a_sweep_changes_one_number_of_a_method_and_nothing_else():
         assert changed == chosen_values(method) | {number: own + 7}
 
 
-def test_what_is_kept_says_how_it_was_made_and_is_of_the_training_and_test_frames_of_today():
+def test_what_is_kept_says_how_it_was_made_and_by_which_it_is_known_again():
     for path in sorted(kept_results_folder().glob("*.json")):
         check_kept(path)
 
 
 def check_kept(path: Path) -> None:
     skeleton = Skeleton.load(path.stem)
-    world, results = simulator.world_of(skeleton), cached_results.kept_results(path.stem)
-    tests = {split: world.test_split(split, n_sessions=1) for split in world.splits}
-    assert path.stat().st_size < 200_000
-    assert set(results["rows"]) == set(run.ROWS)
-    for variant, row in results["rows"].items():
+    kept = cached_results.kept_results(path.stem)
+    splits = simulator.world_of(skeleton).splits
+    assert path.stat().st_size < 300_000
+    assert set(kept["rows"]) <= set(run.ROWS)
+    for row in kept["rows"].values():
         made = row["made"]
         assert made["command"].startswith("liex evaluate tables")
         assert made["version"]
         assert made["code"]
         assert isinstance(made["from"]["recipe"]["seed"], int)
+        assert {"learning_code", "training_pictures", "models", "seeds"} <= set(made)
         assert row["rate"]["frames_per_s"] > 0
-        assert cached_results.fits(row, run.made_from(variant, skeleton), tests), (
-            f"{variant}: refresh with --fresh"
-        )
+        assert set(row["splits"]) == set(splits)
         for numbers in row["splits"].values():
             assert numbers["n_frames"] >= 2000
+            assert len(numbers["fingerprints"]) == numbers["n_recordings"] == 40
             assert len(numbers["joint_mm"]) == skeleton.n_joints

@@ -1,0 +1,153 @@
+"""Hashes by which a kept result is known to be of today's code, model, training and test pictures.
+
+- `learning_code`: of the sources that decide what is learned and how a pose is estimated, without
+  comments, docstrings and spaces; what is rendered and cut out is told by the pictures themselves.
+- `training_pictures`: of the first block of training pictures as the foreground cuts it out.
+- `CommonView.fingerprint`: of each test recording's pictures, components, choice and size.
+- `model_digests`: of the model files, where they are at hand.
+"""
+
+from __future__ import annotations
+
+import ast
+import hashlib
+import io
+import tokenize
+from functools import cache
+from pathlib import Path
+
+from liex_lab.catalog import MODELS
+
+_DIGITS = 16
+# modules that matter to every row, under `liex_lab` and `pipelines`
+_ESTIMATION = (
+    "_cascade_kernels",
+    "_feature_kernels",
+    "calibration",
+    "cascade",
+    "estimator",
+    "initial",
+    "method",
+    "proposals",
+    "scoring",
+    "training",
+)
+_FOREST = ("_kernels", "_walk", "forest", "grow")
+_OF_ALL = (
+    *(f"liex_lab/forests/{name}.py" for name in _FOREST),
+    *(f"liex_lab/estimation/{name}.py" for name in _ESTIMATION),
+    "liex_lab/baselines/baseline.py",
+    "liex_lab/evaluation/pose.py",
+    "pipelines/training/pose_model.py",
+    "pipelines/evaluation/paper/common_view.py",
+)
+_OWN = {
+    "rf": ("baselines/forest.py", "baselines/_forest.py"),
+    "cnn": ("baselines/cnn.py", "baselines/patches.py"),
+    "paper-no-metric": ("baselines/ablations.py",),
+}
+
+
+def learning_code(variant: str) -> str:
+    """Hash of the sources that decide a row's model and poses.
+
+    Args:
+        variant: a row of the tables.
+    """
+    told = hashlib.sha256()
+    paths = [*_OF_ALL, *(f"liex_lab/{path}" for path in _OWN.get(variant, ()))]
+    if variant in ("rf", "cnn"):
+        paths.append("pipelines/training/baselines.py")
+    for path in paths:
+        told.update(f"{path}\n{bare_source(_source(path))}\n".encode())
+    return told.hexdigest()[:_DIGITS]
+
+
+def _source(path: str) -> str:
+    room, rest = path.split("/", 1)
+    # installed, `pipelines` lies inside the library; in the repository beside it
+    folder = MODELS.parent if room == "liex_lab" else Path(__file__).resolve().parents[2]
+    return (folder / rest).read_text(encoding="utf-8")
+
+
+@cache
+def bare_source(source: str) -> str:
+    """A module's text without comments, docstrings and spaces.
+
+    Args:
+        source: of a Python module.
+    """
+    lines = [list(line) for line in source.splitlines(keepends=True)]
+
+    def blank(first: tuple[int, int], last: tuple[int, int]) -> None:
+        for row in range(first[0], last[0] + 1):
+            line = lines[row - 1]
+            begin = first[1] if row == first[0] else 0
+            end = min(last[1], len(line)) if row == last[0] else len(line)
+            line[begin:end] = " " * (end - begin)
+
+    for token in tokenize.generate_tokens(io.StringIO(source).readline):
+        if token.type == tokenize.COMMENT:
+            blank(token.start, token.end)
+    for node in ast.walk(ast.parse(source)):
+        body = getattr(node, "body", None)
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef) and body:
+            first = body[0]
+            if isinstance(first, ast.Expr) and isinstance(first.value, ast.Constant):
+                blank((first.lineno, 0), (first.end_lineno or first.lineno, 10**9))
+    return "".join("".join(map("".join, lines)).split())
+
+
+def training_pictures(variant: str, animal: str) -> str:
+    """Hash of the first block of the pictures that a row's model learns from, cut out.
+
+    Args:
+        variant: a row of the tables.
+        animal: a bundled animal's name.
+    """
+    return _first_pictures("default" if variant == "default" else "paper", animal)
+
+
+@cache
+def _first_pictures(base: str, animal: str) -> str:
+    from liex_lab.body.skeleton import Skeleton
+    from liex_lab.estimation.method import method_of
+    from liex_lab.runtime.progress import silent
+
+    from ...training.pose_model import recipe_of, rendered_set
+
+    skeleton = Skeleton.load(animal)
+    data = rendered_set(
+        skeleton, method_of(base, skeleton), recipe_of(base, skeleton), 0, 1, silent
+    )
+    told = hashlib.sha256(data.images.heights.tobytes())
+    told.update(data.truth.positions.round(3).tobytes())
+    return told.hexdigest()[:_DIGITS]
+
+
+def model_digests(animal: str, variant: str, draws: int) -> list[str | None]:
+    """SHA-256 of a row's model files; None for one that is not at hand.
+
+    Args:
+        animal: a bundled animal's name.
+        variant: a row of the tables.
+        draws: number of models that the row is the mean of.
+    """
+    from liex_lab.body.skeleton import Skeleton
+    from liex_lab.catalog import bundled_models, find_model
+
+    from ...training.baselines import BASELINES, cached_baseline, training_of
+    from ...training.pose_model import cache_path
+
+    if variant == "default" and animal in bundled_models():
+        paths = [find_model(animal)]
+    elif variant in BASELINES:
+        skeleton = Skeleton.load(animal)
+        paths = [cached_baseline(variant, skeleton, training_of(variant, skeleton))]
+    else:
+        base = "default" if variant == "default" else "paper"
+        paths = [cache_path(animal, base, draw) for draw in range(draws)]
+    return [
+        hashlib.sha256(path.read_bytes()).hexdigest()[:_DIGITS] if path.is_file() else None
+        for path in paths
+    ]
