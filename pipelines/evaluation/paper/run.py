@@ -301,12 +301,14 @@ def rates_of(
     before = numba.get_num_threads()
     numba.set_num_threads(cores)
     rates = {}
-    for name, subject in subjects.items():
-        size = subject.find_size(sample, scene)
-        rates[name] = _RATE_FRAMES / best_seconds(
-            partial(subject.estimate, frames, scene, size), _RATE_REPEATS
-        )
-    numba.set_num_threads(before)
+    try:
+        for name, subject in subjects.items():
+            size = subject.find_size(sample, scene)
+            rates[name] = _RATE_FRAMES / best_seconds(
+                partial(subject.estimate, frames, scene, size), _RATE_REPEATS
+            )
+    finally:
+        numba.set_num_threads(before)
     picture = f"{recording.width} x {recording.height}"
     return {
         name: {
@@ -323,8 +325,10 @@ def _sensitivities(
     skeleton: Skeleton, kept: Mapping[str, Any], budget: Budget, command: str, progress: Progress
 ) -> dict[str, Any]:
     """Fig. 7 of the paper's variant and of ours, kept or measured now."""
+    from liex_lab.estimation.method import method_of
+
     from .quick import QUICK_SWEEP
-    from .sensitivity import Sweep, sensitivity
+    from .sensitivity import Sweep, sensitivity, without_void
 
     curves = {}
     for variant in SWEPT[: 1 if budget.quick else None]:
@@ -333,7 +337,8 @@ def _sensitivities(
         made["method"].pop("tells_facing", None)  # no model of a sweep does
         known = kept.get(variant)
         if known is not None and known["made"]["from"] == made:
-            curves[variant] = {**known, "origin": "kept"}
+            told = without_void(known, method_of(variant, skeleton))
+            curves[variant] = {**told, "origin": "kept"}
             continue
         curve = sensitivity(skeleton, variant, sweep, progress)
         curves[variant] = {
