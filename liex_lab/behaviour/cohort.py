@@ -90,7 +90,7 @@ STATS: tuple[Column, ...] = columns(
         "float64",
         "",
         "the smallest p that a permutation of these units can give",
-        "2 / arrangements",
+        "2 / arrangements, 1 / arrangements where a block has unequally many of both groups",
     ),
     ("family", "string", "", "the tests that p_fdr is corrected for"),
     ("n_family", "int64", "", "how many they are"),
