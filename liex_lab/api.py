@@ -33,6 +33,7 @@ def run_session(
     plan: Plan | None = None,
     out: str | Path = ".",
     *,
+    settings: Sequence[str] = (),
     folder: Path | None = None,
     overwrite: bool = False,
     notes: Mapping[str, Any] | None = None,
@@ -49,8 +50,10 @@ def run_session(
     Args:
         recording: path of a recording, or address of a virtual one, or a recording that is open
             already.
-        plan: all settings of the run; None takes the bundled plan of the mouse.
+        plan: all settings of the run; None takes the bundled plan that fits, that of the mouse
+            where it does.
         out: the folder into which the session folder `<recording's name>.liex` is written.
+        settings: changes of the plan where none is named, texts like 'animal.spine_mm=65'.
         folder: the session folder itself, where it should have another name.
         overwrite: replace a session that is there already.
         notes: further facts for session.json, see `SessionWriter.note`.
@@ -71,7 +74,6 @@ def run_session(
     from liex_lab.pipelines.session import measure_session
     from liex_lab.pipelines.workers import Processes
 
-    plan = plan or Plan.load("mouse")
     if workers > 1 and pool is None:
         pool = Processes(workers)
     with telling_of_compiling(progress) as progress:
@@ -79,6 +81,7 @@ def run_session(
             recording,
             plan,
             out,
+            settings=settings,
             folder=folder,
             overwrite=overwrite,
             notes=notes,
@@ -241,7 +244,38 @@ def run_study(
         only=only,
         dry_run=dry_run,
         board=board,
+        describe=correct_session,
     )
+
+
+def describe_session(
+    session: str | Path,
+    facts: Mapping[str, str],
+    *,
+    author: str = "",
+    progress: Progress = silent,
+) -> Path:
+    """Say who the animal of a session is; table `sessions` and report follow, nothing is measured.
+
+    It is kept in the log of corrections and can be taken back like one.
+
+    Args:
+        session: the session folder.
+        facts: any of subject_id, group, cage, sex, batch and session_start_time (ISO 8601 with a
+            time zone); an empty text is unknown.
+        author: who says so; "" takes who is logged in.
+        progress: told how far the work is.
+
+    Returns:
+        The session folder.
+
+    Raises:
+        SessionError: there is no such fact, or another program is correcting the session.
+        PlanError: a value cannot be used.
+    """
+    from liex_lab.sessions.correcting import descriptions
+
+    return correct_session(session, descriptions(facts), author=author, progress=progress)
 
 
 def serve_dashboard(
@@ -404,6 +438,47 @@ def evaluate_tracking(
         model=model,
         paper=paper,
         n_frames=n_frames,
+        draw=draw,
+        progress=progress,
+    )
+
+
+def evaluate_scenes(
+    only: Sequence[str] = (),
+    *,
+    n_frames: int = 300,
+    n_recordings: int = 1,
+    sealed: bool = False,
+    pictures: Path | None = None,
+    progress: Progress = silent,
+) -> dict[str, Any]:
+    """Measure rendered scenes as a lab's camera would see them, and score the tables.
+
+    Args:
+        only: names of scenes; () takes all.
+        n_frames: length of each recording.
+        n_recordings: of each scene, each of another animal.
+        sealed: measure on the seeds that are not for development.
+        pictures: the folder for drawn frames, one PNG a scene; None draws none.
+        progress: told how far the work is.
+
+    Returns:
+        Table of numbers: `rows` of figures by name, and the protocol as text.
+
+    Raises:
+        LiexError: there is no such scene.
+    """
+    from functools import partial
+
+    from liex_lab.dashboards.paper.scenes import draw_scene
+    from liex_lab.pipelines.evaluation.scenes import evaluate_scenes as measure
+
+    draw = None if pictures is None else partial(draw_scene, folder=pictures)
+    return measure(
+        only,
+        n_frames=n_frames,
+        n_recordings=n_recordings,
+        sealed=sealed,
         draw=draw,
         progress=progress,
     )

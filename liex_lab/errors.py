@@ -21,6 +21,26 @@ class RecordingError(LiexError):
     """Raised for a recording that cannot be opened or read."""
 
 
+class UnknownCameraError(RecordingError):
+    """Raised for pictures that do not say what camera took them."""
+
+
+class UnknownTimesError(RecordingError):
+    """Raised for pictures that do not say when they were taken."""
+
+
+class SeveralKindsError(RecordingError):
+    """Raised for a folder with pictures of several kinds.
+
+    Attributes:
+        pattern: names the pictures of one of the kinds, as in "*.tif".
+    """
+
+    def __init__(self, message: str, pattern: str) -> None:
+        super().__init__(message)
+        self.pattern = pattern
+
+
 class PlanError(LiexError):
     """Raised for a plan, or a value in it, that cannot be used."""
 
@@ -39,6 +59,10 @@ class StudyError(LiexError):
 
 class EstimationError(LiexError):
     """Raised for a recording in which the animal cannot be measured."""
+
+
+class MisfitError(EstimationError):
+    """Raised for a recording that shows something else than the plan's animal."""
 
 
 class MissingPackageError(LiexError):

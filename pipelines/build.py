@@ -21,7 +21,9 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from liex_lab.actions.timeline import TimelineModel
+    from liex_lab.arena.floor import Floor
     from liex_lab.arena.outline import Arena
+    from liex_lab.arena.scene import Scene
     from liex_lab.arena.zones import DrawnZone, Zone
     from liex_lab.behaviour.bouts import MouseRules
     from liex_lab.behaviour.places import Surroundings
@@ -35,6 +37,7 @@ if TYPE_CHECKING:
     from liex_lab.tracking.tracker import FrameTracker
 
 
+_RULED = "mouse"  # the animal that the rules were made for
 _SPANS = (
     0.6,
     1.8,
@@ -63,7 +66,10 @@ def build_recording(
 
 
 def open_planned(
-    recording: str | Path | Recording, plan: Plan, progress: Progress = silent
+    recording: str | Path | Recording,
+    plan: Plan,
+    progress: Progress = silent,
+    pattern: str | None = None,
 ) -> Recording:
     """The recording opened as the plan says, its pictures as they are; the plan's camera overrules.
 
@@ -73,6 +79,7 @@ def open_planned(
         recording: a path or address, or a recording that is open already, whose camera is replaced.
         plan: states the camera, and frame rate and topic of recordings that need them.
         progress: told while an archive is unpacked or an index made.
+        pattern: which pictures of a folder to take; None takes those that its camera.toml states.
 
     Raises:
         RecordingError: the recording cannot be opened, or is cut short and the plan does not accept
@@ -87,6 +94,7 @@ def open_planned(
             camera=_stated_lens(plan),
             fps=settings.fps,
             topic=settings.topic,
+            pattern=pattern,
             strict=not settings.accept_truncated,
             progress=progress,
         )
@@ -107,10 +115,12 @@ def build_water(plan: Plan) -> Water | None:
 
 
 def _stated_lens(plan: Plan) -> Lens | None:
-    """The plan's camera where it states all of it."""
+    """The plan's camera where it states all of it, or something to be replaced by its preset."""
     from liex_lab.optics.camera import Lens
 
     stated = {name: getattr(plan.camera, name) for name in ("fx", "fy", "cx", "cy")}
+    if None in stated.values() and plan.camera.preset is not None:
+        return Lens(1.0, 1.0, 0.0, 0.0)  # its numbers follow once the pictures' size is known
     return None if None in stated.values() else Lens(**stated, distortion=_stated_distortion(plan))
 
 
@@ -122,8 +132,12 @@ def _stated_distortion(plan: Plan) -> Distortion | None:
 
 def _overruled(camera: Camera, plan: Plan) -> Camera:
     """The camera with what the plan states put in."""
+    if plan.camera.preset is not None:
+        from liex_lab.optics.presets import preset
+
+        camera = preset(plan.camera.preset, camera.width, camera.height)
     stated: dict[str, Any] = plan.camera.model_dump(
-        exclude_none=True, exclude={"distortion", "distortion_model"}
+        exclude_none=True, exclude={"preset", "distortion", "distortion_model"}
     )
     if plan.camera.distortion is not None:
         stated["distortion"] = _stated_distortion(plan)
@@ -255,14 +269,48 @@ def build_scene(
 
     animal = plan.animal
     foreground = plan.foreground
+    region, floor = build_stated_scene(recording.camera, plan)
     if skeleton.view.foreground == FOREGROUNDS[1]:
+        if region is not None or floor is not None:
+            raise PlanError(
+                "arena.region and arena.floor are for animals before a still background, and the "
+                f"{skeleton.name} is told by its distance; set foreground.near_mm and far_mm"
+            )
         return HandSegmenter.learn(
             recording, skeleton.view, n_frames, (foreground.near_mm, foreground.far_mm)
         )
     sizes = (animal.spine_min_mm, animal.spine_max_mm)
     return BackgroundSubtraction.learn(
-        recording, sizes, n_frames, foreground.min_height_mm, skeleton.view
+        recording, sizes, n_frames, foreground.min_height_mm, skeleton.view, floor, region
     )
+
+
+def build_stated_scene(camera: Camera, plan: Plan) -> tuple[NDArray[np.bool_] | None, Floor | None]:
+    """The region (H, W) outside of which nothing is looked at, and the floor, as the plan states
+    them.
+
+    Args:
+        camera: the ideal pinhole camera of the recording.
+        plan: its settings `arena.region` and `arena.floor`.
+
+    Returns:
+        None for what is not stated.
+
+    Raises:
+        PlanError: the region is no polygon in the picture, or the floor does not face the camera.
+    """
+    from liex_lab.arena.scene import plane_of, region_mask
+
+    stated = plan.arena
+    region = (
+        None if stated.region is None else region_mask(stated.region, camera.width, camera.height)
+    )
+    floor = (
+        None
+        if isinstance(stated.floor, str)
+        else plane_of(stated.floor.point, stated.floor.normal, camera)
+    )
+    return region, floor
 
 
 def build_provenance(
@@ -299,7 +347,22 @@ def build_provenance(
         },
         arena=arena,
         zones=zones,
+        scene=build_described_scene(tracker.scene, arena),
     )
+
+
+def build_described_scene(segmenter: Segmenter, arena: Arena) -> Scene | None:
+    """What stands still before the camera, for session.json; None for a hand, which has no floor.
+
+    Args:
+        segmenter: the learned segmentation.
+        arena: the outline of its floor.
+    """
+    from liex_lab.foreground.background_segmenter import BackgroundSubtraction
+
+    if not isinstance(segmenter, BackgroundSubtraction):
+        return None
+    return replace(segmenter.described(), outline=arena)
 
 
 def build_arena(scene: Segmenter, plan: Plan) -> tuple[Arena, tuple[Zone, ...]]:
@@ -358,7 +421,9 @@ def build_rules(plan: Plan) -> MouseRules:
 
 
 def build_recogniser(plan: Plan, skeleton: Skeleton) -> TimelineModel | None:
-    """The plan's action recogniser: the named or the bundled one; None where rules name actions.
+    """The plan's action recogniser: the named or the bundled one; None where there is none.
+
+    Then rules name the actions, or nothing does, see `why_nameless`.
 
     Args:
         plan: its setting `actions.model`: a name, a path, `rules`, or None for the animal's bundled
@@ -381,3 +446,21 @@ def build_recogniser(plan: Plan, skeleton: Skeleton) -> TimelineModel | None:
             f"says {skeleton.name}; set actions.model to another one, or to 'rules'"
         )
     return model
+
+
+def why_nameless(plan: Plan, skeleton: Skeleton) -> str:
+    """Why no actions are named where there is no recogniser; '' where rules name them.
+
+    The rules are those of a mouse: a hand does not rear, and a snake does not run.
+
+    Args:
+        plan: its setting `actions.model`; 'rules' asks for the rules, whatever the animal is.
+        skeleton: the animal's skeleton.
+    """
+    if plan.actions.model is not None or skeleton.name == _RULED:
+        return ""
+    return (
+        f"No actions are named: no vocabulary was made for a {skeleton.name}. `liex train actions` "
+        "makes one from what you label; `--set actions.model=rules` names rears, runs, walks and "
+        "pauses as of a mouse."
+    )

@@ -81,7 +81,7 @@ def correct_session(
         put_back(folder, aside)  # somebody was killed here
         made_of = basis(raw.path, raw.metadata)
         log = read_log(raw.path)
-        if log.entries and log.made_of != made_of and (what or undo):
+        if log.touched and log.made_of != made_of and (what or undo):
             raise SessionError(
                 f"the corrections of {raw.path} were made on another measurement of this "
                 "recording; look at them with `liex correct list`, then apply them with `liex "
@@ -97,9 +97,11 @@ def correct_session(
         shutil.rmtree(part, ignore_errors=True)
         part.mkdir()
         try:
-            if log.standing:
+            if log.touched:
                 progress(0, None, "measuring what was corrected")
                 log = _apply(raw, log, part, blueprint)
+            if log.described:
+                log = _describe(raw, log, part)
             (part / LOG).write_text(log.to_json(), encoding="utf-8")
             put_in_place(part, folder, aside)
         finally:
@@ -148,15 +150,33 @@ def _apply(raw: Session, log: Log, folder: Path, blueprint: BlueprintMaker | Non
     return replace(log, files=file_facts(folder, {REPLAY: replay}), facts=facts)
 
 
+def _describe(raw: Session, log: Log, folder: Path) -> Log:
+    """Write the table `sessions` with what people said of the animal; returns the log with it."""
+    import pandas as pd
+
+    from liex_lab.sessions.evidence import provenance_of
+    from liex_lab.sessions.place import file_facts
+    from liex_lab.sessions.tracks import skeleton_of
+    from liex_lab.tables import schema
+
+    path = folder / "sessions.parquet"
+    table = pd.read_parquet(path) if path.is_file() else raw.table("sessions")
+    said = {key: value for key, value in log.described.items() if key in table}
+    metadata = provenance_of(raw, skeleton_of(raw)).table_metadata()
+    schema.write_table(path, schema.SESSIONS, schema.from_pandas(table.assign(**said)), metadata)
+    kept = {name: facts for name, facts in log.files.items() if name != path.name}
+    return replace(log, files={**kept, path.name: file_facts(folder, {})[path.name]})
+
+
 def _told(log: Log) -> dict[str, Any]:
     """The standing corrections in short for session.json: numbers by kind, authors, last time."""
-    made = [(entry.what, entry.author) for entry in log.standing if entry.what is not None]
+    made = [(entry.what, entry.author) for entry in log.touched if entry.what is not None]
     kinds = {kind: sum(what.kind == kind for what, _ in made) for kind in ("flip", "joint", "bout")}
     return {
         "n": len(made),
         **kinds,
         "authors": sorted({author for _, author in made}),
-        "last": log.standing[-1].made_at,
+        "last": log.touched[-1].made_at,
     }
 
 

@@ -1,7 +1,8 @@
 """Quality report of a recording, `liex doctor`: what is in it, and what to know before trusting it.
 
-Needs no model. Looks at stamps (rate, jitter, gaps, faults), camera and lens, depth range and
-unread pixels, and in frames spread over the recording at floor, noise, arena, water and animal.
+Looks at stamps (rate, jitter, gaps, faults), camera and lens, depth range and
+unread pixels, in frames spread over the recording at floor, noise, arena, water and animal, and
+where asked at which plan fits, which alone needs models.
 `FINDINGS` lists every number with its unit; problems are sentences that say what to do.
 """
 
@@ -18,7 +19,9 @@ from liex_lab.plan import Plan
 from liex_lab.recordings.timestamps import DROPPED, Gap
 from liex_lab.runtime.progress import Progress, silent
 
-from .build import build_water, open_planned
+from .build import build_water
+from .choice import Proposal, propose_plan
+from .doctor_files import next_command, open_anyhow
 from .doctor_scene import SceneLook
 
 if TYPE_CHECKING:
@@ -51,13 +54,19 @@ FINDINGS: Final = {  # key of the JSON: what it says; numbers that cannot be tol
     "floor_tilt_rad": "angle between the optical axis and the floor's perpendicular",
     "water_depth_mm": "of the water over the floor, below the lens",
     "arena": "shape of the floor, mm in the arena frame: see session.json",
+    "scene": "floor, region, fixtures, and how many animals move: see session.json",
     "animal_length_mm": (
         "of its outline from above, four standard deviations along the long axis; median"
     ),
     "animal_area_mm2": "seen from above",
     "animal_share": "of the frames looked at, in which it was found",
     "animal_sits_still": "whether it had become a part of the background",
+    "plan": "the bundled plan that fits, or the one that was named; None where none does",
+    "plan_says": "how it fits, or what contradicts each plan",
+    "n_animals": "things of the animal's size in view at once that its body fits",
+    "missing": "what the files do not say, and the lines to write; empty where they say it",
     "problems": "what is wrong, and what to do about it",
+    "next": "the command to run next",
 }
 # frames looked at, spread over the recording; as many as a run learns its scene from
 _N_SAMPLED = 96
@@ -74,17 +83,23 @@ def examine(
     *,
     fps: float | None = None,
     topic: str | None = None,
+    propose: bool = False,
+    named: bool = True,
     progress: Progress = silent,
 ) -> dict[str, Any]:
     """The findings of a recording: the keys of `FINDINGS`, in types that JSON can hold.
 
-    A recording that is cut short is looked at as far as it goes.
+    A recording that is cut short is looked at as far as it goes. One that does not say what camera
+    took it or when is looked at with a guess, and the lines that say it are told.
 
     Args:
         path: a file, folder or address of a recording.
         plan: camera, water surface, expected sizes; None takes the default plan.
         fps: frame rate of recordings without stamps, before the plan's.
         topic: depth topic of a message log, before the plan's.
+        propose: hold the bundled plans against the recording, which takes their models: the given
+            or the usual one first, and others only where it does not fit.
+        named: whether someone named the plan, who is told then if it does not fit.
         progress: told while an archive is unpacked or an index made.
 
     Raises:
@@ -93,9 +108,11 @@ def examine(
     from liex_lab.foreground.background import sample_frames, stride_for
     from liex_lab.recordings.rectify import rectified
 
+    asked = plan if named else None
     plan = _asked(plan or Plan(), fps, topic)
     water = build_water(plan)
-    with open_planned(path, plan, progress) as opened:
+    recording, missing = open_anyhow(path, plan, progress)
+    with recording as opened:
         progress(0, None, "looking at frames spread over the recording")
         seen = rectified(opened, water)
         stride = stride_for(seen, plan.animal.spine_min_mm)
@@ -104,6 +121,10 @@ def examine(
         scene = SceneLook(seen, plan, water, sample, stride)
         if depth.median_mm is not None:
             scene.at_scene()
+        proposal = Proposal(None, "")
+        if propose and depth.median_mm is not None:
+            progress(0, None, "looking which plan fits")
+            proposal = propose_plan(seen, asked)
         lens = opened.camera
         found = {
             **_time_facts(opened),
@@ -114,12 +135,18 @@ def examine(
             "water": None if water is None else water.to_dict(),
             **depth.facts(),
             **scene.facts,
+            "plan": proposal.plan,
+            "plan_says": proposal.says,
+            "n_animals": proposal.n_animals,
+            "missing": missing,
             "problems": [
                 *seen.problems,
                 *_time_problems(opened),
                 *depth.problems(),
                 *scene.problems,
+                *proposal.problems,
             ],
+            "next": next_command(path, proposal, missing),
         }
     return {key: found[key] for key in FINDINGS}
 
@@ -253,10 +280,12 @@ def print_report(findings: dict[str, Any]) -> None:
         table.add_row(name, Text(value))
     console = Console()
     console.print(table)
-    if not findings["problems"]:
+    if not findings["problems"] and not findings["missing"]:
         console.print("no problems found", style="green")
-    for problem in findings["problems"]:
+    for problem in (*findings["missing"], *findings["problems"]):
         console.print(Text(f"- {problem}", style="yellow"), soft_wrap=True)
+    if findings["next"]:
+        console.print(Text(f"next: {findings['next']}"), soft_wrap=True)
 
 
 def lines(findings: dict[str, Any]) -> list[tuple[str, str]]:
@@ -332,6 +361,7 @@ def lines(findings: dict[str, Any]) -> list[tuple[str, str]]:
             else f"{_text(f['floor_mm'], 'mm')} from the lens, tilted by {degrees} degrees",
         ),
         ("arena", shape or "unknown"),
+        ("scene", _scene_text(f["scene"])),
         (
             "animal",
             "not found"
@@ -341,7 +371,27 @@ def lines(findings: dict[str, Any]) -> list[tuple[str, str]]:
                 f"{f['animal_share']:.0%} of the frames"
             ),
         ),
+        *([("plan", f["plan_says"])] if f["plan_says"] else []),
     ]
+
+
+def _scene_text(scene: dict[str, Any] | None) -> str:
+    """How the floor was found, its roughness, what stands on it and how many animals move."""
+    if scene is None:
+        return "unknown"
+    floor = scene["floor"]
+    share = floor["support"]
+    support = "nothing moves" if share is None else f"{share:.0%} of what moves stands on it"
+    n_fixtures = len(scene["fixtures"])
+    return ", ".join(
+        [
+            f"floor from {floor['from']} ({support})",
+            f"rough to {_text(floor['roughness_mm'], 'mm', 1)}",
+            f"{n_fixtures} thing{'' if n_fixtures == 1 else 's'} on it",
+            f"at most {scene['n_animals']} moving together",
+            *(["only a region is looked at"] if scene["region_px"] else []),
+        ]
+    )
 
 
 def _text(value: float | None, unit: str, digits: int = 0) -> str:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from liex_lab.errors import EstimationError, PlanError
 from liex_lab.plan import Plan
 
-from .build import build_zones
+from .build import build_stated_scene, build_zones
 
 if TYPE_CHECKING:
     from liex_lab.arena.floor import Floor
@@ -41,6 +41,7 @@ KEYS = (
     "floor_tilt_rad",
     "water_depth_mm",
     "arena",
+    "scene",
     "animal_length_mm",
     "animal_area_mm2",
     "animal_share",
@@ -69,24 +70,54 @@ class SceneLook:
     stride: int
     facts: dict[str, Any] = field(default_factory=lambda: dict.fromkeys(KEYS))
     problems: list[str] = field(default_factory=list)
+    _floor: Floor | None = None
+    _region: NDArray[np.bool_] | None = None
 
     def at_scene(self) -> None:
         """Look at floor, noise, arena, water and animal; fills facts and problems."""
-        from liex_lab.arena.floor import Floor, find_floor, floor_patch, floor_region
+        from liex_lab.arena.floor import Floor, floor_patch
         from liex_lab.arena.outline import find_arena
+        from liex_lab.body.skeleton import Skeleton
         from liex_lab.foreground.background import learn_background
+        from liex_lab.foreground.standing import find_standing
 
-        background, *_ = learn_background(self.sample)
         grid = self.seen.camera.every(self.stride)
         try:
-            floor = find_floor(background, grid)
+            region, stated = build_stated_scene(self.seen.camera, self.plan)
+        except PlanError as error:
+            self.problems.append(str(error))
+            return
+        if region is not None:
+            self._region = region[:: self.stride, :: self.stride]
+            self.sample = self.sample * self._region
+        self._floor = stated
+        background, spread, _ = learn_background(self.sample)
+        animal = self.plan.animal
+        try:
+            standing = find_standing(
+                self.sample,
+                background,
+                spread,
+                grid,
+                (animal.spine_min_mm, animal.spine_max_mm),
+                self.plan.foreground.min_height_mm,
+                Skeleton.load(animal.skeleton).view,
+                None
+                if stated is None
+                else Floor.from_plane(stated.normal, stated.distance_mm, grid),
+            )
         except EstimationError as error:
             self.problems.append(f"no floor: {error}")
             return
+        if standing.doubt:
+            self.problems.append(standing.doubt)
+        if standing.region is not None:
+            background = np.where(standing.region, background, np.float32(0))
+        floor = standing.floor
         patch = floor_patch(background, floor.depth(grid.width, grid.height))
         noise = _noise(self.sample, patch)
-        region = floor_region(background, floor.depth(grid.width, grid.height))
-        read = [frame[region] > 0 for frame in self.sample if frame.any()]
+        on_floor = standing.on_floor
+        read = [frame[on_floor] > 0 for frame in self.sample if frame.any()]
         unread = 1.0 - float(np.mean(read))
         self.facts |= {"noise_mm": noise, "floor_unread_share": unread}
         arena = find_arena(background, floor, grid)
@@ -172,15 +203,26 @@ class SceneLook:
         )
         view = Skeleton.load(animal.skeleton).view
         expected = (animal.spine_min_mm, animal.spine_max_mm)
+        missing = ""
         for factor in (1.0, _WIDER):
             sizes = (expected[0] / factor, expected[1] * factor)
             try:
                 scene, sample = BackgroundSubtraction.learn(
-                    memory, sizes, len(self.sample), foreground.min_height_mm, view
+                    memory,
+                    sizes,
+                    len(self.sample),
+                    foreground.min_height_mm,
+                    view,
+                    self._floor,
+                    self._region,
                 )
             except EstimationError as error:
-                missing = error
+                missing = missing or str(error)
                 continue
+            if factor == 1.0:
+                self.facts["scene"] = scene.described().to_dict()
+            elif scene.standing is not None and not scene.standing.moves:
+                continue  # a thing of another size that keeps still is a thing
             crops = scene.extract(sample, 1.0)
             length = 4.0 * float(np.median(crops.blobs.sd_along[crops.found]))
             if factor == 1.0:
@@ -188,7 +230,7 @@ class SceneLook:
             else:
                 self._tell_wrong_size(length, expected)
             return
-        self.problems.append(str(missing))
+        self.problems.append(missing)
 
     def _tell_animal(
         self,

@@ -9,7 +9,7 @@ made of all frames at once.
 from __future__ import annotations
 
 import time
-from collections.abc import Generator, Mapping
+from collections.abc import Generator, Mapping, Sequence
 from contextlib import closing
 from functools import partial
 from pathlib import Path
@@ -29,27 +29,32 @@ from .build import (
     build_recording,
     build_rules,
     build_surroundings,
-    build_tracker,
+    why_nameless,
 )
+from .choice import USUAL, Fitted, fit_plan
 from .shards import CHUNK, LENGTH, MEASURING, Shard, measure_shards
 from .workers import WorkerPool
 
 if TYPE_CHECKING:
-    from liex_lab.actions.timeline import TimelineModel
+    import pandas as pd
+    from numpy.typing import NDArray
+
+    from liex_lab.actions.timeline import Recognised, TimelineModel
     from liex_lab.behaviour.summary import Behaviour
     from liex_lab.recordings.frame import DepthFrame
     from liex_lab.recordings.recording import Recording
     from liex_lab.sessions import Provenance, Session, SessionWriter
+    from liex_lab.sessions.verdict import Verdict
     from liex_lab.sessions.writer import BlueprintMaker, ReportMaker
     from liex_lab.tables.rows import Rows
-    from liex_lab.tracking.tracker import FrameTracker
 
 
 def measure_session(
     recording: str | Path | Recording,
-    plan: Plan,
+    plan: Plan | None,
     out: str | Path,
     *,
+    settings: Sequence[str] = (),
     folder: Path | None = None,
     overwrite: bool = False,
     notes: Mapping[str, Any] | None = None,
@@ -60,14 +65,17 @@ def measure_session(
 ) -> Path:
     """Measure every frame of a recording and write the session folder.
 
-    An unfinished session of the same recording and plan is continued. Where a pool of workers is
+    An unfinished session of the same recording and plan is continued. A plan that the recording
+    does not fit is refused before anything is measured; where none is named the bundled one that
+    fits is used. Where a pool of workers is
     given and the recording is long (more than two shards) and stated by its path, its shards are
     measured side by side; the tables are the same.
 
     Args:
         recording: a path or address, or a recording that is open already.
-        plan: everything that the run depends on.
+        plan: everything that the run depends on; None takes the bundled plan that fits.
         out: folder of the session, which is named after the plan's session or the recording.
+        settings: changes of a plan that was not named, as `Plan.with_settings` takes them.
         folder: the session folder itself, instead of `out/NAME.liex`.
         overwrite: replace a session that is there already, once the new one is whole.
         notes: what session.json is to hold besides, see `SessionWriter.note`.
@@ -83,6 +91,7 @@ def measure_session(
         SessionError: a session is there already, or another process writes it.
         RecordingError: the recording cannot be opened or read.
         PlanError: the plan, or a file that it names, cannot be used.
+        MisfitError: the recording shows something else than the plan's animal.
         EstimationError: no animal is found.
     """
     from liex_lab.sessions import SessionWriter
@@ -91,16 +100,21 @@ def measure_session(
     from liex_lab.sessions.place import check_place
 
     started = time.perf_counter()
+    first = plan or Plan.load(USUAL).with_settings(settings)
     with (
-        in_background(partial(build_estimator, plan)) as estimator,
-        build_recording(recording, plan, progress) as opened,
+        in_background(partial(build_estimator, first)) as estimator,
+        build_recording(recording, first, progress) as opened,
     ):
-        folder = folder or Path(out) / f"{plan.session.name or opened.name}.liex"
+        folder = folder or Path(out) / f"{first.session.name or opened.name}.liex"
         put_back_session(folder)
         check_place(folder, overwrite)
         check_free(part_folder(folder))
         progress(0, None, "learning the background, the floor and the animal's size")
-        tracker = build_tracker(opened, plan, estimator)
+        unnamed = None if plan else settings
+        fitted = fit_plan(opened, first, estimator, settings=unnamed, progress=progress)
+        opened = fitted.recording
+        plan = fitted.plan
+        tracker = fitted.tracker
         build_recogniser(
             plan, tracker.estimator.skeleton
         )  # a slip in its name is told before any work is done
@@ -122,9 +136,9 @@ def measure_session(
                     writer.add(frames, seen=seen)
                     progress(frames[-1].index + 1, len(opened), MEASURING)
             began = time.perf_counter()
-            make_track(writer, tracker)
+            verdict = make_track(writer, fitted)
             timings["track"] += time.perf_counter() - began
-            writer.note(problems=opened.problems, **dict(notes or {}))
+            writer.note(problems=opened.problems, verdict=verdict.to_dict(), **dict(notes or {}))
             session = conclude(writer, plan, timings)
     return session.path
 
@@ -138,17 +152,33 @@ def _read_ahead(opened: Recording, first: int) -> Generator[list[DepthFrame], No
     yield from chunks if opened.format == "synthetic" else prefetch(chunks)
 
 
-def make_track(writer: SessionWriter, tracker: FrameTracker) -> None:
+def make_track(writer: SessionWriter, fitted: Fitted) -> Verdict:
     """Make the track of a session whose frames have all been measured, and hand it to the writer.
 
     Args:
         writer: holds the observations, and allocates the track's arrays.
-        tracker: the tracker that measured the frames.
+        fitted: the plan and its tracker that measured the frames.
+
+    Returns:
+        How it went.
     """
+    from liex_lab.sessions.verdict import Verdict
     from liex_lab.tracking.observations import Observations
 
+    tracker = fitted.tracker
     whole = writer.seen(Observations)
-    writer.take(tracker.track(whole, allocate=writer.allocate), whole, tracker.subject)
+    tracked = tracker.track(whole, allocate=writer.allocate)
+    fit = tracker.sample_fit
+    verdict = Verdict.of(
+        tracked.track,
+        whole,
+        misfits=fitted.misfits,
+        n_animals=1 if fit is None else fit.n_animals,
+        cautions=fitted.notes,
+        accepted=fitted.plan.estimation.accept_misfit,
+    )
+    writer.take(tracked, whole, tracker.subject)
+    return verdict
 
 
 def conclude(writer: SessionWriter, plan: Plan, timings: dict[str, float]) -> Session:
@@ -160,7 +190,7 @@ def conclude(writer: SessionWriter, plan: Plan, timings: dict[str, float]) -> Se
         timings: seconds of `prepare` and `track`, for session.json.
     """
     behaviour, notes = measure_behaviour(writer.rows, plan, writer.origin, writer.allocate)
-    writer.note(**notes)
+    writer.note(**notes, problems=_told_refused(notes))
     rest()
     return writer.close(timings_s=timings, **behaviour.for_session())
 
@@ -176,33 +206,46 @@ def measure_behaviour(
         origin: skeleton, arena, zones and water.
         allocate: allocator of large arrays, such as one of files on disk.
     """
-    from liex_lab.behaviour.summary import measure_rows
+    from liex_lab.behaviour.summary import measure_rows, moving_rows
+    from liex_lab.tables.schema import BOUTS, empty_table
 
     recogniser = build_recogniser(plan, origin.skeleton)
-    named, notes = ({}, {}) if recogniser is None else name_actions(recogniser, rows, allocate)
+    rules = build_rules(plan)
+    around = build_surroundings(origin)
+    moved = moving_rows(rows, rules, around, allocate)
+    if recogniser is not None:
+        named, notes = name_actions(recogniser, rows, moved, allocate)
+    elif nameless := why_nameless(plan, origin.skeleton):
+        named = {"bouts": empty_table(BOUTS), "actions": {}}
+        notes = {"no_actions": nameless}
+    else:
+        named = {}
+        notes = {}
     rest()
-    return measure_rows(
-        rows, build_rules(plan), build_surroundings(origin), allocate=allocate, **named
-    ), notes
+    return measure_rows(rows, rules, around, moved=moved, allocate=allocate, **named), notes
 
 
 def name_actions(
-    recogniser: TimelineModel, rows: Rows, allocate: Allocator = np.empty
+    recogniser: TimelineModel, rows: Rows, moved: pd.DataFrame, allocate: Allocator = np.empty
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """The ethogram of a track by a recogniser, and notes for session.json.
 
     Args:
         recogniser: names the frames.
         rows: the track as table rows, with the distance of the animal from the nearest wall, mm.
+        moved: the table `kinematics` of the track, which bouts are checked by.
         allocate: allocator of large arrays.
 
     Returns:
         `bouts` and the definitions of `actions`, as `behaviour.measure` takes them; and notes:
-        which recogniser it was, and which actions the frame rate cannot tell.
+        which recogniser it was, which actions the frame rate cannot tell, and which bouts were
+        refused since they contradict their definition.
     """
+    from liex_lab.actions.vocabulary import printed_meanings
+    from liex_lab.behaviour.checking import recognise
     from liex_lab.tables.rows import bout_rows
 
-    found = recogniser.recognise(rows.track, rows.wall_distance_mm, allocate)
+    found = recognise(recogniser, rows.track, rows.wall_distance_mm, moved, allocate)
     notes = {
         "action_model": {
             "skeleton": recogniser.skeleton,
@@ -210,7 +253,40 @@ def name_actions(
             **recogniser.card,
         },
         "unresolved_actions": found.unresolved,
+        "refused_bouts": {"bouts": _refusals(found, rows.track.times_ns)},
     }
-    actions = {word: recogniser.definitions.get(word, "") for word in recogniser.words if word}
+    meanings = printed_meanings(recogniser.skeleton, recogniser.definitions)
+    actions = {word: meanings.get(word, "") for word in recogniser.words if word}
     bouts = bout_rows(found.ethogram, rows.frames_table, str(recogniser.card.get("sha256", "")))
     return {"bouts": bouts, "actions": actions}, notes
+
+
+def _told_refused(notes: dict[str, Any]) -> list[str]:
+    """That bouts were refused, as a sentence for the session's problems; none where none was."""
+    n = len(notes.get("refused_bouts", {}).get("bouts", []))
+    if not n:
+        return []
+    told = "1 bout" if n == 1 else f"{n} bouts"
+    return [
+        f"{told} as the recogniser first named {'it' if n == 1 else 'them'} contradicted the "
+        "definition of the name, and got another name or none; the report lists "
+        f"{'it' if n == 1 else 'them'}."
+    ]
+
+
+def _refusals(found: Recognised, times_ns: NDArray[np.int64]) -> list[dict[str, Any]]:
+    """The refused bouts for session.json, in order of time; times are s since the first frame."""
+    from liex_lab.actions.ethogram import frame_stops
+
+    start_s = (times_ns - times_ns[:1]) * 1e-9
+    stop_s = (frame_stops(times_ns) - times_ns[:1]) * 1e-9
+    return [
+        {
+            "action": one.action,
+            "start_s": round(float(start_s[one.rows.start]), 6),
+            "stop_s": round(float(stop_s[one.rows.stop - 1]), 6),
+            "named": one.named,
+            "why": one.why,
+        }
+        for one in sorted(found.refused, key=lambda one: one.rows.start)
+    ]

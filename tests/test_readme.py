@@ -8,11 +8,13 @@ import tomllib
 from pathlib import Path
 
 import pytest
+from liex_lab.pipelines.convert import convert
 from typer.testing import CliRunner
 
 import liex_lab
 from liex_lab import cli
 from liex_lab.arena.zones import read_zones
+from liex_lab.behaviour.cohort import STATS
 from liex_lab.behaviour.listing import FIRST, all_columns, first_columns
 from liex_lab.body import Skeleton
 from liex_lab.plan import Plan
@@ -54,7 +56,8 @@ def test_every_verb_and_every_setting_exists() -> None:
     ]  # the first is `liex ...`
     told = CliRunner().invoke(cli.app, ["--help"]).output
     known = (
-        "cohort compare convert correct dashboard demo doctor evaluate export info live report "
+        "cohort compare convert correct dashboard demo describe doctor evaluate export info live "
+        "report "
         "run show suggest "
     )
     known += "train verify"
@@ -69,12 +72,35 @@ def test_every_verb_and_every_setting_exists() -> None:
         assert key in plan[table], f"{table}.{key}"
 
 
-def test_the_python_example_uses_what_there_is() -> None:
-    (example,) = blocks("python")
-    attributes = [node for node in ast.walk(ast.parse(example)) if isinstance(node, ast.Attribute)]
-    used = {node.attr for node in attributes if ast.unparse(node.value) == "liex_lab"}
-    assert used == {"open_recording", "Plan", "run_session", "Session"}
-    assert used <= set(liex_lab.__all__)
+def test_every_python_example_runs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Each is run as it stands, on a short virtual recording that has the name it asks for."""
+    monkeypatch.chdir(tmp_path)
+    convert("synthetic:walk?seed=3&frames=60", "recording.mcap")
+    examples = blocks("python")
+    assert examples
+    for example in examples:
+        for asked in set(re.findall(r'"(recording\.[a-z.]+)"', example)):
+            example = example.replace(asked, "recording.mcap")
+        for _ in range(2):  # again it replaces what is there
+            exec(compile(example, "README.md", "exec"), {})
+        names = {
+            node.attr
+            for node in ast.walk(ast.parse(example))
+            if isinstance(node, ast.Attribute) and ast.unparse(node.value) == "liex_lab"
+        }
+        assert names <= set(liex_lab.__all__)
+    assert (tmp_path / "results" / "recording.liex" / "session.json").is_file()
+    assert capsys.readouterr().out.count("\n") >= 2 * len(examples)
+
+
+def test_every_column_that_is_named_is_one() -> None:
+    named = set(re.findall(r"`(?:frames|poses|kinematics|bouts|summary) `?(\w+)`", TEXT))
+    named |= set(re.findall(r"`((?:rear|distance|speed|mean|n)_\w+)`", TEXT))
+    known = {name.split(".")[1] for name in all_columns()} | {column.name for column in STATS}
+    assert named
+    assert named <= known
 
 
 def test_the_zones_can_be_read(tmp_path: Path) -> None:

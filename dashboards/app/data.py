@@ -15,14 +15,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from liex_lab.actions.colours import PALETTE, action_colours
 from liex_lab.behaviour import cohort
 from liex_lab.errors import LiexError, SessionError
 from liex_lab.runtime.progress import Progress, silent
 from liex_lab.sessions import Session
 from liex_lab.sessions.corrections import LOG, corrected_folder
 from liex_lab.sessions.listed import WHO, Entry
-
-from ..report.svg import ACTION_COLOURS, action_colour
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -157,15 +156,24 @@ class StudyData:
         Args:
             keys: names of measured sessions.
         """
-        entries = [self.entries[key] for key in keys if key in self.entries]
-        found = self._of_all(
-            "ethogram", _ethogram, [entry for entry in entries if entry in self.done]
-        )
+        done = {entry.key: entry for entry in self.done}
+        entries = [done[key] for key in keys if key in done]
+        found = self._of_all("ethogram", _ethogram, entries)
         return {
             entry.key: one
-            for entry, one in zip(entries, found, strict=False)
+            for entry, one in zip(entries, found, strict=True)
             if isinstance(one, Ethogram)
         }
+
+    def damage(self, key: str) -> str:
+        """What is wrong with the ethogram of a session, as a sentence; empty where it can be read.
+
+        Args:
+            key: its name in the study.
+        """
+        entry = self.entries[key]
+        found = self._of_one("ethogram", _ethogram, entry)
+        return "" if isinstance(found, Ethogram) else str(found["damage"])
 
     def collected(self) -> pd.DataFrame:
         """One row per measured session, as `cohort.compare` takes it, with its `key`.
@@ -276,14 +284,14 @@ def colours_of(words: Sequence[str], vocabulary: Sequence[str] = ()) -> dict[str
 
     Args:
         words: the words, those that matter most first.
-        vocabulary: all words in the order in which report and replay colour them.
+        vocabulary: all words, which report and replay colour.
     """
-    own = {word: action_colour(k) for k, word in reversed(list(enumerate(vocabulary)))}
+    own = action_colours(vocabulary)
     chosen: dict[str, str] = {}
     for word in words:
         if word in own and own[word] not in chosen.values():
             chosen[word] = own[word]
-    free = iter([colour for colour in ACTION_COLOURS if colour not in chosen.values()])
+    free = iter([colour for colour in PALETTE if colour not in chosen.values()])
     return {word: chosen.get(word) or next(free, GREY) for word in words}
 
 

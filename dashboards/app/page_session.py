@@ -11,10 +11,11 @@ from urllib.parse import quote
 import numpy as np
 from dash import ALL, Dash, Input, Output, Patch, State, ctx, dcc, html, no_update
 
-from liex_lab.errors import LiexError
+from liex_lab.errors import LiexError, SessionError
 
 from ..report.charts import traces
 from ..report.quality import warnings
+from ..units import counted, shown
 from . import page_corrections, plots
 from .data import StudyData, colours_of, shown_words
 from .frames import Frames
@@ -76,7 +77,9 @@ def session_page(
         SessionError: the session cannot be opened.
     """
     session = data.session(key)
-    one = data.ethograms([key])[key]
+    one = data.ethograms([key]).get(key)
+    if one is None:
+        raise SessionError(f"the bouts of '{key}' cannot be read; {data.damage(key)}")
     entry = data.entries[key]
     curves = traces(session)
     coloured = colours_of(shown_words([one]), one.vocabulary)
@@ -101,7 +104,7 @@ def session_page(
         *(
             [
                 html.Details(
-                    [html.Summary(f"{len(said)} things to know first"), html.Ul(said)],
+                    [html.Summary(f"{counted(len(said), 'thing')} to know first"), html.Ul(said)],
                     className="problems",
                 )
             ]
@@ -205,7 +208,7 @@ def _steps(at_s: float) -> html.Div:
 
 
 def _replay(may_show: bool) -> html.Div:
-    shown = html.Button(
+    button = html.Button(
         "Open the replay here",
         id="open-replay",
         n_clicks=0,
@@ -217,7 +220,7 @@ def _replay(may_show: bool) -> html.Div:
         className="replay",
         children=[
             html.H3("Replay"),
-            shown if may_show else html.Div(shown, hidden=True),
+            button if may_show else html.Div(button, hidden=True),
             html.P(
                 [
                     "Or in a terminal: ",
@@ -314,15 +317,17 @@ def facts(session: Session, row: int) -> list[Any]:
     known = [(title, frame[name], unit) for name, title, unit in _FACTS if name in frame]
     if session.has("kinematics.parquet"):
         moved = session.kinematics.iloc[row]
-        known += [(title, moved[name], unit) for name, title, unit in _MOVED if name in moved]
+        known += [
+            (title, *shown(moved[name], unit)) for name, title, unit in _MOVED if name in moved
+        ]
     bouts = session.bouts
     now = bouts[(bouts["start_s"] <= frame["time_s"]) & (frame["time_s"] < bouts["stop_s"])]
     action = ", ".join(str(word).replace("_", " ") for word in now["action"]) or "no name"
     items: list[Any] = [html.Dt("action"), html.Dd(action)]
     for title, value, unit in known:
-        shown = f"{value:.3f}" if title == "time" else number(value)
-        if shown not in ("", "nan"):
-            items += [html.Dt(title), html.Dd(f"{shown} {unit if shown != '–' else ''}".strip())]
+        told = f"{value:.3f}" if title == "time" else number(value)
+        if told not in ("", "nan"):
+            items += [html.Dt(title), html.Dd(f"{told} {unit if told != '–' else ''}".strip())]
     return items
 
 

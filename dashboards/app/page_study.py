@@ -7,13 +7,14 @@ from typing import Any
 
 from dash import Dash, Input, Output, State, dcc, html, no_update
 
-from ..report.svg import ACTION_COLOURS
+from liex_lab.actions.colours import PALETTE
+
 from . import plots
 from .data import GREY, NO_POSE, OTHER, StudyData, colours_of, shown_words, vocabulary_of
 from .parts import download, graph
 from .tables import STATES, block, csv_address, session_address
 
-MOST_COLOURS = len(ACTION_COLOURS)
+MOST_COLOURS = len(PALETTE)
 
 
 def sessions_page(data: StudyData) -> list[Any]:

@@ -61,6 +61,7 @@ SESSIONS = {
 STATS = {
     "measure": "measure",
     "contrast": "contrast",
+    "refused": "not tested, because",
     "estimate": "difference",
     "ci_low": "from",
     "ci_high": "to",
@@ -70,7 +71,6 @@ STATS = {
     "p": "p",
     "p_fdr": "p, corrected",
     "test": "test",
-    "refused": "not tested, because",
     "unit": "unit",
     "n_units_first": "units, first",
     "n_units_second": "units, second",
@@ -89,6 +89,7 @@ BOUTS = {
     "score": "score",
     "source": "by",
     "peak_speed_mm_s": "peak, mm/s",
+    "contradicts": "contradicts its definition",
     "path_mm": "way, mm",
 }
 GAPS = {"start_s": "from, s", "stop_s": "to, s", "n_frames_missing": "frames", "reason": "reason"}

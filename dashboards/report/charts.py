@@ -7,9 +7,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from liex_lab.actions.colours import action_colours
 from liex_lab.behaviour.around import around_onsets
 from liex_lab.sessions import Session
 
+from ..units import shown
 from . import svg, svg_matrices
 
 if TYPE_CHECKING:
@@ -23,11 +25,11 @@ _RED = "#EE6677"
 _PURPLE = "#AA3377"
 # column of the kinematics, title, what it is, unit, colour, whether the axis begins at zero
 _CURVES = (
-    ("speed_mm_s", "Speed", "of the body centre, mm/s", "mm/s", _BLUE, True),
-    ("nose_height_mm", "Nose height", "above the floor, mm; rearing shaded", "mm", _GREEN, True),
-    ("z_mm", "Height", "of the body centre above the floor, mm", "mm", _GREEN, True),
-    ("tail_beat_hz", "Tail beat", "frequency, Hz", "Hz", _PURPLE, True),
-    ("bend_rad", "Bend", "of the whole body, rad; positive to the left", "rad", _PURPLE, False),
+    ("speed_mm_s", "Speed", "of the body centre", "mm/s", _BLUE, True),
+    ("nose_height_mm", "Nose height", "above the floor", "mm", _GREEN, True),
+    ("z_mm", "Height", "of the body centre above the floor", "mm", _GREEN, True),
+    ("tail_beat_hz", "Tail beat", "frequency", "Hz", _PURPLE, True),
+    ("bend_rad", "Bend", "of the whole body, positive to the left", "rad", _PURPLE, False),
 )
 _WALKING = ("speed_mm_s", "nose_height_mm")
 _SWIMMING = ("speed_mm_s", "z_mm", "bend_rad", "tail_beat_hz")
@@ -69,8 +71,8 @@ def charts(session: Session, words: list[str]) -> dict[str, str]:
     if session.has("summary.csv"):
         row = session.summary.iloc[0]
         shares = [
-            (word, float(row[f"{word}_share"]), svg.action_colour(k))
-            for k, word in enumerate(words)
+            (word, float(row[f"{word}_share"]), colour)
+            for word, colour in action_colours(words).items()
             if f"{word}_share" in row
         ]
         drawn["budget"] = svg.budget(shares)
@@ -94,13 +96,15 @@ def curves(session: Session) -> list[tuple[str, str, str]]:
     bouts = session.bouts
     time_s = frames["time_s"].to_numpy(float)
     time = svg.time_scale(session.metadata["frames"]["duration_s"])
-    rears = bouts.loc[bouts["action"] == "rear", ["start_s", "stop_s"]].to_numpy(float)
-    shown = _SWIMMING if "tail_beat_hz" in moved else _WALKING
+    rearing = bouts["action"].astype(str).str.startswith("rear")
+    rears = bouts.loc[rearing, ["start_s", "stop_s"]].to_numpy(float)
+    wanted = _SWIMMING if "tail_beat_hz" in moved else _WALKING
     made = []
     for name, title, what, unit, colour, from_zero in _CURVES:
-        if name in shown and name in moved:
+        if name in wanted and name in moved:
             shaded = [(float(a), float(b)) for a, b in rears] if name == "nose_height_mm" else []
-            values = _across_gaps(moved[name], frames)
+            values, unit = shown(_across_gaps(moved[name], frames), unit)
+            what = f"{what}, {unit}{'; rearing shaded' if shaded else ''}"
             made.append(
                 (title, what, svg.curve(time_s, values, time, unit, colour, shaded, from_zero))
             )
@@ -118,15 +122,14 @@ def traces(session: Session) -> list[tuple[str, Array, Array, str]]:
     """
     frames = session.frames
     time_s = frames["time_s"].to_numpy(float)
-    made = []
+    made: list[tuple[str, Array, Array, str]] = []
     if session.has("kinematics.parquet"):
         moved = session.kinematics
-        shown = _SWIMMING if "tail_beat_hz" in moved else _WALKING
-        made = [
-            (f"{title}, {unit}", time_s, _across_gaps(moved[name], frames), colour)
-            for name, title, _, unit, colour, _ in _CURVES
-            if name in shown and name in moved
-        ]
+        wanted = _SWIMMING if "tail_beat_hz" in moved else _WALKING
+        for name, title, _, unit, colour, _ in _CURVES:
+            if name in wanted and name in moved:
+                values, unit = shown(_across_gaps(moved[name], frames), unit)
+                made.append((f"{title}, {unit}", time_s, values, colour))
     return [
         *made,
         ("Predicted error, mm", time_s, _across_gaps(frames["predicted_error_mm"], frames), _RED),
@@ -153,11 +156,12 @@ def around_actions(session: Session, words: list[str]) -> list[tuple[str, str]]:
         known = {word: one for word, one in found.items() if one is not None}
         if not known:
             continue
-        top = max(float(np.nanmax(one.high)) for one in known.values())
+        scale, unit = shown(1.0, unit)
+        top = scale * max(float(np.nanmax(one.high)) for one in known.values())
         for word, one in known.items():
-            drawn = svg_matrices.around(
-                one.time_s, one.low, one.median, one.high, unit, colour, (0.0, 1.05 * top or 1.0)
-            )
+            low, median, high = (scale * some for some in (one.low, one.median, one.high))
+            limits = (0.0, 1.05 * top or 1.0)
+            drawn = svg_matrices.around(one.time_s, low, median, high, unit, colour, limits)
             made.append((f"{title} around {word.replace('_', ' ')}, {one.n} bouts", drawn))
     return made
 
@@ -195,7 +199,7 @@ def pictures(session: Session) -> list[tuple[str, str, str, str]]:
         )
         time_s = float(frames.loc[index, "time_s"])
         word = _word_at(session.bouts, time_s)
-        colour = svg.action_colour(words.index(word)) if word in words else ""
+        colour = action_colours(words).get(word, "")
         made.append((drawn, f"{time_s:.2f} s", word, colour))
     return made
 
@@ -246,8 +250,8 @@ def _matrix(table: pd.DataFrame, words: list[str]) -> str:
 
 def _activity(table: pd.DataFrame, words: list[str]) -> str:
     parts = [
-        (word, table[f"{word}_s"].to_numpy(float), svg.action_colour(k))
-        for k, word in enumerate(words)
+        (word, table[f"{word}_s"].to_numpy(float), colour)
+        for word, colour in action_colours(words).items()
         if f"{word}_s" in table
     ]
     numbers = (table[name].to_numpy(float) for name in ("start_s", "stop_s", "observed_s"))

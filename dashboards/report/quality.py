@@ -11,6 +11,8 @@ import numpy as np
 
 from liex_lab.sessions import Session
 
+from ..units import counted, shown
+
 _LOST_SHARE = 0.02
 _DOUBTFUL_SHARE = 0.05
 _ERROR_SHARE = 0.1
@@ -28,6 +30,54 @@ def warnings(session: Session) -> list[str]:
         *_of_frames(session),
         *_of_flips(session),
         *_of_measures(session),
+        *_of_names(session),
+    ]
+
+
+def _of_names(session: Session) -> list[str]:
+    """Bouts that a person named or a correction changed, and that contradict their definition."""
+    if "contradicts" not in session.bouts:
+        return []
+    wrong = session.bouts[session.bouts["contradicts"].fillna("") != ""]
+    if not len(wrong):
+        return []
+    return [
+        f"{counted(len(wrong), 'bout contradicts', 'bouts contradict')} the definition of the "
+        "name, which was left as it is; see the list below."
+    ]
+
+
+def refusal_rows(session: Session) -> list[tuple[str, str, str, str, str]]:
+    """Bouts that contradict their definition: those renamed first, then those left as they are.
+
+    Args:
+        session: the opened session.
+
+    Returns:
+        (from, to, name, what became of it, what does not hold), times in s.
+    """
+    found = [
+        (
+            f"{one['start_s']:.2f}",
+            f"{one['stop_s']:.2f}",
+            str(one["action"]),
+            str(one["named"]) or "no name",
+            str(one["why"]),
+        )
+        for one in (session.metadata.get("refused_bouts") or {}).get("bouts", [])
+    ]
+    if "contradicts" not in session.bouts:
+        return found
+    wrong = session.bouts[session.bouts["contradicts"].fillna("") != ""]
+    return found + [
+        (
+            f"{row.start_s:.2f}",
+            f"{row.stop_s:.2f}",
+            str(row.action),
+            f"left, by {row.source}",
+            str(row.contradicts),
+        )
+        for row in wrong.itertuples()
     ]
 
 
@@ -39,17 +89,18 @@ def _of_frames(session: Session) -> list[str]:
     doubtful = int(frames["flags"].get("doubtful", 0))
     if frames["n_missing"]:
         found.append(
-            f"The camera did not deliver {frames['n_missing']:,} frames, in {frames['n_gaps']:,} "
-            "gaps; nothing is measured across them."
+            f"The camera did not deliver {counted(frames['n_missing'], 'frame')}, in "
+            f"{counted(frames['n_gaps'], 'gap')}; nothing is measured across them."
         )
     if lost > _LOST_SHARE * n:
         found.append(
-            f"{lost:,} frames ({lost / n:.1%}) have no pose; times and shares are of the rest."
+            f"{counted(lost, 'frame has', 'frames have')} no pose ({lost / n:.1%} of {n:,}); times "
+            "and shares are of the rest."
         )
     if doubtful > _DOUBTFUL_SHARE * n:
         found.append(
-            f"{doubtful:,} frames ({doubtful / n:.1%}) are doubtful: their predicted error is "
-            "large."
+            f"{counted(doubtful, 'frame is', 'frames are')} doubtful ({doubtful / n:.1%} of "
+            f"{n:,}): the predicted error is large."
         )
     error = session.frames["predicted_error_mm"].median()
     spine = session.frames["spine_mm"].median()
@@ -68,8 +119,9 @@ def _of_flips(session: Session) -> list[str]:
     seconds = float((flips["stop_s"] - flips["start_s"]).sum())
     undone = int(flips["applied"].astype(bool).sum())
     return [
-        f"Head and tail may have been exchanged in {len(flips)} stretches of {seconds:.1f} s in "
-        f"all; {undone} were put right. They are listed below: look at them in the replay."
+        f"Head and tail may have been exchanged in {counted(len(flips), 'stretch', 'stretches')} "
+        f"of {seconds:.1f} s in all; {counted(undone, 'was', 'were')} put right. "
+        "See the list below, and look at the replay."
     ]
 
 
@@ -82,9 +134,11 @@ def _of_measures(session: Session) -> list[str]:
     noise = row.get("speed_noise_mm_s", np.nan)
     pause = rules.get("pause_below_mm_s", np.nan)
     if noise > _NOISE_SHARE * pause:
+        noise, unit = shown(noise, "mm/s")
+        pause, _ = shown(pause, "mm/s")
         found.append(
-            f"Errors of the pose alone may look like a speed of up to {noise:.0f} mm/s, and a "
-            f"pause is one below {pause:g} mm/s: pauses, and distance and speed at rest, are not "
+            f"Errors of the pose alone may look like a speed of up to {noise:.3g} {unit}, and a "
+            f"pause is one below {pause:g} {unit}: pauses, and distance and speed at rest, are not "
             "to be trusted."
         )
     described = session.columns

@@ -12,12 +12,15 @@ from typing import Any
 
 import numpy as np
 
+from liex_lab.actions.colours import action_colours
 from liex_lab.sessions import Session
 from liex_lab.sessions.failure import write_whole
+from liex_lab.sessions.verdict import verdict_in
 
-from . import svg
+from ..units import counted, shown, titled
 from .charts import FRAMES, KINEMATICS, around_actions, charts, curves, pictures
-from .quality import flip_rows, frame_account, warnings
+from .methods import methods, optics, spine_mm
+from .quality import flip_rows, frame_account, refusal_rows, warnings
 
 TEMPLATES = Path(__file__).parent / "templates"
 _TABLES = {
@@ -75,6 +78,7 @@ def render(session: Session) -> str:
             f"{name.replace('_', ' ')} {value}"
             for name, value in session.metadata["subject"].items()
         ),
+        verdict=verdict_in(session.metadata),
         warnings=warnings(session),
         account=frame_account(session),
         flips=flip_rows(session),
@@ -88,6 +92,8 @@ def render(session: Session) -> str:
         zones=zone_rows(session),
         facts=facts(session),
         gaps=gap_rows(session),
+        refused=refusal_rows(session),
+        no_actions=session.metadata.get("no_actions", ""),
         methods=methods(session),
         glossary=glossary(session),
     )
@@ -104,11 +110,11 @@ def action_rows(session: Session, words: list[str]) -> list[tuple[str, str, str,
     return [
         (
             word,
-            svg.action_colour(k),
+            colour,
             session.metadata["actions"][word],
             str(unresolved.get(word, "")),
         )
-        for k, word in enumerate(words)
+        for word, colour in action_colours(words).items()
     ]
 
 
@@ -119,7 +125,7 @@ def headline(session: Session) -> str:
         session: the opened session.
     """
     frames = session.metadata["frames"]
-    parts = [f"{frames['n_frames']:,} frames", _clock(frames["duration_s"])]
+    parts = [counted(frames["n_frames"], "frame"), _clock(frames["duration_s"])]
     if frames["fps_median"]:
         parts.append(f"{frames['fps_median']:.1f} frames/s")
     if session.metadata["session_start_time"]:
@@ -134,26 +140,32 @@ def cards(session: Session) -> list[tuple[str, str, str]]:
         session: the opened session.
     """
     frames = session.metadata["frames"]
-    good = [(f"{frames['n_observed'] / frames['n_frames']:.1%}", "", "of the frames with a pose")]
+    n = frames["n_frames"]
+    good = [
+        (f"{frames['n_observed'] / n:.1%}", "", f"of {counted(n, 'frame')} with a pose"),
+    ]
     error = session.frames["predicted_error_mm"].median()
     if np.isfinite(error):
         good.append((f"{error:.1f}", "mm", "predicted joint error, median"))
     if not session.has("summary.csv"):
         return good
     row = session.summary.iloc[0]
-    shown = [
+    speed, unit = shown(row["mean_speed_mm_s"], "mm/s")
+    first = [
         (f"{row['distance_m']:.2f}", "m", "distance"),
-        (_number(row["mean_speed_mm_s"]), "mm/s", "mean speed"),
+        (_number(speed), unit, "mean speed"),
     ]
     if "rear_count" in row and "tail_beat_hz" not in row:
-        shown.append((f"{int(row['rear_count'])}", "", f"rears, {row['rear_s']:.1f} s in all"))
+        rears = int(row["rear_count"])
+        what = "rear" if rears == 1 else "rears"
+        first.append((f"{rears}", "", f"{what}, {row['rear_s']:.1f} s in all"))
     elif np.isfinite(row.get("tail_beat_hz", np.nan)):
-        shown.append((f"{row['tail_beat_hz']:.1f}", "Hz", "tail beat, median"))
-    return [*shown, *good]
+        first.append((f"{row['tail_beat_hz']:.1f}", "Hz", "tail beat, median"))
+    return [*first, *good]
 
 
 def summary_rows(session: Session, words: list[str]) -> list[tuple[str, str, str, str]]:
-    """The summary as (column, value, unit, meaning), but for the columns of the actions and zones.
+    """The summary as (title, value, unit, meaning), but for the columns of the actions and zones.
 
     Args:
         session: the opened session.
@@ -169,16 +181,22 @@ def summary_rows(session: Session, words: list[str]) -> list[tuple[str, str, str
         *(f"{word}_{what}" for word in words for what, _ in _BUDGET),
     }
     elsewhere |= {f"zone_{zone.name}_{what}" for zone in session.zones for what in ("s", "share")}
-    return [
-        (
-            name,
-            f"{row[name]:.1%}" if name.endswith("_share") else _number(row[name]),
-            "" if name.endswith("_share") else str(described.loc[name, "unit"]),
-            str(described.loc[name, "meaning"]),
+    found = []
+    for name in session.summary.columns:
+        if name in elsewhere:
+            continue
+        kept = str(described.loc[name, "unit"] or "")
+        value, unit = shown(row[name], kept)
+        share = name.endswith("_share")
+        found.append(
+            (
+                titled(name, kept),
+                f"{value:.1%}" if share else _number(value),
+                "" if share else unit,
+                str(described.loc[name, "meaning"]),
+            )
         )
-        for name in session.summary.columns
-        if name not in elsewhere
-    ]
+    return found
 
 
 _BUDGET = (
@@ -202,14 +220,14 @@ def budget_rows(session: Session, words: list[str]) -> list[tuple[str, str, list
         return []
     row = session.summary.iloc[0]
     rows = []
-    for k, word in enumerate(words):
+    for word, colour in action_colours(words).items():
         if f"{word}_s" in row:  # sessions of an older version lack some of the others
             values = [row.get(f"{word}_{what}", np.nan) for what, _ in _BUDGET]
             texts = [
                 f"{value:.1%}" if what == "share" and np.isfinite(value) else _number(value)
                 for value, (what, _) in zip(values, _BUDGET, strict=True)
             ]
-            rows.append((word, svg.action_colour(k), texts))
+            rows.append((word, colour, texts))
     return rows
 
 
@@ -252,7 +270,13 @@ def facts(session: Session) -> list[tuple[str, str]]:
     flags = ", ".join(
         f"{count} {flag.replace('_', ' ')}" for flag, count in frames["flags"].items()
     )
-    size = f"{animal['spine_mm']:.1f} mm" if animal.get("spine_mm") else "unknown"
+    spine = spine_mm(session)
+    size = f"spine {spine:.1f} mm" if np.isfinite(spine) else "spine unknown"
+    if animal.get("spine_mm"):
+        size += (
+            f"; size that the method began with {animal['spine_mm']:.1f} mm "
+            f"({animal.get('origin', 'origin unknown')})"
+        )
     memory = about.get("peak_memory_mb")
     zones = ", ".join(zone.name for zone in session.zones)
     known = [
@@ -260,13 +284,12 @@ def facts(session: Session) -> list[tuple[str, str]]:
         ("Input, sha256", about["input"]["sha256"]),
         (
             "Animal",
-            f"{about['individual']}, {animal['name']}, spine {size} "
-            f"({animal.get('origin', 'origin unknown')})",
+            f"{about['individual']}, {animal['name']}, {size}",
         ),
         (
             "Frames",
             f"{frames['n_frames']:,} recorded ({flags}); {frames['n_missing']} not delivered, in "
-            f"{frames['n_gaps']} gaps",
+            f"{counted(frames['n_gaps'], 'gap')}",
         ),
         (
             "Camera",
@@ -289,35 +312,10 @@ def facts(session: Session) -> list[tuple[str, str]]:
             + (f", peak memory {memory:.0f} MB" if memory else ""),
         ),
     ]
-    if undone := _optics(session):
+    if undone := optics(session):
         known.insert(5, ("Optics", undone))
     subject = ", ".join(f"{name} {value}" for name, value in about["subject"].items())
     return known + ([("Subject", subject)] if subject else [])
-
-
-def _optics(session: Session) -> str:
-    """What was undone between the real camera and the ideal one; empty where nothing was.
-
-    A sentence without its full stop.
-    """
-    optics = session.metadata["camera"].get("optics", {})
-    undone = []
-    if bent := optics.get("distortion"):
-        undone.append(
-            f"the lens distortion ({bent['model']} "
-            f"{', '.join(f'{k:g}' for k in bent['coefficients'])})"
-        )
-    if water := optics.get("water"):
-        undone.append(
-            f"the refraction at a water surface {water['height_mm']:g} mm below the lens (index "
-            f"{water['refractive_index']:g}, {water['ranging'].replace('_', ' ')} camera)"
-        )
-    if optics.get("mirrored"):
-        undone.append("the mirroring of the pictures")
-    what = " and ".join(undone)
-    return (
-        f"{what} undone; camera and pictures are those of an ideal camera in air" if undone else ""
-    )
 
 
 def gap_rows(session: Session) -> list[tuple[str, str, str, str]]:
@@ -335,83 +333,6 @@ def gap_rows(session: Session) -> list[tuple[str, str, str, str]]:
             str(row.reason).replace("_", " "),
         )
         for row in shown.itertuples()
-    ]
-
-
-def methods(session: Session) -> list[str]:
-    """Paragraphs for a methods section, from the run's own record.
-
-    Args:
-        session: the opened session.
-    """
-    about = session.metadata
-    camera = about["camera"]
-    frames = about["frames"]
-    animal = about["animal"]
-    model = about["model"]
-    error = session.frames["predicted_error_mm"].median()
-    rate = f" at {frames['fps_median']:.1f} frames/s" if frames["fps_median"] else ""
-    learned = (
-        f" with the model {model['name']} (sha256 {model.get('sha256', '')[:16]})"
-        if model.get("name")
-        else ""
-    )
-    size = (
-        f"; the animal's length along them is {animal['spine_mm']:.1f} mm"
-        if animal.get("spine_mm")
-        else ""
-    )
-    origin = f" ({animal['origin']})" if size and animal.get("origin") else ""
-    known = (
-        f" The median joint error that the model predicts is {error:.1f} mm."
-        if np.isfinite(error)
-        else ""
-    )
-    first = (
-        f"Depth images of one {animal['name']} ({camera['width']} x {camera['height']} pixels, "
-        f"{frames['n_frames']:,} frames{rate}, camera {camera['floor_distance_mm']:.0f} mm from "
-        f"the floor) were analysed with liex_lab {about['versions']['liex_lab']}{learned}. A "
-        f"skeleton of {len(animal['joints'])} joints ({', '.join(animal['joints'])}) on the body's "
-        f"mid-axis was fitted to every frame{size}{origin}. {frames['n_observed']:,} of "
-        f"{frames['n_frames']:,} recorded frames have a pose, {frames['flags'].get('doubtful', 0)} "
-        f"of them flagged as doubtful; {frames['n_missing']} further frames were not delivered by "
-        f"the camera.{known} Positions are millimetres in the arena frame, z up from the floor."
-    )
-    if undone := _optics(session):
-        first += f" {undone[0].upper()}{undone[1:]}."
-    return [first, *_by_hand(session), *_behaviour_methods(session)]
-
-
-def _by_hand(session: Session) -> list[str]:
-    """What people corrected, as a methods section has to say it; empty where nothing was."""
-    told = session.metadata.get("corrections")
-    if not told:
-        return []
-    kinds = {
-        "flip": "head and tail exchanged over a stretch",
-        "joint": "joints placed",
-        "bout": "edits of bouts",
-    }
-    parts = ", ".join(f"{text}: {told[kind]}" for kind, text in kinds.items() if told.get(kind))
-    return [
-        f"After measurement, {told['n']} corrections were made by hand by "
-        f"{', '.join(told['authors'])} ({parts})."
-    ]
-
-
-def _behaviour_methods(session: Session) -> list[str]:
-    rules = session.metadata.get("rules")
-    actions = session.metadata.get("actions", {})
-    if not rules or not actions:
-        return []
-    named = "; ".join(f"{word.replace('_', ' ')}: {meaning}" for word, meaning in actions.items())
-    return [
-        "Speed is that of the mean of all joints but the nose over the floor, from its positions "
-        f"{rules['speed_half_window_s']:g} s before and after at the frames' true times, never "
-        "across a gap. Every frame has at most one name, given by rule, the first that applies "
-        f"of: {named}. Bouts of one kind with less than {rules['merge_pauses_s']:g} s between them "
-        f"were joined, then those shorter than {rules['min_bout_s']:g} s dropped. Shares are of "
-        f"the {session.metadata['frames']['observed_s']:.1f} s in which the animal was observed."
     ]
 
 

@@ -18,6 +18,8 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from liex_lab.actions.colours import action_colours
+
 Array = NDArray[np.float64]
 
 # shared by all figures over time, so that their axes stand below each other
@@ -27,20 +29,6 @@ RIGHT = 22
 ARENA = "the arena"  # the outline that needs no name
 _MAX_PLACES = 20_000  # of the way over the floor: five a second of an hour
 _MAX_COLUMNS = 1200  # of a curve; more points than that cannot be told apart on a page
-ACTION_COLOURS = (
-    "#EE6677",
-    "#CCBB44",
-    "#4477AA",
-    "#BBBBBB",
-    "#228833",
-    "#66CCEE",
-    "#AA3377",
-    "#332288",
-    "#999933",
-    "#EE8866",
-    "#44BB99",
-    "#882255",
-)
 _VIRIDIS = np.array(
     [
         [68, 1, 84],
@@ -165,6 +153,7 @@ def lanes(
         lost: spans (start, stop) without a pose, s.
         time: the time axis.
     """
+    own = action_colours(words)
     row = 18.0
     top = 6.0
     bottom = top + row * max(len(words), 1)
@@ -177,8 +166,8 @@ def lanes(
             f'<text class="label" x="{LEFT - 8}" y="{y + row / 2 + 4:.1f}" text-anchor="end">'
             f"{escape(word.replace('_', ' '))}</text>"
         )
-        own = [(start, stop) for start, stop, action in spans if action == word]
-        for start, stop in _merged(own, time):
+        named = [(start, stop) for start, stop, action in spans if action == word]
+        for start, stop in _merged(named, time):
             parts.append(
                 _bar(
                     time,
@@ -186,7 +175,7 @@ def lanes(
                     stop,
                     y + 2,
                     row - 4,
-                    action_colour(k),
+                    own[word],
                     f"{word} {stop - start:.2f} s",
                 )
             )
@@ -414,15 +403,6 @@ def viridis(share: float) -> str:
     low = min(int(at), len(_VIRIDIS) - 2)
     r, g, b = _VIRIDIS[low] + (at - low) * (_VIRIDIS[low + 1] - _VIRIDIS[low])
     return f"#{int(r):02x}{int(g):02x}{int(b):02x}"
-
-
-def action_colour(place: int) -> str:
-    """The colour of a word of the vocabulary, as in the replay.
-
-    Args:
-        place: index of the word in the vocabulary.
-    """
-    return ACTION_COLOURS[place % len(ACTION_COLOURS)]
 
 
 _HATCH = (

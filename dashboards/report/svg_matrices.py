@@ -29,7 +29,7 @@ def matrix(
     """
     # room for words as long as 'rear unsupported'
     cell = 58.0
-    left = 124.0
+    left = 158.0
     top = 104.0
     size = cell * len(words)
     parts = []
@@ -38,7 +38,8 @@ def matrix(
         at = (k + 0.5) * cell
         parts.append(
             f'<text class="label" x="{left - 8}" y="{top + at + 4:.1f}" '
-            f'text-anchor="end">{label}</text>'
+            f'text-anchor="end">{label} <tspan class="tick">n {np.nansum(counts[k]):.0f}</tspan>'
+            "</text>"
         )
         x = left + at
         y = top - 8

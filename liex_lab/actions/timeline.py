@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -23,6 +24,7 @@ from numpy.typing import NDArray
 from liex_lab.actions.channels import Segment, channel_names, segments_of
 from liex_lab.actions.ethogram import UNLABELLED, Ethogram, frame_stops, runs_of
 from liex_lab.actions.labels import LabelledTrack
+from liex_lab.actions.refusals import Broken, FrameCheck, Refused, commonest, overlap
 from liex_lab.actions.semi_markov import SemiMarkovModel
 from liex_lab.actions.vocabulary import FASTEST
 from liex_lab.actions.window_features import window_features
@@ -43,7 +45,7 @@ _SPEED_S = 0.2
 _SLACK = 1.25
 _STILL = 0.1
 _UNSEEN = 6.0
-# how often bouts that are too slow are refused, and what that costs a tick
+# how often bouts that contradict what their word means are refused, and what that costs a tick
 _MOST_DECODED = 6
 _REFUSED = 10.0
 _FRAMES_NEEDED = 3.5  # within a bout for it to be seen at all: fewer than four frames
@@ -134,7 +136,11 @@ class TimelineModel:
         return scores
 
     def recognise(
-        self, track: Track, wall_mm: Array | None = None, allocate: Allocator = np.empty
+        self,
+        track: Track,
+        wall_mm: Array | None = None,
+        allocate: Allocator = np.empty,
+        broken: Broken | None = None,
     ) -> Recognised:
         """The ethogram of a track, and the probability of each word in each of its frames.
 
@@ -142,9 +148,12 @@ class TimelineModel:
             track: one animal's track of n frames.
             wall_mm: (n,) distance of the animal from the nearest wall, mm; None where nobody knows.
             allocate: allocator of large intermediate arrays and of the probabilities.
+            broken: says of the frames [start, stop) what of a word's definition does not hold
+                there, '' for nothing; such a bout is refused and the track decoded again, in the
+                end without a name. None refuses only what is never as fast as its word asks for.
 
         Returns:
-            Ethogram, probabilities, and what the frame rate cannot resolve.
+            Ethogram, probabilities, what the frame rate cannot resolve, and what was refused.
         """
         n = track.n_frames
         probability = allocate((n, len(self.words)), float)
@@ -156,38 +165,91 @@ class TimelineModel:
         time_s = (track.times_ns - track.times_ns[:1]) * 1e-9
         names = channel_names(track.skeleton)
         step = 1.0 / self.clock_hz
+        refused: list[tuple[slice, int, str]] = []
+        broken = None if broken is None else cache(broken)
         for number, segment in enumerate(segments_of(track, self.clock_hz, wall_mm, allocate)):
             speed = steady_speed(segment, names)
             scores = self.scores(segment, names, speed, allocate)
-            decoded = self._decode(scores, speed, allocate)
-            certain = self.chain.probabilities(scores, step, allocate)
             begin = segment.times_s[0]
             first, last = np.searchsorted(time_s, [begin - 1e-6, segment.times_s[-1] + step])
+            tick = np.clip(
+                np.round((time_s[first:last] - begin) / step).astype(int), 0, len(scores) - 1
+            )
+            decoded = self._decode(
+                scores, speed, allocate, FrameCheck(broken, first, tick), refused
+            )
+            certain = self.chain.probabilities(scores, step, allocate)
             for piece in blocks(last - first, _PIECE):
                 rows = slice(first + piece.start, first + piece.stop)
-                tick = np.clip(
-                    np.round((time_s[rows] - begin) / step).astype(int), 0, len(scores) - 1
-                )
-                told = certain[tick]
-                code[rows] = decoded[tick]
+                told = certain[tick[piece]]
+                code[rows] = decoded[tick[piece]]
                 probability[rows] = told
                 part[rows] = number
                 score[rows] = np.take_along_axis(told, code[rows, None], axis=1)[:, 0]
+        if broken is not None and n:
+            self._unname(code, part, broken, refused)
         ethogram = Ethogram.of_words(
             code, track.times_ns, self.definitions, score, part, names=self.words
         )
-        return Recognised(ethogram, self.words, probability, self.unresolved(track.times_ns))
+        return Recognised(
+            ethogram,
+            self.words,
+            probability,
+            self.unresolved(track.times_ns),
+            tuple(
+                Refused(rows, self.words[word], self.words[commonest(code[rows])], why)
+                for rows, word, why in refused
+            ),
+        )
 
-    def _decode(self, scores: Array, speed: Array, allocate: Allocator) -> NDArray[np.int64]:
-        """The most probable words (m,) of bouts that reach the speed their word asks for.
+    def _unname(
+        self,
+        code: NDArray[np.int64],
+        part: NDArray[np.int64],
+        broken: Broken,
+        refused: list[tuple[slice, int, str]],
+    ) -> None:
+        """Take the name from bouts of frames that contradict it: those that ticks did not show.
 
-        Scores (m, K) of bouts that never do are lowered in place and decoded again, at most six
-        times.
+        A slow camera may have no frame of what lies between two bouts of one word.
         """
-        for _ in range(_MOST_DECODED):
+        nothing = self.words.index(UNLABELLED)
+        starts, stops, _ = runs_of(code + len(self.words) * part)
+        for start, stop in zip(starts.tolist(), stops.tolist(), strict=True):
+            word = int(code[start])
+            if word != nothing and (why := broken(start, stop, self.words[word])):
+                refused.append((slice(start, stop), word, why))
+                code[start:stop] = nothing
+
+    def _decode(
+        self,
+        scores: Array,
+        speed: Array,
+        allocate: Allocator,
+        check: FrameCheck,
+        refused: list[tuple[slice, int, str]],
+    ) -> NDArray[np.int64]:
+        """The most probable words (m,) of bouts that are what their word asks for.
+
+        Scores (m, K) of bouts that are not are lowered in place and decoded again, at most six
+        times; what contradicts its definition even then loses its name. `refused` gets the frames,
+        word and reason of each bout that contradicted.
+        """
+        nothing = self.words.index(UNLABELLED)
+        for left in reversed(range(_MOST_DECODED)):
             decoded = self.chain.decode(scores, 1.0 / self.clock_hz, allocate)
             starts, stops, words = runs_of(decoded)
-            wrong = np.maximum.reduceat(speed, starts) < self.peaks[words] / _SLACK
+            slow = np.maximum.reduceat(speed, starts) < self.peaks[words] / _SLACK
+            false = np.zeros(len(starts), bool)
+            for k, (start, stop, word) in enumerate(zip(starts, stops, words, strict=True)):
+                rows, why = check.broken(start, stop, self.words[word])
+                if why:
+                    false[k] = True
+                    if not any(word == w and overlap(rows, other) for other, w, _ in refused):
+                        refused.append((rows, int(word), why))
+                    if not left:
+                        decoded[start:stop] = nothing
+            wrong = slow | false
             if not wrong.any():
                 break
             for start, stop, word in zip(starts[wrong], stops[wrong], words[wrong], strict=True):
@@ -259,12 +321,14 @@ class Recognised:
         words: (K) the vocabulary.
         probability: (n, K) of each word in every frame, NaN where there is no pose.
         unresolved: word -> what the frame rate cannot resolve of it, and why.
+        refused: bouts that were as good as named, but contradict what their word means.
     """
 
     ethogram: Ethogram
     words: tuple[str, ...]
     probability: Array
     unresolved: dict[str, str]
+    refused: tuple[Refused, ...] = ()
 
 
 @dataclass(frozen=True)

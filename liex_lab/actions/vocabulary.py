@@ -1,60 +1,279 @@
-"""Vocabularies of the bundled ethograms: definitions of the words, and the fastest part of each.
+"""Vocabularies of the bundled ethograms: what each word means, and what a bout of it has to show.
 
-Thresholds in the definitions are starting values, with the literature's.
+A `Definition` is a sentence and the limits that can be measured of a bout; the numbers in the
+sentence, the clause that is printed behind it and the check of every bout (`behaviour.checking`)
+all come from these limits. Thresholds are starting values, with the literature's.
 """
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import NamedTuple
 
-DEFINITIONS: dict[str, dict[str, str]] = {
+# by so much of itself a number said with "about" may be missed; a bout's ends are less certain
+ABOUT = 0.25
+ABOUT_TIME = 1.0 / 3.0
+
+
+class Measure(NamedTuple):
+    """A measure of a bout that a definition may bound.
+
+    Attributes:
+        says: its name in a sentence.
+        unit: the unit that people read, with the space or without it before.
+        kept: of the unit that it is measured in, how many make one that people read.
+    """
+
+    says: str
+    unit: str = ""
+    kept: float = 1.0
+
+
+_DEGREES = (" degrees", math.radians(1.0))
+_CM_S = (" cm/s", 10.0)
+MEASURES = {
+    "speed_mm_s": Measure("mean and median speed", *_CM_S),
+    "peak_speed_mm_s": Measure("peak speed", *_CM_S),
+    "speed_bl_s": Measure("mean speed", " lengths/s"),
+    "quiet_bl_s": Measure("mean speed beyond speed_sd_mm_s, the noise,", " lengths/s"),
+    "duration_s": Measure("duration", " s"),
+    "left_turn_rad": Measure("net turn to its left", *_DEGREES),
+    "right_turn_rad": Measure("net turn to its right", *_DEGREES),
+    "either_turn_rad": Measure("net turn to either side", *_DEGREES),
+    "swing_rad": Measure("swing of the heading", *_DEGREES),
+    "bend_rad": Measure("largest bend", *_DEGREES),
+    "usual_bend_rad": Measure("median bend", *_DEGREES),
+    "pitch_rad": Measure("mean pitch", *_DEGREES),
+    "raised_bl": Measure("highest nose above the tail's base", " lengths"),
+    "moved_bl": Measure("displacement", " lengths"),
+}
+
+
+class Limit(NamedTuple):
+    """Bounds of a measure that every bout of a word keeps.
+
+    Attributes:
+        measure: one of `MEASURES`, which names its unit.
+        least: the lower bound, in that unit.
+        most: the upper bound.
+        about: a definition that says "about" is kept to within this share of the bound.
+    """
+
+    measure: str
+    least: float = -math.inf
+    most: float = math.inf
+    about: float = 0.0
+
+    @property
+    def bounds(self) -> tuple[float, float]:
+        """What is checked: the least and the most, in the unit of the measure."""
+        low = self.least - self.about * abs(self.least) if math.isfinite(self.least) else self.least
+        high = self.most + self.about * abs(self.most) if math.isfinite(self.most) else self.most
+        return low, high
+
+    def holds(self, value: float) -> bool:
+        """Whether a value lies within the bounds; one that could not be measured does.
+
+        Args:
+            value: of the measure, in its unit.
+        """
+        low, high = self.bounds
+        return not (value < low or value > high)
+
+    def shown(self, value: float) -> str:
+        """A value of the measure, in words and in the unit that people read.
+
+        Args:
+            value: of the measure, in its unit.
+        """
+        measure = MEASURES[self.measure]
+        return f"{measure.says} {value / measure.kept:.3g}{measure.unit}"
+
+    @property
+    def span(self) -> str:
+        """The bounds that are checked, in the unit that people read."""
+        measure = MEASURES[self.measure]
+        low, high = (f"{bound / measure.kept:.3g}" for bound in self.bounds)
+        if math.isinf(self.most):
+            return f"at least {low}{measure.unit}"
+        if math.isinf(self.least):
+            return f"at most {high}{measure.unit}"
+        return f"{low} to {high}{measure.unit}"
+
+    @property
+    def told(self) -> str:
+        """What is checked, in words."""
+        return f"{MEASURES[self.measure].says} {self.span}"
+
+
+@dataclass(frozen=True)
+class Definition:
+    """What a word means.
+
+    Attributes:
+        pattern: the sentence; {0}, {1}, ... are the finite bounds of its limits, in order.
+        limits: what can be measured of it.
+    """
+
+    pattern: str
+    limits: tuple[Limit, ...]
+
+    @property
+    def sentence(self) -> str:
+        """The definition by itself, which virtual animals act by and models keep."""
+        bounds = [
+            f"{bound / MEASURES[limit.measure].kept:.6g}"
+            for limit in self.limits
+            for bound in (limit.least, limit.most)
+            if math.isfinite(bound)
+        ]
+        return self.pattern.format(*bounds)
+
+    @property
+    def printed(self) -> str:
+        """The definition with what was checked of every bout."""
+        return f"{self.sentence} (checked: {', '.join(limit.told for limit in self.limits)})"
+
+
+def _defined(pattern: str, *limits: Limit) -> Definition:
+    return Definition(pattern, limits)
+
+
+def _deg(degrees: float) -> float:
+    return math.radians(degrees)
+
+
+_REARS = Limit("raised_bl", least=0.4)
+WORDS: dict[str, dict[str, Definition]] = {
     "fish": {
-        "scoot": (
-            "forward swim with tail beats, 0.7 to 4 lengths/s, bends below about 32 degrees in "
-            "all, no turn"
+        "scoot": _defined(
+            "forward swim with tail beats, {0} to {1} lengths/s, bends below about {2} degrees in "
+            "all, no turn",
+            Limit("speed_bl_s", 0.7, 4.0, about=ABOUT),
+            Limit("usual_bend_rad", most=_deg(32.0), about=ABOUT),
         ),
-        "j_turn": (
-            "slow turn of up to 45 degrees by repeated one-sided bends far caudally, the front "
-            "half straight"
+        "j_turn": _defined(
+            "slow turn of up to {0} degrees by repeated one-sided bends far caudally, the front "
+            "half straight",
+            Limit("either_turn_rad", most=_deg(45.0), about=ABOUT),
         ),
-        "c_turn": (
-            "C-bend of more than about 90 degrees in all within some 0.1 s, then a counter-bend "
-            "and a burst"
+        "c_turn": _defined(
+            "C-bend of more than about {0} degrees in all within some 0.1 s, then a counter-bend "
+            "and a burst",
+            Limit("bend_rad", least=_deg(90.0), about=ABOUT),
         ),
-        "r_turn": (
-            "routine turn by a single bend of about 45 to 110 degrees in all, without a strong "
-            "counter-bend"
+        "r_turn": _defined(
+            "routine turn by a single bend of about {0} to {1} degrees in all, without a strong "
+            "counter-bend",
+            Limit("bend_rad", _deg(45.0), _deg(110.0), about=ABOUT),
         ),
-        "surface": "swims up, pitch above about 15 degrees",
-        "dive": "swims down, pitch below about -15 degrees",
-        "zigzag": (
-            "erratic: turns of 65 degrees and more that change side every 0.2 to 0.4 s, at "
-            "raised speed"
+        "surface": _defined(
+            "swims up, pitch above about {0} degrees",
+            Limit("pitch_rad", least=_deg(15.0), about=ABOUT),
         ),
-        "thrash": "large alternating bends of the whole body with little displacement",
-        "freeze": "below about 0.1 lengths/s without tail beats for 0.9 s or more",
+        "dive": _defined(
+            "swims down, pitch below about {0} degrees",
+            Limit("pitch_rad", most=_deg(-15.0), about=ABOUT),
+        ),
+        "zigzag": _defined(
+            "erratic: turns of {0} degrees and more that change side every 0.2 to 0.4 s, at "
+            "raised speed",
+            Limit("swing_rad", least=_deg(65.0)),
+        ),
+        "thrash": _defined(
+            "large alternating bends of the whole body with little displacement",
+            Limit("moved_bl", most=1.0),
+        ),
+        "freeze": _defined(
+            "below about {0} lengths/s without tail beats for {1} s or more",
+            Limit("quiet_bl_s", most=0.1, about=ABOUT),
+            Limit("duration_s", least=0.9),
+        ),
     },
     "mouse": {
-        "walk": "goes at about 5 to 30 cm/s",
-        "run": "goes faster than about 30 cm/s",
-        "turn_left": "turns by more than 30 degrees to its left, at up to 15 cm/s",
-        "turn_right": "turns by more than 30 degrees to its right, at up to 15 cm/s",
-        "rear_supported": (
+        "walk": _defined(
+            "goes at about {0} to {1} cm/s", Limit("speed_mm_s", 50.0, 300.0, about=ABOUT)
+        ),
+        "run": _defined(
+            "goes faster than about {0} cm/s", Limit("speed_mm_s", least=300.0, about=ABOUT)
+        ),
+        "turn_left": _defined(
+            "turns by more than {0} degrees to its left, at up to {1} cm/s",
+            Limit("left_turn_rad", least=_deg(30.0)),
+            Limit("speed_mm_s", most=150.0),
+        ),
+        "turn_right": _defined(
+            "turns by more than {0} degrees to its right, at up to {1} cm/s",
+            Limit("right_turn_rad", least=_deg(30.0)),
+            Limit("speed_mm_s", most=150.0),
+        ),
+        "rear_supported": _defined(
             "nose raised far above the tail's base with a wall within about 5 cm before it; "
-            "rising and descending belong to it"
+            "rising and descending belong to it",
+            _REARS,
         ),
-        "rear_unsupported": (
+        "rear_unsupported": _defined(
             "nose raised far above the tail's base without a wall within about 5 cm before it; "
-            "rising and descending belong to it"
+            "rising and descending belong to it",
+            _REARS,
         ),
-        "groom": "sits hunched below 2 cm/s with rhythmic strokes of head and paws",
-        "pause": "stays below 5 cm/s and looks about",
-        "freeze": "no movement of the body at all for 1 s or more",
-        "sniff": "nose down to the floor with fast small movements of the head, below 10 cm/s",
-        "dart": "a burst from standing to 23 cm/s or more and back within about 1 s",
-        "stretch_attend": "body long, low and straight, below 5 cm/s",
+        "groom": _defined(
+            "sits hunched below {0} cm/s with rhythmic strokes of head and paws",
+            Limit("speed_mm_s", most=20.0),
+        ),
+        "pause": _defined("stays below {0} cm/s and looks about", Limit("speed_mm_s", most=50.0)),
+        "freeze": _defined(
+            "no movement of the body at all for {0} s or more",
+            Limit("duration_s", least=1.0),
+            Limit("speed_mm_s", most=20.0),
+        ),
+        "sniff": _defined(
+            "nose down to the floor with fast small movements of the head, below {0} cm/s",
+            Limit("speed_mm_s", most=100.0),
+        ),
+        "dart": _defined(
+            "a burst from standing to {0} cm/s or more and back within about {1} s",
+            Limit("peak_speed_mm_s", least=230.0),
+            Limit("duration_s", most=1.0, about=ABOUT_TIME),
+        ),
+        "stretch_attend": _defined(
+            "body long, low and straight, below {0} cm/s", Limit("speed_mm_s", most=50.0)
+        ),
     },
 }
+DEFINITIONS: dict[str, dict[str, str]] = {
+    animal: {word: one.sentence for word, one in words.items()} for animal, words in WORDS.items()
+}
+_BY_PRINT = {one.printed: one for words in WORDS.values() for one in words.values()}
+
+
+def limits_of(meaning: str) -> tuple[Limit, ...]:
+    """The limits of a definition as it was printed; none of any other sentence.
+
+    What a session's or a person's own words mean is not ours to check, so the sentence decides and
+    not the word.
+
+    Args:
+        meaning: the definition that stands beside a word, as `Definition.printed` gives it.
+    """
+    known = _BY_PRINT.get(meaning)
+    return known.limits if known else ()
+
+
+def printed_meanings(skeleton: str, kept: Mapping[str, str]) -> dict[str, str]:
+    """The definitions that a model keeps, those of this vocabulary with what is checked of them.
+
+    Args:
+        skeleton: name of the animal's skeleton.
+        kept: word -> definition as the model keeps it.
+    """
+    own = WORDS.get(skeleton, {})
+    return {
+        word: own[word].printed if word in own and own[word].sentence == meaning else meaning
+        for word, meaning in kept.items()
+    }
 
 
 class Fastest(NamedTuple):

@@ -72,8 +72,8 @@ class MouseRules:
 
     def definitions(self) -> dict[str, str]:
         """What each word of `ACTIONS` means with these numbers, as sentences for a reader."""
-        walk = f"{self.pause_below_mm_s:g} mm/s"
-        run = f"{self.run_above_mm_s:g} mm/s"
+        walk = f"{self.pause_below_mm_s / 10.0:g} cm/s"
+        run = f"{self.run_above_mm_s / 10.0:g} cm/s"
         return {
             "rear": (
                 f"the nose is {self.rear_height_mm:g} mm or more above the tail's base, or "

@@ -49,9 +49,21 @@ STATS: tuple[Column, ...] = columns(
     "stats",
     ("measure", "string", "", "column of the summary that is compared"),
     ("contrast", "string", "", "second group - first group"),
-    ("estimate", "float64", "", "difference of the groups, in the measure's own unit"),
-    ("ci_low", "float64", "", "lower end of the difference's 95 % interval", "t, over the units"),
-    ("ci_high", "float64", "", "upper end of it", "t, over the units"),
+    (
+        "estimate",
+        "float64",
+        "",
+        "difference of the groups, in the measure's own unit: of the units' means, or as the "
+        "mixed model estimates it where test names one",
+    ),
+    (
+        "ci_low",
+        "float64",
+        "",
+        "lower end of the difference's 95 % interval",
+        "t over the units, or of the mixed model where test names one",
+    ),
+    ("ci_high", "float64", "", "upper end of it", "as ci_low"),
     (
         "effect_size",
         "float64",
@@ -90,7 +102,7 @@ STATS: tuple[Column, ...] = columns(
         "float64",
         "",
         "the smallest p that a permutation of these units can give",
-        "2 / arrangements, 1 / arrangements where a block has unequally many of both groups",
+        "2 / arrangements; 1 / arrangements where an arrangement has no mirror image",
     ),
     ("family", "string", "", "the tests that p_fdr is corrected for"),
     ("n_family", "int64", "", "how many they are"),
@@ -343,5 +355,7 @@ def methods(stats: pd.DataFrame, alpha: float = 0.05) -> str:
         f"{alpha:g} was taken as the limit."
     )
     if len(refused):
-        text += f" {len(refused)} comparisons were not tested, as the design does not allow it."
+        n = len(refused)
+        told = "comparison was" if n == 1 else "comparisons were"
+        text += f" {n} {told} not tested, as the design does not allow it."
     return text

@@ -292,6 +292,7 @@ BOUT_MEASURES: tuple[Column, ...] = columns(
         "mean speed within the bout",
         "path_mm / time with a speed",
     ),
+    ("median_speed_mm_s", "float64", "mm/s", "median speed of the bout's frames"),
     ("peak_speed_mm_s", "float64", "mm/s", "fastest speed within the bout", "max of speed_mm_s"),
     (
         "peak_speed_sd_mm_s",
@@ -342,6 +343,16 @@ BOUT_MEASURES: tuple[Column, ...] = columns(
         "start_s - stop_s of the last one",
         ZZ,
     ),
+    (
+        "contradicts",
+        "string",
+        "",
+        "what of the printed definition of its word does not hold of the bout; empty where all "
+        "that can be measured holds, and where no limits are stated. Such bouts of a model are "
+        "named otherwise, those of a person stay",
+        "the limits behind `checked` in the definition",
+        OWN,
+    ),
 )
 
 WALKING_BOUTS: tuple[Column, ...] = columns(
@@ -352,6 +363,13 @@ WALKING_BOUTS: tuple[Column, ...] = columns(
         "mm",
         "highest nose within the bout",
         "max of nose_height_mm",
+    ),
+    (
+        "peak_nose_over_rump_mm",
+        "float64",
+        "mm",
+        "how far the nose is above the tail's base at most within the bout",
+        "max of nose_over_rump_mm",
     ),
     ("time_to_peak_height_s", "float64", "s", "from the bout's onset to its highest nose"),
 )

@@ -6,7 +6,7 @@ the list; a test holds README.md to it.
 
 from __future__ import annotations
 
-from liex_lab.behaviour.bouts import ACTIONS
+from liex_lab.actions.vocabulary import WORDS
 from liex_lab.behaviour.summary_columns import Vocabulary
 from liex_lab.tables.schema import TABLES, Column
 
@@ -63,7 +63,10 @@ FIRST = (
 
 def all_columns() -> dict[str, Column]:
     """Every column that a session can have, of animals that walk and that swim, by `table.name`."""
-    walking, swimming = (Vocabulary(ACTIONS, (), swims).columns for swims in (False, True))
+    walking, swimming = (
+        Vocabulary(tuple(WORDS[animal]), (), swims).columns
+        for animal, swims in (("mouse", False), ("fish", True))
+    )
     stored = [column for rows in TABLES.values() for column in rows]
     return {f"{c.table}.{c.name}": c for c in (*stored, *swimming, *walking)}
 

@@ -1,8 +1,8 @@
 """All behaviour tables of one animal, and the summary: the one row that a biologist reads first.
 
 Glue over `kinematics`, `bouts`, `measures`, `transitions`, `activity` and `places`; the summary
-adds distance, speeds, turn bias, time budget (count, time, share, rate and latency of each action)
-and times in zones. Shares are of the time in which the animal was observed.
+adds distance, speeds, turn bias, time budget (count, time, share, rate and latency of each action,
+and of all rears together) and times in zones. Shares are of the observed time.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from liex_lab.behaviour.places import (
     surface_height_mm,
     visits,
 )
-from liex_lab.behaviour.summary_columns import Vocabulary, summary_columns
+from liex_lab.behaviour.summary_columns import Vocabulary, rears_of, summary_columns
 from liex_lab.behaviour.transitions import transitions
 from liex_lab.runtime.memory import Allocator
 from liex_lab.tables.rows import stop_times
@@ -84,6 +84,32 @@ class Behaviour:
         }
 
 
+def moving(
+    frames: pd.DataFrame,
+    poses: pd.DataFrame | Joints,
+    rules: MouseRules,
+    around: Surroundings,
+    allocate: Allocator = np.empty,
+) -> pd.DataFrame:
+    """The table `kinematics` with the thresholds and the water of a session.
+
+    Args:
+        frames: the table `frames`.
+        poses: the table `poses` of these frames, or its joints.
+        rules: window of the speed, and from where on it is impossible.
+        around: the water's surface.
+        allocate: makes the arrays of the table (an allocator, as `np.empty`).
+    """
+    return kinematics(
+        frames,
+        poses,
+        rules.speed_half_window_s,
+        rules.impossible_above_mm_s,
+        around.surface_z_mm,
+        allocate,
+    )
+
+
 def measure(
     frames: pd.DataFrame,
     poses: pd.DataFrame | Joints,
@@ -93,6 +119,7 @@ def measure(
     *,
     bouts: pd.DataFrame | None = None,
     actions: Mapping[str, str] | None = None,
+    moved: pd.DataFrame | None = None,
     allocate: Allocator = np.empty,
 ) -> Behaviour:
     """The behaviour tables of one animal from its poses.
@@ -107,24 +134,20 @@ def measure(
             rules'.
         actions: its vocabulary, word -> definition; None takes the rules'. Words that occur in no
             vocabulary are added without a definition.
+        moved: the table `kinematics` of these poses, where it is made already, see `moving`.
         allocate: makes the arrays of the table `kinematics` (an allocator, as `np.empty`).
     """
     rules = rules or MouseRules()
     around = around or Surroundings()
-    moved = kinematics(
-        frames,
-        poses,
-        rules.speed_half_window_s,
-        rules.impossible_above_mm_s,
-        around.surface_z_mm,
-        allocate,
-    )
-    named = find_bouts(frames, moved, rules) if bouts is None else measure_bouts(bouts, moved)
+    moved = moving(frames, poses, rules, around, allocate) if moved is None else moved
     actions = dict(rules.definitions() if actions is None else actions)
+    named = (
+        find_bouts(frames, moved, rules) if bouts is None else measure_bouts(bouts, moved, actions)
+    )
     actions |= dict.fromkeys(sorted(set(named["action"]) - set(actions)), "")
     words = Vocabulary(tuple(actions), tuple(around.zones), "tail_angle_rad" in moved)
     gaps = empty_table(GAPS) if gaps is None else gaps
-    summary = summarise(frames, moved, named, words, around)
+    summary = summarise(frames, moved, named, words, around, rules)
     behaviour = Behaviour(
         moved,
         named,
@@ -148,10 +171,34 @@ def measure_rows(
         rows: the track with its frame counts and names.
         rules: the thresholds; None takes the defaults.
         around: arena, zones and water; None where nothing is known.
-        **how: bouts, actions and room of `measure`.
+        **how: bouts, actions, moved and allocate of `measure`.
     """
     gaps = to_pandas(GAPS, rows.gaps())
     return measure(rows.frames_table, Joints.of_track(rows.track), rules, around, gaps, **how)
+
+
+def moving_rows(
+    rows: Rows, rules: MouseRules, around: Surroundings, allocate: Allocator = np.empty
+) -> pd.DataFrame:
+    """The table `kinematics` of a track that is not in a session yet, see `moving`.
+
+    Args:
+        rows: the track with its frame counts and names.
+        rules: window of the speed, and from where on it is impossible.
+        around: the water's surface.
+        allocate: makes the arrays of the table (an allocator, as `np.empty`).
+    """
+    times_ns = rows.track.times_ns
+    frames = pd.DataFrame(  # no more than is needed: the whole table is made once names are known
+        {
+            "session_id": rows.session_id,
+            "individual": rows.individual,
+            "frame_index": rows.frame_index,
+            "time_s": rows.time_s,
+            "dt_s": np.append(np.nan, np.diff(times_ns) * 1e-9)[: len(times_ns)],
+        }
+    )
+    return moving(frames, Joints.of_track(rows.track), rules, around, allocate)
 
 
 def stated_by(session: SessionTables) -> tuple[MouseRules, Surroundings]:
@@ -197,6 +244,7 @@ def summarise(
     bouts: pd.DataFrame,
     words: Vocabulary | None = None,
     around: Surroundings | None = None,
+    rules: MouseRules | None = None,
 ) -> pd.DataFrame:
     """The table `summary`: one row for one animal.
 
@@ -207,6 +255,7 @@ def summarise(
         words: actions, zones and whether the animal swims; None takes the rules' actions of a
             walking animal.
         around: arena, zones and water; None where nothing is known.
+        rules: what is slower than their pause does not move for certain; None takes the defaults.
 
     Returns:
         The columns of `summary_columns`.
@@ -235,8 +284,10 @@ def summarise(
         block |= depth_measures(kinematics, hold, around.surface_z_mm)
         block |= {name: _median(kinematics[name]) for name in ("tail_beat_hz", "tail_beat_mm")}
     else:
-        moving = bouts["action"].isin(["walk", "run"])
-        block["distance_moving_m"] = float(bouts.loc[moving, "path_mm"].sum()) / 1000.0
+        pause_mm_s = (rules or MouseRules()).pause_below_mm_s
+        block["distance_moving_m"] = _moving_m(
+            kinematics, np.fmax(pause_mm_s, block["speed_noise_mm_s"])
+        )
     return to_pandas(summary_columns(words.words, words.zones, words.swims), block)
 
 
@@ -262,6 +313,13 @@ def _motion(kinematics: pd.DataFrame, hold: Array) -> dict[str, float]:
     }
 
 
+def _moving_m(kinematics: pd.DataFrame, faster_than_mm_s: float) -> float:
+    """Way, m, of the frames that are faster than a speed."""
+    speed = kinematics["speed_mm_s"].to_numpy(float)
+    step = kinematics["step_mm"].to_numpy(float)
+    return float(np.nansum(step[speed > faster_than_mm_s])) / 1000.0
+
+
 def _budget(
     bouts: pd.DataFrame, words: Sequence[str], observed_s: float, first_s: float
 ) -> dict[str, float]:
@@ -280,6 +338,15 @@ def _budget(
             f"{word}_latency_s": float(own["start_s"].min()) - first_s if n else np.nan,
         }
     rest = max(0.0, observed_s - sum(found[f"{word}_s"] for word in words))
+    if kinds := rears_of(words):
+        own = bouts[bouts["action"].isin(kinds)]
+        seconds = sum(found[f"{kind}_s"] for kind in kinds)
+        found |= {
+            "rear_count": len(own),
+            "rear_s": seconds,
+            "rear_share": seconds / observed_s if observed_s > 0 else np.nan,
+            "rear_latency_s": float(own["start_s"].min()) - first_s if len(own) else np.nan,
+        }
     found["unlabelled_s"] = rest if rest > 1e-9 else 0.0  # rounding of sums of seconds
     found["unlabelled_share"] = found["unlabelled_s"] / observed_s if observed_s > 0 else np.nan
     return found

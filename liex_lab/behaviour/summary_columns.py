@@ -21,7 +21,7 @@ _SHARE = "shares add up to one, so they are not independent"
 _GENERAL = (
     *_WHO,
     ("n_frames", "int64", "", "recorded frames"),
-    ("n_lost", "int64", "", "recorded frames without a pose"),
+    ("n_lost", "int64", "", "recorded frames without a measured pose; bridged ones are among them"),
     ("n_doubtful", "int64", "", "recorded frames whose pose is flagged as doubtful"),
     (
         "duration_s",
@@ -33,9 +33,9 @@ _GENERAL = (
         "observed_s",
         "float64",
         "s",
-        "time with a pose; what rates and shares are divided by",
-        "sum over frames with a pose of the time to the next frame; before a gap or the end, the "
-        "median dt",
+        "time with a measured pose; what rates and shares are divided by",
+        "sum over frames with a measured pose of the time to the next frame; before a gap or the "
+        "end, the median dt",
     ),
     (
         "spine_mm",
@@ -106,8 +106,11 @@ _WALKER = (
         "distance_moving_m",
         "float64",
         "m",
-        "way of the body centre within walk and run, free of jitter at rest",
-        "sum of path_mm within walk and run / 1000",
+        "way of the body centre in the frames in which it moves for certain: free of jitter at "
+        "rest, and the same whatever the actions are named",
+        "sum of step_mm / 1000 over the frames faster than the plan's behaviour.pause_below_mm_s "
+        "and than speed_noise_mm_s",
+        OWN,
     ),
 )
 
@@ -173,6 +176,8 @@ def summary_columns(
         swims: of an animal that swims, else of one that walks.
     """
     named = [row for word in words for row in _of_action(word)]
+    if together := rears_of(words):
+        named += _of_rears(together)
     placed = [row for zone in zones for row in _of_zone(zone)]
     rest = (
         (
@@ -191,6 +196,40 @@ def summary_columns(
         ),
     )
     return columns("summary", *_GENERAL, *(_SWIMMER if swims else _WALKER), *named, *rest, *placed)
+
+
+def rears_of(words: Sequence[str]) -> tuple[str, ...]:
+    """The kinds of rearing that a vocabulary tells apart; none where it has rear itself.
+
+    Args:
+        words: the actions' names.
+    """
+    return () if "rear" in words else tuple(word for word in words if word.startswith("rear_"))
+
+
+def _of_rears(kinds: Sequence[str]) -> tuple[tuple[str, ...], ...]:
+    both = f"{' and '.join(kinds)} together"
+    counts = " + ".join(f"{kind}_count" for kind in kinds)
+    times = " + ".join(f"{kind}_s" for kind in kinds)
+    return (
+        ("rear_count", "int64", "", f"number of bouts of {both}", counts),
+        ("rear_s", "float64", "s", f"time in {both}", times),
+        (
+            "rear_share",
+            "float64",
+            "",
+            f"share of the observed time in {both}",
+            "rear_s / observed_s",
+            OWN,
+        ),
+        (
+            "rear_latency_s",
+            "float64",
+            "s",
+            f"time from the first sight of the animal to the first of {both}; empty where there "
+            "is none",
+        ),
+    )
 
 
 def _of_action(word: str) -> tuple[tuple[str, ...], ...]:

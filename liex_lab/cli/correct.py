@@ -190,6 +190,33 @@ def redo(session: SessionPath) -> None:
     _do(session, [], "")
 
 
+def describe(
+    session: SessionPath,
+    facts: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="KEY=VALUE...",
+            help="subject_id, group, cage, sex, batch or session_start_time; KEY= takes it away.",
+        ),
+    ],
+    by: Author = "",
+) -> None:
+    """Say who the animal is: subject_id=m07 group=drug. Nothing is measured again."""
+    from liex_lab.api import describe_session
+
+    said = {}
+    for fact in facts:
+        key, equals, value = fact.partition("=")
+        if not equals:
+            raise SessionError(f"a fact is written as KEY=VALUE, such as group=drug, not {fact!r}")
+        said[key.strip()] = value.strip()
+    with progress_bar() as progress:
+        describe_session(session, said, author=by, progress=progress)
+    for key, value in said.items():
+        typer.echo(f"described: {key} is {value or 'not known'}")
+    typer.echo(f"report:    {session / 'report.html'}")
+
+
 def _opened(session: Path) -> Session:
     from liex_lab.sessions import Session
 

@@ -14,6 +14,7 @@ from liex_lab.cli.options import (
     SessionPath,
     keep_numbers,
     tell_numbers,
+    tell_rows,
 )
 from liex_lab.cli.sections import group_of_verbs
 from liex_lab.runtime.progress import progress_bar
@@ -213,6 +214,45 @@ def evaluate_tracking(
             progress=progress,
         )
     tell_numbers(result, json_file)
+
+
+@evaluate.command("scenes")
+def evaluate_scenes(
+    only: Annotated[
+        str | None, typer.Option("--only", metavar="NAME,...", help="Only these scenes.")
+    ] = None,
+    n_frames: Annotated[int, typer.Option("--frames", min=20, help="Of each recording.")] = 300,
+    n_recordings: Annotated[
+        int, typer.Option("--recordings", min=1, help="Of each scene, each of another animal.")
+    ] = 1,
+    sealed: Annotated[
+        bool,
+        typer.Option("--sealed", help="The split that is kept for the end: never develop on it."),
+    ] = False,
+    pictures: Annotated[
+        Path | None,
+        typer.Option("--pictures", metavar="DIR", help="Draw frames of each scene there."),
+    ] = None,
+    json_file: JsonFile = None,
+) -> None:
+    """What stands before a lab's camera, scene by scene: found, joint errors, and what is wrong but
+    trusted.
+    """
+    from liex_lab.api import evaluate_scenes as measure
+
+    names = [name.strip() for name in only.split(",")] if only else []
+    with progress_bar() as progress:
+        result = measure(
+            names,
+            n_frames=n_frames,
+            n_recordings=n_recordings,
+            sealed=sealed,
+            pictures=pictures,
+            progress=progress,
+        )
+    if json_file is not None:
+        keep_numbers(result, json_file)
+    tell_rows(result["rows"])
 
 
 @evaluate.command("live")

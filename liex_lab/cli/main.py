@@ -15,7 +15,7 @@ from typing import Annotated, Any, NoReturn
 import typer
 
 import liex_lab
-from liex_lab.cli.correct import correct
+from liex_lab.cli.correct import correct, describe
 from liex_lab.cli.evaluate import evaluate
 from liex_lab.cli.options import (
     JsonFile,
@@ -26,16 +26,20 @@ from liex_lab.cli.options import (
     Settings,
     TopicName,
     VariantName,
+    WhichPlan,
+    region_setting,
     tell_numbers,
     to_json,
+    told_scores,
 )
 from liex_lab.cli.results import compare, export, report
 from liex_lab.cli.sections import MODELS, RECORDINGS, SESSIONS, START, STUDIES, group_of_verbs
 from liex_lab.cli.study import cohort, dashboard, verify
-from liex_lab.errors import LiexError
+from liex_lab.errors import LiexError, MisfitError
 from liex_lab.runtime.disk import is_full, why_full
 from liex_lab.runtime.progress import progress_bar
 
+LOOK_AT_IT = 4  # the exit code of a run whose scene does not fit, or of which little was measured
 # the exit code of our own faults (EX_SOFTWARE); what the user can put right is 1, a wrong call 2
 FAULT = 70
 _USERS_TO_MEND = {
@@ -53,6 +57,7 @@ app = group_of_verbs(
 )
 app.add_typer(evaluate, name="evaluate", rich_help_panel=MODELS)
 app.add_typer(correct, name="correct", rich_help_panel=SESSIONS)
+app.command(rich_help_panel=SESSIONS)(describe)
 app.command(rich_help_panel=SESSIONS)(report)
 app.command(rich_help_panel=SESSIONS)(verify)
 app.command(rich_help_panel=SESSIONS)(export)
@@ -89,7 +94,7 @@ def demo(out: OutFolder = Path()) -> None:
 @app.command(rich_help_panel=START)
 def run(
     recording: RecordingPath,
-    plan: PlanName = "mouse",
+    plan: WhichPlan = None,
     out: OutFolder = Path(),
     topic: TopicName = None,
     settings: Settings = None,
@@ -113,20 +118,35 @@ def run(
             help="Processes that share a long recording; the tables are the same.",
         ),
     ] = 1,
+    accept: Annotated[
+        bool,
+        typer.Option(
+            "--accept", help="Measure it although it does not look like the plan's animal."
+        ),
+    ] = False,
 ) -> None:
-    """Turn a recording into a session folder: poses, behaviour tables, replay, report."""
+    """Turn a recording into a session folder: poses, behaviour tables, replay, report.
+
+    Ends with a line that says how it went, and with exit code 4 where someone has to look at it.
+    """
     from liex_lab.plan import Plan
 
     asked = [] if topic is None else [f"recording.topic={topic}"]
     asked += ["replay.depth=false"] * no_depth + ["replay.candidates=true"] * candidates
-    chosen = Plan.load(plan).with_settings(
-        [*asked, *(settings or [])]
-    )  # first: a wrong plan is told at once
+    asked += [*["estimation.accept_misfit=true"] * accept, *(settings or [])]
+    # first: a wrong plan or setting is told at once
+    chosen = Plan.load(plan or "mouse").with_settings(asked)
     from liex_lab.api import run_session
 
     with progress_bar() as progress:
         session = run_session(
-            recording, chosen, out, overwrite=overwrite, workers=workers, progress=progress
+            recording,
+            chosen if plan else None,
+            out,
+            settings=() if plan else asked,
+            overwrite=overwrite,
+            workers=workers,
+            progress=progress,
         )
     _tell_session(session)
 
@@ -139,17 +159,34 @@ def doctor(
         float | None, typer.Option("--fps", help="Frames per second, where the file has no times.")
     ] = None,
     topic: TopicName = None,
-    plan: PlanName = "mouse",
+    region: Annotated[
+        str | None,
+        typer.Option(
+            "--region",
+            metavar='"X,Y X,Y ..."',
+            help="Look only inside this polygon, corners in pixels.",
+        ),
+    ] = None,
+    plan: WhichPlan = None,
     settings: Settings = None,
 ) -> None:
-    """Say what is in a recording and what is wrong with it. Needs no model."""
+    """Say what is in a recording, what is wrong with it, and which plan fits."""
     from liex_lab.plan import Plan
 
-    chosen = Plan.load(plan).with_settings(settings or [])
+    asked = [*(settings or []), *region_setting(region)]
+    chosen = Plan.load(plan or "mouse").with_settings(asked)
     from liex_lab.pipelines.doctor import examine, print_report
 
     with progress_bar() as progress:
-        findings = examine(recording, plan=chosen, fps=fps, topic=topic, progress=progress)
+        findings = examine(
+            recording,
+            plan=chosen,
+            fps=fps,
+            topic=topic,
+            propose=True,
+            named=plan is not None,
+            progress=progress,
+        )
     if as_json:
         typer.echo(to_json(findings))
     else:
@@ -271,8 +308,8 @@ def train(
                 pose_model=pose_model,
                 progress=progress,
             )
-        if report:
-            tell_numbers(report, None)
+        for sentence in told_scores(report):
+            typer.echo(sentence)
         typer.echo(f"model: {model}")
         return
     if animal == "tracking" and particles:
@@ -409,6 +446,9 @@ def info(
     plan: Annotated[
         str | None, typer.Option("--plan", help="Print this plan, to copy and change it.")
     ] = None,
+    everything: Annotated[
+        bool, typer.Option("--all", help="Every package, and every line of the models' cards.")
+    ] = False,
 ) -> None:
     """Versions, bundled plans and models; `liex info --plan mouse > my-plan.toml` makes a plan of
     your own.
@@ -422,9 +462,19 @@ def info(
     from liex_lab.sessions.provenance import versions
 
     facts: dict[str, Any] = versions()
+    if not everything:
+        facts = {name: facts[name] for name in ("liex_lab", "python")}
     facts["plans"] = ", ".join(known_plans())
     models = bundled_models()
     facts["models"] = ", ".join(models) or "none"
+    if not everything:
+        facts |= {
+            f"model {name}": f"sha256 {str(card.get('sha256', 'unknown'))[:16]}"
+            for name, card in models.items()
+        }
+        tell_numbers(facts, None)
+        typer.echo("`liex info --all` lists every package and how the models were made")
+        return
     facts |= {
         f"model {name}: {key}": value
         for name, card in models.items()
@@ -440,6 +490,8 @@ def main() -> None:
     os.environ.setdefault("RUST_LOG", _RUST_LOG)
     try:
         app()
+    except MisfitError as error:
+        _fail(str(error), LOOK_AT_IT)
     except LiexError as error:
         _fail(str(error))
     except OSError as error:
@@ -467,7 +519,9 @@ def _fault() -> NoReturn:
 
 
 def _tell_session(session: Path) -> None:
+    """Where the session is, and how it went; exit code 4 where someone has to look at it."""
     from liex_lab.sessions.older import taken_from
+    from liex_lab.sessions.verdict import read_verdict
 
     typer.echo(f"session: {session}")
     if copy := taken_from(session):
@@ -476,3 +530,9 @@ def _tell_session(session: Path) -> None:
     if report.is_file():
         typer.echo(f"report:  {report}")
     typer.echo(f"replay:  liex show {session}")
+    verdict = read_verdict(session)
+    if verdict["sentence"]:
+        colour = typer.colors.YELLOW if verdict["look_at_it"] else None
+        typer.secho(f"result:  {verdict['sentence']}", fg=colour)
+    if verdict["look_at_it"] and not verdict["accepted"]:
+        raise typer.Exit(LOOK_AT_IT)

@@ -17,6 +17,12 @@ SessionPath = Annotated[
 PlanName = Annotated[
     str, typer.Option("--plan", help="A bundled plan (`liex info` lists them), or a .toml file.")
 ]
+WhichPlan = Annotated[
+    str | None,
+    typer.Option(
+        "--plan", help="A bundled plan, or a .toml file; not named: the bundled one that fits."
+    ),
+]
 OutFolder = Annotated[
     Path, typer.Option("--out", metavar="DIR", help="The folder in which NAME.liex is made.")
 ]
@@ -43,6 +49,24 @@ JsonFile = Annotated[
 ]
 
 
+def region_setting(region: str | None) -> list[str]:
+    """The setting of a plan that a region "x,y x,y x,y" stands for; none where none is given."""
+    from liex_lab.errors import PlanError
+
+    if region is None:
+        return []
+    try:
+        corners = [[float(value) for value in corner.split(",")] for corner in region.split()]
+    except ValueError:
+        corners = []
+    if len(corners) < 3 or any(len(corner) != 2 for corner in corners):
+        raise PlanError(
+            "--region takes three or more corners in pixels, as in --region "
+            f"'60,40 260,40 260,200 60,200', got '{region}'"
+        )
+    return [f"arena.region={corners}"]
+
+
 def tell_numbers(result: dict[str, Any], json_file: Path | None) -> None:
     """The numbers as a table on the screen, and as JSON where a file was named."""
     if json_file is not None:
@@ -58,6 +82,23 @@ def tell_numbers(result: dict[str, Any], json_file: Path | None) -> None:
     Console().print(table)
 
 
+def tell_rows(rows: dict[str, dict[str, Any]]) -> None:
+    """Rows of figures by name as a Markdown table on the screen, one line a row."""
+    columns = [*dict.fromkeys(name for row in rows.values() for name in row)]
+    lines = [["", *(name.replace("_", " ") for name in columns)], ["---"] * (len(columns) + 1)]
+    lines += [[name, *(_cell(row.get(column)) for column in columns)] for name, row in rows.items()]
+    for line in lines:
+        typer.echo(f"| {' | '.join(line)} |")
+
+
+def _cell(value: Any) -> str:
+    if value is None:
+        return "–"
+    if isinstance(value, list):
+        return "; ".join(value)
+    return f"{value:.3g}" if isinstance(value, float) else str(value)
+
+
 def keep_numbers(result: dict[str, Any], json_file: Path) -> None:
     """Write the numbers as JSON."""
     json_file.parent.mkdir(parents=True, exist_ok=True)
@@ -69,3 +110,27 @@ def to_json(result: Any) -> str:
     from liex_lab.evaluation.pose import plain
 
     return json.dumps(plain(result), indent=2, allow_nan=False, ensure_ascii=False)
+
+
+def told_scores(report: dict[str, Any]) -> list[str]:
+    """Scores of recognised actions (`actions.scores.timeline_scores`) as sentences.
+
+    Args:
+        report: the scores of leave-one-animal-out; empty where there are none.
+    """
+    if not report:
+        return []
+    if "macro_f1" not in report:
+        return [f"{name}: {value}" for name, value in report.items()]
+    told = [
+        "Each animal's actions were recognised by what the others taught: macro F1 of the frames "
+        f"{report['macro_f1']:.2f}, F1 of bouts that overlap by half {report['segment_f1_50']:.2f}."
+    ]
+    for word, one in report["per_action"].items():
+        if "bouts" in one:
+            n = one["bouts"]
+            told.append(
+                f"  {word}: F1 {one['f1']:.2f}, {one['precision']:.0%} of what was called so is, "
+                f"{one['recall']:.0%} of it was found; {n} {'bout' if n == 1 else 'bouts'}"
+            )
+    return told

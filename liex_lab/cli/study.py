@@ -142,8 +142,12 @@ def _tell_study(standings: list[SessionStatus], all_of_them: bool) -> int:
     """
     counts: dict[str, int] = {}
     for one in standings:
-        counts[one.state] = counts.get(one.state, 0) + 1
-        if all_of_them or one.state not in ("done", "excluded"):
+        look = one.state == "done" and one.reason
+        state = "done, look at it" if look else one.state
+        counts[state] = counts.get(state, 0) + 1
+        if look:
+            typer.echo(f"{'done':9}{one.session.id}  {one.reason}")
+        elif all_of_them or one.state not in ("done", "excluded"):
             remedy = f"; {one.failure['remedy']}" if one.failure and one.state == "failed" else ""
             typer.echo(f"{one.state:9}{one.session.id}  {one.reason}{remedy}".rstrip())
     typer.echo(

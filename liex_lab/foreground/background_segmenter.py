@@ -21,7 +21,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from liex_lab.arena.floor import Floor, find_floor, floor_region
+from liex_lab.arena.floor import Floor
+from liex_lab.arena.scene import Scene, find_fixtures, region_corners, roughness
 from liex_lab.body.skeleton import MOUSE_VIEW, VIEWS, View
 from liex_lab.errors import EstimationError
 from liex_lab.foreground import _height_map_kernels as kernels
@@ -30,6 +31,7 @@ from liex_lab.foreground.background import learn_background, sample_frames, stri
 from liex_lab.foreground.crop_camera import pack_crop_cameras
 from liex_lab.foreground.height_maps import HeightMaps
 from liex_lab.foreground.segmenter import Segmenter
+from liex_lab.foreground.standing import Standing, find_standing
 from liex_lab.optics.camera import Camera
 from liex_lab.recordings.recording import Recording
 from liex_lab.runtime.shapes import check_shapes
@@ -43,6 +45,12 @@ _AREA_SD = 0.25
 _VOLUME_SD = 0.2
 # of the frames: a lump that the animal touches that often is a part of it that keeps still
 _TOUCH_SHARE = 0.9
+_OTHER = 3.0  # times larger or smaller is another thing
+# what was never seen moving is an animal only if it is no longer than so many largest spines,
+# higher than so many times what stands out at all, and larger than so many of the least areas
+_LONGEST = 2.0
+_HIGHER = 1.4
+_LARGER = 1.5
 
 
 @dataclass(frozen=True)
@@ -61,6 +69,7 @@ class BackgroundSubtraction(Segmenter):
         view: how such animals are looked at.
         stride: only every so many-th row and column of the picture is looked at; H and W count
             those.
+        standing: how the floor was found, None where it was given.
     """
 
     camera: Camera
@@ -72,6 +81,7 @@ class BackgroundSubtraction(Segmenter):
     volume_mm3: float = 0.0
     view: View = MOUSE_VIEW
     stride: int = 1
+    standing: Standing | None = None
 
     @cached_property
     def grid(self) -> Camera:
@@ -107,6 +117,8 @@ class BackgroundSubtraction(Segmenter):
         n_frames: int = 96,
         min_height_mm: float = 7.0,
         view: View = MOUSE_VIEW,
+        floor: Floor | None = None,
+        region: NDArray[np.bool_] | None = None,
     ) -> tuple[BackgroundSubtraction, NDArray[np.float32]]:
         """The background subtraction of a recording, learned from frames spread over it.
 
@@ -124,6 +136,9 @@ class BackgroundSubtraction(Segmenter):
             min_height_mm: what stands out from the background by less is not the animal.
             view: how such animals are looked at; one that does not stand on the floor may be
                 anywhere.
+            floor: the floor where it is stated; None finds it.
+            region: (height, width) bool of the whole picture, where it is looked at; None
+                everywhere.
 
         Returns:
             The segmenter, and the sample (n, H, W) float32 mm of frames from which it was learned,
@@ -135,17 +150,29 @@ class BackgroundSubtraction(Segmenter):
         """
         stride = stride_for(recording, spine_mm[0])
         sample = sample_frames(recording, n_frames, stride)
+        if region is not None:
+            sample *= region[::stride, ::stride]
         background, spread, near = learn_background(sample)
         _check_background(sample, background)
         grid = recording.camera.every(stride)
-        seen = find_floor(background, grid)
+        stated = None if floor is None else Floor.from_plane(floor.normal, floor.distance_mm, grid)
+        standing = find_standing(
+            sample, background, spread, grid, spine_mm, min_height_mm, view, stated
+        )
+        if region is not None:
+            cut = region[::stride, ::stride]
+            standing = replace(standing, region=cut, on_floor=standing.on_floor & cut)
+        if standing.region is not None:  # what lies around is not looked at
+            background = np.where(standing.region, background, np.float32(0))
+            near = np.where(standing.region, near, np.float32(0))
+        seen = standing.floor
         floor = (
             seen
             if stride == 1
             else Floor.from_plane(seen.normal, seen.distance_mm, recording.camera)
         )
         bare = seen.depth(grid.width, grid.height)
-        on_floor = floor_region(background, bare)
+        on_floor = standing.on_floor
         background = np.where((background == 0) & on_floor, bare, background)
         # the rims and walls around the floor flicker between near and far: there, nearer than ever
         # is what counts
@@ -155,9 +182,17 @@ class BackgroundSubtraction(Segmenter):
         stands = view.frame == VIEWS[0]  # one that floats may be seen before anything
         over = on_floor if stands else np.ones_like(on_floor)
         scene = BackgroundSubtraction(
-            recording.camera, floor, background, limit, over, view=view, stride=stride
+            recording.camera,
+            floor,
+            background,
+            limit,
+            over,
+            view=view,
+            stride=stride,
+            standing=standing,
         )
-        area, share = scene.usual_area(sample, spine_mm)
+        area, share = scene._moving_area(sample, spine_mm)
+        moves = share >= 0.5 or (share > 0.0 and standing.moves)
         if share < 0.5:  # perhaps it sits in its own background: compare with the floor itself
             bare_limit = np.where(
                 on_floor, np.maximum(bare - np.float32(min_height_mm), 0), limit
@@ -166,12 +201,26 @@ class BackgroundSubtraction(Segmenter):
                 scene, limit=bare_limit, background=np.where(on_floor, bare, background)
             )
             still_area, still_share = still.usual_area(sample, spine_mm)
-            if still_share > share:
+            rests = replace(still, area_mm2=still_area)
+            if still_share > share and not (
+                stands
+                and standing.moves
+                and area > 0.0
+                and (
+                    rests._stays_beside(replace(scene, area_mm2=area), sample)
+                    or not rests._is_like_an_animal(sample, spine_mm, min_height_mm)
+                )
+            ):
                 scene = still
                 area = still_area
                 share = still_share
+                moves = False
         elif stands:
             scene, area = scene.with_its_still_part(sample, spine_mm, min_height_mm, area)
+        # what was not seen moving is an animal only where it is as large and as high as one
+        if stands and share > 0.0 and not moves:
+            seen_as = replace(scene, area_mm2=area)
+            share = share if seen_as._is_like_an_animal(sample, spine_mm, min_height_mm) else 0.0
         if share == 0.0:
             raise EstimationError(
                 f"no animal was found in {len(sample)} frames spread over the recording: nothing "
@@ -181,6 +230,57 @@ class BackgroundSubtraction(Segmenter):
             )
         scene = replace(scene, area_mm2=area)
         return replace(scene, volume_mm3=scene.usual_volume(sample)), sample
+
+    def _moving_area(
+        self, sample: NDArray[np.float32], spine_mm: tuple[float, float]
+    ) -> tuple[float, float]:
+        """The usual area mm^2, and the share of the frames that show it, see `usual_area`.
+
+        Where that is not the area of what was seen moving clearly, but of specks that come back in
+        more frames, as before an animal came, the area of what moves counts.
+        """
+        area, share = self.usual_area(sample, spine_mm)
+        standing = self.standing
+        if standing is None or not standing.moves or self.view.frame != VIEWS[0]:
+            return area, share
+        if area > 0.0 and abs(np.log(area / standing.thing_mm2)) < np.log(_OTHER):
+            return area, share
+        crops = replace(self, area_mm2=standing.thing_mm2).extract(sample, 1.0)
+        return standing.thing_mm2, float(crops.found.mean())
+
+    def _stays_beside(self, moving: BackgroundSubtraction, sample: NDArray[np.float32]) -> bool:
+        """Whether what stands on the bare floor is there beside what moves: another thing.
+
+        Args:
+            moving: the scene in which only what moves is seen, with its area.
+            sample: (n, H, W) float32 mm, frames at this scene's stride.
+        """
+        mover = moving.extract(sample, 1.0)
+        both = self.extract(sample, 1.0)
+        seen = mover.found & both.found
+        if not seen.any():
+            return True
+        apart = np.linalg.norm(mover[seen].centroid[:, :2] - both[seen].centroid[:, :2], axis=1)
+        beside = (apart > np.sqrt(self.area_mm2)) | (both.n_blobs[seen] > 1)
+        return bool(beside.mean() > 0.5)
+
+    def _is_like_an_animal(
+        self, sample: NDArray[np.float32], spine_mm: tuple[float, float], min_height_mm: float
+    ) -> bool:
+        """Whether what is found in a sample (n, H, W) mm is neither longer than the largest animal,
+        nor as low as an uneven floor.
+        """
+        crops = self.extract(sample, 1.0)
+        if not crops.found.any():
+            return False
+        blobs = crops[crops.found].blobs
+        length = 4.0 * float(np.median(blobs.sd_along))
+        height = float(np.median(blobs.volume_mm3 / blobs.area_mm2))
+        return (
+            length < _LONGEST * spine_mm[1]
+            and height > _HIGHER * min_height_mm
+            and self.area_mm2 > _LARGER * self.view.area[0] * spine_mm[0] ** 2
+        )
 
     def with_its_still_part(
         self,
@@ -289,6 +389,27 @@ class BackgroundSubtraction(Segmenter):
             n_blobs[start : start + 16] = crops.n_blobs
         alone = n_blobs == 1 if (n_blobs == 1).sum() >= 5 else n_blobs > 0
         return float(np.median(volume[alone]))
+
+    def described(self) -> Scene:
+        """The scene as it is written to session.json, without its outline."""
+        floor = self._grid_floor
+        bare = floor.depth(self.grid.width, self.grid.height)
+        rough = roughness(self.background, bare, self.on_floor)
+        fixtures = find_fixtures(self.background, floor, self.grid, self.on_floor)
+        standing = self.standing
+        if standing is None:
+            return Scene(self.floor, roughness_mm=rough, fixtures=fixtures)
+        return Scene(
+            self.floor,
+            standing.origin,
+            standing.support if standing.moves else None,
+            standing.n_things,
+            standing.n_together,
+            rough,
+            region_corners(standing.region, self.stride),
+            fixtures=fixtures,
+            doubts=(standing.doubt,) if standing.doubt else (),
+        )
 
     def every(self, step: int) -> BackgroundSubtraction:
         """The same segmenter for pictures of every `step`-th row and column.

@@ -280,8 +280,11 @@ def _comment(text: str) -> list[str]:
     return textwrap.wrap(text, 116, initial_indent="# ", subsequent_indent="# ")
 
 
-def _literal(value: bool | int | float | str | list[float]) -> str:
+def _literal(value: Any) -> str:
     """A value as TOML writes it. JSON's string escapes are TOML's, but for DEL."""
+    if isinstance(value, Table):
+        inner = (f"{key} = {_literal(item)}" for key, item in value.model_dump().items())
+        return f"{{{', '.join(inner)}}}"
     if isinstance(value, list):
         return f"[{', '.join(_literal(item) for item in value)}]"
     if isinstance(value, bool):

@@ -13,6 +13,8 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 Positive = Annotated[float, Field(gt=0)]
+# names of liex_lab.optics.presets, stated here for a plan is read before any library is there
+CameraName = Literal["kinect-v2", "primesense", "azure-nfov", "femto-bolt", "d435", "raytrix-r5"]
 NotNegative = Annotated[float, Field(ge=0)]
 
 
@@ -64,6 +66,13 @@ class CameraOverride(Table):
     camera.
     """
 
+    preset: CameraName | None = Field(
+        None,
+        description=(
+            "a camera by name, for recordings that do not say what took them: its nominal numbers, "
+            "which its own calibration betters by one or two per cent"
+        ),
+    )
     fx: Positive | None = Field(
         None, description="focal length along a row, pixels; not set: what the recording says"
     )
@@ -137,8 +146,33 @@ class WaterSurface(Table):
     )
 
 
+class StatedFloor(Table):
+    """A floor that is stated: a point of the plane and its normal, camera frame."""
+
+    point: Annotated[list[float], Field(min_length=3, max_length=3)]
+    normal: Annotated[list[float], Field(min_length=3, max_length=3)]
+
+
+Corner = Annotated[list[float], Field(min_length=2, max_length=2)]
+
+
 class ArenaFacts(Table):
-    """[arena]: where in the arena the animal is."""
+    """[arena]: where the arena is in the picture, and where in it the animal is."""
+
+    floor: Literal["auto"] | StatedFloor = Field(
+        "auto",
+        description=(
+            "the plane animals stand on: 'auto' finds it, or {point = [x, y, z], normal = [x, y, "
+            "z]}, mm in the camera's frame (x right, y down, z away)"
+        ),
+    )
+    region: list[Corner] | None = Field(
+        None,
+        description=(
+            "corners [x, y], pixels, of a polygon around the arena, outside of which nothing is "
+            "looked at; not set: the whole picture, or what lies around the floor that was found"
+        ),
+    )
 
     zones: str | None = Field(
         None,
@@ -160,11 +194,11 @@ class RecordingOptions(Table):
         False,
         description="true: use the whole frames of a recording that ends in the middle of one",
     )
-    mirrored: bool = Field(
-        False,
+    mirrored: bool | None = Field(
+        None,
         description=(
             "true: exchange left and right, for pictures that come mirrored, or to measure a "
-            "left hand"
+            "left hand; not set: of a hand it is found, of others false"
         ),
     )
 
@@ -204,6 +238,13 @@ class Estimation(Table):
         description=(
             "frames with a larger predicted error are flagged doubtful; not set: the model's own "
             "limit"
+        ),
+    )
+    accept_misfit: bool = Field(
+        False,
+        description=(
+            "true: measure a recording that does not look like this plan's animal all the same, as "
+            "liex run --accept does"
         ),
     )
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from liex_lab.errors import LiexError, RecordingError
+from liex_lab.errors import LiexError, RecordingError, UnknownCameraError
 from liex_lab.optics.camera import Camera, Distortion, Lens
 from liex_lab.recordings.depth_units import ENCODINGS, Stored, decode, own_unit_mm
 from liex_lab.recordings.frame import Depth
@@ -136,12 +136,12 @@ class CameraFile:
         if stated is not None:
             return fitting(stated, width, height, "the camera that was stated")
         if not self.intrinsics:
-            raise RecordingError(
+            raise UnknownCameraError(
                 f"the camera is not known, for there is no [camera] in {self.path}; {WHAT_TO_WRITE}"
             )
         missing = [name for name in _INTRINSICS if name not in self.intrinsics]
         if missing:
-            raise RecordingError(
+            raise UnknownCameraError(
                 f"{self.path} does not state {', '.join(missing)}; {WHAT_TO_WRITE}"
             )
         camera = Camera(

@@ -42,6 +42,7 @@ _FILES = (
 # an address of a virtual recording; rendering stands above reading, so it is named only here
 _RENDERED = "synthetic:"
 _RENDERER = "liex_lab.simulation.address"
+_WITH_PATTERN = "images.folder.open_images"
 _WITH_TOPICS = ("messages.mcap.open_mcap", "messages.rosbag.open_bag")
 _RAYTRIX = (
     "is in Raytrix's own format, which only the maker's licensed software reads; compute metric "
@@ -78,6 +79,7 @@ class _How:
     fps: float | None
     topic: str | None
     progress: Progress
+    pattern: str | None = None
 
     def open(self, where: str, path: Path) -> Recording:
         """By the function `where` of `formats`, as in "oni.reader.open_oni"; it brings its
@@ -86,6 +88,7 @@ class _How:
         module, name = where.rsplit(".", 1)
         opener = getattr(import_module(f"liex_lab.recordings.formats.{module}"), name)
         topic = (self.topic,) if where in _WITH_TOPICS else ()
+        topic = (self.pattern,) if where == _WITH_PATTERN and self.pattern else topic
         recording: Recording = opener(path, self.camera, self.fps, self.progress, *topic)
         return recording
 
@@ -101,6 +104,7 @@ def open_recording(
     camera: Lens | None = None,
     fps: float | None = None,
     topic: str | None = None,
+    pattern: str | None = None,
     strict: bool = False,
     progress: Progress = silent,
 ) -> Recording:
@@ -112,6 +116,7 @@ def open_recording(
         camera: comes before whatever the files state; a `Lens` for pictures of any size.
         fps: frame rate, Hz; used only where the files hold no time stamps.
         topic: the depth topic to read of an MCAP file or a ROS bag with several of them.
+        pattern: which pictures of a folder to take, as in "*.tif", before a camera.toml.
         strict: refuse a recording that is cut short, instead of only saying so in `problems` and
             `truncated`.
         progress: told while an archive is unpacked or an index made.
@@ -125,7 +130,7 @@ def open_recording(
     """
     path = Path(path)
     try:
-        recording = _open(path, _How(camera, fps, topic, progress))
+        recording = _open(path, _How(camera, fps, topic, progress, pattern))
     except OSError as error:
         raise RecordingError(
             f"{error.filename or path} cannot be read ({error.strerror or error}); check it"

@@ -269,16 +269,23 @@ class Recording:
         return cut
 
     def seen_by(
-        self, camera: Camera, change: Callable[[Depth], Depth], optics: dict[str, Any]
+        self,
+        camera: Camera,
+        change: Callable[[Depth], Depth],
+        optics: dict[str, Any],
+        *,
+        lent: bool = False,
     ) -> Recording:
         """The same frames as another camera would have taken them, transformed when they are read.
 
-        The input, and so the digest, stays the same; closing one recording closes both.
+        The input, and so the digest, stays the same; closing one recording closes both, also when
+        nobody holds it any more, unless it is lent.
 
         Args:
             camera: the camera of the transformed pictures.
             change: turns depth (H, W) float32 mm of this camera into depth of the other one.
             optics: what `change` undoes, kept as the `optics` of the result.
+            lent: this recording stays open whatever becomes of the result.
 
         Returns:
             The recording through the other camera.
@@ -297,7 +304,7 @@ class Recording:
             metadata=self.metadata,
             step_ns=self._step_ns,
             stored=self._stored,
-            close=self.close,
+            close=None if lent else self.close,
             faults=self._faults,
             grow=lambda: (more := self.grown()) and more.seen_by(camera, change, optics),
         )

@@ -57,13 +57,14 @@ def rectified(recording: Recording, water: Water | None = None) -> Recording:
     return seen
 
 
-def mirrored(recording: Recording) -> Recording:
+def mirrored(recording: Recording, *, lent: bool = False) -> Recording:
     """The recording with left and right exchanged in every picture.
 
     Drivers of some cameras deliver mirrored pictures; and a left hand in the mirror is a right one.
 
     Args:
         recording: depth to be mirrored.
+        lent: the recording stays open whatever becomes of its mirror image.
 
     Returns:
         The mirrored recording, with its principal point mirrored too.
@@ -71,7 +72,9 @@ def mirrored(recording: Recording) -> Recording:
     camera = recording.camera
     turned = replace(camera, cx=camera.width - 1.0 - camera.cx)
     optics = {**recording.optics, "mirrored": True}
-    return recording.seen_by(turned, lambda depth: np.ascontiguousarray(depth[:, ::-1]), optics)
+    return recording.seen_by(
+        turned, lambda depth: np.ascontiguousarray(depth[:, ::-1]), optics, lent=lent
+    )
 
 
 def ideal_camera(camera: Camera, water: Water | None = None) -> Camera:

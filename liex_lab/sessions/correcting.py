@@ -9,13 +9,22 @@ from __future__ import annotations
 
 import difflib
 import math
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.errors import LiexError, SessionError
-from liex_lab.sessions.corrections import BoutEdit, FlipSpan, JointMove
+from liex_lab.plan import Plan
+from liex_lab.sessions.corrections import (
+    DESCRIBED,
+    BoutEdit,
+    Correction,
+    Description,
+    FlipSpan,
+    JointMove,
+)
 from liex_lab.tables.rows import frame_count, stop_times
 
 if TYPE_CHECKING:
@@ -388,3 +397,29 @@ def _joint_row(session: Session, frame: int, joint: str) -> tuple[int, Array]:
             "the animal was found"
         )
     return row, place
+
+
+def descriptions(facts: Mapping[str, str]) -> list[Correction]:
+    """What is known of the animal and the session, as corrections.
+
+    Args:
+        facts: any of `DESCRIBED`; an empty text is unknown.
+
+    Raises:
+        SessionError: there is no such fact, or none is given.
+        PlanError: a value cannot be used, as a start time without a time zone.
+    """
+    if not facts:
+        raise SessionError(f"nothing to describe; give any of {', '.join(DESCRIBED)} as KEY=VALUE")
+    for key in facts:
+        if key not in DESCRIBED:
+            near = difflib.get_close_matches(key, DESCRIBED, 1, 0.4)
+            raise SessionError(
+                f"a session is not described by {key!r}"
+                + (f"; did you mean {near[0]}?" if near else f"; say {', '.join(DESCRIBED)}")
+            )
+    said = {key: value for key, value in facts.items() if value}
+    checked = Plan.from_table({"session": said}).session.model_dump()
+    return [
+        Description(key, str(checked[key] or "") if value else "") for key, value in facts.items()
+    ]

@@ -1,4 +1,5 @@
-"""Append-only log of human corrections to a session: flips, moved joints, edited bouts.
+"""Append-only log of human corrections to a session: flips, moved joints, edited bouts, and who
+the animal is.
 
 A session's own files are never written again. Beside them lies the folder `corrected`:
 `corrections.json` is the log, to which entries are only ever added (one may take back another), and
@@ -20,6 +21,7 @@ from typing import Any, ClassVar
 
 from liex_lab.catalog import sha256
 from liex_lab.errors import SessionError
+from liex_lab.sessions.listed import WHO
 
 FOLDER = "corrected"
 LOG = "corrections.json"
@@ -30,9 +32,12 @@ FACTS = {
     "actions",
     "action_model",
     "unresolved_actions",
+    "refused_bouts",
     "corrections",
 }  # sections that may change
 EDITS = ("add", "rename", "recut", "delete")
+START = "session_start_time"
+DESCRIBED = (*WHO, START)
 
 
 @dataclass(frozen=True)
@@ -123,8 +128,41 @@ class BoutEdit:
         return f"{self.action} for {seconds}" + (" (cut anew)" if self.edit == "recut" else "")
 
 
-Correction = FlipSpan | JointMove | BoutEdit
-_KINDS: dict[str, type[Correction]] = {"flip": FlipSpan, "joint": JointMove, "bout": BoutEdit}
+@dataclass(frozen=True)
+class Description:
+    """Something that is known of the animal or the session, and that nothing is measured by.
+
+    It holds for every measurement of the recording.
+
+    Attributes:
+        kind: the word for it in the log.
+        key: one of `DESCRIBED`.
+        value: its value; '' is unknown.
+
+    Raises:
+        ValueError: the key is not known.
+    """
+
+    kind: ClassVar[str] = "description"
+    key: str
+    value: str
+
+    def __post_init__(self) -> None:
+        if self.key not in DESCRIBED:
+            raise ValueError(f"{self.key} = {self.value}")
+
+    def __str__(self) -> str:
+        """The sentence for a list of corrections."""
+        return f"{self.key} is {self.value or 'not known'}"
+
+
+Correction = FlipSpan | JointMove | BoutEdit | Description
+_KINDS: dict[str, type[Correction]] = {
+    "flip": FlipSpan,
+    "joint": JointMove,
+    "bout": BoutEdit,
+    "description": Description,
+}
 _UNDO = "undo"
 
 
@@ -206,9 +244,19 @@ class Log:
         """The standing corrections of one kind.
 
         Args:
-            kind: `FlipSpan`, `JointMove` or `BoutEdit`.
+            kind: `FlipSpan`, `JointMove`, `BoutEdit` or `Description`.
         """
         return [entry.what for entry in self.standing if isinstance(entry.what, kind)]
+
+    @property
+    def described(self) -> dict[str, str]:
+        """What is known of animal and session, by the words of `DESCRIBED`; '' is unknown."""
+        return {one.key: one.value for one in self.corrections(Description)}
+
+    @property
+    def touched(self) -> tuple[Entry, ...]:
+        """The standing corrections of what was measured: all but descriptions."""
+        return tuple(one for one in self.standing if not isinstance(one.what, Description))
 
     def added(self, what: Sequence[Correction], undo: Sequence[int] = (), author: str = "") -> Log:
         """The log with further entries: first those that take others back, then new corrections.
@@ -358,3 +406,20 @@ def applies(log: Log, session: Path, metadata: Mapping[str, Any]) -> bool:
         metadata: the content of session.json.
     """
     return bool(log.standing) and log.made_of == basis(session, metadata)
+
+
+def with_description(metadata: Mapping[str, Any], described: Mapping[str, str]) -> dict[str, Any]:
+    """The content of session.json with what was described since.
+
+    Args:
+        metadata: the content of session.json.
+        described: see `Log.described`.
+    """
+    found = dict(metadata)
+    who = {name: value for name, value in described.items() if name != START}
+    if who:
+        subject = {**metadata.get("subject", {}), **who}
+        found["subject"] = {name: value for name, value in subject.items() if value}
+    if START in described:
+        found[START] = described[START] or None
+    return found

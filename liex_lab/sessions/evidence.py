@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from liex_lab.sessions.session import Session
 
 FILE = "observations.npz"
+_LATER = ("covered", "beside")  # columns that sessions of earlier versions do not hold
 _BLOCK = 16_384  # frames that are in memory at a time
 
 
@@ -103,7 +104,14 @@ def read_evidence(session: Session) -> tuple[Observations, Subject]:
     with reading_from(path), path.open("rb") as file, np.load(file, allow_pickle=False) as kept:
         facts = json.loads(kept["subject"].tobytes())
         skeleton = Skeleton.from_table(facts["skeleton"], str(path))
-        seen = Observations(skeleton, *(kept[name] for name in COLUMNS))
+        none = Observations.empty(skeleton, np.zeros(len(session.frames), np.int64))
+        seen = Observations(
+            skeleton,
+            *(
+                getattr(none, name) if name in _LATER and name not in kept else kept[name]
+                for name in COLUMNS
+            ),
+        )
         _check_shapes(seen, len(session.frames))
         stretch = facts.get("stretch_sd")  # sessions of earlier versions do not tell
         subject = Subject(

@@ -24,12 +24,13 @@ from liex_lab.optics.camera import Camera
 
 if TYPE_CHECKING:
     from liex_lab.arena.floor import Floor
+    from liex_lab.arena.scene import Scene
     from liex_lab.arena.zones import Zone
     from liex_lab.plan import Plan
     from liex_lab.recordings.recording import Recording
     from liex_lab.recordings.timestamps import Gap
 
-SCHEMA_VERSION = 4
+SCHEMA_VERSION = 5
 _PACKAGES = (
     "liex_lab",
     "numpy",
@@ -71,6 +72,7 @@ class Provenance:
         optics: what was undone of lens and water.
         arena: the shape of the floor.
         zones: those that a person has drawn on it.
+        scene: floor, region, fixtures and how many animals move; None where there is no floor.
         replay_depth: whether the replay is to hold the depth.
         replay_candidates: whether it is to hold every hypothesis of single frames.
     """
@@ -96,6 +98,7 @@ class Provenance:
     optics: dict[str, Any] = field(default_factory=dict)
     arena: Arena = UNKNOWN
     zones: Sequence[Zone] = ()
+    scene: Scene | None = None
     replay_depth: bool = True
     replay_candidates: bool = False
 
@@ -200,6 +203,7 @@ class Provenance:
             },
             "arena": self.arena.to_dict(),
             "zones": [zone.to_dict() for zone in self.zones],
+            **({} if self.scene is None else {"scene": self.scene.to_dict()}),
             "animal": {
                 "name": self.skeleton.name,
                 "joints": list(self.skeleton.names),

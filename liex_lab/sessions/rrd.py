@@ -21,6 +21,7 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
+from liex_lab.actions import colours
 from liex_lab.errors import SessionError
 from liex_lab.geometry import so3
 from liex_lab.recordings.rvl import rvl_message
@@ -67,22 +68,7 @@ _TURN_S = 2.0
 _PATIENCE_S = 120.0
 MM_PER_UNIT = 1000.0  # our depth is in mm, the scene in metres
 
-# Colours that stay apart for the colour-blind (Tol's bright and muted sets); action words take them
-# in order.
-PALETTE = (
-    0xEE6677,
-    0xCCBB44,
-    0x4477AA,
-    0xBBBBBB,
-    0x228833,
-    0x66CCEE,
-    0xAA3377,
-    0x332288,
-    0x999933,
-    0xEE8866,
-    0x44BB99,
-    0x882255,
-)
+PALETTE = tuple(int(colour[1:], 16) for colour in colours.PALETTE)
 _FLAG_COLOURS = {
     "doubtful": 0xCCBB44,
     "not_found": 0xEE6677,
@@ -190,7 +176,7 @@ class ReplayWriter:
             rows: the track as the tables see it.
             kinematics: the table `kinematics`.
             bouts: the table `bouts`.
-            words: the ethogram's vocabulary, which takes the colours of `PALETTE` in order.
+            words: the ethogram's vocabulary, coloured by `actions.colours`.
             problems: sentences about the recording, logged as warnings.
             candidates: the pose hypotheses of single frames, where they are to be shown, too.
 
@@ -517,7 +503,8 @@ class ReplayWriter:
             )
         )
         end = (int(rows.frame_index[-1]) + 1, float(stop_times(rows.time_s)[-1]))
-        self._log_lane(ACTIONS, spans, dict(zip(words, cycle(PALETTE), strict=False)), end)
+        own = colours.action_colours(words)
+        self._log_lane(ACTIONS, spans, {word: int(own[word][1:], 16) for word in own}, end)
         count = frame_count(rows.frame_index)
         time = rows.time_s
         stop = stop_times(rows.time_s)

@@ -7,7 +7,7 @@ the place of the measured ones (see `liex_lab.sessions.corrections`).
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from functools import cached_property
 from pathlib import Path, PurePosixPath
@@ -21,7 +21,13 @@ from liex_lab.errors import SessionError
 from liex_lab.geometry import SE3
 from liex_lab.optics.camera import Camera
 from liex_lab.runtime.memory import rest
-from liex_lab.sessions.corrections import Log, applies, corrected_folder, read_log
+from liex_lab.sessions.corrections import (
+    Log,
+    applies,
+    corrected_folder,
+    read_log,
+    with_description,
+)
 from liex_lab.sessions.older import put_back_session
 from liex_lab.sessions.provenance import SCHEMA_VERSION
 from liex_lab.sessions.reading import reading_from
@@ -80,12 +86,20 @@ class Session:
         path: the session folder.
         metadata: the content of session.json.
         log: the corrections that apply; None for none.
+        described: what people said of the animal since, see `Log.described`; None for nothing.
     """
 
-    def __init__(self, path: Path, metadata: dict[str, Any], log: Log | None = None) -> None:
+    def __init__(
+        self,
+        path: Path,
+        metadata: dict[str, Any],
+        log: Log | None = None,
+        described: Mapping[str, str] | None = None,
+    ) -> None:
         self.path = path
         self.log = log or Log("")  # of corrections; none where they do not apply, or are not wanted
-        self.metadata = {**metadata, **self.log.facts}
+        self.described = dict(described or {})
+        self.metadata = with_description({**metadata, **self.log.facts}, self.described)
 
     @staticmethod
     def open(path: str | Path, *, raw: bool = False) -> Session:
@@ -130,7 +144,8 @@ class Session:
                     f"the session {folder} lacks {name}; run `liex run` on the recording again"
                 )
         log = Log("") if raw else read_log(folder)
-        return Session(folder, metadata, log if applies(log, folder, metadata) else None)
+        fitting = log if applies(log, folder, metadata) else None
+        return Session(folder, metadata, fitting, log.described)
 
     @property
     def name(self) -> str:
@@ -264,7 +279,7 @@ class Session:
         """
         import pyarrow.parquet as pq
 
-        other = Session(self.path, self.metadata, self.log)
+        other = Session(self.path, self.metadata, self.log, self.described)
         for name, columns in wanted.items():
             path = self.file(f"{name}.parquet")
             if path.is_file():
@@ -297,7 +312,9 @@ class Session:
             raise SessionError(f"the session {self.path} has no table '{name}'; it holds {known}")
         with reading_from(path):
             if frame_index is None:
-                return pd.read_parquet(path, columns=columns)
+                found = pd.read_parquet(path, columns=columns)
+                said = self.described if name == "sessions" else {}
+                return found.assign(**{key: said[key] for key in said if key in found})
             return _rows_of(path, columns, frame_index)
 
 

@@ -23,11 +23,14 @@ from liex_lab.simulation.tracking_sequences import SEQUENCES, tracking_sequence
 
 _ANIMALS: Final = {"walk": "mouse", "swim": "fish", "gesture": "hand"}  # "move" takes any
 _SEQUENCES: Final = {f"track-{name}": name for name in SEQUENCES}
-_KINDS: Final = (*_ANIMALS, "move", *_SEQUENCES)
+_SCENE: Final = "scene"
+_KINDS: Final = (*_ANIMALS, "move", *_SEQUENCES, _SCENE)
 _SENSORS: Final = {"walk": ("kinect-v2", "primesense", "primesense-qvga"), "swim": ("raytrix-r5",)}
 _EXAMPLE = "synthetic:walk?seed=3&frames=300&sensor=kinect-v2&spine_mm=65"
 _MOST_FRAMES = 100_000  # an hour; the truth of every frame is held in memory
+_MOST_SCENE_FRAMES = 20_000  # cables and bedding are held in memory, too
 _SIZES = (0.5, 2.9)  # of the home length
+_BUILDS = ("other", "train")  # of animals in scenes: a build that no model was trained on, or one
 
 
 def open_synthetic(address: str, camera: Lens | None = None) -> Recording:
@@ -38,7 +41,8 @@ def open_synthetic(address: str, camera: Lens | None = None) -> Recording:
     Each setting may be left out: seed 0, 300 frames, the animal's usual sensor, and a size drawn
     from the seed. track-easy and track-hard are the test sequences of
     `simulation.tracking_sequences`, of a mouse, or with animal=fish or animal=hand of those; with a
-    seed or more frames they are others of their kind.
+    seed or more frames they are others of their kind. scene is one of `simulation.scenes`, such as
+    synthetic:scene?name=raised&seed=3; build=train takes a body like those of the training.
 
     Args:
         address: of the recording, beginning with synthetic:.
@@ -58,6 +62,8 @@ def open_synthetic(address: str, camera: Lens | None = None) -> Recording:
             f"{_EXAMPLE}"
         )
     stated = dict(parse_qsl(query, keep_blank_values=True))
+    if kind == _SCENE:
+        return _stated_camera(_open_scene(address, stated), camera)
     animal = (
         _ANIMALS[kind]
         if kind in _ANIMALS
@@ -69,13 +75,7 @@ def open_synthetic(address: str, camera: Lens | None = None) -> Recording:
         )
     skeleton = Skeleton.load(animal)
     settings = _settings(kind, skeleton.length)
-    for key in stated:
-        if key not in settings:
-            near = difflib.get_close_matches(key, settings, 1, cutoff=0.0)[0]
-            raise RecordingError(
-                f"{address}: {key} is no setting of it; the nearest one is {near}, as in {_EXAMPLE}"
-            )
-    values = {key: _value(address, key, text, settings[key]) for key, text in stated.items()}
+    values = _values(address, stated, settings)
     world = world_of(skeleton)
     session: TrueRecording
     if kind in _SEQUENCES:
@@ -86,11 +86,60 @@ def open_synthetic(address: str, camera: Lens | None = None) -> Recording:
         seed = values.pop("seed", 0)
         n_frames = values.pop("frames", 300)
         session = world.motion(seed, n_frames, name=f"synthetic-{kind}-{seed}", **values)
+    return _stated_camera(session, camera)
+
+
+def _stated_camera(session: Recording, camera: Lens | None) -> Recording:
+    """The recording with the camera that was stated, where one was."""
     if camera is not None:
         session.camera = fitting(
             camera, session.width, session.height, "the camera that was stated"
         )
     return session
+
+
+def _open_scene(address: str, stated: dict[str, str]) -> Recording:
+    """The recording of a scene's address."""
+    from liex_lab.simulation.scenes.catalogue import SCENES, SEALED_FROM, film
+
+    named = stated.pop("name", "plain")
+    if named not in SCENES:
+        near = difflib.get_close_matches(named, SCENES, 1, cutoff=0.0)[0]
+        raise RecordingError(
+            f"{address}: there is no scene {named}, the nearest one is {near}; known are "
+            f"{', '.join(SCENES)}"
+        )
+    plan, _ = SCENES[named]
+    kind = next(kind for kind, animal in _ANIMALS.items() if animal == plan)
+    settings = _settings(kind, Skeleton.load(plan).length)
+    settings["frames"] = (
+        int,
+        lambda n: 1 <= n <= _MOST_SCENE_FRAMES,
+        f"a whole number from 1 to {_MOST_SCENE_FRAMES}",
+    )
+    if plan != "mouse":
+        settings.pop("sensor", None)
+    settings["build"] = (str, lambda build: build in _BUILDS, f"one of {', '.join(_BUILDS)}")
+    values = _values(address, stated, settings)
+    seed = values.pop("seed", 0)
+    if seed >= SEALED_FROM:
+        raise RecordingError(
+            f"{address}: seeds from {SEALED_FROM} on are kept for `liex evaluate scenes --sealed`; "
+            "take a smaller one"
+        )
+    family = values.pop("build", _BUILDS[0])
+    return film(named, seed, values.pop("frames", 300), family=family, **values)
+
+
+def _values(address: str, stated: dict[str, str], settings: dict[str, _Setting]) -> dict[str, Any]:
+    """The values of an address's settings, each checked against those that the kind knows."""
+    for key in stated:
+        if key not in settings:
+            near = difflib.get_close_matches(key, settings, 1, cutoff=0.0)[0]
+            raise RecordingError(
+                f"{address}: {key} is no setting of it; the nearest one is {near}, as in {_EXAMPLE}"
+            )
+    return {key: _value(address, key, text, settings[key]) for key, text in stated.items()}
 
 
 _Setting = tuple[Callable[[str], Any], Callable[[Any], bool], str]

@@ -10,9 +10,12 @@ while it scoots, glides, turns, rises, dives and rests.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import NDArray
 
+from liex_lab.body.pose import Pose
 from liex_lab.body.shape import BodyShape
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.simulation.fish import FishSpecies, bend_profile, clearance, hung
@@ -23,6 +26,8 @@ from liex_lab.simulation.sensors import KINECT_V2_SENSOR, RAYTRIX_R5_SENSOR, Sen
 from liex_lab.simulation.species import MouseSpecies
 
 Array = NDArray[np.float64]
+Script = Callable[[np.random.Generator, int], tuple[NDArray[np.int64], Array]]
+Path = Callable[[np.random.Generator, SimulatedScene, float, Array], tuple[Array, Array]]
 
 _RATE_HZ = 30.0
 # the stretches of a walk: how many in a shuffled deck, shortest and longest duration in s, speed in
@@ -93,26 +98,7 @@ def walking_session(
     )
     scene = SimulatedScene.draw(rng, sensor.camera, spine)
     shape = species.shapes(rng, family, 1)
-    kinds, spines_per_s = _walk_script(rng, n_frames)
-    posture = _flow(rng, skeleton, shape[0].broadcast(n_frames), kinds)
-    position, heading = _path(rng, scene, spine, spines_per_s * spine)
-    # the trunk sways with the stride
-    phase = 2 * np.pi * np.cumsum(np.sqrt(spines_per_s) * _STRIDE_HZ_PER_SPINE) / _RATE_HZ
-    posture.turn[:, 1:-1] += (0.06 * np.minimum(spines_per_s, 1.0) * np.sin(phase))[:, None] * [
-        1.0,
-        -0.5,
-        -0.5,
-    ]
-    pose, girth = stand(
-        skeleton,
-        posture,
-        heading,
-        np.full(n_frames, spine / skeleton.length),
-        shape[0].broadcast(n_frames),
-        _smooth(rng.uniform(0.0, 3.0, n_frames)[:, None])[:, 0],
-    )
-    middle = pose.joints(skeleton)[..., :2].mean(axis=1)
-    pose.root.translation[:, :2] += position - middle
+    pose, girth = walk(rng, scene, species, shape, spine, n_frames)
     contents = assemble(
         rng,
         scene,
@@ -134,8 +120,67 @@ def walking_session(
     return SyntheticSession(name, scene, contents)
 
 
-def _walk_script(rng: np.random.Generator, n: int) -> tuple[NDArray[np.int64], Array]:
-    """What the animal does in each frame (n,), and how fast it goes (n,) spines/s."""
+def walk(
+    rng: np.random.Generator,
+    scene: SimulatedScene,
+    species: MouseSpecies,
+    shape: BodyShape,
+    spine_mm: float,
+    n_frames: int,
+    script: Script | None = None,
+    path: Path | None = None,
+) -> tuple[Pose, Array]:
+    """How one mouse goes about in an arena, frame by frame at 30 frames/s.
+
+    Args:
+        rng: source of randomness; postures are drawn before the path, so that one seed gives the
+            same postures in every arena.
+        scene: the arena.
+        species: the species.
+        shape: its body, a batch of one.
+        spine_mm: its length, mm.
+        n_frames: how many frames.
+        script: what it does and how fast it goes, see `walk_script`, the usual one where None.
+        path: where it goes at that speed, see `free_path`, the usual one where None.
+
+    Returns:
+        Poses (n_frames) in the arena frame, and girths (n_frames,).
+    """
+    skeleton = species.skeleton
+    body = shape[0].broadcast(n_frames)
+    kinds, spines_per_s = (script or walk_script)(rng, n_frames)
+    posture = _flow(rng, skeleton, body, kinds)
+    position, heading = (path or free_path)(rng, scene, spine_mm, spines_per_s * spine_mm)
+    # the trunk sways with the stride
+    phase = 2 * np.pi * np.cumsum(np.sqrt(spines_per_s) * _STRIDE_HZ_PER_SPINE) / _RATE_HZ
+    posture.turn[:, 1:-1] += (0.06 * np.minimum(spines_per_s, 1.0) * np.sin(phase))[:, None] * [
+        1.0,
+        -0.5,
+        -0.5,
+    ]
+    pose, girth = stand(
+        skeleton,
+        posture,
+        heading,
+        np.full(n_frames, spine_mm / skeleton.length),
+        shape[0].broadcast(n_frames),
+        _smooth(rng.uniform(0.0, 3.0, n_frames)[:, None])[:, 0],
+    )
+    middle = pose.joints(skeleton)[..., :2].mean(axis=1)
+    pose.root.translation[:, :2] += position - middle
+    return pose, girth
+
+
+def walk_script(rng: np.random.Generator, n: int) -> tuple[NDArray[np.int64], Array]:
+    """What a mouse does in each frame, and how fast it goes: stretches of all kinds of posture.
+
+    Args:
+        rng: source of randomness.
+        n: how many frames.
+
+    Returns:
+        Kinds of posture (n,), indices into `pose_prior.KINDS`, and speeds (n,), spines/s.
+    """
     kinds = np.empty(n, np.int64)
     speed = np.empty(n)
     deck: list[int] = []
@@ -182,11 +227,19 @@ def _smooth(rows: Array) -> Array:
     )
 
 
-def _path(
+def free_path(
     rng: np.random.Generator, scene: SimulatedScene, spine_mm: float, speed: Array
 ) -> tuple[Array, Array]:
-    """Positions (n, 2) mm of the body's middle and headings (n,) rad: it wanders, and turns back
-    before a wall.
+    """A mouse that wanders, and turns back before a wall.
+
+    Args:
+        rng: source of randomness.
+        scene: the arena.
+        spine_mm: length of the animal, mm.
+        speed: (n,) mm/s.
+
+    Returns:
+        Positions (n, 2) of the body's middle, mm, arena frame, and headings (n,) rad.
     """
     n = len(speed)
     camera = scene.camera

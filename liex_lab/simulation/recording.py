@@ -109,6 +109,23 @@ class TrueRecording(Recording):
         """
         raise NotImplementedError
 
+    def chunks(self, n_frames: int, first: int = 0) -> Iterator[list[DepthFrame]]:
+        """The frames in lists, each list made on all threads.
+
+        Args:
+            n_frames: frames a list; the last may be shorter.
+            first: frame to begin with.
+
+        Yields:
+            Lists of depth frames in order of time.
+        """
+        for start in range(first, len(self), n_frames):
+            stop = min(start + n_frames, len(self))
+            depths = self.depths(start, stop)
+            yield [
+                DepthFrame(i, int(self.times_ns[i]), depths[i - start]) for i in range(start, stop)
+            ]
+
 
 class SyntheticSession(TrueRecording):
     """A virtual animal in a virtual arena, rendered on demand.
@@ -196,23 +213,6 @@ class SyntheticSession(TrueRecording):
         )
         unit = float(contents.parameters[0, UNIT])
         return out.astype(np.float32) if unit == 1.0 else out * np.float32(unit)
-
-    def chunks(self, n_frames: int, first: int = 0) -> Iterator[list[DepthFrame]]:
-        """The frames in lists, each list made on all threads.
-
-        Args:
-            n_frames: frames a list; the last may be shorter.
-            first: frame to begin with.
-
-        Yields:
-            Lists of depth frames in order of time.
-        """
-        for start in range(first, len(self), n_frames):
-            stop = min(start + n_frames, len(self))
-            depths = self.depths(start, stop)
-            yield [
-                DepthFrame(i, int(self.times_ns[i]), depths[i - start]) for i in range(start, stop)
-            ]
 
     @staticmethod
     def draw(

@@ -9,7 +9,6 @@ pictures.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -20,7 +19,6 @@ from liex_lab.body.surface import Surface
 from liex_lab.errors import RecordingError
 from liex_lab.geometry import SE3
 from liex_lab.optics.camera import Camera
-from liex_lab.recordings.frame import DepthFrame
 from liex_lab.simulation import corruptions
 from liex_lab.simulation.corruptions import Event, Loss
 from liex_lab.simulation.hand.simulator import FRAME_NS, NYU_SENSOR, HandSession, HandSimulator
@@ -109,23 +107,6 @@ class TestSequence(TrueRecording):
             depths, still, start, self.scene.contents.seeds, camera.project(middle), reach
         )
         return depths
-
-    def chunks(self, n_frames: int, first: int = 0) -> Iterator[list[DepthFrame]]:
-        """The frames in lists, each list made on all threads.
-
-        Args:
-            n_frames: frames a list; the last may be shorter.
-            first: frame to begin with.
-
-        Yields:
-            Lists of depth frames in order of time.
-        """
-        for start in range(first, len(self), n_frames):
-            stop = min(start + n_frames, len(self))
-            depths = self.depths(start, stop)
-            yield [
-                DepthFrame(i, int(self.times_ns[i]), depths[i - start]) for i in range(start, stop)
-            ]
 
 
 _TRUTH = (

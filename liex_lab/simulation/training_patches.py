@@ -20,13 +20,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.body.pose import Pose
+from liex_lab.body.shape import BodyShape
 from liex_lab.body.surface import Body, Surface
+from liex_lab.errors import LiexError
 from liex_lab.geometry import SE3
 from liex_lab.runtime.threads import threads
 from liex_lab.simulation import _render_kernels as render_kernels
 from liex_lab.simulation._sensor_kernels import EROSION, NOISE, NORMAL
 from liex_lab.simulation.objects import PART_FACES, rounded
 from liex_lab.simulation.scene import SceneSpec, draw_views
+from liex_lab.simulation.scenes.worn import draw_worn
 from liex_lab.simulation.species import MouseSpecies, Species
 
 Array = NDArray[np.float64]
@@ -157,6 +160,7 @@ def training_windows(
     spine_mm: float | None = None,
     window_px: int = 144,
     parallel: bool = True,
+    worn_share: float = 0.0,
 ) -> TrainingPatches:
     """The first n training patches of a seed; those that `training_blocks` makes.
 
@@ -171,6 +175,7 @@ def training_windows(
         spine_mm: mean length of the animals, mm; None takes the skeleton's own.
         window_px: side of the patches, px.
         parallel: render on all threads.
+        worn_share: of the mice that wear a head stage or a cable.
 
     Returns:
         n patches with their truth.
@@ -188,6 +193,7 @@ def training_windows(
         spine_mm=spine_mm,
         window_px=window_px,
         parallel=parallel,
+        worn_share=worn_share,
     ):
         parts.append(block if left >= BLOCK else block[:left])
         left -= BLOCK
@@ -207,6 +213,7 @@ def training_blocks(
     spine_mm: float | None = None,
     window_px: int = 144,
     parallel: bool = True,
+    worn_share: float = 0.0,
 ) -> Iterator[TrainingPatches]:
     """Blocks of `BLOCK` training patches from block `first` on.
 
@@ -226,6 +233,8 @@ def training_blocks(
         window_px: side of the patches, px; it must hold the animal with a margin, and 144 does up
             to mice of 70 mm.
         parallel: render on all threads.
+        worn_share: of the mini-sessions whose mouse wears a head stage or a cable, see
+            `scenes.worn.draw_worn`; 0 makes the patches that there were before it could.
 
     Yields:
         One set of `BLOCK` patches a block.
@@ -235,9 +244,9 @@ def training_blocks(
     for number in range(first, first + n_blocks):
         rng = np.random.default_rng([seed, number])
         views = _draw_looks(rng, species, family, noise, erosion_px, degraded_share, spine_mm)
-        yield _draw_block(
-            rng, species, surface, views, window_px, number * (BLOCK // PER_SESSION), parallel
-        )
+        wearing = (np.random.default_rng([seed, number, 1]), worn_share)
+        first_session = number * (BLOCK // PER_SESSION)
+        yield _draw_block(rng, species, surface, views, window_px, first_session, parallel, wearing)
 
 
 def _draw_looks(
@@ -328,6 +337,22 @@ def inverse_depth_plane(
     )
 
 
+def _with_worn(
+    thing: Array,
+    has_thing: NDArray[np.bool_],
+    worn: Array,
+    worn_faces: NDArray[np.int32],
+    wears: NDArray[np.bool_],
+) -> tuple[Array, NDArray[np.int32], NDArray[np.bool_]]:
+    """Neighbours and what is worn as one mesh (n, V, 3); each far behind the camera without it."""
+    away = np.array([0.0, 0.0, 1e7])
+    both = [
+        mesh + (~there)[:, None, None] * away for mesh, there in ((thing, has_thing), (worn, wears))
+    ]
+    faces = np.concatenate([PART_FACES, worn_faces + np.int32(thing.shape[1])])
+    return np.concatenate(both, axis=1), faces, has_thing | wears
+
+
 def _draw_block(
     rng: np.random.Generator,
     species: Species,
@@ -336,6 +361,7 @@ def _draw_block(
     window_px: int,
     first_session: int,
     parallel: bool,
+    wearing: tuple[np.random.Generator, float],
 ) -> TrainingPatches:
     """The images of one block."""
     n = len(views.size)
@@ -352,13 +378,22 @@ def _draw_block(
     thing, has_thing = _draw_neighbours(
         rng, trunk, views.size * skeleton.length, scale, species.floats
     )
+    thing_faces = PART_FACES
+    if wearing[1] > 0.0:
+        if not isinstance(views.shape, BodyShape):
+            raise LiexError(
+                f"head stages and cables stand on a tubular body, which a {skeleton.name} has not; "
+                "leave out worn_share"
+            )
+        worn = draw_worn(wearing[0], skeleton, pose, views.shape, girth, wearing[1], PER_SESSION)
+        thing, thing_faces, has_thing = _with_worn(thing, has_thing, *worn)
     walls = _draw_walls(rng, trunk, species.setting)
     seeds = rng.integers(1, 2**63, n).astype(np.uint64)
     depth = np.empty((n, window_px, window_px), np.uint16)
     background = np.empty_like(depth)
     with threads(parallel):
         render_kernels.draw_windows(
-            render_kernels.Meshes(vertices, surface.faces, thing, PART_FACES, has_thing),
+            render_kernels.Meshes(vertices, surface.faces, thing, thing_faces, has_thing),
             render_kernels.PatchCamera(views.intrinsics, views.picture, origin),
             render_kernels.ArenaView(
                 views.T_arena_camera.rotation,

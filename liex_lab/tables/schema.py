@@ -239,9 +239,9 @@ FRAMES = columns(
         "flag",
         "string",
         "",
-        "empty when the pose is trusted; doubtful: its predicted error is large; corrected: a "
-        "person placed joints of it; not_found or no_depth: nothing was measured, and there is "
-        "no pose where it is not bridged",
+        "empty when the pose is trusted; doubtful: its predicted error is large, or the picture "
+        "contradicts it; corrected: a person placed joints of it; not_found or no_depth: nothing "
+        "was measured, and there is no pose where it is not bridged",
         "",
         "tracker",
     ),
@@ -389,8 +389,9 @@ GAPS = columns(
         "n_frames_missing",
         "int64",
         "",
-        "frames without a pose, or never delivered by the camera; 0 where only a time "
-        "stamp was moved, 1 where the clock jumped, for how many it were nobody knows",
+        "frames in which no pose was measured (bridged ones, which have a pose all the same, are "
+        "among them), or that the camera never delivered; 0 where only a time stamp was moved, 1 "
+        "where the clock jumped, for how many it were nobody knows",
     ),
     (
         "reason",
@@ -442,14 +443,19 @@ SESSIONS = columns(
         "when the recording began, ISO 8601 with zone; empty when unknown",
     ),
     ("n_frames", "int64", "", "recorded frames"),
-    ("n_frames_observed", "int64", "", "recorded frames with a pose"),
+    (
+        "n_frames_observed",
+        "int64",
+        "",
+        "recorded frames with a measured pose; bridged ones do not count",
+    ),
     (
         "observed_s",
         "float64",
         "s",
-        "time with a pose",
-        "sum over frames with a pose of the time to the next frame; before a gap or the end, the "
-        "median dt",
+        "time with a measured pose",
+        "sum over frames with a measured pose of the time to the next frame; before a gap or the "
+        "end, the median dt",
     ),
     ("fps_median", "float64", "1/s", "frames per second", "1 / median dt"),
     ("calibration_hash", "string", "", "hash of the camera's numbers and its place in the arena"),

@@ -47,6 +47,8 @@ class Observations:
         centroid_mm: (n, H, 3) centre of that component, arena frame, mm.
         centroid_px: (n, H, 2) its projection, px of the depth image.
         has_depth: (n,) True where anything was read.
+        covered: (n, H) share of the silhouette that the rendered body covers.
+        beside: (n, H) share of the rendered body that lies beside the silhouette.
     """
 
     skeleton: Skeleton
@@ -62,6 +64,8 @@ class Observations:
     centroid_mm: Small
     centroid_px: Small
     has_depth: NDArray[np.bool_]
+    covered: Small
+    beside: Small
 
     @staticmethod
     def empty(skeleton: Skeleton, times_ns: NDArray[np.int64]) -> Observations:
@@ -96,6 +100,8 @@ class Observations:
             nothing(3),
             nothing(2),
             np.ones(n, np.bool_),
+            nothing(),
+            nothing(),
         )
 
     def put_pose(self, h: int, pose: Pose) -> None:

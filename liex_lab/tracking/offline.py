@@ -9,7 +9,9 @@
 4. Validation gate: a hypothesis that was passed by, but lies within one predicted error of the
    curve, its own and the curve's together, is a measurement after all; twice over, for each time
    the curve comes nearer to others.
-5. Gaps up to `bridge_s` are bridged by the curve, longer ones are NaN.
+5. Gaps up to `bridge_s` are bridged by the curve, longer ones are NaN, and so are frames in which
+   an animal is in full view elsewhere.
+6. Poses that the picture contradicts are doubtful (`trust`).
 
 The default tracker of the package; it replaces the particle filter of Lie-X section 4.2
 (`particles`).
@@ -33,6 +35,7 @@ from liex_lab.tracking.motion_model import TrackingParameters
 from liex_lab.tracking.observations import Observations, joints_of, reversed_pose
 from liex_lab.tracking.smoother import Curve, smooth
 from liex_lab.tracking.track import Flip, Track, Tracked
+from liex_lab.tracking.trust import MOST_ERROR, contradicted, elsewhere
 
 Array = NDArray[np.float64]
 
@@ -147,9 +150,28 @@ def track_whole(
                 draw(rows)
     measured = used & (path >= 0)
     bridged = short_gaps(seconds, measured, subject.bridge_s)
+    strayed = np.zeros(len(seen), np.bool_)
+    for rows in blocks(len(seen), _BLOCK):
+        strayed[rows] = elsewhere(
+            subject.skeleton,
+            seen[rows],
+            track.joints_mm[rows],
+            track.predicted_error_mm[rows],
+            subject.length_mm,
+            usual_px,
+        )
+    bridged &= ~strayed  # what is in view is measured, or it has no pose
+    strayed |= contradicted(seen, path, subject.length_mm)
     for rows in blocks(len(seen), _BLOCK):
         _mask_and_flag(
-            subject, track[rows], seen[rows], path[rows], doubt[rows], measured[rows], bridged[rows]
+            subject,
+            track[rows],
+            seen[rows],
+            path[rows],
+            doubt[rows],
+            measured[rows],
+            bridged[rows],
+            strayed[rows],
         )
     flips = _flips(seen, track)
     return Tracked(
@@ -252,8 +274,16 @@ def to_track(
     bridged = short_gaps(seen.seconds, measured, subject.bridge_s, ahead)
     track = Track.empty(subject.skeleton, seen.times_ns[told])
     _write(subject, track, curve[told], tuning)
+    strayed = contradicted(seen, path, subject.length_mm)
     _mask_and_flag(
-        subject, track, seen[told], path[told], doubt[told], measured[told], bridged[told]
+        subject,
+        track,
+        seen[told],
+        path[told],
+        doubt[told],
+        measured[told],
+        bridged[told],
+        strayed[told],
     )
     return track
 
@@ -289,8 +319,13 @@ def _mask_and_flag(
     doubt: Array,
     measured: NDArray[np.bool_],
     bridged: NDArray[np.bool_],
+    strayed: NDArray[np.bool_],
 ) -> None:
-    """Mask rows (n) of a track to those measured or bridged; add projections, flags and sight."""
+    """Mask rows (n) of a track to those measured or bridged; add projections, flags and sight.
+
+    Poses are doubtful where their predicted error is large or the picture contradicts them
+    (strayed, (n,)).
+    """
     there = measured | bridged
     for column in (
         track.joints_mm,
@@ -310,9 +345,9 @@ def _mask_and_flag(
     track.p_flip[there] = doubt[there]
     _add_sight(track, seen, path, measured)
     track.bridged[:] = bridged
-    track.flag[measured] = np.where(track.predicted_error_mm > subject.doubtful_mm, "doubtful", "")[
-        measured
-    ]
+    limit = min(subject.doubtful_mm, MOST_ERROR * subject.length_mm)
+    doubtful = strayed | (track.predicted_error_mm > limit)
+    track.flag[measured] = np.where(doubtful, "doubtful", "")[measured]
     track.flag[~measured & ~seen.has_depth] = "no_depth"
 
 

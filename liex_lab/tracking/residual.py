@@ -3,7 +3,9 @@
 r = median over the pixels that both cover of |z_rendered - z_observed|, with a default body of the
 skeleton whose girth is found once per recording by a grid search from 0.75 to 1.35. The readings
 are those of the height maps, taken back to depth: z = (1 - h / d) / (a u + b v + c), with h the
-height, d the camera's distance and a u + b v + c the inverse depth of the plane.
+height, d the camera's distance and a u + b v + c the inverse depth of the plane. Beside the
+distance stand the two shares of the outlines: |S and B| / |S| of the silhouette S that the body B
+covers, and |B without S| / |B| of the body that lies beside it.
 """
 
 from __future__ import annotations
@@ -25,6 +27,23 @@ Array = NDArray[np.float64]
 
 _GIRTHS = np.linspace(0.75, 1.35, 13)  # of the default body at the animal's size
 _MIN_OVERLAP_PX = 20
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """How well rendered bodies agree with what was read, in n height maps.
+
+    Attributes:
+        residual_mm: (n,) median absolute difference between body and reading over the pixels that
+            both cover, mm; NaN where fewer than 20 pixels are covered by both.
+        covered: (n,) share (0 to 1) of the silhouette's pixels that the body covers.
+        beside: (n,) share (0 to 1) of the body's pixels on which nothing of the animal was read; 1
+            where the body is nowhere in the height map.
+    """
+
+    residual_mm: Array
+    covered: Array
+    beside: Array
 
 
 @dataclass(frozen=True)
@@ -52,15 +71,28 @@ class BodyResidual:
         Returns:
             (n,) mm; NaN where fewer than 20 pixels are covered by both.
         """
+        return self.agreement(pose_arena, crops, scene).residual_mm
+
+    def agreement(self, pose_arena: Pose, crops: HeightMaps, scene: Segmenter) -> Agreement:
+        """Distance of the body from the readings, and how their outlines lie over each other.
+
+        Args:
+            pose_arena: (n) poses, arena frame.
+            crops: their n height maps.
+            scene: the segmenter that cut them.
+
+        Returns:
+            The agreement of each pose with its height map.
+        """
         n = len(pose_arena.scale)
         check_shapes("poses", ("heights", crops.heights, (n, CROP, CROP)))
         if n == 0:
-            return np.zeros(0)
+            return Agreement(np.zeros(0), np.zeros(0), np.zeros(0))
         rendered = render_crops(self.surface, pose_arena, self.girth, crops, scene)
-        out = np.empty(n)
+        out = np.empty((3, n))
         planes = scene.planes(crops, self.camera_view)
         _compare(rendered, crops.heights, crops.origin, crops.step, planes, crops.distance, out)
-        return out
+        return Agreement(*out)
 
     @staticmethod
     def fit(
@@ -88,12 +120,17 @@ class BodyResidual:
         least = np.inf
         for girth in _GIRTHS:
             body = BodyResidual(surface, float(girth), camera_view)
-            off = body.of(placed, crops, scene)
-            cost = float(np.median(off[np.isfinite(off)])) if np.isfinite(off).any() else np.inf
+            cost = _median(body.of(placed, crops, scene))
             if cost < least:
                 best = body
                 least = cost
         return best
+
+
+def _median(residual_mm: Array) -> float:
+    """The median of what is known; infinite where nothing is."""
+    known = residual_mm[np.isfinite(residual_mm)]
+    return float(np.median(known)) if len(known) else np.inf
 
 
 def render_crops(
@@ -129,15 +166,21 @@ def render_crops(
 
 @njit(cache=True, parallel=True)
 def _compare(rendered, heights, origin, step, planes, distance, out):
-    """Median |rendered - observed| depth, mm, over pixels where both are, into out (n,)."""
+    """Median |rendered - observed| depth, mm, over pixels where both are, the share of the observed
+    pixels that are covered, and the share of the rendered ones that lie beside, into out (3, n).
+    """
     for i in prange(rendered.shape[0]):
         size = rendered.shape[1]
         plane = planes[i]
         offset = np.empty(size * size)
         n = 0
+        n_read = 0
+        n_drawn = 0
         for r in range(size):
             v = origin[i, 1] + step[i] * r
             for c in range(size):
+                n_read += heights[i, r, c] > 0
+                n_drawn += rendered[i, r, c] > 0
                 if rendered[i, r, c] > 0 and heights[i, r, c] > 0:
                     u = origin[i, 0] + step[i] * c
                     observed = (1.0 - heights[i, r, c] / 16.0 / distance[i]) / (
@@ -145,4 +188,6 @@ def _compare(rendered, heights, origin, step, planes, distance, out):
                     )
                     offset[n] = abs(rendered[i, r, c] - observed)
                     n += 1
-        out[i] = np.median(offset[:n]) if n >= _MIN_OVERLAP_PX else np.nan
+        out[0, i] = np.median(offset[:n]) if n >= _MIN_OVERLAP_PX else np.nan
+        out[1, i] = n / max(n_read, 1)
+        out[2, i] = 1.0 - n / max(n_drawn, 1)

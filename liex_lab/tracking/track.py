@@ -23,7 +23,10 @@ _BLOCK = 16_384  # frames that are in memory at a time
 CORRECTED = "corrected"  # the flag of a pose of which a person placed joints
 FLAGS = {
     "": "a pose was measured and is trusted",
-    "doubtful": "a pose was measured, but its predicted error is large for this animal",
+    "doubtful": (
+        "a pose was measured, but its predicted error is large for this animal, or the picture "
+        "contradicts it"
+    ),
     "not_found": (
         "the frame holds depth, but nothing in it looks like the animal; the row is NaN, or bridged"
     ),

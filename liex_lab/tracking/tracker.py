@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from liex_lab.body.surface import Surface
 from liex_lab.errors import EstimationError
 from liex_lab.estimation.estimator import Estimates, PoseEstimator
+from liex_lab.foreground.background_segmenter import BackgroundSubtraction
 from liex_lab.foreground.segmenter import Segmenter
 from liex_lab.recordings.frame import DepthFrame
 from liex_lab.runtime.memory import Allocator
@@ -25,10 +26,12 @@ from liex_lab.tracking.motion_model import TrackingParameters
 from liex_lab.tracking.observations import Observations
 from liex_lab.tracking.occlusion import OcclusionCorrection
 from liex_lab.tracking.offline import Subject, single_frames, track_whole
-from liex_lab.tracking.residual import BodyResidual
+from liex_lab.tracking.residual import Agreement, BodyResidual
+from liex_lab.tracking.sample_fit import SampleFit, count_animals
 from liex_lab.tracking.track import Flip, Track, Tracked
 
 BRIDGE_S = 0.5
+_MOST_COUNTED = 24  # frames in which animals are counted
 
 
 @dataclass(frozen=True)
@@ -48,6 +51,8 @@ class FrameTracker:
             estimate.
         free_ends: occlusion correction, which puts an animal that swims where the end of it that is
             seen says; None without.
+        sample_fit: how well the model explains the sampled frames; None of a tracker that was made
+            without any.
     """
 
     estimator: PoseEstimator
@@ -60,6 +65,7 @@ class FrameTracker:
     blur: float = 0.0
     size_spread: float = 0.0
     free_ends: OcclusionCorrection | None = None
+    sample_fit: SampleFit | None = None
 
     @staticmethod
     def prepare(
@@ -102,8 +108,8 @@ class FrameTracker:
             Surface.of(estimator.skeleton), pose[used], crops[used], scene, camera_view
         )
         limit = doubtful_mm or estimator.model.calibration.doubtful_mm * size
-        misfit = body.of(pose[used], crops[used], scene)
-        misfit = misfit[np.isfinite(misfit)]
+        agreement = body.agreement(pose[used], crops[used], scene)
+        misfit = agreement.residual_mm[np.isfinite(agreement.residual_mm)]
         blur = float(np.median(misfit)) / (home * size) if len(misfit) else 0.0
         spread = float(np.log(estimator.sizes_told(estimates)).std())
         ends = None
@@ -113,9 +119,16 @@ class FrameTracker:
             ends = OcclusionCorrection.fit(
                 estimator.skeleton, scene, estimates.chosen.pose[used], crops[used], sample[used]
             )
+        fit = SampleFit.of(
+            int((sample > 0).any(axis=(1, 2)).sum()),
+            size * home,
+            estimates.chosen.error_mm[used],
+            agreement,
+            _count(estimator, scene, sample[used], size, body, agreement, crops.n_blobs[used]),
+        )
         origin = "plan" if spine_mm else "recording"
         return FrameTracker(
-            estimator, scene, size, origin, body, limit, bridge_s, blur, spread, ends
+            estimator, scene, size, origin, body, limit, bridge_s, blur, spread, ends, fit
         )
 
     @property
@@ -225,7 +238,40 @@ class FrameTracker:
         seen.centroid_mm[found, h] = centre
         from_camera = self.scene.floor.T_arena_camera.inverse() @ centre
         seen.centroid_px[found, h] = self.scene.camera.project(from_camera)
+        columns = (seen.residual_mm, seen.covered, seen.beside)
         if h % 2:  # the body turned round covers the same pixels, nearly
-            seen.residual_mm[found, h] = seen.residual_mm[found, h - 1]
-        else:
-            seen.residual_mm[found, h] = self.body.of(pose[found], crops[found], self.scene)
+            for column in columns:
+                column[found, h] = column[found, h - 1]
+            return
+        told = self.body.agreement(pose[found], crops[found], self.scene)
+        for column, values in zip(
+            columns, (told.residual_mm, told.covered, told.beside), strict=True
+        ):
+            column[found, h] = values
+
+
+def _count(
+    estimator: PoseEstimator,
+    scene: Segmenter,
+    sample: NDArray[np.float32],
+    size: float,
+    body: BodyResidual,
+    first: Agreement,
+    n_things: NDArray[np.int64],
+) -> int:
+    """How many animals are in view at once in a sample (n, H, W) mm of frames with an animal.
+
+    Of hands, whose pictures always hold ends of other things, one is counted.
+    """
+    if not isinstance(scene, BackgroundSubtraction):
+        return 1
+    unsure = np.flatnonzero(n_things > 1)
+    rows = unsure[np.linspace(0, len(unsure) - 1, min(len(unsure), _MOST_COUNTED)).astype(int)]
+    if not len(rows):
+        return 1
+    other = estimator.hypotheses(sample[rows], scene, size)[2]
+    there = other.found
+    pose = other.chosen.pose.moved(scene.floor.T_arena_camera)[there]
+    second = body.agreement(pose, other.crops[there], scene)
+    n = len(n_things) * len(rows) // len(unsure)  # as many of all frames as were looked at of these
+    return count_animals(first, second, rows[there], n)

@@ -307,15 +307,17 @@ def one_hour(
         `frames`, `seconds` by the clock, `core_seconds` of this process, and `cores` of the
         machine.
     """
+    from liex_lab.behaviour.checking import recognise
+
     usual = float(np.median(np.diff(one.track.times_ns))) * 1e-9
     n = round(hour_s / usual)
     again = one[np.arange(n) % len(one)].track
     hour = replace(again, times_ns=np.round(np.arange(n) * usual * 1e9).astype(np.int64))
     wall = None if one.wall_mm is None else one.wall_mm[np.arange(n) % len(one)]
-    recogniser.recognise(one.track, one.wall_mm)  # compiles
+    recognise(recogniser, one.track, one.wall_mm)  # compiles
     began = time.perf_counter()
     worked = time.process_time()
-    recogniser.recognise(hour, wall)
+    recognise(recogniser, hour, wall)
     return {
         "frames": n,
         "seconds": time.perf_counter() - began,
@@ -330,10 +332,11 @@ def _minutes(tracks: Sequence[LabelledTrack]) -> float:
 
 def _scores(recogniser: TimelineModel, tracks: Sequence[LabelledTrack]) -> dict[str, Any]:
     from liex_lab.actions.scores import timeline_scores
+    from liex_lab.behaviour.checking import recognise
 
     return timeline_scores(
         (
-            (one, recogniser.recognise(one.track, one.wall_mm).ethogram.words(one.track.times_ns))
+            (one, recognise(recogniser, one.track, one.wall_mm).ethogram.words(one.track.times_ns))
             for one in tracks
         ),
         recogniser.words,

@@ -10,9 +10,10 @@ from liex_lab.plan.study import STUDY_FILE, Study
 from liex_lab.sessions import Session
 from liex_lab.sessions.failure import FAILED_FILE, read_failure
 from liex_lab.sessions.listed import WHO, Entry
+from liex_lab.sessions.verdict import verdict_in
 
 from ..compare import find_sessions
-from .status import SessionStatus, standings
+from .status import SessionStatus, standings, to_look_at
 
 
 def list_sessions(place: str | Path) -> tuple[str, Callable[[], Sequence[Entry]]]:
@@ -78,6 +79,7 @@ def _measured(folder: Path) -> Entry:
         session = Session.open(folder)
         row = session.table("sessions").iloc[0]
         who = {name: str(row[name]) for name in WHO if isinstance(row.get(name), str) and row[name]}
-        return Entry(session.name, "done", folder=folder, who=who)
+        reason = to_look_at(verdict_in(session.metadata))
+        return Entry(session.name, "done", reason, folder=folder, who=who)
     except (LiexError, IndexError) as error:
         return Entry(folder.name, "failed", str(error))

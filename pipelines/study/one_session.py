@@ -13,10 +13,11 @@ from liex_lab.plan.study import PlannedSession
 from liex_lab.runtime.progress import Progress, silent
 from liex_lab.sessions.failure import describe_failure, read_failure, write_failure
 from liex_lab.sessions.older import set_outdated, taken_from
+from liex_lab.sessions.verdict import read_verdict
 
 from ..shards import MEASURING
 from ..workers import WorkerPool
-from .status import input_stamp
+from .status import input_stamp, to_look_at
 
 
 class RunSession(Protocol):
@@ -67,8 +68,9 @@ def measure_one(
         pool: pool of workers for the session's shards.
 
     Returns:
-        `id`, `state` (`done` or `failed`), `seconds`, `failure` (None where it is done), and
-        `corrections_taken_from` (the outdated copy that people had corrected; "" for none).
+        `id`, `state` (`done` or `failed`), `seconds`, `failure` (None where it is done),
+        `corrections_taken_from` (the outdated copy that people had corrected; "" for none), and
+        `look_at_it` (why someone has to look at it although it is done; "" where nobody has to).
     """
     if run_id and (ended := _ended(session, run_id)):
         return ended
@@ -109,6 +111,7 @@ def measure_one(
         "seconds": seconds,
         "failure": failure,
         "corrections_taken_from": "" if failure else taken_from(session.folder),
+        "look_at_it": "" if failure else to_look_at(read_verdict(session.folder)),
     }
 
 

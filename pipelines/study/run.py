@@ -8,17 +8,32 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 from liex_lab.errors import StudyError
 from liex_lab.plan.study import Study
 from liex_lab.runtime.progress import Board
+from liex_lab.sessions.corrections import Description
 from liex_lab.sessions.lock import locked
 
+from ..correct import correct_session
 from .one_session import RunSession
 from .slurm import SlurmTable
 from .status import SessionStatus, standings
 from .table import write_study_table
+
+
+class DescribeSession(Protocol):
+    """What writes descriptions into a session: `liex_lab.api.correct_session`."""
+
+    def __call__(self, session: str | Path, what: Sequence[Description], *, author: str) -> Path:
+        """Write them; returns the session folder.
+
+        Args:
+            session: the session folder.
+            what: the descriptions.
+            author: whose they are.
+        """
 
 
 def run_study(
@@ -33,6 +48,7 @@ def run_study(
     only: Sequence[str],
     dry_run: bool,
     board: Callable[[int], AbstractContextManager[Board]],
+    describe: DescribeSession = correct_session,
 ) -> list[SessionStatus]:
     """Measure the sessions of a study that are to be done; returns every session's status.
 
@@ -47,6 +63,7 @@ def run_study(
         only: ids of sessions, the others are left out; () takes all.
         dry_run: only look.
         board: opens the display of so many sessions' progress.
+        describe: writes descriptions into a session, `liex_lab.api.correct_session`.
 
     Raises:
         StudyError: both scheduler and slurm are given, or no scheduler answers.
@@ -66,7 +83,11 @@ def run_study(
         study.cohort_folder / ".lock",
         f"the study {study.name} is being measured by another process",
     ):
-        todo = [one for one in before if one.to_do]
+        for one in before:
+            if one.described:
+                said = [Description(key, value) for key, value in one.described.items()]
+                describe(one.session.folder, said, author=f"study {study.name}")
+        todo = [one for one in before if one.to_do and not one.described]
         if todo:
             _measure(todo, run, board, workers=workers, scheduler=scheduler, slurm=table)
         after = standings(study)
@@ -89,10 +110,11 @@ def _measure(
             failure = result["failure"]
             copy = result.get("corrections_taken_from")
             taken = f", with the corrections of {copy}" if copy else ""
+            look = f"; {why}" if (why := result.get("look_at_it")) else ""
             sentence = (
                 f"failed: {failure['reason']}"
                 if failure
-                else f"is done, in {result['seconds']:.0f} s{taken}"
+                else f"is done, in {result['seconds']:.0f} s{taken}{look}"
             )
             shown.ended(result["id"], sentence, failed=failure is not None)
 

@@ -9,16 +9,18 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
 from liex_lab.errors import LiexError
 from liex_lab.plan import Plan
 from liex_lab.plan.study import VIRTUAL, PlannedSession, Study
+from liex_lab.sessions.corrections import DESCRIBED, START, read_log, with_description
 from liex_lab.sessions.failure import read_failure
 from liex_lab.sessions.provenance import SCHEMA_VERSION, package_version
+from liex_lab.sessions.verdict import LOOK_AT_IT, verdict_in
 
 _SAYS = {
     ".toml",
@@ -38,18 +40,21 @@ class SessionStatus:
     Attributes:
         session: the planned session.
         state: done, failed, new, begun, changed or excluded.
-        reason: why it is to be done, or was not.
+        reason: why it is to be done, was not, or is to be looked at although it is done.
         failure: of the last attempt, if it failed.
+        described: what the study says otherwise of the animal than its results; then nothing else
+            changed, and nothing is measured anew.
     """
 
     session: PlannedSession
     state: State
     reason: str = ""
     failure: dict[str, Any] | None = None
+    described: dict[str, str] = field(default_factory=dict)
 
     @property
     def to_do(self) -> bool:
-        """Whether a run of the study measures it: it is new, begun or changed."""
+        """Whether a run of the study has to do with it: it is new, begun or changed."""
         return self.state in ("new", "begun", "changed")
 
 
@@ -79,7 +84,7 @@ def standings(
 
 
 def _asked_again(one: SessionStatus, retry: bool, again: bool) -> SessionStatus:
-    if again and one.state == "done":
+    if again and (one.state == "done" or one.described):
         return SessionStatus(one.session, "changed", "asked for with --again")
     if (retry or again) and one.state == "failed":
         return SessionStatus(one.session, "changed", "it failed, and is tried again", one.failure)
@@ -95,12 +100,21 @@ def standing(session: PlannedSession) -> SessionStatus:
     if session.exclude:
         return SessionStatus(session, "excluded", session.exclude)
     if (session.folder / "session.json").is_file():
+        said: dict[str, str] = {}
         try:
             document = json.loads((session.folder / "session.json").read_text(encoding="utf-8"))
             why = next(filter(None, (check() for check in _checks(session, document))), "")
+            if not why:
+                said = _described_anew(session, document)
         except (OSError, ValueError, LiexError, AttributeError, TypeError):
+            document = {}
             why = "its session.json cannot be read"
-        return SessionStatus(session, "changed" if why else "done", why)
+        if said:
+            told = ", ".join(f"{key} = {value or 'unknown'}" for key, value in said.items())
+            why = f"described anew: {told}; nothing is measured again"
+        if why:
+            return SessionStatus(session, "changed", why, described=said)
+        return SessionStatus(session, "done", to_look_at(verdict_in(document)))
     failure = read_failure(session.folder)
     if failure is not None:
         why = (
@@ -119,11 +133,23 @@ def standing(session: PlannedSession) -> SessionStatus:
     )
 
 
+def to_look_at(verdict: Mapping[str, Any]) -> str:
+    """Why someone has to look at a session that is done, '' where nobody has to.
+
+    Args:
+        verdict: as `sessions.verdict.read_verdict` gives it.
+    """
+    if not verdict["look_at_it"]:
+        return ""
+    accepted = ", accepted" if verdict["accepted"] else ""
+    return f"{LOOK_AT_IT}{accepted}: {'; '.join(map(str, verdict['reasons']))}"
+
+
 def _checks(session: PlannedSession, document: dict[str, Any]) -> Iterable[Callable[[], str]]:
     """Tests that say why a stored session is not the planned one, '' if it is; cheapest first."""
     return (
         lambda: _version_changed(document),
-        lambda: _plan_changed(session.plan, document.get("plan", {})),
+        lambda: plan_changed(session.plan, document.get("plan", {})),
         lambda: _model_changed(session.plan, document.get("model", {})),
         lambda: _input_changed(session, document.get("input", {})),
     )
@@ -142,9 +168,17 @@ def _version_changed(document: dict[str, Any]) -> str:
     )
 
 
-def _plan_changed(plan: Plan, stored: dict[str, Any]) -> str:
+def plan_changed(plan: Plan, stored: dict[str, Any]) -> str:
+    """What a plan says otherwise than the one that a session was measured by, '' if nothing.
+
+    Args:
+        plan: the plan of today.
+        stored: the plan in session.json.
+    """
     then = Plan.from_table(stored).model_dump()
     now = plan.model_dump()
+    if plan.recording.mirrored is None:  # then it is found, and stored as it was found
+        now["recording"]["mirrored"] = then["recording"]["mirrored"]
     differing = [
         f"{section}.{key} = {now[section][key]}"
         if isinstance(now[section], dict)
@@ -152,9 +186,26 @@ def _plan_changed(plan: Plan, stored: dict[str, Any]) -> str:
         for section in now
         for key in (now[section] if isinstance(now[section], dict) else [""])
         if (now[section][key] != then[section][key] if key else now[section] != then[section])
+        and not (section == "session" and key in DESCRIBED)
     ]
     more = f" and {len(differing) - 3} more" if len(differing) > 3 else ""
     return f"plan changed: {', '.join(differing[:3])}{more}" if differing else ""
+
+
+def _described_anew(session: PlannedSession, document: dict[str, Any]) -> dict[str, str]:
+    """What the plan says otherwise of animal and session than the results; '' takes it back."""
+    stated = session.plan.session.model_dump()
+    then = Plan.from_table(document.get("plan", {})).session.model_dump()
+    described = read_log(session.folder).described
+    now = with_description(document, described)
+    known = {**then, **now.get("subject", {}), **described}
+    known[START] = now.get(START) or known[START]
+    wanted = {
+        key: str(stated[key] or "")
+        for key in DESCRIBED
+        if stated[key] is not None or then[key] is not None
+    }
+    return {key: value for key, value in wanted.items() if value != str(known.get(key) or "")}
 
 
 def _model_changed(plan: Plan, stored: dict[str, Any]) -> str:

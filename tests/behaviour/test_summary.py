@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from liex_lab.behaviour import ACTIONS, measure
@@ -22,7 +23,7 @@ def test_distance_speed_and_rearing_of_a_known_walk():
     assert row["median_speed_mm_s"] == pytest.approx(200.0, rel=1e-3)
     assert row["rear_count"] == 1
     assert row["rear_s"] == pytest.approx(1.9, abs=0.1)
-    assert row["distance_moving_m"] == pytest.approx(0.2 * row["walk_s"], rel=1e-3)
+    assert row["distance_moving_m"] == pytest.approx(2.0, rel=1e-3), "rearing or not, it moves"
     assert row["spine_mm"] == pytest.approx(SPINE_MM)
     assert row["duration_s"] == pytest.approx(10.0, abs=1e-6)
 
@@ -49,3 +50,52 @@ def test_the_row_has_the_listed_columns():
     summary = measure(*tables_of(WalkingMouse(steady(1.0)))).summary
     assert list(summary.columns) == [column.name for column in summary_columns(ACTIONS)]
     assert len(summary) == 1
+
+
+def named(mouse: WalkingMouse, *spans: tuple[str, float, float]) -> pd.DataFrame:
+    """Bouts (action, from, to) of a mouse, as a model would name them."""
+    time_s = mouse.times_s
+    rows = [(word, *np.searchsorted(time_s, [a, b])) for word, a, b in spans]
+    return pd.DataFrame(
+        {
+            "session_id": "circle",
+            "individual": "mouse_1",
+            "action": [word for word, _, _ in rows],
+            "start_s": [time_s[a] for _, a, _ in rows],
+            "stop_s": [time_s[b] for _, _, b in rows],
+            "duration_s": [time_s[b] - time_s[a] for _, a, b in rows],
+            "start_frame": [a for _, a, _ in rows],
+            "stop_frame": [b for _, _, b in rows],
+            "score": 0.9,
+            "source": "model",
+            "model_hash": "abc",
+        }
+    )
+
+
+def test_the_way_in_which_it_moved_does_not_depend_on_the_names_of_actions():
+    mouse = WalkingMouse(steady(10.0), speed_mm_s=120.0)
+    told = [
+        measure(*tables_of(mouse), bouts=named(mouse, *spans), actions={"x": "", "walk": ""})
+        for spans in ([], [("x", 1.0, 9.0)], [("walk", 2.0, 3.0)])
+    ]
+    ways = [one.summary["distance_moving_m"].iloc[0] for one in told]
+    assert ways == [ways[0]] * 3
+    assert ways[0] == pytest.approx(1.2, rel=1e-3)
+    slow = WalkingMouse(steady(10.0), speed_mm_s=30.0)
+    assert summary_of(slow)["distance_moving_m"] == 0.0
+    noisy = WalkingMouse(steady(10.0), speed_mm_s=60.0, sd_mm=10.0)
+    row = summary_of(noisy)
+    assert row["speed_noise_mm_s"] > 60.0
+    assert row["distance_moving_m"] == 0.0, "slower than its noise, nobody knows that it moved"
+
+
+def test_rears_with_and_without_a_wall_are_counted_together():
+    mouse = WalkingMouse(steady(10.0))
+    spans = [("rear_supported", 2.0, 3.0), ("walk", 3.0, 5.0), ("rear_unsupported", 6.0, 6.5)]
+    words = dict.fromkeys(("walk", "rear_supported", "rear_unsupported"), "")
+    row = measure(*tables_of(mouse), bouts=named(mouse, *spans), actions=words).summary.iloc[0]
+    assert row["rear_count"] == 2
+    assert row["rear_s"] == pytest.approx(1.5, abs=1e-6)
+    assert row["rear_share"] == pytest.approx(0.15, abs=1e-6)
+    assert row["rear_latency_s"] == pytest.approx(2.0, abs=1e-6)

@@ -20,11 +20,13 @@ from typer.testing import CliRunner
 
 import liex_lab
 from liex_lab import api, cli
+from liex_lab.cli.options import told_scores
 from liex_lab.errors import RecordingError
 from liex_lab.plan import Plan
+from liex_lab.sessions.verdict import Verdict
 
 VERBS = ["demo", "run", "doctor", "convert", "train", "evaluate", "live", "correct", "show", "info"]
-MEASURES = ["pose", "speed", "sizes", "tables", "reference", "tracking"]
+MEASURES = ["pose", "speed", "sizes", "tables", "reference", "tracking", "scenes"]
 
 
 def liex(
@@ -145,7 +147,7 @@ def test_run_hands_the_plan_with_its_settings_to_the_job(
     seen: dict[str, Any] = {}
 
     def run_session(
-        recording: Path, plan: Plan, out: Path, *, overwrite: bool, workers: int, progress: Any
+        recording: Path, plan: Plan, out: Path, *, overwrite: bool, progress: Any, **_: Any
     ) -> Path:
         progress(1, 2, "working")
         progress(2, 2, "working")
@@ -160,6 +162,8 @@ def test_run_hands_the_plan_with_its_settings_to_the_job(
     words = [
         "run",
         "m01.mcap",
+        "--plan",
+        "mouse",
         "--set",
         "animal.spine_mm=65",
         "--set",
@@ -174,6 +178,41 @@ def test_run_hands_the_plan_with_its_settings_to_the_job(
     assert (seen["recording"], seen["out"], seen["overwrite"]) == (Path("m01.mcap"), tmp_path, True)
     assert f"session: {tmp_path / 'm01.liex'}" in result.output
     assert f"report:  {tmp_path / 'm01.liex' / 'report.html'}" in result.output
+
+
+@pytest.mark.parametrize(
+    ("reasons", "accepted", "code"), [([], False, 0), (["it is huge"], False, 4), (["x"], True, 0)]
+)
+def test_run_ends_with_how_it_went_and_exit_code_4_where_someone_has_to_look(
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    reasons: list[str],
+    accepted: bool,
+    code: int,
+) -> None:
+    def run_session(recording: Path, plan: Plan | None, out: Path, **how: Any) -> Path:
+        assert plan is None, "none was named"
+        assert how["settings"] == ["estimation.accept_misfit=true"] * accepted
+        verdict = Verdict(9, 9, 8, 7, 2.0, 1, tuple(reasons), (), accepted)
+        (out / "session.json").write_text(json.dumps({"verdict": verdict.to_dict()}))
+        return out
+
+    monkeypatch.setattr("liex_lab.api.run_session", run_session)
+    words = ["run", "m01.mcap", "--out", str(tmp_path), *["--accept"] * accepted]
+    result = CliRunner().invoke(cli.app, words)
+    assert result.exit_code == code, result.output
+    last = result.output.strip().splitlines()[-1]
+    assert last.startswith("result:  9 frames, 8 with a pose (89%), 7 of them trusted")
+    assert ("look at it" in last) == bool(reasons)
+
+
+def test_a_recording_that_does_not_fit_its_plan_is_a_sentence_and_exit_code_4() -> None:
+    told = "from liex_lab.errors import MisfitError\n" + BREAK.format(
+        "raise MisfitError('too long')"
+    )
+    ran = liex("info", "--plan", "mouse", code=told)
+    assert (ran.returncode, ran.stdout) == (4, "")
+    assert ran.stderr.strip() == "liex: too long"
 
 
 def test_demo_ends_with_the_path_of_a_session(
@@ -236,6 +275,28 @@ def test_evaluate_pose_writes_its_numbers(monkeypatch: pytest.MonkeyPatch, tmp_p
     assert seen == ["mouse", "hard", "paper", {"model": None, "n_frames": 50, "spine_mm": 65.0}]
     assert json.loads(file.read_text())["curve"] == [0, 1]
     assert "mean over joints [mm]" in result.output, "brackets are text, not markup"
+
+
+def test_evaluate_scenes_tells_one_line_a_scene(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    seen: list[Any] = []
+
+    def evaluate_scenes(only: list[str], **options: Any) -> dict[str, Any]:
+        options.pop("progress")(0, 1, "scene plain")
+        seen.extend([only, options])
+        row = {"found": 0.98765, "hidden_right": None, "said": ["look here", "and here"]}
+        return {"rows": {"plain": row}, "protocol": "found: share"}
+
+    job(monkeypatch, "evaluation.scenes", evaluate_scenes=evaluate_scenes)
+    file = tmp_path / "scenes.json"
+    words = ["--only", "plain, raised", "--frames", "60", "--json", str(file)]
+    result = CliRunner().invoke(cli.app, ["evaluate", "scenes", *words])
+    assert result.exit_code == 0, result.output
+    assert seen[0] == ["plain", "raised"]
+    assert seen[1] == {"n_frames": 60, "n_recordings": 1, "sealed": False, "draw": None}
+    assert "| plain | 0.988 | – | look here; and here |" in result.output
+    assert json.loads(file.read_text())["rows"]["plain"]["hidden_right"] is None
 
 
 def test_the_other_measures_reach_their_jobs(
@@ -348,17 +409,20 @@ def test_convert_says_what_was_written_and_what_is_odd(
 
 
 def test_run_hands_the_topic_to_the_plan(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    plans: list[Plan] = []
+    seen: list[tuple[Plan | None, list[str]]] = []
 
-    def run_session(recording: Path, plan: Plan, out: Path, **how: Any) -> Path:
-        plans.append(plan)
+    def run_session(recording: Path, plan: Plan | None, out: Path, **how: Any) -> Path:
+        seen.append((plan, how["settings"]))
         return out
 
     monkeypatch.setattr("liex_lab.api.run_session", run_session)
-    CliRunner().invoke(
-        cli.app, ["run", "m01.mcap", "--topic", "/left/depth", "--out", str(tmp_path)]
-    )
-    assert plans[0].recording.topic == "/left/depth"
+    words = ["run", "m01.mcap", "--topic", "/left/depth", "--out", str(tmp_path)]
+    CliRunner().invoke(cli.app, [*words, "--plan", "mouse"])
+    CliRunner().invoke(cli.app, words)
+    (plan, _), (unnamed, settings) = seen
+    assert plan is not None
+    assert plan.recording.topic == "/left/depth"
+    assert (unnamed, settings) == (None, ["recording.topic=/left/depth"])
 
 
 def test_train_names_the_model_after_the_animal(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -390,8 +454,22 @@ def test_errors_of_a_job_come_through(
 
 def test_info_tells_versions_and_plans_and_prints_a_plan_to_copy() -> None:
     told = CliRunner().invoke(cli.app, ["info"]).output
+    assert all(word in told for word in ("liex_lab", "python", "plans", "mouse", "models"))
+    assert len(told.splitlines()) < 20
+    told = CliRunner().invoke(cli.app, ["info", "--all"]).output
     assert all(word in told for word in ("numba", "rerun-sdk", "plans", "mouse", "models"))
     assert (
         CliRunner().invoke(cli.app, ["info", "--plan", "mouse"]).output
         == Plan.load("mouse").to_toml()
     )
+
+
+def test_scores_of_a_trained_recogniser_are_sentences() -> None:
+    go = {"f1": 0.5, "precision": 0.25, "recall": 1.0, "segment_f1_50": 0.5, "bouts": 1}
+    report = {"animals": 2, "macro_f1": 0.5, "segment_f1_50": 0.5, "per_action": {"go": go}}
+    first, second = told_scores(report)
+    assert "macro F1 of the frames 0.50" in first
+    assert second.endswith("25% of what was called so is, 100% of it was found; 1 bout")
+    alone = told_scores({"animals": 1, "note": "one animal only"})
+    assert alone == ["animals: 1", "note: one animal only"]
+    assert told_scores({}) == []

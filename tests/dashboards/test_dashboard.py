@@ -19,13 +19,14 @@ from liex_lab.dashboards.app import plots, tables
 from liex_lab.dashboards.app.data import GREY, Ethogram, StudyData, colours_of, raster
 from liex_lab.dashboards.app.page_session import moved_to
 from liex_lab.dashboards.app.server import address, make_app
-from liex_lab.dashboards.report.svg import ACTION_COLOURS, action_colour
 from liex_lab.pipelines.study.listing import list_sessions
 from typer.testing import CliRunner
 
 from liex_lab import api, cli
+from liex_lab.actions.colours import PALETTE, action_colours
 from liex_lab.errors import LiexError, SessionError
 from liex_lab.sessions import Session
+from liex_lab.sessions.listed import Entry
 from tests.dashboards import copies
 
 KEY = "sub-m003_ses-01"
@@ -106,15 +107,15 @@ def test_each_part_of_the_time_has_the_colour_of_what_fills_most_of_it(
 
 
 def test_no_two_actions_share_a_colour_but_the_grey_ones() -> None:
-    n = len(ACTION_COLOURS)
+    n = len(PALETTE)
     colours = list(colours_of([f"w{k}" for k in range(n + 3)]).values())
     assert len(set(colours[:n])) == n
     assert set(colours[n:]) == {GREY}
     words = ["rear", "run", "walk", "pause"]
     assert colours_of(["walk", "rear", "unheard"], words) == {
-        "walk": action_colour(2),
-        "rear": action_colour(0),
-        "unheard": action_colour(1),
+        "walk": action_colours(words)["walk"],
+        "rear": action_colours(words)["rear"],
+        "unheard": PALETTE[0],
     }
 
 
@@ -266,3 +267,29 @@ def test_what_is_not_there_is_told(data: StudyData) -> None:
         data.session("sub-m000_ses-02")
     with pytest.raises(SessionError, match="no table"):
         tables.find(data, "nothing")
+
+
+def test_every_ethogram_stands_under_its_own_key(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    entries = [
+        Entry("a", "failed", folder=tmp_path / "a"),
+        Entry("b", "done", folder=tmp_path / "b"),
+        Entry("c", "new"),
+        Entry("d", "done", folder=tmp_path / "d"),
+    ]
+    shown = StudyData("x", lambda: entries)
+    known = {
+        key: Ethogram(np.zeros((0, 2)), [], np.zeros((0, 2)), seconds)
+        for key, seconds in (("b", 2.0), ("d", 4.0))
+    }
+    monkeypatch.setattr(shown, "_of_one", lambda what, read, entry: known[entry.key])
+    found = shown.ethograms(["a", "b", "c", "d", "e"])
+    assert {key: one.duration_s for key, one in found.items()} == {"b": 2.0, "d": 4.0}
+
+
+def test_a_damaged_ethogram_is_a_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    shown = StudyData("x", lambda: [Entry("b", "done", folder=tmp_path / "b")])
+    monkeypatch.setattr(shown, "_of_one", lambda what, read, entry: {"damage": "run it again"})
+    assert shown.ethograms(["b"]) == {}
+    assert shown.damage("b") == "run it again"

@@ -15,6 +15,7 @@ from liex_lab.dashboards.report import svg as figures
 from liex_lab.dashboards.report.quality import flip_rows, frame_account, warnings
 from liex_lab.dashboards.report.report import methods, render, write_report
 
+from liex_lab.actions import colours
 from liex_lab.arena.outline import Arena
 from liex_lab.arena.zones import Zone
 from liex_lab.behaviour import measure_session
@@ -110,7 +111,7 @@ def test_text_from_the_recording_cannot_become_markup(page):
 def test_warnings_come_before_everything_else_and_say_what_is_wrong(session, page):
     sentences = warnings(session)
     assert sentences[0] == "Dark & <cold>."
-    assert any("did not deliver 6 frames, in 1 gaps" in sentence for sentence in sentences)
+    assert any("did not deliver 6 frames, in 1 gap;" in sentence for sentence in sentences)
     assert page.index("Read this first") < page.index('class="cards"')
     shares = [share for _, share, _, _ in frame_account(session)]
     assert sum(shares) == pytest.approx(1.0)
@@ -135,7 +136,7 @@ def test_exchanges_of_head_and_tail_are_warned_of_and_listed(session, monkeypatc
     again = Session.open(session.path)
     monkeypatch.setattr(type(again), "flips", flips)
     assert any(
-        "2 stretches of 0.8 s in all; 1 were put right" in sentence for sentence in warnings(again)
+        "2 stretches of 0.8 s in all; 1 was put right" in sentence for sentence in warnings(again)
     )
     assert flip_rows(again) == [
         ("1.00", "1.50", "0.90", "put right"),
@@ -256,6 +257,7 @@ def test_a_session_without_any_pose_has_a_report_too(tmp_path):
 
 
 def test_the_replay_and_the_report_give_an_action_the_same_colour():
-    assert len(figures.ACTION_COLOURS) == len(PALETTE)
-    for k in range(len(PALETTE)):
-        assert int(figures.action_colour(k)[1:], 16) == PALETTE[k]
+    assert tuple(int(colour[1:], 16) for colour in colours.PALETTE) == PALETTE
+    words = ["walk", "rear_supported"]
+    lanes = figures.lanes([(0.0, 1.0, "walk")], words, [], figures.time_scale(2.0))
+    assert colours.action_colours(words)["walk"] in lanes

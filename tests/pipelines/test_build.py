@@ -5,8 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from liex_lab.pipelines.build import build_estimator, build_recording
+from liex_lab.pipelines.build import (
+    build_estimator,
+    build_recogniser,
+    build_recording,
+    why_nameless,
+)
 
+from liex_lab.body import Skeleton
 from liex_lab.catalog import MODELS
 from liex_lab.errors import LiexError
 from liex_lab.optics.camera import Distortion
@@ -133,3 +139,12 @@ def test_a_model_is_kept_until_another_one_is_in_its_place(tmp_path):
     own.write_bytes((MODELS / "fish.npz").read_bytes())
     with pytest.raises(LiexError, match="made for the skeleton fish"):
         build_estimator(plan(f"estimation.model={own}"))
+
+
+def test_no_actions_are_named_of_an_animal_that_no_vocabulary_was_made_for() -> None:
+    hand = Skeleton.load("hand")
+    plan = Plan.load("hand")
+    assert build_recogniser(plan, hand) is None
+    assert "no vocabulary was made for a hand" in why_nameless(plan, hand)
+    assert why_nameless(plan.with_settings(["actions.model=rules"]), hand) == ""
+    assert why_nameless(Plan.load("mouse"), Skeleton.load("mouse")) == ""

@@ -334,3 +334,56 @@ def test_the_command_line_corrects_lists_and_takes_back(session: Session) -> Non
     for words in (("bout", place, "--at", 2.5), ("joint", place, "--frame", 4, "--joint", "nose")):
         with pytest.raises(LiexError, match=r"one edit at a time|given in one way"):
             liex(*words)
+
+
+def test_who_the_animal_is_can_be_said_afterwards_and_taken_back(session: Session) -> None:
+    before = contents(session.path)
+    invoked = CliRunner().invoke(
+        cli.app,
+        ["describe", str(session.path), "subject_id=m07", "group=drug", "--by", "ada"],
+    )
+    assert invoked.exit_code == 0, invoked.output
+    told = Session.open(session.path)
+    assert (
+        told.metadata["subject"] | {"subject_id": "m07", "group": "drug"}
+        == told.metadata["subject"]
+    )
+    row = told.table("sessions").iloc[0]
+    assert (row["subject_id"], row["group"]) == ("m07", "drug")
+    assert pd.read_parquet(told.file("sessions.parquet"))["group"].iloc[0] == "drug"
+    assert set(told.log.files) == {"sessions.parquet"}, "nothing was measured again"
+    assert "corrections" not in told.metadata
+    assert "drug" in (session.path / "report.html").read_text(encoding="utf-8")
+    after = contents(session.path)
+    assert {name: after[name] for name in before} == before, "what was written stays as it was"
+    assert Session.open(session.path, raw=True).metadata["subject"] == session.metadata["subject"]
+    assert all(finding.state != "wrong" for finding in verify_session(session.path, lambda: Path()))
+    again = corrected(told, *correcting.descriptions({"group": ""}))
+    assert "group" not in again.metadata["subject"]
+    assert again.table("sessions")["group"].iloc[0] == ""
+    back = corrected(again, undo=[3])
+    assert back.metadata["subject"]["group"] == "drug"
+
+
+def test_descriptions_stand_beside_corrections(session: Session) -> None:
+    moment = "2026-08-21T10:00:00+02:00"
+    one = corrected(session, correcting.rename_bout(session, 2.5, "run"))
+    two = corrected(one, *correcting.descriptions({"cage": "c1", "session_start_time": moment}))
+    assert two.metadata["corrections"]["n"] == 1
+    assert two.metadata["session_start_time"] == moment
+    assert two.table("sessions")["cage"].iloc[0] == "c1"
+    assert ("run", "human") in set(zip(two.bouts["action"], two.bouts["source"], strict=True))
+
+
+@pytest.mark.parametrize(
+    ("facts", "said"),
+    [
+        ({"grup": "drug"}, "did you mean group"),
+        ({"weight": "20"}, "subject_id, group, cage"),
+        ({}, "nothing to describe"),
+        ({"session_start_time": "yesterday"}, "time zone"),
+    ],
+)
+def test_a_fact_that_cannot_be_said_is_refused(facts: dict[str, str], said: str) -> None:
+    with pytest.raises(LiexError, match=said):
+        correcting.descriptions(facts)

@@ -59,11 +59,17 @@ KEYS = [
     "floor_tilt_rad",
     "water_depth_mm",
     "arena",
+    "scene",
     "animal_length_mm",
     "animal_area_mm2",
     "animal_share",
     "animal_sits_still",
+    "plan",
+    "plan_says",
+    "n_animals",
+    "missing",
     "problems",
+    "next",
 ]
 CAMERA = Camera(140.0, 141.0, 79.5, 59.5, 160, 120)
 

@@ -209,7 +209,7 @@ def test_an_older_session_is_replaced_only_on_demand_and_that_is_said_at_once(
     session, folder, monkeypatch
 ):
     monkeypatch.setattr(
-        job, "build_tracker", lambda *_: pytest.fail("minutes of work before the refusal")
+        job, "fit_plan", lambda *_, **__: pytest.fail("minutes of work before the refusal")
     )
     with pytest.raises(SessionError, match="overwrite"):
         run_session(folder, Plan.load("mouse"), session.path.parent)

@@ -30,7 +30,7 @@ from liex_lab.recordings.formats.images.nyu_labels import (
     NyuReference,
     fit_hands,
 )
-from liex_lab.recordings.frame import Depth, DepthFrame
+from liex_lab.recordings.frame import Depth
 from liex_lab.simulation._sensor_kernels import PRIMESENSE_KIND
 from liex_lab.simulation.hand import scene
 from liex_lab.simulation.hand.gestures import draw_gestures
@@ -132,23 +132,6 @@ class HandSession(TrueRecording):
         return part.pictures(
             faces, intrinsics, size, np.zeros((n, 2), np.int64), (c.height, c.width)
         ).astype(np.float32)
-
-    def chunks(self, n_frames: int, first: int = 0) -> Iterator[list[DepthFrame]]:
-        """The frames in lists, each list made on all threads.
-
-        Args:
-            n_frames: frames a list; the last may be shorter.
-            first: frame to begin with.
-
-        Yields:
-            Lists of depth frames in order of time.
-        """
-        for start in range(first, len(self), n_frames):
-            stop = min(start + n_frames, len(self))
-            depths = self.depths(start, stop)
-            yield [
-                DepthFrame(i, int(self.times_ns[i]), depths[i - start]) for i in range(start, stop)
-            ]
 
 
 @dataclass(frozen=True)

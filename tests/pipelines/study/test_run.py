@@ -12,16 +12,20 @@ from pathlib import Path
 import pandas as pd
 import pytest
 from liex_lab.pipelines.study import dask_cluster
+from liex_lab.pipelines.study.listing import list_sessions
 from liex_lab.pipelines.study.one_session import measure_one
 from liex_lab.pipelines.study.slurm import SlurmTable
-from liex_lab.pipelines.study.status import standing, standings
+from liex_lab.pipelines.study.status import plan_changed, standing, standings
 from liex_lab.pipelines.study.table import write_study_table
 from typer.testing import CliRunner
 
 from liex_lab import api, cli
 from liex_lab.errors import LiexError, StudyError
+from liex_lab.plan import Plan
 from liex_lab.plan.study import Study
 from liex_lab.runtime.progress import Board
+from liex_lab.sessions.corrections import Description
+from liex_lab.sessions.verdict import Verdict
 from tests.pipelines.pretended import pretended_run, shared_task
 
 BROKEN = ("empty", "torn", "full", "fault", "deadly", "missing")
@@ -193,6 +197,37 @@ def test_a_session_is_done_again_only_when_input_plan_or_version_changed(
     assert why(file) == ("done", ""), "results outlive their recording"
 
 
+def test_who_an_animal_is_changes_without_measuring(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = one_session(tmp_path)
+    text = file.read_text()
+    file.write_text(text.replace('group = "@g"', 'group = "drug"\ncage = "c1"'))
+    state, reason = why(file)
+    assert (state, reason) == (
+        "changed",
+        "described anew: group = drug, cage = c1; nothing is measured again",
+    )
+    described = []
+
+    def describe(session: Path, what: list[Description], **who: str) -> Path:
+        described.append((Path(session), [str(one) for one in what]))
+        return Path(session)
+
+    def never(*_: object, **__: object) -> Path:
+        raise AssertionError("it measured")
+
+    monkeypatch.setattr(api, "correct_session", describe)
+    monkeypatch.setattr(api, "run_session", never)
+    runs = (tmp_path / "good.runs").stat().st_size
+    api.run_study(file, workers=1)
+    folder = Study.load(file).sessions[0].folder
+    assert described == [(folder, ["group is drug", "cage is c1"])]
+    assert (tmp_path / "good.runs").stat().st_size == runs
+    file.write_text(text + "set = { behaviour.rear_height_mm = 41.0 }\n")
+    assert why(file)[1].startswith("plan changed"), "what is measured by still counts"
+
+
 class _Digest:
     """A recording of which only the hash is asked."""
 
@@ -228,6 +263,40 @@ def test_an_outdated_session_that_fails_is_kept_under_another_name(tmp_path: Pat
     assert (session.folder.with_name("behav.outdated") / "session.json").is_file()
     measure_one(session, pretended_run)
     assert why(file) == ("done", "")
+
+
+def test_a_session_that_someone_has_to_look_at_is_done_and_says_why(
+    tmp_path: Path,
+) -> None:
+    file = one_session(tmp_path)
+    session = Study.load(file).sessions[0]
+    path = session.folder / "session.json"
+    document = json.loads(path.read_text())
+    verdict = Verdict(40, 40, 39, 3, 9.0, 1, ("only 3 of the 40 frames are trusted",))
+    path.write_text(json.dumps(document | {"verdict": verdict.to_dict()}))
+    assert why(file) == ("done", "look at it: only 3 of the 40 frames are trusted")
+    result = CliRunner().invoke(cli.app, ["cohort", str(file)])
+    assert result.exit_code == 0, result.output
+    said, counted = result.output.strip().splitlines()
+    assert said.split() == [
+        "done",
+        session.id,
+        *["look", "at", "it:", "only", "3", "of", "the", "40", "frames", "are", "trusted"],
+    ]
+    assert counted == "1 sessions: 1 done, look at it"
+    (entry,) = list_sessions(file)[1]()
+    assert (entry.state, entry.reason) == why(file)
+
+
+@pytest.mark.parametrize("found", [True, False])
+def test_which_hand_was_found_changes_no_plan(found: bool) -> None:
+    """A plan that leaves open which hand it is stays the plan of a session that found it."""
+    plan = Plan.load("hand")
+    stored = plan.with_settings([f"recording.mirrored={str(found).lower()}"])
+    assert plan_changed(plan, stored.model_dump(exclude_none=True)) == ""
+    assert "mirrored" in plan_changed(
+        stored, plan.with_settings([f"recording.mirrored={str(not found).lower()}"]).model_dump()
+    )
 
 
 def test_a_damaged_end_of_a_session_is_done_again(tmp_path: Path) -> None:

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from liex_lab.errors import RecordingError
+from liex_lab.errors import RecordingError, SeveralKindsError, UnknownTimesError
 from liex_lab.optics.camera import Lens
 from liex_lab.recordings.camera_file import CAMERA_FILE, WHAT_TO_WRITE, CameraFile, rate
 from liex_lab.recordings.depth_units import COLOUR, Stored
@@ -103,10 +103,11 @@ def list_pictures(folder: Path, pattern: str = "*") -> tuple[str, list[Path]]:
     kinds = {kind: [p for p in chosen if p.suffix.lower() in ends] for kind, ends in KINDS.items()}
     found = [kind for kind, files in kinds.items() if files]
     if len(found) > 1:
-        raise RecordingError(
+        one = f"*{kinds[found[0]][0].suffix}"
+        raise SeveralKindsError(
             f"{folder} holds both {found[0]} and {found[1]} pictures, and a recording has one "
-            "kind; choose with a line "
-            f'such as pattern = "*{KINDS[found[0]][0]}" under [camera] in camera.toml'
+            f'kind; choose with a line such as pattern = "{one}" under [camera] in camera.toml',
+            one,
         )
     eight_bit = [path for path in chosen if path.suffix.lower() in _EIGHT_BIT]
     if not found and eight_bit:
@@ -137,7 +138,11 @@ def natural_key(name: str) -> list[tuple[int, int, str]]:
 
 
 def open_images(
-    path: Path, camera: Lens | None = None, fps: float | None = None, progress: Progress = silent
+    path: Path,
+    camera: Lens | None = None,
+    fps: float | None = None,
+    progress: Progress = silent,
+    pattern: str | None = None,
 ) -> Recording:
     """Open a folder of pictures, or one picture or stack, as a recording.
 
@@ -147,6 +152,7 @@ def open_images(
         fps: frame rate, Hz; used only where there are no time stamps, and before that of a
             camera.toml.
         progress: told how many pictures were looked at.
+        pattern: which names of the folder to take; None takes those that camera.toml states.
 
     Returns:
         The recording.
@@ -157,7 +163,9 @@ def open_images(
     folder = path if path.is_dir() else path.parent
     camera_toml = CameraFile.read(folder / CAMERA_FILE)
     kind, files = (
-        list_pictures(path, camera_toml.pattern) if path.is_dir() else (_kind(path), [path])
+        list_pictures(path, pattern or camera_toml.pattern)
+        if path.is_dir()
+        else (_kind(path), [path])
     )
     if kind == "PCLZF":
         camera_toml = _with_xml(camera_toml, files[0])
@@ -271,7 +279,7 @@ class Folder:
         return monotone, start_of_clock(int(monotone.times_ns[0])) if moment else None
 
     def _no_times(self) -> RecordingError:
-        return RecordingError(
+        return UnknownTimesError(
             f"the times of the pictures in {self.folder} are not known; write "
             f"{self.camera_toml.timestamps} with a line time_ns (or time_s) and then one time per "
             "picture, or state a constant rate with fps = 30.0 under [camera] in camera.toml"

@@ -20,7 +20,7 @@ from threading import Lock
 import numpy as np
 from numpy.typing import NDArray
 
-from liex_lab.errors import LiexError, RecordingError
+from liex_lab.errors import LiexError, RecordingError, UnknownCameraError
 from liex_lab.optics.camera import Camera, Distortion, Lens
 from liex_lab.recordings.camera_file import CAMERA_FILE, CameraFile, fitting
 from liex_lab.recordings.formats.messages.depth_images import decode, picture_size
@@ -392,7 +392,7 @@ def _camera(
             if calibrations
             else " for"
         )
-        raise RecordingError(
+        raise UnknownCameraError(
             f"{path} holds no CameraCalibration or CameraInfo{several} {printable(topic.name)}; "
             "write a camera.toml beside it with [camera], fx = ..., fy = ..., cx = ... and cy = "
             "... in pixels"

@@ -1,0 +1,102 @@
+"""Depth cameras by name, for recordings that do not say what took them.
+
+Every number is a nominal value or one unit's factory calibration; units of a make differ by one or
+two per cent in focal length and by some pixels in the principal point, so a camera's own
+calibration is always better.
+
+Sources:
+
+- kinect-v2, primesense, primesense-qvga, raytrix-r5: as `liex_lab.optics.camera` has them; OpenNI
+  states a horizontal field of view of 1.0145 rad for PrimeSense's sensors, f = 320 / tan(0.507).
+- azure-nfov: factory calibration of one Azure Kinect DK, in microsoft/Azure-Kinect-Sensor-SDK
+  issue 1617 (in units of 1024 px); the narrow mode, 640 x 576, is the part of the sensor's 1024 x
+  1024 px that begins at pixel (192, 180), as the SDK cuts it.
+- femto-bolt: factory calibration of one Orbbec Femto Bolt, in orbbec/OrbbecSDK issue 56; the sensor
+  and its modes are those of the Azure Kinect.
+- d435: `rs-enumerate-devices -c` of one RealSense D435, in realsenseai/realsense-ros issue 2788;
+  for 1280 x 720 librealsense issue 3314. Its depth pictures are rectified: there is no distortion.
+"""
+
+from __future__ import annotations
+
+from liex_lab.errors import LiexError
+from liex_lab.optics.camera import (
+    BROWN_CONRADY,
+    KINECT_V2,
+    PRIMESENSE,
+    PRIMESENSE_QVGA,
+    RAYTRIX_R5,
+    Camera,
+    Distortion,
+)
+
+_AZURE = Distortion(
+    BROWN_CONRADY, (4.72474, 3.20922, 5.9e-6, 0.000124, 0.170596, 5.05586, 4.77578, 0.886494)
+)
+_FEMTO = Distortion(
+    BROWN_CONRADY, (8.68957, 4.46817, 0.0, 0.0, 0.172922, 9.01699, 7.37854, 1.05598)
+)
+# of each name, one camera for each size of its pictures
+PRESETS = {
+    "kinect-v2": (KINECT_V2,),
+    "primesense": (PRIMESENSE, PRIMESENSE_QVGA),
+    "azure-nfov": (Camera(503.9, 503.7, 321.0, 328.5, 640, 576, distortion=_AZURE),),
+    "femto-bolt": (Camera(505.3, 505.2, 338.2, 325.0, 640, 576, distortion=_FEMTO),),
+    "d435": (
+        Camera(424.2, 424.2, 423.4, 239.5, 848, 480),
+        Camera(384.2, 384.2, 319.5, 239.5, 640, 480),
+        Camera(638.0, 638.0, 639.5, 359.5, 1280, 720),
+        Camera(320.2, 320.2, 319.6, 179.5, 640, 360),
+    ),
+    "raytrix-r5": (RAYTRIX_R5,),
+}
+
+
+def preset(name: str, width: int, height: int) -> Camera:
+    """The camera of a name, for pictures of a size.
+
+    Args:
+        name: a key of `PRESETS`.
+        width: columns of the pictures, px.
+        height: rows of the pictures, px.
+
+    Raises:
+        LiexError: there is no such name, or that camera takes no pictures of this size.
+    """
+    cameras = PRESETS.get(name)
+    if cameras is None:
+        raise LiexError(
+            f"camera.preset is one of {', '.join(PRESETS)}, got '{name}'; choose one of them, or "
+            "state fx, fy, cx and cy"
+        )
+    for camera in cameras:
+        if (camera.width, camera.height) == (width, height):
+            return Camera(
+                camera.fx,
+                camera.fy,
+                camera.cx,
+                camera.cy,
+                width,
+                height,
+                source=f"preset {name}",
+                distortion=camera.distortion,
+            )
+    sizes = " or ".join(f"{camera.width} x {camera.height}" for camera in cameras)
+    raise LiexError(
+        f"the camera '{name}' takes pictures of {sizes} px, but these have {width} x {height}; "
+        "name the camera that took them, or state fx, fy, cx and cy"
+    )
+
+
+def of_size(width: int, height: int) -> list[str]:
+    """Names of the cameras that take pictures of a size.
+
+    Args:
+        width: columns of the pictures, px.
+        height: rows of the pictures, px.
+    """
+    return [
+        name
+        for name, cameras in PRESETS.items()
+        if any((camera.width, camera.height) == (width, height) for camera in cameras)
+    ]

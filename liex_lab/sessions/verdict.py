@@ -1,0 +1,174 @@
+"""The verdict on a session: how it went in one sentence, and whether someone has to look at it.
+
+A run that measured the wrong thing looks, from its tables alone, like any other. So a session says
+of itself what share of the frames with an animal in view was measured and is trusted, whether the
+scene fits the plan, and what to distrust: on the terminal, in `verdict` of session.json, at the top
+of the report, and in the list of a study.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from liex_lab.runtime.memory import blocks
+
+if TYPE_CHECKING:
+    from liex_lab.tracking.observations import Observations
+    from liex_lab.tracking.track import Track
+
+LOOK_AT_IT = "look at it"
+_MEASURED_SHARE = 0.5  # of the frames in which something of the animal's size is in view
+_LEAST_SHARE = 0.2  # of all frames that hold depth
+_DOUBTFUL_SHARE = 0.05
+_BLOCK = 16_384
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """How a session went; `verdict` of session.json holds these fields and `sentence`.
+
+    Attributes:
+        n_frames: frames recorded.
+        n_in_view: frames in which something of the animal's size is in view.
+        n_posed: frames with a pose, measured or bridged.
+        n_trusted: frames with a measured pose that nothing contradicts.
+        expected_error_mm: median predicted joint error of the measured poses, mm; None without any.
+        n_animals: how many things of the animal's size move in view at once; 0 where no frame has
+            a pose.
+        reasons: why someone has to look at it, such as that the scene does not fit the plan; empty
+            where nobody has to.
+        cautions: what else to distrust.
+        accepted: whether the plan says to measure all the same (`estimation.accept_misfit`).
+    """
+
+    n_frames: int
+    n_in_view: int
+    n_posed: int
+    n_trusted: int
+    expected_error_mm: float | None
+    n_animals: int
+    reasons: tuple[str, ...] = ()
+    cautions: tuple[str, ...] = ()
+    accepted: bool = False
+
+    @staticmethod
+    def of(
+        track: Track,
+        seen: Observations,
+        *,
+        misfits: Sequence[str] = (),
+        n_animals: int = 1,
+        cautions: Sequence[str] = (),
+        accepted: bool = False,
+    ) -> Verdict:
+        """The verdict on a track.
+
+        Args:
+            track: one row for every frame.
+            seen: what the single frames said.
+            misfits: how the scene does not fit the plan.
+            n_animals: how many animals were counted in the frames that were learned from.
+            cautions: what is to be said besides.
+            accepted: whether the plan says to measure all the same.
+        """
+        n_in_view = 0
+        n_depth = 0
+        n_trusted = 0
+        for rows in blocks(track.n_frames, _BLOCK):
+            part = seen[rows]
+            n_in_view += int(part.known.any(axis=1).sum())
+            n_depth += int(part.has_depth.sum())
+            n_trusted += int((track[rows].observed & (track.flag[rows] == "")).sum())
+        n_posed = int(track.posed.sum())
+        errors = track.predicted_error_mm[track.observed]
+        doubtful = int((track.flag == "doubtful").sum())
+        reasons = list(misfits)
+        if n_trusted < _LEAST_SHARE * n_depth:
+            reasons.append(f"an animal is measured in {n_trusted} of {n_depth} frames only")
+        elif n_trusted < _MEASURED_SHARE * n_in_view:
+            reasons.append(
+                f"only {n_trusted} of the {n_in_view} frames with something of its size in view "
+                "are measured and trusted"
+            )
+        said = list(cautions)
+        if n_animals > 1:
+            said.append(f"{n_animals} animals are in view and one of them is followed")
+        if doubtful > _DOUBTFUL_SHARE * track.n_frames:
+            said.append(f"{doubtful} poses are doubtful")
+        return Verdict(
+            track.n_frames,
+            n_in_view,
+            n_posed,
+            n_trusted,
+            float(np.median(errors)) if len(errors) else None,
+            n_animals if n_posed else 0,
+            tuple(reasons),
+            tuple(said),
+            accepted,
+        )
+
+    @property
+    def look_at_it(self) -> bool:
+        """Whether someone has to look at the session before it is used."""
+        return bool(self.reasons)
+
+    @property
+    def sentence(self) -> str:
+        """How it went, in one line."""
+        share = f"{self.n_posed / self.n_frames:.0%}" if self.n_frames else "none"
+        parts = [
+            f"{self.n_frames:,} frames, {self.n_posed:,} with a pose ({share}), "
+            f"{self.n_trusted:,} of them trusted"
+        ]
+        if self.expected_error_mm is not None:
+            parts[0] += f", expected error {self.expected_error_mm:.1f} mm"
+        if self.reasons:
+            accepted = " (accepted)" if self.accepted else ""
+            parts.append(f"{LOOK_AT_IT}{accepted}: {'; '.join(self.reasons)}")
+        if self.cautions:
+            parts.append(f"note: {'; '.join(self.cautions)}")
+        return ". ".join(parts)
+
+    def to_dict(self) -> dict[str, Any]:
+        """The fields and the sentence, as session.json holds them."""
+        return {
+            **asdict(self),
+            "reasons": list(self.reasons),
+            "cautions": list(self.cautions),
+            "look_at_it": self.look_at_it,
+            "sentence": self.sentence,
+        }
+
+
+def read_verdict(folder: Path) -> Mapping[str, Any]:
+    """The verdict in a session's folder, or what stands for it in sessions of earlier versions.
+
+    Args:
+        folder: the session folder.
+
+    Returns:
+        At least `look_at_it`, `accepted`, `reasons`, `cautions` and `sentence` ("" where nothing
+        was said).
+    """
+    try:
+        document = json.loads((folder / "session.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError):
+        document = {}
+    return verdict_in(document if isinstance(document, dict) else {})
+
+
+def verdict_in(document: Mapping[str, Any]) -> Mapping[str, Any]:
+    """The verdict in the content of a session.json, as `read_verdict` gives it.
+
+    Args:
+        document: content of session.json.
+    """
+    unsaid = {"look_at_it": False, "accepted": False, "reasons": [], "cautions": [], "sentence": ""}
+    found = document.get("verdict")
+    return {**unsaid, **found} if isinstance(found, Mapping) else unsaid

@@ -1,0 +1,287 @@
+"""The animals of a scene: one body each, where it goes, and when it is there.
+
+Body, posture and path of an animal are drawn from the seed alone and not from the scene, so that
+the same animal does the same in every scene of a seed, as far as its place allows.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from liex_lab.body.pose import Pose
+from liex_lab.body.shape import BodyShape
+from liex_lab.body.surface import Surface
+from liex_lab.geometry import SE3
+from liex_lab.simulation.locomotion import Path, Script, free_path, smoothed, walk
+from liex_lab.simulation.scene import SimulatedScene
+from liex_lab.simulation.species import MouseSpecies
+
+Array = NDArray[np.float64]
+
+PRESENCES = ("always", "asleep", "still", "late", "leaves", "never")
+AWAY = np.array([0.0, 0.0, 1e7])  # mm: behind any camera that looks down
+_RATE_HZ = 30.0
+_ADULTS_MM = (55.0, 75.0)
+_BREATHS_HZ = 2.5
+_BREATH = 0.012  # of the girth
+_SLEEP = (0.12, 0.90)  # of the recording, at most
+_COMES = 2.0 / 3.0
+_GOES = 0.45
+_APART = 0.95  # of a spine, between the middles of two animals
+_TRIES = 60
+_TURN_RAD_S = 5.0
+_PAUSE_S = 0.8
+_DOOR_MM = 25.0
+_ARRIVED_MM = 6.0
+_ERRAND = 1.8  # spines a second on the way to a door
+
+
+@dataclass(frozen=True)
+class Animal:
+    """One animal in n frames.
+
+    Attributes:
+        spine_mm: its length, mm.
+        shape: its body, a batch of one.
+        pose: (n) arena frame.
+        girth: (n,) factor of all lengths across the body.
+        bends: (n, TAIL_RINGS) rad, how its tail lies.
+        present: (n,) bool, whether it is in the arena.
+    """
+
+    spine_mm: float
+    shape: BodyShape
+    pose: Pose
+    girth: Array
+    bends: Array
+    present: NDArray[np.bool_]
+
+    @staticmethod
+    def draw(
+        seed: int,
+        which: int,
+        species: MouseSpecies,
+        arena: SimulatedScene,
+        family: str,
+        spine_mm: float | None,
+        timing: tuple[NDArray[np.int64], NDArray[np.bool_]],
+        script: Script | None = None,
+        path: Path | None = None,
+    ) -> Animal:
+        """An animal that walks in an arena.
+
+        Args:
+            seed: of the recording.
+            which: number of the animal.
+            species: the mouse.
+            arena: where it goes.
+            family: of body shapes, see `draw_shapes`.
+            spine_mm: its length, mm; None draws it.
+            timing: which moment of its walk (n,) each frame shows, and whether it is there (n,).
+            script: what it does, see `locomotion.walk`.
+            path: where it goes, likewise.
+
+        Returns:
+            The animal.
+        """
+        moments, present = timing
+        body = np.random.default_rng([seed, which, 1])
+        drawn = float(body.uniform(*_ADULTS_MM))
+        spine = drawn if spine_mm is None else float(spine_mm)
+        shape = species.shapes(body, family, 1)
+        n_moments = int(moments.max()) + 1
+        going = np.random.default_rng([seed, which, 2])
+        pose, girth = walk(going, arena, species, shape, spine, n_moments, script, path)
+        tail = np.random.default_rng([seed, which, 3])
+        first = species.bends(tail, 1)
+        assert first is not None  # mice have tails
+        bends = first + 4.0 * smoothed(tail.normal(0.0, 0.05, (n_moments, first.shape[1])), 3.6)
+        asleep = np.diff(moments, prepend=moments[0] - 1) == 0
+        breath = 1.0 + _BREATH * np.sin(
+            2 * np.pi * _BREATHS_HZ * np.arange(len(moments)) / _RATE_HZ
+        )
+        return Animal(
+            spine,
+            shape,
+            pose[moments],
+            girth[moments] * np.where(asleep, breath, 1.0),
+            bends[moments],
+            present,
+        )
+
+    def lifted(self, height: Array) -> Animal:
+        """The same animal higher above the floor.
+
+        Args:
+            height: (n,) mm.
+        """
+        shift = self.pose.root.translation + np.stack([0 * height, 0 * height, height], axis=-1)
+        return replace(
+            self, pose=Pose(SE3(self.pose.root.rotation, shift), self.pose.angles, self.pose.scale)
+        )
+
+    def middle(self, species: MouseSpecies) -> Array:
+        """The mean of its joints (n, 3), mm, arena frame.
+
+        Args:
+            species: the mouse.
+        """
+        return np.asarray(self.pose.joints(species.skeleton).mean(axis=1))
+
+    def vertices(self, surface: Surface, part: slice) -> Array:
+        """Its mesh in some frames.
+
+        Args:
+            surface: of its skeleton.
+            part: which frames.
+
+        Returns:
+            (k, V, 3) mm, arena frame; where it is not there, far behind the camera.
+        """
+        mesh = surface.vertices(self.pose[part], self.shape[0], self.girth[part], self.bends[part])
+        mesh[~self.present[part]] += AWAY
+        return mesh
+
+
+def timing_of(presence: str, n_frames: int) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    """When an animal is there and when it moves.
+
+    Args:
+        presence: 'always'; 'asleep', motionless for 78 % of the recording; 'still', for all of it;
+            'late', from two thirds on; 'leaves', for 45 %; or 'never'.
+        n_frames: length of the recording.
+
+    Returns:
+        Which moment of its walk each frame shows (n,), and whether it is there (n,).
+    """
+    frame = np.arange(n_frames)
+    there = np.ones(n_frames, np.bool_)
+    if presence == "asleep":
+        falls, wakes = (int(share * n_frames) for share in _SLEEP)
+        return np.where(frame < falls, frame, np.maximum(falls, frame - (wakes - falls))), there
+    if presence == "still":
+        return np.zeros(n_frames, np.int64), there
+    if presence == "late":
+        comes = int(_COMES * n_frames)
+        return np.maximum(frame - comes, 0), frame >= comes
+    if presence == "leaves":
+        return frame, frame < max(1, int(_GOES * n_frames))
+    return frame, there & (presence != "never")
+
+
+def calm_script(rng: np.random.Generator, n: int) -> tuple[NDArray[np.int64], Array]:
+    """A mouse that walks without rearing, with pauses.
+
+    Args:
+        rng: source of randomness.
+        n: how many frames.
+
+    Returns:
+        Kinds of posture (n,) and speeds (n,), spines/s, see `locomotion.walk_script`.
+    """
+    speed = np.empty(n)
+    at = 0
+    while at < n:
+        stop = at + int(_RATE_HZ * rng.uniform(0.8, 2.5))
+        speed[at:stop] = rng.uniform(1.0, 2.4)
+        pause = stop + int(_RATE_HZ * rng.uniform(0.1, _PAUSE_S))
+        speed[stop:pause] = 0.0
+        at = pause
+    return np.zeros(n, np.int64), np.maximum(smoothed(speed[:, None], 3.6)[:, 0], 0.0)
+
+
+def visiting(door: Array, inside: Array, spans: tuple[tuple[float, float], ...]) -> Path:
+    """A path that wanders from before a house, and goes into it for some stretches.
+
+    Args:
+        door: (2,) before the house, mm, arena frame.
+        inside: (2,) in it.
+        spans: from when until when it wants to be inside, as shares of the recording.
+
+    Returns:
+        A path for `locomotion.walk`.
+    """
+
+    def path(
+        rng: np.random.Generator, scene: SimulatedScene, spine_mm: float, speed: Array
+    ) -> tuple[Array, Array]:
+        n = len(speed)
+        position = np.empty((n, 2))
+        heading = np.empty(n)
+        goals = [free_spot(rng, scene, 0.8 * spine_mm) for _ in range(40)]
+        at = door + 0.6 * (door - inside)
+        way = rng.uniform(-np.pi, np.pi)
+        passing = False  # through the door, one way or the other
+        for i in range(n):
+            wants = any(low <= i / n < high for low, high in spans)
+            at_door = bool(np.linalg.norm(at - door) < _DOOR_MM)
+            passing = passing or at_door if wants else passing and not at_door
+            goal = inside if wants and passing else goals[(i // 45) % len(goals)]
+            if wants != passing:
+                goal = door
+            gap = goal - at
+            if np.linalg.norm(gap) > _ARRIVED_MM:
+                errand = wants or passing
+                ahead = np.arctan2(gap[1], gap[0])
+                most = (2.0 if errand else 1.0) * _TURN_RAD_S / _RATE_HZ
+                way += np.clip((ahead - way + np.pi) % (2 * np.pi) - np.pi, -most, most)
+                run = max(speed[i], _ERRAND * spine_mm * errand) / _RATE_HZ
+                facing = max(float(np.cos(ahead - way)), 0.1)
+                step = run * facing * np.array([np.cos(way), np.sin(way)])
+                if errand or scene.freedom(at + step) > 0.4 * spine_mm:
+                    at = at + step
+            position[i] = at
+            heading[i] = way
+        return position, heading
+
+    return path
+
+
+def free_spot(rng: np.random.Generator, scene: SimulatedScene, margin_mm: float) -> Array:
+    """A random place in an arena, away from walls and clutter.
+
+    Args:
+        rng: source of randomness.
+        scene: the arena.
+        margin_mm: from them, mm.
+
+    Returns:
+        (2,) mm, arena frame; the roomiest of some tries.
+    """
+    spots = scene.centre + rng.uniform(-1.0, 1.0, (_TRIES, 2)) * scene.half
+    room = np.array([scene.freedom(spot) for spot in spots])
+    free = room > margin_mm
+    return np.asarray(spots[int(np.argmax(free)) if free.any() else int(np.argmax(room))])
+
+
+def keeping_apart(other: Array, spine_mm: float) -> Path:
+    """A path that does not cross another animal's.
+
+    Args:
+        other: (n, 2) where the other is, mm, arena frame.
+        spine_mm: its length, mm.
+
+    Returns:
+        A path for `locomotion.walk`: of some free paths the one that comes least near.
+    """
+
+    def path(
+        rng: np.random.Generator, scene: SimulatedScene, own_mm: float, speed: Array
+    ) -> tuple[Array, Array]:
+        best: tuple[Array, Array] | None = None
+        best_gap = -np.inf
+        for _ in range(_TRIES):
+            position, heading = free_path(rng, scene, own_mm, speed)
+            gap = float(np.linalg.norm(position - other[: len(position)], axis=1).min())
+            if gap > best_gap:
+                best = (position, heading)
+                best_gap = gap
+            if gap > _APART * 0.5 * (spine_mm + own_mm):
+                break
+        assert best is not None
+        return best
+
+    return path

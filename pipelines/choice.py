@@ -1,0 +1,287 @@
+"""Which plan a recording fits: the one that was named, another one, or none.
+
+The scene is learned and the animal's size found as a run does; what `sample_fit` then says of the
+sampled frames decides. Where the named plan does not fit, or none was named and the usual one does
+not, every other bundled plan is tried on a handful of frames. Left and right hands are told apart
+in the same way: the recording and its mirror image are both tried, and of the wrong one the
+predicted error is about twice as large.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
+
+from liex_lab.errors import EstimationError, LiexError, MisfitError
+from liex_lab.plan import Plan, known_plans
+from liex_lab.runtime.progress import Progress, silent
+
+from .build import build_tracker
+
+if TYPE_CHECKING:
+    from liex_lab.estimation.estimator import PoseEstimator
+    from liex_lab.recordings.recording import Recording
+    from liex_lab.tracking.sample_fit import SampleFit
+    from liex_lab.tracking.tracker import FrameTracker
+
+USUAL = "mouse"  # tried first where no plan is named
+_HANDFUL = "foreground.n_background_frames=24"
+# of the predicted error of the pictures as they are: their mirror image fits a hand better
+_MIRRORED_BELOW = 0.75
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """A plan that is used, and its tracker.
+
+    Attributes:
+        recording: the recording, mirrored where that was found.
+        plan: the plan with what was found filled in.
+        tracker: the tracker of the recording, prepared.
+        misfits: what contradicts that the recording shows the plan's animal, accepted all the same.
+        notes: what was found and is to be said.
+    """
+
+    recording: Recording
+    plan: Plan
+    tracker: FrameTracker
+    misfits: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Look:
+    """A plan held against a handful of frames.
+
+    Attributes:
+        name: of the plan.
+        fit: what the frames say; None where nothing of the animal was found.
+        misfits: what contradicts the plan; empty where it fits.
+    """
+
+    name: str
+    fit: SampleFit | None
+    misfits: tuple[str, ...] = field(default=())
+
+
+@dataclass(frozen=True)
+class Proposal:
+    """Which plan a recording fits, for people to read.
+
+    Attributes:
+        plan: name of the bundled plan, or of the animal of the plan that was given; None where no
+            plan fits.
+        says: how it fits, or what contradicts each plan.
+        n_animals: things of the animal's size in view at once; None where no plan fits.
+        problems: sentences about several animals, and about a given plan that does not fit.
+    """
+
+    plan: str | None
+    says: str
+    n_animals: int | None = None
+    problems: tuple[str, ...] = ()
+
+
+def propose_plan(recording: Recording, plan: Plan | None = None) -> Proposal:
+    """The plan that a recording fits, by a handful of frames.
+
+    Args:
+        recording: an open recording.
+        plan: the plan that was given, which is tried first; None tries the usual one.
+    """
+    first = look(recording, plan or USUAL)
+    looks = [first]
+    if first.misfits:
+        given = plan or Plan.load(USUAL)
+        looks += [look(recording, name) for name in known_plans() if not _is(given, name)]
+    found = best(looks)
+    if found is None or found.fit is None:
+        says = ". ".join(f"{one.name}: {', '.join(one.misfits)}" for one in looks)
+        return Proposal(None, f"none fits. {says}")
+    fit = found.fit
+    says = (
+        f"{found.name} fits: {fit.spine_mm:.0f} mm long, expected error {fit.error_mm:.1f} mm, its "
+        f"body covers {fit.covered:.0%} of what is seen"
+    )
+    problems = list(_other_hand(recording, found, plan))
+    if plan is not None and found is not first:
+        problems.append(
+            f"the plan of the {first.name} does not fit: {', and '.join(first.misfits)}; say "
+            f"--plan {found.name}"
+        )
+    if fit.n_animals > 1:
+        problems.append(
+            f"{fit.n_animals} animals are in view at once and a run follows one of them; record "
+            "them one at a time"
+        )
+    return Proposal(found.name, says, fit.n_animals, tuple(problems))
+
+
+def _other_hand(recording: Recording, found: Look, plan: Plan | None) -> tuple[str, ...]:
+    """That a hand is a left one or its pictures mirrored, where they are; () of anything else."""
+    from liex_lab.recordings.rectify import mirrored
+
+    stated = plan is not None and plan.recording.mirrored is not None
+    if found.name != "hand" or stated or found.fit is None:
+        return ()
+    other = look(mirrored(recording, lent=True), found.name).fit
+    if other is None or other.error_mm > _MIRRORED_BELOW * found.fit.error_mm:
+        return ()
+    return (
+        "it is a left hand, or the pictures are mirrored: the expected error is "
+        f"{found.fit.error_mm:.1f} mm as they are and {other.error_mm:.1f} mm mirrored; a run "
+        "finds that by itself, and --set recording.mirrored=true states it",
+    )
+
+
+def fit_plan(
+    recording: Recording,
+    plan: Plan,
+    estimator_of: Callable[[], PoseEstimator] | None = None,
+    *,
+    settings: Sequence[str] | None = None,
+    progress: Progress = silent,
+) -> Fitted:
+    """The tracker of a recording by its plan, or by the bundled one that fits where none was named.
+
+    Args:
+        recording: an open recording.
+        plan: the plan that was named, or the usual one.
+        estimator_of: waits for the plan's estimator; None makes it.
+        settings: where no plan was named, the settings that are changed in any of them; None where
+            `plan` was named.
+        progress: told what is being done.
+
+    Raises:
+        MisfitError: the recording shows something else than the plan's animal, and the plan does
+            not say to measure it all the same.
+        EstimationError: no animal is found, and no other plan fits.
+    """
+    tracker = None
+    cause: EstimationError | None = None
+    try:
+        tracker = build_tracker(recording, plan, estimator_of)
+        misfits = misfits_of(tracker.sample_fit, plan)
+    except EstimationError as error:
+        cause = error
+        misfits = (str(error).partition("; ")[0],)
+    accepted = plan.estimation.accept_misfit
+    if tracker is not None:
+        found = _right_way_round(Fitted(recording, plan, tracker, misfits), progress)
+        if not found.misfits:
+            return found
+        if accepted:  # but no pose of it is trusted
+            return replace(found, tracker=replace(found.tracker, doubtful_mm=0.0))
+    if cause is not None and accepted:
+        raise cause
+    progress(0, None, "looking which plan fits")
+    fitting = best([look(recording, name) for name in known_plans() if not _is(plan, name)])
+    if fitting is not None and settings is not None:
+        chosen = Plan.load(fitting.name).with_settings(settings)
+        note = f"no plan was named, and {fitting.name} fits"
+        found = Fitted(recording, chosen, build_tracker(recording, chosen), (), (note,))
+        return _right_way_round(found, progress)
+    if fitting is None and cause is not None:
+        raise cause
+    raise MisfitError(_refusal(plan, misfits, fitting)) from None
+
+
+def look(recording: Recording, plan: Plan | str) -> Look:
+    """Hold a plan against a handful of frames.
+
+    Args:
+        recording: an open recording.
+        plan: the plan, or the name of a bundled one.
+    """
+    name = plan if isinstance(plan, str) else plan.animal.name
+    chosen = Plan.load(plan) if isinstance(plan, str) else plan
+    plan = chosen.with_settings([_HANDFUL])
+    try:
+        fit = build_tracker(recording, plan).sample_fit
+    except LiexError as error:
+        return Look(name, None, (str(error).partition("; ")[0],))
+    return Look(name, fit, misfits_of(fit, plan))
+
+
+def best(looks: Sequence[Look]) -> Look | None:
+    """The plan that fits, and of several the one with the least error for its animal's length.
+
+    Args:
+        looks: plans that were tried.
+    """
+    fitting = [one for one in looks if one.fit is not None and not one.misfits]
+    return min(fitting, key=_error_share, default=None)
+
+
+def misfits_of(fit: SampleFit | None, plan: Plan) -> tuple[str, ...]:
+    """What contradicts that a recording shows the plan's animal.
+
+    Args:
+        fit: what the sampled frames say; None where nothing is known.
+        plan: its section `animal`.
+    """
+    if fit is None:
+        return ()
+    animal = plan.animal
+    stated = animal.spine_mm is not None
+    return tuple(fit.misfits(animal.spine_min_mm, animal.spine_max_mm, stated))
+
+
+def _error_share(one: Look) -> float:
+    return one.fit.error_mm / one.fit.spine_mm if one.fit is not None else float("inf")
+
+
+def _is(plan: Plan, name: str) -> bool:
+    """Whether a bundled plan is of the same animal as this one."""
+    return Plan.load(name).animal.skeleton == plan.animal.skeleton
+
+
+def _refusal(plan: Plan, misfits: Sequence[str], fitting: Look | None) -> str:
+    what = (
+        f"the recording does not fit the plan of the {plan.animal.name}: {', and '.join(misfits)}"
+    )
+    if fitting is None or fitting.fit is None:
+        return (
+            f"{what}; no other bundled plan fits either: check the camera's numbers and the depth "
+            "unit with `liex doctor`, or add --accept to measure it all the same"
+        )
+    return (
+        f"{what}, while the plan '{fitting.name}' fits ({fitting.fit.spine_mm:.0f} mm long, "
+        f"expected error {fitting.fit.error_mm:.1f} mm); say --plan {fitting.name}, or add "
+        "--accept to measure it all the same"
+    )
+
+
+def _right_way_round(found: Fitted, progress: Progress) -> Fitted:
+    """The same, or the mirror image where the pictures are of a hand and fit better so."""
+    from liex_lab.foreground.hand_segmenter import HandSegmenter
+    from liex_lab.recordings.rectify import mirrored
+
+    plan = found.plan
+    fit = found.tracker.sample_fit
+    is_hand = isinstance(found.tracker.scene, HandSegmenter)
+    if not is_hand or plan.recording.mirrored is not None or fit is None:
+        return found
+    if not fit.has_length(plan.animal.spine_min_mm, plan.animal.spine_max_mm):
+        return found  # it is no hand at all
+    progress(0, None, "looking which hand it is")
+    handful = plan.with_settings([_HANDFUL])
+    turned = mirrored(found.recording, lent=True)
+    try:
+        other = build_tracker(turned, handful).sample_fit
+    except EstimationError:
+        other = None
+    error_mm = fit.error_mm
+    if other is None or other.error_mm > _MIRRORED_BELOW * error_mm:
+        settled = plan.with_settings(["recording.mirrored=false"])
+        return Fitted(found.recording, settled, found.tracker, found.misfits, found.notes)
+    settled = plan.with_settings(["recording.mirrored=true"])
+    tracker = build_tracker(turned, settled)
+    note = (
+        f"a left hand or mirrored pictures: expected error {other.error_mm:.1f} mm mirrored, "
+        f"{error_mm:.1f} mm as they are, so left and right were exchanged (recording.mirrored)"
+    )
+    return Fitted(
+        turned, settled, tracker, misfits_of(tracker.sample_fit, settled), (*found.notes, note)
+    )

@@ -1,0 +1,217 @@
+"""Evaluation of scenes: what stands before a lab's depth camera, and whether the product notices.
+
+`liex evaluate scenes` renders each scene of `simulation.scenes` with exact truth, measures it as
+`liex run` does (the whole session, without report and replay's depth), reads the tables back and
+scores them. Development has seeds of its own; the sealed split has others, which no test and no
+development touches.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import tempfile
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from liex_lab.errors import LiexError
+from liex_lab.evaluation.scenes import SCENES_PROTOCOL, Individual, Tally, Truth
+from liex_lab.runtime.progress import Progress, silent
+
+from ..build import plan_of
+from ..session import measure_session
+
+if TYPE_CHECKING:
+    from liex_lab.plan import Plan
+    from liex_lab.sessions import Session
+    from liex_lab.simulation.recording import TrueRecording
+
+Array = NDArray[np.float64]
+
+SEEDS: Final = (1001, 1002)  # one of another build, one of those that models were trained on
+SEALED_SEEDS: Final = (931_507_211, 931_507_212, 931_507_213)
+N_FRAMES: Final = 300
+_REFUSED = 1  # exit code of the command line
+
+
+@dataclass(frozen=True)
+class Case:
+    """A row of the table: a scene under a plan.
+
+    Attributes:
+        scene: name of the scene.
+        plan: the bundled plan that it is measured with.
+        beside: the row whose error its own is set against; '' for none.
+    """
+
+    scene: str
+    plan: str = "mouse"
+    beside: str = "plain"
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a run of the product made of a recording.
+
+    Attributes:
+        individuals: of all sessions that it wrote; () where it refused.
+        said: its problems, or the sentence with which it ended.
+        exit_code: of the run.
+    """
+
+    individuals: tuple[Individual, ...]
+    said: tuple[str, ...]
+    exit_code: int
+
+
+Draw = Callable[[str, "TrueRecording", Sequence[Truth], Sequence[Individual]], object]
+
+
+def cases() -> dict[str, Case]:
+    """All rows of the table by name.
+
+    Returns:
+        Every scene under the plan of its animal, then animals under the plan of another.
+    """
+    from liex_lab.simulation.scenes.catalogue import SCENES
+
+    found = {name: Case(name, plan, beside) for name, (plan, beside) in SCENES.items()}
+    return found | {
+        "mouse-as-hand": Case("plain", "hand", ""),
+        "mouse-as-fish": Case("plain", "fish", ""),
+        "fish-as-mouse": Case("fish", "mouse", ""),
+    }
+
+
+def evaluate_scenes(
+    only: Sequence[str] = (),
+    *,
+    n_frames: int = N_FRAMES,
+    n_recordings: int = 1,
+    sealed: bool = False,
+    draw: Draw | None = None,
+    progress: Progress = silent,
+) -> dict[str, Any]:
+    """The figures of each scene; `liex evaluate scenes`.
+
+    Args:
+        only: names of rows; () takes all. The row beside which one stands is measured, too.
+        n_frames: length of each recording.
+        n_recordings: of each scene, each of another seed and animal; the first is of a build that
+            no model was trained on, the second of one like those.
+        sealed: measure on the sealed seeds, which are not for development.
+        draw: is given each row's name, first recording, truth and
+            what was measured, for a picture.
+        progress: told row by row.
+
+    Returns:
+        `rows` of figures by name, `seeds`, `n_frames` and the protocol.
+
+    Raises:
+        LiexError: there is no such row, or not so many seeds.
+    """
+    every = cases()
+    for name in only:
+        if name not in every:
+            raise LiexError(f"there is no scene '{name}'; known are {', '.join(every)}")
+    seeds = SEALED_SEEDS if sealed else SEEDS
+    if not 1 <= n_recordings <= len(seeds):
+        raise LiexError(f"of each scene there are 1 to {len(seeds)} recordings, got {n_recordings}")
+    chosen = [name for name in every if not only or name in only]
+    wanted = [*dict.fromkeys([*(every[name].beside for name in chosen), *chosen])]
+    rows: dict[str, dict[str, Any]] = {}
+    names = [name for name in every if name in wanted]
+    for k, name in enumerate(names):
+        progress(k, len(names), f"scene {name}")
+        rows[name] = _measure_row(name, every[name], seeds[:n_recordings], n_frames, draw)
+        beside = rows.get(every[name].beside, {}).get("mean_joint_error_mm")
+        own = rows[name]["mean_joint_error_mm"]
+        rows[name]["ratio_to_plain"] = own / beside if own and beside else None
+    return {
+        "rows": {name: rows[name] for name in names},
+        "seeds": "sealed" if sealed else list(seeds[:n_recordings]),
+        "n_frames": n_frames,
+        "protocol": SCENES_PROTOCOL,
+    }
+
+
+def _measure_row(
+    name: str, case: Case, seeds: Sequence[int], n_frames: int, draw: Draw | None
+) -> dict[str, Any]:
+    """The figures of one row over some recordings."""
+    from liex_lab.simulation.scenes.catalogue import film
+
+    plan = plan_of(case.plan)
+    tally = Tally()
+    said: list[str] = []
+    exit_code = 0
+    for k, seed in enumerate(seeds):
+        recording = film(case.scene, seed, n_frames, family="train" if k % 2 else "other")
+        # its content follows from these: it need not be rendered a second time to be hashed
+        recording.take_digest(hashlib.sha256(f"{recording.name} {n_frames}".encode()).hexdigest())
+        truths = [
+            Truth(animal.spine_mm, animal.joints_camera, animal.visible)
+            for animal in recording.animals
+        ]
+        fits = recording.skeleton.name == plan.animal.skeleton
+        outcome = run_product(recording, plan)
+        tally.add(truths, outcome.individuals, n_frames, recording.skeleton.tip, fits)
+        said += [sentence for sentence in outcome.said if sentence not in said]
+        exit_code = max(exit_code, outcome.exit_code)
+        if draw is not None and k == 0:
+            draw(name, recording, truths, outcome.individuals)
+    return {**tally.figures(), "said": said, "exit_code": exit_code}
+
+
+def run_product(recording: TrueRecording, plan: Plan) -> Outcome:
+    """Measure a recording as a user does, and read the tables back.
+
+    Args:
+        recording: the recording.
+        plan: the plan.
+
+    Returns:
+        What the tables say in the camera frame, what the run said, and its exit code.
+    """
+    from liex_lab.sessions import Session
+
+    quick = plan.with_settings(["replay.depth=false"])
+    with tempfile.TemporaryDirectory(prefix="liex-scenes-") as folder:
+        try:
+            measure_session(recording, quick, folder)
+        except LiexError as error:
+            return Outcome((), (str(error),), _REFUSED)
+        sessions = [Session.open(path) for path in sorted(Path(folder).glob("*.liex"))]
+        return Outcome(
+            tuple(one for session in sessions for one in read_individuals(session)),
+            tuple(sentence for session in sessions for sentence in session.metadata["problems"]),
+            0,
+        )
+
+
+def read_individuals(session: Session) -> list[Individual]:
+    """The individuals of a session as its tables say.
+
+    Args:
+        session: an opened session.
+
+    Returns:
+        One each, in the frame of the camera that took the pictures.
+    """
+    T_camera_arena = session.T_arena_camera.inverse()
+    mirrored = bool((session.metadata.get("optics") or {}).get("mirrored"))
+    n_joints = len(session.poses["joint"].unique())
+    found = []
+    for name, frames in session.frames.groupby("individual", sort=True):
+        poses = session.poses[session.poses["individual"] == name]
+        arena = poses[["x_mm", "y_mm", "z_mm"]].to_numpy(float).reshape(-1, n_joints, 3)
+        joints = T_camera_arena @ arena
+        if mirrored:
+            joints = joints * [-1.0, 1.0, 1.0]
+        trusted = (frames["flag"] == "").to_numpy(bool) & np.isfinite(joints).all(axis=(1, 2))
+        found.append(Individual(joints, trusted))
+    return found

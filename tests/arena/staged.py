@@ -1,0 +1,79 @@
+"""Small stages for stories about scenes: an arena anywhere, and a mouse that walks in it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from unittest.mock import patch
+
+import numpy as np
+
+from liex_lab.geometry import SE3
+from liex_lab.recordings.recording import Recording
+from liex_lab.simulation.locomotion import walking_session
+from liex_lab.simulation.recording import SyntheticSession
+from liex_lab.simulation.scene import BOX, SimulatedScene
+from liex_lab.simulation.sensors import PRIMESENSE_QVGA_SENSOR
+
+CAMERA = PRIMESENSE_QVGA_SENSOR.camera
+
+
+def view(height_mm: float, tilt_deg: float = 0.0) -> SE3:
+    """A camera so high above the arena's floor and tilted by so much."""
+    tilt = np.radians(tilt_deg)
+    up = -np.array([0.0, np.sin(tilt), np.cos(tilt)])
+    x = np.array([1.0, 0.0, 0.0])
+    return SE3(np.stack([x, np.cross(up, x), up]), np.array([0.0, 0.0, height_mm]))
+
+
+def stage(
+    half_mm: tuple[float, float] = (150.0, 150.0),
+    *,
+    height_mm: float = 900.0,
+    wall_mm: float = 120.0,
+    raised_mm: float = 0.0,
+    tilt_deg: float = 0.0,
+    centre_mm: tuple[float, float] = (0.0, 0.0),
+    room: bool = True,
+) -> SimulatedScene:
+    """A box of an arena, raised above the floor of the room, which is in view all around it."""
+    T = view(height_mm, tilt_deg)
+    middle = CAMERA.unproject(np.array([CAMERA.cx, CAMERA.cy]), np.array(1.0))
+    d = T.rotation @ middle
+    foot = -height_mm / d[2] * d[:2] + np.array(centre_mm)
+    empty = np.zeros((0, 0), np.float32)
+    half = np.array(half_mm)
+    scene = SimulatedScene(CAMERA, T, BOX, foot, half, 0.0, wall_mm, np.zeros((0, 2)), empty)
+    u, v = np.meshgrid(np.arange(CAMERA.width), np.arange(CAMERA.height))
+    rays = CAMERA.unproject(np.stack([u, v], axis=-1), np.ones(u.shape)) @ T.rotation.T
+    fall = np.maximum(-rays[..., 2], 1e-3)
+    on_floor = height_mm / fall
+    inside = scene.wall_clearance(on_floor[..., None] * rays[..., :2]) > 0
+    wall = scene._wall_distance(rays)
+    high = height_mm + wall * rays[..., 2]
+    on_wall = ~inside & (wall > 0) & (high > 0) & (high < wall_mm)
+    around = (height_mm + raised_mm) / fall if room else np.zeros(u.shape)
+    still = np.where(inside, on_floor, np.where(on_wall, wall, around))
+    return replace(scene, still=still.astype(np.float32))
+
+
+def walk(scene: SimulatedScene, n_frames: int = 96, seed: int = 5, **more) -> SyntheticSession:
+    """A mouse of 65 mm that walks on a stage."""
+    with patch.object(SimulatedScene, "draw", staticmethod(lambda *_: scene)):
+        return walking_session(seed, n_frames, sensor=PRIMESENSE_QVGA_SENSOR, spine_mm=65.0, **more)
+
+
+def changed(
+    recording: Recording, change: Callable[[int, np.ndarray], np.ndarray], n_frames: int = 0
+) -> Recording:
+    """A recording with every picture changed."""
+    n = n_frames or len(recording)
+    return Recording(
+        name=recording.name,
+        format="synthetic",
+        camera=recording.camera,
+        times_ns=np.arange(n) * 33_333_333,
+        read=lambda k: change(k, recording.frame(min(k, len(recording) - 1)).depth).astype(
+            np.float32
+        ),
+    )

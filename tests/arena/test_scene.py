@@ -1,0 +1,116 @@
+"""The scene as a noun: stated in a plan or found, written down, and refused in one sentence."""
+
+from __future__ import annotations
+
+import json
+from functools import cache
+
+import numpy as np
+import pytest
+from liex_lab.pipelines.build import build_scene
+from typer.testing import CliRunner
+
+from liex_lab.arena.scene import plane_of, region_mask
+from liex_lab.body.skeleton import Skeleton
+from liex_lab.errors import EstimationError, PlanError
+from liex_lab.foreground.background_segmenter import BackgroundSubtraction
+from liex_lab.plan import Plan
+from liex_lab.recordings.recording import Recording
+from tests.arena.staged import CAMERA, changed, stage, walk
+
+N_FRAMES = 24
+
+
+@cache
+def on_a_table() -> Recording:
+    """A mouse in an arena on a table, the floor of the room in view."""
+    mouse = walk(stage(height_mm=700.0, raised_mm=480.0), N_FRAMES)
+    pictures = mouse.depths(0, N_FRAMES)
+    return changed(mouse, lambda k, _: pictures[k])
+
+
+def seen(*settings: str) -> BackgroundSubtraction:
+    plan = Plan.load("mouse").with_settings(settings)
+    scene, _ = build_scene(on_a_table(), plan, Skeleton.load("mouse"), N_FRAMES)
+    assert isinstance(scene, BackgroundSubtraction)
+    return scene
+
+
+def test_a_scene_says_where_its_floor_comes_from_and_what_stands_and_moves_on_it():
+    found = seen().described()
+    assert found.floor_from == "where animals stand"
+    assert found.floor_support is not None
+    assert found.floor_support > 0.9
+    assert found.n_animals == 1
+    assert found.roughness_mm is not None
+    assert found.roughness_mm < 3.0
+    assert len(found.region_px) >= 4
+    document = json.loads(json.dumps(found.to_dict()))
+    assert document["floor"]["distance_mm"] == pytest.approx(700.0, abs=3.0)
+    assert document["doubts"] == []
+
+
+def test_a_floor_that_is_stated_is_taken_as_it_is():
+    found = seen("arena.floor={point = [0, 0, 701.5], normal = [0, 0, -1]}").described()
+    assert found.floor_from == "plan"
+    assert found.floor.distance_mm == 701.5
+
+
+def test_outside_a_region_that_is_stated_nothing_is_looked_at():
+    scene = seen("arena.region=[[60, 20], [250, 20], [250, 220], [60, 220]]")
+    assert not scene.limit[:20].any()
+    assert not scene.limit[:, 251:].any()
+    assert scene.limit[100, 100] > 0
+    assert scene.floor.distance_mm == pytest.approx(700.0, abs=3.0)
+
+
+def test_a_floor_that_nothing_stands_on_is_refused():
+    with pytest.raises(EstimationError, match="nothing stands on the floor"):
+        seen("arena.floor={point = [0, 0, 1180], normal = [0, 0, 1]}")
+
+
+@pytest.mark.parametrize(
+    ("corners", "message"),
+    [
+        ([[400, 300], [500, 300], [500, 400]], "outside the picture"),
+        ([[10, 10], [90, 90], [50, 50]], "encloses 0 pixels"),
+        ([[10, 10], [90, 90]], "three or more corners"),
+    ],
+)
+def test_a_region_that_is_none_is_refused_in_one_sentence(corners, message):
+    with pytest.raises(PlanError, match=message):
+        region_mask(corners, CAMERA.width, CAMERA.height)
+
+
+@pytest.mark.parametrize("normal", [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
+def test_a_plane_that_does_not_face_the_camera_is_no_floor(normal):
+    with pytest.raises(PlanError, match="a plane before the camera that faces it"):
+        plane_of([0.0, 0.0, 700.0], normal, CAMERA)
+
+
+def test_a_plan_with_a_floor_and_a_region_is_written_and_read_again():
+    plan = Plan.load("mouse").with_settings(
+        [
+            "arena.floor={point = [0.0, 0.0, 700.0], normal = [0.0, 0.1, 1.0]}",
+            "arena.region=[[1.0, 2.0], [30.0, 2.0], [30.0, 40.0]]",
+        ]
+    )
+    assert Plan.from_toml(plan.to_toml()) == plan
+
+
+def test_the_doctor_takes_a_region_and_says_what_is_wrong_with_it(tmp_path):
+    from liex_lab.cli.main import app
+
+    wrong = CliRunner().invoke(app, ["doctor", "synthetic:walk?frames=3", "--region", "1,2 three"])
+    assert wrong.exit_code != 0
+    assert "three or more corners" in f"{wrong.output}{wrong.exception}"
+
+
+def test_rough_ground_is_told_by_its_spread():
+    from liex_lab.arena.scene import roughness
+
+    rng = np.random.default_rng(0)
+    bare = np.full((80, 80), 700.0, np.float32)
+    bedding = (bare - rng.normal(9.0, 6.0, bare.shape)).astype(np.float32)
+    assert roughness(bedding, bare, np.ones(bare.shape, bool)) == pytest.approx(6.0, rel=0.1)
+    assert roughness(np.zeros_like(bare), bare, np.ones(bare.shape, bool)) is None

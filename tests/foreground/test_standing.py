@@ -1,0 +1,122 @@
+"""The floor is where animals stand, however small and however high it lies."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from liex_lab.arena.floor import find_floor
+from liex_lab.arena.outline import find_arena
+from liex_lab.errors import EstimationError
+from liex_lab.foreground.background_segmenter import BackgroundSubtraction
+from liex_lab.recordings.recording import Recording
+from tests.arena.staged import changed, stage, walk
+
+SPINES = (40.0, 115.0)
+N_FRAMES = 24
+
+STAGES: dict[str, dict[str, Any]] = {
+    "a small arena in the dark": {
+        "half_mm": (95.0, 95.0),
+        "height_mm": 900.0,
+        "wall_mm": 150.0,
+        "room": False,
+    },
+    "a small arena 30 mm above the bench": {
+        "half_mm": (95.0, 95.0),
+        "height_mm": 900.0,
+        "wall_mm": 150.0,
+        "raised_mm": 30.0,
+    },
+    "an arena on a table": {"height_mm": 700.0, "raised_mm": 480.0},
+    "a platform without walls": {"height_mm": 700.0, "wall_mm": 0.0, "raised_mm": 480.0},
+    "a platform seen at 35 degrees": {
+        "height_mm": 700.0,
+        "wall_mm": 0.0,
+        "raised_mm": 300.0,
+        "tilt_deg": 35.0,
+    },
+}
+
+
+def check(recording: Recording, truth, scene: BackgroundSubtraction, sample) -> None:
+    assert scene.floor.distance_mm == pytest.approx(truth.floor.distance_mm, abs=3.0)
+    angle = np.degrees(np.arccos(np.clip(scene.floor.normal @ truth.floor.normal, -1, 1)))
+    assert angle < 0.5
+    crops = scene.extract(sample, 1.0)
+    assert crops.found.mean() > 0.9
+    off = scene.middles(crops)[crops.found] - truth.joints_arena.mean(axis=1)[crops.found]
+    assert np.median(np.linalg.norm(off[:, :2], axis=1)) < 25.0
+
+
+@pytest.mark.parametrize("name", STAGES)
+def test_the_floor_is_where_the_mouse_walks(name):
+    mouse = walk(stage(**STAGES[name]), N_FRAMES)
+    scene, sample = BackgroundSubtraction.learn(mouse, SPINES, N_FRAMES)
+    check(mouse, mouse, scene, sample)
+    assert scene.standing is not None
+    assert scene.standing.support > 0.8
+    assert not scene.standing.doubt
+
+
+def test_an_arena_on_a_table_has_its_own_outline_and_nothing_else_is_looked_at():
+    mouse = walk(stage(height_mm=700.0, raised_mm=480.0), N_FRAMES)
+    scene, _ = BackgroundSubtraction.learn(mouse, SPINES, N_FRAMES)
+    arena = find_arena(scene.background, scene.floor, scene.camera)
+    assert arena.kind == "rectangular"
+    np.testing.assert_allclose(np.array(arena.half_mm), 150.0, atol=4.0)
+    assert arena.edge == "wall"
+    assert not scene.limit[0].any()  # the room's floor
+
+
+def test_a_glossy_floor_with_holes_is_still_the_floor():
+    rng = np.random.default_rng(3)
+    mouse = walk(stage(height_mm=700.0, raised_mm=480.0), N_FRAMES)
+    holes = rng.random((240, 320)) < 0.25
+    glossy = changed(mouse, lambda _, depth: np.where(holes & (depth > 600.0), 0, depth))
+    scene, sample = BackgroundSubtraction.learn(glossy, SPINES, N_FRAMES)
+    assert scene.floor.distance_mm == pytest.approx(700.0, abs=3.0)
+    assert scene.extract(sample, 1.0).found.mean() > 0.9
+
+
+def test_in_an_ordinary_scene_the_floor_is_the_largest_plane_to_the_last_bit():
+    mouse = walk(stage((250.0, 200.0), height_mm=700.0, room=False), N_FRAMES)
+    scene, sample = BackgroundSubtraction.learn(mouse, SPINES, N_FRAMES)
+    from liex_lab.foreground.background import learn_background
+
+    present = find_floor(learn_background(sample)[0], mouse.camera)
+    assert scene.floor.distance_mm == present.distance_mm
+    np.testing.assert_array_equal(scene.floor.normal, present.normal)
+    assert scene.standing is not None
+    assert scene.standing.region is None
+    assert scene.standing.support > 0.9
+
+
+def test_where_nothing_moves_the_walled_ground_is_taken_and_said_to_be_in_doubt():
+    from liex_lab.body.skeleton import MOUSE_VIEW
+    from liex_lab.foreground.standing import find_standing
+
+    still = stage(height_mm=700.0, raised_mm=480.0).still
+    empty = np.tile(still, (6, 1, 1))
+    mouse = walk(stage(height_mm=700.0, raised_mm=480.0), 2)
+    found = find_standing(empty, still, np.zeros_like(still), mouse.camera, SPINES, 7.0, MOUSE_VIEW)
+    assert found.floor.distance_mm == pytest.approx(700.0, abs=2.0)
+    assert "nothing of an animal's size was seen moving" in found.doubt
+    assert np.isnan(found.support)
+    low = replace(mouse.scene, still=np.where(still > 900.0, np.float32(0), still)).still
+    ordinary = find_standing(
+        np.tile(low, (6, 1, 1)), low, np.zeros_like(low), mouse.camera, SPINES, 7.0, MOUSE_VIEW
+    )
+    assert ordinary.region is None  # walls enclose the largest plane itself
+
+
+def test_a_scene_in_which_nothing_is_flat_is_refused_in_one_sentence():
+    rng = np.random.default_rng(0)
+    mouse = walk(stage(), 4)
+    rubble = rng.uniform(400.0, 900.0, (240, 320)).astype(np.float32)
+    rough = changed(mouse, lambda k, depth: rubble)
+    with pytest.raises(EstimationError, match="no floor was found"):
+        BackgroundSubtraction.learn(rough, SPINES, 4)

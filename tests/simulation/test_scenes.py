@@ -1,0 +1,224 @@
+"""Scenes: the same seed is the same picture, the truth lies in it, each scene is what it says."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from liex_lab.errors import RecordingError
+from liex_lab.recordings import open_recording
+from liex_lab.simulation.scenes.cast import PRESENCES, timing_of
+from liex_lab.simulation.scenes.catalogue import SCENES, SEALED_FROM, film
+from liex_lab.simulation.scenes.meshes import box, joined, render_still
+from liex_lab.simulation.scenes.places import look_down
+from liex_lab.simulation.scenes.recording import SceneRecording, TrueScene
+from liex_lab.simulation.sensors import KINECT_V2_SENSOR, PRIMESENSE_QVGA_SENSOR
+from liex_lab.simulation.training_patches import BLOCK, PER_SESSION, training_windows
+
+SEED = 41
+N = 12
+
+
+def mice(name: str, n_frames: int = N, **settings: float) -> SceneRecording:
+    made = film(name, SEED, n_frames, sensor=PRIMESENSE_QVGA_SENSOR, **settings)  # type: ignore[arg-type]
+    assert isinstance(made, SceneRecording)
+    return made
+
+
+def heights(recording: TrueScene, frame: int) -> np.ndarray:
+    """Height of every pixel above the true floor, mm; NaN where unread."""
+    depth = recording.depths(frame, frame + 1)[0].astype(float)
+    v, u = np.mgrid[: depth.shape[0], : depth.shape[1]]
+    points = recording.camera.unproject(np.stack([u, v], axis=-1), depth)
+    z = (recording.T_arena_camera @ points)[..., 2]
+    return np.asarray(np.where(depth > 0, z, np.nan))
+
+
+@pytest.mark.parametrize("name", ["plain", "bedding", "glossy", "tether", "drift", "mirrored-hand"])
+def test_a_scene_is_the_same_whenever_and_in_whatever_order_it_is_read(name: str) -> None:
+    sensor = KINECT_V2_SENSOR if name == "mirrored-hand" else PRIMESENSE_QVGA_SENSOR
+    n = 3 if name == "mirrored-hand" else 26  # epochs of bedding and reflections are 12 frames
+    first = film(name, SEED, n, sensor=sensor)
+    again = film(name, SEED, n, sensor=sensor)
+    backwards = [again.depths(i, i + 1)[0] for i in range(n - 1, -1, -1)][::-1]
+    np.testing.assert_array_equal(first.depths(0, n), np.stack(backwards))
+    np.testing.assert_array_equal(
+        np.stack([frame.depth for chunk in first.chunks(5) for frame in chunk]), first.depths(0, n)
+    )
+
+
+@pytest.mark.parametrize("name", [name for name, (plan, _) in SCENES.items() if plan == "mouse"])
+def test_the_animals_stand_where_the_truth_says(name: str) -> None:
+    recording = mice(name, 36)  # long enough for a hand that brings an animal to be gone
+    assert len(recording) == 36
+    for animal in recording.animals:
+        frame = int(np.argmax(animal.visible))
+        assert animal.visible[frame] > 0.6
+        uv = recording.camera.project(animal.joints_camera[frame]).round().astype(int)
+        high = heights(recording, frame)
+        back = high[uv[1:4, 1], uv[1:4, 0]]
+        assert np.nanmedian(back) > 8.0, "the trunk stands above the floor where the joints are"
+
+
+def test_scenes_of_one_seed_have_the_same_animal() -> None:
+    plain, raised = mice("plain"), mice("raised")
+    assert plain.spine_mm == raised.spine_mm
+    np.testing.assert_array_equal(plain.pose.angles, raised.pose.angles)
+    assert plain.spine_mm != film("plain", SEED + 1, N).spine_mm
+
+
+def test_a_raised_arena_has_the_rooms_floor_in_view_far_below() -> None:
+    high = heights(mice("raised"), 0)
+    assert (np.abs(high + 480.0) < 25.0).mean() > 0.2
+    assert 0.05 < (np.abs(high) < 15.0).mean() < 0.5
+
+
+def test_the_floor_of_a_small_arena_is_about_a_seventh_of_the_picture() -> None:
+    recording = film("small", SEED, 1)
+    assert isinstance(recording, SceneRecording)
+    high = heights(recording, 0)
+    v, u = np.mgrid[: high.shape[0], : high.shape[1]]
+    across = np.hypot(u - recording.camera.cx, v - recording.camera.cy) < 130
+    assert 0.10 < (across & (np.abs(high) < 12.0)).mean() < 0.20
+
+
+def test_a_tilted_camera_looks_aslant() -> None:
+    axis = mice("tilted", 1).T_arena_camera.rotation[:, 2]
+    assert np.degrees(np.arccos(-axis[2])) == pytest.approx(35.0)
+
+
+def test_bedding_changes_where_the_animal_walks_and_lifts_it() -> None:
+    recording = mice("bedding", 60)
+    stills = recording.stage.stills
+    assert len(stills) == 5
+    changed = np.abs(stills[-1] - stills[0])
+    assert 0.0 < (changed > 2.0).mean() < 0.3
+    flat = mice("plain", 60)
+    rump, level = (r.joints_arena[:, 0, 2] for r in (recording, flat))
+    assert (rump - level).min() > 0.5
+
+
+def test_a_mouse_in_its_house_is_hidden() -> None:
+    recording = mice("house", 240)
+    seen = recording.animals[0].visible
+    assert (seen[:40] > 0.5).any()
+    assert 0.1 < (seen < 0.1).mean() < 0.7
+    hidden = int(np.argmin(seen))
+    above = heights(recording, hidden)
+    uv = recording.camera.project(recording.joints_camera[hidden]).round().astype(int)
+    assert np.nanmedian(above[uv[:, 1], uv[:, 0]]) == pytest.approx(66.0, abs=6.0)  # its roof
+
+
+def test_a_tether_reaches_from_the_head_to_the_commutator() -> None:
+    recording = mice("tether")
+    cable = recording.stage.moving[1].vertices
+    head = recording.joints_arena[:, -2:].mean(axis=1)
+    assert (np.linalg.norm(cable[:, 0] - head, axis=-1) < 30.0).all()
+    np.testing.assert_allclose(cable[:, -1], np.broadcast_to(cable[0, -1], (N, 3)), atol=12.0)
+    assert cable[0, -1, 2] > 200.0
+
+
+def test_a_sensor_that_warms_up_reads_more_and_more() -> None:
+    drifting, steady = mice("drift", 40), mice("plain", 40)
+    shift = np.nanmedian(
+        drifting.depths(39, 40)[0].astype(float) - steady.depths(39, 40)[0].astype(float)
+    )
+    assert 3.0 < shift < 6.0
+    np.testing.assert_array_equal(drifting.depths(0, 1), steady.depths(0, 1))
+
+
+@pytest.mark.parametrize("presence", PRESENCES)
+def test_animals_are_there_and_move_as_long_as_they_should(presence: str) -> None:
+    moments, there = timing_of(presence, 300)
+    resting = (np.diff(moments) == 0)[there[1:]].mean() if there.any() else 0.0
+    share, rest = {
+        "always": (1.0, 0.0),
+        "asleep": (1.0, 0.78),
+        "still": (1.0, 1.0),
+        "late": (1 / 3, 0.0),
+        "leaves": (0.45, 0.0),
+        "never": (0.0, 0.0),
+    }[presence]
+    assert there.mean() == pytest.approx(share, abs=0.01)
+    assert resting == pytest.approx(rest, abs=0.02)
+
+
+def test_an_animal_that_comes_late_has_no_truth_before() -> None:
+    animal = mice("late", 30).animals[0]
+    assert np.isnan(animal.joints_camera[:20]).all()
+    assert np.isfinite(animal.joints_camera[20:]).all()
+    assert not animal.visible[:20].any()
+
+
+def test_two_animals_keep_apart_and_an_empty_arena_has_none() -> None:
+    first, second = mice("two-animals").animals
+    gap = np.linalg.norm(
+        first.joints_camera.mean(axis=1) - second.joints_camera.mean(axis=1), axis=-1
+    )
+    assert gap.min() > 25.0
+    assert mice("empty").animals == ()
+    assert len(mice("four-arenas").animals) == 4
+
+
+def test_a_mirrored_hand_is_the_hand_with_left_and_right_exchanged() -> None:
+    hand, mirrored = (film(name, SEED, 2) for name in ("hand", "mirrored-hand"))
+    np.testing.assert_array_equal(mirrored.depths(0, 2), hand.depths(0, 2)[..., ::-1])
+    ours = mirrored.camera.project(mirrored.joints_camera)
+    theirs = hand.camera.project(hand.joints_camera)
+    np.testing.assert_allclose(ours[..., 0], hand.width - 1 - theirs[..., 0])
+    np.testing.assert_allclose(ours[..., 1], theirs[..., 1])
+
+
+def test_a_still_picture_shows_the_nearest_thing() -> None:
+    T = look_down(600.0, 0.0, 0.0)
+    camera = PRIMESENSE_QVGA_SENSOR.camera
+    floor, block = box([0, 0, -5], [900, 900, 5]), box([0, 0, 25], [30, 30, 25])
+    depth = render_still([joined([floor, block])], camera, T.inverse())
+    assert depth[119, 159] == pytest.approx(550.0)
+    assert depth[10, 10] == pytest.approx(600.0)
+
+
+# training
+
+
+def test_mice_of_training_patches_wear_things_only_where_asked() -> None:
+    bare, worn = (training_windows(17, BLOCK, worn_share=share) for share in (0.0, 0.6))
+    np.testing.assert_array_equal(bare.depth, training_windows(17, BLOCK).depth)
+    np.testing.assert_array_equal(bare.joints_mm, worn.joints_mm)
+    np.testing.assert_array_equal(bare.background, worn.background)
+    nearer = (bare.depth.astype(int) - worn.depth > 12) & (worn.depth > 0)
+    wears = nearer.sum(axis=(1, 2)) > 3
+    by_mouse = wears.reshape(-1, PER_SESSION).mean(axis=1)
+    assert ((by_mouse < 0.3) | (by_mouse > 0.7)).mean() > 0.9, "it is worn in all frames"
+    assert 0.4 < (by_mouse > 0.5).mean() < 0.8
+
+
+# addresses
+
+
+def test_a_scene_is_a_recording_by_its_address() -> None:
+    address = f"synthetic:scene?name=raised&seed={SEED}&frames=3&sensor=primesense-qvga"
+    recording = open_recording(address)
+    assert isinstance(recording, TrueScene)
+    assert (recording.name, len(recording)) == (f"scene-raised-{SEED}", 3)
+    np.testing.assert_array_equal(recording.frame(1).depth, mice("raised", 3).depths(1, 2)[0])
+
+
+@pytest.mark.parametrize(
+    ("address", "says"),
+    [
+        ("synthetic:scene?name=raise", "nearest one is raised"),
+        ("synthetic:scene?name=fish&sensor=kinect-v2", "sensor is no setting"),
+        ("synthetic:scene?build=rat", "one of other, train"),
+        ("synthetic:scene?frames=30000", "from 1 to 20000"),
+        (f"synthetic:scene?seed={SEALED_FROM}", "are kept for"),
+    ],
+)
+def test_a_slip_in_a_scenes_address_is_told(address: str, says: str) -> None:
+    with pytest.raises(RecordingError, match=says):
+        open_recording(address)
+
+
+def test_there_is_no_scene_of_another_name() -> None:
+    with pytest.raises(RecordingError, match="there is no scene 'moon'"):
+        film("moon", 0, 1)
