@@ -407,6 +407,7 @@ def evaluate_tracking(
     sequence: str = "hard",
     *,
     model: str | Path | None = None,
+    paper: bool = False,
     n_frames: int | None = None,
     figure: Path | None = None,
     progress: Progress = silent,
@@ -417,6 +418,7 @@ def evaluate_tracking(
         animal: name of the skeleton: fish, mouse or hand.
         sequence: name of the fixed virtual test sequence.
         model: a pose model by name or path; None takes the animal's bundled one.
+        paper: also compare Algorithms 1 and 3 with the parts of the paper's variant.
         n_frames: only so many frames of the sequence; None takes all.
         figure: the PNG of joint error over time to draw; None draws none.
         progress: told how far the work is.
@@ -430,7 +432,15 @@ def evaluate_tracking(
     from liex_lab.pipelines.evaluation.tracking import evaluate_tracking as measure
 
     draw = None if figure is None else partial(draw_tracking, path=figure)
-    return measure(animal, sequence, model=model, n_frames=n_frames, draw=draw, progress=progress)
+    return measure(
+        animal,
+        sequence,
+        model=model,
+        paper=paper,
+        n_frames=n_frames,
+        draw=draw,
+        progress=progress,
+    )
 
 
 def evaluate_scenes(

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from textwrap import fill
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -145,6 +146,10 @@ def _sensitivity(results: Mapping[str, Mapping[str, Any]]) -> Figure:
             for variant, curve in one["sensitivity"].items():
                 points = curve["curves"].get(number, [])
                 name, colour, _ = _METHODS[variant]
+                if number in curve.get("left_out", {}):
+                    reason = f"{name} {curve['left_out'][number]}"
+                    panel.text(0.04, 0.04, fill(reason, 48), fontsize=6, transform=panel.transAxes)
+                    continue
                 panel.plot(
                     [p["value"] for p in points],
                     [p["mean_mm"] for p in points],

@@ -22,7 +22,7 @@ Array = NDArray[np.float64]
 
 _LINES = {  # row: (name in the legend, colour, width)
     "single": ("single frames", "#999999", 1.0),
-    "algorithm3": ("Algorithm 3", "#4477AA", 0.8),
+    "algorithm3": ("Algorithm 3 on our parts", "#4477AA", 0.8),
     "smoothed": ("smoothed", "#AA3377", 1.6),
 }
 _TRUTH = "#228833"

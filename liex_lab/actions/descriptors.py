@@ -49,7 +49,8 @@ def tangent_descriptor(track: Track) -> Array:
     base = np.concatenate([step, step[-1:]])
     change = np.diff(angles, axis=0)
     change = np.concatenate([change, change[-1:]])
-    middle = 1 + (track.skeleton.n_joints - 1) // 2  # joints 1-10 of the fish, the rest after them
+    # of the fish joints 2 to 10 and 11 to the last in the paper's count, which begins at the base
+    middle = max(2, (track.skeleton.n_joints - 1) // 2)
     halves = [
         rows[:, part].mean(axis=1)
         for part in (slice(1, middle), slice(middle, -1))

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from liex_lab.actions import _semi_markov_kernels as kernels
 from liex_lab.runtime.memory import Allocator, blocks
+from liex_lab.runtime.shapes import check_shapes
 
 Array = NDArray[np.float64]
 
@@ -90,6 +91,7 @@ class SemiMarkovModel:
         """
         scores = np.ascontiguousarray(scores)
         terms = self._terms(step_s)
+        check_shapes("a recording", ("scores", scores, ("m", len(terms[0]) - 1)))
         value = np.empty(terms[0][-1])
         label = np.zeros(len(scores), np.int64)
         came_from = allocate(scores.shape, np.int16)
@@ -113,8 +115,9 @@ class SemiMarkovModel:
         Returns:
             (m, K) probabilities, rows sum to 1.
         """
-        out = allocate(scores.shape, float)
         terms = self._terms(step_s)
+        check_shapes("a recording", ("scores", scores, ("m", len(terms[0]) - 1)))
+        out = allocate(scores.shape, float)
         for ticks in blocks(len(scores), _PIECE):
             low = max(0, ticks.start - _MARGIN)
             high = min(len(scores), ticks.stop + _MARGIN)

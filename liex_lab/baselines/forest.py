@@ -15,12 +15,14 @@ candidates", 7 and 12 trees of depth 20, on the depth invariant two-point featur
   points is the pixel itself, as in Shotton's own forests.
 - F2 learns from where trees of F1 that were not grown on the image put it, and from that only where
   F1 has not taken the tail for the head.
+- F2's coordinates begin at the home pose as the animal is usually seen: a hand that shows its palm
+  is turned by pi from one that lies like a mouse.
 """
 
 from __future__ import annotations
 
 import io
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -63,6 +65,8 @@ class ForestPlan:
         n_points: pixels of an image that F1 is asked at.
         draws: times that F2 sees each image, from other pixels.
         bandwidths: (2,) bandwidths of the modes of F1 and F2, of the animal's length.
+        home_turn: (3,) rotation vector, rad, by which the animal as it is usually seen is turned
+            out of the home pose, see `Method`.
     """
 
     where: GrowthPlan = _F1
@@ -71,6 +75,7 @@ class ForestPlan:
     n_points: int = 32
     draws: int = 2
     bandwidths: tuple[float, float] = (0.15, 0.25)
+    home_turn: tuple[float, ...] = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -94,6 +99,15 @@ class RegressionForest:
     def takes_size(self) -> bool:
         """False: the paper's baselines know nothing of size."""
         return False
+
+    def __post_init__(self) -> None:
+        """Refuse forests that read what their samples do not have, for kernels do not check it."""
+        n_coordinates = len(levers(self.skeleton))
+        for name, forest, n in (("F1", self.where, _N_WHERE), ("F2", self.pose, n_coordinates)):
+            try:
+                check_forest(forest, 1, 0, n)
+            except ValueError as error:
+                raise ValueError(f"{name} of a regression forest cannot be used: {error}") from None
 
     def find_size(self, sample: NDArray[np.float32], scene: Segmenter) -> float:
         """Always 1: the paper's forests know nothing of size.
@@ -134,7 +148,7 @@ class RegressionForest:
         Returns:
             The joints in the camera frame.
         """
-        s = self.skeleton
+        s = as_seen(self.skeleton, self.plan.home_turn)
         n = len(crop_cameras)
         joints = np.full((n, s.n_joints, 3), np.nan)
         with threads(parallel):
@@ -183,13 +197,32 @@ class RegressionForest:
                     Forest(*(archive[f"{name}_{part}"] for part in ("nodes", "roots", "leaves")))
                     for name in ("where", "pose")
                 )
-            check_forest(where, 1, 0, _N_WHERE)
-            check_forest(pose, 1, 0, len(levers(skeleton)))
+            return RegressionForest(skeleton, plan, where, pose)
         except DAMAGE as error:
             raise ModelError(
                 f"{path} is not a whole regression forest ({error}); remove it and train again"
             ) from None
-        return RegressionForest(skeleton, plan, where, pose)
+
+
+def as_seen(skeleton: Skeleton, home_turn: tuple[float, ...]) -> Skeleton:
+    """The same body with a base joint whose frame is turned, so that its home pose is.
+
+    Args:
+        skeleton: the animal's skeleton.
+        home_turn: (3,) rotation vector by which the home pose is turned about the base joint, rad.
+
+    Returns:
+        The skeleton; a pose has the same joints where its base rotation R is R exp(home_turn)^T.
+    """
+    if not any(home_turn):
+        return skeleton
+    turn = so3.exp(np.array(home_turn))
+    offsets = skeleton.offsets.copy()
+    rest = skeleton.rest.copy()
+    children = skeleton.parents == 0
+    offsets[children] = offsets[children] @ turn.T
+    rest[children] = turn @ rest[children]
+    return replace(skeleton, offsets=offsets, rest=rest)
 
 
 def levers(skeleton: Skeleton) -> Array:
@@ -228,7 +261,12 @@ def levers(skeleton: Skeleton) -> Array:
 
 
 def coordinates(
-    data: TrainingSet, skeleton: Skeleton, image: NDArray[np.int32], places: Array, headings: Array
+    data: TrainingSet,
+    skeleton: Skeleton,
+    image: NDArray[np.int32],
+    places: Array,
+    headings: Array,
+    home_turn: tuple[float, ...] = (0.0, 0.0, 0.0),
 ) -> Array:
     """True coordinates of F2, relative to a position and a heading that F1 estimated.
 
@@ -238,6 +276,7 @@ def coordinates(
         image: (n,) int32 index of each sample's image.
         places: (n, 3) base positions, mm, view frame.
         headings: (n,) headings, rad, view frame.
+        home_turn: (3,) rotation vector by which the home pose is turned, rad, see `as_seen`.
 
     Returns:
         (n, D) coordinates in lever units.
@@ -245,13 +284,14 @@ def coordinates(
     zero = np.zeros_like(headings)
     start = SE3(so3.exp(np.stack([zero, zero, headings], axis=1)), places)
     truth = data.truth
-    twist = (start.inverse() @ SE3(truth.rotations[image, 0], truth.positions[image, 0])).log()
+    base = truth.rotations[image, 0] @ so3.exp(np.array(home_turn)).T
+    twist = (start.inverse() @ SE3(base, truth.positions[image, 0])).log()
     parts = [twist, np.log(truth.scale[image])[:, None]]
     for j in skeleton.solved[1:]:
         parent = truth.rotations[image, skeleton.parents[j]] @ skeleton.rest[j]
         turn = so3.log(np.swapaxes(parent, 1, 2) @ truth.rotations[image, j])
         parts.append(turn[:, skeleton.axes[j]])
-    return np.concatenate(parts, axis=1) * levers(skeleton)
+    return np.concatenate(parts, axis=1) * levers(as_seen(skeleton, home_turn))
 
 
 def _settings(plan: ForestPlan, skeleton: Skeleton) -> kernels.VoteSettings:
@@ -297,8 +337,8 @@ def train_forests(
         places,
         headings,
     )
-    labels = coordinates(data, skeleton, image, places, headings)
-    turned = np.linalg.norm(labels[:, :3] / levers(skeleton)[:3], axis=1)
+    labels = coordinates(data, skeleton, image, places, headings, plan.home_turn)
+    turned = np.linalg.norm(labels[:, :3] / levers(as_seen(skeleton, plan.home_turn))[:3], axis=1)
     samples = _samples(data, skeleton, image, places, headings)
     pose, _ = grow_forest(samples, labels.astype(np.float32), turned < np.pi / 2, plan.pose, rng)
     return RegressionForest(skeleton, plan, where, pose)
@@ -315,7 +355,8 @@ def _grow_where(
     )
     image = np.repeat(animals, plan.training_points)
     places = points.reshape(-1, 3)
-    heading = 0.5 * skeleton.length * data.truth.rotations[image, 0, :2, 0]
+    forward = data.truth.rotations[image, 0] @ so3.exp(np.array(plan.home_turn)).T[:, 0]
+    heading = 0.5 * skeleton.length * forward[:, :2]
     labels = np.concatenate([data.truth.positions[image, 0] - places, heading], axis=1).astype(
         np.float32
     )

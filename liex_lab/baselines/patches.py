@@ -15,11 +15,13 @@ import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
 
-from liex_lab.foreground._crop_camera_kernels import crop_camera
+from liex_lab.foreground._crop_camera_kernels import N_CROP_CAMERA, crop_camera
+from liex_lab.runtime.shapes import check_shapes
 
 Array = NDArray[np.float64]
 
 PATCH = 224
+N_FRAME = 5  # numbers of a square, see `frames_of`
 _MARGIN = 1.1
 _MM = 16.0  # heights are sixteenths
 
@@ -35,7 +37,9 @@ def frames_of(heights: NDArray[np.int16], crop_cameras: Array) -> Array:
         (n, 5): picture pixel (u, v) of the square's centre, half the side in picture pixels, the
         animal's mean depth, mm, and half the side in mm at that depth.
     """
-    frames = np.empty((len(crop_cameras), 5))
+    n = len(crop_cameras)
+    _check(heights, crop_cameras)
+    frames = np.empty((n, N_FRAME))
     _frames_all(heights, crop_cameras, frames)
     return frames
 
@@ -53,9 +57,20 @@ def patches_of(
     Returns:
         (n, PATCH, PATCH) float32 brightness, 0 to 255; 0 beside the animal.
     """
-    patches = np.empty((len(crop_cameras), PATCH, PATCH), np.float32)
+    n = len(crop_cameras)
+    _check(heights, crop_cameras)
+    check_shapes("patches", ("frames", frames, (n, N_FRAME)))
+    patches = np.empty((n, PATCH, PATCH), np.float32)
     _patches_all(heights, crop_cameras, frames, patches)
     return patches
+
+
+def _check(heights: NDArray[np.int16], crop_cameras: Array) -> None:
+    check_shapes(
+        "patches",
+        ("heights", heights, ("n", "S", "S")),
+        ("crop_cameras", crop_cameras, ("n", N_CROP_CAMERA)),
+    )
 
 
 def targets_of(joints_camera: Array, crop_cameras: Array, frames: Array) -> NDArray[np.float32]:

@@ -235,7 +235,8 @@ class BoutReader:
         most = min(int(_MOST_LAG_S * 10 * self.fps), len(fine) // 2)
         agreement = [_correlation(a[: len(a) - lag], b[lag:]) for lag in range(most)]
         best = int(np.argmax(agreement)) if agreement else 0
-        if best == 0 or agreement[best] < _LEAST_CORRELATION:
+        # at an end of its range the correlation is not known to have its peak
+        if best in (0, most - 1) or agreement[best] < _LEAST_CORRELATION:
             return np.nan
         return self.length_mm / 3.0 / (best * 0.1 / self.fps)
 

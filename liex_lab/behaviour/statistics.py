@@ -157,16 +157,21 @@ def smallest_p(units: Units) -> float:
     """The smallest two-sided p that a permutation test of these units can give.
 
     It is 2 / `arrangements` where every arrangement has its mirror image (paired units, or equally
-    many of both groups in every block), else 1 / `arrangements`.
+    many of both groups in every block that has both), else 1 / `arrangements`. A block of one group
+    can be arranged in one way only and does not count. Where arrangements are drawn, it is at least
+    1 / (1 + `MOST_EXACT`).
 
     Args:
         units: the units of the comparison.
     """
+    blocks = [units.second[units.block == b] for b in np.unique(units.block)]
     even = units.paired or all(
-        2 * int(units.second[units.block == b].sum()) == int((units.block == b).sum())
-        for b in np.unique(units.block)
+        2 * int(second.sum()) == len(second) for second in blocks if 0 < second.sum() < len(second)
     )
-    return (2.0 if even else 1.0) / arrangements(units)
+    n_ways = arrangements(units)
+    if n_ways > MOST_EXACT:
+        return max((2.0 if even else 1.0) / n_ways, 1.0 / (1 + MOST_EXACT))
+    return min(1.0, (2.0 if even else 1.0) / n_ways)
 
 
 def permutation(units: Units, rng: np.random.Generator) -> float:
@@ -220,7 +225,9 @@ def _all_differences(units: Units) -> Array:
     for block in np.unique(units.block):
         inside = np.flatnonzero(units.block == block)
         k = int(units.second[inside].sum())
-        ways = np.array(list(combinations(range(len(inside)), k)), np.int64).reshape(-1, k)
+        if k in (0, len(inside)):  # a block of one group can be arranged in one way
+            continue
+        ways = np.array(list(combinations(range(len(inside)), k)), np.int64)
         # sum of weights x values: k of n values get (n - k) / n and the others -k / n, which is sum
         # - k x mean
         differences = y[inside][ways].sum(axis=1) - k * y[inside].mean()

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from liex_lab.body.pose import Pose
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.errors import LiexError
+from liex_lab.runtime.shapes import check_index, check_shapes
 
 Array = NDArray[np.float64]
 
@@ -154,7 +155,16 @@ class MeshBody:
         Returns:
             (n, V, 3) mm, in the frame of the joints.
         """
-        body = self.broadcast(len(positions))
+        n = len(positions)
+        check_shapes(
+            "a mesh's poses",
+            ("rotations", rotations, (n, skeleton.n_joints, 3, 3)),
+            ("positions", positions, (n, skeleton.n_joints, 3)),
+            ("scale", scale, (n,)),
+            ("girth", girth, (n,)),
+        )
+        check_index("the skeleton's joints", self.bones, skeleton.n_joints)
+        body = self.broadcast(n)
         out = np.empty((len(positions), self.n_vertices, 3))
         carrier = skeleton.parents[self.bones]
         _skin_mesh(

@@ -24,6 +24,7 @@ from liex_lab.body.skeleton import Skeleton
 from liex_lab.errors import LiexError, one_line
 from liex_lab.geometry import SE3
 from liex_lab.optics.camera import Camera
+from liex_lab.runtime.shapes import check_index, check_shapes
 from liex_lab.runtime.threads import threads
 
 Array = NDArray[np.float64]
@@ -277,6 +278,8 @@ def render_mesh(
     """
     T = SE3.identity() if T_camera_mesh is None else T_camera_mesh
     u0, v0, width, height = (0, 0, camera.width, camera.height) if window is None else window
+    check_shapes("a mesh", ("vertices", vertices, ("V", 3)), ("faces", faces, ("F", 3)))
+    check_index("vertices", faces, len(vertices))
     inverse = np.zeros((height, width))
     depth = np.empty((height, width), np.float32)
     rasterizer_kernels.draw(
@@ -319,7 +322,17 @@ def render_meshes(
     Returns:
         (n, H, W) float32 mm, 0 where the mesh is not.
     """
-    depth = np.empty((len(vertices), size[1], size[0]), np.float32)
+    n = len(vertices)
+    check_shapes(
+        "meshes",
+        ("vertices", vertices, (n, "V", 3)),
+        ("faces", faces, ("F", 3)),
+        ("rotations", T_camera_mesh.rotation, (n, 3, 3)),
+        ("intrinsics", np.asarray(intrinsics), (n, 4)),
+        ("origin", np.asarray(origin), (n, 2)),
+    )
+    check_index("vertices", faces, vertices.shape[1])
+    depth = np.empty((n, size[1], size[0]), np.float32)
     drive = rasterizer_kernels.draw_batch_parallel if parallel else rasterizer_kernels.draw_batch
     drive(
         vertices,

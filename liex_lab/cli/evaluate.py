@@ -217,19 +217,33 @@ def evaluate_tracking(
     n_frames: Annotated[
         int | None, typer.Option("--frames", min=40, help="A sequence of this many frames.")
     ] = None,
+    paper: Annotated[
+        bool,
+        typer.Option(
+            "--paper",
+            help="Also the paper's own comparison, Algorithm 1 and 3 on the parts of its variant, "
+            "which is trained first where it has not been (minutes).",
+        ),
+    ] = False,
     figure: Annotated[
         Path | None, typer.Option("--figure", metavar="PNG", help="Draw error over time.")
     ] = None,
     json_file: JsonFile = None,
 ) -> None:
-    """Joint errors over a sequence: single frames, Algorithm 3, and the default tracker online and
-    smoothed.
+    """Joint errors over a sequence: single frames, Algorithm 3 on our parts, and the default
+    tracker online and smoothed.
     """
     from liex_lab.api import evaluate_tracking as measure
 
     with progress_bar() as progress:
         result = measure(
-            animal, sequence, model=model, n_frames=n_frames, figure=figure, progress=progress
+            animal,
+            sequence,
+            model=model,
+            paper=paper,
+            n_frames=n_frames,
+            figure=figure,
+            progress=progress,
         )
     tell_numbers(result, json_file)
 

@@ -281,6 +281,13 @@ def train(
             "--model", metavar="FILE", help="Of `train actions`: the model that measures poses."
         ),
     ] = None,
+    particles: Annotated[
+        bool,
+        typer.Option(
+            "--particles",
+            help="Of `train tracking`: search the noise of the paper's Algorithm 3 instead.",
+        ),
+    ] = False,
 ) -> None:
     """Make an animal's model from rendered pictures, the same again, byte for byte, whenever it is
     run.
@@ -304,6 +311,13 @@ def train(
         for sentence in told_scores(report):
             typer.echo(sentence)
         typer.echo(f"model: {model}")
+        return
+    if animal == "tracking" and particles:
+        from liex_lab.pipelines.evaluation.paper.algorithm3 import search_noise
+
+        with progress_bar() as progress:
+            found = search_noise(of, progress=progress)
+        tell_numbers(found, out)
         return
     if animal == "tracking":
         from liex_lab.pipelines.training.motion_model import train_tracking

@@ -28,9 +28,12 @@ from liex_lab.estimation import _feature_kernels as kernels
 from liex_lab.estimation import _residual_kernels as residual_kernels
 from liex_lab.estimation._cascade_kernels import modes_of_votes
 from liex_lab.estimation.method import Method
+from liex_lab.foreground._blob_kernels import N_MOMENTS
+from liex_lab.foreground._crop_camera_kernels import N_CROP_CAMERA
 from liex_lab.forests._kernels import VIEW
 from liex_lab.forests.forest import Forest, Samples, predict, predict_each
 from liex_lab.geometry import SE3, so3
+from liex_lab.runtime.shapes import check_index, check_shapes
 
 Array = NDArray[np.float64]
 
@@ -52,6 +55,17 @@ class Candidates:
     positions: Array
     scale: Array
     size: Array
+
+    def __post_init__(self) -> None:
+        """Refuse arrays that do not fit together, for kernels do not check them."""
+        check_shapes(
+            "candidates",
+            ("image", self.image, ("n",)),
+            ("rotations", self.rotations, ("n", "J", 3, 3)),
+            ("positions", self.positions, ("n", "J", 3)),
+            ("scale", self.scale, ("n",)),
+            ("size", self.size, ("n",)),
+        )
 
     @staticmethod
     def start(
@@ -99,6 +113,15 @@ class ImageSet:
     crop_cameras: Array
     moments: Array
 
+    def __post_init__(self) -> None:
+        """Refuse arrays that do not fit together, for kernels do not check them."""
+        check_shapes(
+            "images",
+            ("heights", self.heights, ("m", "S", "S")),
+            ("crop_cameras", self.crop_cameras, ("m", N_CROP_CAMERA)),
+            ("moments", self.moments, ("m", N_MOMENTS)),
+        )
+
     def __getitem__(self, rows: NDArray[np.int64]) -> ImageSet:
         """Some of the images.
 
@@ -137,6 +160,13 @@ class Cascade:
             return 7 if self.method.regress_scale else 6
         return int(self.skeleton.axes[joint].sum())
 
+    def _check(self, candidates: Candidates, images: ImageSet | None = None) -> None:
+        """Refuse candidates of another body, or on images that are not there."""
+        n_joints = self.skeleton.n_joints
+        check_shapes("candidates", ("positions", candidates.positions, ("n", n_joints, 3)))
+        if images is not None:
+            check_index("images", candidates.image, len(images.heights))
+
     def place(self, candidates: Candidates, joint: int) -> None:
         """Put a joint where its parent carries it, at its home angle.
 
@@ -144,6 +174,7 @@ class Cascade:
             candidates: the candidates, which are changed in place.
             joint: number of the joint; its parent must be in place.
         """
+        self._check(candidates)
         kernels.place_all(
             joint,
             KinematicTree.of(self.skeleton),
@@ -221,6 +252,7 @@ class Cascade:
         Returns:
             n samples with one view per joint, on the height maps of the images.
         """
+        self._check(candidates, images)
         n = len(candidates)
         views = np.empty((n, len(joints), VIEW), np.float32)
         scalars = np.empty((n, kernels.N_SCALARS), np.float32)
@@ -286,6 +318,9 @@ class Cascade:
                 size.
         """
         method = self.method
+        self._check(candidates)
+        wanted = len(candidates), self.n_values(joint)
+        check_shapes("a correction", ("values", values, wanted))
         if joint == 0:
             levers = np.array([method.base_lever_mm, method.scale_lever_mm])
             kernels.correct_base_all(

@@ -26,14 +26,14 @@ from liex_lab.body.kinematic_tree import KinematicTree
 from liex_lab.body.pose import Pose
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.catalog import find_model
-from liex_lab.errors import EstimationError
+from liex_lab.errors import EstimationError, ModelError
 from liex_lab.estimation import _cascade_kernels as kernels
 from liex_lab.estimation._residual_kernels import SphereModel
 from liex_lab.estimation.cascade import ImageSet, body_of
 from liex_lab.estimation.forest_correction import corrected
 from liex_lab.estimation.head_tail import HeadTailClassifier, both_ways
 from liex_lab.estimation.initial import draw_starts, start_poses
-from liex_lab.estimation.model import Model
+from liex_lab.estimation.model import Model, check_model
 from liex_lab.estimation.proposals import N_WAYS, propose
 from liex_lab.estimation.refine import Refiner
 from liex_lab.estimation.ridge_correction import SURE_SHARE, RidgeCorrection
@@ -217,6 +217,10 @@ class PoseEstimator:
     def _packed(self) -> tuple[kernels.Trees, kernels.Trees, kernels.Trees]:
         """Regressors, pruner and metric as the kernels want them."""
         model = self.model
+        try:
+            check_model(model)
+        except ValueError as error:
+            raise ModelError(f"this model cannot be used ({error}); train it again") from None
         regressors = [forest for rounds in model.cascade.forests for forest in rounds]
         return _pack(regressors), _pack([model.pruner or model.metric]), _pack([model.metric])
 
@@ -284,6 +288,7 @@ class PoseEstimator:
         """
         method = self.model.method
         skeleton = self.skeleton
+        images = ImageSet(crops.heights, crop_cameras, crops.moments)
         n = len(crop_cameras)
         k = self._starts.shape[1]
         sizes = np.full((n, k), size)
@@ -298,7 +303,6 @@ class PoseEstimator:
             method.home_turn,
         )
         if self.model.cascade.proposals is not None:
-            images = ImageSet(crops.heights, crop_cameras, crops.moments)
             base_rotation, base_position = propose(
                 self.model.cascade.proposals, images, sizes[:, 0], method
             )
@@ -329,9 +333,7 @@ class PoseEstimator:
             if self.model.facing is None or not n:
                 return *poses, scores
             facing = HeadTailClassifier(skeleton, self.model.facing)
-            scores = facing.judged(
-                ImageSet(crops.heights, crop_cameras, crops.moments), poses.positions, scores, size
-            )
+            scores = facing.judged(images, poses.positions, scores, size)
         return *poses, scores
 
     def estimate(

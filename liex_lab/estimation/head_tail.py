@@ -20,6 +20,7 @@ from liex_lab.body.skeleton import Skeleton
 from liex_lab.estimation import _head_tail_kernels as kernels
 from liex_lab.estimation.cascade import ImageSet
 from liex_lab.mlp import Network, descend
+from liex_lab.runtime.shapes import check_shapes
 
 Array = NDArray[np.float64]
 
@@ -176,6 +177,8 @@ def laid_along(
         (n, A, B) float32 heights in units of 10 mm at home size, for the reference length; 0 beside
         the animal.
     """
+    n = len(images.heights)
+    check_shapes("poses", ("joints", joints, (n, skeleton.n_joints, 3)), ("size", size, (n,)))
     unit = skeleton.relative_size
     along = np.arange(-_ALONG_MM, _ALONG_MM + 1e-6, _STEP_MM) * unit
     across = np.arange(-_ACROSS_MM, _ACROSS_MM + 1e-6, _STEP_MM) * unit

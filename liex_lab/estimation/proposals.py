@@ -20,6 +20,7 @@ from liex_lab.forests._kernels import VIEW
 from liex_lab.forests.forest import Forest, Samples, predict_each
 from liex_lab.forests.grow import grow_forest
 from liex_lab.geometry import so3
+from liex_lab.runtime.shapes import check_shapes
 
 Array = NDArray[np.float64]
 
@@ -41,7 +42,8 @@ def views_along_axis(
         2 m samples, an image's two in a row, and the frames they are taken in: rotations (2 m, 3,
         3) and centres (2 m, 3) mm, view frame.
     """
-    m = len(size)
+    m = len(images.heights)
+    check_shapes("proposals", ("size", size, (m,)))
     image = np.repeat(np.arange(m, dtype=np.int32), N_WAYS)
     moments = images.moments[image]
     blob = moment_columns(moments)

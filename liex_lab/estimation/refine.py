@@ -26,7 +26,10 @@ from liex_lab.body.spheres import Spheres
 from liex_lab.estimation import _refine_kernels as kernels
 from liex_lab.estimation import _residual_kernels as residual_kernels
 from liex_lab.estimation.cascade import ImageSet, body_of
+from liex_lab.foreground._blob_kernels import N_MOMENTS
+from liex_lab.foreground._crop_camera_kernels import N_CROP_CAMERA
 from liex_lab.geometry import SE3
+from liex_lab.runtime.shapes import check_shapes
 
 Array = NDArray[np.float64]
 
@@ -79,6 +82,19 @@ class Refiner:
             row[: len(some)] = some
         return Refiner(s, tree, kernels.FreeAngles(limits, moves, turns), body_of(balls))
 
+    def _check(self, pose: Pose, heights: NDArray[np.int16], crop_cameras: Array) -> None:
+        """Refuse poses (n, K) of another body or for other height maps."""
+        n_joints = self.skeleton.n_joints
+        check_shapes(
+            "poses to refine",
+            ("rotations", pose.root.rotation, ("n", "K", 3, 3)),
+            ("translations", pose.root.translation, ("n", "K", 3)),
+            ("angles", pose.angles, ("n", "K", n_joints, 3)),
+            ("scales", pose.scale, ("n", "K")),
+            ("heights", heights, ("n", "S", "S")),
+            ("crop_cameras", crop_cameras, ("n", N_CROP_CAMERA)),
+        )
+
     def refine(
         self, pose: Pose, heights: NDArray[np.int16], crop_cameras: Array, size: float, n_steps: int
     ) -> Pose:
@@ -95,6 +111,7 @@ class Refiner:
             (n, K) refined poses.
         """
         unit = self.body.unit_mm * size
+        self._check(pose, heights, crop_cameras)
         rotation = pose.root.rotation.copy()
         position = pose.root.translation.copy()
         angles = pose.angles.copy()
@@ -137,7 +154,11 @@ class Refiner:
         Returns:
             (n, K, N_FIT) residuals, see `_residual_kernels.explain`.
         """
-        frames, (n, k), j = pose.frames(self.skeleton), pose.scale.shape, self.skeleton.n_joints
+        self._check(pose, heights, crop_cameras)
+        check_shapes("height maps", ("moments", moments, (len(heights), N_MOMENTS)))
+        frames = pose.frames(self.skeleton)
+        n, k = pose.scale.shape
+        j = self.skeleton.n_joints
         out = np.empty((n * k, residual_kernels.N_FIT), np.float32)
         residual_kernels.explain_all(
             heights,

@@ -22,6 +22,7 @@ from liex_lab.body.skeleton import Skeleton
 from liex_lab.estimation import _profile_kernels as kernels
 from liex_lab.estimation.cascade import ImageSet
 from liex_lab.foreground.crop_camera import mm_per_px
+from liex_lab.runtime.shapes import check_shapes
 
 Array = NDArray[np.float64]
 
@@ -211,7 +212,9 @@ def clues(skeleton: Skeleton, pose: Pose, joints: Array, images: ImageSet, size:
     Returns:
         (n, F) features, F = 2 J + N_OTHERS.
     """
-    n, j = joints.shape[:2]
+    n = len(images.heights)
+    j = skeleton.n_joints
+    check_shapes("poses", ("joints", joints, (n, j, 3)), ("size", size, (n,)))
     length = skeleton.length * size
     seen = np.empty((n, 2 * j + 2))
     kernels.look_along(

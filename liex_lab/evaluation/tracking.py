@@ -21,7 +21,12 @@ Array = NDArray[np.float64]
 
 TRACKING_PROTOCOL = (
     "Error of a frame: mean over joints of the 3D distance between measured and true joint, mm. "
-    "single: what each frame says by itself; algorithm3: the paper's, 200 particles; online: the "
+    "single: what each frame says by itself; algorithm3: the paper's particle filter, 200 "
+    "particles, on our regressors and metric; algorithm1_paper, algorithm3_paper and "
+    "algorithm3_paper_base_round: the paper's single frames (the best-scored candidate) and its "
+    "filter with the parts of its own variant, without and with a round of the base's "
+    "regressors, set against each other by ratio_to_single, its process noise searched on other "
+    "sequences; online: the "
     "default tracker, each row told some frames late (online_lag_frames); smoothed: the default "
     "tracker over the whole sequence. mean and p95: over the frames in which the row has a pose, "
     "bridged ones included; lost_rate: share of frames without one. ratio_to_single and "

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from liex_lab.foreground import _background_kernels as kernels
 from liex_lab.recordings.recording import Recording
+from liex_lab.runtime.shapes import check_shapes
 
 # readings this near to one another, of the depth or in mm, are one surface
 _MODE_SHARE = 0.012
@@ -83,6 +84,7 @@ def learn_background(
         deviation, and the depth that a twentieth of the readings are nearer than.
     """
     stack = sample if isinstance(sample, np.ndarray) else sample_frames(sample, 96)
+    check_shapes("a sample", ("frames", stack, ("n", "H", "W")))
     depth, spread, near = np.zeros((3, *stack.shape[1:]), np.float32)
     numbers = [np.float32(value) for value in (_MODE_SHARE, _MODE_MM, _NEAR_SHARE)]
     kernels.far_modes(stack, *numbers, depth, spread, near)

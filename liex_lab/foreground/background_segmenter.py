@@ -34,6 +34,7 @@ from liex_lab.foreground.segmenter import Segmenter
 from liex_lab.foreground.standing import Standing, find_standing
 from liex_lab.optics.camera import Camera
 from liex_lab.recordings.recording import Recording
+from liex_lab.runtime.shapes import check_shapes
 from liex_lab.runtime.threads import threads
 
 Array = NDArray[np.float64]
@@ -351,6 +352,7 @@ class BackgroundSubtraction(Segmenter):
             The area, mm^2, and the share (0 to 1) of frames with a component within a factor of 4
             of it; both 0 where no component has an animal's size.
         """
+        self._check(depths)
         areas = np.zeros((len(depths), MAX_BLOBS))
         bridge = 0 if self.view.frame == VIEWS[0] else kernels.BRIDGE
         kernels.blob_areas(
@@ -505,6 +507,10 @@ class BackgroundSubtraction(Segmenter):
             crops.step,
         )
 
+    def _check(self, depths: NDArray[np.float32]) -> None:
+        """Refuse frames of another size than those that the scene was learned from."""
+        check_shapes("frames of this scene", ("depths", depths, ("n", *self.limit.shape)))
+
     def _extract(
         self,
         depths: NDArray[np.float32],
@@ -532,6 +538,7 @@ class BackgroundSubtraction(Segmenter):
         """
         if depths.shape[1:] != self.limit.shape:
             depths = depths[:, :: self.stride, :: self.stride]
+        self._check(depths)
         crops = HeightMaps.blank(n_things * len(depths), self.floor.distance_mm)
         grid = self.grid
         with threads(parallel):

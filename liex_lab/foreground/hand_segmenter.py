@@ -26,6 +26,7 @@ from liex_lab.foreground.height_maps import CROP, HeightMaps
 from liex_lab.foreground.segmenter import Segmenter
 from liex_lab.optics.camera import Camera
 from liex_lab.recordings.recording import Recording
+from liex_lab.runtime.shapes import check_shapes
 from liex_lab.runtime.threads import threads
 
 Array = NDArray[np.float64]
@@ -278,6 +279,12 @@ def cut_nearest(
     Returns:
         n or 2 n height maps.
     """
+    check_shapes(
+        "pictures of hands",
+        ("depths", depths, ("n", "H", "W")),
+        ("intrinsics", intrinsics, ("n", 4)),
+        ("size", size, ("n",)),
+    )
     crops = HeightMaps.blank(n_things * len(depths), 1000.0)
     sights = kernels.HandSight(
         *range_mm,
@@ -299,7 +306,9 @@ def crop_cameras_of(crops: HeightMaps, intrinsics: Array, camera_view: bool) -> 
         intrinsics: (n, 4) fx, fy, cx, cy px of each picture.
         camera_view: as they were extracted.
     """
-    rotations = np.empty((len(crops.step), 3, 3))
+    n = len(crops.step)
+    check_shapes("height maps", ("intrinsics", intrinsics, (n, 4)))
+    rotations = np.empty((n, 3, 3))
     kernels.fill_rotations(intrinsics, crops.origin, crops.step, CROP, camera_view, rotations)
     return pack_crop_cameras(intrinsics, rotations, crops.distance, crops.origin, crops.step)
 

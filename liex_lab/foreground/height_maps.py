@@ -27,6 +27,7 @@ from liex_lab.foreground._blob_kernels import N_MOMENTS, BlobMoments
 from liex_lab.foreground._crop_camera_kernels import CropRows
 from liex_lab.foreground.crop_camera import pack_crop_cameras
 from liex_lab.optics.camera import Camera
+from liex_lab.runtime.shapes import check_shapes
 
 Array = NDArray[np.float64]
 
@@ -63,6 +64,19 @@ class HeightMaps:
     moments: Array
     distance: Array
     n_blobs: NDArray[np.int64]
+
+    def __post_init__(self) -> None:
+        """Refuse arrays that do not fit together, for kernels do not check them."""
+        check_shapes(
+            "height maps",
+            ("heights", self.heights, ("n", "S", "S")),
+            ("origin", self.origin, ("n", 2)),
+            ("step", self.step, ("n",)),
+            ("n_px", self.n_px, ("n",)),
+            ("moments", self.moments, ("n", N_MOMENTS)),
+            ("distance", self.distance, ("n",)),
+            ("n_blobs", self.n_blobs, ("n",)),
+        )
 
     @staticmethod
     def blank(n: int, distance_mm: Array | float) -> HeightMaps:
@@ -169,6 +183,17 @@ class Patches:
     inverse_depth: Array
     view: View = MOUSE_VIEW
 
+    def __post_init__(self) -> None:
+        """Refuse arrays that do not fit together, for kernels do not check them."""
+        check_shapes(
+            "patches",
+            ("depth", self.depth, ("n", "H", "W")),
+            ("background", self.background, ("n", "H", "W")),
+            ("intrinsics", self.intrinsics, ("n", 4)),
+            ("origin", self.origin, ("n", 2)),
+            ("inverse_depth", self.inverse_depth, ("n", 3)),
+        )
+
     def floor(self, k: int) -> Floor:
         """The floor of one patch.
 
@@ -204,6 +229,7 @@ class Patches:
             patches.
         """
         n = len(self.depth)
+        check_shapes("animals", ("area_mm2", area_mm2, (n,)), ("size", size, (n,)))
         distance = np.empty(n)
         # a window is the picture of a camera whose centre is shifted
         intrinsics = self.intrinsics.copy()

@@ -13,13 +13,15 @@ used (`estimation._cascade_kernels.mode_of_votes`).
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
 
-from liex_lab.forests._kernels import ONE_PROBE, SCALAR, TWO_PROBES, descend
+from liex_lab.forests._kernels import ONE_PROBE, SCALAR, TWO_PROBES, VIEW, descend
+from liex_lab.runtime.shapes import check_index, check_shapes
 
 Array = NDArray[np.float64]
 
@@ -39,6 +41,16 @@ class Forest:
     nodes: NDArray[np.int32]
     roots: NDArray[np.int32]
     leaves: NDArray[np.float32]
+
+    @cached_property
+    def reads(self) -> tuple[int, int]:
+        """How many views and how many scalars of a sample its tests read."""
+        tests = self.nodes[self.nodes[:, 2] >= 0, 3]
+        scalar = (tests & 3) == SCALAR
+        n_views, n_scalars = (
+            int(tests.max(where=each, initial=-1) >> 2) + 1 for each in (~scalar, scalar)
+        )
+        return n_views, n_scalars
 
     @property
     def n_trees(self) -> int:
@@ -158,6 +170,25 @@ def check_forest(forest: Forest, n_views: int, n_scalars: int, n_values: int) ->
         )
 
 
+def check_samples(forest: Forest, samples: Samples) -> None:
+    """Check that samples are as wide as the tests of a forest read.
+
+    Args:
+        forest: the forest that is asked.
+        samples: the samples that it is asked about.
+
+    Raises:
+        ValueError: the samples have fewer views or scalars than a test names.
+    """
+    n_views, n_scalars = forest.reads
+    given = samples.views.shape[1], samples.scalars.shape[1]
+    if given[0] < n_views or given[1] < n_scalars:
+        raise ValueError(
+            f"the forest reads {n_views} views and {n_scalars} scalars, but its samples have "
+            f"{given[0]} and {given[1]}; give it samples of the kind that it was grown on"
+        )
+
+
 @dataclass(frozen=True)
 class Samples:
     """What a forest is trained on or asked about: n samples on a set of height maps.
@@ -175,6 +206,18 @@ class Samples:
     inverse_size: NDArray[np.float32]
     views: NDArray[np.float32]
     scalars: NDArray[np.float32]
+
+    def __post_init__(self) -> None:
+        """Refuse arrays that do not fit together, for kernels do not check them."""
+        check_shapes(
+            "samples",
+            ("heights", self.heights, ("images", "S", "S")),
+            ("image", self.image, ("n",)),
+            ("inverse_size", self.inverse_size, ("n",)),
+            ("views", self.views, ("n", "V", VIEW)),
+            ("scalars", self.scalars, ("n", "n_scalars")),
+        )
+        check_index("height maps", self.image, len(self.heights))
 
     def __len__(self) -> int:
         """Number of samples."""
@@ -223,8 +266,11 @@ def predict(
     Returns:
         (n, D) float32 predictions.
     """
+    check_samples(forest, samples)
     out = np.zeros((len(samples), forest.leaves.shape[1]), np.float32)
     bag = np.zeros((forest.n_trees, 1), np.bool_) if in_bag is None else in_bag
+    if in_bag is not None:
+        check_shapes("a forest", ("in_bag", bag, (forest.n_trees, len(samples.heights))))
     _predict(
         forest.nodes,
         forest.roots,
@@ -250,6 +296,7 @@ def predict_each(forest: Forest, samples: Samples) -> NDArray[np.float32]:
     Returns:
         (n, T, D) float32, the votes of the single trees.
     """
+    check_samples(forest, samples)
     out = np.empty((len(samples), forest.n_trees, forest.leaves.shape[1]), np.float32)
     _predict_each(
         forest.nodes,

@@ -30,6 +30,7 @@ from liex_lab.forests._kernels import (
     response,
 )
 from liex_lab.forests.forest import Forest, Samples, predict
+from liex_lab.runtime.shapes import check_shapes
 
 _N_THRESHOLDS = 20
 _TREES_A_STAGE = 2
@@ -131,6 +132,8 @@ def grow_forest(
         The forest, and (T, n_images) bool, which images each tree was grown on.
     """
     n_images = len(samples.heights)
+    n = len(samples)
+    check_shapes("a forest's growth", ("labels", labels, (n, "D")), ("keep", keep, (n,)))
     in_bag = np.zeros((plan.n_trees, n_images), np.bool_)
     for t in range(plan.n_trees):
         in_bag[t, rng.permutation(n_images)[: max(1, round(plan.bag_share * n_images))]] = True
@@ -176,8 +179,9 @@ def boost_forest(
     """Grow a forest by stochastic gradient boosting of the squared error.
 
     Each pair of trees is grown in parallel, on different bags of images, on the residuals that the
-    pairs before it left (Friedman 2002, with two trees a stage). Leaves are scaled so that the mean
-    over trees, which is how every forest predicts, is the boosted sum.
+    pairs before it left (Friedman 2002, with two trees a stage); of an odd number the last tree is
+    a stage by itself. Leaves are scaled so that the mean over trees, which is how every forest
+    predicts, is the boosted sum.
 
     Args:
         samples: n samples with their features; all are learned from.
@@ -192,16 +196,14 @@ def boost_forest(
     mean = labels.mean(axis=0)
     left = (labels - mean).astype(np.float32)
     everything = np.ones(len(labels), np.bool_)
-    n_stages = max(1, plan.n_trees // _TREES_A_STAGE)
     trees = []
-    for _ in range(n_stages):
-        stage, _ = grow_forest(
-            samples, left, everything, replace(plan, n_trees=_TREES_A_STAGE), rng
-        )
+    for first in range(0, plan.n_trees, _TREES_A_STAGE):
+        n = min(_TREES_A_STAGE, plan.n_trees - first)
+        stage, _ = grow_forest(samples, left, everything, replace(plan, n_trees=n), rng)
         left -= shrinkage * predict(stage, samples)
-        trees.append(
-            Forest(stage.nodes, stage.roots, stage.leaves * np.float32(shrinkage * n_stages) + mean)
-        )
+        # the mean over all trees counts this stage's with n / n_trees
+        share = np.float32(shrinkage * (plan.n_trees / n))
+        trees.append(Forest(stage.nodes, stage.roots, stage.leaves * share + mean))
     return Forest.join(trees)
 
 

@@ -63,3 +63,31 @@ def brownian_path(start: SE3, steps: ArrayLike, delta: float, times: ArrayLike) 
         np.stack([nodes[k].translation for k in before]),
     )
     return at_node @ SE3.exp(((t - before * delta) / np.sqrt(delta))[:, None] * z[before])
+
+
+def brownian_ends(start: SE3, steps: ArrayLike, delta: float, time: float) -> SE3:
+    """Where many paths g(t) are at one time, by Lie-X Eq. 6 and 7.
+
+    Args:
+        start: a batch (n,), the elements g(0).
+        steps: (n, n_steps, 6) tangent steps z of each path.
+        delta: step length, s.
+        time: s, in [0, n_steps * delta].
+
+    Returns:
+        A batch (n,).
+
+    Raises:
+        ValueError: a time outside the paths, or a delta that is not positive.
+    """
+    z = np.asarray(steps, float)
+    n_steps = z.shape[1]
+    if not delta > 0 or not 0 <= time <= n_steps * delta * (1 + 1e-12):
+        raise ValueError(
+            f"the time must lie within the paths, 0 to {n_steps * delta} s, got {time} s"
+        )
+    end = start
+    for k in range(n_steps):
+        spent = min(max(time - k * delta, 0.0), delta)
+        end = end @ SE3.exp(spent / np.sqrt(delta) * z[:, k])
+    return end

@@ -43,7 +43,6 @@ class Recording:
             read-only.
         problems: sentences about what is odd in the file, also those found while reading.
         truncated: True where the file is cut or damaged.
-        n_whole: how many of the frames are whole.
         metadata: facts that the files state, such as subject_id and session_start_time (ISO 8601
             with zone).
         optics: what was undone on reading (distortion, water, mirroring), empty where nothing was;
@@ -61,7 +60,7 @@ class Recording:
         sources: Sequence[Path] = (),
         problems: list[str] | None = None,
         truncated: bool = False,
-        n_whole: int | None = None,
+        whole: NDArray[np.bool_] | None = None,
         metadata: dict[str, Any] | None = None,
         close: Callable[[], None] | None = None,
         step_ns: int | None = None,
@@ -80,7 +79,7 @@ class Recording:
             sources: the files of the input, for `digest`; empty for a recording that is in no file.
             problems: sentences about what is odd; the list is shared, so reading may append to it.
             truncated: whether the file is cut or damaged.
-            n_whole: how many frames are whole; None for all.
+            whole: (n,) bool, which frames are whole; None for all.
             metadata: facts that the files state.
             close: lets go of open files; called once, at the latest when nobody holds the
                 recording.
@@ -101,12 +100,12 @@ class Recording:
         self.times_ns = np.ascontiguousarray(times_ns, np.int64)
         self.problems: list[str] = [] if problems is None else problems
         self.truncated = truncated
-        self.n_whole = len(self.times_ns) if n_whole is None else n_whole
         self.metadata: dict[str, Any] = {} if metadata is None else dict(metadata)
         self.optics: dict[str, Any] = {}
         self._read = read
         self._sources = tuple(sources)
         self._stored = np.arange(len(self.times_ns)) if stored is None else stored
+        self._whole_frames = np.ones(len(self.times_ns), np.bool_) if whole is None else whole
         self._faults = np.zeros(len(self.times_ns), np.uint8) if faults is None else faults
         self._step_ns = median_step(self.times_ns) if step_ns is None else step_ns
         self._digest: str | None = None
@@ -123,6 +122,11 @@ class Recording:
         self.times_ns.flags.writeable = False
         # at the latest when nobody holds the recording any more, or the program ends
         self._close = None if close is None else weakref.finalize(self, close)
+
+    @property
+    def n_whole(self) -> int:
+        """How many of the frames are whole."""
+        return int(self._whole_frames.sum())
 
     @property
     def width(self) -> int:
@@ -254,6 +258,7 @@ class Recording:
             sources=self._sources,
             problems=self.problems,
             truncated=self.truncated,
+            whole=self._whole_frames[rows],
             metadata=self.metadata,
             step_ns=self._step_ns * step,
             stored=self._stored[rows],
@@ -295,7 +300,7 @@ class Recording:
             sources=self._sources,
             problems=self.problems,
             truncated=self.truncated,
-            n_whole=self.n_whole,
+            whole=self._whole_frames,
             metadata=self.metadata,
             step_ns=self._step_ns,
             stored=self._stored,

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.runtime.memory import Allocator, blocks
+from liex_lab.runtime.shapes import check_shapes
 from liex_lab.tracking import _association_kernels as kernels
 from liex_lab.tracking.observations import Observations
 
@@ -108,7 +109,8 @@ class HypothesisAssociation:
             allocate: allocator of intermediate arrays.
 
         Returns:
-            (n,) int64 index of the hypothesis, `NONE` where the frame was passed by.
+            (n,) int64 index of the hypothesis, `NONE` where the frame was passed by; in all frames
+            where no chain costs less than to pass all of them by, unless a decision stands.
         """
         n, h = seen.score.shape
         emission = self._emission(seen, allocate)
@@ -120,15 +122,28 @@ class HypothesisAssociation:
         cost = allocate((n, h), float)
         parent = allocate((n, h, 2), np.int64)
         joints = self.joints(seen) if joints is None else joints
+        check_shapes("hypotheses", ("joints", joints, (n, h, len(self._joints), 3)))
         chains = kernels.Chains(np.zeros((_BEAM, 2), np.int64), cost, parent)
         frames = kernels.Hypotheses(seen.seconds, joints, seen.error_mm, emission, missed_cost)
         n_beam = 0
         for rows in blocks(n, _BLOCK):
             n_beam = kernels.extend_all(rows.start, rows.stop, chains, n_beam, frames, self._costs)
         path = np.full(n, NONE, np.int64)
-        if n_beam:
+        if n_beam and self._is_worth(chains.beam[0], cost, missed_cost, told):
             kernels.trace_back(chains.beam[0, 0], chains.beam[0, 1], parent, 0, path)
         return path
+
+    @staticmethod
+    def _is_worth(
+        last: NDArray[np.int64], cost: Array, missed_cost: Array, told: NDArray[np.int64] | None
+    ) -> bool:
+        """Whether the chain that ends in the link `last` is likelier than that no frame shows the
+        animal: the empty chain misses every frame.
+        """
+        if told is not None and (told != NONE).any():
+            return True
+        passed_after = missed_cost[-1] - missed_cost[last[0] + 1]
+        return bool(cost[last[0], last[1]] + passed_after <= missed_cost[-1])
 
     def _emission(self, seen: Observations, allocate: Allocator) -> Array:
         """Emission cost (n, H) of each hypothesis, nats: its capped score; NaN without."""
@@ -173,6 +188,11 @@ class HypothesisAssociation:
         if not len(used):
             return doubt
         joints = self.joints(seen) if joints is None else joints
+        check_shapes(
+            "hypotheses",
+            ("joints", joints, (*seen.score.shape, len(self._joints), 3)),
+            ("path", path, (len(joints),)),
+        )
         one, two = (allocate((len(used), *joints.shape[2:]), joints.dtype) for _ in range(2))
         for part in blocks(len(used), _BLOCK):
             taken = path[used[part]]

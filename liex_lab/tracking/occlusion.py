@@ -21,6 +21,7 @@ from liex_lab.body.skeleton import Skeleton
 from liex_lab.foreground.height_maps import HeightMaps
 from liex_lab.foreground.segmenter import Segmenter
 from liex_lab.geometry import SE3
+from liex_lab.runtime.shapes import check_shapes
 from liex_lab.tracking.observations import joints_of
 
 Array = NDArray[np.float64]
@@ -112,6 +113,10 @@ class OcclusionCorrection:
         Its joints (n, J, 3) mm are in the camera frame.
         """
         ends = self.scene.camera.project(joints[:, [0, self.skeleton.tip]])
+        n = len(ends)
+        check_shapes(
+            "poses", ("heights", crops.heights, (n, "S", "S")), ("depths", depths, (n, "H", "W"))
+        )
         out = np.zeros((len(ends), 5))
         before = _BEFORE * float(np.sqrt(self.scene.area_mm2))
         _look(crops.heights, crops.origin, crops.step, crops.distance, depths, ends, before, out)

@@ -3,13 +3,15 @@
 1. Select: draw K particles from the cumulative weights.
 2. Propagate: the base joint by a left-invariant Brownian step, g exp(sqrt(δ) ξ) with ξ ~ N(0, C)
    (Eq. 6 and 7); every other joint by the cascade's regressors from its parent (Eq. 10).
+   The paper does not say whether the base's own regressors run after its step; `base_rounds` of
+   `ParticleFilter` is the reading.
 3. Measure: m is the learned metric's score; w = exp(-m^2 / 2 σ^2) (Eq. 12), normalised to sum 1
    (Eq. 13).
 4. Estimate: the weighted average of tangent vectors (Eq. 14), taken about itself: the intrinsic
    mean on the group.
 
-What the paper leaves open is stated in `Wander` and in `ParticleFilter`. The filter keeps its row
-in the tables of the evaluation; the default tracker is `curve` (`offline`).
+What the paper leaves open is stated in `ProcessNoise` and in `ParticleFilter`. The filter keeps its
+rows in the tables of the evaluation; the default tracker is `curve` (`offline`).
 """
 
 from __future__ import annotations
@@ -25,7 +27,7 @@ from liex_lab.estimation.estimator import Estimates, PoseEstimator
 from liex_lab.foreground.crop_camera import view_of
 from liex_lab.foreground.segmenter import Segmenter
 from liex_lab.forests.forest import predict
-from liex_lab.geometry import SE3, brownian_path, brownian_steps, so3
+from liex_lab.geometry import SE3, brownian_ends, brownian_steps, so3
 from liex_lab.recordings.frame import DepthFrame
 
 Array = NDArray[np.float64]
@@ -34,8 +36,8 @@ _AVERAGING_PASSES = 10
 
 
 @dataclass(frozen=True)
-class Wander:
-    """What the paper leaves open: how far base joints wander, and how the metric's scores weigh.
+class ProcessNoise:
+    """Process noise of the base joint, and how the metric's scores weigh: left open by the paper.
 
     Lengths are those of an animal of the reference length.
 
@@ -54,18 +56,27 @@ class Wander:
     sigma_mm: float = 2.0
 
     @staticmethod
-    def of(name: str) -> Wander:
+    def of(name: str, variant: str = "default", base_rounds: int = 0) -> ProcessNoise:
         """The parameters of an animal.
 
         A fish goes and turns three times as far, by its length, between two frames as a mouse.
+        Those of the paper's variant were searched on sequences to develop on (`liex train tracking
+        --particles`).
 
         Args:
             name: name of the skeleton; 'fish' has its own, all others the default.
+            variant: whose regressors and metric are used, 'default' or 'paper'.
+            base_rounds: rounds of the base joint, see `ParticleFilter`.
 
         Returns:
-            The parameters.
+            The parameters; the animal's own where none were searched for the variant.
         """
-        return Wander(turn_rad=0.45, shift_mm=12.0) if name == "fish" else Wander()
+        own = ProcessNoise(turn_rad=0.45, shift_mm=12.0) if name == "fish" else ProcessNoise()
+        return _SEARCHED.get((name, variant, base_rounds), own)
+
+
+# by animal, variant and rounds of the base joint
+_SEARCHED: dict[tuple[str, str, int], ProcessNoise] = {}
 
 
 @dataclass
@@ -82,15 +93,17 @@ class ParticleFilter:
 
     Selection, propagation of the base by Eq. 7 and of the other joints by Eq. 10, measurement by
     the learned metric with Eq. 12 and 13, and Eq. 14, where the average of tangent vectors is taken
-    about itself, that is on the group. Each particle keeps the bones' scale of the first frame. In
-    a frame without a foreground particles wander on.
+    about itself, that is on the group. Each particle keeps the bones' scale of the first frame
+    unless a base round corrects it. In a frame without a foreground particles wander on.
 
     Args:
         estimator: the pose estimator whose regressors and metric are used.
         scene: the segmenter of the recording's camera.
         size: the animal's spine over the skeleton's home length.
         rng: source of the Brownian steps and of the selection.
-        how: parameters; None takes the animal's own.
+        noise: process noise; None takes the animal's own.
+        base_rounds: so many of the base joint's last regression rounds run on every particle after
+            its Brownian step; 0: none, as the paper's words have it.
     """
 
     def __init__(
@@ -99,13 +112,15 @@ class ParticleFilter:
         scene: Segmenter,
         size: float,
         rng: np.random.Generator,
-        how: Wander | None = None,
+        noise: ProcessNoise | None = None,
+        base_rounds: int = 0,
     ) -> None:
         self._estimator = estimator
         self._scene = scene
         self._size = size
         self._rng = rng
-        self._how = how or Wander.of(estimator.skeleton.name)
+        self._noise = noise or ProcessNoise.of(estimator.skeleton.name)
+        self._base_rounds = base_rounds
         self._particles: _Particles | None = None
         self._last_ns = 0
 
@@ -136,7 +151,8 @@ class ParticleFilter:
         T_view_camera = SE3(view.rotation[0], view.translation[0])
         images = ImageSet(crops.heights, crop_cameras, crops.moments)
         rotations, positions, score = self._measure(images, T_view_camera @ self._particles.base)
-        w = np.exp(-(score**2 - (score**2).min()) / (2.0 * (self._how.sigma_mm * self._unit) ** 2))
+        sigma = self._noise.sigma_mm * self._unit
+        w = np.exp(-(score**2 - (score**2).min()) / (2.0 * sigma**2))
         self._particles.weight = w / w.sum()
         pose = self._average(rotations, positions).moved(T_view_camera.inverse())
         self._particles.base = T_view_camera.inverse() @ SE3(rotations[:, 0], positions[:, 0])
@@ -149,7 +165,7 @@ class ParticleFilter:
         return self._estimator.skeleton.relative_size
 
     def _begin(self, found: Estimates) -> tuple[Pose, float]:
-        k = self._how.n_particles
+        k = self._noise.n_particles
         pose = found.chosen.pose
         base = SE3(
             np.repeat(pose.root.rotation, k, axis=0), np.repeat(pose.root.translation, k, axis=0)
@@ -163,7 +179,7 @@ class ParticleFilter:
         """Selection: draw particles from the cumulative weights; all weigh the same afterwards."""
         assert self._particles is not None
         p = self._particles
-        k = self._how.n_particles
+        k = self._noise.n_particles
         total = np.cumsum(p.weight)
         drawn = np.searchsorted(total, self._rng.random(k) * total[-1])
         self._particles = _Particles(
@@ -175,17 +191,13 @@ class ParticleFilter:
     def _propagate(self, dt: float) -> None:
         """Propagation: move every base joint along a Brownian path of dt seconds (Eq. 7)."""
         assert self._particles is not None
-        how = self._how
+        noise = self._noise
         p = self._particles
-        spread = np.array([how.turn_rad] * 3 + [how.shift_mm * self._size * self._unit] * 3)
-        n_steps = max(1, int(np.ceil(dt / how.delta_s - 1e-9)))
+        spread = np.array([noise.turn_rad] * 3 + [noise.shift_mm * self._size * self._unit] * 3)
+        n_steps = max(1, int(np.ceil(dt / noise.delta_s - 1e-9)))
         # the deviations are those of a whole step, so steps are drawn for a unit of time of delta_s
         steps = brownian_steps(self._rng, np.diag(spread**2), n_steps, len(p.scale))
-        for i in range(len(p.scale)):
-            start = SE3(p.base.rotation[i], p.base.translation[i])
-            end = brownian_path(start, steps[i], 1.0, min(dt / how.delta_s, float(n_steps)))
-            p.base.rotation[i] = end.rotation[0]
-            p.base.translation[i] = end.translation[0]
+        p.base = brownian_ends(p.base, steps, 1.0, min(dt / noise.delta_s, float(n_steps)))
 
     def _measure(self, images: ImageSet, base: SE3) -> tuple[Array, Array, Array]:
         """All joints of the particles, regressed from their bases, and the metric's scores (K,).
@@ -204,19 +216,17 @@ class ParticleFilter:
             self._particles.scale,
             np.full(k, self._size),
         )
-        for joint, rounds in zip(cascade.skeleton.solved[1:], cascade.forests[1:], strict=True):
-            cascade.place(candidates, joint)
-            for forest in rounds:
+        for joint, rounds in zip(cascade.skeleton.solved, cascade.forests, strict=True):
+            if joint:
+                cascade.place(candidates, joint)
+            for forest in rounds if joint else rounds[len(rounds) - self._base_rounds :]:
                 cascade.apply(
                     candidates, joint, predict(forest, cascade.samples(images, candidates, [joint]))
                 )
         cascade.place_ends(candidates)
-        everything = cascade.samples(images, candidates, list(range(cascade.skeleton.n_joints)))
-        return (
-            candidates.rotations,
-            candidates.positions,
-            predict(model.metric, everything)[:, 0].astype(float),
-        )
+        self._particles.scale = candidates.scale  # a base round may have corrected it
+        scores = predict(model.metric, cascade.metric_samples(images, candidates))
+        return candidates.rotations, candidates.positions, scores[:, 0].astype(float)
 
     def _average(self, rotations: Array, positions: Array) -> Pose:
         """Eq. 14 about the average itself: the base on SE(3), other joints on their axes."""

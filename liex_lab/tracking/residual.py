@@ -21,6 +21,7 @@ from liex_lab.body.surface import Surface, render_meshes
 from liex_lab.foreground.height_maps import CROP, HeightMaps
 from liex_lab.foreground.segmenter import Segmenter
 from liex_lab.geometry import SE3
+from liex_lab.runtime.shapes import check_shapes
 
 Array = NDArray[np.float64]
 
@@ -84,6 +85,7 @@ class BodyResidual:
             The agreement of each pose with its height map.
         """
         n = len(pose_arena.scale)
+        check_shapes("poses", ("heights", crops.heights, (n, CROP, CROP)))
         if n == 0:
             return Agreement(np.zeros(0), np.zeros(0), np.zeros(0))
         rendered = render_crops(self.surface, pose_arena, self.girth, crops, scene)
@@ -110,13 +112,19 @@ class BodyResidual:
             camera_view: how the height maps were cut, see `BackgroundSubtraction.extract`.
 
         Returns:
-            The body whose median residual over the frames is least; the thinnest where no pose
-            overlaps what was read.
+            The body whose median residual over the frames is least; the default girth where no
+            frame shows enough of any body.
         """
-        bodies = [BodyResidual(surface, float(girth), camera_view) for girth in _GIRTHS]
         placed = pose_arena.placed(surface.skeleton)
-        cost = [_median(body.of(placed, crops, scene)) for body in bodies]
-        return bodies[int(np.argmin(cost))]
+        best = BodyResidual(surface, camera_view=camera_view)
+        least = np.inf
+        for girth in _GIRTHS:
+            body = BodyResidual(surface, float(girth), camera_view)
+            cost = _median(body.of(placed, crops, scene))
+            if cost < least:
+                best = body
+                least = cost
+        return best
 
 
 def _median(residual_mm: Array) -> float:

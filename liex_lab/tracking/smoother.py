@@ -21,6 +21,7 @@ from liex_lab.body.kinematic_tree import KinematicTree
 from liex_lab.body.pose import Pose
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.geometry import SE3
+from liex_lab.runtime.shapes import check_shapes
 from liex_lab.tracking import _smoother_kernels as kernels
 from liex_lab.tracking.observations import joints_of
 
@@ -188,8 +189,15 @@ def smooth(
     Returns:
         A curve of n frames; all NaN where nothing was measured.
     """
-    known = np.isfinite(pose.scale) & np.isfinite(error_mm)
     n = len(seconds)
+    check_shapes(
+        "a track",
+        ("rotations", pose.root.rotation, (n, 3, 3)),
+        ("angles", pose.angles, (n, skeleton.n_joints, 3)),
+        ("scales", pose.scale, (n,)),
+        ("error_mm", error_mm, (n,)),
+    )
+    known = np.isfinite(pose.scale) & np.isfinite(error_mm)
     if not known.any():
         return Curve.unknown(n, skeleton.n_joints)
     seen = kernels.Poses(

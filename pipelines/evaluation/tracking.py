@@ -5,9 +5,12 @@
 a bar before the animal, a second object, an animal lost in floor or glare, and fast motion). Rows:
 
 - single: what each frame says by itself (Algorithm 1);
-- algorithm3: the paper's particle filter, 200 particles (section 4.2, Algorithm 3);
+- algorithm3: the paper's particle filter, 200 particles (section 4.2, Algorithm 3), on our
+  regressors and our metric;
 - online: the default tracker (association by Viterbi, Kalman smoothing), `ONLINE_LAG` frames late;
-- smoothed: the default tracker over the whole sequence.
+- smoothed: the default tracker over the whole sequence;
+- algorithm1_paper, algorithm3_paper, algorithm3_paper_base_round, if asked for: the paper's own
+  comparison, with the parts of its variant, see `paper.algorithm3`.
 
 Numbers: mean and 95 % of the mean joint error, mm, and their ratios to single frames; the same over
 frames in view, where a missing pose counts as half the length; share of lost frames; longest run of
@@ -27,8 +30,10 @@ from numpy.typing import NDArray
 
 from liex_lab.evaluation.tracking import TRACKING_PROTOCOL, Followed, figures
 from liex_lab.runtime.progress import Progress, silent
+from liex_lab.tracking.particles import ProcessNoise
 
 from ..build import build_scene, plan_of
+from .paper.algorithm3 import PAPER_ROWS, SINGLE, comparison, follow, paper_rows
 from .pose import estimator_of
 
 if TYPE_CHECKING:
@@ -42,6 +47,15 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 ROWS = ("single", "algorithm3", "online", "smoothed")
+ROW_NAMES = {
+    "single": "single frames",
+    "algorithm3": "Algorithm 3 on our parts",
+    "online": "default tracker, online",
+    "smoothed": "default tracker",
+    "algorithm1_paper": "Algorithm 1 on the paper's parts",
+    "algorithm3_paper": "Algorithm 3 on the paper's parts",
+    "algorithm3_paper_base_round": "Algorithm 3 on the paper's parts, one base round",
+}
 ONLINE_LAG = 5  # frames
 _CHUNK = 32
 # chunks that the tracker is timed on, and how often
@@ -70,6 +84,7 @@ def evaluate_tracking(
     *,
     model: str | Path | None = None,
     rows: Sequence[str] = ROWS,
+    paper: bool = False,
     seeds: Sequence[int] = (),
     n_frames: int | None = None,
     draw: Callable[[TestSequence, dict[str, Followed]], object] | None = None,
@@ -82,6 +97,8 @@ def evaluate_tracking(
         sequence: `easy` or `hard`.
         model: another pose model than the animal's own.
         rows: only some of `ROWS`.
+        paper: also measure the paper's own comparison, with the parts of its variant, which is
+            trained where it has not been.
         seeds: of other sequences of the same kind, whose frames are taken together; () takes the
             fixed one.
         n_frames: length of each sequence; None takes the usual one.
@@ -89,7 +106,8 @@ def evaluate_tracking(
         progress: told chunk by chunk.
 
     Returns:
-        `rows` of figures by name, `speed`, `online_lag_frames` and the protocol.
+        `rows` of figures by name, `row_names`, `speed`, `online_lag_frames`, the protocol, and
+        `notes` where there are any.
     """
     from liex_lab.body.skeleton import Skeleton
     from liex_lab.simulation.simulator import world_of
@@ -98,28 +116,38 @@ def evaluate_tracking(
     world = world_of(Skeleton.load(animal))
     plan = plan_of(animal)
     estimator = estimator_of(animal, "default", progress, *(() if model is None else (model,)))
+    rival = estimator_of(animal, "paper", progress) if paper else None
     measured = []
     for seed in seeds or (None,):
         recording = tracking_sequence(world, sequence, seed=seed, n_frames=n_frames)
-        measured.append(follow_sequence(recording, estimator, plan, rows, progress))
+        found = follow_sequence(recording, estimator, plan, rows, progress)
+        if rival is not None:
+            found.rows.update(paper_rows(recording, rival, plan, progress))
+        measured.append(found)
     events = [m.sequence.events for m in measured]
     length = float(np.mean([m.sequence.spine_mm for m in measured]))
     table = {
         name: figures(
-            [m.rows[name] for m in measured], [m.rows["single"] for m in measured], events, length
+            [m.rows[name] for m in measured],
+            [m.rows[SINGLE if name in PAPER_ROWS else "single"] for m in measured],
+            events,
+            length,
         )
         for name in measured[0].rows
-        if name in rows
+        if name in rows or name in PAPER_ROWS
     }
     result = {
         "animal": animal,
         "sequence": sequence,
         "n_frames": sum(len(m.sequence) for m in measured),
         "rows": table,
+        "row_names": {name: ROW_NAMES[name] for name in table},
         "speed": measured[0].speed,
         "online_lag_frames": ONLINE_LAG,
         "protocol": TRACKING_PROTOCOL,
     }
+    if paper:
+        result["notes"] = [comparison(table)]
     if draw is not None:
         draw(measured[0].sequence, measured[0].rows)
     return result
@@ -189,14 +217,9 @@ def follow_sequence(
         put("online", track, seconds["observe"] + time.perf_counter() - began)
     if "algorithm3" in rows:
         progress(0, n, f"Algorithm 3 on {recording.name}")
-        began = time.perf_counter()
-        joints, sd = _algorithm3(tracker, recording, plan.seed)
-        found["algorithm3"] = Followed(
-            recording.T_arena_camera @ joints,
-            recording.joints_arena,
-            sd,
-            n / (time.perf_counter() - began),
-            tip,
+        noise = ProcessNoise.of(estimator.skeleton.name)
+        found["algorithm3"] = follow(
+            recording, estimator, tracker.scene, tracker.size, noise, 0, plan.seed
         )
     progress(0, n, "timing the tracker")
     return Measured(
@@ -231,25 +254,3 @@ def _online(tracker: FrameTracker, seen: Observations) -> Track:
 
     online = OnlineTracker(tracker.subject, ONLINE_LAG)
     return Track.join([part for part in (online.add(seen), online.close()) if part is not None])
-
-
-def _algorithm3(tracker: FrameTracker, recording: TestSequence, seed: int) -> tuple[Array, Array]:
-    """Joints (n, J, 3) mm in the camera frame and their standard deviations (n, J) by Algorithm 3;
-    NaN where it has no estimate.
-    """
-    from liex_lab.tracking.particles import ParticleFilter
-
-    skeleton = tracker.estimator.skeleton
-    filter = ParticleFilter(
-        tracker.estimator, tracker.scene, tracker.size, np.random.default_rng(seed)
-    )
-    joints = np.full((len(recording), skeleton.n_joints, 3), np.nan)
-    sd = np.full(joints.shape[:2], np.nan)
-    share = np.array(tracker.subject.joint_share) / np.sqrt(3.0)
-    for frames in recording.chunks(_CHUNK):
-        for frame in frames:
-            step = filter.step(frame)
-            if step is not None:
-                joints[frame.index] = step[0].joints(skeleton)
-                sd[frame.index] = step[1] * share
-    return joints, sd

@@ -43,10 +43,16 @@ class Training:
     plan: ForestPlan | CnnPlan
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain values of the training, a cache key: equal values mean equal training."""
-        plain: dict[str, Any] = json.loads(
-            json.dumps({"recipe": vars(self.recipe), "plan": asdict(self.plan)})
-        )
+        """Plain values of the training, a cache key: equal values mean equal training.
+
+        A turn of the home pose that is none is left out, for plans did not always have one.
+        """
+        plan = {
+            name: value
+            for name, value in asdict(self.plan).items()
+            if name != "home_turn" or any(value)
+        }
+        plain: dict[str, Any] = json.loads(json.dumps({"recipe": vars(self.recipe), "plan": plan}))
         return plain
 
 
@@ -65,12 +71,16 @@ def training_of(variant: str, skeleton: Skeleton) -> Training:
         variant: `rf` or `cnn`, a key of `BASELINES`.
         skeleton: the animal's skeleton.
     """
+    from liex_lab.estimation.method import method_of
+
     from .pose_model import recipe_of
 
     recipe = replace(recipe_of("paper", skeleton), n_calibration=0)
     plan = BASELINES[variant]
     if isinstance(plan, CnnPlan):
         plan = replace(plan, epochs=round(_SEEN / recipe.n_images))
+    else:
+        plan = replace(plan, home_turn=method_of("paper", skeleton).home_turn)
     return Training(recipe, plan)
 
 

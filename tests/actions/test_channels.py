@@ -91,6 +91,21 @@ def test_the_papers_descriptors_have_252_and_888_numbers_and_do_not_depend_on_th
     assert np.abs(position_descriptor(track) - joints).max() > 5.0
 
 
+def test_the_halves_of_a_fish_are_its_joints_2_to_10_and_11_to_the_last() -> None:
+    """Counted from 1 with the base, as in the paper: the hinge of joint 11 is the hind half's."""
+    clock = np.arange(0.0, 1.0, 0.02)
+    track = straight_track("fish", clock, 60.0 * clock, 0.0 * clock)
+    still = tangent_descriptor(track)
+    # the whole sequence comes last: 18 means, then 18 deviations
+    front, hind = slice(-30, -27), slice(-24, -21)
+    for joint, half, other, n in ((9, front, hind, 9), (10, hind, front, 10)):
+        track.angles_rad[:] = 0.0
+        track.angles_rad[:, joint, 2] = 0.9
+        moved = tangent_descriptor(track) - still
+        np.testing.assert_allclose(moved[half], [0.0, 0.0, 0.9 / n], atol=1e-6)
+        np.testing.assert_allclose(moved[other], 0.0, atol=1e-6)
+
+
 @pytest.mark.parametrize("rate_hz", [15.0, 100.0])
 def test_channels_made_piece_by_piece_are_those_made_at_once(
     rate_hz: float, monkeypatch: pytest.MonkeyPatch, tmp_path: Path

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from liex_lab.pipelines.training.baselines import training_of
 
 from liex_lab.baselines import _forest as kernels
 from liex_lab.baselines.ablations import PlainMean
@@ -17,6 +18,7 @@ from liex_lab.baselines.baseline import see
 from liex_lab.baselines.forest import (
     ForestPlan,
     RegressionForest,
+    as_seen,
     coordinates,
     levers,
     train_forests,
@@ -29,6 +31,7 @@ from liex_lab.estimation.estimator import PoseEstimator
 from liex_lab.estimation.method import METHODS
 from liex_lab.forests.grow import GrowthPlan
 from liex_lab.geometry import SE3, so3
+from liex_lab.simulation.hand.pose_prior import draw_seen
 from tests.estimation.toy import FLOOR, SCENE, Toy, toy_mice, trained, training_set, unseen
 
 PAPER = METHODS["paper"]
@@ -99,6 +102,34 @@ def test_the_true_coordinates_unfold_to_the_true_pose():
         )
         np.testing.assert_allclose(positions, data.truth.positions[k], atol=1e-6)
         assert scale == pytest.approx(data.truth.scale[k])
+
+
+def test_a_hand_that_shows_its_palm_is_near_the_pose_that_f2_begins_at():
+    """From an upright start it is turned by half a turn, and F2 would not learn from it."""
+    skeleton = Skeleton.load("hand")
+    turn = training_of("rf", skeleton).plan.home_turn
+    _, turns = draw_seen(np.random.default_rng(0), skeleton, 400)
+    headings = np.arctan2(turns[:, 1, 0], turns[:, 0, 0])
+    flat = so3.exp(np.stack([0 * headings, 0 * headings, headings], axis=1))
+    off = [
+        np.linalg.norm(so3.log(np.swapaxes(flat @ start, 1, 2) @ turns), axis=1)
+        for start in (np.eye(3), so3.exp(np.array(turn)))
+    ]
+    assert (off[0] < np.pi / 2).mean() < 0.25
+    assert (off[1] < np.pi / 2).mean() > 0.7
+
+
+@pytest.mark.parametrize("turn", [(0.0, 0.0, 0.0), (3.1416, 0.0, 0.0), (0.3, -0.2, 2.0)])
+def test_a_body_with_a_turned_home_has_the_same_poses(turn):
+    skeleton = Skeleton.load("hand")
+    rng = np.random.default_rng(1)
+    root = SE3.exp(rng.normal(0, 1, (6, 6)) * [1, 1, 1, 40, 40, 40])
+    angles = rng.normal(0, 0.4, (6, skeleton.n_joints, 3)) * skeleton.axes
+    angles[:, 0] = 0.0
+    joints = Pose(root, angles, np.ones(6)).joints(skeleton)
+    turned = SE3(root.rotation @ so3.exp(np.array(turn)).T, root.translation)
+    again = Pose(turned, angles, np.ones(6)).joints(as_seen(skeleton, turn))
+    np.testing.assert_allclose(again, joints, atol=1e-9)
 
 
 @given(n_points=st.integers(1, 40), phase=st.floats(0.0, 0.999))

@@ -13,7 +13,13 @@ from liex_lab.pipelines.evaluation.statistics import PLANS, StudyPlan, error_rat
 from liex_lab.behaviour import measure_session
 from liex_lab.behaviour.cohort import STATS, collect, compare, methods
 from liex_lab.behaviour.design import CAGE, PAIRED, NotComparable, Units, find_units
-from liex_lab.behaviour.statistics import arrangements, estimate, permutation, smallest_p
+from liex_lab.behaviour.statistics import (
+    MOST_EXACT,
+    arrangements,
+    estimate,
+    permutation,
+    smallest_p,
+)
 from tests.sessions.walking_mouse import WalkingMouse, steady, write
 
 RNG = np.random.default_rng(0)
@@ -281,3 +287,41 @@ def test_a_large_effect_is_found():
 def test_what_a_permutation_can_reach_is_told():
     assert smallest_p(units_of(study(4))) == pytest.approx(2 / 70)  # two-sided 0.029
     assert smallest_p(units_of(study(3))) == pytest.approx(0.1)
+
+
+@pytest.mark.parametrize(
+    "second",
+    [
+        {0: "0011", 1: "01"},
+        {0: "0011", 1: "000"},  # a block of one group has one arrangement, which mirrors itself
+        {0: "0011", 1: "111", 2: "01"},
+        {0: "001", 1: "0011"},
+        {0: "00111"},
+        {0: "0", 1: "11"},
+    ],
+)
+def test_the_smallest_p_is_that_of_the_largest_difference_there_can_be(second):
+    """The clearest study of its design: every unit of the second group above every other."""
+    block = np.concatenate([[number] * len(groups) for number, groups in second.items()])
+    flags = np.array([flag == "1" for groups in second.values() for flag in groups])
+    rng = np.random.default_rng(4)
+    reached = []
+    for _ in range(20):
+        values = rng.exponential(1.0, len(flags)) + 50.0 * flags
+        units = Units("animal", values, flags, block, np.ones(len(flags), np.int64))
+        reached.append(permutation(units, rng))
+    assert smallest_p(units) == pytest.approx(min(reached))
+
+
+def test_drawn_arrangements_cannot_reach_less_than_one_in_their_number():
+    n = 12
+    flags = np.arange(2 * n) >= n
+    units = Units(
+        "animal",
+        50.0 * flags.astype(np.float64),
+        flags,
+        np.zeros(2 * n, np.int64),
+        np.ones(2 * n, np.int64),
+    )
+    assert smallest_p(units) == pytest.approx(permutation(units, np.random.default_rng(0)), rel=0.5)
+    assert smallest_p(units) == 1.0 / (1 + MOST_EXACT)

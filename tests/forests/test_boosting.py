@@ -84,3 +84,18 @@ def test_joined_forests_predict_as_each_of_them_alone(numbers):
     )
     third = Forest(joined.nodes, joined.roots[2 * PLAN.n_trees :], joined.leaves)
     np.testing.assert_array_equal(predict(third, samples), predict(parts[2], samples))
+
+
+@pytest.mark.parametrize("n_trees", [1, 5])
+def test_no_tree_of_an_odd_number_is_lost(numbers, n_trees):
+    samples, labels = numbers
+    plan = GrowthPlan(**{**vars(PLAN), "n_trees": n_trees})
+    boosted = boost_forest(samples, labels, plan, 0.3, np.random.default_rng(2))
+    assert boosted.n_trees == n_trees
+    mean = labels.mean(axis=0)
+    total = np.zeros_like(labels)
+    for first in range(0, n_trees, 2):
+        stage = Forest(boosted.nodes, boosted.roots[first : first + 2], boosted.leaves)
+        total += (predict(stage, samples) - mean) * (stage.n_trees / n_trees)
+    np.testing.assert_allclose(predict(boosted, samples), mean + total, atol=1e-3)
+    assert np.std(predict(boosted, samples) - labels) < np.std(labels)

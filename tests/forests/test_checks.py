@@ -11,8 +11,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from liex_lab.forests._kernels import ONE_PROBE, SCALAR, number_nodes
-from liex_lab.forests.forest import Forest, check_forest, check_roots
+from liex_lab.forests._kernels import ONE_PROBE, SCALAR, VIEW, number_nodes
+from liex_lab.forests.forest import (
+    Forest,
+    Samples,
+    check_forest,
+    check_roots,
+    predict,
+    predict_each,
+)
 
 N_VIEWS, N_SCALARS, N_VALUES = 2, 3, 2
 IS_LEAF = np.array([False, False, True, True, True, False, True, True])  # trees of 5 and 3 nodes
@@ -159,3 +166,42 @@ def test_whatever_passes_leads_from_every_root_to_a_leaf(row, word, value):
         kind, channel = forest.nodes[at, 3] & 3, forest.nodes[at, 3] >> 2
         assert 0 <= channel < (N_SCALARS if kind == SCALAR else N_VIEWS)
         waiting += [(child, depth + 1), (child + 1, depth + 1)]
+
+
+def asked(n_views: int, n_scalars: int) -> Samples:
+    """Two samples of a blank picture."""
+    return Samples(
+        np.zeros((1, 4, 4), np.int16),
+        np.zeros(2, np.int32),
+        np.ones(2, np.float32),
+        np.zeros((2, n_views, VIEW), np.float32),
+        np.zeros((2, n_scalars), np.float32),
+    )
+
+
+def test_samples_narrower_than_a_test_reads_are_refused():
+    forest = small()
+    assert forest.reads == (N_VIEWS, N_SCALARS)
+    for answer in (predict, predict_each):
+        assert np.isfinite(answer(forest, asked(N_VIEWS, N_SCALARS))).all()
+        for n_views, n_scalars in ((N_VIEWS - 1, N_SCALARS), (N_VIEWS, N_SCALARS - 1)):
+            with pytest.raises(ValueError, match="reads 2 views and 3 scalars, but its samples"):
+                answer(forest, asked(n_views, n_scalars))
+    with pytest.raises(ValueError, match="in_bag"):
+        predict(forest, asked(N_VIEWS, N_SCALARS), np.zeros((2, 5), np.bool_))
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        {"image": np.ones(2, np.int32)},
+        {"image": np.zeros(3, np.int32)},
+        {"views": np.zeros((2, 1, VIEW - 1), np.float32)},
+        {"scalars": np.zeros(2, np.float32)},
+        {"inverse_size": np.ones(1, np.float32)},
+        {"heights": np.zeros((4, 4), np.int16)},
+    ],
+)
+def test_samples_that_do_not_fit_together_are_refused(other):
+    with pytest.raises(ValueError, match=r"should (have the shape|be 0 to)"):
+        replace(asked(N_VIEWS, N_SCALARS), **other)

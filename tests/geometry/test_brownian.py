@@ -7,7 +7,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from liex_lab.geometry import SE3, brownian_path, brownian_steps
+from liex_lab.geometry import SE3, brownian_ends, brownian_path, brownian_steps
 from tests.oracles import motion
 
 DELTA = 0.04
@@ -84,3 +84,17 @@ def test_the_motion_is_left_invariant() -> None:
 def test_a_time_outside_the_path_is_refused(times: list[float]) -> None:
     with pytest.raises(ValueError, match="within the path"):
         brownian_path(START, np.zeros((4, 6)), DELTA, times)
+
+
+def test_the_ends_of_many_paths_are_those_of_each() -> None:
+    steps = brownian_steps(np.random.default_rng(9), COVARIANCE, 3, 7)
+    start = SE3.exp(brownian_steps(np.random.default_rng(10), COVARIANCE, 7))
+    for time in (0.0, 0.4 * DELTA, DELTA, 2.7 * DELTA, 3 * DELTA):
+        ends = brownian_ends(start, steps, DELTA, time)
+        for k in range(7):
+            one = SE3(start.rotation[k], start.translation[k])
+            alone = brownian_path(one, steps[k], DELTA, time)
+            np.testing.assert_allclose(ends.matrix[k], alone.matrix[0], atol=1e-9)
+    for time in (-0.1, 3.1 * DELTA):
+        with pytest.raises(ValueError, match="the time must lie within the paths"):
+            brownian_ends(start, steps, DELTA, time)

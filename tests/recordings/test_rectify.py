@@ -40,7 +40,7 @@ def recording(camera: Camera = CAMERA) -> Recording:
         read=lambda k: STORED[k].copy(),
         problems=["odd"],
         truncated=True,
-        n_whole=8,
+        whole=np.arange(9) != 4,
         metadata={"subject_id": "m01"},
     )
 

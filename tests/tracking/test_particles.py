@@ -7,13 +7,19 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from liex_lab.estimation.cascade import Candidates, ImageSet
 from liex_lab.estimation.estimator import PoseEstimator
+from liex_lab.foreground.crop_camera import view_of
+from liex_lab.foreground.hand_segmenter import HandSegmenter
+from liex_lab.forests.forest import predict
+from liex_lab.geometry import SE3
 from liex_lab.recordings.frame import DepthFrame
-from liex_lab.tracking.particles import ParticleFilter, Wander
+from liex_lab.simulation.hand.simulator import HandSimulator
+from liex_lab.tracking.particles import ParticleFilter, ProcessNoise
 from tests.estimation.toy import CAMERA, FLOOR, SCENE, Toy, toy_mice, trained
 
 STEP_NS = 33_333_333
-FEW = Wander(n_particles=40)
+FEW = ProcessNoise(n_particles=40)
 
 
 @pytest.fixture(scope="module")
@@ -54,3 +60,58 @@ def test_before_the_animal_is_found_and_without_a_foreground_there_is_no_estimat
     bare = FLOOR.depth(CAMERA.width, CAMERA.height)
     found = follow(estimator, np.stack([bare, toy.depths[0], bare, toy.depths[0]]))
     assert [joints is None for joints in found] == [True, False, True, False]
+
+
+def test_the_metric_of_a_hand_sees_what_it_has_learned_from():
+    """Its residuals against the picture among it: without them it read past the row's end, and the
+    hand was lost within some frames.
+    """
+    hand = PoseEstimator.load("hand")
+    gestures = HandSimulator(hand.skeleton).motion(3, 12)
+    scene, sample = HandSegmenter.learn(gestures, hand.skeleton.view, 12)
+    size = hand.find_size(sample, scene)
+    particles = ParticleFilter(hand, scene, size, np.random.default_rng(0), FEW)
+    off = []
+    for frame in gestures:
+        step = particles.step(frame)
+        assert step is not None
+        joints = step[0].joints(hand.skeleton)
+        truth = gestures.joints_camera[frame.index]
+        off.append(np.linalg.norm(joints - truth, axis=-1).mean())
+    assert np.median(off) < 15.0
+    assert max(off) < 30.0
+
+
+def test_a_base_round_is_the_last_correction_of_the_cascade(estimator, toy):
+    """Without noise particles stay where they are; a round moves them as it moves candidates."""
+    quiet = ProcessNoise(n_particles=3, turn_rad=0.0, shift_mm=0.0)
+    cascade = estimator.model.cascade
+    roots = {}
+    for base_rounds in (0, 1):
+        particles = ParticleFilter(
+            estimator, SCENE, 1.0, np.random.default_rng(0), quiet, base_rounds
+        )
+        steps = [particles.step(DepthFrame(k, k * STEP_NS, toy.depths[k])) for k in range(2)]
+        roots[base_rounds] = [step[0].root for step in steps if step is not None]
+    first, stayed = roots[0]
+    np.testing.assert_allclose(stayed.matrix, first.matrix, atol=1e-6)
+    crops = SCENE.extract(toy.depths[1:2], 1.0)
+    crop_cameras = SCENE.crop_cameras(crops, False)
+    view = view_of(crop_cameras)
+    T_view_camera = SE3(view.rotation[0], view.translation[0])
+    base = T_view_camera @ first
+    candidates = Candidates.start(
+        cascade.skeleton,
+        np.zeros(1, np.int32),
+        base.rotation[None],
+        base.translation[None],
+        estimator.estimate(toy.depths[:1], SCENE, 1.0).chosen.pose.scale,
+        np.ones(1),
+    )
+    images = ImageSet(crops.heights, crop_cameras, crops.moments)
+    values = predict(cascade.forests[0][-1], cascade.samples(images, candidates, [0]))
+    cascade.apply(candidates, 0, values)
+    moved = SE3(candidates.rotations[0, 0], candidates.positions[0, 0])
+    wanted = T_view_camera.inverse() @ moved
+    np.testing.assert_allclose(roots[1][1].matrix, wanted.matrix, atol=1e-5)
+    assert np.abs(wanted.matrix - first.matrix).max() > 1e-2

@@ -112,3 +112,15 @@ def test_frames_that_cannot_be_compared_do_not_disturb_the_girth(clean, surface)
     assert BodyResidual.fit(
         surface, pose, SCENE.extract(depths, 1.0), SCENE
     ).girth == pytest.approx(1.2, abs=0.051)
+
+
+def test_frames_that_no_body_covers_leave_the_girth_as_it_is(clean, surface):
+    crops = SCENE.extract(clean.depths[:3], 1.0)
+    far = moved(clean.pose[slice(0, 3)], x=5000.0)
+    assert np.isnan(BodyResidual(surface).of(far, crops, SCENE)).all()
+    assert BodyResidual.fit(surface, far, crops, SCENE).girth == 1.0
+    # one frame that shows the animal is enough, whatever the others do
+    mixed = far.moved(SE3.identity())
+    mixed.root.translation[0] = clean.pose.root.translation[0]
+    alone = BodyResidual.fit(surface, clean.pose[slice(0, 1)], crops[slice(0, 1)], SCENE)
+    assert BodyResidual.fit(surface, mixed, crops, SCENE).girth == alone.girth

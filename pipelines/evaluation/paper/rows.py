@@ -237,12 +237,14 @@ def rates_of(
     before = numba.get_num_threads()
     numba.set_num_threads(cores)
     rates = {}
-    for name, subject in subjects.items():
-        size = subject.find_size(sample, scene)
-        rates[name] = _RATE_FRAMES / best_seconds(
-            partial(subject.estimate, frames, scene, size), _RATE_REPEATS
-        )
-    numba.set_num_threads(before)
+    try:
+        for name, subject in subjects.items():
+            size = subject.find_size(sample, scene)
+            rates[name] = _RATE_FRAMES / best_seconds(
+                partial(subject.estimate, frames, scene, size), _RATE_REPEATS
+            )
+    finally:
+        numba.set_num_threads(before)
     picture = f"{recording.width} x {recording.height}"
     return {
         name: {

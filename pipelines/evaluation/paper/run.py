@@ -346,9 +346,11 @@ def _sensitivities(
     A curve is measured where its row is asked for anew; a kept one that is of another method,
     training or code is left out.
     """
+    from liex_lab.estimation.method import method_of
+
     from .fingerprints import learning_code
     from .quick import QUICK_SWEEP
-    from .sensitivity import Sweep, sensitivity
+    from .sensitivity import Sweep, sensitivity, without_void
 
     curves = {}
     for variant in SWEPT[: 1 if budget.quick else None]:
@@ -360,7 +362,8 @@ def _sensitivities(
         if known is not None and (
             known["made"]["from"] == made and known["made"].get("learning_code") == code
         ):
-            curves[variant] = {**known, "origin": "kept"}
+            kept_curve = without_void(known, method_of(variant, skeleton))
+            curves[variant] = {**kept_curve, "origin": "kept"}
             continue
         if not budget.quick and (
             budget.kept or budget.sealed or variant not in budget.fresh or budget.n_frames

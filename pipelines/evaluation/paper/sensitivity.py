@@ -8,6 +8,7 @@ of its own, on 2,048 images, so errors are larger than in the tables; only the c
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -30,6 +31,12 @@ PROTOCOL = (
 )
 
 
+INITIAL_POSES = "initial poses"
+_PROPOSED = (
+    "not varied: a forest proposes the initial poses of this variant, two for each of its trees"
+)
+
+
 @dataclass(frozen=True)
 class Sweep:
     """The budget of a sweep, and the values tried beside the method's own.
@@ -43,7 +50,7 @@ class Sweep:
     n_images: int = 2_048
     n_test: int = 1_024
     values: tuple[tuple[str, tuple[int, ...]], ...] = (
-        ("initial poses", (1, 2, 5, 10, 20, 40, 80)),
+        (INITIAL_POSES, (1, 2, 5, 10, 20, 40, 80)),
         ("rounds", (1, 2, 3, 5, 7)),
         ("trees", (1, 3, 6, 10, 20)),
         ("tree depth", (6, 10, 14, 18, 24)),
@@ -73,7 +80,7 @@ def chosen_values(method: Method) -> dict[str, int]:
         method: the variant.
     """
     return {
-        "initial poses": method.n_candidates,
+        INITIAL_POSES: method.n_candidates,
         "rounds": method.rounds,
         "trees": method.regressors.n_trees,
         "tree depth": method.regressors.max_depth,
@@ -89,7 +96,7 @@ def with_value(method: Method, number: str, value: int) -> Method:
         number: `initial poses`, `rounds`, `trees`, `tree depth`, or else `metric trees`.
         value: its new value.
     """
-    if number == "initial poses":
+    if number == INITIAL_POSES:
         return replace(method, n_candidates=value, top_k=min(value, method.top_k))
     if number == "rounds":
         return replace(method, rounds=value)
@@ -98,6 +105,32 @@ def with_value(method: Method, number: str, value: int) -> Method:
     if number == "tree depth":
         return replace(method, regressors=replace(method.regressors, max_depth=value))
     return replace(method, metric=replace(method.metric, n_trees=value))
+
+
+def left_out(method: Method) -> dict[str, str]:
+    """Which of the five numbers the method does not have to vary, with the reason for each.
+
+    Args:
+        method: the variant.
+    """
+    return {} if method.proposals is None else {INITIAL_POSES: _PROPOSED}
+
+
+def without_void(curves: Mapping[str, Any], method: Method) -> dict[str, Any]:
+    """Curves as `sensitivity` returns them, without those of numbers that the method does not vary.
+
+    Results that were kept before these were left out hold such curves.
+
+    Args:
+        curves: what `sensitivity` returned, or what was kept of it.
+        method: the variant.
+    """
+    void = left_out(method)
+    parts = {
+        name: {number: value for number, value in curves[name].items() if number not in void}
+        for name in ("curves", "chosen")
+    }
+    return {**curves, **parts, "left_out": void}
 
 
 def sensitivity(
@@ -112,7 +145,8 @@ def sensitivity(
         progress: told point by point.
 
     Returns:
-        `curves` by number, the method's `chosen` values, amounts, seed and protocol.
+        `curves` by number, the method's `chosen` values, the numbers `left_out` with the reason,
+        amounts, seed and protocol.
     """
     from liex_lab.estimation.method import method_of
 
@@ -125,7 +159,12 @@ def sensitivity(
     test = rendered_set(skeleton, method, recipe, sweep.n_images, sweep.n_test, silent)
     own = chosen_values(method)
     base = _train(data, skeleton, method, recipe.seed)
-    points = {number: sorted({*values, own[number]}) for number, values in sweep.values}
+    void = left_out(method)
+    points = {
+        number: sorted({*values, own[number]})
+        for number, values in sweep.values
+        if number not in void
+    }
     n_points = sum(map(len, points.values()))
     done = 0
     curves: dict[str, list[dict[str, float]]] = {}
@@ -142,7 +181,8 @@ def sensitivity(
         "n_images": len(data.size),
         "n_test": int(test.animal.sum()),
         "seed": recipe.seed,
-        "chosen": own,
+        "chosen": {number: own[number] for number in own if number not in void},
+        "left_out": void,
         "curves": curves,
         "protocol": PROTOCOL,
     }
@@ -165,7 +205,7 @@ def _trained_with(
     from liex_lab.estimation.training import train_metric
 
     changed = with_value(method, number, value)
-    if number == "initial poses" or changed == method:
+    if number == INITIAL_POSES or changed == method:
         return base
     if number == "metric trees":
         cascade = replace(base.cascade, method=changed)

@@ -9,6 +9,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+import numba
 import numpy as np
 import pytest
 from liex_lab.dashboards.paper.plates import draw_figures
@@ -23,7 +24,12 @@ from liex_lab.pipelines.evaluation.paper import (
     table_text,
 )
 from liex_lab.pipelines.evaluation.paper.deviations import DEVIATIONS
-from liex_lab.pipelines.evaluation.paper.sensitivity import Sweep, chosen_values, with_value
+from liex_lab.pipelines.evaluation.paper.sensitivity import (
+    Sweep,
+    chosen_values,
+    with_value,
+    without_void,
+)
 from liex_lab.pipelines.training.baselines import training_of
 
 from liex_lab.baselines.forest import ForestPlan, train_forests
@@ -377,3 +383,50 @@ def check_kept(path: Path) -> None:
             assert numbers["n_frames"] >= 2000
             assert len(numbers["fingerprints"]) == numbers["n_recordings"] == 40
             assert len(numbers["joint_mm"]) == skeleton.n_joints
+
+
+def test_a_variant_whose_initial_poses_are_proposed_has_no_number_of_them_to_vary():
+    """Curves of it that were kept say the same for every number; they are left out with why."""
+    hand, mouse = Skeleton.load("hand"), Skeleton.load("mouse")
+    proposed, drawn = method_of("default", hand), method_of("paper", mouse)
+    curve = [{"value": n, "mean_mm": 14.7, "median_mm": 8.2} for n in (10, 20)]
+    kept = {
+        "curves": {"initial poses": curve, "trees": curve},
+        "chosen": {"initial poses": 20, "trees": 10},
+    }
+    told = without_void(kept, proposed)
+    assert list(told["curves"]) == list(told["chosen"]) == ["trees"]
+    assert "a forest proposes" in told["left_out"]["initial poses"]
+    assert without_void(kept, drawn) == {**kept, "left_out": {}}
+
+
+class Still:
+    """Two empty frames."""
+
+    width = 4
+
+    def __len__(self) -> int:
+        return 2
+
+    def depths(self, start: int, stop: int) -> np.ndarray:
+        return np.ones((stop - start, 4, 4), np.float32)
+
+
+class Failing:
+    """Runs out of memory."""
+
+    skeleton = Skeleton.load("mouse")
+
+    def find_size(self, *_: object) -> float:
+        raise MemoryError
+
+
+def test_the_number_of_threads_is_put_back_where_timing_fails(monkeypatch):
+    before = numba.get_num_threads()
+    asked: list[int] = []
+    monkeypatch.setattr(numba, "set_num_threads", asked.append)
+    monkeypatch.setattr("liex_lab.pipelines.build.build_scene", lambda *_: (None, None))
+    with pytest.raises(MemoryError):
+        run.rates_of("mouse", {"default": Failing()}, [Still()])
+    assert len(asked) == 2
+    assert asked[-1] == before

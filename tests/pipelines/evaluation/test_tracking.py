@@ -10,7 +10,18 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from liex_lab.dashboards.paper.tracking import draw_tracking, worst_moments
+from liex_lab.pipelines.evaluation import tracking
+from liex_lab.pipelines.evaluation.paper.algorithm3 import (
+    PAPER_ROWS,
+    _pattern_search,
+    comparison,
+)
 from liex_lab.pipelines.evaluation.tracking import evaluate_tracking
+
+from liex_lab.estimation.estimator import PoseEstimator
+from liex_lab.runtime.progress import silent
+from liex_lab.tracking.particles import ProcessNoise
+from tests.estimation.toy import trained
 
 ROWS = ("single", "online", "smoothed")
 FIGURES = {
@@ -37,6 +48,53 @@ def test_the_smoothed_track_is_better_than_its_frames(tmp_path):
     assert smoothed["longest_flip_frames"] <= 5
     assert result["speed"]["frames_per_s_1core"] > 0 < result["speed"]["frames_per_s_all_cores"]
     assert picture.read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.slow
+def test_the_paper_s_algorithms_are_set_against_each_other(monkeypatch):
+    """With a small model of the paper's variant: both readings of Algorithm 3, and a sentence."""
+    paper = PoseEstimator(trained("paper").model)
+    own = PoseEstimator.load("mouse")
+    monkeypatch.setattr(
+        tracking, "estimator_of", lambda animal, variant, *_: paper if variant == "paper" else own
+    )
+    result = evaluate_tracking("mouse", "easy", rows=("single",), paper=True, n_frames=40)
+    assert list(result["rows"]) == ["single", *PAPER_ROWS] == list(result["row_names"])
+    assert result["rows"]["algorithm1_paper"]["ratio_to_single"] == 1.0
+    (note,) = result["notes"]
+    assert "8.42 to 7.19 mm" in note
+    for row in PAPER_ROWS:
+        assert f"{result['rows'][row]['mean_joint_error_mm']:.2f}" in note
+
+
+def test_whether_the_paper_s_gain_is_seen_follows_from_the_numbers():
+    def told(*errors: float) -> str:
+        return comparison(
+            {
+                row: {"mean_joint_error_mm": error, "ratio_to_single": error / errors[0]}
+                for row, error in zip(PAPER_ROWS, errors, strict=True)
+            }
+        )
+
+    assert "is not reproduced here" in told(4.0, 9.0, 4.4)
+    assert "gain is reproduced here" in told(4.0, 9.0, 3.6)
+    assert "9.00 mm with no base rounds (ratio 2.25)" in told(4.0, 9.0, 3.6)
+    assert "3.60 mm with 1 base round (ratio 0.90)" in told(4.0, 9.0, 3.6)
+    lost = {row: {"lost_rate": 1.0} for row in PAPER_ROWS}
+    assert "is not reproduced" in comparison({**lost, PAPER_ROWS[0]: {"mean_joint_error_mm": 4.0}})
+
+
+def test_the_noise_is_searched_downhill_and_no_setting_is_tried_twice():
+    asked: list[ProcessNoise] = []
+
+    def error_of(noise: ProcessNoise) -> float:
+        asked.append(noise)
+        return abs(np.log(noise.turn_rad / 0.04)) + abs(np.log(noise.sigma_mm / 4.0))
+
+    tried = _pattern_search(ProcessNoise(), error_of, "x", silent)
+    best = min(tried, key=lambda noise: tried[noise])
+    assert len(asked) == len(set(asked)) == len(tried)
+    assert (best.turn_rad, best.shift_mm, best.sigma_mm) == (0.0375, 4.0, 4.0)
 
 
 def test_the_worst_moments_lie_apart():

@@ -135,6 +135,11 @@ def test_a_cut_png_is_there_and_wholly_unread(tmp_path: Path, share: float) -> N
     cut(folder / "frame_4.png", share)
     with open_recording(folder) as recording:
         assert (len(recording), recording.truncated, recording.n_whole) == (12, True, 11)
+        assert [recording[part].n_whole for part in (slice(6), slice(5, 12), slice(4, 5))] == [
+            5,
+            7,
+            0,
+        ]
         assert any(
             "1 of 12 pictures" in problem and "frame_4.png" in problem
             for problem in recording.problems

@@ -125,3 +125,10 @@ def test_a_folder_of_other_views_only_says_which_is_missing(tmp_path: Path) -> N
     folder = write_nyu(tmp_path, STORED[:1])
     (folder / "depth_1_0000001.png").rename(folder / "depth_2_0000001.png")
     assert "depth_1_0000001.png" in refusal(folder)
+
+
+@pytest.mark.parametrize("view", [-1, 0, 4])
+def test_a_view_that_there_is_not_is_refused(tmp_path: Path, view: int) -> None:
+    joint_file(tmp_path)
+    with pytest.raises(RecordingError, match=r"1 to 3|should hold joints"):
+        read_nyu_joints(tmp_path, view=view)

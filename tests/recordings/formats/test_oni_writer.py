@@ -11,7 +11,7 @@ from liex_lab.errors import RecordingError
 from liex_lab.optics.camera import Camera
 from liex_lab.recordings import open_recording
 from liex_lab.recordings.formats.oni import writer
-from liex_lab.recordings.formats.oni.writer import Codec, write_oni
+from liex_lab.recordings.formats.oni.writer import Codec, OniWriter, write_oni
 from tests.recordings.writers import (
     SMALL,
     depth_frames,
@@ -160,3 +160,14 @@ def test_a_long_file_has_no_seek_table(path: Path, monkeypatch: pytest.MonkeyPat
     write_oni_file(path, STORED)
     with open_recording(path, strict=True) as recording:
         np.testing.assert_array_equal([frame.depth for frame in recording], STORED)
+
+
+@pytest.mark.parametrize("unit_mm", [0.5, 10.0])
+def test_a_step_that_the_format_does_not_have_is_refused_and_leaves_no_file(
+    path: Path, unit_mm: float
+) -> None:
+    with pytest.raises(ValueError, match=r"1 mm or 0\.1 mm"):
+        OniWriter(path, SMALL, unit_mm=unit_mm)
+    with pytest.raises(ValueError, match=r"1 mm or 0\.1 mm"):
+        write_oni(in_memory(STORED), path, unit_mm=unit_mm)
+    assert not list(path.parent.iterdir())

@@ -17,7 +17,8 @@ from hypothesis import strategies as st
 from liex_lab.recordings import open_recording
 from liex_lab.recordings.formats.moseq.azure_kinect import MODES, Mode, read_calibration
 from liex_lab.recordings.formats.video.ffv1 import crc_table, is_key, slices_agree
-from liex_lab.recordings.formats.video.video import open_video
+from liex_lab.recordings.formats.video.index import DepthTrack
+from liex_lab.recordings.formats.video.video import DepthVideo, open_video
 from liex_lab.runtime.progress import silent
 from tests.oracles import ffv1
 from tests.recordings.asking import refusal
@@ -309,3 +310,15 @@ def test_the_depth_is_the_track_that_says_so(tmp_path: Path) -> None:
     assert "no video track" in refusal(
         write_mkv(tmp_path / "c.mkv", STORED, titles=()), camera=SMALL
     )
+
+
+@pytest.mark.parametrize("n_bytes", [0, 7, 9, 16])
+def test_a_raw_picture_of_another_size_is_unread(tmp_path: Path, n_bytes: int) -> None:
+    """Also of an odd number of bytes, which are no whole numbers of two."""
+    path = tmp_path / "raw.avi"
+    path.write_bytes(bytes(range(24)))
+    track = DepthTrack("b16g", 2, 2, offsets=[0, 8], sizes=[n_bytes, 8])
+    video = DepthVideo(path, track)
+    assert video.read(0) is None
+    np.testing.assert_array_equal(video.read(1), [[0x0809, 0x0A0B], [0x0C0D, 0x0E0F]])
+    video.close()

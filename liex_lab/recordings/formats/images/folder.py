@@ -233,7 +233,7 @@ class Folder:
             sources=[*self.files, *(file for file in stated_in if file.is_file())],
             problems=problems,
             truncated=stack.truncated,
-            n_whole=sum(stack.whole[: len(monotone.times_ns)]),
+            whole=np.array(stack.whole[: len(monotone.times_ns)], np.bool_),
             metadata=({"session_start_time": start} if start else {}) | camera_toml.metadata,
             close=stack.close,
             faults=monotone.faults,

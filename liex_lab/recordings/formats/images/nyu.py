@@ -143,13 +143,16 @@ def read_nyu_joints(folder: Path, view: int = VIEW) -> NyuJoints:
         The joints of all frames.
 
     Raises:
-        RecordingError: there is no such file, or it does not hold 36 joints to a frame.
+        RecordingError: there is no such file or no such view, or the file does not hold 36 joints
+            to a frame.
     """
     from scipy.io import loadmat
     from scipy.io.matlab import MatReadError
 
     path = folder / JOINT_FILE if folder.is_dir() else folder
     wanted = ["joint_uvd", "joint_xyz", "joint_names"]
+    if view < 1:
+        raise RecordingError(f"the data set's cameras are numbered 1 to 3, got view {view}")
     if not path.is_file():
         raise RecordingError(
             f"there is no {JOINT_FILE} in {folder}; copy it there from the data set"

@@ -81,8 +81,6 @@ def write_oni(
         raise RecordingError(
             f"there is no folder {path.parent} to write {path.name} into; make it first"
         )
-    if unit_mm not in _PIXEL_FORMATS:
-        raise ValueError(f"a step of an .oni file is 1 mm or 0.1 mm, got {unit_mm}")
     start_us = min(
         0, _microseconds(int(recording.times_ns[0]))
     )  # the format has no time before zero
@@ -126,7 +124,12 @@ class OniWriter:
             unit_mm: mm of a stored step, 1.0 or 0.1.
             rate_hz: the frame rate that the file states, Hz; every frame has its own time.
             exact: refuse depths that are no whole number of steps instead of rounding them.
+
+        Raises:
+            ValueError: unit_mm is neither 1.0 nor 0.1.
         """
+        if unit_mm not in _PIXEL_FORMATS:
+            raise ValueError(f"a step of an .oni file is 1 mm or 0.1 mm, got {unit_mm}")
         self._codec = codec
         self._unit_mm = unit_mm
         self._exact = exact

@@ -97,9 +97,12 @@ class DepthVideo:
         """
         with self._lock:
             if self._ffv1 is None:
-                raw = np.frombuffer(self._bytes(index), RAW[self.track.codec])
-                whole = len(raw) == self.width * self.height
-                return raw.reshape(self.height, self.width).astype(np.uint16) if whole else None
+                kind = np.dtype(RAW[self.track.codec])
+                data = self._bytes(index)
+                if len(data) != self.width * self.height * kind.itemsize:
+                    return None
+                raw = np.frombuffer(data, kind).reshape(self.height, self.width)
+                return raw.astype(np.uint16)
             before = np.searchsorted(self._keys, index, side="right") - 1
             if before < 0:
                 return None
