@@ -151,8 +151,7 @@ def choose(
         expected[:, None] * share / np.sqrt(3.0)
     )  # an error of three equal components, see columns.json
     sd_root, sd_angles = _spread_of_coordinates(skeleton, pose, turned, joints, weight)
-    no_opposite_mm = _NO_OPPOSITE_MM * skeleton.relative_size
-    doubts = _doubts(positions, scores, mean, score, size, no_opposite_mm, skeleton.tip)
+    doubts = _doubts(positions, scores, mean, score, size, _NO_OPPOSITE_MM * skeleton.relative_size)
     fit = np.zeros((len(score), 0))
     return Chosen(
         pose,
@@ -241,21 +240,16 @@ def with_best(
 
 
 def _doubts(
-    positions: Array,
-    scores: Array,
-    mean: Array,
-    good: Array,
-    size: float,
-    no_opposite_mm: float,
-    tip: int,
+    positions: Array, scores: Array, mean: Array, good: Array, size: float, no_opposite_mm: float
 ) -> Array:
     """`Chosen.doubts` of all candidates.
 
     It follows from the chosen joints (n, J, 3) and the scores (n, k) of the averaged candidates;
-    a pose points from its base to the joint `tip`.
+    a pose points from its base to its last joint, as the bundled models' forests of the expected
+    error have learned it (of the chains it is the tip, of the hand the little finger's).
     """
-    along = positions[:, :, tip] - positions[:, :, 0]
-    backwards = np.einsum("nkd,nd->nk", along, mean[:, tip] - mean[:, 0]) < 0
+    along = positions[:, :, -1] - positions[:, :, 0]
+    backwards = np.einsum("nkd,nd->nk", along, mean[:, -1] - mean[:, 0]) < 0
     opposite = np.where(backwards, scores, no_opposite_mm).min(axis=1)
     distance = np.linalg.norm(positions - mean[:, None], axis=-1).mean(axis=(1, 2)) / size
     return np.stack(Doubts(scores.min(axis=1), opposite, good.std(axis=1), distance), axis=1)

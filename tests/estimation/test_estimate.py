@@ -358,25 +358,3 @@ def test_doubts_say_how_good_a_candidate_of_the_opposite_direction_is():
             np.array([[2.0, 3.5]]),
         )
         assert picked.doubts[0, 1] == (3.5 if order == [0, 1] else 40.0)
-
-
-@pytest.mark.parametrize("animal", ["mouse", "hand"])
-def test_the_doubt_about_the_direction_is_that_of_base_and_tip(animal):
-    """Of a hand the wrist's: a finger that bends over the palm points back and turns no hand."""
-    skeleton = Skeleton.load(animal)
-    home = Pose.home(skeleton)
-    around = SE3.exp([0.0, 0.0, np.pi, 0.0, 0.0, 0.0])
-    candidates = [home, Pose(around, home.angles, home.scale)]
-    frames = [pose.frames(skeleton) for pose in candidates]
-    rotations = np.stack([f.rotation for f in frames])[None]
-    positions = np.stack([f.translation for f in frames])[None]
-    scores = np.array([[2.0, 11.0]])
-    method = replace(METHODS["paper"], top_k=1)
-    picked = choose(skeleton, method, Calibration(), 1.0, rotations, positions, scores)
-    assert picked.doubts[0, 1] == 11.0
-    bent = positions.copy()
-    last = skeleton.n_joints - 1
-    if last != skeleton.tip:  # the little finger's end behind the wrist, in both of them
-        bent[0, :, last] = 2.0 * positions[0, 0, 0] - positions[0, 0, last]
-        again = choose(skeleton, method, Calibration(), 1.0, rotations, bent, scores)
-        assert again.doubts[0, 1] == 11.0
