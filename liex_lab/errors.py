@@ -5,12 +5,19 @@ Each message is one sentence: what was expected, what came, what to do.
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 
 class LiexError(Exception):
     """Base of every error that the user can put right.
 
     The command line prints its message alone, without a traceback.
+
+    Attributes:
+        exit_code: that the command line ends with.
     """
+
+    exit_code: ClassVar[int] = 1
 
     def __str__(self) -> str:
         """The message on one line, whatever it quotes of the user's own."""
@@ -62,7 +69,12 @@ class EstimationError(LiexError):
 
 
 class MisfitError(EstimationError):
-    """Raised for a recording that shows something else than the plan's animal."""
+    """Raised for a recording that shows something else than the plan's animal.
+
+    Its exit code is also that of a run whose session someone has to look at.
+    """
+
+    exit_code = 4
 
 
 class MissingPackageError(LiexError):

@@ -39,7 +39,6 @@ from liex_lab.errors import LiexError, MisfitError
 from liex_lab.runtime.disk import is_full, why_full
 from liex_lab.runtime.progress import progress_bar
 
-LOOK_AT_IT = 4  # the exit code of a run whose scene does not fit, or of which little was measured
 # the exit code of our own faults (EX_SOFTWARE); what the user can put right is 1, a wrong call 2
 FAULT = 70
 _USERS_TO_MEND = {
@@ -490,10 +489,8 @@ def main() -> None:
     os.environ.setdefault("RUST_LOG", _RUST_LOG)
     try:
         app()
-    except MisfitError as error:
-        _fail(str(error), LOOK_AT_IT)
     except LiexError as error:
-        _fail(str(error))
+        _fail(str(error), error.exit_code)
     except OSError as error:
         if is_full(error):
             _fail(f"{why_full(error)}; make room there and run the same command again")
@@ -535,4 +532,4 @@ def _tell_session(session: Path) -> None:
         colour = typer.colors.YELLOW if verdict["look_at_it"] else None
         typer.secho(f"result:  {verdict['sentence']}", fg=colour)
     if verdict["look_at_it"] and not verdict["accepted"]:
-        raise typer.Exit(LOOK_AT_IT)
+        raise typer.Exit(MisfitError.exit_code)

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from liex_lab.errors import LiexError
+from liex_lab.errors import LiexError, MisfitError
 from liex_lab.evaluation.scenes import SCENES_PROTOCOL, Individual, Tally, Truth
 from liex_lab.runtime.progress import Progress, silent
 
@@ -35,7 +35,6 @@ Array = NDArray[np.float64]
 SEEDS: Final = (1001, 1002)  # one of another build, one of those that models were trained on
 SEALED_SEEDS: Final = (931_507_211, 931_507_212, 931_507_213)
 N_FRAMES: Final = 300
-_REFUSED = 1  # exit code of the command line
 
 
 @dataclass(frozen=True)
@@ -178,18 +177,24 @@ def run_product(recording: TrueRecording, plan: Plan) -> Outcome:
         What the tables say in the camera frame, what the run said, and its exit code.
     """
     from liex_lab.sessions import Session
+    from liex_lab.sessions.verdict import verdict_in
 
     quick = plan.with_settings(["replay.depth=false"])
     with tempfile.TemporaryDirectory(prefix="liex-scenes-") as folder:
         try:
             measure_session(recording, quick, folder)
         except LiexError as error:
-            return Outcome((), (str(error),), _REFUSED)
+            return Outcome((), (str(error),), error.exit_code)
         sessions = [Session.open(path) for path in sorted(Path(folder).glob("*.liex"))]
+        verdicts = [verdict_in(session.metadata) for session in sessions]
         return Outcome(
             tuple(one for session in sessions for one in read_individuals(session)),
-            tuple(sentence for session in sessions for sentence in session.metadata["problems"]),
-            0,
+            tuple(
+                sentence
+                for session, verdict in zip(sessions, verdicts, strict=True)
+                for sentence in (verdict["sentence"], *session.metadata["problems"])
+            ),
+            MisfitError.exit_code if any(verdict["look_at_it"] for verdict in verdicts) else 0,
         )
 
 
