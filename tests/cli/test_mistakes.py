@@ -191,7 +191,7 @@ def test_a_place_that_is_a_file_is_told_before_any_work(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(
-        "liex_lab.pipelines.session.build_tracker", lambda *_: pytest.fail("work was begun")
+        "liex_lab.pipelines.session.fit_plan", lambda *_: pytest.fail("work was begun")
     )
     file = tmp_path / "results"
     file.write_text("mine")
