@@ -89,7 +89,7 @@ def flat_grounds(background: NDArray[np.float32], camera: Camera, least_mm2: flo
     mm2_per_px = step * step / (camera.fx * camera.fy)
     grounds: list[Ground] = []
     for _ in range(_MAX_PLANES):
-        if not len(seeds):
+        if not len(seeds) or not left.any():
             break
         some = points[left]
         at = depth[left]

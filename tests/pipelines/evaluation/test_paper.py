@@ -427,6 +427,6 @@ def test_the_number_of_threads_is_put_back_where_timing_fails(monkeypatch):
     monkeypatch.setattr(numba, "set_num_threads", asked.append)
     monkeypatch.setattr("liex_lab.pipelines.build.build_scene", lambda *_: (None, None))
     with pytest.raises(MemoryError):
-        run.rates_of("mouse", {"default": Failing()}, [Still()])
+        rows.rates_of("mouse", {"default": Failing()}, [Still()])
     assert len(asked) == 2
     assert asked[-1] == before
