@@ -191,7 +191,7 @@ class BackgroundSubtraction(Segmenter):
             stride=stride,
             standing=standing,
         )
-        area, share = scene._moving_area(sample, spine_mm)
+        area, share = scene._moving_area(sample, spine_mm, min_height_mm)
         moves = share >= 0.5 or (share > 0.0 and standing.moves)
         if share < 0.5:  # perhaps it sits in its own background: compare with the floor itself
             bare_limit = np.where(
@@ -232,18 +232,23 @@ class BackgroundSubtraction(Segmenter):
         return replace(scene, volume_mm3=scene.usual_volume(sample)), sample
 
     def _moving_area(
-        self, sample: NDArray[np.float32], spine_mm: tuple[float, float]
+        self, sample: NDArray[np.float32], spine_mm: tuple[float, float], min_height_mm: float
     ) -> tuple[float, float]:
         """The usual area mm^2, and the share of the frames that show it, see `usual_area`.
 
         Where that is not the area of what was seen moving clearly, but of specks that come back in
-        more frames, as before an animal came, the area of what moves counts.
+        more frames, as before an animal came, the area of what moves counts. What is like an animal
+        is no speck, though a larger thing comes and goes beside it.
         """
         area, share = self.usual_area(sample, spine_mm)
         standing = self.standing
         if standing is None or not standing.moves or self.view.frame != VIEWS[0]:
             return area, share
         if area > 0.0 and abs(np.log(area / standing.thing_mm2)) < np.log(_OTHER):
+            return area, share
+        if share >= 0.5 and replace(self, area_mm2=area)._is_like_an_animal(
+            sample, spine_mm, min_height_mm
+        ):
             return area, share
         crops = replace(self, area_mm2=standing.thing_mm2).extract(sample, 1.0)
         return standing.thing_mm2, float(crops.found.mean())

@@ -396,7 +396,8 @@ def calibration_knots(claims: Sequence[_Claim], stretch: tuple[float, float]) ->
         (median stated error over the length, factor) for each group, in rising order.
     """
     said, sd, deviation = (
-        np.concatenate([getattr(claim, name) for claim in claims]) for name in ("said", "sd", "off")
+        np.concatenate([getattr(claim, name) for claim in claims])
+        for name in ("said", "sd", "deviation")
     )
     away = np.concatenate([claim.stretch_sd(*stretch) * claim.away for claim in claims])
     knots = []

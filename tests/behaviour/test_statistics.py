@@ -232,7 +232,7 @@ def test_the_false_discovery_rate_is_of_the_tests_that_were_made():
     assert list(stats.columns) == [column.name for column in STATS]
     text = methods(stats)
     assert "over 4 tests (family: four and one)" in text
-    assert "1 comparisons were not tested" in text
+    assert "1 comparison was not tested" in text
 
 
 def test_three_groups_are_compared_in_pairs_or_with_the_one_named():

@@ -40,7 +40,7 @@ def test_a_long_curve_keeps_its_peaks_and_its_holes():
 def test_a_bar_stands_at_its_time():
     time = figures.time_scale(10.0)
     svg = figures.lanes([(2.5, 5.0, "rear")], ["rear", "walk"], [], time)
-    found = re.search(r'fill="#EE6677" x="([\d.]+)" y="[\d.]+" width="([\d.]+)"', svg)
+    found = re.search(r'fill="#[0-9A-Fa-f]{6}" x="([\d.]+)" y="[\d.]+" width="([\d.]+)"', svg)
     assert found
     x, width = map(float, found.groups())
     assert x == pytest.approx(float(time(2.5)), abs=0.01)
