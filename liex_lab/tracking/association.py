@@ -109,8 +109,7 @@ class HypothesisAssociation:
             allocate: allocator of intermediate arrays.
 
         Returns:
-            (n,) int64 index of the hypothesis, `NONE` where the frame was passed by; in all frames
-            where no chain costs less than to pass all of them by, unless a decision stands.
+            (n,) int64 index of the hypothesis, `NONE` where the frame was passed by.
         """
         n, h = seen.score.shape
         emission = self._emission(seen, allocate)
@@ -129,21 +128,9 @@ class HypothesisAssociation:
         for rows in blocks(n, _BLOCK):
             n_beam = kernels.extend_all(rows.start, rows.stop, chains, n_beam, frames, self._costs)
         path = np.full(n, NONE, np.int64)
-        if n_beam and self._is_worth(chains.beam[0], cost, missed_cost, told):
+        if n_beam:
             kernels.trace_back(chains.beam[0, 0], chains.beam[0, 1], parent, 0, path)
         return path
-
-    @staticmethod
-    def _is_worth(
-        last: NDArray[np.int64], cost: Array, missed_cost: Array, told: NDArray[np.int64] | None
-    ) -> bool:
-        """Whether the chain that ends in the link `last` is likelier than that no frame shows the
-        animal: the empty chain misses every frame.
-        """
-        if told is not None and (told != NONE).any():
-            return True
-        passed_after = missed_cost[-1] - missed_cost[last[0] + 1]
-        return bool(cost[last[0], last[1]] + passed_after <= missed_cost[-1])
 
     def _emission(self, seen: Observations, allocate: Allocator) -> Array:
         """Emission cost (n, H) of each hypothesis, nats: its capped score; NaN without."""

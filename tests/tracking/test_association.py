@@ -1,4 +1,4 @@
-"""The association: which hypotheses are the animal, and that none may be."""
+"""The association: which hypotheses are the animal."""
 
 from __future__ import annotations
 
@@ -8,8 +8,7 @@ import pytest
 from liex_lab.tracking.association import NONE, HypothesisAssociation
 from liex_lab.tracking.motion_model import TrackingParameters
 from liex_lab.tracking.observations import Observations
-from liex_lab.tracking.offline import track_whole
-from tests.tracking.stories import MOUSE, SUBJECT, lose, told, walk
+from tests.tracking.stories import MOUSE, lose, told, walk
 
 CLOCK = np.arange(20) / 30.0
 COSTS = TrackingParameters.of("mouse").chain
@@ -22,16 +21,6 @@ def story(score: float) -> Observations:
     lose(seen, np.arange(20) != 7)
     seen.score[7] = score
     return seen
-
-
-def test_a_lone_frame_that_is_likelier_nothing_is_passed_by():
-    """Its score costs more than to pass the frame by."""
-    poor = story(2.0 * COSTS.score_mm * COSTS.none)
-    assert COSTS.score_most > COSTS.none
-    assert (CHAIN.path(poor) == NONE).all()
-    assert (CHAIN.doubt(poor, CHAIN.path(poor)) == 0).all()
-    track = track_whole(SUBJECT, poor).track
-    assert np.isnan(track.joints_mm).all()
 
 
 def test_a_lone_frame_that_is_likelier_the_animal_is_taken():
