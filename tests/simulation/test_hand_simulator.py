@@ -33,7 +33,7 @@ def block() -> TrainingPatches:
 def test_the_world_of_a_hand_is_its_own() -> None:
     world = world_of(HAND)
     assert isinstance(world, HandSimulator)
-    assert world.splits == ("clean", "hard", "other-body")
+    assert world.splits == ("clean", "hard", "other-body", "other-camera")
     assert "NYU" in world.sources
 
 

@@ -60,7 +60,7 @@ def test_a_block_depends_on_its_seed_and_number_alone(monkeypatch, animal):
     np.testing.assert_array_equal(both[1].joints_mm, second.joints_mm)
     assert (both[0].depth != both[1].depth).any()
     assert both[1].session.tolist() == [2] * 8 + [3] * 8
-    assert world.splits == ("clean", "hard", "other-body")
+    assert world.splits == ("clean", "hard", "other-body", "other-camera")
 
 
 @pytest.mark.parametrize("animal", ["fish", "snake"])
