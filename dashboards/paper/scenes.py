@@ -12,8 +12,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from liex_lab.evaluation.scenes import Individual, Truth
+from liex_lab.evaluation.scenes import Individual
 from liex_lab.simulation.recording import TrueRecording
+from liex_lab.simulation.scenes.recording import TrueAnimal
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -31,7 +32,7 @@ _DPI = 90
 def draw_scene(
     name: str,
     recording: TrueRecording,
-    truths: Sequence[Truth],
+    truths: Sequence[TrueAnimal],
     individuals: Sequence[Individual],
     folder: Path,
 ) -> Path:
@@ -69,7 +70,7 @@ def _picture(
     panel: Axes,
     recording: TrueRecording,
     depth: NDArray[np.float32],
-    truths: Sequence[Truth],
+    truths: Sequence[TrueAnimal],
     individuals: Sequence[Individual],
     frame: int,
 ) -> None:
@@ -107,7 +108,7 @@ def _skeleton(
 def _go_near(
     panel: Axes,
     recording: TrueRecording,
-    truths: Sequence[Truth],
+    truths: Sequence[TrueAnimal],
     frame: int,
 ) -> None:
     """Show only what is around the first animal, where it is there."""

@@ -10,10 +10,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from liex_lab.simulation.scenes.recording import TrueAnimal
 
 Array = NDArray[np.float64]
 
@@ -51,21 +54,6 @@ class Individual:
     trusted: NDArray[np.bool_]
 
 
-@dataclass(frozen=True)
-class Truth:
-    """One true animal in n frames.
-
-    Attributes:
-        spine_mm: its length, mm.
-        joints_camera: (n, J, 3) mm, camera frame; NaN where it is not there.
-        visible: (n,) share of it that is seen, 0 where it is not there.
-    """
-
-    spine_mm: float
-    joints_camera: Array
-    visible: Array
-
-
 @dataclass
 class Tally:
     """Counts over recordings of one scene, from which its figures follow.
@@ -94,7 +82,7 @@ class Tally:
 
     def add(
         self,
-        truths: Sequence[Truth],
+        truths: Sequence[TrueAnimal],
         individuals: Sequence[Individual],
         n_frames: int,
         tip: int = -1,
@@ -122,7 +110,7 @@ class Tally:
         for t, truth in enumerate(truths):
             self._add_animal(truth, individuals[pairs[t]] if t in pairs else None, tip)
 
-    def _add_animal(self, truth: Truth, one: Individual | None, tip: int) -> None:
+    def _add_animal(self, truth: TrueAnimal, one: Individual | None, tip: int) -> None:
         there = np.isfinite(truth.joints_camera).all(axis=(1, 2))
         view = there & (truth.visible >= IN_VIEW)
         hidden = there & (truth.visible <= HIDDEN)
@@ -173,7 +161,7 @@ def error_mm(joints: Array, truth: Array) -> Array:
     return np.asarray(np.linalg.norm(joints - truth, axis=-1).mean(axis=1))
 
 
-def matched(truths: Sequence[Truth], individuals: Sequence[Individual]) -> dict[int, int]:
+def matched(truths: Sequence[TrueAnimal], individuals: Sequence[Individual]) -> dict[int, int]:
     """Which individual of a session is which animal, by the least sum of errors over frames.
 
     An error counts up to a spine, and a spine stands for a missing pose.

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.errors import LiexError, MisfitError
-from liex_lab.evaluation.scenes import SCENES_PROTOCOL, Individual, Tally, Truth
+from liex_lab.evaluation.scenes import SCENES_PROTOCOL, Individual, Tally
 from liex_lab.runtime.progress import Progress, silent
 
 from ..build import plan_of
@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from liex_lab.plan import Plan
     from liex_lab.sessions import Session
     from liex_lab.simulation.recording import TrueRecording
+    from liex_lab.simulation.scenes.recording import TrueAnimal
 
 Array = NDArray[np.float64]
 
@@ -67,7 +68,7 @@ class Outcome:
     exit_code: int
 
 
-Draw = Callable[[str, "TrueRecording", Sequence[Truth], Sequence[Individual]], object]
+Draw = Callable[[str, "TrueRecording", Sequence["TrueAnimal"], Sequence[Individual]], object]
 
 
 def cases() -> dict[str, Case]:
@@ -152,10 +153,7 @@ def _measure_row(
         recording = film(case.scene, seed, n_frames, family="train" if k % 2 else "other")
         # its content follows from these: it need not be rendered a second time to be hashed
         recording.take_digest(hashlib.sha256(f"{recording.name} {n_frames}".encode()).hexdigest())
-        truths = [
-            Truth(animal.spine_mm, animal.joints_camera, animal.visible)
-            for animal in recording.animals
-        ]
+        truths = recording.animals
         fits = recording.skeleton.name == plan.animal.skeleton
         outcome = run_product(recording, plan)
         tally.add(truths, outcome.individuals, n_frames, recording.skeleton.tip, fits)

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from liex_lab.evaluation.scenes import Individual, Tally, Truth, matched
+from liex_lab.evaluation.scenes import Individual, Tally, matched
+from liex_lab.simulation.scenes.recording import TrueAnimal
 
 N = 10
 SPINE = 60.0
@@ -17,15 +18,17 @@ def joints(x: float = 0.0) -> np.ndarray:
     return np.tile(one + np.array([x, 0.0, 0.0]), (N, 1, 1))
 
 
-def truth(x: float = 0.0, visible: float = 1.0) -> Truth:
-    return Truth(SPINE, joints(x), np.full(N, visible))
+def truth(x: float = 0.0, visible: float = 1.0) -> TrueAnimal:
+    return TrueAnimal(SPINE, joints(x), np.full(N, visible))
 
 
 def said(x: float = 0.0, trusted: bool = True) -> Individual:
     return Individual(joints(x), np.full(N, trusted))
 
 
-def figures(truths: list[Truth], individuals: list[Individual], **how: bool) -> dict[str, object]:
+def figures(
+    truths: list[TrueAnimal], individuals: list[Individual], **how: bool
+) -> dict[str, object]:
     tally = Tally()
     tally.add(truths, individuals, N, **how)
     return tally.figures()
