@@ -191,7 +191,5 @@ def test_a_region_in_millimetres_on_the_floor_is_the_one_in_the_picture(tmp_path
     rays = made.camera.unproject(corners, 1.0)
     depth = made.floor.distance_mm / (rays @ made.floor.normal)
     place = made.floor.T_arena_camera @ (rays * depth[:, None])
-    np.testing.assert_allclose(
-        np.hypot(place[:, 0] + 150.0, place[:, 1] - 10.0), 120.0, atol=1e-6
-    )
+    np.testing.assert_allclose(np.hypot(place[:, 0] + 150.0, place[:, 1] - 10.0), 120.0, atol=1e-6)
     assert Plan.from_toml(plan.to_toml()) == plan
