@@ -60,6 +60,10 @@ class SessionError(LiexError):
     """Raised for a session folder that is missing, unfinished or not of liex_lab."""
 
 
+class PlaceError(LiexError):
+    """Raised for a place that nothing may be written to, such as one behind a symbolic link."""
+
+
 class StudyError(LiexError):
     """Raised for a study file, or something in it, that cannot be used."""
 

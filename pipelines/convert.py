@@ -7,9 +7,7 @@ steps of one that is stated.
 
 from __future__ import annotations
 
-import os
 import re
-import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -28,6 +26,7 @@ from liex_lab.recordings.writer import (
     PictureFolderWriter,
     RecordingWriter,
 )
+from liex_lab.runtime.durable import replacing
 from liex_lab.runtime.progress import Progress, silent
 
 _STEPS_MM = {
@@ -223,23 +222,11 @@ def _in_place(target: Path) -> Iterator[Path]:
     """A name beside `target` to write under; what was written gets its own when the block ends, and
     else is gone.
     """
-    part = target.with_name(f".{target.name}.part-{os.getpid()}")
     try:
-        yield part
-        if target.is_dir():
-            _remove(target)
-        part.replace(target)
+        with replacing(target, replace_folder=True) as part:
+            yield part
     except OSError as error:
         raise RecordingError(
             f"the recording cannot be written as {target} ({error.strerror or error}); make room, "
             "or name another place"
         ) from None
-    finally:
-        _remove(part)
-
-
-def _remove(path: Path) -> None:
-    if path.is_dir():
-        shutil.rmtree(path)
-    else:
-        path.unlink(missing_ok=True)

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 from liex_lab.errors import SessionError
 from liex_lab.plan import Plan
 from liex_lab.runtime.durable import put_back, put_in_place
+from liex_lab.runtime.places import unlinked, unlinked_tree
 from liex_lab.runtime.progress import Progress, silent
 from liex_lab.sessions.corrections import (
     FOLDER,
@@ -77,7 +78,8 @@ def correct_session(
 
     raw = Session.open(session, raw=True)
     with locked(raw.path / _BUSY, f"{raw.path} is being corrected by another program"):
-        folder, aside = raw.path / FOLDER, raw.path / f"{FOLDER}.old"
+        folder = unlinked_tree(raw.path / FOLDER)
+        aside = unlinked(raw.path / f"{FOLDER}.old")
         put_back(folder, aside)  # somebody was killed here
         made_of = basis(raw.path, raw.metadata)
         log = read_log(raw.path)
@@ -93,7 +95,7 @@ def correct_session(
                 f"{raw.path} has no corrections to apply; `liex correct --help` says how to make "
                 "one"
             )
-        part = raw.path / f"{FOLDER}.part"
+        part = unlinked(raw.path / f"{FOLDER}.part")
         shutil.rmtree(part, ignore_errors=True)
         part.mkdir()
         try:

@@ -19,6 +19,7 @@ import numpy as np
 
 from liex_lab.plan import Plan
 from liex_lab.runtime.memory import Allocator, rest
+from liex_lab.runtime.places import inside
 from liex_lab.runtime.progress import Progress, silent
 from liex_lab.runtime.threads import in_background, prefetch
 
@@ -105,7 +106,7 @@ def measure_session(
         in_background(partial(build_estimator, first)) as estimator,
         build_recording(recording, first, progress) as opened,
     ):
-        folder = folder or Path(out) / f"{first.session.name or opened.name}.liex"
+        folder = folder or inside(Path(out), first.session.name or opened.name, ".liex")
         put_back_session(folder)
         check_place(folder, overwrite)
         check_free(part_folder(folder))

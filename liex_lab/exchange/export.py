@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import difflib
-import os
-import shutil
 from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
 
 from liex_lab.errors import SessionError
+from liex_lab.runtime.durable import replacing
+from liex_lab.runtime.places import inside
 from liex_lab.sessions import Session
 
 # target -> (module, ending of what it writes, what it is)
@@ -69,31 +69,15 @@ def export(
             f"{folder} is a file, and exports go into a folder; name another one with --out"
         )
     folder.mkdir(parents=True, exist_ok=True)
-    path = folder / f"{session.name}{ending}"
+    path = inside(folder, session.name, ending)
     if path.exists() and not overwrite:
         raise SessionError(
             f"{path} exists already; name another place with --out, or say --overwrite"
         )
-    part = folder / f".{os.getpid()}.part-{path.name}"
     try:
         writer: Callable[[Session, Path], None] = import_module(home).write
-        writer(session, part)
-        _replace(part, path)
+        with replacing(path, replace_folder=True) as part:
+            writer(session, part)
     except ImportError as error:
         raise SessionError(f"to write {to}, {error.name} is missing: {_EXTRA}") from None
-    finally:
-        _remove(part)
     return path
-
-
-def _replace(part: Path, path: Path) -> None:
-    if path.is_dir():
-        shutil.rmtree(path)
-    os.replace(part, path)
-
-
-def _remove(part: Path) -> None:
-    if part.is_dir():
-        shutil.rmtree(part, ignore_errors=True)
-    else:
-        part.unlink(missing_ok=True)

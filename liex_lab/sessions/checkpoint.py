@@ -22,8 +22,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.errors import SessionError
+from liex_lab.runtime.durable import write_whole
 from liex_lab.runtime.memory import mapped
-from liex_lab.sessions.failure import write_whole
+from liex_lab.runtime.places import unlinked, unlinked_tree
 from liex_lab.sessions.lock import take_lock
 
 # between two checkpoints: as much work is lost at most, besides what it takes to begin
@@ -92,7 +93,7 @@ class Checkpoint:
         Raises:
             SessionError: another process is writing the session.
         """
-        folder.mkdir(parents=True, exist_ok=True)
+        unlinked_tree(folder).mkdir(parents=True, exist_ok=True)
         check_free(folder)
         held = take_lock(folder / _LOCK)
         if held is None:  # taken in between
@@ -418,7 +419,7 @@ def hash_once(recording: Recording, folder: Path, progress: Progress) -> None:
     began = time.monotonic()
     digest = recording.digest(progress)
     if stamp and time.monotonic() - began > EVERY_S:
-        folder.mkdir(parents=True, exist_ok=True)
+        unlinked(folder).mkdir(parents=True, exist_ok=True)
         write_whole(folder / _INPUT, json.dumps({"stamp": stamp, "sha256": digest}))
 
 

@@ -8,8 +8,10 @@ from typing import Any
 
 from liex_lab.catalog import sha256
 from liex_lab.errors import SessionError
+from liex_lab.runtime.places import unlinked
 from liex_lab.sessions.checkpoint import OWN
 from liex_lab.sessions.failure import FAILED_FILE
+from liex_lab.sessions.older import aside_folder, part_folder
 
 _HASHED = {".parquet", ".csv", ".json", ".toml"}
 
@@ -25,7 +27,10 @@ def check_place(path: Path, overwrite: bool) -> None:
 
     Raises:
         SessionError: the session may not be written there.
+        PlaceError: the session's place, or one beside it that is needed, is a symbolic link.
     """
+    for place in (path, part_folder(path), aside_folder(path)):
+        unlinked(place)
     nearest = next((folder for folder in path.parents if folder.exists()), None)
     if nearest is not None and not nearest.is_dir():
         raise SessionError(

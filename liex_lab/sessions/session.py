@@ -32,7 +32,7 @@ from liex_lab.sessions.older import put_back_session
 from liex_lab.sessions.provenance import SCHEMA_VERSION
 from liex_lab.sessions.reading import reading_from
 from liex_lab.sessions.thumbnails import FOLDER
-from liex_lab.tables.schema import as_it_was
+from liex_lab.tables.spreadsheets import read_harmless
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -215,8 +215,6 @@ class Session:
         Raises:
             SessionError: the session was written without behaviour measures.
         """
-        import pandas as pd
-
         path = self.file("summary.csv")
         if not path.is_file():
             raise SessionError(
@@ -224,8 +222,7 @@ class Session:
                 "measures"
             )
         with reading_from(path):
-            table = pd.read_csv(path, dtype={"session_id": "str", "individual": "str"})
-            return table.map(as_it_was)
+            return read_harmless(path, ("session_id", "individual"))
 
     @cached_property
     def columns(self) -> pd.DataFrame:

@@ -15,9 +15,9 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING
 
+from liex_lab.runtime.durable import write_whole
 from liex_lab.sessions.buffer import Columnar
 from liex_lab.sessions.checkpoint import LOGS, STRETCHES, Checkpoint, Columns
-from liex_lab.sessions.failure import write_whole
 from liex_lab.sessions.provenance import Provenance
 from liex_lab.sessions.writer import seen_rows
 

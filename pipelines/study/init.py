@@ -13,7 +13,7 @@ from pathlib import Path
 
 from liex_lab.errors import StudyError
 from liex_lab.plan.study import DERIVED, RAW, STUDY_FILE, Study
-from liex_lab.sessions.failure import write_whole
+from liex_lab.runtime.durable import write_whole
 
 _FILES = (".mcap", ".bag", ".db3", ".oni", ".tar.gz", ".tgz", ".avi", ".mkv")
 _FOLDERS = (
