@@ -73,8 +73,8 @@ def correct_session(
         SessionError: a correction cannot be applied, there is none, those of the log were made on
             another measurement, or another program corrects the session.
     """
+    from liex_lab.runtime.lock import locked
     from liex_lab.sessions import Session
-    from liex_lab.sessions.lock import locked
 
     raw = Session.open(session, raw=True)
     with locked(raw.path / _BUSY, f"{raw.path} is being corrected by another program"):

@@ -38,6 +38,7 @@ from liex_lab.cli.study import cohort, dashboard, verify
 from liex_lab.errors import LiexError, MisfitError
 from liex_lab.runtime.disk import is_full, why_full
 from liex_lab.runtime.progress import progress_bar
+from liex_lab.runtime.signals import Ended, ending
 
 # the exit code of our own faults (EX_SOFTWARE); what the user can put right is 1, a wrong call 2
 FAULT = 70
@@ -488,7 +489,10 @@ def main() -> None:
     """
     os.environ.setdefault("RUST_LOG", _RUST_LOG)
     try:
-        app()
+        with ending():
+            app()
+    except Ended as ended:
+        _fail(str(ended), ended.exit_code)
     except LiexError as error:
         _fail(str(error), error.exit_code)
     except OSError as error:

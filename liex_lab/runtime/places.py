@@ -11,7 +11,7 @@ from __future__ import annotations
 import hashlib
 import os
 import unicodedata
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 from liex_lab.errors import PlaceError
 
@@ -128,3 +128,27 @@ def unlinked_tree(folder: Path) -> Path:
         for name in (*folders, *files):
             unlinked(Path(within, name))
     return folder
+
+
+def storable(text: str) -> str:
+    """A text as files can hold it, such as a name that the system does not give as Unicode.
+
+    Args:
+        text: any text.
+
+    Returns:
+        The text; NUL and halves of characters are the replacement character.
+    """
+    raw = text.replace("\0", "\ufffd").encode("utf-16", "surrogatepass")
+    return raw.decode("utf-16", "replace")
+
+
+def named_beside(text: str) -> bool:
+    """Whether a file may name another one so: in its own folder or below, nowhere else.
+
+    Args:
+        text: the path as it is written, with / or backslashes.
+    """
+    parts = PurePosixPath(text.replace("\\", "/")).parts
+    outside = text.startswith(("/", "\\", "~")) or text[1:2] == ":" or ".." in parts
+    return not outside and "\0" not in text

@@ -23,9 +23,9 @@ from numpy.typing import NDArray
 
 from liex_lab.errors import SessionError
 from liex_lab.runtime.durable import write_whole
+from liex_lab.runtime.lock import take_lock
 from liex_lab.runtime.memory import mapped
 from liex_lab.runtime.places import unlinked, unlinked_tree
-from liex_lab.sessions.lock import take_lock
 
 # between two checkpoints: as much work is lost at most, besides what it takes to begin
 EVERY_S = 3.0

@@ -12,10 +12,10 @@ from typing import Any, Protocol
 
 from liex_lab.errors import StudyError
 from liex_lab.plan.study import Study
+from liex_lab.runtime.lock import locked
 from liex_lab.runtime.places import unlinked_below
 from liex_lab.runtime.progress import Board
 from liex_lab.sessions.corrections import Description
-from liex_lab.sessions.lock import locked
 
 from ..correct import correct_session
 from .one_session import RunSession

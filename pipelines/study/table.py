@@ -93,7 +93,8 @@ def _row(study: Study, one: SessionStatus) -> dict[str, Any]:
     session = one.session
     failure = one.failure or {}
     document = _document(session.folder) if one.state == "done" else {}
-    frames = document.get("frames", {})
+    counted = document.get("frames")
+    frames = counted if isinstance(counted, dict) else {}
     return {
         "session_id": session.id,
         "subject_id": session.animal.id,
@@ -116,7 +117,7 @@ def _row(study: Study, one: SessionStatus) -> dict[str, Any]:
 def _document(folder: Path) -> dict[str, Any]:
     try:
         found = json.loads((folder / "session.json").read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+    except (OSError, ValueError, RecursionError):
         return {}
     return found if isinstance(found, dict) else {}
 
