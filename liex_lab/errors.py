@@ -5,7 +5,30 @@ Each message is one sentence: what was expected, what came, what to do.
 
 from __future__ import annotations
 
+import unicodedata
 from typing import ClassVar
+
+
+def printable(text: object) -> str:
+    """A text as a terminal may show it: no name of a file moves the cursor or hides what follows.
+
+    Args:
+        text: anything; what it says of itself may quote names of files and recordings.
+
+    Returns:
+        The text; control characters, those that turn the direction of writing, and halves of
+        characters are written as escapes. Line ends and tabs stay.
+    """
+    said = str(text)
+    if said.isascii() and said.isprintable():
+        return said
+    return "".join(
+        c if c in "\n\t\u200d" or unicodedata.category(c) not in _UNSEEN else ascii(c)[1:-1]
+        for c in said
+    )
+
+
+_UNSEEN = {"Cc", "Cf", "Cs", "Zl", "Zp"}
 
 
 class LiexError(Exception):
@@ -21,7 +44,7 @@ class LiexError(Exception):
 
     def __str__(self) -> str:
         """The message on one line, whatever it quotes of the user's own."""
-        return " ".join(super().__str__().splitlines())
+        return printable(" ".join(super().__str__().splitlines()))
 
 
 class RecordingError(LiexError):

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from liex_lab.errors import RecordingError
 from liex_lab.plan import Plan
 from liex_lab.runtime.memory import Allocator, rest
 from liex_lab.runtime.places import inside
@@ -95,6 +96,7 @@ def measure_session(
         MisfitError: the recording shows something else than the plan's animal.
         EstimationError: no animal is found.
     """
+    from liex_lab.recordings.timestamps import unwritable_times
     from liex_lab.sessions import SessionWriter
     from liex_lab.sessions.checkpoint import check_free, hash_once
     from liex_lab.sessions.older import part_folder, put_back_session
@@ -107,6 +109,8 @@ def measure_session(
         build_recording(recording, first, progress) as opened,
     ):
         folder = folder or inside(Path(out), first.session.name or opened.name, ".liex")
+        if told := unwritable_times(opened.times_ns):
+            raise RecordingError(f"of {opened.name} {told}")
         put_back_session(folder)
         check_place(folder, overwrite)
         check_free(part_folder(folder))

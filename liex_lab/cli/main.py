@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import errno
 import os
+import shlex
 import subprocess
 import sys
 import traceback
@@ -28,6 +29,7 @@ from liex_lab.cli.options import (
     VariantName,
     WhichPlan,
     region_setting,
+    say,
     tell_numbers,
     to_json,
     told_scores,
@@ -35,7 +37,7 @@ from liex_lab.cli.options import (
 from liex_lab.cli.results import compare, export, report
 from liex_lab.cli.sections import MODELS, RECORDINGS, SESSIONS, START, STUDIES, group_of_verbs
 from liex_lab.cli.study import cohort, dashboard, verify
-from liex_lab.errors import LiexError, MisfitError
+from liex_lab.errors import LiexError, MisfitError, printable
 from liex_lab.runtime.disk import is_full, why_full
 from liex_lab.runtime.progress import progress_bar
 from liex_lab.runtime.signals import Ended, ending
@@ -68,7 +70,7 @@ app.command(rich_help_panel=STUDIES)(dashboard)
 
 def _version(wanted: bool) -> None:
     if wanted:
-        typer.echo(f"liex_lab {liex_lab.__version__}")
+        say(f"liex_lab {liex_lab.__version__}")
         raise typer.Exit()
 
 
@@ -188,7 +190,7 @@ def doctor(
             progress=progress,
         )
     if as_json:
-        typer.echo(to_json(findings))
+        say(to_json(findings))
     else:
         print_report(findings)
 
@@ -235,9 +237,9 @@ def convert(
             overwrite=overwrite,
             progress=progress,
         )
-    typer.echo(f"recording: {done.path} ({done.n_frames} frames)")
+    say(f"recording: {done.path} ({done.n_frames} frames)")
     for sentence in (*done.problems, *done.notes):
-        typer.echo(f"note: {sentence}")
+        say(f"note: {sentence}")
 
 
 @app.command(rich_help_panel=MODELS)
@@ -309,8 +311,8 @@ def train(
                 progress=progress,
             )
         for sentence in told_scores(report):
-            typer.echo(sentence)
-        typer.echo(f"model: {model}")
+            say(sentence)
+        say(f"model: {model}")
         return
     if animal == "tracking" and particles:
         from liex_lab.pipelines.evaluation.paper.algorithm3 import search_noise
@@ -326,7 +328,7 @@ def train(
             table = train_tracking(
                 of, out or Path("tunings.toml"), workers=workers, progress=progress
             )
-        typer.echo(f"tunings: {table}")
+        say(f"tunings: {table}")
         return
     from liex_lab.pipelines.training.pose_model import train_model
 
@@ -335,7 +337,7 @@ def train(
         model = train_model(
             animal, variant, path, workers=workers, n_images=n_images, progress=progress
         )
-    typer.echo(f"model: {model}")
+    say(f"model: {model}")
 
 
 @app.command(rich_help_panel=SESSIONS)
@@ -351,13 +353,15 @@ def suggest(
     """
     from rich.console import Console
     from rich.table import Table
+    from rich.text import Text
 
     from liex_lab.pipelines.training.action_model import suggest as job
 
     table = Table("from (s)", "to (s)", "taken for", "or else", "doubt")
     for row in job(session, model=model, n=n).itertuples():
         numbers = (f"{row.start_s:.2f}", f"{row.stop_s:.2f}", f"{row.uncertainty:.2f}")
-        table.add_row(*numbers[:2], str(row.guess), str(row.or_else), numbers[2])
+        words = (Text(printable(row.guess)), Text(printable(row.or_else)))
+        table.add_row(*numbers[:2], *words, numbers[2])
     Console().print(table)
 
 
@@ -422,7 +426,7 @@ def show(
     # RERUN_ANALYTICS: what a laboratory looks at is nobody else's business; the viewer in a browser
     # does not heed it
     if web:
-        typer.echo(
+        say(
             "Rerun's viewer in the browser calls tel.rerun.io, its makers' count of uses; the "
             "window does not"
         )
@@ -473,7 +477,7 @@ def info(
             for name, card in models.items()
         }
         tell_numbers(facts, None)
-        typer.echo("`liex info --all` lists every package and how the models were made")
+        say("`liex info --all` lists every package and how the models were made")
         return
     facts |= {
         f"model {name}: {key}": value
@@ -488,6 +492,8 @@ def main() -> None:
     ours shows itself.
     """
     os.environ.setdefault("RUST_LOG", _RUST_LOG)
+    if told := liex_lab._KERNELS_TOLD:
+        typer.echo(f"note: {printable(told)}", err=True)
     try:
         with ending():
             app()
@@ -510,7 +516,7 @@ def main() -> None:
 
 
 def _fail(sentence: str, code: int = 1) -> NoReturn:
-    typer.secho(f"liex: {sentence}", fg=typer.colors.RED, err=True)
+    typer.secho(f"liex: {printable(sentence)}", fg=typer.colors.RED, err=True)
     sys.exit(code)
 
 
@@ -524,16 +530,16 @@ def _tell_session(session: Path) -> None:
     from liex_lab.sessions.older import taken_from
     from liex_lab.sessions.verdict import read_verdict
 
-    typer.echo(f"session: {session}")
+    say(f"session: {session}")
     if copy := taken_from(session):
-        typer.echo(f"note: the corrections of {copy} were taken over; see `liex correct list`")
+        say(f"note: the corrections of {copy} were taken over; see `liex correct list`")
     report = session / "report.html"
     if report.is_file():
-        typer.echo(f"report:  {report}")
-    typer.echo(f"replay:  liex show {session}")
+        say(f"report:  {report}")
+    say(f"replay:  liex show {shlex.quote(str(session))}")
     verdict = read_verdict(session)
     if verdict["sentence"]:
         colour = typer.colors.YELLOW if verdict["look_at_it"] else None
-        typer.secho(f"result:  {verdict['sentence']}", fg=colour)
+        typer.secho(f"result:  {printable(verdict['sentence'])}", fg=colour)
     if verdict["look_at_it"] and not verdict["accepted"]:
         raise typer.Exit(MisfitError.exit_code)

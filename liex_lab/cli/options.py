@@ -8,6 +8,8 @@ from typing import Annotated, Any
 
 import typer
 
+from liex_lab.errors import printable
+
 RecordingPath = Annotated[
     Path, typer.Argument(metavar="RECORDING", help="A file, a folder, or synthetic:walk.")
 ]
@@ -67,6 +69,11 @@ def region_setting(region: str | None) -> list[str]:
     return [f"arena.region={corners}"]
 
 
+def say(text: object) -> None:
+    """A line on the screen, whatever names of files it quotes."""
+    typer.echo(printable(text))
+
+
 def tell_numbers(result: dict[str, Any], json_file: Path | None) -> None:
     """The numbers as a table on the screen, and as JSON where a file was named."""
     if json_file is not None:
@@ -78,7 +85,8 @@ def tell_numbers(result: dict[str, Any], json_file: Path | None) -> None:
     table = Table(show_header=False)
     for name, value in result.items():
         said = to_json(value) if isinstance(value, dict) else str(value)
-        table.add_row(name, Text(f"{value:.4g}" if isinstance(value, float) else said))
+        said = f"{value:.4g}" if isinstance(value, float) else said
+        table.add_row(Text(printable(name)), Text(printable(said)))
     Console().print(table)
 
 
@@ -88,7 +96,7 @@ def tell_rows(rows: dict[str, dict[str, Any]]) -> None:
     lines = [["", *(name.replace("_", " ") for name in columns)], ["---"] * (len(columns) + 1)]
     lines += [[name, *(_cell(row.get(column)) for column in columns)] for name, row in rows.items()]
     for line in lines:
-        typer.echo(f"| {' | '.join(line)} |")
+        say(f"| {' | '.join(line)} |")
 
 
 def _cell(value: Any) -> str:

@@ -9,6 +9,7 @@ from typing import Annotated
 
 import typer
 
+from liex_lab.cli.options import say
 from liex_lab.runtime.progress import progress_bar
 
 
@@ -57,8 +58,8 @@ def compare(
             else row["refused"]
         )
         n = f"{row['n_units_first']} and {row['n_units_second']} units ({row['unit'] or 'none'})"
-        typer.echo(f"{row['measure']}, {row['contrast']}: {numbers}; {n}\n    {p}")
-    typer.echo(f"tables: {found['folder']}")
+        say(f"{row['measure']}, {row['contrast']}: {numbers}; {n}\n    {p}")
+    say(f"tables: {found['folder']}")
 
 
 def report(
@@ -69,7 +70,7 @@ def report(
     """Write a session's report.html again, with what people corrected since."""
     from liex_lab.dashboards.report.report import write_report
 
-    typer.echo(f"report: {write_report(session)}")
+    say(f"report: {write_report(session)}")
 
 
 def export(
@@ -95,4 +96,4 @@ def export(
     from liex_lab.exchange import export as job
     from liex_lab.sessions import Session
 
-    typer.echo(f"export: {job(Session.open(session), to, out, overwrite=overwrite)}")
+    say(f"export: {job(Session.open(session), to, out, overwrite=overwrite)}")

@@ -37,8 +37,20 @@ def sync_tree(folder: Path) -> None:
         for name in sorted(names):
             file = Path(inside, name)
             if file.is_file() and not file.is_symlink():
-                _sync(file, os.O_RDWR if sys.platform == "win32" else os.O_RDONLY)
+                sync_file(file)
         sync_folder(Path(inside))
+
+
+def sync_file(file: Path) -> None:
+    """Synchronise the content of a file to disk.
+
+    Args:
+        file: the file.
+
+    Raises:
+        OSError: the disk is full or broken.
+    """
+    _sync(file, os.O_RDWR if sys.platform == "win32" else os.O_RDONLY)
 
 
 def sync_folder(folder: Path) -> None:
@@ -81,7 +93,7 @@ def replacing(path: Path, replace_folder: bool = False) -> Iterator[Path]:
         if part.is_dir():
             sync_tree(part)
         else:
-            _sync(part, os.O_RDWR if sys.platform == "win32" else os.O_RDONLY)
+            sync_file(part)
         if path.is_dir() and replace_folder:
             put_in_place(part, path, path.with_name(f".{path.name}.old"))
         else:

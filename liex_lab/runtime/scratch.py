@@ -1,7 +1,7 @@
 """Temporary folders that do not outlive their process, however it ends.
 
-Each is locked as long as it is in use. One that nobody holds any more belonged to a process that was
-killed, and goes when the next one is made.
+Each is locked as long as it is in use. One that nobody holds any more belonged to a process that
+was killed, and goes when the next one is made.
 """
 
 from __future__ import annotations

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.errors import SessionError
-from liex_lab.runtime.durable import write_whole
+from liex_lab.runtime.durable import sync_file, sync_tree, write_whole
 from liex_lab.runtime.lock import take_lock
 from liex_lab.runtime.memory import mapped
 from liex_lab.runtime.places import unlinked, unlinked_tree
@@ -180,6 +180,10 @@ class Checkpoint:
         self.state.runs += 1  # the next part, not begun yet
 
     def _keep(self, state: State) -> None:
+        """Note what is there, once it is on disk: a power cut leaves nothing that is not."""
+        sync_tree(self.folder / _SEEN)
+        for log, sizes in state.logs.items():
+            sync_file(self.part(log, len(sizes) - 1))
         write_whole(self.folder / _STATE, json.dumps(vars(state)))
         self.state, self._last = state, self._clock()
 

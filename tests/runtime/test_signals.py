@@ -115,7 +115,8 @@ def alive(pid: int) -> bool:
 def test_no_worker_is_left_behind(number: int, handled: bool, tmp_path: Path) -> None:
     work = "list(Processes(2, 1).each(do, [1, 2, 3]))"
     if handled:
-        work = f"import liex_lab.cli.main; cli = sys.modules['liex_lab.cli.main']; cli.app = lambda: {work}; cli.main()"
+        begin = "import liex_lab.cli.main; cli = sys.modules['liex_lab.cli.main']; "
+        work = f"{begin}cli.app = lambda: {work}; cli.main()"
     script = tmp_path / "script.py"
     script.write_text(POOL.format(main=work))
     with subprocess.Popen(
