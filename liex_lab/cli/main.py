@@ -131,7 +131,7 @@ def run(
     from liex_lab.plan import Plan
 
     asked = [] if topic is None else [f"recording.topic={topic}"]
-    asked += ["replay.depth=false"] * no_depth + ["replay.candidates=true"] * candidates
+    asked += ["replay.depth=none"] * no_depth + ["replay.candidates=true"] * candidates
     asked += [*["estimation.accept_misfit=true"] * accept, *(settings or [])]
     # first: a wrong plan or setting is told at once
     chosen = Plan.load(plan or "mouse").with_settings(asked)

@@ -1,9 +1,11 @@
 """Rerun replay log (.rrd): depth, skeleton, scalars and actions on timelines `frame` and `time`.
 
 Lengths are metres, the arena is right-handed with z up. Depth is stored without loss: RVL (Wilson
-2017, run-length and variable-length coding), or PNG where sensor noise makes that smaller. Depth
-streams in as it comes; everything small is written at the end from the same track the tables are
-made of.
+2017, run-length and variable-length coding), or PNG where sensor noise makes that smaller. Cut-outs
+are seen by pinhole cameras of their own, whose principal point is that of the camera less the
+cut-out's corner, before the still scene, which is there once; the entity `places` says where they
+lie in the picture, see `cutout_frame`. Depth streams in as it comes; everything small is written at
+the end from the same track the tables are made of.
 """
 
 from __future__ import annotations
@@ -13,6 +15,7 @@ import ctypes
 import threading
 import time
 from collections.abc import Sequence
+from dataclasses import dataclass
 from itertools import cycle
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -27,6 +30,7 @@ from liex_lab.geometry import so3
 from liex_lab.recordings.rvl import rvl_message
 from liex_lab.runtime.disk import probe_full
 from liex_lab.runtime.memory import blocks
+from liex_lab.sessions.cutouts import N_BOXES, Boxes
 from liex_lab.sessions.joining import RRD_HEAD, rrd_messages
 from liex_lab.sessions.provenance import Provenance
 from liex_lab.sessions.rrd_body import log_body, send_body
@@ -42,6 +46,9 @@ DepthBatch = Sequence[NDArray[np.uint16]]
 
 DEPTH = "arena/camera/image/depth"
 IMAGE = "arena/camera/image"
+BACKGROUND = "arena/camera/image/background"
+CUTOUTS = "arena/camera/cutouts"
+PLACES = "arena/camera/image/places"
 OVERLAY = "arena/camera/image/overlay"
 SKELETON = "arena/skeleton"
 ROOT = "arena/root"
@@ -63,6 +70,11 @@ _NOISY_PNG = (
 _TOGETHER = 64
 _TOGETHER_BYTES = 1 << 23
 _BLOCK = 8192  # frames of small things sent in one go
+# one above the other in the picture
+_BACKMOST = -40.0
+_BEHIND = -30.0
+_WHOLE = -20.0  # shown later, over cut-outs that it was left out for
+_RVL = "application/rvl"  # media type
 # turns in which a flush is waited for, and how long a file may stand still, where the disk has room
 _TURN_S = 2.0
 _PATIENCE_S = 120.0
@@ -101,9 +113,7 @@ class ReplayWriter:
     ) -> None:
         self._origin = origin
         self._first_ns: int | None = None
-        self._waiting: list[
-            tuple[int, int, NDArray[np.uint8], str]
-        ] = []  # frame, ns since the first, depth, its kind
+        self._waiting: list[_Picture] = []
         stream = rr.RecordingStream(
             "liex_lab", recording_id=origin.recording_id, send_properties=False
         )
@@ -128,38 +138,103 @@ class ReplayWriter:
         """
         self._first_ns = first_ns
 
-    def add(self, frame_index: Sequence[int], times_ns: Sequence[int], depth: DepthBatch) -> None:
-        """Write depth of consecutive frames; nothing where the replay is to be without depth.
+    def add(
+        self,
+        frame_index: Sequence[int],
+        times_ns: Sequence[int],
+        depth: DepthBatch,
+        boxes: Boxes | None = None,
+    ) -> None:
+        """Write depth of consecutive frames; nothing where there is none.
 
         Args:
             frame_index: the camera's count of the n frames.
             times_ns: their times, ns.
-            depth: n pictures (H, W) uint16 mm, 0 where unread.
+            depth: n pictures (H, W) uint16 mm, 0 where unread; none where depth is not kept.
+            boxes: (n, K, 4) left, top, right and bottom of the cut-outs, px, all 0 for none; None
+                where whole pictures are kept. It is the same for all frames of a replay.
         """
-        if not self._origin.replay_depth:
+        if not depth:
             return
         if self._first_ns is None:
             self._first_ns = int(times_ns[0])
-            self._log_depth_kind(depth[0])
-        for index, time_ns, image in zip(frame_index, times_ns, depth, strict=True):
-            self._waiting.append((int(index), int(time_ns) - self._first_ns, *packed(image)))
+            self._log_depth_kind(depth[0], whole=boxes is None)
+        for i, image in enumerate(depth):
+            cuts = [] if boxes is None else boxes[i].tolist()
+            parts = [_cut_out(image, box) for box in cuts]
+            picture = _Picture(
+                int(frame_index[i]),
+                int(times_ns[i]) - self._first_ns,
+                [packed(image)] if boxes is None else parts,
+                cuts,
+            )
+            self._waiting.append(picture)
             if (
                 len(self._waiting) == _TOGETHER
-                or sum(blob.nbytes for _, _, blob, _ in self._waiting) > _TOGETHER_BYTES
+                or sum(picture.n_bytes for picture in self._waiting) > _TOGETHER_BYTES
             ):
                 self._send_depth()
 
     def _send_depth(self) -> None:
         """Write the depth that waits."""
-        if self._waiting:
-            index, elapsed, blobs, kinds = zip(*self._waiting, strict=True)
-            columns = rr.EncodedDepthImage.columns(blob=blobs, media_type=kinds)
-            self._stream.send_columns(
-                DEPTH, _timeline(np.array(index), np.array(elapsed)), [*columns]
-            )
-            self._flush()
-            self._n_sent += 1
-            self._waiting.clear()
+        if not self._waiting:
+            return
+        waiting = self._waiting
+        when = _timeline(
+            np.array([picture.index for picture in waiting]),
+            np.array([picture.elapsed_ns for picture in waiting]),
+        )
+        if not waiting[0].boxes:
+            self._send_pictures(DEPTH, when, [picture.parts[0] for picture in waiting])
+        for k in range(len(waiting[0].boxes)):
+            boxes = np.array([picture.boxes[k] for picture in waiting], np.float64)
+            self._send_cutouts(k, when, boxes, [picture.parts[k] for picture in waiting])
+        self._flush()
+        self._waiting.clear()
+
+    def _send_pictures(
+        self,
+        entity: str,
+        when: list[rr.TimeColumn],
+        parts: Sequence[tuple[NDArray[np.uint8], str]],
+    ) -> None:
+        """Depth pictures, packed; those of no bytes are none."""
+        there = [part for part in parts if len(part[0])]
+        blobs, kinds = zip(*there, strict=True) if there else ((), ())
+        columns = rr.EncodedDepthImage.columns(blob=blobs, media_type=kinds)
+        counts = [int(len(blob) > 0) for blob, _ in parts]
+        self._stream.send_columns(entity, when, [*columns.partition(counts)])
+        self._n_sent += 1
+
+    def _send_cutouts(
+        self,
+        k: int,
+        when: list[rr.TimeColumn],
+        boxes: Array,
+        parts: Sequence[tuple[NDArray[np.uint8], str]],
+    ) -> None:
+        """The k-th cut-out of frames with its lens, and where in the picture it lies; boxes (n, 4)
+        px.
+        """
+        there = boxes[:, 2] > boxes[:, 0]
+        if not there.any() and k:
+            return
+        n = len(boxes)
+        lens = np.tile(self._origin.camera.matrix, (n, 1, 1))
+        lens[:, :2, 2] -= boxes[:, :2]
+        lenses = rr.Pinhole.columns(
+            image_from_camera=lens,
+            resolution=np.maximum(boxes[:, 2:] - boxes[:, :2], 1.0),
+        )
+        corners = np.hstack([boxes[:, :2], np.zeros((n, 1))])
+        places = rr.Transform3D.columns(
+            translation=corners,
+            child_frame=[cutout_frame(k)] * n,
+            parent_frame=[f"tf#/{IMAGE}"] * n,
+        )
+        self._stream.send_columns(f"{CUTOUTS}/{k + 1}", when, [*lenses])
+        self._stream.send_columns(f"{PLACES}/{k + 1}", when, [*places])
+        self._send_pictures(f"{CUTOUTS}/{k + 1}/depth", when, parts)
 
     def finish(
         self,
@@ -337,16 +412,27 @@ class ReplayWriter:
         drawn = [(zone.name, zone.outline_mm(), colour) for zone, colour in zones]
         return ([("", walls, _WALL)] if len(walls) else []) + drawn
 
-    def _log_depth_kind(self, first: NDArray[np.uint16]) -> None:
-        """What holds for every depth image: unit, colours, layout."""
+    def _log_depth_kind(self, first: NDArray[np.uint16], *, whole: bool) -> None:
+        """What holds for every depth image: unit, colours, layout; and the still scene."""
         look: dict[str, Any] = {
             "meter": MM_PER_UNIT,
             "colormap": "viridis",
             "point_fill_ratio": 0.25,
             "depth_range": colour_range(first, self._origin.floor_distance_mm),
         }
-        kind = rr.EncodedDepthImage.from_fields(**look)
-        self._stream.log(DEPTH, kind, static=True)
+        if whole:
+            kind = rr.EncodedDepthImage.from_fields(**look, draw_order=_WHOLE)
+            self._stream.log(DEPTH, kind, static=True)
+            return
+        for k in range(N_BOXES):
+            kind = rr.EncodedDepthImage.from_fields(**look, draw_order=_BEHIND)
+            self._stream.log(f"{CUTOUTS}/{k + 1}/depth", kind, static=True)
+        assert self._origin.background is not None
+        blob, media_type = packed(self._origin.background)
+        scene = rr.EncodedDepthImage(
+            blob=blob, media_type=media_type, **look, draw_order=_BACKMOST
+        )
+        self._stream.log(BACKGROUND, scene, static=True)
 
     def _log_skeleton(
         self, rows: Rows, index: NDArray[np.int64], elapsed: NDArray[np.int64]
@@ -543,6 +629,33 @@ class ReplayWriter:
         )
 
 
+@dataclass(frozen=True)
+class _Picture:
+    """What is kept of one frame's depth: its packed parts, and their boxes, none for a whole one."""
+
+    index: int
+    elapsed_ns: int
+    parts: Sequence[tuple[NDArray[np.uint8], str]]
+    boxes: Sequence[Sequence[int]]
+
+    @property
+    def n_bytes(self) -> int:
+        """Of all parts."""
+        return sum(len(blob) for blob, _ in self.parts)
+
+
+def cutout_frame(k: int) -> str:
+    """Rerun's name of the coordinate frame of the k-th cut-out in the picture.
+
+    In space a cut-out is seen by a pinhole camera of its own; in a view of the picture its entity
+    is put into this frame instead, for Rerun shows what one camera sees in no other's picture.
+
+    Args:
+        k: counted from 0.
+    """
+    return f"cutout {k + 1} in the picture"
+
+
 def corrected_entity(entity: str) -> str:
     """Entity path in the replay of corrections of what the session's own replay keeps at `entity`.
 
@@ -605,7 +718,18 @@ def packed(depth: NDArray[np.uint16]) -> tuple[NDArray[np.uint8], str]:
         png = cv2.imencode(".png", depth, _NOISY_PNG)[1].ravel()
         if len(png) < _PACKED_FURTHER * len(rvl):
             return png, "image/png"
-    return rvl, "application/rvl"
+    return rvl, _RVL
+
+
+def _cut_out(depth: NDArray[np.uint16], box: Sequence[int]) -> tuple[NDArray[np.uint8], str]:
+    """A box of a picture, encoded without loss; no bytes where there is no box.
+
+    Always RVL: Rerun takes PNGs for a video, whose pictures may not change their size.
+    """
+    left, top, right, bottom = box
+    if right <= left:
+        return np.empty(0, np.uint8), _RVL
+    return rvl_message(depth[top:bottom, left:right]), _RVL
 
 
 def colour_range(depth: NDArray[np.uint16], floor_distance_mm: float) -> tuple[float, float]:
