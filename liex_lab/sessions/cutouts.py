@@ -21,13 +21,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from liex_lab.errors import RecordingError, SessionError
 from liex_lab.recordings.rvl import to_millimetres
 from liex_lab.sessions.reading import reading_from
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from liex_lab.recordings.frame import DepthFrame
     from liex_lab.recordings.recording import Recording
     from liex_lab.sessions.provenance import Provenance
     from liex_lab.sessions.session import Session
@@ -55,11 +55,14 @@ def still_scene(recording: Recording) -> Depth:
         recording: an open recording.
 
     Returns:
-        (H, W) uint16 mm, 0 where nothing keeps coming back.
+        (H, W) uint16 mm, smoothed by a median of 3 x 3 pixels, 0 where nothing keeps coming back.
     """
+    import cv2
+
     from liex_lab.foreground.background import learn_background, sample_frames
 
-    return to_millimetres(learn_background(sample_frames(recording, _FRAMES))[0])
+    learned = to_millimetres(learn_background(sample_frames(recording, _FRAMES))[0])
+    return np.asarray(cv2.medianBlur(learned, 3), np.uint16)  # specks of 16 frames are no scene
 
 
 class PictureKeeper:
@@ -190,6 +193,34 @@ def write_boxes(folder: Path, boxes: Boxes) -> None:
         boxes: (n, K, 4) of every frame.
     """
     np.savez_compressed(folder / FILE, boxes=boxes)
+
+
+def open_pictures(session: Session) -> Recording:
+    """The depth pictures that a session keeps, as a recording; a session's pictures are read here.
+
+    Outside of its boxes a picture shows the still scene, see `Kept`.
+
+    Args:
+        session: the session.
+
+    Returns:
+        The recording of session.mcap; its rows are those of the table `frames`.
+
+    Raises:
+        SessionError: the session keeps no depth.
+        RecordingError: session.mcap cannot be read.
+    """
+    from liex_lab.recordings import open_recording
+
+    try:
+        return open_recording(session.path / "session.mcap")
+    except RecordingError:
+        if session.metadata["plan"].get("replay", {}).get("depth") not in (NONE, False):
+            raise
+    raise SessionError(
+        f'{session.path} keeps no depth pictures, for its plan says replay.depth = "none"; run '
+        "`liex run` on the recording again with --set replay.depth=animal"
+    )
 
 
 class Kept:

@@ -3,8 +3,8 @@
 Messages follow Foxglove's schemas (RawImage 16UC1 in mm, CameraCalibration, FrameTransforms,
 SceneUpdate, PosesInFrame, ImageAnnotations, Log) and one JSON schema of our own for actions.
 Pictures are whole, for Foxglove shows one image; where the still scene stands behind cut-outs,
-Zstandard finds it in the picture before, some 50 to a chunk. Depth streams in as it comes; everything small is written at the end from the same track the tables are
-made of.
+Zstandard finds it in the picture before, some 50 pictures to a chunk. Depth streams in as it comes;
+everything small is written at the end from the same track the tables are made of.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ _BLOCK = 8192  # frames of a track that are in memory
 # level (0 is the usual one) and bytes of the chunks: whole pictures, one to a chunk; and those that
 # are alike but for a cut-out
 _WHOLE = (0, 128 * 1024)
-_ALIKE = (7, 32 * 1024 * 1024)
+_ALIKE = (9, 32 * 1024 * 1024)
 _ACTION_SCHEMA = {
     "title": "liex_lab.ActionState",
     "description": "The action that begins now; an empty word ends the last one.",

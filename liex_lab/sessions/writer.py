@@ -48,6 +48,7 @@ from liex_lab.sessions.thumbnails import Keepsakes
 from liex_lab.tables import schema
 from liex_lab.tables.rows import Rows, rows_only
 from liex_lab.tables.schema import Column
+from liex_lab.tracking.observations import Observations
 from liex_lab.tracking.track import Flip, Track, Tracked
 
 if TYPE_CHECKING:
@@ -55,7 +56,6 @@ if TYPE_CHECKING:
 
     from liex_lab.recordings.frame import DepthFrame
     from liex_lab.sessions.session import Session
-    from liex_lab.tracking.observations import Observations
     from liex_lab.tracking.offline import Subject
 
 INDEX = "frame_index"
@@ -196,7 +196,7 @@ class SessionWriter:
         self,
         frames: Sequence[DepthFrame],
         track_part: Track | None = None,
-        seen: Observations | None = None,
+        seen: Columnar | None = None,
     ) -> None:
         """Write consecutive frames.
 
@@ -204,7 +204,8 @@ class SessionWriter:
             frames: the next frames.
             track_part: their rows of the track, unless `close` gets the whole track.
             seen: their observations, one row per frame, kept on disk until the session is whole: an
-                interrupted run can go on from there, see `seen`.
+                interrupted run can go on from there, see `seen`. They say where the animal is,
+                around which the depth is kept.
 
         Raises:
             SessionError: the track part is of other frames, or a log could not be written.
@@ -225,7 +226,8 @@ class SessionWriter:
         ):  # bounds the copies, however many frames come at once
             part = slice(start, start + 16)
             depth = [to_millimetres(frame.depth) for frame in frames[part]]
-            kept, cuts = self._keeper.keep(depth, None if seen is None else seen[part])
+            found = seen[part] if isinstance(seen, Observations) else None
+            kept, cuts = self._keeper.keep(depth, found)
             self._drain(_BEHIND)
             replay, messages = (self._loggers[log] for log in LOGS)
             self._logging.append(
