@@ -46,6 +46,7 @@ class Packed:
         source_bytes: size of the recording that it was made of; 0 for one that is in no file.
         kept: share of the pixels of a picture that are kept.
         verified: whether it was read again and compared.
+        written: whether it is new, not one that was only verified.
         deleted: files that were removed.
         notes: sentences about what was found.
     """
@@ -56,6 +57,7 @@ class Packed:
     source_bytes: int
     kept: float
     verified: bool
+    written: bool
     deleted: list[Path]
     notes: list[str]
 
@@ -73,6 +75,8 @@ def pack(
 ) -> Packed:
     """Write the archive of a recording; it has its name only when it is whole.
 
+    With `verify`, an archive is held against the hash that it states instead.
+
     Args:
         recording: a path or address.
         to: the archive, NAME.mcap; None: NAME.pack.mcap beside the recording.
@@ -89,6 +93,13 @@ def pack(
             opened or is an archive already, or what was read again differs.
     """
     with open_planned(recording, plan, progress) as opened:
+        if "packed" in opened.metadata:
+            if verify and to is None and not delete_original:
+                return _checked(recording, opened, progress)
+            raise RecordingError(
+                f"{recording} is an archive of `liex pack` already; `liex pack {recording} "
+                "--verify` checks it against the hash that it states"
+            )
         target = _target(recording, to, opened, overwrite)
         if delete_original:
             _check_deletable(opened)
@@ -111,6 +122,7 @@ def pack(
             sum(source.stat().st_size for source in opened.sources),
             1.0 if mask is None else float(mask.mean()),
             verify or delete_original,
+            True,
             list(opened.sources) if delete_original else [],
             [*opened.problems, *notes],
         )
@@ -119,38 +131,17 @@ def pack(
     return done
 
 
-def verify_archive(path: str | Path, progress: Progress = silent) -> int:
-    """Read an archive and compare its times and pictures with the hash that it states.
-
-    Args:
-        path: the archive.
-        progress: told frame by frame.
-
-    Returns:
-        How many frames it holds.
-
-    Raises:
-        RecordingError: it is no archive, is cut, or was changed.
-    """
-    from liex_lab.recordings import open_recording
-
-    with open_recording(path, strict=True, progress=progress) as opened:
-        stated = opened.metadata.get("packed")
-        if stated is None:
-            raise RecordingError(
-                f"{path} is no archive of `liex pack`, so it states no hash to be verified; leave "
-                "out --verify-only, and --verify compares the new archive with it"
-            )
-        if _hash_of(opened, progress) != stated["depth_sha256"] or not _none_damaged(opened):
-            raise RecordingError(
-                f"{path} was changed since it was packed: its times and pictures have another "
-                "hash than it states; take another copy of it"
-            )
-        return len(opened)
-
-
-def _none_damaged(opened: Recording) -> bool:
-    return not any("is damaged" in problem for problem in opened.problems)
+def _checked(path: str | Path, opened: Recording, progress: Progress) -> Packed:
+    """An archive, its times and pictures held against the hash that it states."""
+    stated = opened.metadata["packed"]
+    digest = _hash_of(opened, progress)
+    if digest != stated["depth_sha256"]:
+        raise RecordingError(
+            f"{path} was cut or changed since it was packed: its times and pictures have another "
+            "hash than it states; take another copy of it"
+        )
+    size = Path(path).stat().st_size
+    return Packed(Path(path), len(opened), size, 0, 1.0, True, False, [], list(opened.problems))
 
 
 def _target(
@@ -159,10 +150,6 @@ def _target(
     """Where the archive goes."""
     from liex_lab.recordings.formats.messages.pack_facts import SUFFIX
 
-    if "packed" in opened.metadata:
-        raise RecordingError(
-            f"{recording} is an archive of `liex pack` already; check it with --verify-only"
-        )
     beside = Path(recording).parent if opened.sources else Path()
     target = Path(to) if to is not None else beside / f"{opened.name}{SUFFIX}.mcap"
     if target.suffix.lower() != ".mcap":

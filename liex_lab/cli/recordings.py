@@ -70,10 +70,8 @@ def pack(
     ] = None,
     whole: Annotated[bool, typer.Option("--whole", help="Keep whole pictures.")] = False,
     verify: Annotated[
-        bool, typer.Option("--verify", help="Read it again and compare it with the recording.")
-    ] = False,
-    verify_only: Annotated[
-        bool, typer.Option("--verify-only", help="Check an archive against the hash it states.")
+        bool,
+        typer.Option("--verify", help="Read it again and compare; of an archive: with its hash."),
     ] = False,
     delete_original: Annotated[
         bool,
@@ -87,31 +85,25 @@ def pack(
 ) -> None:
     """Pack a recording without loss: its arena in 16 bits, half as large, read by every verb."""
     from liex_lab.pipelines.pack import pack as job
-    from liex_lab.pipelines.pack import verify_archive
     from liex_lab.plan import Plan
 
     if whole and region is not None:
         raise typer.BadParameter("--whole keeps every pixel; leave out --region or --whole")
-    if verify_only and (delete_original or to is not None):
-        raise typer.BadParameter("--verify-only writes and removes nothing; leave out the others")
     asked = [*region_setting(region), *([] if topic is None else [f"recording.topic={topic}"])]
     chosen = Plan.load(plan or "mouse").with_settings([*asked, *(settings or [])])
     with progress_bar() as progress:
-        if verify_only:
-            n_frames = verify_archive(recording, progress)
-        else:
-            done = job(
-                recording,
-                to,
-                plan=chosen,
-                whole=whole,
-                verify=verify,
-                delete_original=delete_original,
-                overwrite=overwrite,
-                progress=progress,
-            )
-    if verify_only:
-        typer.echo(f"archive: {recording} ({n_frames} frames) is as it was packed")
+        done = job(
+            recording,
+            to,
+            plan=chosen,
+            whole=whole,
+            verify=verify,
+            delete_original=delete_original,
+            overwrite=overwrite,
+            progress=progress,
+        )
+    if not done.written:
+        typer.echo(f"archive: {done.path} ({done.n_frames} frames) is as it was packed")
         return
     size = f"{done.n_bytes / 1e6:.1f} MB"
     if done.source_bytes:
