@@ -7,7 +7,6 @@ from __future__ import annotations
 import errno
 import os
 import shlex
-import subprocess
 import sys
 import traceback
 from pathlib import Path
@@ -34,6 +33,8 @@ from liex_lab.cli.options import (
     to_json,
     told_scores,
 )
+from liex_lab.cli.recordings import convert, pack
+from liex_lab.cli.replay import show
 from liex_lab.cli.results import compare, export, report
 from liex_lab.cli.sections import MODELS, RECORDINGS, SESSIONS, START, STUDIES, group_of_verbs
 from liex_lab.cli.study import cohort, dashboard, verify
@@ -134,7 +135,7 @@ def run(
     from liex_lab.plan import Plan
 
     asked = [] if topic is None else [f"recording.topic={topic}"]
-    asked += ["replay.depth=false"] * no_depth + ["replay.candidates=true"] * candidates
+    asked += ["replay.depth=none"] * no_depth + ["replay.candidates=true"] * candidates
     asked += [*["estimation.accept_misfit=true"] * accept, *(settings or [])]
     # first: a wrong plan or setting is told at once
     chosen = Plan.load(plan or "mouse").with_settings(asked)
@@ -195,51 +196,8 @@ def doctor(
         print_report(findings)
 
 
-@app.command(rich_help_panel=RECORDINGS)
-def convert(
-    recording: RecordingPath,
-    to: Annotated[
-        Path,
-        typer.Option(
-            "--to", metavar="TARGET", help="NAME.mcap, NAME.oni, or a folder for PNG pictures."
-        ),
-    ],
-    fps: Annotated[
-        float | None, typer.Option("--fps", help="Frames per second, where the file has no times.")
-    ] = None,
-    topic: TopicName = None,
-    step_mm: Annotated[
-        float | None,
-        typer.Option(
-            "--step-mm", min=0.001, help="Round depth to steps of this size; not for MCAP."
-        ),
-    ] = None,
-    ros: Annotated[
-        bool, typer.Option("--ros", help="MCAP with ROS 2's messages instead of Foxglove's.")
-    ] = False,
-    overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Replace what is there under this name.")
-    ] = False,
-) -> None:
-    """Write a recording as MCAP (which keeps every depth), as .oni, or as a folder of 16-bit PNG
-    pictures.
-    """
-    from liex_lab.pipelines.convert import convert as job
-
-    with progress_bar() as progress:
-        done = job(
-            recording,
-            to,
-            fps=fps,
-            topic=topic,
-            step_mm=step_mm,
-            ros=ros,
-            overwrite=overwrite,
-            progress=progress,
-        )
-    say(f"recording: {done.path} ({done.n_frames} frames)")
-    for sentence in (*done.problems, *done.notes):
-        say(f"note: {sentence}")
+app.command(rich_help_panel=RECORDINGS)(convert)
+app.command(rich_help_panel=RECORDINGS)(pack)
 
 
 @app.command(rich_help_panel=MODELS)
@@ -396,53 +354,7 @@ def live(
     tell_numbers(result, json_file)
 
 
-@app.command(rich_help_panel=START)
-def show(
-    session: SessionPath,
-    web: Annotated[
-        bool, typer.Option("--web", help="In the browser, where Rerun calls tel.rerun.io.")
-    ] = False,
-    at_s: Annotated[
-        float | None, typer.Option("--at", metavar="S", min=0.0, help="Open it at this time.")
-    ] = None,
-) -> None:
-    """Open a session's replay in Rerun."""
-    from liex_lab.sessions import Session
-    from liex_lab.sessions.viewer import has_screen, replays_with, show_replay
-
-    replay = Session.open(session).path / "session.rrd"
-    if at_s is not None:
-        if web:
-            raise typer.BadParameter(
-                "a moment can be shown in a window only; leave out --web or --at"
-            )
-        show_replay(replay, at_s).wait()
-        return
-    if not web and not has_screen():
-        raise LiexError(
-            f"Rerun needs a screen and there is none here; open {replay} on a computer that has "
-            "one, or add --web"
-        )
-    # RERUN_ANALYTICS: what a laboratory looks at is nobody else's business; the viewer in a browser
-    # does not heed it
-    if web:
-        say(
-            "Rerun's viewer in the browser calls tel.rerun.io, its makers' count of uses; the "
-            "window does not"
-        )
-    shown = [str(file) for file in replays_with(replay)]
-    command = [
-        sys.executable,
-        "-m",
-        "rerun",
-        *shown,
-        "--bind",
-        "127.0.0.1",
-        *(["--web-viewer"] if web else []),
-    ]
-    raise typer.Exit(
-        subprocess.run(command, env={**os.environ, "RERUN_ANALYTICS": "0"}, check=False).returncode
-    )
+app.command(rich_help_panel=START)(show)
 
 
 @app.command(rich_help_panel=MODELS)

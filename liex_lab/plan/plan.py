@@ -65,7 +65,7 @@ class Plan(Table):
         session: facts about the animal and the day.
         actions: who names what the animal does.
         behaviour: where one behaviour ends and the next begins.
-        replay: what the Rerun replay holds.
+        replay: what the replays hold.
     """
 
     seed: int = Field(0, ge=0, description="all randomness of a run comes from this number")

@@ -56,6 +56,7 @@ FILES = (
     "session.rrd",
     "session.mcap",
     "observations.npz",
+    "cutouts.npz",
     "replay.rbl",
     "foxglove.json",
 )
@@ -66,6 +67,7 @@ _OPTIONAL = {
     "activity.parquet",
     "zones.parquet",
     "observations.npz",
+    "cutouts.npz",
     "replay.rbl",
     "foxglove.json",
 }
