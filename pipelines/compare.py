@@ -7,6 +7,7 @@ were assigned to a group, with false discovery rates over the whole table (see `
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -32,7 +33,8 @@ def compare_sessions(
 ) -> dict[str, Any]:
     """Compare the groups of all sessions in the given folders and write the tables.
 
-    Writes stats.parquet, stats.csv, sessions.csv, columns.json and methods.txt.
+    Writes stats.parquet, stats.csv, sessions.csv, columns.json, methods.txt and comparison.json,
+    which says where the sessions are.
 
     Args:
         places: session folders, or folders with sessions anywhere in them.
@@ -88,8 +90,18 @@ def compare_sessions(
     (target / "columns.json").write_text(
         json.dumps(entries, indent=1, ensure_ascii=False) + "\n", encoding="utf-8"
     )
+    where = {"sessions": [_seen_from(target, folder) for folder in folders]}
+    (target / "comparison.json").write_text(json.dumps(where, indent=1) + "\n", encoding="utf-8")
     (target / "methods.txt").write_text(methods(stats) + "\n", encoding="utf-8")
     return {"stats": stats, "folder": target}
+
+
+def _seen_from(target: Path, folder: Path) -> str:
+    """The path of a session as seen from the comparison's folder, so that both can be moved."""
+    try:
+        return Path(os.path.relpath(folder, target.resolve())).as_posix()
+    except ValueError:  # on another drive
+        return str(folder)
 
 
 def find_sessions(places: Sequence[str | Path]) -> list[Path]:

@@ -81,7 +81,7 @@ def ethogram(seen: Seen) -> Figure | None:
     axes.set_title(
         f"Ethogram, {seen.who}, n = {counted(len(bouts), 'bout')}; hatched: no pose or no frame"
     )
-    unit, size = time_unit(seen.duration_s)
+    _, size = time_unit(seen.duration_s)
     least = _HAIR_MM * seen.duration_s / width
     spans = [(float(a), float(b)) for a, b in seen.lost_s]
     axes.broken_barh(
@@ -127,7 +127,7 @@ def curves(seen: Seen) -> Figure | None:
     figure = sheet(TWO_COLUMNS_MM, len(rows) * step + 8.0)
     width = TWO_COLUMNS_MM - LEFT_MM - RIGHT_MM
     time_s = seen.frames["time_s"].to_numpy(float)
-    unit_s, size = time_unit(seen.duration_s)
+    _, size = time_unit(seen.duration_s)
     rearing = seen.bouts["action"].astype(str).str.startswith("rear")
     rears = seen.bouts.loc[rearing, ["start_s", "stop_s"]].to_numpy(float)
     for k, (title, unit, values, colour, from_zero) in enumerate(rows):
@@ -160,7 +160,7 @@ def cumulative_distance(seen: Seen) -> Figure | None:
     if not known or seen.kinematics is None:
         return None
     time_s, metres, n = walked(seen)
-    unit, size = time_unit(seen.duration_s)
+    _, size = time_unit(seen.duration_s)
     figure = sheet(ONE_COLUMN_MM, 52.0)
     axes = panel(figure, 12.0, 9.0, ONE_COLUMN_MM - 17.0, 33.0)
     axes.set_title(f"Cumulative distance, {seen.who}\n{metres[-1]:.2f} m, n = {counted(n, 'step')}")

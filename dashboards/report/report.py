@@ -90,6 +90,7 @@ def render(session: Session, figures: Path | None = None) -> str:
         pictures=pictures(session),
         figures=for_the_page(session, figures),
         clips=clip_links(session),
+        video=None if (video := found_video(session)) is None else video.name,
         actions=action_rows(session, words),
         summary=summary_rows(session, words),
         budget=budget_rows(session, words),
@@ -125,11 +126,20 @@ def action_rows(session: Session, words: list[str]) -> list[tuple[str, str, str,
 def clip_links(session: Session) -> dict[str, str]:
     """The videos of actions that lie beside the report: action -> name of the file.
 
+    A video of `rear` is one of rear_supported, too.
+
     Args:
         session: the opened session.
     """
-    found = {word: found_video(session, word) for word in session.metadata.get("actions", {})}
-    return {word: path.name for word, path in found.items() if path is not None}
+    links = {}
+    for word in session.metadata.get("actions", {}):
+        parts = word.split("_")
+        for k in range(len(parts), 0, -1):
+            video = found_video(session, "_".join(parts[:k]))
+            if video is not None:
+                links[word] = video.name
+                break
+    return links
 
 
 def headline(session: Session) -> str:

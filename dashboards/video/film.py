@@ -220,7 +220,7 @@ class Film:
         """Trail and skeleton; `at` (n, J, 2) are the joints in the picture, px."""
         import cv2
 
-        size = max(picture.shape[1] / 320.0, 0.6)
+        size = max(picture.shape[1] / 320.0, 0.9)
         first = self.row_at(self.time_s[row] - _TRAIL_S)
         trail = at[first : row + 1].mean(axis=1)
         trail = trail[np.isfinite(trail).all(axis=1)]
@@ -232,7 +232,7 @@ class Film:
             return
         colour = _rgb(self._colours.get(word, "#ffffff"))
         fixed = np.rint(16.0 * joints).astype(int)
-        thick = max(int(round(1.6 * size)), 1)
+        thick = max(int(round(1.6 * size)), 2)
         for shade, width in (((0, 0, 0), thick + 2), (colour, thick)):
             for a, b in self._bones:
                 p, q = (int(fixed[a, 0]), int(fixed[a, 1])), (int(fixed[b, 0]), int(fixed[b, 1]))

@@ -24,7 +24,7 @@ def _stencil(text: str, size: int) -> NDArray[np.float32]:
     from PIL import Image, ImageDraw
 
     font = _font(size)
-    left, top, right, bottom = font.getbbox(text)
+    left, _, right, bottom = font.getbbox(text)
     image = Image.new("L", (max(int(right - min(left, 0)), 1), max(int(bottom), 1)))
     ImageDraw.Draw(image).text((-min(left, 0), 0), text, font=font, fill=255)
     return np.asarray(image, np.float32) / 255.0

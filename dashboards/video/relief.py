@@ -15,8 +15,11 @@ from liex_lab.sessions import Session
 
 Array = NDArray[np.float64]
 _UNREAD = 34  # grey of what was not read, and of walls
-_WALL = 58
 _WALLS_FROM = 1.6  # of the scale: what is higher is no animal
+_SMOOTH_PX = 1.0
+_PLAIN = 128  # of light: as bright as the colour itself
+_WALL_MM = 8.0  # beyond the outline, which is not known better
+_STRENGTH = 0.3
 _LIGHT = np.array([-0.5, -0.6])
 
 
@@ -40,7 +43,8 @@ class Relief:
         self._pixel_mm = float(self._above_mm) / camera.fx
         self.top_mm = top_mm
         shades = colormaps["viridis"](np.linspace(0.08, 1.0, 256))
-        self._colours = (255.0 * np.asarray(shades)[:, :3]).astype(np.float32)
+        self._colours = (255.0 * np.asarray(shades)[:, :3]).astype(np.uint8)
+        self._outside = _beyond_walls(session, np.stack([*rays, np.ones_like(rays[0])], axis=-1))
 
     def heights(self, depth: NDArray[np.uint16]) -> NDArray[np.float32]:
         """(H, W) heights above the floor, mm; NaN where nothing was read.
@@ -78,16 +82,24 @@ class Relief:
         read = np.isfinite(heights)
         # what was not read is the floor while it is enlarged, and painted over afterwards
         clipped = np.clip(np.where(read, heights, 0.0), -10.0, 3.0 * self.top_mm)
-        smooth = cv2.resize(clipped.astype(np.float32), size, interpolation=cv2.INTER_CUBIC)
-        seen = cv2.resize(read.astype(np.float32), size, interpolation=cv2.INTER_LINEAR)
-        share = np.clip(smooth / self.top_mm, 0.0, 1.0)
-        step = self._pixel_mm * side[0] / size[0]
-        slope_y, slope_x = np.gradient(cv2.GaussianBlur(smooth, (0, 0), 1.2), step)
-        light = np.clip(1.0 + 0.35 * (_LIGHT[0] * slope_x + _LIGHT[1] * slope_y), 0.6, 1.3)
-        colours = self._colours[(255.0 * share).astype(np.uint8)] * light[..., None]
-        colours[smooth > _WALLS_FROM * self.top_mm] = _WALL
-        colours[seen < 0.5] = _UNREAD
-        return np.clip(colours, 0.0, 255.0).astype(np.uint8)
+        even = cv2.GaussianBlur(clipped.astype(np.float32), (0, 0), _SMOOTH_PX)
+        smooth = cv2.resize(even, size, interpolation=cv2.INTER_CUBIC)
+        share = np.clip(255.0 / self.top_mm * smooth, 0.0, 255.0).astype(np.uint8)
+        colours = cv2.LUT(cv2.merge([share] * 3), self._colours[None])
+        light = cv2.resize(self._light(even), size, interpolation=cv2.INTER_LINEAR)
+        colours = cv2.multiply(colours, cv2.merge([light] * 3), scale=1.0 / _PLAIN)
+        outside = _part(self._outside, left, top, side) > 0.5
+        # a wall is no animal; one that rears at the wall is seen before it all the same
+        wall = outside | (clipped > _WALLS_FROM * self.top_mm)
+        colours[_enlarged(wall, size)] //= 4
+        colours[_enlarged(~read, size)] = _UNREAD
+        return np.asarray(colours, np.uint8)
+
+    def _light(self, heights: NDArray[np.float32]) -> NDArray[np.uint8]:
+        """How light a slope is, `_PLAIN` where there is none: uint8 of the heights' shape."""
+        slope_y, slope_x = np.gradient(heights, self._pixel_mm)
+        light = 1.0 + _STRENGTH * (_LIGHT[0] * slope_x + _LIGHT[1] * slope_y)
+        return (_PLAIN * np.clip(light, 0.6, 1.4)).astype(np.uint8)
 
     def scale(self, height: int) -> NDArray[np.uint8]:
         """The colours from 0 to `top_mm`, the highest on top: (height, 6, 3) uint8 RGB.
@@ -96,7 +108,7 @@ class Relief:
             height: of the bar, px.
         """
         at = np.linspace(255.0, 0.0, height).astype(np.uint8)
-        return np.repeat(self._colours[at][:, None], 6, axis=1).astype(np.uint8)
+        return np.repeat(self._colours[at][:, None], 6, axis=1)
 
 
 def _part(
@@ -112,3 +124,22 @@ def _part(
     if x1 > x0 and y1 > y0:
         out[y0 - top : y1 - top, x0 - left : x1 - left] = heights[y0:y1, x0:x1]
     return out
+
+
+def _beyond_walls(session: Session, rays: Array) -> NDArray[np.float32]:
+    """(H, W) 1 where a view ray (H, W, 3) meets the floor's plane outside of the arena, else 0."""
+    T = session.T_arena_camera
+    turned = rays @ np.asarray(T.rotation, float).T
+    place = np.asarray(T.translation, float)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        on_floor = place[:2] - turned[..., :2] / turned[..., 2:] * place[2]
+    distance = session.arena.wall_distance_mm(on_floor)
+    return np.asarray(distance < -_WALL_MM, np.float32)
+
+
+def _enlarged(mask: NDArray[np.bool_], size: tuple[int, int]) -> NDArray[np.bool_]:
+    """A mask in another size, with even edges."""
+    import cv2
+
+    large = cv2.resize(mask.astype(np.uint8) * 255, size, interpolation=cv2.INTER_LINEAR)
+    return np.asarray(large > 127)

@@ -19,6 +19,7 @@ from liex_lab.runtime.progress import Progress, silent
 from liex_lab.sessions import Session
 
 from ..figures.groups import NO_GROUP
+from ..units import counted
 from .encoder import Video, h264
 from .film import Film
 from .lettering import write
@@ -162,7 +163,7 @@ def write_clips(
         if not any(blocks.values()):
             known = sorted({word for session, _ in sessions for word in session.bouts["action"]})
             raise SessionError(
-                f"no bout is named {' or '.join(actions)} in {len(sessions)} session(s); named are "
+                f"no bout is named {' or '.join(actions)} in {counted(len(sessions), 'session')}; named are "
                 f"{', '.join(map(str, known)) or 'none'}"
             )
         chosen = {name: _evenly(cells, most) for name, cells in sorted(blocks.items()) if cells}

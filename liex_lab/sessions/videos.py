@@ -19,13 +19,15 @@ def video_path(folder: Path, name: str, what: str = "") -> Path:
     return folder / (f"{name}_{tail}.mp4" if tail else f"{name}.mp4")
 
 
-def moment(start_s: float) -> str:
-    """What a clip from a moment on is called.
+def stretch(start_s: float | None, stop_s: float | None) -> str:
+    """What a video of a part of a session is called.
 
     Args:
-        start_s: the moment, s.
+        start_s: where it begins, s; None at the beginning.
+        stop_s: where it ends, s; None at the end.
     """
-    return f"at_{start_s:.2f}s"
+    start = f"from_{start_s or 0.0:.2f}s"
+    return start if stop_s is None else f"{start}_to_{stop_s:.2f}s"
 
 
 def found_video(session: Session, what: str = "") -> Path | None:
