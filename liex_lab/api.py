@@ -317,7 +317,8 @@ def export_video(
     """Write a video (H.264): height above the floor, skeleton, trail, action and time.
 
     One session is shown from beginning to end, on its own clock; several stand beside each other,
-    by group. The report of a session links to clips in its folder. With `actions` the clips of their bouts do, aligned at the onsets.
+    by group. With `actions` the clips of their bouts do, aligned at the onsets; the report of a
+    session links to those in its folder.
 
     Args:
         places: a session folder, or several, or folders with sessions anywhere in them.

@@ -132,7 +132,7 @@ def clip_links(session: Session) -> dict[str, str]:
         session: the opened session.
     """
     links = {}
-    for word in session.metadata.get("actions", {}):
+    for word in dict.fromkeys(str(action) for action in session.bouts["action"]):
         parts = word.split("_")
         for k in range(len(parts), 0, -1):
             video = found_video(session, "_".join(parts[:k]))

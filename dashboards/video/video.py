@@ -163,8 +163,8 @@ def write_clips(
         if not any(blocks.values()):
             known = sorted({word for session, _ in sessions for word in session.bouts["action"]})
             raise SessionError(
-                f"no bout is named {' or '.join(actions)} in {counted(len(sessions), 'session')}; named are "
-                f"{', '.join(map(str, known)) or 'none'}"
+                f"no bout is named {' or '.join(actions)} in {counted(len(sessions), 'session')}; "
+                f"named are {', '.join(map(str, known)) or 'none'}"
             )
         chosen = {name: _evenly(cells, most) for name, cells in sorted(blocks.items()) if cells}
         cells = [cell for some in chosen.values() for cell in some]
