@@ -56,7 +56,8 @@ def test_every_verb_and_every_setting_exists() -> None:
     ]  # the first is `liex ...`
     told = CliRunner().invoke(cli.app, ["--help"]).output
     known = (
-        "cohort compare convert correct dashboard demo describe doctor evaluate export info live "
+        "cohort compare convert correct dashboard demo describe doctor evaluate export "
+        "figures info live "
         "report "
         "run show suggest "
     )

@@ -35,7 +35,7 @@ from liex_lab.cli.options import (
 )
 from liex_lab.cli.recordings import convert, pack
 from liex_lab.cli.replay import show
-from liex_lab.cli.results import compare, export, report
+from liex_lab.cli.results import compare, export, figures, report
 from liex_lab.cli.sections import MODELS, RECORDINGS, SESSIONS, START, STUDIES, group_of_verbs
 from liex_lab.cli.study import cohort, dashboard, verify
 from liex_lab.errors import LiexError, MisfitError, printable
@@ -62,6 +62,7 @@ app.add_typer(evaluate, name="evaluate", rich_help_panel=MODELS)
 app.add_typer(correct, name="correct", rich_help_panel=SESSIONS)
 app.command(rich_help_panel=SESSIONS)(describe)
 app.command(rich_help_panel=SESSIONS)(report)
+app.command(rich_help_panel=SESSIONS)(figures)
 app.command(rich_help_panel=SESSIONS)(verify)
 app.command(rich_help_panel=SESSIONS)(export)
 app.command(rich_help_panel=STUDIES)(cohort)
@@ -87,11 +88,15 @@ def _options(
 @app.command(rich_help_panel=START)
 def demo(out: OutFolder = Path()) -> None:
     """Run the bundled sample recording, to see what comes out."""
-    from liex_lab.api import run_demo
+    from liex_lab.api import export_video, run_demo
 
     with progress_bar() as progress:
         session = run_demo(out, progress=progress)
-    _tell_session(session)
+        try:
+            video = f"video:   {export_video(session, progress=progress)}"
+        except LiexError as error:  # the session is whole without it
+            video = f"note: there is no video, for {error}"
+    _tell_session(session, video)
 
 
 @app.command(rich_help_panel=START)
@@ -305,6 +310,9 @@ def suggest(
         str | None, typer.Option("--actions", metavar="FILE", help="An action model, .skops.")
     ] = None,
     n: Annotated[int, typer.Option("--n", min=1, help="How many stretches.")] = 10,
+    video: Annotated[
+        bool, typer.Option("--video", help="Make a clip of each, to look at it.")
+    ] = False,
 ) -> None:
     """List the stretches of a session most worth labelling next: where the recogniser is least
     sure.
@@ -314,12 +322,23 @@ def suggest(
     from rich.text import Text
 
     from liex_lab.pipelines.training.action_model import suggest as job
+    from liex_lab.sessions import Session
+    from liex_lab.sessions.videos import found_video, stretch
 
-    table = Table("from (s)", "to (s)", "taken for", "or else", "doubt")
-    for row in job(session, model=model, n=n).itertuples():
+    rows = list(job(session, model=model, n=n).itertuples())
+    if video:
+        from liex_lab.api import export_video
+
+        for row in rows:
+            export_video(session, start_s=row.start_s, stop_s=row.stop_s, overwrite=True)
+    opened = Session.open(session)
+    table = Table("from (s)", "to (s)", "taken for", "or else", "doubt", "clip")
+    for row in rows:
         numbers = (f"{row.start_s:.2f}", f"{row.stop_s:.2f}", f"{row.uncertainty:.2f}")
         words = (Text(printable(row.guess)), Text(printable(row.or_else)))
-        table.add_row(*numbers[:2], *words, numbers[2])
+        clip = found_video(opened, stretch(row.start_s, row.stop_s))
+        name = Text("" if clip is None else printable(clip.name))
+        table.add_row(*numbers[:2], *words, numbers[2], name)
     Console().print(table)
 
 
@@ -437,7 +456,7 @@ def _fault() -> NoReturn:
     _fail("this is a fault of liex_lab and not of yours; please report the lines above", FAULT)
 
 
-def _tell_session(session: Path) -> None:
+def _tell_session(session: Path, further: str = "") -> None:
     """Where the session is, and how it went; exit code 4 where someone has to look at it."""
     from liex_lab.sessions.older import taken_from
     from liex_lab.sessions.verdict import read_verdict
@@ -448,7 +467,10 @@ def _tell_session(session: Path) -> None:
     report = session / "report.html"
     if report.is_file():
         say(f"report:  {report}")
+        say(f"figures: {session / 'figures'}")
     say(f"replay:  liex show {shlex.quote(str(session))}")
+    if further:
+        say(further)
     verdict = read_verdict(session)
     if verdict["sentence"]:
         colour = typer.colors.YELLOW if verdict["look_at_it"] else None

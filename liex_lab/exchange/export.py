@@ -57,6 +57,10 @@ def export(
         SessionError: the format is not known, a file is there already, or packages are missing.
     """
     if to not in TARGETS:
+        if to == "video":
+            raise SessionError(
+                "a video is no file of another program; `liex_lab.api.export_video` writes it"
+            )
         near = difflib.get_close_matches(to, TARGETS, 1)
         hint = f"did you mean '{near[0]}'? " if near else ""
         raise SessionError(
