@@ -8,6 +8,18 @@ from __future__ import annotations
 from typing import ClassVar
 
 
+def how_to_install(extra: str) -> str:
+    """What to type for packages that only some need: a line that works in a clone of liex_lab.
+
+    Args:
+        extra: its name among the optional dependencies of pyproject.toml.
+    """
+    return (
+        f"install it with `pip install '.[{extra}]'` in the folder that holds liex_lab's "
+        "pyproject.toml"
+    )
+
+
 class LiexError(Exception):
     """Base of every error that the user can put right.
 

@@ -77,7 +77,10 @@ def export(
         Path, typer.Argument(metavar="SESSION", help="A session folder, NAME.liex.")
     ],
     to: Annotated[
-        str, typer.Option("--to", metavar="FORMAT", help="nwb, boris, dlc, movement, sleap or csv.")
+        str,
+        typer.Option(
+            "--to", metavar="FORMAT", help="nwb, boris, dlc, movement, sleap, csv or xlsx."
+        ),
     ],
     out: Annotated[
         Path | None,
@@ -90,7 +93,7 @@ def export(
     ] = False,
 ) -> None:
     """Write a session for another program: NWB, BORIS, DeepLabCut, movement, SLEAP, or every table
-    as CSV.
+    as CSV or in one Excel workbook.
     """
     from liex_lab.exchange import export as job
     from liex_lab.sessions import Session
