@@ -52,7 +52,7 @@ class SeveralKindsError(RecordingError):
     """Raised for a folder with pictures of several kinds.
 
     Attributes:
-        pattern: names the pictures of one of the kinds, as in "*.tif".
+        pattern: names the pictures of one of the kinds, as in `*.tif`.
     """
 
     def __init__(self, message: str, pattern: str) -> None:
