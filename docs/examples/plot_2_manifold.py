@@ -1,6 +1,6 @@
 """
-Poses on manifolds
-==================
+Means, directions and steps on a manifold
+=========================================
 
 A pose is where the animal is, which way it faces, and how each joint is bent. Angles are no
 ordinary numbers: halfway between 170 degrees and -170 degrees lies 180, not 0. And bones do not

@@ -1,6 +1,6 @@
 """
-What an interval means
-======================
+Intervals against the truth
+===========================
 
 Beside every joint stands a standard deviation, and beside every frame the error to be expected of
 it. This example measures a virtual mouse, whose joints are known, and looks how often the truth
@@ -12,7 +12,7 @@ import numpy as np
 
 import liex_lab
 
-ADDRESS = "synthetic:walk?seed=3&frames=150"
+ADDRESS = "synthetic:walk?seed=3&frames=150&sensor=primesense-qvga"
 plan = liex_lab.Plan.load("mouse").with_settings(["replay.depth=false"])
 folder = liex_lab.run_session(ADDRESS, plan, "results", overwrite=True)
 session = liex_lab.Session.open(folder)

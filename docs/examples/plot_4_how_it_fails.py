@@ -1,6 +1,6 @@
 """
-How it fails
-============
+Three scenes that it was not made for
+=====================================
 
 The same virtual mouse in three scenes that a laboratory may have: as the models learned it, on
 bedding, and with a second mouse. Measured when this page was built, with the truth known.
@@ -46,8 +46,9 @@ for axis, (scene, (error, session)) in zip(np.atleast_1d(axes), rows.items(), st
     frames = session.frames
     axis.plot(frames.time_s, error, color="#D55E00", label="true")
     axis.plot(frames.time_s, frames.predicted_error_mm, color="#0072B2", label="expected")
-    axis.set(title=scene, xlabel="time (s)", ylim=(0, None))
+    axis.set(title=scene, xlabel="time (s)")
 figure.axes[0].set_ylabel("joint error (mm)")
+figure.axes[0].set_ylim(bottom=0)
 figure.axes[0].legend(frameon=False)
 plt.show()
 
