@@ -222,7 +222,10 @@ def _check_target(target: Path, overwrite: bool) -> None:
             "give another name"
         )
     if not overwrite and (is_file or any(target.iterdir())):
-        raise RecordingError(f"{target} is there already; give another name, or add --overwrite")
+        raise RecordingError(
+            f"{target} is there already; give another name, or add "
+            "--overwrite (in Python overwrite=True)"
+        )
 
 
 def _written_here(path: Path) -> bool:

@@ -27,11 +27,12 @@ from liex_lab.cli.options import (
     TopicName,
     VariantName,
     WhichPlan,
+    keep_numbers,
     region_setting,
     say,
     tell_numbers,
+    tell_scores,
     to_json,
-    told_scores,
 )
 from liex_lab.cli.recordings import convert, pack
 from liex_lab.cli.replay import show
@@ -253,6 +254,7 @@ def train(
             help="Of `train tracking`: search the noise of the paper's Algorithm 3 instead.",
         ),
     ] = False,
+    json_file: JsonFile = None,
 ) -> None:
     """Make an animal's model from rendered pictures, the same again, byte for byte, whenever it is
     run.
@@ -273,8 +275,9 @@ def train(
                 pose_model=pose_model,
                 progress=progress,
             )
-        for sentence in told_scores(report):
-            say(sentence)
+        if json_file is not None:
+            keep_numbers(report, json_file)
+        tell_scores(report)
         say(f"model: {model}")
         return
     if animal == "tracking" and particles:
@@ -282,7 +285,7 @@ def train(
 
         with progress_bar() as progress:
             found = search_noise(of, progress=progress)
-        tell_numbers(found, out)
+        tell_numbers(found, json_file or out)
         return
     if animal == "tracking":
         from liex_lab.pipelines.training.motion_model import train_tracking

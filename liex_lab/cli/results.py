@@ -114,7 +114,9 @@ def export(
     to: Annotated[
         str,
         typer.Option(
-            "--to", metavar="FORMAT", help="nwb, boris, dlc, movement, sleap, csv or video."
+            "--to",
+            metavar="FORMAT",
+            help="nwb, boris, dlc, movement, sleap, csv, xlsx or video.",
         ),
     ],
     out: Annotated[
@@ -145,7 +147,7 @@ def export(
     ] = 1.0,
 ) -> None:
     """Write sessions for another program: NWB, BORIS, DeepLabCut, movement, SLEAP, every table as
-    CSV; or as a video, with several beside each other.
+    CSV or in one Excel workbook; or as a video, with several beside each other.
     """
     from liex_lab.exchange import export as job
     from liex_lab.sessions import Session

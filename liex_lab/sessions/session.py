@@ -147,6 +147,16 @@ class Session:
             with reading_from(self.file(path.name)) as own:
                 check_footer(own, path.stem, n_frames, n_joints)
 
+    def __repr__(self) -> str:
+        frames = self.metadata.get("frames", {}).get("n_frames", "unknown")
+        corrected = ", corrected" if self.log.files else ""
+        tables = ", ".join(sorted(path.stem for path in self.path.glob("*.parquet")))
+        return (
+            f"<Session {self.metadata.get('session_id', self.path.stem)}: "
+            f"{self.metadata.get('animal', {}).get('name', 'animal')}, {frames} frames"
+            f"{corrected}; tables {tables}, summary>"
+        )
+
     @property
     def name(self) -> str:
         """The session's id."""
