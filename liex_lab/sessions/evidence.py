@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from liex_lab.sessions.session import Session
 
 FILE = "observations.npz"
-_LATER = ("covered", "beside")  # columns that sessions of earlier versions do not hold
+_LATER = ("covered", "beside", "behind")  # columns that sessions of earlier versions do not hold
 _BLOCK = 16_384  # frames that are in memory at a time
 
 
