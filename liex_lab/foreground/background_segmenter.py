@@ -26,6 +26,7 @@ from liex_lab.errors import EstimationError
 from liex_lab.foreground import _height_map_kernels as kernels
 from liex_lab.foreground._blob_kernels import MAX_BLOBS
 from liex_lab.foreground.background import learn_background, sample_frames, stride_for
+from liex_lab.foreground.cable import Cable
 from liex_lab.foreground.floor_level import FloorLevel, wandering
 from liex_lab.foreground.standing import Standing, find_standing
 from liex_lab.foreground.still_scene import StillScene
@@ -210,6 +211,12 @@ class BackgroundSubtraction(StillScene):
             standing=standing,
             level=level,
         )
+        if stands:
+            smallest = view.area[0] * spine_mm[0] ** 2
+            cable = Cable.find(sample, limit, grid, seen, spine_mm[1], smallest)
+            if cable is not None:
+                sample = cable.cut(sample, limit)
+                scene = replace(scene, cable=cable)
         area, share = scene._moving_area(sample, spine_mm, min_height_mm)
         moves = share >= 0.5 or (share > 0.0 and standing.moves)
         if share < 0.5:  # perhaps it sits in its own background: compare with the floor itself

@@ -19,6 +19,7 @@ from liex_lab.arena.floor import Floor
 from liex_lab.arena.scene import Scene, find_fixtures, region_corners, roughness
 from liex_lab.body.skeleton import MOUSE_VIEW, VIEWS, View
 from liex_lab.foreground import _height_map_kernels as kernels
+from liex_lab.foreground.cable import Cable
 from liex_lab.foreground.crop_camera import pack_crop_cameras
 from liex_lab.foreground.floor_level import FloorLevel
 from liex_lab.foreground.height_maps import HeightMaps
@@ -52,6 +53,7 @@ class StillScene(Segmenter):
         stride: only every so many-th row and column of the picture is looked at; H and W count
             those.
         standing: how the floor was found, None where it was given.
+        cable: how cables are told from the animal; None where it wears none.
         level: brings frames to one level of the floor; None where it is still.
     """
 
@@ -66,6 +68,7 @@ class StillScene(Segmenter):
     stride: int = 1
     standing: Standing | None = None
     level: FloorLevel | None = None
+    cable: Cable | None = None
 
     @cached_property
     def grid(self) -> Camera:
@@ -86,6 +89,7 @@ class StillScene(Segmenter):
         rough = roughness(self.background, bare, self.on_floor)
         fixtures = find_fixtures(self.background, floor, self.grid, self.on_floor)
         standing = self.standing
+        wander_mm = None if self.level is None else self.level.wander_mm
         if standing is None:
             return Scene(self.floor, roughness_mm=rough, fixtures=fixtures)
         return Scene(
@@ -98,6 +102,8 @@ class StillScene(Segmenter):
             region_corners(standing.region, self.stride),
             fixtures=fixtures,
             doubts=(standing.doubt,) if standing.doubt else (),
+            wander_mm=wander_mm,
+            tethered=self.cable is not None,
         )
 
     def every(self, step: int) -> Self:
@@ -117,6 +123,7 @@ class StillScene(Segmenter):
             limit=np.ascontiguousarray(self.limit[cut]),
             on_floor=np.ascontiguousarray(self.on_floor[cut]),
             level=None if self.level is None else self.level.every(step),
+            cable=None if self.cable is None else self.cable.every(step),
         )
 
     def misfit(self, crops: HeightMaps) -> Array:
@@ -197,6 +204,33 @@ class StillScene(Segmenter):
             crops.step,
         )
 
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """That the animal wears a cable, and that the floor's depth wandered."""
+        said = []
+        if self.cable is not None:
+            said.append("the animal wears a cable, which was cut out of the pictures")
+        if self.level is not None:
+            said.append(
+                f"the depth of the floor wandered by {self.level.wander_mm:.1f} mm, as of a sensor "
+                "that warms up, and was brought back to where it was at the beginning"
+            )
+        return tuple(said)
+
+    def cleared(self, depths: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Whole pictures without what the animal wears: 0 where a cable is.
+
+        Args:
+            depths: (n, H, W) float32 mm, whole pictures.
+        """
+        if self.cable is None:
+            return depths
+        thinned = depths[:, :: self.stride, :: self.stride]
+        worn = self.cable.cut(thinned, self.limit) != thinned
+        for axis in (1, 2):
+            worn = np.repeat(worn, self.stride, axis=axis)
+        return np.where(worn[:, : depths.shape[1], : depths.shape[2]], np.float32(0), depths)
+
     def _check(self, depths: NDArray[np.float32]) -> None:
         """Refuse frames of another size than those that the scene was learned from."""
         check_shapes("frames of this scene", ("depths", depths, ("n", *self.limit.shape)))
@@ -231,6 +265,8 @@ class StillScene(Segmenter):
         self._check(depths)
         if self.level is not None:
             depths = self.level.brought_back(depths)
+        if self.cable is not None:
+            depths = self.cable.cut(depths, self.limit)
         crops = HeightMaps.blank(n_things * len(depths), self.floor.distance_mm)
         grid = self.grid
         with threads(parallel):

@@ -233,7 +233,7 @@ class FrameTracker:
         seen.error_mm[:, h] = chosen.error_mm
         seen.score[:, h] = chosen.score
         seen.n_px[found, h] = crops.n_px[found]
-        seen.behind[found, h] = behind_something(crops[found], depths[found])
+        seen.behind[found, h] = behind_something(crops[found], self.scene.cleared(depths[found]))
         if not len(found):
             return
         centre = self.scene.middles(crops[found], self.estimator.model.method.camera_view)
