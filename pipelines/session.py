@@ -182,7 +182,7 @@ def make_track(writer: SessionWriter, fitted: Fitted) -> Verdict:
         whole,
         misfits=fitted.misfits,
         n_animals=1 if fit is None else fit.n_animals,
-        cautions=fitted.notes,
+        cautions=(*fitted.notes, *tracker.scene.remarks),
         accepted=fitted.plan.estimation.accept_misfit,
     )
     writer.take(tracked, whole, tracker.subject)
