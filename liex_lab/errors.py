@@ -31,6 +31,18 @@ def printable(text: object) -> str:
 _UNSEEN = {"Cc", "Cf", "Cs", "Zl", "Zp"}
 
 
+def how_to_install(extra: str) -> str:
+    """What to type for packages that only some need: a line that works in a clone of liex_lab.
+
+    Args:
+        extra: its name among the optional dependencies of pyproject.toml.
+    """
+    return (
+        f"install it with `pip install '.[{extra}]'` in the folder that holds liex_lab's "
+        "pyproject.toml"
+    )
+
+
 class LiexError(Exception):
     """Base of every error that the user can put right.
 
@@ -63,7 +75,7 @@ class SeveralKindsError(RecordingError):
     """Raised for a folder with pictures of several kinds.
 
     Attributes:
-        pattern: names the pictures of one of the kinds, as in "*.tif".
+        pattern: names the pictures of one of the kinds, as in `*.tif`.
     """
 
     def __init__(self, message: str, pattern: str) -> None:

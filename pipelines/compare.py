@@ -7,6 +7,7 @@ were assigned to a group, with false discovery rates over the whole table (see `
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -33,7 +34,8 @@ def compare_sessions(
 ) -> dict[str, Any]:
     """Compare the groups of all sessions in the given folders and write the tables.
 
-    Writes stats.parquet, stats.csv, sessions.csv, columns.json and methods.txt.
+    Writes stats.parquet, stats.csv, sessions.csv, columns.json, methods.txt and comparison.json,
+    which says where the sessions are.
 
     Args:
         places: session folders, or folders with sessions anywhere in them.
@@ -90,8 +92,18 @@ def compare_sessions(
             write_csv(written, part)
     entries = [entry for entry in dictionary(STATS) if entry["table"] == "stats"]
     write_whole(target / "columns.json", json.dumps(entries, indent=1, ensure_ascii=False) + "\n")
+    where = {"sessions": [_seen_from(target, folder) for folder in folders]}
+    write_whole(target / "comparison.json", json.dumps(where, indent=1) + "\n")
     write_whole(target / "methods.txt", methods(stats) + "\n")
     return {"stats": stats, "folder": target}
+
+
+def _seen_from(target: Path, folder: Path) -> str:
+    """The path of a session as seen from the comparison's folder, so that both can be moved."""
+    try:
+        return Path(os.path.relpath(folder, target.resolve())).as_posix()
+    except ValueError:  # on another drive
+        return str(folder)
 
 
 def find_sessions(places: Sequence[str | Path]) -> list[Path]:

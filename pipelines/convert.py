@@ -8,7 +8,7 @@ steps of one that is stated.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -106,7 +106,7 @@ def convert(
 def _convert(
     recording: Recording, target: Path, step_mm: float | None, ros: bool, progress: Progress
 ) -> Converted:
-    with _in_place(target) as part:
+    with in_place(target) as part:
         writer = _writer(recording, target, part, step_mm, ros)
         with writer:
             for frame in recording:
@@ -164,16 +164,30 @@ def _kind(target: Path) -> str:
     return suffix if suffix in (".mcap", ".oni") else ""
 
 
-def _step(recording: Recording, kind: str, target: Path) -> float:
-    """The largest step of which all depths of some frames are whole multiples."""
+def largest_step(recording: Recording, steps_mm: Sequence[float] = _STEPS_MM[""]) -> float | None:
+    """The largest step of which all depths of some frames are whole multiples.
+
+    Args:
+        recording: an open recording.
+        steps_mm: steps to choose from, mm, the largest first.
+
+    Returns:
+        The step, mm; None where there is none.
+    """
     rows = np.unique(np.linspace(0, len(recording) - 1, _N_PROBED).round().astype(int))
     depths = [recording.frame(int(row)).depth for row in rows]
-    for step in _STEPS_MM[kind]:
+    for step in steps_mm:
         if all(whole_steps(depth, step) is not None for depth in depths):
             return step
     # a depth that 16 bits cannot reach is told by the writer, with its frame
-    if max(float(depth.max()) for depth in depths) > 65535.0:
-        return 1.0
+    return 1.0 if max(float(depth.max()) for depth in depths) > 65535.0 else None
+
+
+def _step(recording: Recording, kind: str, target: Path) -> float:
+    """The step of a target's 16-bit pictures."""
+    step = largest_step(recording, _STEPS_MM[kind])
+    if step is not None:
+        return step
     raise RecordingError(
         f"the depths of {recording.name} are no whole steps of {_STEPS_MM[kind][-1]:g} mm, and "
         f"{target.name} would hold 16-bit pictures, which do not keep them; write an .mcap file, "
@@ -208,7 +222,10 @@ def _check_target(target: Path, overwrite: bool) -> None:
             "give another name"
         )
     if not overwrite and (is_file or any(target.iterdir())):
-        raise RecordingError(f"{target} is there already; give another name, or add --overwrite")
+        raise RecordingError(
+            f"{target} is there already; give another name, or add "
+            "--overwrite (in Python overwrite=True)"
+        )
 
 
 def _written_here(path: Path) -> bool:
@@ -218,9 +235,15 @@ def _written_here(path: Path) -> bool:
 
 
 @contextmanager
-def _in_place(target: Path) -> Iterator[Path]:
+def in_place(target: Path) -> Iterator[Path]:
     """A name beside `target` to write under; what was written gets its own when the block ends, and
     else is gone.
+
+    Args:
+        target: the file or folder that is to be.
+
+    Raises:
+        RecordingError: it cannot be written.
     """
     try:
         with replacing(target, replace_folder=True) as part:

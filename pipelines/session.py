@@ -101,6 +101,7 @@ def measure_session(
     from liex_lab.sessions.checkpoint import check_free, hash_once
     from liex_lab.sessions.older import part_folder, put_back_session
     from liex_lab.sessions.place import check_place
+    from liex_lab.sessions.source import link_to
 
     started = time.perf_counter()
     first = plan or Plan.load(USUAL).with_settings(settings)
@@ -143,6 +144,8 @@ def measure_session(
             began = time.perf_counter()
             verdict = make_track(writer, fitted)
             timings["track"] += time.perf_counter() - began
+            if isinstance(recording, str | Path):
+                writer.note(input=link_to(recording, folder))
             writer.note(problems=opened.problems, verdict=verdict.to_dict(), **dict(notes or {}))
             session = conclude(writer, plan, timings)
     return session.path
@@ -179,7 +182,7 @@ def make_track(writer: SessionWriter, fitted: Fitted) -> Verdict:
         whole,
         misfits=fitted.misfits,
         n_animals=1 if fit is None else fit.n_animals,
-        cautions=fitted.notes,
+        cautions=(*fitted.notes, *tracker.scene.remarks),
         accepted=fitted.plan.estimation.accept_misfit,
     )
     writer.take(tracked, whole, tracker.subject)

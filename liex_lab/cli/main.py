@@ -7,7 +7,6 @@ from __future__ import annotations
 import errno
 import os
 import shlex
-import subprocess
 import sys
 import traceback
 from pathlib import Path
@@ -28,13 +27,16 @@ from liex_lab.cli.options import (
     TopicName,
     VariantName,
     WhichPlan,
+    keep_numbers,
     region_setting,
     say,
     tell_numbers,
+    tell_scores,
     to_json,
-    told_scores,
 )
-from liex_lab.cli.results import compare, export, report
+from liex_lab.cli.recordings import convert, pack
+from liex_lab.cli.replay import show
+from liex_lab.cli.results import compare, export, figures, report
 from liex_lab.cli.sections import MODELS, RECORDINGS, SESSIONS, START, STUDIES, group_of_verbs
 from liex_lab.cli.study import cohort, dashboard, verify
 from liex_lab.errors import LiexError, MisfitError, printable
@@ -61,6 +63,7 @@ app.add_typer(evaluate, name="evaluate", rich_help_panel=MODELS)
 app.add_typer(correct, name="correct", rich_help_panel=SESSIONS)
 app.command(rich_help_panel=SESSIONS)(describe)
 app.command(rich_help_panel=SESSIONS)(report)
+app.command(rich_help_panel=SESSIONS)(figures)
 app.command(rich_help_panel=SESSIONS)(verify)
 app.command(rich_help_panel=SESSIONS)(export)
 app.command(rich_help_panel=STUDIES)(cohort)
@@ -86,11 +89,15 @@ def _options(
 @app.command(rich_help_panel=START)
 def demo(out: OutFolder = Path()) -> None:
     """Run the bundled sample recording, to see what comes out."""
-    from liex_lab.api import run_demo
+    from liex_lab.api import export_video, run_demo
 
     with progress_bar() as progress:
         session = run_demo(out, progress=progress)
-    _tell_session(session)
+        try:
+            video = f"video:   {export_video(session, progress=progress)}"
+        except LiexError as error:  # the session is whole without it
+            video = f"note: there is no video, for {error}"
+    _tell_session(session, video)
 
 
 @app.command(rich_help_panel=START)
@@ -134,7 +141,7 @@ def run(
     from liex_lab.plan import Plan
 
     asked = [] if topic is None else [f"recording.topic={topic}"]
-    asked += ["replay.depth=false"] * no_depth + ["replay.candidates=true"] * candidates
+    asked += ["replay.depth=none"] * no_depth + ["replay.candidates=true"] * candidates
     asked += [*["estimation.accept_misfit=true"] * accept, *(settings or [])]
     # first: a wrong plan or setting is told at once
     chosen = Plan.load(plan or "mouse").with_settings(asked)
@@ -195,51 +202,8 @@ def doctor(
         print_report(findings)
 
 
-@app.command(rich_help_panel=RECORDINGS)
-def convert(
-    recording: RecordingPath,
-    to: Annotated[
-        Path,
-        typer.Option(
-            "--to", metavar="TARGET", help="NAME.mcap, NAME.oni, or a folder for PNG pictures."
-        ),
-    ],
-    fps: Annotated[
-        float | None, typer.Option("--fps", help="Frames per second, where the file has no times.")
-    ] = None,
-    topic: TopicName = None,
-    step_mm: Annotated[
-        float | None,
-        typer.Option(
-            "--step-mm", min=0.001, help="Round depth to steps of this size; not for MCAP."
-        ),
-    ] = None,
-    ros: Annotated[
-        bool, typer.Option("--ros", help="MCAP with ROS 2's messages instead of Foxglove's.")
-    ] = False,
-    overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Replace what is there under this name.")
-    ] = False,
-) -> None:
-    """Write a recording as MCAP (which keeps every depth), as .oni, or as a folder of 16-bit PNG
-    pictures.
-    """
-    from liex_lab.pipelines.convert import convert as job
-
-    with progress_bar() as progress:
-        done = job(
-            recording,
-            to,
-            fps=fps,
-            topic=topic,
-            step_mm=step_mm,
-            ros=ros,
-            overwrite=overwrite,
-            progress=progress,
-        )
-    say(f"recording: {done.path} ({done.n_frames} frames)")
-    for sentence in (*done.problems, *done.notes):
-        say(f"note: {sentence}")
+app.command(rich_help_panel=RECORDINGS)(convert)
+app.command(rich_help_panel=RECORDINGS)(pack)
 
 
 @app.command(rich_help_panel=MODELS)
@@ -290,6 +254,7 @@ def train(
             help="Of `train tracking`: search the noise of the paper's Algorithm 3 instead.",
         ),
     ] = False,
+    json_file: JsonFile = None,
 ) -> None:
     """Make an animal's model from rendered pictures, the same again, byte for byte, whenever it is
     run.
@@ -310,8 +275,9 @@ def train(
                 pose_model=pose_model,
                 progress=progress,
             )
-        for sentence in told_scores(report):
-            say(sentence)
+        if json_file is not None:
+            keep_numbers(report, json_file)
+        tell_scores(report)
         say(f"model: {model}")
         return
     if animal == "tracking" and particles:
@@ -319,7 +285,7 @@ def train(
 
         with progress_bar() as progress:
             found = search_noise(of, progress=progress)
-        tell_numbers(found, out)
+        tell_numbers(found, json_file or out)
         return
     if animal == "tracking":
         from liex_lab.pipelines.training.motion_model import train_tracking
@@ -347,6 +313,9 @@ def suggest(
         str | None, typer.Option("--actions", metavar="FILE", help="An action model, .skops.")
     ] = None,
     n: Annotated[int, typer.Option("--n", min=1, help="How many stretches.")] = 10,
+    video: Annotated[
+        bool, typer.Option("--video", help="Make a clip of each, to look at it.")
+    ] = False,
 ) -> None:
     """List the stretches of a session most worth labelling next: where the recogniser is least
     sure.
@@ -356,12 +325,23 @@ def suggest(
     from rich.text import Text
 
     from liex_lab.pipelines.training.action_model import suggest as job
+    from liex_lab.sessions import Session
+    from liex_lab.sessions.videos import found_video, stretch
 
-    table = Table("from (s)", "to (s)", "taken for", "or else", "doubt")
-    for row in job(session, model=model, n=n).itertuples():
+    rows = list(job(session, model=model, n=n).itertuples())
+    if video:
+        from liex_lab.api import export_video
+
+        for row in rows:
+            export_video(session, start_s=row.start_s, stop_s=row.stop_s, overwrite=True)
+    opened = Session.open(session)
+    table = Table("from (s)", "to (s)", "taken for", "or else", "doubt", "clip")
+    for row in rows:
         numbers = (f"{row.start_s:.2f}", f"{row.stop_s:.2f}", f"{row.uncertainty:.2f}")
         words = (Text(printable(row.guess)), Text(printable(row.or_else)))
-        table.add_row(*numbers[:2], *words, numbers[2])
+        clip = found_video(opened, stretch(row.start_s, row.stop_s))
+        name = Text("" if clip is None else printable(clip.name))
+        table.add_row(*numbers[:2], *words, numbers[2], name)
     Console().print(table)
 
 
@@ -396,53 +376,7 @@ def live(
     tell_numbers(result, json_file)
 
 
-@app.command(rich_help_panel=START)
-def show(
-    session: SessionPath,
-    web: Annotated[
-        bool, typer.Option("--web", help="In the browser, where Rerun calls tel.rerun.io.")
-    ] = False,
-    at_s: Annotated[
-        float | None, typer.Option("--at", metavar="S", min=0.0, help="Open it at this time.")
-    ] = None,
-) -> None:
-    """Open a session's replay in Rerun."""
-    from liex_lab.sessions import Session
-    from liex_lab.sessions.viewer import has_screen, replays_with, show_replay
-
-    replay = Session.open(session).path / "session.rrd"
-    if at_s is not None:
-        if web:
-            raise typer.BadParameter(
-                "a moment can be shown in a window only; leave out --web or --at"
-            )
-        show_replay(replay, at_s).wait()
-        return
-    if not web and not has_screen():
-        raise LiexError(
-            f"Rerun needs a screen and there is none here; open {replay} on a computer that has "
-            "one, or add --web"
-        )
-    # RERUN_ANALYTICS: what a laboratory looks at is nobody else's business; the viewer in a browser
-    # does not heed it
-    if web:
-        say(
-            "Rerun's viewer in the browser calls tel.rerun.io, its makers' count of uses; the "
-            "window does not"
-        )
-    shown = [str(file) for file in replays_with(replay)]
-    command = [
-        sys.executable,
-        "-m",
-        "rerun",
-        *shown,
-        "--bind",
-        "127.0.0.1",
-        *(["--web-viewer"] if web else []),
-    ]
-    raise typer.Exit(
-        subprocess.run(command, env={**os.environ, "RERUN_ANALYTICS": "0"}, check=False).returncode
-    )
+app.command(rich_help_panel=START)(show)
 
 
 @app.command(rich_help_panel=MODELS)
@@ -525,7 +459,7 @@ def _fault() -> NoReturn:
     _fail("this is a fault of liex_lab and not of yours; please report the lines above", FAULT)
 
 
-def _tell_session(session: Path) -> None:
+def _tell_session(session: Path, further: str = "") -> None:
     """Where the session is, and how it went; exit code 4 where someone has to look at it."""
     from liex_lab.sessions.older import taken_from
     from liex_lab.sessions.verdict import read_verdict
@@ -536,7 +470,10 @@ def _tell_session(session: Path) -> None:
     report = session / "report.html"
     if report.is_file():
         say(f"report:  {report}")
+        say(f"figures: {session / 'figures'}")
     say(f"replay:  liex show {shlex.quote(str(session))}")
+    if further:
+        say(further)
     verdict = read_verdict(session)
     if verdict["sentence"]:
         colour = typer.colors.YELLOW if verdict["look_at_it"] else None

@@ -120,25 +120,26 @@ def to_json(result: Any) -> str:
     return json.dumps(plain(result), indent=2, allow_nan=False, ensure_ascii=False)
 
 
-def told_scores(report: dict[str, Any]) -> list[str]:
-    """Scores of recognised actions (`actions.scores.timeline_scores`) as sentences.
+def tell_scores(report: dict[str, Any]) -> None:
+    """Scores of recognised actions (`actions.scores.timeline_scores`): a sentence and a table.
 
     Args:
         report: the scores of leave-one-animal-out; empty where there are none.
     """
-    if not report:
-        return []
     if "macro_f1" not in report:
-        return [f"{name}: {value}" for name, value in report.items()]
-    told = [
+        for name, value in report.items():
+            typer.echo(f"{name}: {value}")
+        return
+    from rich.console import Console
+    from rich.table import Table
+
+    typer.echo(
         "Each animal's actions were recognised by what the others taught: macro F1 of the frames "
         f"{report['macro_f1']:.2f}, F1 of bouts that overlap by half {report['segment_f1_50']:.2f}."
-    ]
+    )
+    table = Table("action", "bouts", "F1", "of what was called so, is", "of what is, found")
     for word, one in report["per_action"].items():
         if "bouts" in one:
-            n = one["bouts"]
-            told.append(
-                f"  {word}: F1 {one['f1']:.2f}, {one['precision']:.0%} of what was called so is, "
-                f"{one['recall']:.0%} of it was found; {n} {'bout' if n == 1 else 'bouts'}"
-            )
-    return told
+            shares = (f"{one['precision']:.0%}", f"{one['recall']:.0%}")
+            table.add_row(word, str(one["bouts"]), f"{one['f1']:.2f}", *shares)
+    Console().print(table)

@@ -180,6 +180,14 @@ class Study:
     path: Path
     table: StudyTable
 
+    def __repr__(self) -> str:
+        groups = ", ".join(sorted({animal.group for animal in self.table.animals if animal.group}))
+        return (
+            f"<Study {self.name}: {len(self.table.animals)} animals"
+            f"{f' in the groups {groups}' if groups else ''}, "
+            f"{len(self.table.sessions)} sessions, {self.path}>"
+        )
+
     @staticmethod
     def load(path: str | Path) -> Study:
         """Read the study in a TOML file.

@@ -34,7 +34,8 @@ def check_place(path: Path, overwrite: bool) -> None:
     nearest = next((folder for folder in path.parents if folder.exists()), None)
     if nearest is not None and not nearest.is_dir():
         raise SessionError(
-            f"{nearest} is a file, and a session needs a folder; choose another place with --out"
+            f"{nearest} is a file, and a session needs a folder; choose another place (--out, "
+            "in Python out=)"
         )
     if not path.exists() or (
         path.is_dir() and {entry.name for entry in path.iterdir()} <= {FAILED_FILE}
@@ -42,13 +43,13 @@ def check_place(path: Path, overwrite: bool) -> None:
         return  # what failed before may be replaced
     if not (path / "session.json").is_file():
         raise SessionError(
-            f"{path} exists and is not a session, so it is left alone; choose another place with "
-            "--out"
+            f"{path} exists and is not a session, so it is left alone; choose another place "
+            "(--out, in Python out=)"
         )
     if not overwrite:
         raise SessionError(
-            f"the session {path} exists already; choose another place with --out, or say "
-            "--overwrite"
+            f"the session {path} exists already; choose another place (--out, in Python out=), or "
+            "say --overwrite (in Python overwrite=True)"
         )
 
 

@@ -56,6 +56,7 @@ FILES = (
     "session.rrd",
     "session.mcap",
     "observations.npz",
+    "cutouts.npz",
     "replay.rbl",
     "foxglove.json",
 )
@@ -66,6 +67,7 @@ _OPTIONAL = {
     "activity.parquet",
     "zones.parquet",
     "observations.npz",
+    "cutouts.npz",
     "replay.rbl",
     "foxglove.json",
 }
@@ -144,6 +146,16 @@ class Session:
         for path in sorted(self.path.glob("*.parquet")):
             with reading_from(self.file(path.name)) as own:
                 check_footer(own, path.stem, n_frames, n_joints)
+
+    def __repr__(self) -> str:
+        frames = self.metadata.get("frames", {}).get("n_frames", "unknown")
+        corrected = ", corrected" if self.log.files else ""
+        tables = ", ".join(sorted(path.stem for path in self.path.glob("*.parquet")))
+        return (
+            f"<Session {self.metadata.get('session_id', self.path.stem)}: "
+            f"{self.metadata.get('animal', {}).get('name', 'animal')}, {frames} frames"
+            f"{corrected}; tables {tables}, summary>"
+        )
 
     @property
     def name(self) -> str:

@@ -239,8 +239,9 @@ FRAMES = columns(
         "string",
         "",
         "empty when the pose is trusted; doubtful: its predicted error is large, or the picture "
-        "contradicts it; corrected: a person placed joints of it; not_found or no_depth: nothing "
-        "was measured, and there is no pose where it is not bridged",
+        "contradicts it; corrected: a person placed joints of it; hidden, not_found or no_depth: "
+        "nothing was measured, and there is no pose where it is not bridged; hidden: the animal is "
+        "behind or under something, whole or so much of it that nobody knows how it lies",
         "",
         "tracker",
     ),
@@ -399,8 +400,24 @@ GAPS = columns(
         "camera_dropped: never recorded, start_frame = stop_frame = the next frame; "
         "clock_jumped: the camera was stopped, or its clock set, before the frame; "
         "stamp_repeated, stamp_out_of_order: this frame's own time stamp could not be true and "
-        "was moved; no_depth: recorded without any depth; tracker_lost: nothing in the frame "
-        "looks like the animal",
+        "was moved; no_depth: recorded without any depth; hidden: the animal went behind or under "
+        "something; tracker_lost: nothing in the frame looks like the animal",
+    ),
+    (
+        "x_mm",
+        "float64",
+        "mm",
+        f"where the animal was last seen before it was hidden, else empty; {_AXES}",
+        "",
+        "tracker",
+    ),
+    (
+        "y_mm",
+        "float64",
+        "mm",
+        f"where the animal was last seen before it was hidden, else empty; {_AXES}",
+        "",
+        "tracker",
     ),
 )
 

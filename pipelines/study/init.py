@@ -56,7 +56,10 @@ def begin_study(folder: str | Path, overwrite: bool = False) -> Path:
         )
     file = root / STUDY_FILE
     if file.exists() and not overwrite:
-        raise StudyError(f"{file} exists already; change it by hand, or say --overwrite")
+        raise StudyError(
+            f"{file} exists already; change it by hand, or say "
+            "--overwrite (in Python overwrite=True)"
+        )
     raw = root / RAW if (root / RAW).is_dir() else root
     found = find_recordings(raw)
     if not found:
