@@ -7,9 +7,7 @@ steps of one that is stated.
 
 from __future__ import annotations
 
-import os
 import re
-import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -28,6 +26,7 @@ from liex_lab.recordings.writer import (
     PictureFolderWriter,
     RecordingWriter,
 )
+from liex_lab.runtime.durable import replacing
 from liex_lab.runtime.progress import Progress, silent
 
 _STEPS_MM = {
@@ -223,7 +222,10 @@ def _check_target(target: Path, overwrite: bool) -> None:
             "give another name"
         )
     if not overwrite and (is_file or any(target.iterdir())):
-        raise RecordingError(f"{target} is there already; give another name, or add --overwrite")
+        raise RecordingError(
+            f"{target} is there already; give another name, or add "
+            "--overwrite (in Python overwrite=True)"
+        )
 
 
 def _written_here(path: Path) -> bool:
@@ -243,23 +245,11 @@ def in_place(target: Path) -> Iterator[Path]:
     Raises:
         RecordingError: it cannot be written.
     """
-    part = target.with_name(f".{target.name}.part-{os.getpid()}")
     try:
-        yield part
-        if target.is_dir():
-            _remove(target)
-        part.replace(target)
+        with replacing(target, replace_folder=True) as part:
+            yield part
     except OSError as error:
         raise RecordingError(
             f"the recording cannot be written as {target} ({error.strerror or error}); make room, "
             "or name another place"
         ) from None
-    finally:
-        _remove(part)
-
-
-def _remove(path: Path) -> None:
-    if path.is_dir():
-        shutil.rmtree(path)
-    else:
-        path.unlink(missing_ok=True)

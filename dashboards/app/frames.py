@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 
 from liex_lab.errors import LiexError
 
-from . import plots
-
 if TYPE_CHECKING:
     from liex_lab.recordings.recording import Recording
     from liex_lab.sessions import Session
@@ -62,6 +60,12 @@ class Frames:
             except (LiexError, OSError, IndexError):
                 return _kept(session, row)
 
+    def close(self) -> None:
+        """Close the files that are open."""
+        with self._lock:
+            while self._open:
+                self._open.popitem()[1][1].close()
+
     def figure(self, key: str, session: Session, row: int, *, whole: bool) -> dict[str, Any]:
         """The picture of a frame with its skeleton, as plotly takes it.
 
@@ -71,6 +75,8 @@ class Frames:
             row: the frame's row in the table `frames`.
             whole: the whole picture, else what is around the animal.
         """
+        from . import plots
+
         depth = self.depth(key, session, row)
         index = int(session.frames["frame_index"].iloc[row])
         joints = session.table("poses", ["frame_index", "joint", "u_px", "v_px"], [index])

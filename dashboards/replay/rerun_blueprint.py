@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from liex_lab.runtime.durable import replacing
+
 if TYPE_CHECKING:
     from liex_lab.sessions import Session
 
@@ -31,9 +33,8 @@ def write_blueprint(session: Session) -> Path:
         Path of the file.
     """
     path = session.path / FILE
-    beside = path.with_name(f".{FILE}")
-    replay_blueprint(session.metadata).save("liex_lab", str(beside))
-    beside.replace(path)
+    with replacing(path) as beside:
+        replay_blueprint(session.metadata).save("liex_lab", str(beside))
     return path
 
 

@@ -7,7 +7,14 @@ from typing import Annotated
 
 import typer
 
-from liex_lab.cli.options import RecordingPath, Settings, TopicName, WhichPlan, region_setting
+from liex_lab.cli.options import (
+    RecordingPath,
+    Settings,
+    TopicName,
+    WhichPlan,
+    region_setting,
+    say,
+)
 from liex_lab.runtime.progress import progress_bar
 
 
@@ -52,9 +59,9 @@ def convert(
             overwrite=overwrite,
             progress=progress,
         )
-    typer.echo(f"recording: {done.path} ({done.n_frames} frames)")
+    say(f"recording: {done.path} ({done.n_frames} frames)")
     for sentence in (*done.problems, *done.notes):
-        typer.echo(f"note: {sentence}")
+        say(f"note: {sentence}")
 
 
 def pack(
@@ -103,17 +110,17 @@ def pack(
             progress=progress,
         )
     if not done.written:
-        typer.echo(f"archive: {done.path} ({done.n_frames} frames) is as it was packed")
+        say(f"archive: {done.path} ({done.n_frames} frames) is as it was packed")
         return
     size = f"{done.n_bytes / 1e6:.1f} MB"
     if done.source_bytes:
         share = 100 * done.n_bytes / done.source_bytes
         size += f", {share:.0f}% of the recording's {done.source_bytes / 1e6:.1f} MB"
-    typer.echo(f"archive: {done.path} ({done.n_frames} frames, {size})")
-    typer.echo(f"kept:    {100 * done.kept:.0f}% of a picture's pixels, bit for bit")
+    say(f"archive: {done.path} ({done.n_frames} frames, {size})")
+    say(f"kept:    {100 * done.kept:.0f}% of a picture's pixels, bit for bit")
     if done.verified:
-        typer.echo("checked: every picture and time is that of the recording")
+        say("checked: every picture and time is that of the recording")
     for path in done.deleted:
-        typer.echo(f"removed: {path}")
+        say(f"removed: {path}")
     for sentence in done.notes:
-        typer.echo(f"note: {sentence}")
+        say(f"note: {sentence}")

@@ -11,7 +11,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from liex_lab.cli.options import SessionPath
+from liex_lab.cli.options import SessionPath, say
 from liex_lab.errors import LiexError
 from liex_lab.runtime.progress import progress_bar
 
@@ -60,8 +60,8 @@ def _whole_depth(session: Path, scratch: Path, recording: str | None) -> list[Pa
         with progress_bar() as progress:
             return [whole_pictures(session, scratch / "depth.rrd", recording, progress)]
     except LiexError as error:
-        typer.echo(f"note: {error}")
-        typer.echo("note: the replay shows what the session keeps of the depth")
+        say(f"note: {error}")
+        say("note: the replay shows what the session keeps of the depth")
         return []
 
 
@@ -75,7 +75,7 @@ def _show(replay: Path, more: list[Path], at_s: float | None, web: bool) -> None
     # RERUN_ANALYTICS: what a laboratory looks at is nobody else's business; the viewer in a browser
     # does not heed it
     if web:
-        typer.echo(
+        say(
             "Rerun's viewer in the browser calls tel.rerun.io, its makers' count of uses; the "
             "window does not"
         )

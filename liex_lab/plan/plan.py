@@ -82,6 +82,20 @@ class Plan(Table):
     behaviour: Behaviour = Behaviour()
     replay: Replay = Replay()
 
+    def __repr__(self) -> str:
+        usual = Plan()
+        said = [f"seed={self.seed}"] if self.seed != usual.seed else []
+        for table in type(self).model_fields:
+            if table != "seed":
+                mine, other = getattr(self, table), getattr(usual, table)
+                said += [
+                    f"{table}.{key}={value!r}"
+                    for key, value in mine
+                    if value != getattr(other, key) and (table, key) != ("animal", "name")
+                ]
+        unlike = f"; unlike the defaults: {', '.join(said)}" if said else ", all else by default"
+        return f"<Plan for the {self.animal.name}{unlike}>"
+
     @staticmethod
     def load(plan: str | Path) -> Plan:
         """Load a bundled plan by name, or the plan in a TOML file.

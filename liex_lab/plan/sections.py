@@ -176,7 +176,9 @@ class ArenaFacts(Table):
 
     zones: str | None = Field(
         None,
-        description="path of a TOML file with named zones, circles and polygons; see the README",
+        description=(
+            "path of a TOML file with named zones, circles and polygons; see docs/howto/zones.md"
+        ),
     )
 
 

@@ -118,7 +118,7 @@ def open_recording(
         camera: comes before whatever the files state; a `Lens` for pictures of any size.
         fps: frame rate, Hz; used only where the files hold no time stamps.
         topic: the depth topic to read of an MCAP file or a ROS bag with several of them.
-        pattern: which pictures of a folder to take, as in "*.tif", before a camera.toml.
+        pattern: which pictures of a folder to take, as in `*.tif`, before a camera.toml.
         strict: refuse a recording that is cut short, instead of only saying so in `problems` and
             `truncated`.
         progress: told while an archive is unpacked or an index made.

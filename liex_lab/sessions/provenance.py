@@ -24,6 +24,7 @@ from liex_lab.body.skeleton import Skeleton
 from liex_lab.errors import SessionError
 from liex_lab.geometry import SE3
 from liex_lab.optics.camera import Camera
+from liex_lab.runtime.places import storable
 
 if TYPE_CHECKING:
     from liex_lab.arena.floor import Floor
@@ -33,7 +34,7 @@ if TYPE_CHECKING:
     from liex_lab.recordings.recording import Recording
     from liex_lab.recordings.timestamps import Gap
 
-SCHEMA_VERSION = 5
+SCHEMA_VERSION = 6
 _PACKAGES = (
     "liex_lab",
     "numpy",
@@ -131,7 +132,7 @@ class Provenance:
             "batch": stated.batch,
         }
         known: dict[str, Any] = {
-            "name": stated.name or recording.name,
+            "name": storable(stated.name or recording.name),
             "skeleton": skeleton,
             "camera": recording.camera,
             "T_arena_camera": floor.T_arena_camera,
@@ -143,9 +144,9 @@ class Provenance:
             "individual": stated.individual,
             "n_frames": len(recording),
             "gaps": [*recording.gaps, *recording.faults],
-            "problems": list(recording.problems),
+            "problems": [storable(problem) for problem in recording.problems],
             "truncated": recording.truncated,
-            "subject": {name: str(value) for name, value in subject.items() if value},
+            "subject": {name: storable(str(value)) for name, value in subject.items() if value},
             "session_start_time": stated.session_start_time
             or entries.get("session_start_time")
             or "",

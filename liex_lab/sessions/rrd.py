@@ -56,6 +56,7 @@ PALETTE = tuple(int(colour[1:], 16) for colour in colours.PALETTE)
 _FLAG_COLOURS = {
     "doubtful": 0xCCBB44,
     "not_found": 0xEE6677,
+    "hidden": 0xAA3377,
     "no_depth": 0xBBBBBB,
     "corrected": 0x4477AA,
 }

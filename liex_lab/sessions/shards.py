@@ -15,9 +15,9 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING
 
+from liex_lab.runtime.durable import sync_folder, sync_tree, write_whole
 from liex_lab.sessions.checkpoint import LOGS, STRETCHES, Checkpoint, Columns
 from liex_lab.sessions.cutouts import PictureKeeper
-from liex_lab.sessions.failure import write_whole
 from liex_lab.sessions.provenance import Provenance
 from liex_lab.sessions.writer import seen_rows
 
@@ -139,4 +139,6 @@ class ShardWriter:
         if is_whole(self._whole):  # somebody else was quicker
             return
         shutil.rmtree(self._whole, ignore_errors=True)
+        sync_tree(self._folder)
         self._folder.rename(self._whole)
+        sync_folder(self._whole.parent)

@@ -28,6 +28,7 @@ from liex_lab.errors import LiexError, SessionError
 from liex_lab.runtime.disk import is_full, probe_full, why_full
 from liex_lab.runtime.durable import put_in_place, sync_tree
 from liex_lab.runtime.memory import Allocator, on_disk, peak_memory_mb, rest
+from liex_lab.runtime.places import unlinked_tree
 from liex_lab.sessions.buffer import Columnar, TrackBuffer, columns_of
 from liex_lab.sessions.checkpoint import LOGS, Checkpoint
 from liex_lab.sessions.corrections import FOLDER
@@ -479,7 +480,7 @@ class SessionWriter:
         copy = self._folder / FOLDER
         shutil.rmtree(copy, ignore_errors=True)
         if made is not None:  # they apply again where the poses came out the same
-            shutil.copytree(made, copy)
+            shutil.copytree(unlinked_tree(made), copy)
             sync_tree(copy)
         self._checkpoint.drop_parts()
         put_in_place(self._folder, self.path, aside_folder(self.path))

@@ -206,7 +206,7 @@ def read_individuals(session: Session) -> list[Individual]:
         One each, in the frame of the camera that took the pictures.
     """
     T_camera_arena = session.T_arena_camera.inverse()
-    mirrored = bool((session.metadata.get("optics") or {}).get("mirrored"))
+    mirrored = bool((session.metadata["camera"].get("optics") or {}).get("mirrored"))
     n_joints = len(session.poses["joint"].unique())
     found = []
     for name, frames in session.frames.groupby("individual", sort=True):

@@ -357,7 +357,8 @@ def _choose(file: MessageFile, found: _Found, topic: str | None) -> _Topic:
             choice = sorted(printable(depth.name) for depth in some)
             raise RecordingError(
                 f"{path} holds depth pictures on {len(some)} topics, {', '.join(choice)}; choose "
-                f"one with --topic {choice[0]}, or in a plan with recording.topic"
+                f"one with --topic {choice[0]} (in Python topic=), or in a plan with "
+                "recording.topic"
             )
     raise _no_depth(file)
 
