@@ -1,6 +1,7 @@
 """The picture in README.md: some of the report's own figures, rendered by a headless browser.
 
-After `liex demo`, `photograph("mouse_walk.liex", "dashboards/assets/demo.png")` makes it again.
+After `liex demo`, `photograph("mouse_walk.liex", "dashboards/assets/demo.png")` makes it again, and
+`python docs/pictures.py` all pictures of README.md.
 """
 
 from __future__ import annotations

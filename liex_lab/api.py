@@ -13,7 +13,7 @@ from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from liex_lab.errors import MissingPackageError
+from liex_lab.errors import MissingPackageError, how_to_install
 from liex_lab.plan import Plan
 from liex_lab.plan.study import Study
 from liex_lab.runtime.progress import Board, Progress, progress_board, silent, telling_of_compiling
@@ -489,8 +489,7 @@ def serve_dashboard(
         from liex_lab.dashboards.app.server import LOOPBACK, address, make_app, serve
     except ModuleNotFoundError as error:
         raise MissingPackageError(
-            f"the dashboard needs {error.name}, which is not installed; pip install "
-            "'liex_lab[dashboard]'"
+            f"the dashboard needs {error.name}; {how_to_install('dashboard')}"
         ) from None
     from liex_lab.dashboards.app.data import StudyData
     from liex_lab.sessions.viewer import show_replay

@@ -1,4 +1,4 @@
-"""Depth picture of any frame of a session, from its own replay file, with the skeleton over it."""
+"""Depth picture of any frame of a session, as it is kept there, with the skeleton over it."""
 
 from __future__ import annotations
 
@@ -32,14 +32,15 @@ class Frames:
     def depth(self, key: str, session: Session, row: int) -> NDArray[np.uint16] | None:
         """(H, W) uint16 mm, 0 where unread; None where the session keeps no depth of this frame.
 
-        Without a replay file that can be read, a thumbnail of this very frame does.
+        Outside of the cut-outs that a session keeps it is the still scene. Without a replay file
+        that can be read, a thumbnail of this very frame does.
 
         Args:
             key: the session's name in the study.
             session: the opened session.
             row: the frame's row in the table `frames`.
         """
-        from liex_lab.recordings import open_recording
+        from liex_lab.sessions.cutouts import open_pictures
 
         path = session.path / "session.mcap"
         with self._lock:
@@ -51,7 +52,7 @@ class Frames:
                     if known is not None:
                         known[1].close()
                     stack = ExitStack()
-                    known = (stamp, stack, stack.enter_context(open_recording(path)))
+                    known = (stamp, stack, stack.enter_context(open_pictures(session)))
                 self._open[key] = known
                 while len(self._open) > _HELD:
                     self._open.pop(next(iter(self._open)))[1].close()

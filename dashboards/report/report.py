@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 
 from liex_lab.actions.colours import action_colours
+from liex_lab.runtime.durable import write_whole
 from liex_lab.sessions import Session
-from liex_lab.sessions.failure import write_whole
 from liex_lab.sessions.verdict import verdict_in
 from liex_lab.sessions.videos import found_video
 

@@ -9,6 +9,7 @@ from typing import Annotated
 
 import typer
 
+from liex_lab.cli.options import say
 from liex_lab.runtime.progress import progress_bar
 
 
@@ -57,9 +58,9 @@ def compare(
             else row["refused"]
         )
         n = f"{row['n_units_first']} and {row['n_units_second']} units ({row['unit'] or 'none'})"
-        typer.echo(f"{row['measure']}, {row['contrast']}: {numbers}; {n}\n    {p}")
-    typer.echo(f"tables: {found['folder']}")
-    typer.echo(f"figures: {len(found['figures'])} files in {found['folder'] / 'figures'}")
+        say(f"{row['measure']}, {row['contrast']}: {numbers}; {n}\n    {p}")
+    say(f"tables: {found['folder']}")
+    say(f"figures: {len(found['figures'])} files in {found['folder'] / 'figures'}")
 
 
 def report(
@@ -70,7 +71,7 @@ def report(
     """Write a session's report.html again, with what people corrected since."""
     from liex_lab.dashboards.report.report import write_report
 
-    typer.echo(f"report: {write_report(session)}")
+    say(f"report: {write_report(session)}")
 
 
 def figures(
@@ -101,8 +102,8 @@ def figures(
             place, only=only or (), formats=formats or ("svg", "pdf"), out=out, progress=progress
         )
     if found["empty"]:
-        typer.echo(f"note: there is nothing to draw of {', '.join(found['empty'])}")
-    typer.echo(f"figures: {len(found['files'])} files in {found['folder']}")
+        say(f"note: there is nothing to draw of {', '.join(found['empty'])}")
+    say(f"figures: {len(found['files'])} files in {found['folder']}")
 
 
 def export(
@@ -113,7 +114,9 @@ def export(
     to: Annotated[
         str,
         typer.Option(
-            "--to", metavar="FORMAT", help="nwb, boris, dlc, movement, sleap, csv or video."
+            "--to",
+            metavar="FORMAT",
+            help="nwb, boris, dlc, movement, sleap, csv, xlsx or video.",
         ),
     ],
     out: Annotated[
@@ -144,7 +147,7 @@ def export(
     ] = 1.0,
 ) -> None:
     """Write sessions for another program: NWB, BORIS, DeepLabCut, movement, SLEAP, every table as
-    CSV; or as a video, with several beside each other.
+    CSV or in one Excel workbook; or as a video, with several beside each other.
     """
     from liex_lab.exchange import export as job
     from liex_lab.sessions import Session
@@ -164,11 +167,11 @@ def export(
                 overwrite=overwrite,
                 progress=progress,
             )
-        typer.echo(f"export: {video}")
+        say(f"export: {video}")
         return
     if actions or groups or start_s is not None or stop_s is not None or slower != 1.0:
         raise typer.BadParameter(
             "actions, groups and times are chosen for `--to video`; the other formats hold all"
         )
     for place in places:
-        typer.echo(f"export: {job(Session.open(place), to, out, overwrite=overwrite)}")
+        say(f"export: {job(Session.open(place), to, out, overwrite=overwrite)}")
