@@ -709,9 +709,11 @@ def run_tables(
     fresh: bool = False,
     rows: Sequence[str] = (),
     sealed: bool = False,
+    without: Sequence[str] = (),
+    nyu: Path | None = None,
     progress: Progress = silent,
 ) -> list[Path]:
-    """Make every row of Tables 1-3 of the Lie-X paper and its figures; returns the files written.
+    """Make every table and figure of the Lie-X paper on one page; returns the files written.
 
     Args:
         out: the folder that tables and figures are written into.
@@ -722,10 +724,17 @@ def run_tables(
         fresh: nothing kept is used; every variant is trained again, which takes long.
         rows: only these rows are trained and measured anew, the others kept; () is all.
         sealed: measure the sealed split, which is done once, when an issue ends.
+        without: `tracking` or `actions`, parts of the page that are not measured.
+        nyu: folder of the NYU hand data, counted for Table 2; None leaves it out.
         progress: told how far the work is.
     """
     from liex_lab.catalog import bundled_models
+    from liex_lab.dashboards.paper.confusion import draw_confusions
+    from liex_lab.dashboards.paper.key_frames import draw_key_frames
+    from liex_lab.dashboards.paper.page import write_page
     from liex_lab.dashboards.paper.plates import draw_figures
+    from liex_lab.dashboards.paper.tracking import draw_tracking
+    from liex_lab.pipelines.evaluation.paper.drawers import Drawers
     from liex_lab.pipelines.evaluation.paper.run import make_tables
 
     return make_tables(
@@ -736,6 +745,8 @@ def run_tables(
         fresh=fresh or bool(rows),
         rows=rows,
         sealed=sealed,
-        draw=draw_figures,
+        without=without,
+        nyu=nyu,
+        drawers=Drawers(draw_figures, draw_tracking, draw_confusions, draw_key_frames, write_page),
         progress=progress,
     )
