@@ -179,4 +179,11 @@ def verdict_in(document: Mapping[str, Any]) -> Mapping[str, Any]:
     """
     unsaid = {"look_at_it": False, "accepted": False, "reasons": [], "cautions": [], "sentence": ""}
     found = document.get("verdict")
-    return {**unsaid, **found} if isinstance(found, Mapping) else unsaid
+    if not isinstance(found, Mapping):
+        return unsaid
+    return {
+        **unsaid,
+        **{
+            name: one for name, one in found.items() if isinstance(one, type(unsaid.get(name, one)))
+        },
+    }

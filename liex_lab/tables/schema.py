@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     import pandas as pd
     import pyarrow as pa
 
-_BEGINS_FORMULA = ("=", "+", "-", "@", "\t", "\r", "\n")
 ROWS_PER_GROUP = 100_000  # a block of the widest table then takes some 20 MB
 Block = Mapping[str, Any]  # column -> one value for all rows, or an array
 
@@ -639,35 +638,6 @@ class Words:
     def __getitem__(self, rows: slice) -> Words:
         """Some consecutive rows."""
         return Words(self.codes[rows], self.words)
-
-
-def harmless(value: Any) -> Any:
-    """A cell that no spreadsheet takes for a formula (CSV injection).
-
-    Args:
-        value: a cell of any kind; only text that begins with =, +, -, @, tab or line end is
-            changed.
-
-    Returns:
-        The cell; such text with an apostrophe before it.
-    """
-    return f"'{value}" if isinstance(value, str) and value[:1] in _BEGINS_FORMULA else value
-
-
-def as_it_was(value: Any) -> Any:
-    """The inverse of `harmless`.
-
-    Args:
-        value: a cell of any kind.
-
-    Returns:
-        What `harmless` was given.
-    """
-    return (
-        value[1:]
-        if isinstance(value, str) and value[:1] == "'" and value[1:2] in _BEGINS_FORMULA
-        else value
-    )
 
 
 def to_pandas(schema: Sequence[Column], block: Block, copy: bool = True) -> pd.DataFrame:

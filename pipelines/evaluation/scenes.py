@@ -177,7 +177,7 @@ def run_product(recording: TrueRecording, plan: Plan) -> Outcome:
     from liex_lab.sessions import Session
     from liex_lab.sessions.verdict import verdict_in
 
-    quick = plan.with_settings(["replay.depth=false"])
+    quick = plan.with_settings(["replay.depth=none"])
     with tempfile.TemporaryDirectory(prefix="liex-scenes-") as folder:
         try:
             measure_session(recording, quick, folder)
