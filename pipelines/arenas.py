@@ -17,9 +17,10 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from liex_lab.errors import LiexError
+from liex_lab.errors import LiexError, RecordingError
 from liex_lab.plan import Plan
 from liex_lab.recordings.frame import DepthFrame
+from liex_lab.runtime.places import inside
 from liex_lab.runtime.progress import Progress, silent
 
 from .build import build_recording
@@ -125,9 +126,12 @@ def measure_arenas(
         SessionError: a session is there already, or another process writes it.
     """
     from liex_lab.arena.region import masks_apart
+    from liex_lab.recordings.timestamps import unwritable_times
 
     first = plan or Plan.load(USUAL).with_settings(settings)
     with build_recording(recording, first, progress) as opened:
+        if told := unwritable_times(opened.times_ns):
+            raise RecordingError(f"of {opened.name} {told}")
         shared = opened.remembering(_REMEMBERED_BYTES)
         arenas = arenas_of(shared, first)
         corners = {one.name: stated_corners(shared, first, one.region) for one in arenas}
@@ -136,7 +140,7 @@ def measure_arenas(
         works = []
         for one in arenas:
             name = f"{base}-{one.name}"
-            folder = Path(out) / f"{name}.liex"
+            folder = inside(Path(out), name, ".liex")
             check_unused(folder, overwrite)
             told = arena_settings(one, name)
             works.append(_Work(one, told, corners[one.name], inside[one.name], folder))
@@ -149,7 +153,7 @@ def measure_arenas(
             except LiexError as error:
                 work.error = error
         going = [work for work in works if work.prepared is not None and work.error is None]
-        _measure(going, shared, overwrite, notes, blueprint, report, progress)
+        _measure(going, shared, recording, overwrite, notes, blueprint, report, progress)
     return [ArenaOutcome(work.arena.name, work.session, work.error) for work in works]
 
 
@@ -197,6 +201,7 @@ def _prepare(
 def _measure(
     works: Sequence[_Work],
     shared: Recording,
+    source: str | Path | Recording,
     overwrite: bool,
     notes: Mapping[str, Any] | None,
     blueprint: BlueprintMaker | None,
@@ -231,7 +236,7 @@ def _measure(
                 progress(frames[-1].index + 1, len(shared), MEASURING)
         for work in works:
             if work.prepared is not None and work.writer is not None:
-                work.session = work.prepared.finish(work.writer, notes).path
+                work.session = work.prepared.finish(work.writer, source, notes).path
 
 
 def _depth(recording: Recording, row: int) -> NDArray[np.float32]:

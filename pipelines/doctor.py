@@ -15,10 +15,10 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from liex_lab.errors import LiexError
+from liex_lab.errors import LiexError, printable
 from liex_lab.plan import Plan
 from liex_lab.plan.plan import arena_lines
-from liex_lab.recordings.timestamps import DROPPED, Gap
+from liex_lab.recordings.timestamps import DROPPED, Gap, unwritable_times
 from liex_lab.runtime.progress import Progress, silent
 
 from .build import build_water
@@ -163,6 +163,7 @@ def examine(
             "missing": missing,
             "problems": [
                 *seen.problems,
+                *filter(None, [unwritable_times(opened.times_ns)]),
                 *_time_problems(opened),
                 *depth.problems(),
                 *misplaced,
@@ -317,20 +318,20 @@ def print_report(findings: dict[str, Any]) -> None:
 
     table = Table(show_header=False, box=None, pad_edge=False)
     for name, value in lines(findings):
-        table.add_row(name, Text(value))
+        table.add_row(name, Text(printable(value)))
     console = Console()
     console.print(table)
     if not findings["problems"] and not findings["missing"]:
         console.print("no problems found", style="green")
     for problem in (*findings["missing"], *findings["problems"]):
-        console.print(Text(f"- {problem}", style="yellow"), soft_wrap=True)
+        console.print(Text(printable(f"- {problem}"), style="yellow"), soft_wrap=True)
     if findings["arenas"]:
         told = "several arenas are seen; lines for a plan, with subject_id and group to be added:"
         console.print(Text(told), soft_wrap=True)
         for line in findings["arenas"]:
             console.print(Text(line), soft_wrap=True)
     if findings["next"]:
-        console.print(Text(f"next: {findings['next']}"), soft_wrap=True)
+        console.print(Text(printable(f"next: {findings['next']}")), soft_wrap=True)
 
 
 def lines(findings: dict[str, Any]) -> list[tuple[str, str]]:

@@ -18,9 +18,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from liex_lab.errors import PlanError
+from liex_lab.errors import PlanError, RecordingError
 from liex_lab.plan import Plan
 from liex_lab.runtime.memory import Allocator, rest
+from liex_lab.runtime.places import inside
 from liex_lab.runtime.progress import Progress, silent
 from liex_lab.runtime.threads import in_background, prefetch
 
@@ -97,6 +98,7 @@ def measure_session(
         MisfitError: the recording shows something else than the plan's animal.
         EstimationError: no animal is found.
     """
+    from liex_lab.recordings.timestamps import unwritable_times
     from liex_lab.sessions import SessionWriter
 
     started = time.perf_counter()
@@ -110,7 +112,9 @@ def measure_session(
         in_background(partial(build_estimator, first)) as estimator,
         build_recording(recording, first, progress) as opened,
     ):
-        folder = folder or Path(out) / f"{first.session.name or opened.name}.liex"
+        folder = folder or inside(Path(out), first.session.name or opened.name, ".liex")
+        if told := unwritable_times(opened.times_ns):
+            raise RecordingError(f"of {opened.name} {told}")
         check_unused(folder, overwrite)
         progress(0, None, "learning the background, the floor and the animal's size")
         unnamed = None if plan else settings
@@ -126,7 +130,7 @@ def measure_session(
                 for frames in chunks:
                     prepared.measure(frames, writer)
                     progress(frames[-1].index + 1, len(opened), MEASURING)
-            session = prepared.finish(writer, notes)
+            session = prepared.finish(writer, recording, notes)
     return session.path
 
 
@@ -197,16 +201,27 @@ class Prepared:
         whole = Shard(recording, opened_as, self.fitted.tracker, self.origin, self.folder, 0, n)
         measure_shards(pool, whole, self.folder, progress)
 
-    def finish(self, writer: SessionWriter, notes: Mapping[str, Any] | None = None) -> Session:
+    def finish(
+        self,
+        writer: SessionWriter,
+        source: str | Path | Recording,
+        notes: Mapping[str, Any] | None = None,
+    ) -> Session:
         """Make track, behaviour and tables, and put the session in its place.
 
         Args:
             writer: has all frames.
+            source: path or address of the recording, to which the session links; one that was
+                handed over open has none.
             notes: what session.json is to hold besides.
         """
+        from liex_lab.sessions.source import link_to
+
         began = time.perf_counter()
         verdict = make_track(writer, self.fitted)
         self.timings["track"] += time.perf_counter() - began
+        if isinstance(source, str | Path):
+            writer.note(input=link_to(source, self.folder))
         writer.note(
             problems=self.recording.problems, verdict=verdict.to_dict(), **dict(notes or {})
         )
@@ -272,7 +287,7 @@ def make_track(writer: SessionWriter, fitted: Fitted) -> Verdict:
         whole,
         misfits=fitted.misfits,
         n_animals=1 if fit is None else fit.n_animals,
-        cautions=fitted.notes,
+        cautions=(*fitted.notes, *tracker.scene.remarks),
         accepted=fitted.plan.estimation.accept_misfit,
     )
     writer.take(tracked, whole, tracker.subject)
