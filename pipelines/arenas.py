@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any
 from liex_lab.errors import LiexError, RecordingError
 from liex_lab.plan import Plan
 from liex_lab.recordings.frame import DepthFrame
+from liex_lab.runtime.places import inside
 from liex_lab.runtime.progress import Progress, silent
 
 from .build import build_recording
