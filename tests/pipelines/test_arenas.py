@@ -230,3 +230,33 @@ def test_an_empty_arena_is_said_to_hold_no_animal():
     with pytest.raises(MisfitError, match="no animal was found") as caught:
         fit_plan(film("empty", 1001, N_FRAMES), Plan.load("mouse"))
     assert caught.value.exit_code == 4
+
+
+@pytest.mark.slow
+def test_workers_make_the_same_tables_of_every_arena(tmp_path, monkeypatch):
+    from liex_lab.pipelines import session, shards
+
+    class Inline:
+        """A pool whose only worker is this process."""
+
+        n_done = 0
+
+        def each(self, do, works):
+            for work in works:
+                self.n_done += 1
+                yield do(work)
+
+    for module in (session, shards):
+        monkeypatch.setattr(module, "LENGTH", 15)
+    address = f"synthetic:scene?name=two-arenas&seed=1001&frames={N_FRAMES}"
+    region = "{circle = {centre = [-150, 10], radius = 170}, unit = 'mm'}"
+    table = several().model_dump(exclude_none=True)
+    table["arenas"] = [{"name": "left", "region": Plan().with_settings([f"arena.region={region}"])}]
+    table["arenas"][0]["region"] = table["arenas"][0]["region"].arena.region.model_dump()
+    plan = Plan.from_table(table)
+    pool = Inline()
+    (one,) = measure_arenas(address, plan, tmp_path / "workers", pool=pool)
+    (other,) = measure_arenas(address, plan, tmp_path / "alone")
+    assert pool.n_done == 3
+    assert (one.error, other.error) == (None, None)
+    assert tables(one.session) == tables(other.session)
