@@ -155,7 +155,7 @@ def test_the_region_of_an_arena_is_kept_in_every_frame(tmp_path: Path) -> None:
 
 def test_without_depth_neither_replay_holds_any_and_it_is_said_why(tmp_path: Path) -> None:
     session = written(tmp_path / "none.liex", "none")
-    with pytest.raises(SessionError, match='keeps no depth pictures, for its plan says replay'):
+    with pytest.raises(SessionError, match="keeps no depth pictures, for its plan says replay"):
         open_pictures(session)
     with pytest.raises(SessionError, match="keeps no depth pictures"):
         correcting.joint_move_at_pixel(session, 3, "neck", 40.0, 30.0)
