@@ -211,7 +211,7 @@ def _region(
             return None, ["whole pictures are kept, for no region of the arena stands out"]
         if learned.scene.standing.n_together > 1:  # type: ignore[attr-defined]
             return None, [
-                "whole pictures are kept, for more than one thing moves in them; name the region to "
+                "whole pictures are kept, for more than one thing moves in them; name what is to "
                 "be kept with --region"
             ]
         for share in _WIDER:
