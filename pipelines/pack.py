@@ -192,6 +192,8 @@ def _region(
 
     if corners := _stated(opened, plan):
         return region_mask(corners, opened.width, opened.height), []
+    if plan.arenas is not None:
+        return None, ["whole pictures are kept, for the plan has several arenas in them"]
     try:
         seen = build_recording(recording, plan, progress)
     except LiexError as error:
@@ -207,6 +209,11 @@ def _region(
         region = _found_region(learned, seen.width, seen.height)
         if region is None:
             return None, ["whole pictures are kept, for no region of the arena stands out"]
+        if learned.scene.standing.n_together > 1:  # type: ignore[attr-defined]
+            return None, [
+                "whole pictures are kept, for more than one thing moves in them; name what is to "
+                "be kept with --region"
+            ]
         for share in _WIDER:
             mask = _wider(region, round(share * seen.width))
             inside = seen.seen_by(seen.camera, _within(mask), {}, lent=True)
