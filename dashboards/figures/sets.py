@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.errors import SessionError
-from liex_lab.runtime.durable import sync_folder
+from liex_lab.runtime.durable import replacing, sync_folder
+from liex_lab.runtime.places import inside
 from liex_lab.runtime.progress import Progress, silent
 from liex_lab.sessions import Session
 
@@ -165,15 +166,16 @@ def put_figure(folder: Path, name: str, content: bytes) -> Path:
         folder: the folder of figures; it is made where it is missing.
         name: of the file.
         content: its bytes.
+
+    Raises:
+        PlaceError: a symbolic link lies there.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    part = folder / f".{name}.part"
-    try:
+    stem, dot, kind = name.rpartition(".")
+    place = inside(folder, stem, f"{dot}{kind}")
+    with replacing(place) as part:
         part.write_bytes(content)
-        part.replace(folder / name)
-    finally:
-        part.unlink(missing_ok=True)
-    return folder / name
+    return place
 
 
 def read_comparison(folder: Path) -> tuple[pd.DataFrame, pd.DataFrame, list[Session]]:
