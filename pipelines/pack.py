@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from liex_lab.errors import EstimationError, LiexError, ModelError, RecordingError
 from liex_lab.plan import Plan
+from liex_lab.runtime.places import inside
 from liex_lab.runtime.progress import Progress, silent
 
 from .build import build_recording, build_tracker, open_planned
@@ -151,7 +152,7 @@ def _target(
     from liex_lab.recordings.formats.messages.pack_facts import SUFFIX
 
     beside = Path(recording).parent if opened.sources else Path()
-    target = Path(to) if to is not None else beside / f"{opened.name}{SUFFIX}.mcap"
+    target = Path(to) if to is not None else inside(beside, opened.name, f"{SUFFIX}.mcap")
     if target.suffix.lower() != ".mcap":
         raise RecordingError(f"an archive is an MCAP file; give --to NAME.mcap, not {target.name}")
     if not target.parent.is_dir():

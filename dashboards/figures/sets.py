@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from liex_lab.errors import SessionError
 from liex_lab.runtime.durable import replacing
-from liex_lab.runtime.places import safe_name, unlinked
+from liex_lab.runtime.places import inside, safe_name, unlinked
 from liex_lab.runtime.progress import Progress, silent
 from liex_lab.sessions import Session
 
@@ -169,9 +169,11 @@ def put_figure(folder: Path, name: str, content: bytes) -> Path:
         PlaceError: a symbolic link lies there.
     """
     unlinked(folder).mkdir(parents=True, exist_ok=True)
-    with replacing(folder / name) as part:
+    stem, dot, kind = name.rpartition(".")
+    place = inside(folder, stem, f"{dot}{kind}")
+    with replacing(place) as part:
         part.write_bytes(content)
-    return folder / name
+    return place
 
 
 def read_comparison(folder: Path) -> tuple[pd.DataFrame, pd.DataFrame, list[Session]]:

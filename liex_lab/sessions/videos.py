@@ -16,7 +16,8 @@ def video_path(folder: Path, name: str, what: str = "") -> Path:
         name: of the session, or of the study.
         what: what of it is shown, such as an action; "" for all of it.
     """
-    return folder / safe_name(f"{name}_{what}" if what else name, ".mp4")
+    tail = "".join(c if c.isalnum() or c in "-_.+" else "_" for c in what)
+    return folder / safe_name(f"{name}_{tail}" if tail else name, ".mp4")
 
 
 def stretch(start_s: float | None, stop_s: float | None) -> str:
