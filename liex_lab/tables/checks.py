@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 _LATER = {"wall_distance_mm", "zone", "p_flip", "bridged", *ROOT_COVARIANCES}  # not in schema 1
+_LATER_IN = {("gaps", "x_mm"), ("gaps", "y_mm")}  # since schema 6
 _ROWS_PER_BYTE = 8  # a frame's time stamp alone takes more
 _FEW = 10_000
 _SPANS = {"bouts", "gaps", "flips"}
@@ -63,7 +64,7 @@ def check_footer(path: Path, name: str, n_frames: int, n_joints: int) -> None:
     for column in TABLES.get(name, ()):
         leaf = found.get(column.name)
         if leaf is None:
-            if column.name not in _LATER:
+            if column.name not in _LATER and (name, column.name) not in _LATER_IN:
                 raise ValueError(f"it lacks the column {column.name}")
         elif leaf.physical_type != _STORED[column.dtype] or leaf.max_repetition_level:
             raise ValueError(f"its column {column.name} is not {column.dtype}")
