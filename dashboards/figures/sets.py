@@ -111,7 +111,7 @@ def comparison_figures(
     units = _units(sessions)
     measures = list(dict.fromkeys(stats["measure"].astype(str)))
     if not only or "effects" in only:
-        yield Drawn("effects", "effect sizes with their intervals", groups.effects(stats))
+        yield Drawn("effects", "effect sizes with their intervals", groups.effects(stats, units))
     for measure in measures:
         if not only or measure in only:
             drawn = groups.comparison(table, stats, measure, units.get(measure, ""))

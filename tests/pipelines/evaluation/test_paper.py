@@ -296,21 +296,21 @@ def test_words_follow_the_numbers():
         "rf": 6.0,
         "paper-one-pose": 7.0,
     }
-    (sentence,) = table_text._words(results_with(order), quick=False)
+    (sentence,) = table_text.words(results_with(order), quick=False)
     assert "in another order" in sentence
-    (turned,) = table_text._words(results_with(order | {"rf": 4.5}), quick=False)
+    (turned,) = table_text.words(results_with(order | {"rf": 4.5}), quick=False)
     assert "on the same object" in turned
     assert (
         "RF is ahead on clean (median 4.50 against 5.00 mm), hard (median 5.50 against 6.00 mm)."
         in turned
     )
-    ahead, *others = table_text._words(results_with(order | {"cnn": 1.5}), quick=False)
+    ahead, *others = table_text.words(results_with(order | {"cnn": 1.5}), quick=False)
     assert ahead == (
         "CNN is ahead of the default on clean (median 1.50 against 2.00 mm), hard (median 2.50 "
         "against 3.00 mm)."
     )
     assert len(others) == 1  # and of the paper's variant
-    (unsure,) = table_text._words(results_with(order | {"rf": 4.5}, half=0.6), quick=False)
+    (unsure,) = table_text.words(results_with(order | {"rf": 4.5}, half=0.6), quick=False)
     assert "ahead" not in unsure  # the intervals overlap
 
 
