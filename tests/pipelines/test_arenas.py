@@ -163,7 +163,7 @@ def test_arenas_that_overlap_are_refused(tmp_path):
 
 def test_an_arena_outside_of_the_picture_is_refused(tmp_path):
     table = {"arenas": [{"name": "far", "region": {"rectangle": [[9000, 9000], [9100, 9100]]}}]}
-    with pytest.raises(PlanError, match="the arena far: .*outside the picture"):
+    with pytest.raises(PlanError, match=r"the arena far: .*outside the picture"):
         measure_arenas(recording(), Plan.from_table(table), tmp_path)
 
 
