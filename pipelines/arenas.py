@@ -135,15 +135,15 @@ def measure_arenas(
         shared = opened.remembering(_REMEMBERED_BYTES)
         arenas = arenas_of(shared, first)
         corners = {one.name: stated_corners(shared, first, one.region) for one in arenas}
-        inside = masks_apart(corners, opened.width, opened.height)
+        within = masks_apart(corners, opened.width, opened.height)
         base = first.session.name or opened.name
         works = []
         for one in arenas:
             name = f"{base}-{one.name}"
             folder = inside(Path(out), name, ".liex")
             check_unused(folder, overwrite)
-            told = arena_settings(one, name)
-            works.append(_Work(one, told, corners[one.name], inside[one.name], folder))
+            chosen = arena_settings(one, name)
+            works.append(_Work(one, chosen, corners[one.name], within[one.name], folder))
         for work in works:
             named = plan.with_settings(work.settings) if plan else None
             try:

@@ -190,8 +190,8 @@ def _region(
     """
     from liex_lab.arena.scene import region_mask
 
-    if plan.arena.region is not None:
-        return region_mask(plan.arena.region, opened.width, opened.height), []
+    if corners := _stated(opened, plan):
+        return region_mask(corners, opened.width, opened.height), []
     try:
         seen = build_recording(recording, plan, progress)
     except LiexError as error:
@@ -219,6 +219,13 @@ def _region(
             "whole pictures are kept, for the arena alone would be measured otherwise; name the "
             "region to be kept with --region"
         ]
+
+
+def _stated(opened: Recording, plan: Plan) -> Sequence[Sequence[float]]:
+    """The corners (u, v) px of the plan's region in the recording's pictures; none without one."""
+    from .regions import stated_corners
+
+    return () if plan.arena.region is None else stated_corners(opened, plan, plan.arena.region)
 
 
 def _found_region(tracker: FrameTracker, width: int, height: int) -> Mask | None:
@@ -286,7 +293,7 @@ def _write(
         problems=list(opened.problems),
         moved={int(row): int(moved[row]) for row in np.flatnonzero(moved)},
         source={"name": opened.name, "format": opened.format, "sha256": opened.digest(progress)},
-        region_px=[list(corner) for corner in plan.arena.region or ()],
+        region_px=[list(corner) for corner in _stated(opened, plan)],
         n_px=0 if mask is None else int(mask.sum()),
     )
     whole = _Hash(step_mm)

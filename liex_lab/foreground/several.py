@@ -1,9 +1,9 @@
 """Several arenas in one picture: the grounds on which different animals move, kept apart.
 
-Each ground (`arena.grounds`) on which things of an animal's size are seen moving is an arena, and so
-is one of about their size that walls enclose, though its animal sleeps. An arena's region is what
-lies within a largest spine of its ground's convex hull and nearer to it than to any other (a Voronoi
-cell), so that no two regions meet.
+Each ground (`arena.grounds`) on which things of an animal's size are seen moving is an arena, and
+so is one of about their size that walls enclose, though its animal sleeps. An arena's region is
+what lies within a largest spine of its ground's convex hull and nearer to it than to any other (a
+Voronoi cell), so that no two regions meet.
 """
 
 from __future__ import annotations

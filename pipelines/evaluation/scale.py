@@ -263,7 +263,8 @@ def _decode_and_write(session: Any, recording: Path, plan: Plan, place: Path) ->
             background=still_scene(opened),
         )
         boxes = Kept(session).boxes
-        assert boxes is not None and origin.background is not None
+        assert boxes is not None
+        assert origin.background is not None
         replay = ReplayWriter(place / "session.rrd", origin)
         messages = McapWriter(place / "session.mcap", origin)
         began = time.perf_counter()

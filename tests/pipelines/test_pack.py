@@ -84,7 +84,9 @@ def test_outside_of_a_region_that_was_named_pixels_are_unread(recording: Path) -
 def test_stamps_that_were_moved_are_told_as_of_the_recording(tmp_path: Path) -> None:
     times = MOUSE.times_ns.copy()
     times[20] = times[19]
-    done = pack(recorded(tmp_path / "walk.mcap", times), plan=PLAN, whole=True, verify=True)
+    done = pack(
+        recorded(tmp_path / "walk.mcap", times.tolist()), plan=PLAN, whole=True, verify=True
+    )
     with open_recording(tmp_path / "walk.mcap") as one, open_recording(done.path) as other:
         assert one.faults
         assert other.faults == one.faults
