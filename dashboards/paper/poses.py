@@ -22,7 +22,7 @@ Array = NDArray[np.float64]
 
 _PANEL_INCH = 1.65
 _NEAR = 0.55  # of the animal's length: half of the depth that pictures show
-_BESIDE = 1.25  # of the truth's reach: what lies farther off is not of the animal
+_BESIDE = 1.5  # of the truth's reach: what lies farther off is not of the animal
 _GREY = "#8a8f94"
 _ERROR = "#CC3311"
 
@@ -55,7 +55,8 @@ def draw_poses(animal: str, shown: Sequence[Mapping[str, Any]], path: Path, side
         panel.set_title(f"{one['split']}\n{panel.get_title()}", fontsize=8)
     where = "from the side" if side else "from the camera"
     figure.suptitle(
-        f"{animal}, {where}: truth, blue; pose of each method, red; error in mm", fontsize=9
+        f"{animal}, {where}: truth, blue; pose of each method, red; dot: base; error in mm",
+        fontsize=9,
     )
     figure.savefig(path, dpi=DPI)
     return path
@@ -139,7 +140,7 @@ def _from_the_side(panel: Axes, one: Mapping[str, Any]) -> None:
     half = 0.5 * max(float((high - low).max()), 1.0) * _BESIDE
     middle = 0.5 * (low + high)
     near = (abs(x - middle[0]) < half) & (abs(y - middle[1]) < half) & (abs(z - middle[2]) < half)
-    panel.plot(x[near], z[near], ",", color=_GREY, alpha=0.5)
+    panel.plot(x[near], z[near], ".", color=_GREY, ms=1.6, alpha=0.7)
     panel.set_xlim(middle[0] - half, middle[0] + half)
     panel.set_ylim(middle[2] + half, middle[2] - half)
     panel.set_aspect("equal")

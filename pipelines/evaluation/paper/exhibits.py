@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from .deviations import HAND
 from .further import Further
-from .table_text import error_table, rate_table, words
+from .table_text import error_table, origin_table, rate_table, words
 
 if TYPE_CHECKING:
     from .results import Results
@@ -147,7 +147,10 @@ def exhibits(
             *((f"{r.animal}, rendered", *error_table(r)) for r in results if r.animal == "hand"),
             *_nyu_table(further),
         ],
-        "Table 3": [("", *rate_table(results))],
+        "Table 3": [
+            ("", *rate_table(results)),
+            ("How each row of Tables 1 to 3 was made", *origin_table(results)),
+        ],
         "Fig. 18": _tracking_table(further),
         "Fig. 20": _actions_table(further),
     }

@@ -134,7 +134,7 @@ def write_tables(folder: Path, results: Sequence[Results], quick: bool) -> list[
         "## Table 3: frames per second",
         _grid(*rate_table(results)),
         "## How each row was made",
-        _origins(results),
+        _grid(*origin_table(results)),
         "## What differs from the paper",
         "\n".join(f"- {sentence}" for sentence in DEVIATIONS),
     ]
@@ -361,8 +361,15 @@ def rate_table(results: Sequence[Results]) -> tuple[list[str], list[list[str]]]:
     return head, rows
 
 
-def _origins(results: Sequence[Results]) -> str:
-    """Command, seed, version and amount of training of each row."""
+def origin_table(results: Sequence[Results]) -> tuple[list[str], list[list[str]]]:
+    """Command, seed, version and amount of training of each row.
+
+    Args:
+        results: of all animals.
+
+    Returns:
+        The head, and the rows.
+    """
     rows = []
     for r in results:
         for variant, row in r.rows.items():
@@ -380,16 +387,5 @@ def _origins(results: Sequence[Results]) -> str:
                     f"`{made['command']}`",
                 ]
             )
-    return _grid(
-        [
-            "animal",
-            "method",
-            "",
-            "training images",
-            "seed (trainings)",
-            "version (code)",
-            "machine",
-            "command",
-        ],
-        rows,
-    )
+    head = ["animal", "method", "", "training images", "seed (trainings)", "version (code)"]
+    return [*head, "machine", "command"], rows
