@@ -15,16 +15,18 @@ from liex_lab.pipelines.session import measure_session
 
 from liex_lab.errors import EstimationError, PlanError, SessionError
 from liex_lab.plan import Plan
+from liex_lab.plan.sections import Region, SeveralArenas
 from liex_lab.recordings.frame import Depth
 from liex_lab.recordings.recording import Recording
 from liex_lab.simulation.scenes.catalogue import film
+from liex_lab.simulation.scenes.recording import TrueScene
 
 N_FRAMES = 40
 DIGEST = "0123456789abcdef" * 4
 
 
 @cache
-def pictures(scene: str = "two-arenas") -> tuple[Recording, np.ndarray]:
+def pictures(scene: str = "two-arenas") -> tuple[TrueScene, np.ndarray]:
     """A rendered scene, and its pictures."""
     made = film(scene, 1001, N_FRAMES)
     return made, made.depths(0, N_FRAMES)
@@ -52,10 +54,21 @@ def several(*more: str) -> Plan:
     arenas = propose_arenas(made, Plan.load("mouse"))
     assert len(arenas) == 2
     facts = ({"name": "left", "subject_id": "m01"}, {"name": "right", "subject_id": "m02"})
-    listed = [one.model_copy(update=fact) for one, fact in zip(arenas, facts, strict=True)]
+    named = [one.model_copy(update=fact) for one, fact in zip(arenas, facts, strict=True)]
     table = Plan.load("mouse").model_dump(exclude_none=True)
-    table["arenas"] = [one.model_dump(exclude_none=True) for one in listed]
+    table["arenas"] = [one.model_dump(exclude_none=True) for one in named]
     return Plan.from_table(table).with_settings(["replay.depth=false", *more])
+
+
+def listed(plan: Plan) -> list[SeveralArenas]:
+    assert isinstance(plan.arenas, list)
+    return plan.arenas
+
+
+def corners(region: object) -> list[list[float]]:
+    assert isinstance(region, Region)
+    assert region.polygon is not None
+    return region.polygon
 
 
 def tables(session: Path) -> dict[str, bytes]:
@@ -83,7 +96,7 @@ def test_every_arena_is_the_session_of_the_same_arena_cut_out_and_run_alone(sess
         alone = measure_session(recording(), plan, tmp_path / "alone")
         assert tables(alone) == tables(session)
         whole = recording()
-        masked = whole.masked([tuple(corner) for corner in plan.arena.region.polygon])
+        masked = whole.masked(corners(plan.arena.region))
         again = measure_session(masked, plan, tmp_path / "masked")
         assert tables(again) == tables(session)
 
@@ -115,7 +128,7 @@ def test_each_arena_follows_its_own_animal(sessions):
 def test_an_arena_without_an_animal_stops_no_other(tmp_path):
     made, depths = pictures()
     plan = several()
-    right = recording().masked(plan.arenas[1].region.polygon)
+    right = recording().masked(corners(listed(plan)[1].region))
     still = np.where(right.frame(0).depth > 0, np.median(depths, axis=0), 0).astype(np.float32)
 
     def emptied(depth: Depth) -> Depth:
@@ -155,7 +168,7 @@ def test_an_interrupted_run_of_several_arenas_goes_on(sessions, tmp_path, monkey
 
 def test_arenas_that_overlap_are_refused(tmp_path):
     plan = several()
-    twice = [one.model_copy(update={"region": plan.arenas[0].region}) for one in plan.arenas]
+    twice = [one.model_copy(update={"region": listed(plan)[0].region}) for one in listed(plan)]
     with pytest.raises(PlanError, match="the arenas left and right overlap in"):
         measure_arenas(recording(), plan.model_copy(update={"arenas": twice}), tmp_path)
     assert not list(tmp_path.iterdir())
