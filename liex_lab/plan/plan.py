@@ -113,15 +113,17 @@ class Plan(Table):
 
     def __repr__(self) -> str:
         usual = Plan()
-        said = [f"seed={self.seed}"] if self.seed != usual.seed else []
-        for table in type(self).model_fields:
-            if table != "seed":
-                mine, other = getattr(self, table), getattr(usual, table)
+        said: list[str] = []
+        for name in type(self).model_fields:
+            mine, other = getattr(self, name), getattr(usual, name)
+            if isinstance(mine, Table):
                 said += [
-                    f"{table}.{key}={value!r}"
+                    f"{name}.{key}={value!r}"
                     for key, value in mine
-                    if value != getattr(other, key) and (table, key) != ("animal", "name")
+                    if value != getattr(other, key) and (name, key) != ("animal", "name")
                 ]
+            elif mine != other:
+                said.append(f"{name}={mine if isinstance(mine, int | str) else len(mine)}")
         unlike = f"; unlike the defaults: {', '.join(said)}" if said else ", all else by default"
         return f"<Plan for the {self.animal.name}{unlike}>"
 

@@ -20,7 +20,7 @@ from liex_lab.api import compare_groups, draw_figures
 from liex_lab.arena.outline import Arena
 from liex_lab.arena.zones import Zone
 from liex_lab.behaviour.cohort import compare
-from liex_lab.errors import SessionError
+from liex_lab.errors import PlaceError, SessionError
 from liex_lab.sessions import Session
 from tests.sessions.walking_mouse import FLOOR_MM, WalkingMouse, steady, write
 
@@ -201,6 +201,15 @@ def test_texts_stay_texts_that_can_be_edited(session, tmp_path):
     pdf = (tmp_path / "occupancy.pdf").read_bytes()
     assert b"/Type3" not in pdf
     assert b"CreationDate" not in pdf
+
+
+def test_a_link_in_the_place_of_a_figure_is_not_written_through(session, tmp_path):
+    theirs = tmp_path / "theirs"
+    theirs.mkdir()
+    (tmp_path / "mine").symlink_to(theirs)
+    with pytest.raises(PlaceError, match="symbolic link"):
+        draw_figures(session.path, only=["speed"], out=tmp_path / "mine")
+    assert not list(theirs.iterdir())
 
 
 def test_a_dollar_in_a_name_is_a_dollar(tmp_path):

@@ -163,7 +163,7 @@ def test_arenas_that_overlap_are_refused(tmp_path):
 
 def test_an_arena_outside_of_the_picture_is_refused(tmp_path):
     table = {"arenas": [{"name": "far", "region": {"rectangle": [[9000, 9000], [9100, 9100]]}}]}
-    with pytest.raises(PlanError, match="the arena far: .*outside the picture"):
+    with pytest.raises(PlanError, match=r"the arena far: .*outside the picture"):
         measure_arenas(recording(), Plan.from_table(table), tmp_path)
 
 
@@ -193,3 +193,70 @@ def test_a_region_in_millimetres_on_the_floor_is_the_one_in_the_picture(tmp_path
     place = made.floor.T_arena_camera @ (rays * depth[:, None])
     np.testing.assert_allclose(np.hypot(place[:, 0] + 150.0, place[:, 1] - 10.0), 120.0, atol=1e-6)
     assert Plan.from_toml(plan.to_toml()) == plan
+
+
+@pytest.mark.slow
+def test_the_doctor_proposes_several_arenas_and_says_what_to_run_next():
+    from liex_lab.pipelines.doctor import examine
+
+    found = examine(
+        "synthetic:scene?name=two-arenas&seed=1001&frames=40", propose=True, named=False
+    )
+    assert found["arenas"].count("[[arenas]]") == 2
+    text = "\n".join(found["arenas"])
+    assert Plan.from_toml(text).arenas is not None
+    assert found["next"].endswith("--set arenas=auto")
+    assert not any("animals are in view at once" in problem for problem in found["problems"])
+
+
+@pytest.mark.slow
+def test_the_doctor_says_what_is_wrong_with_a_region_and_looks_all_the_same():
+    from liex_lab.pipelines.doctor import examine
+
+    plan = Plan.load("mouse").with_settings(
+        ["arena.region=[[9000, 9000], [9100, 9000], [9000, 9100]]"]
+    )
+    found = examine("synthetic:walk?frames=20", plan)
+    assert any("outside the picture" in problem for problem in found["problems"])
+    assert found["floor_mm"] is not None
+
+
+@pytest.mark.slow
+def test_an_empty_arena_is_said_to_hold_no_animal():
+    from liex_lab.pipelines.choice import fit_plan
+
+    from liex_lab.errors import MisfitError
+
+    with pytest.raises(MisfitError, match="no animal was found") as caught:
+        fit_plan(film("empty", 1001, N_FRAMES), Plan.load("mouse"))
+    assert caught.value.exit_code == 4
+
+
+@pytest.mark.slow
+def test_workers_make_the_same_tables_of_every_arena(tmp_path, monkeypatch):
+    from liex_lab.pipelines import session, shards
+
+    class Inline:
+        """A pool whose only worker is this process."""
+
+        n_done = 0
+
+        def each(self, do, works):
+            for work in works:
+                self.n_done += 1
+                yield do(work)
+
+    for module in (session, shards):
+        monkeypatch.setattr(module, "LENGTH", 15)
+    address = f"synthetic:scene?name=two-arenas&seed=1001&frames={N_FRAMES}"
+    region = "{circle = {centre = [-150, 10], radius = 170}, unit = 'mm'}"
+    table = several().model_dump(exclude_none=True)
+    table["arenas"] = [{"name": "left", "region": Plan().with_settings([f"arena.region={region}"])}]
+    table["arenas"][0]["region"] = table["arenas"][0]["region"].arena.region.model_dump()
+    plan = Plan.from_table(table)
+    pool = Inline()
+    (one,) = measure_arenas(address, plan, tmp_path / "workers", pool=pool)
+    (other,) = measure_arenas(address, plan, tmp_path / "alone")
+    assert pool.n_done == 3
+    assert (one.error, other.error) == (None, None)
+    assert tables(one.session) == tables(other.session)

@@ -247,3 +247,9 @@ def test_a_run_on_an_archive_gives_the_same_tables(tmp_path: Path) -> None:
     for name in names:
         one, other = ((session.path / name).read_bytes() for session in sessions)
         assert one == other, name
+
+
+def test_of_several_arenas_whole_pictures_are_kept(recording: Path) -> None:
+    done = pack(recording, plan=PLAN.with_settings(["arenas=auto"]))
+    assert done.kept == 1.0
+    assert any("several arenas" in note for note in done.notes)
