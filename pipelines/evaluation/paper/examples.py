@@ -3,8 +3,7 @@
 Of each split the middle frame of the first recording and of that halfway are examples, whatever a
 row makes of them. The failures of a row are the worst frames of the two recordings of each split
 in which it errs most. A row keeps the joints of its first run; the pictures are rendered anew where
-they are drawn. A kept row without examples gets them from its model in the cache, where the file's
-digest is the row's.
+they are drawn.
 """
 
 from __future__ import annotations
@@ -18,13 +17,8 @@ from numpy.typing import NDArray
 
 from liex_lab.optics.camera import Camera
 
-from ...build import build_scene, plan_of
-from .common_view import CommonView, measured
-
 if TYPE_CHECKING:
     from liex_lab.simulation.recording import TrueRecording
-
-    from .rows import Subject
 
 Array = NDArray[np.float64]
 
@@ -101,51 +95,6 @@ def failures_in(
         {**pose_at(split, k, i, joints[k][i]), "error_mm": round(error, _DIGITS)}
         for error, k, i in worst[:_FAILURES]
     ]
-
-
-def examples_of_kept(
-    animal: str,
-    variant: str,
-    row: Mapping[str, Any],
-    tests: Mapping[str, Sequence[TrueRecording]],
-    views: Mapping[str, Sequence[CommonView]],
-) -> list[dict[str, Any]]:
-    """The examples of a kept row, its own or from its model in the cache; [] where neither is.
-
-    Args:
-        animal: a bundled animal's name.
-        variant: a row of the tables.
-        row: the kept row; the digest of its first model proves that one in the cache is its own.
-        tests: recordings with their truth by split.
-        views: what every row is given, by split and recording.
-    """
-    if "examples" in row:
-        return list(row["examples"])
-    from .fingerprints import model_digests
-
-    known = row["made"].get("models", [])
-    if not known or model_digests(animal, variant, 1)[0] != known[0]:
-        return []
-    subject = _first_run(animal, variant)
-    plan = plan_of(animal)
-    found = []
-    for split, recordings in tests.items():
-        for k, i in example_frames(recordings):
-            scene, frames = build_scene(recordings[k], plan, subject.skeleton, len(recordings[k]))
-            view = replace(views[split][k], second=views[split][k].second[i : i + 1])
-            joints = measured(subject, frames[i : i + 1], scene, view, {})[0]
-            found.append(pose_at(split, k, i, joints[0]))
-    return found
-
-
-def _first_run(animal: str, variant: str) -> Subject:
-    """The first run of a row whose model is in the cache."""
-    from ..pose import estimator_of, subject_of
-    from .rows import TRAINING_DRAWS, runs_of_models
-
-    if variant in TRAINING_DRAWS:
-        return runs_of_models(variant, [estimator_of(animal, "paper")])[0]
-    return subject_of(animal, variant)
 
 
 def shown_poses(

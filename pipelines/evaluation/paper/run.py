@@ -234,7 +234,7 @@ def _kept(
 ) -> Mapping[str, Any]:
     """Kept rows that fit go into the results, why another does not into `missing`; the curves."""
     from .cached_results import kept_results, why_refused
-    from .examples import examples_of_kept
+    from .kept_examples import examples_of_kept
 
     if not budget.kept:
         for name in ROWS:

@@ -25,6 +25,7 @@ from liex_lab.pipelines.evaluation.paper import (
     examples,
     exhibits,
     fingerprints,
+    kept_examples,
     quick,
     rows,
     run,
@@ -202,7 +203,7 @@ def test_kept_rows_keep_their_poses_in_the_examples(made):
     assert len(places) == 4
     for name, row in kept.items():
         assert [{key: one[key] for key in places[0]} for one in row["examples"]] == places
-        again = examples.examples_of_kept("mouse", name, row, recordings, {})
+        again = kept_examples.examples_of_kept("mouse", name, row, recordings, {})
         assert again == row["examples"]
         shown = examples.shown_poses(places, {name: again}, recordings)
         for one in shown:
@@ -223,7 +224,9 @@ def test_a_kept_row_without_poses_gets_them_only_from_the_very_model_it_was_meas
     monkeypatch.setattr(fingerprints, "model_digests", lambda *_: ["a"])
     monkeypatch.setattr(pose, "subject_of", lambda *_: chooser)
     found, refused = (
-        examples.examples_of_kept("mouse", "rf", {"made": {"models": [digest]}}, recordings, views)
+        kept_examples.examples_of_kept(
+            "mouse", "rf", {"made": {"models": [digest]}}, recordings, views
+        )
         for digest in ("a", "b")
     )
     assert refused == []
