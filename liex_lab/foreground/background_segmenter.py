@@ -338,7 +338,7 @@ class BackgroundSubtraction(StillScene):
             return False
         blobs = crops[crops.found].blobs
         length = 4.0 * float(np.median(blobs.sd_along))
-        height = float(np.median(blobs.volume_mm3 / blobs.area_mm2))
+        height = float(np.median(blobs.volume_mm3 / np.maximum(blobs.area_mm2, 1e-9)))
         return (
             length < _LONGEST * spine_mm[1]
             and height > _HIGHER * min_height_mm

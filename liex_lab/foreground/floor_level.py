@@ -74,7 +74,7 @@ class FloorLevel:
                 continue
             off = (read[known] - self.depth_mm[known]).astype(float)
             off = off[np.abs(off - np.median(off)) < _REACH_MM]
-            levels[k] = off.mean()
+            levels[k] = off.mean() if len(off) else 0.0  # half is near, half far: no level
         return levels
 
     def brought_back(self, depths: Depths, levels: Array | None = None) -> Depths:

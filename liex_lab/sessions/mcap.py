@@ -12,6 +12,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Sequence
+from itertools import zip_longest
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -121,10 +122,11 @@ class McapWriter:
         Raises:
             OSError: the system refused to write.
         """
-        for time_ns in times_ns:
+        for time_ns, image in zip_longest(times_ns, depth):
             if self._calibrated_ns is None or time_ns - self._calibrated_ns >= _SECOND:
                 self._log_camera(int(time_ns))
-        for time_ns, image in zip(times_ns, depth, strict=False):
+            if image is None:
+                continue
             height, width = image.shape
             message = messages.RawImage(
                 timestamp=_stamp(time_ns),
