@@ -32,6 +32,7 @@ from .build import (
     why_nameless,
 )
 from .choice import USUAL, Fitted, fit_plan
+from .compiling import compile_ahead
 from .shards import CHUNK, LENGTH, MEASURING, Shard, measure_shards
 from .workers import WorkerPool
 
@@ -109,6 +110,7 @@ def measure_session(
         put_back_session(folder)
         check_place(folder, overwrite)
         check_free(part_folder(folder))
+        compile_ahead(first.animal.skeleton, progress)
         progress(0, None, "learning the background, the floor and the animal's size")
         unnamed = None if plan else settings
         fitted = fit_plan(opened, first, estimator, settings=unnamed, progress=progress)

@@ -16,6 +16,7 @@ from liex_lab.runtime.progress import Board
 from liex_lab.sessions.corrections import Description
 from liex_lab.sessions.lock import locked
 
+from ..compiling import compile_ahead
 from ..correct import correct_session
 from .one_session import RunSession
 from .slurm import SlurmTable
@@ -118,4 +119,7 @@ def _measure(
             )
             shown.ended(result["id"], sentence, failed=failure is not None)
 
+        if not where["scheduler"] and not where["slurm"]:  # once, and not in every worker
+            for animal in sorted({one.session.plan.animal.skeleton for one in todo}):
+                compile_ahead(animal)
         measure_cohort(todo, run, told=shown.told, finished=finished, **where)
