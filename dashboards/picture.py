@@ -1,6 +1,7 @@
 """The picture in README.md: some of the report's own figures, rendered by a headless browser.
 
-After `liex demo`, `photograph("mouse_walk.liex", "dashboards/assets/demo.png")` makes it again.
+After `liex demo`, `photograph("mouse_walk.liex", "dashboards/assets/demo.png")` makes it again, and
+`python docs/pictures.py` all pictures of README.md.
 """
 
 from __future__ import annotations
@@ -12,21 +13,19 @@ from pathlib import Path
 
 from liex_lab.sessions import Session
 
-from .report.charts import charts, curves, pictures
+from .figures.sets import for_the_page
+from .report.charts import pictures
 from .report.report import TEMPLATES
 
 WIDTH = 860
-HEIGHT = 690
+HEIGHT = 960
 _SHOWN = 4  # of the contact sheet
 _STYLE = f"""
 :root {{ color-scheme: light; }}
 main {{ width: {WIDTH}px; padding: 18px 22px; }}
-.strip {{ grid-template-columns: repeat(4, 1fr); }}
-.title {{ margin: 8px 0 0; font-size: 13px; font-weight: 600; }}
-.pair div svg .tick {{ font-size: 15px; }}
-.pair div svg .label {{ font-size: 12px; }}
+.strip {{ grid-template-columns: repeat(2, 1fr); gap: 4px 12px; }}
+.pair {{ display: grid; grid-template-columns: 1fr 420px; gap: 22px; margin-bottom: 6px; }}
 svg image {{ image-rendering: pixelated; }}
-.pair {{ display: grid; grid-template-columns: 310px 1fr; gap: 22px; margin-top: 8px; }}
 """
 
 
@@ -38,7 +37,7 @@ def page(session: Session) -> str:
     """
     template = (TEMPLATES / "report.html.j2").read_text(encoding="utf-8")
     style = re.search(r"<style>(.*?)</style>", template, re.DOTALL)
-    drawn = charts(session, list(session.metadata["actions"]))
+    drawn = for_the_page(session, None)
     sheet = pictures(session)
     some = sorted(
         {round(k * (len(sheet) - 1) / (_SHOWN - 1)) for k in range(_SHOWN)} if sheet else ()
@@ -48,15 +47,10 @@ def page(session: Session) -> str:
         f"{when}</figcaption></figure>"
         for svg, when, word, _ in (sheet[k] for k in some)
     )
-    titled = [
-        ("Actions", drawn["lanes"]),
-        *((title, svg) for title, _, svg in curves(session)),
-        ("Joint error to be expected", drawn["error"]),
-    ]
-    lines = "".join(f'<p class="title">{title}</p><figure>{svg}</figure>' for title, svg in titled)
-    way = f'<figure><p class="title">Way over the floor</p>{drawn["way"]}</figure>'
+    way = f"<figure>{drawn.get('trajectory', '')}</figure>"
+    lines = "".join(f"<figure>{drawn.get(name, '')}</figure>" for name in ("ethogram", "curves"))
     css = (style[1] if style else "") + _STYLE
-    body = f'<div class="strip">{strip}</div><div class="pair">{way}<div>{lines}</div></div>'
+    body = f'<div class="pair"><div class="strip">{strip}</div>{way}</div>{lines}'
     return f'<!doctype html><meta charset="utf-8"><style>{css}</style><main>{body}</main>'
 
 

@@ -5,8 +5,8 @@ A depth recording goes in; 3D skeletons, a replay and behaviour tables come out:
     session_folder = liex_lab.run_session("recording.mcap", plan=liex_lab.Plan.load("mouse"))
     poses = liex_lab.Session.open(session_folder).poses
 
-Importing the package does nothing and costs little: each public name brings its own module along
-when it is asked for.
+Importing the package sees to a place for compiled kernels, no more, and costs little: each public
+name brings its own module along when it is asked for.
 """
 
 from __future__ import annotations
@@ -15,10 +15,12 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from liex_lab.moved import keep_old_paths
+from liex_lab.runtime.kernel_cache import keep_kernels
 
 __version__ = "0.1.0"
 
 keep_old_paths()
+_KERNELS_TOLD = keep_kernels()  # a sentence for the command line, where there is something to say
 
 _HOMES = {
     "Camera": "liex_lab.optics.camera",

@@ -13,7 +13,7 @@ from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from liex_lab.errors import MissingPackageError
+from liex_lab.errors import MissingPackageError, how_to_install
 from liex_lab.plan import Plan
 from liex_lab.plan.study import Study
 from liex_lab.runtime.progress import Board, Progress, progress_board, silent, telling_of_compiling
@@ -196,6 +196,185 @@ def run_demo(out: str | Path = ".", *, progress: Progress = silent) -> Path:
     )
 
 
+def draw_figures(
+    place: str | Path,
+    *,
+    only: Sequence[str] = (),
+    formats: Sequence[str] = ("svg", "pdf"),
+    out: str | Path | None = None,
+    progress: Progress = silent,
+) -> dict[str, Any]:
+    """Draw the figures of a session, a study or a comparison as files.
+
+    They are as wide as one or two columns of a journal, their texts can be edited, and the same
+    tables give the same bytes.
+
+    Args:
+        place: a session folder; a study file, its folder, or a folder with sessions in it; or the
+            folder of a comparison.
+        only: names of figures, such as 'occupancy'; of a comparison its measures, too; () takes
+            all.
+        formats: some of svg, pdf and png.
+        out: the folder for them; None takes `figures` beside what they are of.
+        progress: told which figure is drawn.
+
+    Returns:
+        `files`: the paths; `empty`: names of figures of which there is nothing to draw; `folder`.
+
+    Raises:
+        SessionError: there is no such figure or format, or nothing at all to draw.
+        StudyError: there is no such place.
+    """
+    from liex_lab.dashboards.figures import sets
+    from liex_lab.errors import SessionError
+    from liex_lab.pipelines.study.listing import list_sessions
+    from liex_lab.sessions import Session
+
+    path = Path(place)
+    folder = path if path.is_dir() else path.parent
+    sets.check_kinds(formats)
+    if (path / "session.json").is_file():
+        sets.check_names(only, list(sets.OF_SESSION))
+        drawn = sets.session_figures(Session.open(path), only)
+    elif (path / sets.COMPARISON_FILE).is_file():
+        table, stats, sessions = sets.read_comparison(path)
+        measures = [str(name) for name in dict.fromkeys(stats["measure"])]
+        sets.check_names(only, ["effects", *measures, *sets.OF_STUDY])
+        drawn = sets.comparison_figures(table, stats, sessions, only)
+    else:
+        sets.check_names(only, list(sets.OF_STUDY))
+        _, look = list_sessions(path)
+        folders = [entry.folder for entry in look() if entry.folder is not None]
+        if not folders:
+            raise SessionError(
+                f"no session of {path} has been measured; `liex cohort` measures them"
+            )
+        drawn = sets.study_figures([Session.open(one) for one in folders], only)
+    target = folder / sets.FOLDER if out is None else Path(out)
+    files, empty = sets.write_figures(drawn, target, formats, progress)
+    if not files:
+        raise SessionError(
+            f"{path} holds nothing to draw of {', '.join(empty)}: no pose was found, or too few "
+            "actions; its report says why"
+        )
+    return {"files": files, "empty": empty, "folder": target}
+
+
+def compare_groups(
+    places: Sequence[str | Path],
+    out: str | Path,
+    measures: Sequence[str] = (),
+    *,
+    reference: str | None = None,
+    animals: str | Path | None = None,
+    engine: str = "auto",
+    progress: Progress = silent,
+) -> dict[str, Any]:
+    """Compare the groups of sessions; writes tables, a text of methods, and figures.
+
+    Args:
+        places: session folders, or folders with sessions anywhere in them.
+        out: folder of the tables; it is made where it is missing.
+        measures: columns of the summary; () takes the usual ones and every action's share.
+        reference: compare with this group only; None compares all pairs.
+        animals: a CSV with `subject_id` and any of group, cage, sex, batch, which overrules what
+            the sessions say.
+        engine: `auto`, `permutation` or `mixed`.
+        progress: told session by session and figure by figure.
+
+    Returns:
+        `stats`: the table's rows; `folder`: where the files are; `figures`: their paths.
+
+    Raises:
+        SessionError: there are no two groups, or a folder, column, engine or CSV cannot be used.
+    """
+    from liex_lab.pipelines.compare import compare_sessions
+
+    found = compare_sessions(
+        places,
+        out,
+        measures,
+        reference=reference,
+        animals=animals,
+        engine=engine,
+        progress=progress,
+    )
+    return {**found, "figures": draw_figures(found["folder"], progress=progress)["files"]}
+
+
+def export_video(
+    places: str | Path | Sequence[str | Path],
+    out: str | Path | None = None,
+    *,
+    actions: Sequence[str] = (),
+    groups: Sequence[str] = (),
+    start_s: float | None = None,
+    stop_s: float | None = None,
+    slower: float = 1.0,
+    overwrite: bool = False,
+    progress: Progress = silent,
+) -> Path:
+    """Write a video (H.264): height above the floor, skeleton, trail, action and time.
+
+    One session is shown from beginning to end, on its own clock; several stand beside each other,
+    by group. With `actions` the clips of their bouts do, aligned at the onsets; the report of a
+    session links to those in its folder.
+
+    Args:
+        places: a session folder, or several, or folders with sessions anywhere in them.
+        out: the folder for it; None takes the session's own, or, of several, this one.
+        actions: words, or beginnings of words: rear is rear_supported and rear_unsupported, too.
+        groups: only sessions of these groups; () takes all.
+        start_s: of one session only what follows this time, s.
+        stop_s: and only what is before this one, s.
+        slower: so many times slower than it was.
+        overwrite: replace what is there under this name.
+        progress: told how far it is.
+
+    Returns:
+        Path of the video.
+
+    Raises:
+        SessionError: a session keeps no depth, no bout has such a name, this PyAV has no encoder,
+            or there is such a file already.
+    """
+    from liex_lab.dashboards.report.report import write_report
+    from liex_lab.dashboards.video.video import write_clips, write_session
+    from liex_lab.errors import SessionError
+    from liex_lab.pipelines.compare import find_sessions
+    from liex_lab.sessions import Session
+    from liex_lab.sessions.videos import stretch, video_path
+
+    given = [places] if isinstance(places, str | Path) else list(places)
+    opened = [Session.open(folder) for folder in find_sessions(given)]
+    named = [(session, str(session.table("sessions")["group"].iloc[0] or "")) for session in opened]
+    chosen = [pair for pair in named if not groups or pair[1] in groups]
+    if not chosen:
+        there = ", ".join(sorted({group for _, group in named} - {""})) or "none"
+        raise SessionError(f"no session is of {' or '.join(groups)}; their groups are {there}")
+    part = start_s is not None or stop_s is not None
+    if part and (len(chosen) > 1 or actions):
+        raise SessionError("a stretch of time is shown of one session, without actions")
+    if not slower > 0:
+        raise SessionError(f"slower is a number above 0, such as 4, got {slower:g}")
+    alone = chosen[0][0]
+    folder = Path(out) if out is not None else alone.path if len(chosen) == 1 else Path()
+    what = stretch(start_s, stop_s) if part else "+".join(actions)
+    path = video_path(folder, alone.name if len(chosen) == 1 else "sessions", what)
+    if path.exists() and not overwrite:
+        raise SessionError(
+            f"{path} exists already; name another place with --out, or say --overwrite"
+        )
+    if len(chosen) == 1 and not actions:
+        return write_session(
+            alone, path, start_s=start_s, stop_s=stop_s, slower=slower, progress=progress
+        )
+    write_clips(chosen, path, actions, slower=slower, progress=progress)
+    if folder == alone.path:
+        write_report(folder)  # which links to it
+    return path
+
+
 def run_study(
     study: str | Path,
     *,
@@ -310,8 +489,7 @@ def serve_dashboard(
         from liex_lab.dashboards.app.server import LOOPBACK, address, make_app, serve
     except ModuleNotFoundError as error:
         raise MissingPackageError(
-            f"the dashboard needs {error.name}, which is not installed; pip install "
-            "'liex_lab[dashboard]'"
+            f"the dashboard needs {error.name}; {how_to_install('dashboard')}"
         ) from None
     from liex_lab.dashboards.app.data import StudyData
     from liex_lab.sessions.viewer import show_replay

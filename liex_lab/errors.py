@@ -5,7 +5,42 @@ Each message is one sentence: what was expected, what came, what to do.
 
 from __future__ import annotations
 
+import unicodedata
 from typing import ClassVar
+
+
+def printable(text: object) -> str:
+    """A text as a terminal may show it: no name of a file moves the cursor or hides what follows.
+
+    Args:
+        text: anything; what it says of itself may quote names of files and recordings.
+
+    Returns:
+        The text; control characters, those that turn the direction of writing, and halves of
+        characters are written as escapes. Line ends and tabs stay.
+    """
+    said = str(text)
+    if said.isascii() and said.isprintable():
+        return said
+    return "".join(
+        c if c in "\n\t\u200d" or unicodedata.category(c) not in _UNSEEN else ascii(c)[1:-1]
+        for c in said
+    )
+
+
+_UNSEEN = {"Cc", "Cf", "Cs", "Zl", "Zp"}
+
+
+def how_to_install(extra: str) -> str:
+    """What to type for packages that only some need: a line that works in a clone of liex_lab.
+
+    Args:
+        extra: its name among the optional dependencies of pyproject.toml.
+    """
+    return (
+        f"install it with `pip install '.[{extra}]'` in the folder that holds liex_lab's "
+        "pyproject.toml"
+    )
 
 
 class LiexError(Exception):
@@ -21,7 +56,7 @@ class LiexError(Exception):
 
     def __str__(self) -> str:
         """The message on one line, whatever it quotes of the user's own."""
-        return " ".join(super().__str__().splitlines())
+        return printable(" ".join(super().__str__().splitlines()))
 
 
 class RecordingError(LiexError):
@@ -40,7 +75,7 @@ class SeveralKindsError(RecordingError):
     """Raised for a folder with pictures of several kinds.
 
     Attributes:
-        pattern: names the pictures of one of the kinds, as in "*.tif".
+        pattern: names the pictures of one of the kinds, as in `*.tif`.
     """
 
     def __init__(self, message: str, pattern: str) -> None:
@@ -58,6 +93,10 @@ class ModelError(LiexError):
 
 class SessionError(LiexError):
     """Raised for a session folder that is missing, unfinished or not of liex_lab."""
+
+
+class PlaceError(LiexError):
+    """Raised for a place that nothing may be written to, such as one behind a symbolic link."""
 
 
 class StudyError(LiexError):

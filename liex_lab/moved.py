@@ -21,6 +21,7 @@ else:  # importlib.abc brings tempfile and random along, for a class that is not
     Loader = object
 
 MOVED = {
+    "liex_lab.sessions.lock": "liex_lab.runtime.lock",
     "liex_lab.actions.chain": "liex_lab.actions.semi_markov",
     "liex_lab.actions.labelled": "liex_lab.actions.labels",
     "liex_lab.actions.tables": "liex_lab.tables.rows",

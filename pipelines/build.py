@@ -348,7 +348,20 @@ def build_provenance(
         arena=arena,
         zones=zones,
         scene=build_described_scene(tracker.scene, arena),
+        background=build_background(recording, plan),
     )
+
+
+def build_background(recording: Recording, plan: Plan) -> NDArray[np.uint16] | None:
+    """The still scene (H, W) mm before which the replay shows cut-outs; None where it shows none.
+
+    Args:
+        recording: an open recording.
+        plan: its section `replay`.
+    """
+    from liex_lab.sessions.cutouts import ANIMAL, ARENA, still_scene
+
+    return still_scene(recording) if plan.replay.depth in (ANIMAL, ARENA) else None
 
 
 def build_described_scene(segmenter: Segmenter, arena: Arena) -> Scene | None:

@@ -244,12 +244,14 @@ def _refusal(plan: Plan, misfits: Sequence[str], fitting: Look | None) -> str:
     if fitting is None or fitting.fit is None:
         return (
             f"{what}; no other bundled plan fits either: check the camera's numbers and the depth "
-            "unit with `liex doctor`, or add --accept to measure it all the same"
+            "unit with `liex doctor`, or add --accept (in Python the "
+            "setting 'estimation.accept_misfit=true') to measure it all the same"
         )
     return (
         f"{what}, while the plan '{fitting.name}' fits ({fitting.fit.spine_mm:.0f} mm long, "
         f"expected error {fitting.fit.error_mm:.1f} mm); say --plan {fitting.name}, or add "
-        "--accept to measure it all the same"
+        "--accept (in Python the setting 'estimation.accept_misfit=true') to measure it all the "
+        "same"
     )
 
 

@@ -7,11 +7,13 @@ were assigned to a group, with false discovery rates over the whole table (see `
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from liex_lab.errors import SessionError
+from liex_lab.runtime.durable import replacing, write_whole
 from liex_lab.runtime.progress import Progress, silent
 
 if TYPE_CHECKING:
@@ -32,7 +34,8 @@ def compare_sessions(
 ) -> dict[str, Any]:
     """Compare the groups of all sessions in the given folders and write the tables.
 
-    Writes stats.parquet, stats.csv, sessions.csv, columns.json and methods.txt.
+    Writes stats.parquet, stats.csv, sessions.csv, columns.json, methods.txt and comparison.json,
+    which says where the sessions are.
 
     Args:
         places: session folders, or folders with sessions anywhere in them.
@@ -53,6 +56,7 @@ def compare_sessions(
     from liex_lab.behaviour.cohort import ENGINES, STATS, collect, compare, methods, usual_measures
     from liex_lab.sessions import Session
     from liex_lab.tables.schema import dictionary, from_pandas, write_table
+    from liex_lab.tables.spreadsheets import write_csv
 
     if engine not in ENGINES:
         raise SessionError(f"the engine is one of {', '.join(ENGINES)}, got '{engine}'")
@@ -81,15 +85,25 @@ def compare_sessions(
     stats = compare(table, wanted, reference, engine=engine)
     target = Path(out)
     target.mkdir(parents=True, exist_ok=True)
-    write_table(target / "stats.parquet", STATS, from_pandas(stats), {"table": "stats"})
-    stats.to_csv(target / "stats.csv", index=False, lineterminator="\n")
-    table.to_csv(target / "sessions.csv", index=False, lineterminator="\n")
+    with replacing(target / "stats.parquet") as part:
+        write_table(part, STATS, from_pandas(stats), {"table": "stats"})
+    for name, written in (("stats", stats), ("sessions", table)):
+        with replacing(target / f"{name}.csv") as part:
+            write_csv(written, part)
     entries = [entry for entry in dictionary(STATS) if entry["table"] == "stats"]
-    (target / "columns.json").write_text(
-        json.dumps(entries, indent=1, ensure_ascii=False) + "\n", encoding="utf-8"
-    )
-    (target / "methods.txt").write_text(methods(stats) + "\n", encoding="utf-8")
+    write_whole(target / "columns.json", json.dumps(entries, indent=1, ensure_ascii=False) + "\n")
+    where = {"sessions": [_seen_from(target, folder) for folder in folders]}
+    write_whole(target / "comparison.json", json.dumps(where, indent=1) + "\n")
+    write_whole(target / "methods.txt", methods(stats) + "\n")
     return {"stats": stats, "folder": target}
+
+
+def _seen_from(target: Path, folder: Path) -> str:
+    """The path of a session as seen from the comparison's folder, so that both can be moved."""
+    try:
+        return Path(os.path.relpath(folder, target.resolve())).as_posix()
+    except ValueError:  # on another drive
+        return str(folder)
 
 
 def find_sessions(places: Sequence[str | Path]) -> list[Path]:

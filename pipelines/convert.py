@@ -7,10 +7,8 @@ steps of one that is stated.
 
 from __future__ import annotations
 
-import os
 import re
-import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,6 +26,7 @@ from liex_lab.recordings.writer import (
     PictureFolderWriter,
     RecordingWriter,
 )
+from liex_lab.runtime.durable import replacing
 from liex_lab.runtime.progress import Progress, silent
 
 _STEPS_MM = {
@@ -107,7 +106,7 @@ def convert(
 def _convert(
     recording: Recording, target: Path, step_mm: float | None, ros: bool, progress: Progress
 ) -> Converted:
-    with _in_place(target) as part:
+    with in_place(target) as part:
         writer = _writer(recording, target, part, step_mm, ros)
         with writer:
             for frame in recording:
@@ -165,16 +164,30 @@ def _kind(target: Path) -> str:
     return suffix if suffix in (".mcap", ".oni") else ""
 
 
-def _step(recording: Recording, kind: str, target: Path) -> float:
-    """The largest step of which all depths of some frames are whole multiples."""
+def largest_step(recording: Recording, steps_mm: Sequence[float] = _STEPS_MM[""]) -> float | None:
+    """The largest step of which all depths of some frames are whole multiples.
+
+    Args:
+        recording: an open recording.
+        steps_mm: steps to choose from, mm, the largest first.
+
+    Returns:
+        The step, mm; None where there is none.
+    """
     rows = np.unique(np.linspace(0, len(recording) - 1, _N_PROBED).round().astype(int))
     depths = [recording.frame(int(row)).depth for row in rows]
-    for step in _STEPS_MM[kind]:
+    for step in steps_mm:
         if all(whole_steps(depth, step) is not None for depth in depths):
             return step
     # a depth that 16 bits cannot reach is told by the writer, with its frame
-    if max(float(depth.max()) for depth in depths) > 65535.0:
-        return 1.0
+    return 1.0 if max(float(depth.max()) for depth in depths) > 65535.0 else None
+
+
+def _step(recording: Recording, kind: str, target: Path) -> float:
+    """The step of a target's 16-bit pictures."""
+    step = largest_step(recording, _STEPS_MM[kind])
+    if step is not None:
+        return step
     raise RecordingError(
         f"the depths of {recording.name} are no whole steps of {_STEPS_MM[kind][-1]:g} mm, and "
         f"{target.name} would hold 16-bit pictures, which do not keep them; write an .mcap file, "
@@ -209,7 +222,10 @@ def _check_target(target: Path, overwrite: bool) -> None:
             "give another name"
         )
     if not overwrite and (is_file or any(target.iterdir())):
-        raise RecordingError(f"{target} is there already; give another name, or add --overwrite")
+        raise RecordingError(
+            f"{target} is there already; give another name, or add "
+            "--overwrite (in Python overwrite=True)"
+        )
 
 
 def _written_here(path: Path) -> bool:
@@ -219,27 +235,21 @@ def _written_here(path: Path) -> bool:
 
 
 @contextmanager
-def _in_place(target: Path) -> Iterator[Path]:
+def in_place(target: Path) -> Iterator[Path]:
     """A name beside `target` to write under; what was written gets its own when the block ends, and
     else is gone.
+
+    Args:
+        target: the file or folder that is to be.
+
+    Raises:
+        RecordingError: it cannot be written.
     """
-    part = target.with_name(f".{target.name}.part-{os.getpid()}")
     try:
-        yield part
-        if target.is_dir():
-            _remove(target)
-        part.replace(target)
+        with replacing(target, replace_folder=True) as part:
+            yield part
     except OSError as error:
         raise RecordingError(
             f"the recording cannot be written as {target} ({error.strerror or error}); make room, "
             "or name another place"
         ) from None
-    finally:
-        _remove(part)
-
-
-def _remove(path: Path) -> None:
-    if path.is_dir():
-        shutil.rmtree(path)
-    else:
-        path.unlink(missing_ok=True)

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 from liex_lab.errors import SessionError
 from liex_lab.plan import Plan
 from liex_lab.runtime.durable import put_back, put_in_place
+from liex_lab.runtime.places import unlinked, unlinked_tree
 from liex_lab.runtime.progress import Progress, silent
 from liex_lab.sessions.corrections import (
     FOLDER,
@@ -72,12 +73,13 @@ def correct_session(
         SessionError: a correction cannot be applied, there is none, those of the log were made on
             another measurement, or another program corrects the session.
     """
+    from liex_lab.runtime.lock import locked
     from liex_lab.sessions import Session
-    from liex_lab.sessions.lock import locked
 
     raw = Session.open(session, raw=True)
     with locked(raw.path / _BUSY, f"{raw.path} is being corrected by another program"):
-        folder, aside = raw.path / FOLDER, raw.path / f"{FOLDER}.old"
+        folder = unlinked_tree(raw.path / FOLDER)
+        aside = unlinked(raw.path / f"{FOLDER}.old")
         put_back(folder, aside)  # somebody was killed here
         made_of = basis(raw.path, raw.metadata)
         log = read_log(raw.path)
@@ -93,7 +95,7 @@ def correct_session(
                 f"{raw.path} has no corrections to apply; `liex correct --help` says how to make "
                 "one"
             )
-        part = raw.path / f"{FOLDER}.part"
+        part = unlinked(raw.path / f"{FOLDER}.part")
         shutil.rmtree(part, ignore_errors=True)
         part.mkdir()
         try:

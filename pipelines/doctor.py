@@ -15,8 +15,9 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from liex_lab.errors import printable
 from liex_lab.plan import Plan
-from liex_lab.recordings.timestamps import DROPPED, Gap
+from liex_lab.recordings.timestamps import DROPPED, Gap, unwritable_times
 from liex_lab.runtime.progress import Progress, silent
 
 from .build import build_water
@@ -141,6 +142,7 @@ def examine(
             "missing": missing,
             "problems": [
                 *seen.problems,
+                *filter(None, [unwritable_times(opened.times_ns)]),
                 *_time_problems(opened),
                 *depth.problems(),
                 *scene.problems,
@@ -277,15 +279,15 @@ def print_report(findings: dict[str, Any]) -> None:
 
     table = Table(show_header=False, box=None, pad_edge=False)
     for name, value in lines(findings):
-        table.add_row(name, Text(value))
+        table.add_row(name, Text(printable(value)))
     console = Console()
     console.print(table)
     if not findings["problems"] and not findings["missing"]:
         console.print("no problems found", style="green")
     for problem in (*findings["missing"], *findings["problems"]):
-        console.print(Text(f"- {problem}", style="yellow"), soft_wrap=True)
+        console.print(Text(printable(f"- {problem}"), style="yellow"), soft_wrap=True)
     if findings["next"]:
-        console.print(Text(f"next: {findings['next']}"), soft_wrap=True)
+        console.print(Text(printable(f"next: {findings['next']}")), soft_wrap=True)
 
 
 def lines(findings: dict[str, Any]) -> list[tuple[str, str]]:

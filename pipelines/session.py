@@ -17,8 +17,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from liex_lab.errors import RecordingError
 from liex_lab.plan import Plan
 from liex_lab.runtime.memory import Allocator, rest
+from liex_lab.runtime.places import inside
 from liex_lab.runtime.progress import Progress, silent
 from liex_lab.runtime.threads import in_background, prefetch
 
@@ -95,10 +97,12 @@ def measure_session(
         MisfitError: the recording shows something else than the plan's animal.
         EstimationError: no animal is found.
     """
+    from liex_lab.recordings.timestamps import unwritable_times
     from liex_lab.sessions import SessionWriter
     from liex_lab.sessions.checkpoint import check_free, hash_once
     from liex_lab.sessions.older import part_folder, put_back_session
     from liex_lab.sessions.place import check_place
+    from liex_lab.sessions.source import link_to
 
     started = time.perf_counter()
     first = plan or Plan.load(USUAL).with_settings(settings)
@@ -106,7 +110,9 @@ def measure_session(
         in_background(partial(build_estimator, first)) as estimator,
         build_recording(recording, first, progress) as opened,
     ):
-        folder = folder or Path(out) / f"{first.session.name or opened.name}.liex"
+        folder = folder or inside(Path(out), first.session.name or opened.name, ".liex")
+        if told := unwritable_times(opened.times_ns):
+            raise RecordingError(f"of {opened.name} {told}")
         put_back_session(folder)
         check_place(folder, overwrite)
         check_free(part_folder(folder))
@@ -140,6 +146,8 @@ def measure_session(
             began = time.perf_counter()
             verdict = make_track(writer, fitted)
             timings["track"] += time.perf_counter() - began
+            if isinstance(recording, str | Path):
+                writer.note(input=link_to(recording, folder))
             writer.note(problems=opened.problems, verdict=verdict.to_dict(), **dict(notes or {}))
             session = conclude(writer, plan, timings)
     return session.path
@@ -176,7 +184,7 @@ def make_track(writer: SessionWriter, fitted: Fitted) -> Verdict:
         whole,
         misfits=fitted.misfits,
         n_animals=1 if fit is None else fit.n_animals,
-        cautions=fitted.notes,
+        cautions=(*fitted.notes, *tracker.scene.remarks),
         accepted=fitted.plan.estimation.accept_misfit,
     )
     writer.take(tracked, whole, tracker.subject)

@@ -163,7 +163,9 @@ def _logs(session: Session) -> Iterator[Finding]:
         yield Finding("wrong", str(error))
         return
     wanted = session.metadata.get("frames", {}).get("n_frames")
-    if n_depth != wanted:
+    if n_depth == 0 and _at(session.metadata, "plan.replay.depth") == "none":
+        yield Finding("ok", f"session.rrd ({n} messages) is whole; no depth was to be kept")
+    elif n_depth != wanted:
         yield Finding(
             "wrong", f"session.mcap holds {n_depth} depth pictures and the session {wanted} frames"
         )

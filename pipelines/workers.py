@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from typing import Protocol, TypeVar
 
 from liex_lab.errors import SessionError
+from liex_lab.runtime.children import end_children, end_with_parent
 
 Work = TypeVar("Work")
 Done = TypeVar("Done")
@@ -60,7 +61,11 @@ class Processes:
         count = min(self.n, len(works))
         threads = self.threads or max(1, n_cores() // count)
         context = multiprocessing.get_context("spawn")  # numba's threads do not live through a fork
-        with _cores_for_each(threads), ProcessPoolExecutor(count, mp_context=context) as pool:
+        others = {child.pid for child in multiprocessing.active_children() if child.pid}
+        with (
+            _cores_for_each(threads),
+            ProcessPoolExecutor(count, context, initializer=end_with_parent) as pool,
+        ):
             try:
                 for future in as_completed([pool.submit(do, work) for work in works]):
                     yield future.result()
@@ -69,6 +74,10 @@ class Processes:
                     "a worker process ended without a word, perhaps for want of memory; run the "
                     "same command again, it goes on where it was, or give fewer --workers"
                 ) from None
+            except BaseException as error:
+                if not isinstance(error, Exception):  # it has to end, and a shard takes minutes
+                    end_children(but=others)
+                raise
             finally:
                 pool.shutdown(cancel_futures=True)
 

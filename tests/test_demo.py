@@ -39,11 +39,20 @@ def session(tmp_path_factory: pytest.TempPathFactory) -> Session:
         f"session: {out / 'mouse_walk.liex'}",
         f"report:  {out / 'mouse_walk.liex' / 'report.html'}",
     ]
+    assert f"video:   {out / 'mouse_walk.liex' / 'mouse_walk.mp4'}" in ran.stdout.splitlines()
     return Session.open(out / "mouse_walk.liex")
 
 
 def test_the_folder_is_whole(session: Session) -> None:
-    assert {path.name for path in session.path.iterdir()} == {*FILES, "report.html", "thumbnails"}
+    assert {path.name for path in session.path.iterdir()} == {
+        *FILES,
+        "report.html",
+        "thumbnails",
+        "figures",
+        "mouse_walk.mp4",
+    }
+    drawn = {path.name for path in (session.path / "figures").iterdir()}
+    assert {"figures.pdf", "occupancy.svg", "ethogram.svg", "arena.svg"} <= drawn
     # nothing is wrong with it; bouts that contradicted their definition are said to be refused
     refused = session.metadata.get("refused_bouts", {}).get("bouts", [])
     assert len(session.metadata["problems"]) == bool(refused)

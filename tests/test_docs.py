@@ -11,7 +11,11 @@ import pytest
 import liex_lab
 from tests.conftest import REPOSITORY
 
-PAGES = sorted([*(REPOSITORY / "docs").glob("*.md"), REPOSITORY / "CONTRIBUTING.md"])
+PAGES = sorted(
+    path
+    for path in [*(REPOSITORY / "docs").rglob("*.md"), REPOSITORY / "CONTRIBUTING.md"]
+    if not {"auto_examples", "_build"} & set(path.parts)
+)
 ROOMS = [
     "",
     "liex_lab",
@@ -35,7 +39,14 @@ def test_every_file_that_a_page_names_exists(page: Path) -> None:
     text = page.read_text(encoding="utf-8")
     named = re.findall(r"`((?:[\w.-]+/)*[\w-]+\.(?:py|toml|md)|(?:[\w.-]+/)+)`", text)
     linked = re.findall(r"\]\(([^)h][^)]*)\)", text)
-    made = {"study.toml", "plan.toml", "camera.toml"}  # by the program, or by a user
+    made = {
+        "study.toml",
+        "plan.toml",
+        "camera.toml",
+        "raytrix.toml",
+        "study/study.toml",
+    }  # by the program, or by a user
+    made |= {"study/study.toml", "derivatives/liex-lab/sub-m01/ses-01/behav/"}
     missing = [path for path in named if path not in made and not is_there(path)]
     missing += [link for link in linked if not (page.parent / link).exists()]
     assert not missing

@@ -1,4 +1,4 @@
-"""What README.md says is there, is there."""
+"""What README.md and the manual in docs/ say is there, is there."""
 
 from __future__ import annotations
 
@@ -17,59 +17,95 @@ from liex_lab.arena.zones import read_zones
 from liex_lab.behaviour.cohort import STATS
 from liex_lab.behaviour.listing import FIRST, all_columns, first_columns
 from liex_lab.body import Skeleton
+from liex_lab.catalog import bundled_models
+from liex_lab.exchange import TARGETS
 from liex_lab.plan import Plan
 from liex_lab.sessions.session import FILES
 from tests.conftest import REPOSITORY
 
-TEXT = (REPOSITORY / "README.md").read_text(encoding="utf-8")
+README = (REPOSITORY / "README.md").read_text(encoding="utf-8")
+DOCS = REPOSITORY / "docs"
+PAGES = {
+    path.relative_to(DOCS).as_posix(): path.read_text(encoding="utf-8")
+    for path in DOCS.rglob("*.md")
+    if not {"auto_examples", "_build"} & set(path.parts)
+}
+EVERYTHING = "\n".join([README, *PAGES.values()])
+
+OTHERS = {"height_ave_mm", "velocity_2d_mm"}  # MoSeq's columns
 
 
-def section(title: str) -> str:
-    return TEXT.split(f"\n## {title}\n")[1].split("\n## ")[0]
+def blocks(language: str, text: str) -> list[str]:
+    return re.findall(rf"```{language}\n(.*?)```", text, re.DOTALL)
 
 
-def blocks(language: str) -> list[str]:
-    return re.findall(rf"```{language}\n(.*?)```", TEXT, re.DOTALL)
-
-
-def test_every_file_and_every_link_is_there() -> None:
-    out = section("What comes out")
-    assert set(FILES) | {"report.html"} == set(
-        re.findall(r"`([a-z_]+\.[a-z]+)`", out.split("The columns that")[0])
-    )
-    for link in re.findall(r"\]\(([^)h][^)]*)\)", TEXT):
-        assert (REPOSITORY / link).exists(), link
+def test_the_readme_is_short_and_its_pictures_are_small() -> None:
+    assert len(README.splitlines()) <= 150
+    pictures = re.findall(r"!\[[^\]]*\]\(([^)]+)\)", README)
+    assert len(pictures) == 3
+    assert sum((REPOSITORY / path).stat().st_size for path in pictures) <= 350_000
     assert (REPOSITORY / "dashboards" / "assets" / "demo.png").stat().st_size <= 150_000
 
 
+def test_every_file_of_a_session_and_every_link_is_there() -> None:
+    told = re.findall(r"^\| .*", PAGES["reference/session-folder.md"], re.MULTILINE)
+    named = set(re.findall(r"`([a-z_]+\.[a-z]+)`", "\n".join(told)))
+    assert set(FILES) | {"report.html"} == named
+    for link in re.findall(r"\]\(([^)h][^)]*)\)", README):
+        assert (REPOSITORY / link).exists(), link
+
+
 def test_the_list_of_columns_is_the_columns_own() -> None:
-    listed = TEXT.split("<!-- columns: python -m liex_lab.behaviour.listing -->\n")[1].split(
-        "<!-- end of columns"
-    )[0]
-    assert listed == first_columns()
+    page = PAGES["reference/columns.md"]
+    start = "<!-- columns: python -m liex_lab.behaviour.listing -->\n"
+    assert page.split(start)[1].split("<!-- end of columns")[0] == first_columns()
     assert set(FIRST) <= set(all_columns())
 
 
-def test_every_verb_and_every_setting_exists() -> None:
-    verbs = re.findall(r"^\| `(\w+)", section("The verbs"), re.MULTILINE)[
-        1:
-    ]  # the first is `liex ...`
-    told = CliRunner().invoke(cli.app, ["--help"]).output
-    known = (
-        "cohort compare convert correct dashboard demo describe doctor evaluate export info live "
-        "report "
-        "run show suggest "
-    )
-    known += "train verify"
-    assert sorted(verbs) == sorted(known.split())
-    assert all(verb in told for verb in verbs)
+def test_errors_in_the_readme_are_those_of_the_models_card() -> None:
+    scores = bundled_models()["mouse"]["scores"]
+    told = [float(mm) for mm in re.findall(r"(\d\.\d) mm", README)]
+    splits = ("clean", "hard", "other-body")
+    assert told == [round(scores[split]["mean_joint_error_mm"], 1) for split in splits]
+
+
+def test_every_verb_option_setting_and_format_that_is_named_exists() -> None:
+    help_of: dict[str, str] = {}
+
+    def helped(*words: str) -> str:
+        if " ".join(words) not in help_of:
+            help_of[" ".join(words)] = CliRunner().invoke(cli.app, [*words, "--help"]).output
+        return help_of[" ".join(words)]
+
+    top = helped()
+    shell = [block for text in (README, *PAGES.values()) for block in blocks("sh", text)]
+    lines = "".join(shell).splitlines()
+    lines += re.findall(r"`(liex [a-z][^`]*)`", EVERYTHING)
+    calls = [line.strip().removeprefix(".venv/bin/") for line in lines]
+    calls = [call for call in calls if call.startswith("liex ")]
+    assert len(calls) > 60
+    for call in calls:
+        words = call.split("#")[0].split()[1:]
+        verb = words[0]
+        if verb.startswith("--") or verb == "VERB":
+            continue
+        assert f"  {verb} " in top, call
+        inner = [words[1]] if verb in ("correct", "evaluate") and len(words) > 1 else []
+        if inner and not re.fullmatch(r"[a-z]+", inner[0]):
+            inner = []
+        options = helped(verb, *inner)
+        assert "Usage:" in options, call
+        for option in re.findall(r" (--[a-z][a-z-]*)", call.split("#")[0]):
+            assert option in options, call
     plan = tomllib.loads(
         re.sub(r"^# (\w+) =$", r"\1 = 0", Plan.load("mouse").to_toml(), flags=re.MULTILINE)
     )
-    for table, key in re.findall(
-        r"`(\w+)\.(\w+)(?:=[^`]*)?`", section("The plan").split("**Size.**")[0]
-    ):
-        assert key in plan[table], f"{table}.{key}"
+    tables = "|".join(plan)
+    for table, key in re.findall(rf"`(?:--set )?({tables})\.([a-z]\w+)(?:=[^`]*)?`", EVERYTHING):
+        if key not in ("parquet", "csv", "json", "toml", "rrd", "mcap", "rbl"):
+            assert key in plan[table], f"{table}.{key}"
+    formats = set(re.findall(r"--to ([a-z]+)\b", EVERYTHING)) - {"study", "live"}
+    assert {"csv", "xlsx", "nwb"} <= formats <= set(TARGETS)
 
 
 def test_every_python_example_runs(
@@ -78,8 +114,12 @@ def test_every_python_example_runs(
     """Each is run as it stands, on a short virtual recording that has the name it asks for."""
     monkeypatch.chdir(tmp_path)
     convert("synthetic:walk?seed=3&frames=60", "recording.mcap")
-    examples = blocks("python")
-    assert examples
+    examples = [
+        example
+        for text in (README, PAGES["reference/python.md"], PAGES["howto/ephys.md"])
+        for example in blocks("python", text)
+    ]
+    assert len(examples) == 3
     for example in examples:
         for asked in set(re.findall(r'"(recording\.[a-z.]+)"', example)):
             example = example.replace(asked, "recording.mcap")
@@ -96,21 +136,28 @@ def test_every_python_example_runs(
 
 
 def test_every_column_that_is_named_is_one() -> None:
-    named = set(re.findall(r"`(?:frames|poses|kinematics|bouts|summary) `?(\w+)`", TEXT))
-    named |= set(re.findall(r"`((?:rear|distance|speed|mean|n)_\w+)`", TEXT))
+    units = "mm|mm_s|mm_s2|rad|rad_s|px|s|m|hz|share|count"
+    named = set(re.findall(rf"`([a-z]\w*_(?:{units}))`", EVERYTHING))
     known = {name.split(".")[1] for name in all_columns()} | {column.name for column in STATS}
-    assert named
-    assert named <= known
+    known |= {
+        key
+        for table in Plan.load("mouse").model_dump().values()
+        if isinstance(table, dict)
+        for key in table
+    }
+    known |= {"expected_error_mm", "unit_mm", "mesh_unit_mm", "time_s"}
+    assert len(named) > 20
+    assert named <= known | OTHERS, named - known
 
 
 def test_the_zones_can_be_read(tmp_path: Path) -> None:
-    (example,) = [block for block in blocks("toml") if "[[zones]]" in block]
+    (example,) = blocks("toml", PAGES["howto/zones.md"])
     (tmp_path / "zones.toml").write_text(example, encoding="utf-8")
     assert [zone.name for zone in read_zones(tmp_path / "zones.toml")] == ["centre", "nest"]
 
 
 def test_the_animal_of_ones_own_can_be_read(tmp_path: Path) -> None:
-    (example,) = [block for block in blocks("toml") if "[[joints]]" in block]
+    (example,) = blocks("toml", PAGES["tutorials/own-animal.md"])
     (tmp_path / "gerbil.toml").write_text(example, encoding="utf-8")
     gerbil = Skeleton.load(tmp_path / "gerbil.toml")
     assert (gerbil.name, gerbil.n_joints, gerbil.dof) == ("gerbil", 3, 8)

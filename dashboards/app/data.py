@@ -17,7 +17,7 @@ import numpy as np
 
 from liex_lab.actions.colours import PALETTE, action_colours
 from liex_lab.behaviour import cohort
-from liex_lab.errors import LiexError, SessionError
+from liex_lab.errors import LiexError, SessionError, one_line
 from liex_lab.runtime.progress import Progress, silent
 from liex_lab.sessions import Session
 from liex_lab.sessions.corrections import LOG, corrected_folder
@@ -245,6 +245,11 @@ class StudyData:
             value = read(Session.open(entry.folder))
         except LiexError as error:
             value = {"damage": str(error)}
+        except Exception as error:  # one bad session does not take the study's pages down
+            value = {
+                "damage": f"{entry.folder} cannot be shown ({type(error).__name__}: "
+                f"{one_line(error)}); look at it with `liex verify`"
+            }
         self._kept[what, entry.key] = (stamp, value)
         return value
 

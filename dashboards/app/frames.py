@@ -1,4 +1,4 @@
-"""Depth picture of any frame of a session, from its own replay file, with the skeleton over it."""
+"""Depth picture of any frame of a session, as it is kept there, with the skeleton over it."""
 
 from __future__ import annotations
 
@@ -10,8 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.errors import LiexError
-
-from . import plots
 
 if TYPE_CHECKING:
     from liex_lab.recordings.recording import Recording
@@ -34,14 +32,15 @@ class Frames:
     def depth(self, key: str, session: Session, row: int) -> NDArray[np.uint16] | None:
         """(H, W) uint16 mm, 0 where unread; None where the session keeps no depth of this frame.
 
-        Without a replay file that can be read, a thumbnail of this very frame does.
+        Outside of the cut-outs that a session keeps it is the still scene. Without a replay file
+        that can be read, a thumbnail of this very frame does.
 
         Args:
             key: the session's name in the study.
             session: the opened session.
             row: the frame's row in the table `frames`.
         """
-        from liex_lab.recordings import open_recording
+        from liex_lab.sessions.cutouts import open_pictures
 
         path = session.path / "session.mcap"
         with self._lock:
@@ -53,13 +52,19 @@ class Frames:
                     if known is not None:
                         known[1].close()
                     stack = ExitStack()
-                    known = (stamp, stack, stack.enter_context(open_recording(path)))
+                    known = (stamp, stack, stack.enter_context(open_pictures(session)))
                 self._open[key] = known
                 while len(self._open) > _HELD:
                     self._open.pop(next(iter(self._open)))[1].close()
                 return np.asarray(known[2].frame(row).depth, np.uint16)
             except (LiexError, OSError, IndexError):
                 return _kept(session, row)
+
+    def close(self) -> None:
+        """Close the files that are open."""
+        with self._lock:
+            while self._open:
+                self._open.popitem()[1][1].close()
 
     def figure(self, key: str, session: Session, row: int, *, whole: bool) -> dict[str, Any]:
         """The picture of a frame with its skeleton, as plotly takes it.
@@ -70,6 +75,8 @@ class Frames:
             row: the frame's row in the table `frames`.
             whole: the whole picture, else what is around the animal.
         """
+        from . import plots
+
         depth = self.depth(key, session, row)
         index = int(session.frames["frame_index"].iloc[row])
         joints = session.table("poses", ["frame_index", "joint", "u_px", "v_px"], [index])

@@ -43,11 +43,11 @@ def guard(server: Flask, token: str, page_policy: Callable[[], str]) -> None:
     @server.before_request
     def allowed() -> Any:
         """Let a request through, or answer it with 401, 403 or the cookie that holds the token."""
-        name = urlsplit(f"//{request.host}").hostname or ""
+        name = _site(f"//{request.host}", name=True)
         if not token and name not in LOOPBACK:
             abort(Response("This dashboard answers on 127.0.0.1 only.", 403, mimetype="text/plain"))
         origin = request.headers.get("Origin")
-        if origin and urlsplit(origin).netloc != request.host:
+        if origin and _site(origin) != request.host:
             abort(
                 Response(
                     "This dashboard takes no requests from other sites.", 403, mimetype="text/plain"
@@ -74,6 +74,15 @@ def guard(server: Flask, token: str, page_policy: Callable[[], str]) -> None:
         return response
 
 
+def _site(address: str, name: bool = False) -> str | None:
+    """Host and port of an address, or the host's name alone; None where it is none."""
+    try:
+        found = urlsplit(address)
+        return found.hostname if name else found.netloc
+    except ValueError:
+        return None
+
+
 def add_downloads(server: Flask, data: StudyData) -> None:
     """Add the addresses of tables as CSV, and of sessions' reports.
 
@@ -96,8 +105,12 @@ def add_downloads(server: Flask, data: StudyData) -> None:
     def report(key: str) -> Response:
         """The report of the session `key`; a report needs no script, so it may have none."""
         try:
-            page = (data.session(key).path / "report.html").read_text(encoding="utf-8")
-        except (LiexError, OSError):
+            folder = data.session(key).path.resolve()
+            file = (folder / "report.html").resolve()
+            if file.parent != folder:  # a link that leads elsewhere
+                raise FileNotFoundError(file)
+            page = file.read_text(encoding="utf-8")
+        except (LiexError, OSError, ValueError):
             return Response("This session has no report.", 404, mimetype="text/plain")
         answer = Response(page, mimetype="text/html")
         answer.headers["Content-Security-Policy"] = _REPORT

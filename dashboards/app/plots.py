@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 
 from liex_lab.behaviour.design import animal_means
 
-from ..report.svg import Array, kept_rows, png_uri, shade
+from ..figures.times import kept_rows
+from ..report.contact_sheet import Array, png_uri, shade
 from .data import GREY, NO_POSE, OTHER, Ethogram, raster
 
 INK = "#1f2328"

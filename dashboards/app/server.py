@@ -6,6 +6,7 @@ Nothing is loaded from anywhere else: the content security policy allows this se
 from __future__ import annotations
 
 import logging
+import signal
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ from urllib.parse import parse_qs, unquote
 from dash import ALL, MATCH, ClientsideFunction, Dash, Input, Output, State, dcc, html
 
 from liex_lab.errors import LiexError
+from liex_lab.runtime.signals import Ended
 
 from . import page_corrections, page_groups, page_session, page_study, tables
 from .data import StudyData
@@ -113,6 +115,9 @@ def serve(app: Dash, host: str, port: int, told: Callable[[int], None]) -> None:
         server.serve_forever()
     except KeyboardInterrupt:
         pass
+    except Ended as ended:
+        if ended.signal != signal.SIGINT:  # Ctrl-C is the way to end it
+            raise
     finally:
         server.server_close()
 

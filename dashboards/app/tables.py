@@ -15,7 +15,7 @@ import numpy as np
 from dash import dcc, html
 
 from liex_lab.errors import SessionError
-from liex_lab.tables.schema import harmless
+from liex_lab.tables.spreadsheets import harmless_table
 
 from .data import DONE, StudyData
 from .parts import aria, download
@@ -291,10 +291,7 @@ def as_csv(table: pd.DataFrame) -> Iterator[str]:
     """
     for start in range(0, max(len(table), 1), _BATCH):
         part = table.iloc[start : start + _BATCH]
-        texts = part.select_dtypes(include=["object", "string"]).columns
-        part = part.assign(**{name: part[name].map(harmless) for name in texts})
-        part.columns = [harmless(str(name)) for name in part.columns]
-        yield part.to_csv(index=False, header=start == 0, lineterminator="\n")
+        yield harmless_table(part).to_csv(index=False, header=start == 0, lineterminator="\n")
 
 
 def session_table(data: StudyData, key: str, name: str) -> pd.DataFrame:

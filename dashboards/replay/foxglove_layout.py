@@ -27,7 +27,7 @@ def write_layout(session: Session) -> Path:
     Returns:
         Path of the file.
     """
-    from liex_lab.sessions.failure import write_whole
+    from liex_lab.runtime.durable import write_whole
 
     path = session.path / FILE
     write_whole(path, json.dumps(foxglove_layout(session.metadata), indent=1) + "\n")

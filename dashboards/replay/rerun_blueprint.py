@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from liex_lab.runtime.durable import replacing
+
 if TYPE_CHECKING:
     from liex_lab.sessions import Session
 
@@ -31,9 +33,8 @@ def write_blueprint(session: Session) -> Path:
         Path of the file.
     """
     path = session.path / FILE
-    beside = path.with_name(f".{FILE}")
-    replay_blueprint(session.metadata).save("liex_lab", str(beside))
-    beside.replace(path)
+    with replacing(path) as beside:
+        replay_blueprint(session.metadata).save("liex_lab", str(beside))
     return path
 
 
@@ -46,9 +47,12 @@ def replay_blueprint(session: dict[str, Any]) -> Any:
     Args:
         session: the content of session.json.
     """
+    import rerun as rr
     import rerun.blueprint as rrb
 
+    from liex_lab.sessions.cutouts import N_BOXES
     from liex_lab.sessions.rrd import OVERLAY, SKELETON, corrected_entity
+    from liex_lab.sessions.rrd_depth import CUTOUTS, cutout_frame
 
     # with corrections, what they are made of is left out of the views, but is still there to be
     # looked at
@@ -76,12 +80,17 @@ def replay_blueprint(session: dict[str, Any]) -> Any:
         ),
         line_grid=rrb.LineGrid3D(visible=False),
     )
+    in_picture: Any = {
+        f"{CUTOUTS}/{k + 1}/depth": rr.CoordinateFrame(cutout_frame(k)) for k in range(N_BOXES)
+    }
     picture = rrb.Spatial2DView(
         origin="arena/camera/image",
         contents=[
             "$origin/**",
+            f"+ /{CUTOUTS}/**",
             *(f"- /{OVERLAY}/{name}" for name in ("joints", "bones") if corrected),
         ],
+        overrides=in_picture,
         name="depth with the corrected skeleton" if corrected else "depth with the fitted skeleton",
     )
     lanes = rrb.StateTimelineView(

@@ -92,6 +92,14 @@ def _of_frames(session: Session) -> list[str]:
             f"The camera did not deliver {counted(frames['n_missing'], 'frame')}, in "
             f"{counted(frames['n_gaps'], 'gap')}; nothing is measured across them."
         )
+    hidden = int(frames["flags"].get("hidden", 0))
+    if hidden:
+        found.append(
+            f"The animal is behind or under something in {counted(hidden, 'frame')} "
+            f"({hidden / n:.1%} of {n:,}), which have no pose; the table gaps says since when and "
+            "where it was last seen."
+        )
+    lost -= hidden
     if lost > _LOST_SHARE * n:
         found.append(
             f"{counted(lost, 'frame has', 'frames have')} no pose ({lost / n:.1%} of {n:,}); times "
@@ -159,15 +167,17 @@ def frame_account(session: Session) -> list[tuple[str, float, int, str]]:
         session: the opened session.
 
     Returns:
-        (what, share, number, CSS class for its colour) of trusted, doubtful, lost and undelivered
-        frames.
+        (what, share, number, CSS class for its colour) of trusted, doubtful, hidden, lost and
+        undelivered frames; hidden ones only where there are some.
     """
     frames = session.metadata["frames"]
     doubtful = int(frames["flags"].get("doubtful", 0))
-    lost = frames["n_frames"] - frames["n_observed"]
+    hidden = int(frames["flags"].get("hidden", 0))
+    lost = frames["n_frames"] - frames["n_observed"] - hidden
     parts = [
         ("trusted pose", frames["n_observed"] - doubtful, "good"),
         ("doubtful pose", doubtful, "doubt"),
+        *([("hidden", hidden, "gone")] if hidden else []),
         ("no pose", lost, "lost"),
         ("not delivered", frames["n_missing"], "gone"),
     ]

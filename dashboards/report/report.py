@@ -13,12 +13,15 @@ from typing import Any
 import numpy as np
 
 from liex_lab.actions.colours import action_colours
+from liex_lab.runtime.durable import write_whole
 from liex_lab.sessions import Session
-from liex_lab.sessions.failure import write_whole
 from liex_lab.sessions.verdict import verdict_in
+from liex_lab.sessions.videos import found_video
 
+from ..figures.seen import FRAMES, KINEMATICS
+from ..figures.sets import FOLDER, for_the_page
 from ..units import counted, shown, titled
-from .charts import FRAMES, KINEMATICS, around_actions, charts, curves, pictures
+from .charts import pictures
 from .methods import methods, optics, spine_mm
 from .quality import flip_rows, frame_account, refusal_rows, warnings
 
@@ -40,7 +43,7 @@ _TABLES = {
 
 
 def write_report(folder: str | Path) -> Path:
-    """Make report.html in a session's folder from what lies in it.
+    """Make report.html in a session's folder from what lies in it, and its figures as files.
 
     Args:
         folder: the session's folder.
@@ -49,15 +52,17 @@ def write_report(folder: str | Path) -> Path:
         Path of the report.
     """
     path = Path(folder) / "report.html"
-    write_whole(path, render(Session.open(folder).narrowed(frames=FRAMES, kinematics=KINEMATICS)))
+    session = Session.open(folder).narrowed(frames=FRAMES, kinematics=KINEMATICS)
+    write_whole(path, render(session, path.parent / FOLDER))
     return path
 
 
-def render(session: Session) -> str:
+def render(session: Session, figures: Path | None = None) -> str:
     """The report of a session as one HTML text.
 
     Args:
         session: the opened session.
+        figures: the folder for the figures as files; None writes none.
     """
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
@@ -83,9 +88,9 @@ def render(session: Session) -> str:
         account=frame_account(session),
         flips=flip_rows(session),
         pictures=pictures(session),
-        charts=charts(session, words),
-        curves=curves(session),
-        around=around_actions(session, words),
+        figures=for_the_page(session, figures),
+        clips=clip_links(session),
+        video=None if (video := found_video(session)) is None else video.name,
         actions=action_rows(session, words),
         summary=summary_rows(session, words),
         budget=budget_rows(session, words),
@@ -116,6 +121,25 @@ def action_rows(session: Session, words: list[str]) -> list[tuple[str, str, str,
         )
         for word, colour in action_colours(words).items()
     ]
+
+
+def clip_links(session: Session) -> dict[str, str]:
+    """The videos of actions that lie beside the report: action -> name of the file.
+
+    A video of `rear` is one of rear_supported, too.
+
+    Args:
+        session: the opened session.
+    """
+    links = {}
+    for word in dict.fromkeys(str(action) for action in session.bouts["action"]):
+        parts = word.split("_")
+        for k in range(len(parts), 0, -1):
+            video = found_video(session, "_".join(parts[:k]))
+            if video is not None:
+                links[word] = video.name
+                break
+    return links
 
 
 def headline(session: Session) -> str:

@@ -18,6 +18,7 @@ from liex_lab.actions.timeline import TimelineModel
 from liex_lab.catalog import MODELS, sha256
 from liex_lab.errors import ModelError
 from liex_lab.mlp import Network, check_layers
+from liex_lab.runtime.durable import replacing
 
 SUFFIX = ".skops"
 _FORMAT = 2
@@ -63,9 +64,8 @@ def save_action_model(model: TimelineModel, path: str | Path) -> Path:
             for n in model.networks
         ],
     }
-    unfinished = target.with_name(f"{target.name}.part")
-    write_plain(document, unfinished)
-    unfinished.replace(target)
+    with replacing(target) as unfinished:
+        write_plain(document, unfinished)
     return target
 
 

@@ -67,6 +67,9 @@ class Scene:
         outline: the shape of the arena.
         fixtures: what stands still on the floor, largest first.
         doubts: sentences about why this may be wrong.
+        wander_mm: range of the floor's depth over the recording, mm, as of a sensor that warms up;
+            None where it is still.
+        tethered: whether the animal wears a cable, which is cut out of the pictures.
     """
 
     floor: Floor
@@ -79,6 +82,8 @@ class Scene:
     outline: Arena = UNKNOWN
     fixtures: tuple[Fixture, ...] = ()
     doubts: tuple[str, ...] = ()
+    wander_mm: float | None = None
+    tethered: bool = False
 
     def to_dict(self) -> dict[str, Any]:
         """Plain numbers for session.json; the outline is there already, as `arena`."""
@@ -90,10 +95,12 @@ class Scene:
                 "from": self.floor_from,
                 "support": None if support is None else round(support, 3),
                 "roughness_mm": None if self.roughness_mm is None else round(self.roughness_mm, 2),
+                "wander_mm": None if self.wander_mm is None else round(self.wander_mm, 2),
             },
             "region_px": [[round(u, 1), round(v, 1)] for u, v in self.region_px],
             "n_moving": self.n_moving,
             "n_animals": self.n_animals,
+            "tethered": self.tethered,
             "fixtures": [
                 {
                     "centre_mm": [round(value, 1) for value in fixture.centre_mm],

@@ -1,7 +1,7 @@
-"""README.md's list of columns, printed from the columns' own descriptions.
+"""The list of columns in docs/reference/columns.md, printed from the columns' own descriptions.
 
 The columns are those that a reader is told of first. `python -m liex_lab.behaviour.listing` prints
-the list; a test holds README.md to it.
+the list; a test holds the page to it.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ def all_columns() -> dict[str, Column]:
 
 
 def first_columns() -> str:
-    """README.md's table of columns, as Markdown."""
+    """The table of the columns that are asked for most, as Markdown."""
     known = all_columns()
     lines = ["| column | unit | meaning |", "|---|---|---|"]
     for name in FIRST:

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from liex_lab.errors import LiexError
+from liex_lab.errors import LiexError, how_to_install
 
 _MOST_FACES = 4000
 _FEWEST_FACES = 4
@@ -43,8 +43,7 @@ def read_mesh(path: Path, unit_mm: float, origin: str) -> dict[str, Any]:
         import open3d
     except (ImportError, OSError) as error:
         raise LiexError(
-            f"{origin}: reading {path.name} needs Open3D ({error}); install it with: pip install "
-            "'liex_lab[mesh]'"
+            f"{origin}: reading {path.name} needs Open3D ({error}); {how_to_install('mesh')}"
         ) from None
     with open3d.utility.VerbosityContextManager(open3d.utility.VerbosityLevel.Error):
         mesh = open3d.io.read_triangle_mesh(path)

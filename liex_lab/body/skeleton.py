@@ -154,6 +154,12 @@ class Skeleton:
     view: View
     table: dict[str, Any] = field(default_factory=dict, repr=False, compare=False)
 
+    def __repr__(self) -> str:
+        return (
+            f"<Skeleton {self.name}: {self.n_joints} joints ({', '.join(self.names)}), "
+            f"{self.length:.1f} mm long at home, {self.dof} degrees of freedom>"
+        )
+
     @staticmethod
     def load(animal: str | Path) -> Skeleton:
         """The skeleton of a preset or of a TOML file that a user wrote.

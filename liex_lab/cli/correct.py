@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from liex_lab.cli.options import say
 from liex_lab.cli.sections import group_of_verbs
-from liex_lab.errors import SessionError
+from liex_lab.errors import SessionError, printable
 from liex_lab.runtime.progress import progress_bar
 
 if TYPE_CHECKING:
@@ -146,20 +147,20 @@ def list_corrections(session: SessionPath) -> None:
     standing = {entry.number for entry in log.standing}
     from rich.console import Console
     from rich.table import Table
+    from rich.text import Text
 
     table = Table("", "what", "by", "at", "")
     for entry in log.entries:
         what = str(entry.what) if entry.what is not None else f"{entry.undoes} taken back"
         gone = entry.what is not None and entry.number not in standing
-        table.add_row(
-            str(entry.number), what, entry.author, entry.made_at, "taken back" if gone else ""
-        )
+        said = (str(entry.number), what, entry.author, entry.made_at, "taken back" if gone else "")
+        table.add_row(*(Text(printable(one)) for one in said))
     if not log.entries:
-        typer.echo(f"{opened.path} has no corrections")
+        say(f"{opened.path} has no corrections")
         return
     Console().print(table)
     if log.standing and not applies(log, opened.path, opened.metadata):
-        typer.echo(
+        say(
             "note: they were made on another measurement of this recording and are not applied; "
             f"`liex correct redo` applies them, and without the folder {FOLDER} they are gone"
         )
@@ -213,8 +214,8 @@ def describe(
     with progress_bar() as progress:
         describe_session(session, said, author=by, progress=progress)
     for key, value in said.items():
-        typer.echo(f"described: {key} is {value or 'not known'}")
-    typer.echo(f"report:    {session / 'report.html'}")
+        say(f"described: {key} is {value or 'not known'}")
+    say(f"report:    {session / 'report.html'}")
 
 
 def _opened(session: Path) -> Session:
@@ -229,8 +230,8 @@ def _do(session: Path, what: Sequence[Correction], by: str, undo: Sequence[int] 
     with progress_bar() as progress:
         correct_session(session, what, undo=undo, author=by, progress=progress)
     for one in what[:5]:
-        typer.echo(f"corrected: {one}")
+        say(f"corrected: {one}")
     if len(what) > 5:
-        typer.echo(f"corrected: {len(what) - 5} further bouts")
-    typer.echo(f"tables:    {session / 'corrected'}")
-    typer.echo(f"report:    {session / 'report.html'}")
+        say(f"corrected: {len(what) - 5} further bouts")
+    say(f"tables:    {session / 'corrected'}")
+    say(f"report:    {session / 'report.html'}")

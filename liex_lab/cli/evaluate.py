@@ -13,6 +13,7 @@ from liex_lab.cli.options import (
     RowName,
     SessionPath,
     keep_numbers,
+    say,
     tell_numbers,
     tell_rows,
 )
@@ -165,7 +166,7 @@ def evaluate_tables(
             progress=progress,
         )
     for path in written:
-        typer.echo(path)
+        say(path)
 
 
 @evaluate.command("actions")

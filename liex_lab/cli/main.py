@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import errno
 import os
-import subprocess
+import shlex
 import sys
 import traceback
 from pathlib import Path
@@ -27,17 +27,22 @@ from liex_lab.cli.options import (
     TopicName,
     VariantName,
     WhichPlan,
+    keep_numbers,
     region_setting,
+    say,
     tell_numbers,
+    tell_scores,
     to_json,
-    told_scores,
 )
-from liex_lab.cli.results import compare, export, report
+from liex_lab.cli.recordings import convert, pack
+from liex_lab.cli.replay import show
+from liex_lab.cli.results import compare, export, figures, report
 from liex_lab.cli.sections import MODELS, RECORDINGS, SESSIONS, START, STUDIES, group_of_verbs
 from liex_lab.cli.study import cohort, dashboard, verify
-from liex_lab.errors import LiexError, MisfitError
+from liex_lab.errors import LiexError, MisfitError, printable
 from liex_lab.runtime.disk import is_full, why_full
 from liex_lab.runtime.progress import progress_bar
+from liex_lab.runtime.signals import Ended, ending
 
 # the exit code of our own faults (EX_SOFTWARE); what the user can put right is 1, a wrong call 2
 FAULT = 70
@@ -58,6 +63,7 @@ app.add_typer(evaluate, name="evaluate", rich_help_panel=MODELS)
 app.add_typer(correct, name="correct", rich_help_panel=SESSIONS)
 app.command(rich_help_panel=SESSIONS)(describe)
 app.command(rich_help_panel=SESSIONS)(report)
+app.command(rich_help_panel=SESSIONS)(figures)
 app.command(rich_help_panel=SESSIONS)(verify)
 app.command(rich_help_panel=SESSIONS)(export)
 app.command(rich_help_panel=STUDIES)(cohort)
@@ -67,7 +73,7 @@ app.command(rich_help_panel=STUDIES)(dashboard)
 
 def _version(wanted: bool) -> None:
     if wanted:
-        typer.echo(f"liex_lab {liex_lab.__version__}")
+        say(f"liex_lab {liex_lab.__version__}")
         raise typer.Exit()
 
 
@@ -83,11 +89,15 @@ def _options(
 @app.command(rich_help_panel=START)
 def demo(out: OutFolder = Path()) -> None:
     """Run the bundled sample recording, to see what comes out."""
-    from liex_lab.api import run_demo
+    from liex_lab.api import export_video, run_demo
 
     with progress_bar() as progress:
         session = run_demo(out, progress=progress)
-    _tell_session(session)
+        try:
+            video = f"video:   {export_video(session, progress=progress)}"
+        except LiexError as error:  # the session is whole without it
+            video = f"note: there is no video, for {error}"
+    _tell_session(session, video)
 
 
 @app.command(rich_help_panel=START)
@@ -131,7 +141,7 @@ def run(
     from liex_lab.plan import Plan
 
     asked = [] if topic is None else [f"recording.topic={topic}"]
-    asked += ["replay.depth=false"] * no_depth + ["replay.candidates=true"] * candidates
+    asked += ["replay.depth=none"] * no_depth + ["replay.candidates=true"] * candidates
     asked += [*["estimation.accept_misfit=true"] * accept, *(settings or [])]
     # first: a wrong plan or setting is told at once
     chosen = Plan.load(plan or "mouse").with_settings(asked)
@@ -187,56 +197,13 @@ def doctor(
             progress=progress,
         )
     if as_json:
-        typer.echo(to_json(findings))
+        say(to_json(findings))
     else:
         print_report(findings)
 
 
-@app.command(rich_help_panel=RECORDINGS)
-def convert(
-    recording: RecordingPath,
-    to: Annotated[
-        Path,
-        typer.Option(
-            "--to", metavar="TARGET", help="NAME.mcap, NAME.oni, or a folder for PNG pictures."
-        ),
-    ],
-    fps: Annotated[
-        float | None, typer.Option("--fps", help="Frames per second, where the file has no times.")
-    ] = None,
-    topic: TopicName = None,
-    step_mm: Annotated[
-        float | None,
-        typer.Option(
-            "--step-mm", min=0.001, help="Round depth to steps of this size; not for MCAP."
-        ),
-    ] = None,
-    ros: Annotated[
-        bool, typer.Option("--ros", help="MCAP with ROS 2's messages instead of Foxglove's.")
-    ] = False,
-    overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Replace what is there under this name.")
-    ] = False,
-) -> None:
-    """Write a recording as MCAP (which keeps every depth), as .oni, or as a folder of 16-bit PNG
-    pictures.
-    """
-    from liex_lab.pipelines.convert import convert as job
-
-    with progress_bar() as progress:
-        done = job(
-            recording,
-            to,
-            fps=fps,
-            topic=topic,
-            step_mm=step_mm,
-            ros=ros,
-            overwrite=overwrite,
-            progress=progress,
-        )
-    typer.echo(f"recording: {done.path} ({done.n_frames} frames)")
-    for sentence in (*done.problems, *done.notes):
-        typer.echo(f"note: {sentence}")
+app.command(rich_help_panel=RECORDINGS)(convert)
+app.command(rich_help_panel=RECORDINGS)(pack)
 
 
 @app.command(rich_help_panel=MODELS)
@@ -287,6 +254,7 @@ def train(
             help="Of `train tracking`: search the noise of the paper's Algorithm 3 instead.",
         ),
     ] = False,
+    json_file: JsonFile = None,
 ) -> None:
     """Make an animal's model from rendered pictures, the same again, byte for byte, whenever it is
     run.
@@ -307,16 +275,17 @@ def train(
                 pose_model=pose_model,
                 progress=progress,
             )
-        for sentence in told_scores(report):
-            typer.echo(sentence)
-        typer.echo(f"model: {model}")
+        if json_file is not None:
+            keep_numbers(report, json_file)
+        tell_scores(report)
+        say(f"model: {model}")
         return
     if animal == "tracking" and particles:
         from liex_lab.pipelines.evaluation.paper.algorithm3 import search_noise
 
         with progress_bar() as progress:
             found = search_noise(of, progress=progress)
-        tell_numbers(found, out)
+        tell_numbers(found, json_file or out)
         return
     if animal == "tracking":
         from liex_lab.pipelines.training.motion_model import train_tracking
@@ -325,7 +294,7 @@ def train(
             table = train_tracking(
                 of, out or Path("tunings.toml"), workers=workers, progress=progress
             )
-        typer.echo(f"tunings: {table}")
+        say(f"tunings: {table}")
         return
     from liex_lab.pipelines.training.pose_model import train_model
 
@@ -334,7 +303,7 @@ def train(
         model = train_model(
             animal, variant, path, workers=workers, n_images=n_images, progress=progress
         )
-    typer.echo(f"model: {model}")
+    say(f"model: {model}")
 
 
 @app.command(rich_help_panel=SESSIONS)
@@ -344,19 +313,35 @@ def suggest(
         str | None, typer.Option("--actions", metavar="FILE", help="An action model, .skops.")
     ] = None,
     n: Annotated[int, typer.Option("--n", min=1, help="How many stretches.")] = 10,
+    video: Annotated[
+        bool, typer.Option("--video", help="Make a clip of each, to look at it.")
+    ] = False,
 ) -> None:
     """List the stretches of a session most worth labelling next: where the recogniser is least
     sure.
     """
     from rich.console import Console
     from rich.table import Table
+    from rich.text import Text
 
     from liex_lab.pipelines.training.action_model import suggest as job
+    from liex_lab.sessions import Session
+    from liex_lab.sessions.videos import found_video, stretch
 
-    table = Table("from (s)", "to (s)", "taken for", "or else", "doubt")
-    for row in job(session, model=model, n=n).itertuples():
+    rows = list(job(session, model=model, n=n).itertuples())
+    if video:
+        from liex_lab.api import export_video
+
+        for row in rows:
+            export_video(session, start_s=row.start_s, stop_s=row.stop_s, overwrite=True)
+    opened = Session.open(session)
+    table = Table("from (s)", "to (s)", "taken for", "or else", "doubt", "clip")
+    for row in rows:
         numbers = (f"{row.start_s:.2f}", f"{row.stop_s:.2f}", f"{row.uncertainty:.2f}")
-        table.add_row(*numbers[:2], str(row.guess), str(row.or_else), numbers[2])
+        words = (Text(printable(row.guess)), Text(printable(row.or_else)))
+        clip = found_video(opened, stretch(row.start_s, row.stop_s))
+        name = Text("" if clip is None else printable(clip.name))
+        table.add_row(*numbers[:2], *words, numbers[2], name)
     Console().print(table)
 
 
@@ -391,53 +376,7 @@ def live(
     tell_numbers(result, json_file)
 
 
-@app.command(rich_help_panel=START)
-def show(
-    session: SessionPath,
-    web: Annotated[
-        bool, typer.Option("--web", help="In the browser, where Rerun calls tel.rerun.io.")
-    ] = False,
-    at_s: Annotated[
-        float | None, typer.Option("--at", metavar="S", min=0.0, help="Open it at this time.")
-    ] = None,
-) -> None:
-    """Open a session's replay in Rerun."""
-    from liex_lab.sessions import Session
-    from liex_lab.sessions.viewer import has_screen, replays_with, show_replay
-
-    replay = Session.open(session).path / "session.rrd"
-    if at_s is not None:
-        if web:
-            raise typer.BadParameter(
-                "a moment can be shown in a window only; leave out --web or --at"
-            )
-        show_replay(replay, at_s).wait()
-        return
-    if not web and not has_screen():
-        raise LiexError(
-            f"Rerun needs a screen and there is none here; open {replay} on a computer that has "
-            "one, or add --web"
-        )
-    # RERUN_ANALYTICS: what a laboratory looks at is nobody else's business; the viewer in a browser
-    # does not heed it
-    if web:
-        typer.echo(
-            "Rerun's viewer in the browser calls tel.rerun.io, its makers' count of uses; the "
-            "window does not"
-        )
-    shown = [str(file) for file in replays_with(replay)]
-    command = [
-        sys.executable,
-        "-m",
-        "rerun",
-        *shown,
-        "--bind",
-        "127.0.0.1",
-        *(["--web-viewer"] if web else []),
-    ]
-    raise typer.Exit(
-        subprocess.run(command, env={**os.environ, "RERUN_ANALYTICS": "0"}, check=False).returncode
-    )
+app.command(rich_help_panel=START)(show)
 
 
 @app.command(rich_help_panel=MODELS)
@@ -472,7 +411,7 @@ def info(
             for name, card in models.items()
         }
         tell_numbers(facts, None)
-        typer.echo("`liex info --all` lists every package and how the models were made")
+        say("`liex info --all` lists every package and how the models were made")
         return
     facts |= {
         f"model {name}: {key}": value
@@ -487,8 +426,13 @@ def main() -> None:
     ours shows itself.
     """
     os.environ.setdefault("RUST_LOG", _RUST_LOG)
+    if told := liex_lab._KERNELS_TOLD:
+        typer.echo(f"note: {printable(told)}", err=True)
     try:
-        app()
+        with ending():
+            app()
+    except Ended as ended:
+        _fail(str(ended), ended.exit_code)
     except LiexError as error:
         _fail(str(error), error.exit_code)
     except OSError as error:
@@ -506,7 +450,7 @@ def main() -> None:
 
 
 def _fail(sentence: str, code: int = 1) -> NoReturn:
-    typer.secho(f"liex: {sentence}", fg=typer.colors.RED, err=True)
+    typer.secho(f"liex: {printable(sentence)}", fg=typer.colors.RED, err=True)
     sys.exit(code)
 
 
@@ -515,21 +459,24 @@ def _fault() -> NoReturn:
     _fail("this is a fault of liex_lab and not of yours; please report the lines above", FAULT)
 
 
-def _tell_session(session: Path) -> None:
+def _tell_session(session: Path, further: str = "") -> None:
     """Where the session is, and how it went; exit code 4 where someone has to look at it."""
     from liex_lab.sessions.older import taken_from
     from liex_lab.sessions.verdict import read_verdict
 
-    typer.echo(f"session: {session}")
+    say(f"session: {session}")
     if copy := taken_from(session):
-        typer.echo(f"note: the corrections of {copy} were taken over; see `liex correct list`")
+        say(f"note: the corrections of {copy} were taken over; see `liex correct list`")
     report = session / "report.html"
     if report.is_file():
-        typer.echo(f"report:  {report}")
-    typer.echo(f"replay:  liex show {session}")
+        say(f"report:  {report}")
+        say(f"figures: {session / 'figures'}")
+    say(f"replay:  liex show {shlex.quote(str(session))}")
+    if further:
+        say(further)
     verdict = read_verdict(session)
     if verdict["sentence"]:
         colour = typer.colors.YELLOW if verdict["look_at_it"] else None
-        typer.secho(f"result:  {verdict['sentence']}", fg=colour)
+        typer.secho(f"result:  {printable(verdict['sentence'])}", fg=colour)
     if verdict["look_at_it"] and not verdict["accepted"]:
         raise typer.Exit(MisfitError.exit_code)

@@ -8,6 +8,8 @@ from typing import Annotated, Any
 
 import typer
 
+from liex_lab.errors import printable
+
 RecordingPath = Annotated[
     Path, typer.Argument(metavar="RECORDING", help="A file, a folder, or synthetic:walk.")
 ]
@@ -67,6 +69,11 @@ def region_setting(region: str | None) -> list[str]:
     return [f"arena.region={corners}"]
 
 
+def say(text: object) -> None:
+    """A line on the screen, whatever names of files it quotes."""
+    typer.echo(printable(text))
+
+
 def tell_numbers(result: dict[str, Any], json_file: Path | None) -> None:
     """The numbers as a table on the screen, and as JSON where a file was named."""
     if json_file is not None:
@@ -78,7 +85,8 @@ def tell_numbers(result: dict[str, Any], json_file: Path | None) -> None:
     table = Table(show_header=False)
     for name, value in result.items():
         said = to_json(value) if isinstance(value, dict) else str(value)
-        table.add_row(name, Text(f"{value:.4g}" if isinstance(value, float) else said))
+        said = f"{value:.4g}" if isinstance(value, float) else said
+        table.add_row(Text(printable(name)), Text(printable(said)))
     Console().print(table)
 
 
@@ -88,7 +96,7 @@ def tell_rows(rows: dict[str, dict[str, Any]]) -> None:
     lines = [["", *(name.replace("_", " ") for name in columns)], ["---"] * (len(columns) + 1)]
     lines += [[name, *(_cell(row.get(column)) for column in columns)] for name, row in rows.items()]
     for line in lines:
-        typer.echo(f"| {' | '.join(line)} |")
+        say(f"| {' | '.join(line)} |")
 
 
 def _cell(value: Any) -> str:
@@ -112,25 +120,26 @@ def to_json(result: Any) -> str:
     return json.dumps(plain(result), indent=2, allow_nan=False, ensure_ascii=False)
 
 
-def told_scores(report: dict[str, Any]) -> list[str]:
-    """Scores of recognised actions (`actions.scores.timeline_scores`) as sentences.
+def tell_scores(report: dict[str, Any]) -> None:
+    """Scores of recognised actions (`actions.scores.timeline_scores`): a sentence and a table.
 
     Args:
         report: the scores of leave-one-animal-out; empty where there are none.
     """
-    if not report:
-        return []
     if "macro_f1" not in report:
-        return [f"{name}: {value}" for name, value in report.items()]
-    told = [
+        for name, value in report.items():
+            typer.echo(f"{name}: {value}")
+        return
+    from rich.console import Console
+    from rich.table import Table
+
+    typer.echo(
         "Each animal's actions were recognised by what the others taught: macro F1 of the frames "
         f"{report['macro_f1']:.2f}, F1 of bouts that overlap by half {report['segment_f1_50']:.2f}."
-    ]
+    )
+    table = Table("action", "bouts", "F1", "of what was called so, is", "of what is, found")
     for word, one in report["per_action"].items():
         if "bouts" in one:
-            n = one["bouts"]
-            told.append(
-                f"  {word}: F1 {one['f1']:.2f}, {one['precision']:.0%} of what was called so is, "
-                f"{one['recall']:.0%} of it was found; {n} {'bout' if n == 1 else 'bouts'}"
-            )
-    return told
+            shares = (f"{one['precision']:.0%}", f"{one['recall']:.0%}")
+            table.add_row(word, str(one["bouts"]), f"{one['f1']:.2f}", *shares)
+    Console().print(table)

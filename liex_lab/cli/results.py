@@ -9,6 +9,7 @@ from typing import Annotated
 
 import typer
 
+from liex_lab.cli.options import say
 from liex_lab.runtime.progress import progress_bar
 
 
@@ -34,10 +35,10 @@ def compare(
     """Compare groups of animals: the test that the design allows, effect sizes, and n at every
     level.
     """
-    from liex_lab.pipelines.compare import compare_sessions
+    from liex_lab.api import compare_groups
 
     with progress_bar() as progress:
-        found = compare_sessions(
+        found = compare_groups(
             places,
             out,
             measures or (),
@@ -57,8 +58,9 @@ def compare(
             else row["refused"]
         )
         n = f"{row['n_units_first']} and {row['n_units_second']} units ({row['unit'] or 'none'})"
-        typer.echo(f"{row['measure']}, {row['contrast']}: {numbers}; {n}\n    {p}")
-    typer.echo(f"tables: {found['folder']}")
+        say(f"{row['measure']}, {row['contrast']}: {numbers}; {n}\n    {p}")
+    say(f"tables: {found['folder']}")
+    say(f"figures: {len(found['figures'])} files in {found['folder'] / 'figures'}")
 
 
 def report(
@@ -69,15 +71,53 @@ def report(
     """Write a session's report.html again, with what people corrected since."""
     from liex_lab.dashboards.report.report import write_report
 
-    typer.echo(f"report: {write_report(session)}")
+    say(f"report: {write_report(session)}")
+
+
+def figures(
+    place: Annotated[
+        Path,
+        typer.Argument(
+            metavar="PLACE", help="A session, a study, a folder with sessions, or a comparison."
+        ),
+    ],
+    only: Annotated[
+        list[str] | None,
+        typer.Option("--only", metavar="NAME", help="Only this figure; repeatable."),
+    ] = None,
+    formats: Annotated[
+        list[str] | None,
+        typer.Option("--format", metavar="FORMAT", help="svg, pdf or png; repeatable."),
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", metavar="DIR", help="The folder for them; PLACE/figures."),
+    ] = None,
+) -> None:
+    """Draw figures for a paper: occupancy, trajectory, ethogram, transitions, groups and others."""
+    from liex_lab.api import draw_figures
+
+    with progress_bar() as progress:
+        found = draw_figures(
+            place, only=only or (), formats=formats or ("svg", "pdf"), out=out, progress=progress
+        )
+    if found["empty"]:
+        say(f"note: there is nothing to draw of {', '.join(found['empty'])}")
+    say(f"figures: {len(found['files'])} files in {found['folder']}")
 
 
 def export(
-    session: Annotated[
-        Path, typer.Argument(metavar="SESSION", help="A session folder, NAME.liex.")
+    places: Annotated[
+        list[Path],
+        typer.Argument(metavar="SESSION...", help="Session folders, NAME.liex."),
     ],
     to: Annotated[
-        str, typer.Option("--to", metavar="FORMAT", help="nwb, boris, dlc, movement, sleap or csv.")
+        str,
+        typer.Option(
+            "--to",
+            metavar="FORMAT",
+            help="nwb, boris, dlc, movement, sleap, csv, xlsx or video.",
+        ),
     ],
     out: Annotated[
         Path | None,
@@ -88,11 +128,50 @@ def export(
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Replace what is there under this name.")
     ] = False,
+    actions: Annotated[
+        list[str] | None,
+        typer.Option("--action", metavar="WORD", help="Video: clips of this action; repeatable."),
+    ] = None,
+    groups: Annotated[
+        list[str] | None,
+        typer.Option("--group", metavar="NAME", help="Video: only this group; repeatable."),
+    ] = None,
+    start_s: Annotated[
+        float | None, typer.Option("--from", metavar="S", min=0.0, help="Video: from this time on.")
+    ] = None,
+    stop_s: Annotated[
+        float | None, typer.Option("--until", metavar="S", min=0.0, help="Video: until this time.")
+    ] = None,
+    slower: Annotated[
+        float, typer.Option("--slower", metavar="N", help="Video: so many times slower.")
+    ] = 1.0,
 ) -> None:
-    """Write a session for another program: NWB, BORIS, DeepLabCut, movement, SLEAP, or every table
-    as CSV.
+    """Write sessions for another program: NWB, BORIS, DeepLabCut, movement, SLEAP, every table as
+    CSV or in one Excel workbook; or as a video, with several beside each other.
     """
     from liex_lab.exchange import export as job
     from liex_lab.sessions import Session
 
-    typer.echo(f"export: {job(Session.open(session), to, out, overwrite=overwrite)}")
+    if to == "video":
+        from liex_lab.api import export_video
+
+        with progress_bar() as progress:
+            video = export_video(
+                places,
+                out,
+                actions=actions or (),
+                groups=groups or (),
+                start_s=start_s,
+                stop_s=stop_s,
+                slower=slower,
+                overwrite=overwrite,
+                progress=progress,
+            )
+        say(f"export: {video}")
+        return
+    if actions or groups or start_s is not None or stop_s is not None or slower != 1.0:
+        raise typer.BadParameter(
+            "actions, groups and times are chosen for `--to video`; the other formats hold all"
+        )
+    for place in places:
+        say(f"export: {job(Session.open(place), to, out, overwrite=overwrite)}")

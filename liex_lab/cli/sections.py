@@ -18,10 +18,27 @@ STUDIES = "Many sessions"
 RECORDINGS = "Recordings"
 MODELS = "Models and accuracy"
 _ORDER = (START, SESSIONS, STUDIES, RECORDINGS, MODELS)
+# within its section a verb stands where people need it; one that is not named here stands last
+_OF_WORK = (
+    *("demo", "doctor", "run", "show"),
+    *("report", "correct", "describe", "suggest", "export", "verify"),
+    *("cohort", "compare", "dashboard"),
+    *("convert", "live"),
+    *("info", "train", "evaluate"),
+)
 
 
 class SectionedGroup(TyperGroup):
     """Verbs under the headings that they name; verbs without one stand last."""
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        """The verbs' names in the order of work.
+
+        Args:
+            ctx: click's context of the command line.
+        """
+        names = super().list_commands(ctx)
+        return sorted(names, key=lambda name: _OF_WORK.index(name) if name in _OF_WORK else 99)
 
     # the types are click's, or those of the copy of click that newer Typers carry
     def format_commands(self, ctx: Any, formatter: Any) -> None:

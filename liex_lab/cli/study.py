@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from liex_lab.cli.options import say
 from liex_lab.runtime.progress import progress_bar
 
 if TYPE_CHECKING:
@@ -58,7 +59,7 @@ def cohort(
     if study == "init":
         from liex_lab.pipelines.study.init import begin_study
 
-        typer.echo(f"study: {begin_study(folder or Path(), overwrite)}")
+        say(f"study: {begin_study(folder or Path(), overwrite)}")
         return
     if folder is not None:
         raise typer.BadParameter(
@@ -78,7 +79,7 @@ def cohort(
     )
     failed = _tell_study(standings, dry_run)
     if failed and not dry_run:
-        typer.echo(f"to try what failed again: liex cohort {shlex.quote(study)} --retry")
+        say(f"to try what failed again: liex cohort {shlex.quote(study)} --retry")
         raise typer.Exit(SOME_FAILED)
 
 
@@ -104,7 +105,7 @@ def dashboard(
     from liex_lab.api import serve_dashboard
 
     def told(address: str) -> None:
-        typer.echo(f"dashboard: {address}   (Ctrl+C ends it)")
+        say(f"dashboard: {address}   (Ctrl+C ends it)")
         if open_browser:
             import webbrowser
 
@@ -131,7 +132,7 @@ def verify(
     with progress_bar() as progress:
         findings = verify_session(session, recording, progress=progress)
     for finding in findings:
-        typer.echo(f"{finding.state:6}{finding.sentence}")
+        say(f"{finding.state:6}{finding.sentence}")
     if any(finding.state == "wrong" for finding in findings):
         raise typer.Exit(1)
 
@@ -146,11 +147,11 @@ def _tell_study(standings: list[SessionStatus], all_of_them: bool) -> int:
         state = "done, look at it" if look else one.state
         counts[state] = counts.get(state, 0) + 1
         if look:
-            typer.echo(f"{'done':9}{one.session.id}  {one.reason}")
+            say(f"{'done':9}{one.session.id}  {one.reason}")
         elif all_of_them or one.state not in ("done", "excluded"):
             remedy = f"; {one.failure['remedy']}" if one.failure and one.state == "failed" else ""
-            typer.echo(f"{one.state:9}{one.session.id}  {one.reason}{remedy}".rstrip())
-    typer.echo(
+            say(f"{one.state:9}{one.session.id}  {one.reason}{remedy}".rstrip())
+    say(
         f"{len(standings)} sessions: "
         + ", ".join(f"{n} {state}" for state, n in sorted(counts.items()))
     )

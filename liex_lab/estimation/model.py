@@ -30,6 +30,7 @@ from liex_lab.estimation.ridge_correction import N_OTHERS
 from liex_lab.forests._kernels import number_nodes
 from liex_lab.forests.forest import Forest, check_forest, check_roots
 from liex_lab.mlp import Network, check_layers
+from liex_lab.runtime.npz import check_npz
 
 N_CLUES = 22  # of `scoring.clue_samples`, the residuals apart
 SCHEMA = 3  # of a model that tells which way an animal faces; 2 of one that does not
@@ -176,6 +177,7 @@ class Model:
         """
         try:
             # opened here, for numpy leaves a damaged archive open
+            check_npz(path, _MOST_BYTES)
             with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
                 head = json.loads(archive["head"].tobytes())
                 if head.get("schema", 0) > SCHEMA:
@@ -326,6 +328,7 @@ def _check_numbers(where: str, values: Any) -> None:
 
 
 _HUGE = 1e12
+_MOST_BYTES = 1 << 30  # of a model unpacked: ten times the largest bundled one
 _MOST = 10_000
 # how often each is done, or how many there are, at least
 _COUNTS = {

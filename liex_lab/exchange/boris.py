@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from liex_lab.sessions import Session
+from liex_lab.sessions.videos import found_video, video_path
 
 VERSION = "7.0"
 _MEDIA = "1"  # BORIS' first player
@@ -26,15 +27,20 @@ def write(session: Session, path: Path) -> None:
         path: the .boris file to write.
     """
     path.write_text(
-        json.dumps(project(session), indent=1, ensure_ascii=False) + "\n", encoding="utf-8"
+        json.dumps(project(session, path.parent), indent=1, ensure_ascii=False) + "\n",
+        encoding="utf-8",
     )
 
 
-def project(session: Session) -> dict[str, Any]:
+def project(session: Session, folder: Path | None = None) -> dict[str, Any]:
     """The project as BORIS keeps it, ready for JSON.
+
+    It names the session's video where one was made (`liex export --to video`).
 
     Args:
         session: the session.
+        folder: the folder of the project, in which BORIS looks for the video first; None names the
+            video by its whole path.
     """
     about = session.metadata
     subject = about["individual"]
@@ -58,7 +64,7 @@ def project(session: Session) -> dict[str, Any]:
             "0": {"key": "1", "name": subject, "description": about["animal"]["name"]}
         },
         "behaviors_conf": behaviours,
-        "observations": {session.name: _observation(session, subject)},
+        "observations": {session.name: _observation(session, subject, folder)},
         "behavioral_categories": [],
         "behavioral_categories_config": {},
         "independent_variables": {},
@@ -83,10 +89,22 @@ def _behaviour(word: str, meaning: str, place: int) -> dict[str, Any]:
     }
 
 
-def _observation(session: Session, subject: str) -> dict[str, Any]:
-    """The recording as a media file that BORIS need not find, and two rows per bout."""
+def _media(session: Session, folder: Path | None) -> str:
+    """The video as BORIS finds it: seen from the project's folder where it lies there.
+
+    Without a video the recording's name, which BORIS need not find.
+    """
+    beside = None if folder is None else video_path(folder, session.name)
+    if beside is not None and beside.is_file():
+        return beside.name
+    made = found_video(session)
+    return str(session.metadata["input"]["name"]) if made is None else str(made.resolve())
+
+
+def _observation(session: Session, subject: str, folder: Path | None) -> dict[str, Any]:
+    """The video as the media file, and two rows per bout."""
     frames = session.metadata["frames"]
-    name = session.metadata["input"]["name"]
+    name = _media(session, folder)
     bouts = session.bouts
     times = bouts[["start_s", "stop_s"]].to_numpy(float)
     indices = bouts[["start_frame", "stop_frame"]].to_numpy(int)

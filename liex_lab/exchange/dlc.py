@@ -14,6 +14,7 @@ import pandas as pd
 
 from liex_lab.exchange.poses import Array, Poses, write_times
 from liex_lab.sessions import Session
+from liex_lab.tables.spreadsheets import write_csv
 
 SCORER = "liex_lab"
 
@@ -27,11 +28,11 @@ def write(session: Session, path: Path) -> None:
     """
     poses = Poses.of(session)
     path.mkdir()
-    table(poses, poses.xyz_mm, "xyz").to_csv(path / "poses_3d.csv", lineterminator="\n")
+    write_csv(table(poses, poses.xyz_mm, "xyz"), path / "poses_3d.csv", index=True)
     flat = np.concatenate([poses.uv_px, poses.score[..., None]], axis=-1)
-    table(poses, flat, ("x", "y", "likelihood")).to_csv(path / "poses_2d.csv", lineterminator="\n")
+    write_csv(table(poses, flat, ("x", "y", "likelihood")), path / "poses_2d.csv", index=True)
     write_times(path / "times.csv", poses)
-    session.bouts.to_csv(path / "bouts.csv", index=False, lineterminator="\n")
+    write_csv(session.bouts, path / "bouts.csv")
 
 
 def table(poses: Poses, values: Array, coords: str | tuple[str, ...]) -> pd.DataFrame:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import difflib
-import os
-import shutil
 from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
 
-from liex_lab.errors import SessionError
+from liex_lab.errors import SessionError, how_to_install
+from liex_lab.runtime.durable import replacing
+from liex_lab.runtime.places import inside
 from liex_lab.sessions import Session
 
 # target -> (module, ending of what it writes, what it is)
@@ -36,8 +36,12 @@ TARGETS: dict[str, tuple[str, str, str]] = {
         "_csv",
         "a folder with every table as CSV, and columns.json",
     ),
+    "xlsx": (
+        "liex_lab.exchange.tables_xlsx",
+        ".xlsx",
+        "an Excel workbook with every table as a sheet, and what every column means",
+    ),
 }
-_EXTRA = "this needs further packages; install them with `pip install 'liex_lab[exchange]'`"
 
 
 def export(
@@ -57,6 +61,10 @@ def export(
         SessionError: the format is not known, a file is there already, or packages are missing.
     """
     if to not in TARGETS:
+        if to == "video":
+            raise SessionError(
+                "a video is no file of another program; `liex_lab.api.export_video` writes it"
+            )
         near = difflib.get_close_matches(to, TARGETS, 1)
         hint = f"did you mean '{near[0]}'? " if near else ""
         raise SessionError(
@@ -66,34 +74,22 @@ def export(
     folder = session.path if out is None else Path(out)
     if folder.exists() and not folder.is_dir():
         raise SessionError(
-            f"{folder} is a file, and exports go into a folder; name another one with --out"
+            f"{folder} is a file, and exports go into a folder; name another one (--out, in "
+            "Python out=)"
         )
     folder.mkdir(parents=True, exist_ok=True)
-    path = folder / f"{session.name}{ending}"
+    path = inside(folder, session.name, ending)
     if path.exists() and not overwrite:
         raise SessionError(
-            f"{path} exists already; name another place with --out, or say --overwrite"
+            f"{path} exists already; name another place (--out, in Python out=), or say "
+            "--overwrite (in Python overwrite=True)"
         )
-    part = folder / f".{os.getpid()}.part-{path.name}"
     try:
         writer: Callable[[Session, Path], None] = import_module(home).write
-        writer(session, part)
-        _replace(part, path)
+        with replacing(path, replace_folder=True) as part:
+            writer(session, part)
     except ImportError as error:
-        raise SessionError(f"to write {to}, {error.name} is missing: {_EXTRA}") from None
-    finally:
-        _remove(part)
+        raise SessionError(
+            f"to write {to}, {error.name} is missing; {how_to_install('exchange')}"
+        ) from None
     return path
-
-
-def _replace(part: Path, path: Path) -> None:
-    if path.is_dir():
-        shutil.rmtree(path)
-    os.replace(part, path)
-
-
-def _remove(part: Path) -> None:
-    if part.is_dir():
-        shutil.rmtree(part, ignore_errors=True)
-    else:
-        part.unlink(missing_ok=True)

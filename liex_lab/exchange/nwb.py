@@ -92,7 +92,8 @@ def _start(session: Session) -> datetime:
     if moment is None or moment.tzinfo is None:
         raise SessionError(
             f"NWB wants to know when a session began, with time zone, and {session.name} does not "
-            "say; run it again with --set session.session_start_time=2026-08-21T10:00:00+02:00"
+            "say; tell it with `liex describe SESSION "
+            "session_start_time=2026-08-21T10:00:00+02:00` (in Python describe_session)"
         )
     return moment
 

@@ -8,7 +8,10 @@ from __future__ import annotations
 import shutil
 from pathlib import Path
 
+from liex_lab.runtime.places import inside
 from liex_lab.sessions import Session
+from liex_lab.sessions.reading import reading_from
+from liex_lab.tables.spreadsheets import copy_harmless, write_csv
 
 
 def write(session: Session, path: Path) -> None:
@@ -24,7 +27,8 @@ def write(session: Session, path: Path) -> None:
     ):
         if name.endswith(".parquet"):
             table = name.removesuffix(".parquet")
-            session.table(table).to_csv(path / f"{table}.csv", index=False, lineterminator="\n")
-    for name in ("summary.csv", "columns.json"):
-        if session.has(name):
-            shutil.copyfile(session.file(name), path / name)
+            write_csv(session.table(table), inside(path, table, ".csv"))
+    if session.has("summary.csv"):
+        with reading_from(session.file("summary.csv")) as summary:
+            copy_harmless(summary, path / "summary.csv")
+    shutil.copyfile(session.file("columns.json"), path / "columns.json")

@@ -16,33 +16,27 @@ lump on the floor that the moving animal touches in nearly every frame.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from liex_lab.arena.floor import Floor
-from liex_lab.arena.scene import Scene, find_fixtures, region_corners, roughness
+from liex_lab.arena.floor import Floor, near_plane
 from liex_lab.body.skeleton import MOUSE_VIEW, VIEWS, View
 from liex_lab.errors import EstimationError
 from liex_lab.foreground import _height_map_kernels as kernels
 from liex_lab.foreground._blob_kernels import MAX_BLOBS
 from liex_lab.foreground.background import learn_background, sample_frames, stride_for
-from liex_lab.foreground.crop_camera import pack_crop_cameras
-from liex_lab.foreground.height_maps import HeightMaps
-from liex_lab.foreground.segmenter import Segmenter
+from liex_lab.foreground.cable import Cable
+from liex_lab.foreground.floor_level import FloorLevel, wandering
 from liex_lab.foreground.standing import Standing, find_standing
+from liex_lab.foreground.still_scene import StillScene
+from liex_lab.foreground.unread_floor import unread_floor
 from liex_lab.optics.camera import Camera
 from liex_lab.recordings.recording import Recording
-from liex_lab.runtime.shapes import check_shapes
-from liex_lab.runtime.threads import threads
 
 Array = NDArray[np.float64]
 
 SPREADS = 3.0  # an animal stands out by this many standard deviations of the background's own noise
-# of the logarithms, from posture to posture of one animal
-_AREA_SD = 0.25
-_VOLUME_SD = 0.2
 # of the frames: a lump that the animal touches that often is a part of it that keeps still
 _TOUCH_SHARE = 0.9
 _OTHER = 3.0  # times larger or smaller is another thing
@@ -54,46 +48,64 @@ _LARGER = 1.5
 
 
 @dataclass(frozen=True)
-class BackgroundSubtraction(Segmenter):
-    """The empty scene of one camera, and the depth nearer than which a reading is the animal.
+class _Ground:
+    """What a sample of frames says of the empty scene.
 
     Attributes:
-        camera: the ideal pinhole camera of the recording.
-        floor: the floor plane in that camera's frame.
-        background: (H, W) float32 mm, depth of the empty scene, 0 where unknown.
-        limit: (H, W) float32 mm; a reading below it is in front of the background.
-        on_floor: (H, W) bool, the floor, under which nothing lies, as far as the picture shows it:
-            an animal stands on it with at least a part of its body.
-        area_mm2: the animal's usual area seen from above, mm^2; 0 while unknown.
-        volume_mm3: the animal's usual volume under its back, mm^3; 0 while unknown.
-        view: how such animals are looked at.
-        stride: only every so many-th row and column of the picture is looked at; H and W count
-            those.
-        standing: how the floor was found, None where it was given.
+        background: (H, W) float32 mm, 0 where unknown.
+        spread: (H, W) float32 mm, its standard deviation.
+        near: (H, W) float32 mm, the nearest usual depth.
+        standing: the floor that was found.
+        px_mm2: area of a pixel on it, mm^2.
     """
 
-    camera: Camera
-    floor: Floor
     background: NDArray[np.float32]
-    limit: NDArray[np.float32]
-    on_floor: NDArray[np.bool_]
-    area_mm2: float = 0.0
-    volume_mm3: float = 0.0
-    view: View = MOUSE_VIEW
-    stride: int = 1
-    standing: Standing | None = None
+    spread: NDArray[np.float32]
+    near: NDArray[np.float32]
+    standing: Standing
+    px_mm2: float
 
-    @cached_property
-    def grid(self) -> Camera:
-        """The camera whose pixels are looked at: every `stride`-th of the picture."""
-        return self.camera.every(self.stride)
+    @staticmethod
+    def learn(
+        sample: NDArray[np.float32],
+        camera: Camera,
+        spine_mm: tuple[float, float],
+        min_height_mm: float,
+        view: View,
+        stated: Floor | None,
+        region: NDArray[np.bool_] | None,
+    ) -> _Ground:
+        """The ground in a sample (n, H, W) mm; region (H, W) is where it is looked at, if stated.
 
-    @cached_property
-    def _grid_floor(self) -> Floor:
-        """The floor as that camera sees it."""
-        if self.stride == 1:
-            return self.floor
-        return Floor.from_plane(self.floor.normal, self.floor.distance_mm, self.grid)
+        Raises:
+            EstimationError: no depth was read, nothing comes back often enough, or no floor was
+                found.
+        """
+        background, spread, near = learn_background(sample)
+        _check_background(sample, background)
+        standing = find_standing(
+            sample, background, spread, camera, spine_mm, min_height_mm, view, stated
+        )
+        if region is not None:
+            standing = replace(standing, region=region, on_floor=standing.on_floor & region)
+        if standing.region is not None:  # what lies around is not looked at
+            background = np.where(standing.region, background, np.float32(0))
+            near = np.where(standing.region, near, np.float32(0))
+        px_mm2 = standing.floor.distance_mm**2 / (camera.fx * camera.fy)
+        return _Ground(background, spread, near, standing, px_mm2)
+
+    @property
+    def level(self) -> FloorLevel:
+        """The level of its bare floor."""
+        bare = self.standing.floor.depth(*self.background.shape[::-1])
+        return FloorLevel.on(
+            self.background, self.standing.on_floor & near_plane(self.background, bare)
+        )
+
+
+@dataclass(frozen=True)
+class BackgroundSubtraction(StillScene):
+    """The empty scene of one camera as it was learned from a recording, see `StillScene`."""
 
     @staticmethod
     def from_floor(
@@ -152,19 +164,22 @@ class BackgroundSubtraction(Segmenter):
         sample = sample_frames(recording, n_frames, stride)
         if region is not None:
             sample *= region[::stride, ::stride]
-        background, spread, near = learn_background(sample)
-        _check_background(sample, background)
         grid = recording.camera.every(stride)
         stated = None if floor is None else Floor.from_plane(floor.normal, floor.distance_mm, grid)
-        standing = find_standing(
-            sample, background, spread, grid, spine_mm, min_height_mm, view, stated
-        )
-        if region is not None:
-            cut = region[::stride, ::stride]
-            standing = replace(standing, region=cut, on_floor=standing.on_floor & cut)
-        if standing.region is not None:  # what lies around is not looked at
-            background = np.where(standing.region, background, np.float32(0))
-            near = np.where(standing.region, near, np.float32(0))
+        cut = None if region is None else region[::stride, ::stride]
+        stands = view.frame == VIEWS[0]  # one that floats may be seen before anything
+        ground = _Ground.learn(sample, grid, spine_mm, min_height_mm, view, stated, cut)
+        level = None
+        if stands and (wander := wandering(ground.level.of(sample))) is not None:
+            first, range_mm = wander
+            levels = ground.level.of(sample) - first
+            sample = ground.level.brought_back(sample, levels)
+            ground = _Ground.learn(sample, grid, spine_mm, min_height_mm, view, stated, cut)
+            level = replace(ground.level, wander_mm=range_mm)
+        background = ground.background
+        spread = ground.spread
+        near = ground.near
+        standing = ground.standing
         seen = standing.floor
         floor = (
             seen
@@ -173,13 +188,17 @@ class BackgroundSubtraction(Segmenter):
         )
         bare = seen.depth(grid.width, grid.height)
         on_floor = standing.on_floor
+        if stands:
+            least_px = view.area[0] * spine_mm[0] ** 2 / ground.px_mm2
+            dark = unread_floor(sample, background, bare, on_floor, min_height_mm, least_px)
+            background = np.where(dark, np.float32(0), background)
+            spread = np.where(dark, np.float32(0), spread)
         background = np.where((background == 0) & on_floor, bare, background)
         # the rims and walls around the floor flicker between near and far: there, nearer than ever
         # is what counts
         behind = np.where(on_floor, background, near)
         margin = np.maximum(np.float32(min_height_mm), np.float32(SPREADS) * spread)
         limit = np.maximum(behind - margin, 0).astype(np.float32)
-        stands = view.frame == VIEWS[0]  # one that floats may be seen before anything
         over = on_floor if stands else np.ones_like(on_floor)
         scene = BackgroundSubtraction(
             recording.camera,
@@ -190,7 +209,14 @@ class BackgroundSubtraction(Segmenter):
             view=view,
             stride=stride,
             standing=standing,
+            level=level,
         )
+        if stands:
+            smallest = view.area[0] * spine_mm[0] ** 2
+            cable = Cable.find(sample, limit, grid, seen, spine_mm[1], smallest)
+            if cable is not None:
+                sample = cable.cut(sample, limit)
+                scene = replace(scene, cable=cable)
         area, share = scene._moving_area(sample, spine_mm, min_height_mm)
         moves = share >= 0.5 or (share > 0.0 and standing.moves)
         if share < 0.5:  # perhaps it sits in its own background: compare with the floor itself
@@ -310,7 +336,7 @@ class BackgroundSubtraction(Segmenter):
         """
         import cv2
 
-        bare = self._grid_floor.depth(self.grid.width, self.grid.height)
+        bare = self.grid_floor.depth(self.grid.width, self.grid.height)
         lump = self.on_floor & (self.background > 0) & (bare - self.background > min_height_mm)
         n, labels, stats, _ = cv2.connectedComponentsWithStats(lump.astype(np.uint8))
         crops = replace(self, area_mm2=area).extract(sample, 1.0)
@@ -394,179 +420,6 @@ class BackgroundSubtraction(Segmenter):
             n_blobs[start : start + 16] = crops.n_blobs
         alone = n_blobs == 1 if (n_blobs == 1).sum() >= 5 else n_blobs > 0
         return float(np.median(volume[alone]))
-
-    def described(self) -> Scene:
-        """The scene as it is written to session.json, without its outline."""
-        floor = self._grid_floor
-        bare = floor.depth(self.grid.width, self.grid.height)
-        rough = roughness(self.background, bare, self.on_floor)
-        fixtures = find_fixtures(self.background, floor, self.grid, self.on_floor)
-        standing = self.standing
-        if standing is None:
-            return Scene(self.floor, roughness_mm=rough, fixtures=fixtures)
-        return Scene(
-            self.floor,
-            standing.origin,
-            standing.support if standing.moves else None,
-            standing.n_things,
-            standing.n_together,
-            rough,
-            region_corners(standing.region, self.stride),
-            fixtures=fixtures,
-            doubts=(standing.doubt,) if standing.doubt else (),
-        )
-
-    def every(self, step: int) -> BackgroundSubtraction:
-        """The same segmenter for pictures of every `step`-th row and column.
-
-        Args:
-            step: pixels from one to the next, at least 1.
-        """
-        camera = self.camera.every(step)
-        cut = (slice(None, None, step), slice(None, None, step))
-        floor = Floor.from_plane(self.floor.normal, self.floor.distance_mm, camera)
-        return replace(
-            self,
-            camera=camera,
-            floor=floor,
-            background=np.ascontiguousarray(self.background[cut]),
-            limit=np.ascontiguousarray(self.limit[cut]),
-            on_floor=np.ascontiguousarray(self.on_floor[cut]),
-        )
-
-    def misfit(self, crops: HeightMaps) -> Array:
-        """How unlike the animal each height map (n,) is in size: squared standard deviations.
-
-        The sum of ((log a - log a0) / 0.25)^2 over area and ((log v - log v0) / 0.2)^2 over volume,
-        from posture to posture of one animal. An animal that swims or is held up is judged by its
-        area alone: what is below it is not its own.
-
-        Args:
-            crops: n height maps.
-        """
-        area = np.maximum(crops.blobs.area_mm2, 1.0)
-        volume = np.maximum(crops.blobs.volume_mm3, 1.0)
-        if (
-            self.view.frame != VIEWS[0]
-        ):  # what is below an animal that swims or is held up is not its own
-            return (np.log(area / self.area_mm2) / _AREA_SD) ** 2
-        return (np.log(area / self.area_mm2) / _AREA_SD) ** 2 + (
-            np.log(volume / self.volume_mm3) / _VOLUME_SD
-        ) ** 2
-
-    def view_rotation(self, camera_view: bool) -> Array:
-        """Rotation (3, 3) of T_view_camera: the arena's, or that of an upright camera frame.
-
-        Args:
-            camera_view: whether heights are measured along the optical axis.
-        """
-        return np.diag([1.0, -1.0, -1.0]) if camera_view else self.floor.T_arena_camera.rotation
-
-    def planes(self, crops: HeightMaps, camera_view: bool = False) -> Array:
-        """The plane above which each height map is measured: the floor, or one behind the animal.
-
-        Args:
-            crops: n height maps.
-            camera_view: as they were extracted.
-
-        Returns:
-            (n, 3) a, b, c of 1 / z = a u + b v + c, per mm, u and v in pixels of the picture.
-        """
-        if not camera_view:
-            return np.tile(self.floor.inverse_depth, (len(crops.step), 1))
-        level = np.zeros((len(crops.step), 3))
-        level[:, 2] = 1.0 / crops.distance
-        return level
-
-    def middles(self, crops: HeightMaps, camera_view: bool = False) -> Array:
-        """The centroid (n, 3) mm of what each height map shows, in the arena frame.
-
-        Args:
-            crops: n height maps.
-            camera_view: as they were extracted.
-        """
-        middle = crops.centroid
-        if camera_view:  # the view's frame is not the arena's
-            middle[:, 2] -= crops.distance
-            middle = self.floor.T_arena_camera @ (middle @ self.view_rotation(camera_view))
-        return middle
-
-    def crop_cameras(self, crops: HeightMaps, camera_view: bool = False) -> Array:
-        """The crop cameras of height maps.
-
-        Each says how its map was cut: intrinsics, T_view_camera, origin and step of the crop.
-
-        Args:
-            crops: n height maps.
-            camera_view: as they were extracted.
-
-        Returns:
-            (n, 17), packed as `CropCamera`.
-        """
-        camera = self.camera
-        return pack_crop_cameras(
-            np.array([camera.fx, camera.fy, camera.cx, camera.cy]),
-            self.view_rotation(camera_view),
-            crops.distance,
-            crops.origin,
-            crops.step,
-        )
-
-    def _check(self, depths: NDArray[np.float32]) -> None:
-        """Refuse frames of another size than those that the scene was learned from."""
-        check_shapes("frames of this scene", ("depths", depths, ("n", *self.limit.shape)))
-
-    def _extract(
-        self,
-        depths: NDArray[np.float32],
-        size: float,
-        parallel: bool,
-        camera_view: bool,
-        n_things: int,
-    ) -> HeightMaps:
-        """Height maps of the components whose areas are nearest to the animal's own.
-
-        Heights are measured above the floor, or (camera_view) from the view's behind_mm behind the
-        animal's mean depth, as the paper's features see them.
-
-        Args:
-            depths: (n, H, W) float32 mm, whole pictures, or a sample of them with the scene's own
-                stride.
-            size: the animal's spine length over the skeleton's home length; scales the smoothing.
-            parallel: whether to use all threads, else one.
-            camera_view: whether heights are measured along the optical axis.
-            n_things: candidates a frame, 1 or 2.
-
-        Returns:
-            The rows (n) of the likeliest components, and then (n_things 2) those of the next;
-            origin, step and n_px are in pixels of the whole picture.
-        """
-        if depths.shape[1:] != self.limit.shape:
-            depths = depths[:, :: self.stride, :: self.stride]
-        self._check(depths)
-        crops = HeightMaps.blank(n_things * len(depths), self.floor.distance_mm)
-        grid = self.grid
-        with threads(parallel):
-            kernels.extract_all(
-                depths,
-                self.limit,
-                self.on_floor,
-                self.area_mm2,
-                n_things,
-                camera_view,
-                kernels.Sight(
-                    np.array([grid.fx, grid.fy, grid.cx, grid.cy]),
-                    self._grid_floor.inverse_depth,
-                    self.view_rotation(camera_view),
-                    behind_mm=self.view.behind_mm if camera_view else 0.0,
-                    smooth_mm=self.view.smooth_mm * size,
-                ),
-                crops.rows,
-            )
-        if self.stride > 1:  # told in pixels of the picture
-            for values, factor in ((crops.origin, 1), (crops.step, 1), (crops.n_px, self.stride)):
-                values *= self.stride * factor
-        return crops
 
 
 def _check_background(sample: NDArray[np.float32], background: NDArray[np.float32]) -> None:

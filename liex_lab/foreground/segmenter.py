@@ -74,6 +74,19 @@ class Segmenter(ABC):
         n = len(depths)
         return crops[:n], crops[n:]
 
+    def cleared(self, depths: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Pictures without what the animal wears, 0 there; the same where it wears nothing.
+
+        Args:
+            depths: (n, H, W) float32 mm, whole pictures, 0 where unread.
+        """
+        return depths
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """What was found in the pictures and undone, in sentences; nothing where they are clean."""
+        return ()
+
     @abstractmethod
     def crop_cameras(self, crops: HeightMaps, camera_view: bool = False) -> Array:
         """The crop cameras (n, 17) of height maps, packed as `CropCamera`.

@@ -38,6 +38,15 @@ class SE3:
     rotation: Array
     translation: Array
 
+    def __repr__(self) -> str:
+        batch = np.shape(self.translation)[:-1]
+        if batch:
+            return f"<SE3: a batch of {' x '.join(map(str, batch))} rigid transforms>"
+        cosine = (np.trace(self.rotation) - 1.0) / 2.0
+        angle = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
+        x, y, z = self.translation
+        return f"<SE3: turned by {angle:.1f} degrees, moved by ({x:.1f}, {y:.1f}, {z:.1f}) mm>"
+
     @staticmethod
     def identity(*batch: int) -> SE3:
         """The identity, or a batch of identities.

@@ -65,7 +65,7 @@ class Plan(Table):
         session: facts about the animal and the day.
         actions: who names what the animal does.
         behaviour: where one behaviour ends and the next begins.
-        replay: what the Rerun replay holds.
+        replay: what the replays hold.
     """
 
     seed: int = Field(0, ge=0, description="all randomness of a run comes from this number")
@@ -81,6 +81,20 @@ class Plan(Table):
     actions: Actions = Actions()
     behaviour: Behaviour = Behaviour()
     replay: Replay = Replay()
+
+    def __repr__(self) -> str:
+        usual = Plan()
+        said = [f"seed={self.seed}"] if self.seed != usual.seed else []
+        for table in type(self).model_fields:
+            if table != "seed":
+                mine, other = getattr(self, table), getattr(usual, table)
+                said += [
+                    f"{table}.{key}={value!r}"
+                    for key, value in mine
+                    if value != getattr(other, key) and (table, key) != ("animal", "name")
+                ]
+        unlike = f"; unlike the defaults: {', '.join(said)}" if said else ", all else by default"
+        return f"<Plan for the {self.animal.name}{unlike}>"
 
     @staticmethod
     def load(plan: str | Path) -> Plan:

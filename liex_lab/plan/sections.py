@@ -176,7 +176,9 @@ class ArenaFacts(Table):
 
     zones: str | None = Field(
         None,
-        description="path of a TOML file with named zones, circles and polygons; see the README",
+        description=(
+            "path of a TOML file with named zones, circles and polygons; see docs/howto/zones.md"
+        ),
     )
 
 
@@ -351,14 +353,24 @@ class Behaviour(Table):
 
 
 class Replay(Table):
-    """[replay]: what the Rerun replay, session.rrd, holds."""
+    """[replay]: what the replays, session.rrd and session.mcap, hold."""
 
-    depth: bool = Field(
-        True, description="the depth pictures; without them it takes a hundredth of the room"
+    depth: Literal["animal", "arena", "all", "none"] = Field(
+        "animal",
+        description=(
+            "of the depth pictures: animal, what is around it, before the still scene; arena, its "
+            "region; all, whole pictures, ten times the room; or none"
+        ),
     )
     candidates: bool = Field(
         False, description="every pose that single frames thought possible, too"
     )
+
+    @field_validator("depth", mode="before")
+    @classmethod
+    def _in_words(cls, value: Any) -> Any:
+        """Plans of earlier versions said whether there was to be depth at all."""
+        return {True: "all", False: "none"}[value] if isinstance(value, bool) else value
 
 
 class Actions(Table):

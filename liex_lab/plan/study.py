@@ -15,11 +15,13 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path, PurePosixPath
 from typing import Annotated, Any
+from urllib.parse import parse_qsl
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from liex_lab.errors import PlanError, StudyError
 from liex_lab.plan import Plan, known_plans
+from liex_lab.runtime.places import named_beside
 
 # as in NeuroBlueprint: letters and digits alone, so that no name is a path, a formula or markup
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9]{1,64}$")]
@@ -178,6 +180,14 @@ class Study:
     path: Path
     table: StudyTable
 
+    def __repr__(self) -> str:
+        groups = ", ".join(sorted({animal.group for animal in self.table.animals if animal.group}))
+        return (
+            f"<Study {self.name}: {len(self.table.animals)} animals"
+            f"{f' in the groups {groups}' if groups else ''}, "
+            f"{len(self.table.sessions)} sessions, {self.path}>"
+        )
+
     @staticmethod
     def load(path: str | Path) -> Study:
         """Read the study in a TOML file.
@@ -216,8 +226,12 @@ class Study:
         except ValidationError as error:
             raise StudyError(f"{path}: {_sentence(error)}") from None
         for one in study.table.sessions:
+            what = f"the recording of {one.animal} {one.session}"
             if not one.recording.startswith(VIRTUAL):
-                study.inside(one.recording, f"the recording of {one.animal} {one.session}")
+                study.inside(one.recording, what)
+            for key, value in parse_qsl(one.recording.partition("?")[2]):
+                if key == "animal" and one.recording.startswith(VIRTUAL):
+                    study.inside(value, f"the animal in {what}")
         return study
 
     @property
@@ -272,20 +286,13 @@ class Study:
         Raises:
             StudyError: the path is absolute, begins with ~ or a drive, or has a part '..'.
         """
-        parts = PurePosixPath(text.replace("\\", "/")).parts
-        bad = (
-            "\0" in text
-            or text.startswith(("/", "\\", "~"))
-            or ".." in parts
-            or (len(text) > 1 and text[1] == ":")
-        )
-        if bad:
+        if not named_beside(text):
             raise StudyError(
                 f"{self.path}: {what} is '{text}', and a study names only what is in its own "
                 f"folder {self.folder}; move or link it there and write the path from there, "
                 "without .."
             )
-        return self.folder.joinpath(*parts)
+        return self.folder.joinpath(*PurePosixPath(text.replace("\\", "/")).parts)
 
     def _planned(self, animal: StudyAnimal, one: StudySession) -> PlannedSession:
         id = f"sub-{animal.id}_ses-{one.session}"

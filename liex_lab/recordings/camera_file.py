@@ -19,6 +19,7 @@ from liex_lab.recordings.depth_units import ENCODINGS, Stored, decode, own_unit_
 from liex_lab.recordings.frame import Depth
 from liex_lab.recordings.timestamp_files import UNITS
 from liex_lab.recordings.timestamps import start_of_day
+from liex_lab.runtime.places import named_beside
 
 CAMERA_FILE = "camera.toml"
 WHAT_TO_WRITE = (
@@ -29,6 +30,7 @@ WHAT_TO_WRITE = (
 _INTRINSICS = ("fx", "fy", "cx", "cy")
 _NUMBERS = (*_INTRINSICS, "width", "height", "unit_mm", "fps")
 _TEXTS = ("timestamps", "pattern", "subject_id", "session_start_time", "distortion_model")
+_FOCAL_PX = (1e-3, 1e7)  # far beyond any camera
 _WORDS: dict[str, tuple[str, ...]] = {  # keys that take one of a few words
     "encoding": ENCODINGS,
     "byte_order": ("big", "little"),
@@ -190,9 +192,9 @@ def rate(fps: float | None, where: str) -> float | None:
         fps unchanged.
 
     Raises:
-        RecordingError: it is not in (0, 100000].
+        RecordingError: it is not in [0.0001, 100000].
     """
-    if fps is not None and not (math.isfinite(fps) and 0 < fps <= 100_000):
+    if fps is not None and not (math.isfinite(fps) and 1e-4 <= fps <= 100_000):
         raise RecordingError(
             f"{where} states fps = {fps:g}; a frame rate is a positive number of frames per second"
         )
@@ -209,10 +211,10 @@ def _from_table(path: Path, table: dict[str, Any], problems: tuple[str, ...]) ->
                 f"{path} states {key} = {numbers[key]:g}; it is a positive whole number of pixels"
             )
     for key in ("fx", "fy"):
-        if key in numbers and not numbers[key] > 0:
+        if key in numbers and not _FOCAL_PX[0] < numbers[key] < _FOCAL_PX[1]:
             raise RecordingError(
                 f"{path} states {key} = {numbers[key]:g}; a focal length is a positive number of "
-                "pixels"
+                "pixels, some hundreds of most cameras"
             )
     if numbers.get("unit_mm", 1.0) == 0.0:
         raise RecordingError(
@@ -236,6 +238,11 @@ def _from_table(path: Path, table: dict[str, Any], problems: tuple[str, ...]) ->
             raise RecordingError(
                 f"{path} states {key} = {table[key]!r}; it is a text in quotation marks"
             )
+    if not named_beside(table.get("timestamps", "timestamps.csv")):
+        raise RecordingError(
+            f"{path} states timestamps = {table['timestamps']!r}; it is a file in the recording's "
+            "own folder, written from there without .."
+        )
     metadata = {"subject_id": table["subject_id"]} if "subject_id" in table else {}
     if "session_start_time" in table:
         start = start_of_day(table["session_start_time"])

@@ -1,6 +1,7 @@
 """Dispatch from a path to the reader of its format: the one entry point to depth recordings.
 
-The format is told from the name of a file, or from the names in a folder; the reader's module and
+The format is told from the name of a file, or from the names in a folder (an MCAP file, such as an
+archive by `liex pack`, under any name); the reader's module and
 its libraries are imported only when they are needed.
 """
 
@@ -42,6 +43,7 @@ _FILES = (
 # an address of a virtual recording; rendering stands above reading, so it is named only here
 _RENDERED = "synthetic:"
 _RENDERER = "liex_lab.simulation.address"
+_MCAP = b"\x89MCAP0\r\n"
 _WITH_PATTERN = "images.folder.open_images"
 _WITH_TOPICS = ("messages.mcap.open_mcap", "messages.rosbag.open_bag")
 _RAYTRIX = (
@@ -116,7 +118,7 @@ def open_recording(
         camera: comes before whatever the files state; a `Lens` for pictures of any size.
         fps: frame rate, Hz; used only where the files hold no time stamps.
         topic: the depth topic to read of an MCAP file or a ROS bag with several of them.
-        pattern: which pictures of a folder to take, as in "*.tif", before a camera.toml.
+        pattern: which pictures of a folder to take, as in `*.tif`, before a camera.toml.
         strict: refuse a recording that is cut short, instead of only saying so in `problems` and
             `truncated`.
         progress: told while an archive is unpacked or an index made.
@@ -160,7 +162,7 @@ def _open(path: Path, how: _How) -> Recording:
 
     if looks_like_nyu(path.parent, [path.name]):
         return how.open("images.nyu.open_nyu", path)
-    if (where := _reader(path.name)) is not None:
+    if (where := _reader(path.name) or _told_by_content(path)) is not None:
         if not path.stat().st_size:
             raise RecordingError(f"{path} is empty; copy the recording again")
         return how.open(where, path)
@@ -172,6 +174,12 @@ def _open(path: Path, how: _How) -> Recording:
 
 def _reader(name: str, files: dict[str, str] = _FILES) -> str | None:
     return next((where for end, where in files.items() if name.lower().endswith(end)), None)
+
+
+def _told_by_content(path: Path) -> str | None:
+    """The reader of a file whose name says nothing and whose first bytes are those of MCAP."""
+    with path.open("rb") as file:
+        return _FILES[".mcap"] if file.read(len(_MCAP)) == _MCAP else None
 
 
 def _open_folder(folder: Path, how: _How) -> Recording:

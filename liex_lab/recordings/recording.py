@@ -124,6 +124,16 @@ class Recording:
         self._close = None if close is None else weakref.finalize(self, close)
 
     @property
+    def sources(self) -> tuple[Path, ...]:
+        """The files of the input; none of a recording that is in no file."""
+        return self._sources
+
+    @property
+    def stamp_faults(self) -> NDArray[np.uint8]:
+        """(n,) which stamps were moved and why, an index into `timestamps.FAULTS`; a copy."""
+        return self._faults.copy()
+
+    @property
     def n_whole(self) -> int:
         """How many of the frames are whole."""
         return int(self._whole_frames.sum())

@@ -8,6 +8,7 @@ height and width (u32), little endian, then H * W float32 mm, row by row.
 from __future__ import annotations
 
 import json
+import math
 import socket
 import struct
 import threading
@@ -16,11 +17,11 @@ from collections.abc import Callable, Iterator
 from contextlib import closing
 from dataclasses import dataclass
 from queue import Queue
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from liex_lab.errors import RecordingError
+from liex_lab.errors import LiexError, RecordingError
 from liex_lab.optics.camera import Camera
 from liex_lab.recordings.frame import DepthFrame
 from liex_lab.recordings.recording import Recording
@@ -28,7 +29,10 @@ from liex_lab.recordings.recording import Recording
 _FRAME = struct.Struct("<qqII")  # index, time ns, height, width; then float32 mm, row by row
 _HEAD = struct.Struct("<I")  # length of the greeting, JSON
 _POLL_S = 0.02
-_GREETING_S = 10.0
+_GREETING_S = 10.0  # for the whole of it
+_FRAME_S = 30.0  # for the whole of a frame that has begun
+_PATIENCE_S = 300.0  # for the next frame
+_MOST_PX = 1 << 24  # of a camera
 _LONGEST_GREETING = 1 << 20
 _MOST_WAITING = 128  # frames that have come and were not asked for yet; then the sender waits
 
@@ -160,27 +164,39 @@ def received(host: str, port: int) -> Arriving:
         raise RecordingError(
             f"nobody sends frames at {host}:{port} ({error}); start the sender first"
         ) from None
-    greeting = _greeting(link, f"{host}:{port}")
-    link.settimeout(None)  # the first frame may be long in the making; who is gone closes the link
+    where = f"{host}:{port}"
+    try:
+        name, camera = _greeting(link, where)
+    except BaseException:
+        link.close()
+        raise
     link.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
-    return Arriving(greeting["name"], Camera.from_dict(greeting["camera"]), _stamped(_frames(link)))
+    return Arriving(name, camera, _stamped(_frames(link, camera, where)))
 
 
-def _greeting(link: socket.socket, where: str) -> dict[str, Any]:
-    """What a sender says first."""
-    head = _exactly(link, _HEAD.size)
+def _greeting(link: socket.socket, where: str) -> tuple[str, Camera]:
+    """What a sender says first: the recording's name and its camera."""
+    by = time.monotonic() + _GREETING_S
+    head = _exactly(link, _HEAD.size, by)
     length = _HEAD.unpack(head)[0] if head else 0
     try:
-        said = json.loads(_exactly(link, length)) if 0 < length < _LONGEST_GREETING else None
-    except ValueError:
-        said = None
-    if not isinstance(said, dict) or not {"name", "camera"} <= set(said):
-        link.close()
+        said = json.loads(_exactly(link, length if length < _LONGEST_GREETING else 0, by))
+        name = said["name"]
+        camera = Camera.from_dict(said["camera"])
+        size = (camera.width, camera.height)
+        sound = isinstance(name, str) and all(type(n) is int and n > 0 for n in size)
+        sound = sound and size[0] * size[1] <= _MOST_PX
+        sound = sound and all(
+            math.isfinite(getattr(camera, key)) for key in ("fx", "fy", "cx", "cy")
+        )
+    except (ValueError, TypeError, KeyError, AttributeError, RecursionError, LiexError):
+        sound = False
+    if not sound:
         raise RecordingError(
             f"what is at {where} does not send depth frames as `replayed` does: no greeting with "
-            "name and camera came; check the port"
+            f"name and camera came within {_GREETING_S:g} s; check the port"
         )
-    return said
+    return name, camera
 
 
 def _stamped(frames: Iterator[Arrival]) -> Iterator[Arrival]:
@@ -188,17 +204,20 @@ def _stamped(frames: Iterator[Arrival]) -> Iterator[Arrival]:
 
     So a frame's time is when it came and not when it was asked for.
     """
-    waiting: Queue[Arrival | None] = Queue(_MOST_WAITING)
+    waiting: Queue[Arrival | RecordingError | None] = Queue(_MOST_WAITING)
 
     def fetch() -> None:
         try:
             for arrival in frames:
                 waiting.put(arrival)
-        finally:
             waiting.put(None)
+        except RecordingError as error:
+            waiting.put(error)
 
     threading.Thread(target=fetch, daemon=True).start()
     while (arrival := waiting.get()) is not None:
+        if isinstance(arrival, RecordingError):
+            raise arrival
         yield arrival
 
 
@@ -226,29 +245,43 @@ def _send(server: socket.socket, recording: Recording, speed: float) -> None:
                 return
 
 
-def _frames(link: socket.socket) -> Iterator[Arrival]:
+def _frames(link: socket.socket, camera: Camera, where: str) -> Iterator[Arrival]:
+    """Frames of the camera's size, each whole in time."""
     with link:
-        while head := _exactly(link, _FRAME.size):
+        while True:
+            head = _exactly(link, _FRAME.size, time.monotonic() + _PATIENCE_S)
+            if not head:
+                return
             index, time_ns, height, width = _FRAME.unpack(head)
+            if (width, height) != (camera.width, camera.height):
+                raise RecordingError(
+                    f"{where} sends a frame of {width} x {height} pixels, and its camera has "
+                    f"{camera.width} x {camera.height}; correct the sender"
+                )
             depth = np.empty((height, width), np.float32)
-            if not _fill(link, depth.data.cast("B")):
+            if not _fill(link, depth.data.cast("B"), time.monotonic() + _FRAME_S):
                 return
             yield Arrival(DepthFrame(index, time_ns, depth), time.perf_counter())
 
 
-def _exactly(link: socket.socket, n: int) -> bytes:
-    """The next n bytes, none where the sender has gone."""
+def _exactly(link: socket.socket, n: int, by: float) -> bytes:
+    """The next n bytes, none where the sender has gone or they have not come in time."""
     data = bytearray(n)
-    return bytes(data) if _fill(link, memoryview(data)) else b""
+    return bytes(data) if _fill(link, memoryview(data), by) else b""
 
 
-def _fill(link: socket.socket, place: memoryview) -> bool:
-    """Receive bytes until the buffer is full; False where the sender has gone.
+def _fill(link: socket.socket, place: memoryview, by: float) -> bool:
+    """Receive bytes until the buffer is full; False where the sender has gone, or time is over.
 
-    They go straight to where they stay, for a frame has millions of them.
+    They go straight to where they stay, for a frame has millions of them. `by` is a time of
+    `time.monotonic`, s: one who sends a byte now and then does not hold us for ever.
     """
     filled = 0
     while filled < len(place):
+        left = by - time.monotonic()
+        if left <= 0:
+            return False
+        link.settimeout(left)
         try:
             n = link.recv_into(place[filled:])
         except OSError:

@@ -25,6 +25,7 @@ CLOCK_JUMP_NS = (
 # frames on either side that tell a lasting jump of the clock from a few stamps out of order
 _SURE = 5
 _LONGEST_STEP_NS = 10**9
+LATEST_NS = 2**32 * 10**9  # the year 2106: what the replays' messages can state
 LIMIT_NS = 2**62  # the year 2116 on the usual clock; leaves room for sums in int64
 _PLAUSIBLE_START_NS = (
     946_684_800 * 10**9
@@ -236,6 +237,21 @@ def _join_clocks(times_ns: Times) -> tuple[Times, NDArray[np.int64]]:
     steps = np.zeros(len(times_ns), np.int64)
     steps[jumps] = shifts
     return times_ns + np.cumsum(steps), np.array(jumps, np.int64)
+
+
+def unwritable_times(times_ns: Times) -> str:
+    """Why the stamps of a recording cannot be written into a session; "" where they can.
+
+    Args:
+        times_ns: (n,) stamps, ns.
+    """
+    if not len(times_ns) or (times_ns.min() >= 0 and times_ns.max() < LATEST_NS):
+        return ""
+    return (
+        f"the time stamps go from {times_ns.min() * 1e-9:.6g} s to {times_ns.max() * 1e-9:.6g} s, "
+        "and a session takes those from 0 s (the year 1970) to 4294967295 s (2106); shift them, so "
+        "that the first one is 0 or a date"
+    )
 
 
 def _fewest_moved(times_ns: Times) -> Times:

@@ -12,7 +12,11 @@ import errno
 import os
 import shutil
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+
+from liex_lab.runtime.places import unlinked
 
 # shares and file systems on which this cannot be asked for
 _NOT_HERE = {errno.EINVAL, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS}
@@ -33,8 +37,20 @@ def sync_tree(folder: Path) -> None:
         for name in sorted(names):
             file = Path(inside, name)
             if file.is_file() and not file.is_symlink():
-                _sync(file, os.O_RDWR if sys.platform == "win32" else os.O_RDONLY)
+                sync_file(file)
         sync_folder(Path(inside))
+
+
+def sync_file(file: Path) -> None:
+    """Synchronise the content of a file to disk.
+
+    Args:
+        file: the file.
+
+    Raises:
+        OSError: the disk is full or broken.
+    """
+    _sync(file, os.O_RDWR if sys.platform == "win32" else os.O_RDONLY)
 
 
 def sync_folder(folder: Path) -> None:
@@ -50,6 +66,59 @@ def sync_folder(folder: Path) -> None:
     """
     if sys.platform != "win32":
         _sync(folder, os.O_RDONLY)
+
+
+@contextmanager
+def replacing(path: Path, replace_folder: bool = False) -> Iterator[Path]:
+    """A name beside a place to write a file or folder under; it gets its place when it is whole.
+
+    What was written is synchronised to disk before it is renamed: after a kill or a power cut the
+    place holds what was there before, or all of the new. If the block fails, nothing stays.
+
+    Args:
+        path: the place. A symbolic link there is refused and never followed.
+        replace_folder: whether a folder may be there, which goes for the new one.
+
+    Yields:
+        The name to write under; nothing is there.
+
+    Raises:
+        PlaceError: a symbolic link lies at the place.
+        OSError: it cannot be written, synchronised or renamed.
+    """
+    part = unlinked(path).with_name(f".{os.getpid()}.{path.name}")
+    _remove(part)
+    try:
+        yield part
+        if part.is_dir():
+            sync_tree(part)
+        else:
+            sync_file(part)
+        if path.is_dir() and replace_folder:
+            put_in_place(part, path, path.with_name(f".{path.name}.old"))
+        else:
+            part.replace(path)
+            sync_folder(path.parent)
+    except OSError as error:
+        if error.filename is None:
+            error.filename = str(path)  # writing does not tell what was written
+        raise
+    finally:
+        _remove(part)
+
+
+def write_whole(path: Path, text: str) -> None:
+    """Write a text file atomically, so that nobody ever reads half of it.
+
+    It is written under another name beside its place, synchronised to disk and renamed. After a
+    power cut it is the old one or the new one.
+
+    Args:
+        path: the file; one that is there is replaced.
+        text: its content, written as UTF-8.
+    """
+    with replacing(path) as part:
+        part.write_text(text, encoding="utf-8")
 
 
 def put_in_place(new: Path, place: Path, aside: Path) -> None:
@@ -117,6 +186,14 @@ def discard(folder: Path) -> None:
     if folder.is_dir():
         folder.rename(gone)
         shutil.rmtree(gone, ignore_errors=True)
+
+
+def _remove(path: Path) -> None:
+    """Remove a file, a link or a folder, where one is there."""
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        path.unlink(missing_ok=True)
 
 
 def _sync(path: Path, flags: int) -> None:

@@ -11,6 +11,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Protocol
 
+from liex_lab.errors import printable
+
 
 class Progress(Protocol):
     """Whoever wants to know how far a job is."""
@@ -57,7 +59,7 @@ def progress_bar() -> Iterator[Progress]:
     console = Console(stderr=True)
     columns = (
         SpinnerColumn(),
-        TextColumn("{task.description}"),
+        TextColumn("{task.description}", markup=False),
         BarColumn(),
         TaskProgressColumn(),
         TimeRemainingColumn(),
@@ -74,7 +76,7 @@ def progress_bar() -> Iterator[Progress]:
             if total != last[1] or done < last[0]:
                 display.reset(task, total=total)  # a new stage: its remaining time is its own
             last = (done, total)
-            display.update(task, completed=done, total=total, description=what)
+            display.update(task, completed=done, total=total, description=printable(what))
 
         yield report
 
@@ -222,14 +224,18 @@ def progress_board(n_jobs: int) -> Iterator[Board]:
     from rich.text import Text
 
     console = Console(stderr=True)
-    board = Board(n_jobs, lambda line: console.print(Text(line), highlight=False, soft_wrap=True))
+    board = Board(
+        n_jobs, lambda line: console.print(Text(printable(line)), highlight=False, soft_wrap=True)
+    )
 
     def draw() -> Table:
         grid = Table.grid(padding=(0, 2))
         for name, share in [*board.lines, ("all", board.share)]:
             filled = round(30 * share)
             grid.add_row(
-                Text(name), Text("█" * filled + "·" * (30 - filled)), Text(f"{100 * share:.0f} %")
+                Text(printable(name)),
+                Text("█" * filled + "·" * (30 - filled)),
+                Text(f"{100 * share:.0f} %"),
             )
         left = board.left_s
         grid.add_row(Text("" if left is None else f"about {_span(left)} left"))

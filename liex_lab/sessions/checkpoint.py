@@ -22,9 +22,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.errors import SessionError
+from liex_lab.runtime.durable import sync_file, sync_tree, write_whole
+from liex_lab.runtime.lock import take_lock
 from liex_lab.runtime.memory import mapped
-from liex_lab.sessions.failure import write_whole
-from liex_lab.sessions.lock import take_lock
+from liex_lab.runtime.places import unlinked, unlinked_tree
 
 # between two checkpoints: as much work is lost at most, besides what it takes to begin
 EVERY_S = 3.0
@@ -92,7 +93,7 @@ class Checkpoint:
         Raises:
             SessionError: another process is writing the session.
         """
-        folder.mkdir(parents=True, exist_ok=True)
+        unlinked_tree(folder).mkdir(parents=True, exist_ok=True)
         check_free(folder)
         held = take_lock(folder / _LOCK)
         if held is None:  # taken in between
@@ -179,6 +180,10 @@ class Checkpoint:
         self.state.runs += 1  # the next part, not begun yet
 
     def _keep(self, state: State) -> None:
+        """Note what is there, once it is on disk: a power cut leaves nothing that is not."""
+        sync_tree(self.folder / _SEEN)
+        for log, sizes in state.logs.items():
+            sync_file(self.part(log, len(sizes) - 1))
         write_whole(self.folder / _STATE, json.dumps(vars(state)))
         self.state, self._last = state, self._clock()
 
@@ -418,7 +423,7 @@ def hash_once(recording: Recording, folder: Path, progress: Progress) -> None:
     began = time.monotonic()
     digest = recording.digest(progress)
     if stamp and time.monotonic() - began > EVERY_S:
-        folder.mkdir(parents=True, exist_ok=True)
+        unlinked(folder).mkdir(parents=True, exist_ok=True)
         write_whole(folder / _INPUT, json.dumps({"stamp": stamp, "sha256": digest}))
 
 

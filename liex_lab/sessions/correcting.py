@@ -28,6 +28,8 @@ from liex_lab.sessions.corrections import (
 from liex_lab.tables.rows import frame_count, stop_times
 
 if TYPE_CHECKING:
+    from liex_lab.recordings.recording import Recording
+    from liex_lab.sessions.cutouts import Kept
     from liex_lab.sessions.session import Session
 
 Array = NDArray[np.float64]
@@ -100,9 +102,10 @@ def joint_move_at_pixel(
         v_px: row, px; 0 is the centre of the first one.
 
     Raises:
-        SessionError: the pixel is outside the picture or has no depth, or see `joint_move`.
+        SessionError: the pixel is outside the picture, or of what the session keeps of it, or has
+            no depth, or see `joint_move`.
     """
-    from liex_lab.recordings import open_recording
+    from liex_lab.sessions.cutouts import Kept, open_pictures
 
     row, _ = _joint_row(session, frame, joint)
     camera = session.camera
@@ -116,14 +119,21 @@ def joint_move_at_pixel(
             f"a pixel is a column and a row of the depth picture of {camera.width} x "
             f"{camera.height}, the top-left one (0, 0); got ({u_px:g}, {v_px:g})"
         )
-    with open_recording(session.path / "session.mcap") as recording:
+    kept = Kept(session)
+    if not kept.holds(row, u_px, v_px):
+        raise SessionError(
+            f"pixel ({u_px:g}, {v_px:g}) of frame {frame} is outside of the cut-out that the "
+            "session keeps of it, and shows the still scene; give the joint's place in mm, or run "
+            "`liex run` on the recording again with --set replay.depth=all"
+        )
+    with open_pictures(session) as recording:
         skin_mm = depth_under(recording.frame(row).depth, u_px, v_px)
         if math.isnan(skin_mm):
             raise SessionError(
                 f"frame {frame} has no depth at pixel ({u_px:g}, {v_px:g}); choose one beside it, "
                 "or give the joint's place in mm"
             )
-        inset_mm = _inset_mm(session, recording, joint)
+        inset_mm = _inset_mm(session, recording, kept, joint)
     place = camera.unproject(np.array([u_px, v_px]), np.array(skin_mm + inset_mm))
     return joint_move(session, frame, joint, session.T_arena_camera @ place)
 
@@ -142,7 +152,7 @@ def depth_under(depth: NDArray[Any], u_px: float, v_px: float) -> float:
     return float(np.median(near[near > 0])) if (near > 0).any() else math.nan
 
 
-def _inset_mm(session: Session, recording: Any, joint: str) -> float:
+def _inset_mm(session: Session, recording: Recording, kept: Kept, joint: str) -> float:
     """How much farther from the camera than the skin seen at its pixel a joint usually is, mm."""
     frames = session.frames
     poses = session.poses[session.poses["joint"] == joint]
@@ -160,6 +170,8 @@ def _inset_mm(session: Session, recording: Any, joint: str) -> float:
     into = session.T_arena_camera.inverse()
     found = []
     for row in chosen:
+        if not kept.holds(int(row), *uv[row]):
+            continue  # what is seen there is the still scene
         seen = depth_under(recording.frame(int(row)).depth, *uv[row])
         found.append((into @ places[row])[2] - seen)
     known = np.array(found)[np.isfinite(found)]

@@ -21,6 +21,7 @@ from typing import Any, ClassVar
 
 from liex_lab.catalog import sha256
 from liex_lab.errors import SessionError
+from liex_lab.runtime.places import safe_name
 from liex_lab.sessions.listed import WHO
 
 FOLDER = "corrected"
@@ -379,6 +380,8 @@ def read_log(session: Path) -> Log:
             and all(isinstance(one, dict) for one in (*files.values(), *facts.values()))
         ):
             raise TypeError("files and facts are tables of tables")
+        if any(safe_name(name) != name for name in files):
+            raise ValueError("files outside of its folder")
         if not set(facts) <= FACTS:
             raise ValueError(f"facts of {', '.join(sorted(set(facts) - FACTS))}")
         return Log(str(document["made_of"]), entries, files, facts)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import zipfile
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -17,6 +17,7 @@ from liex_lab.body.skeleton import Skeleton
 from liex_lab.errors import SessionError
 from liex_lab.recordings.timestamps import Gap
 from liex_lab.runtime.memory import blocks
+from liex_lab.runtime.npz import check_npz
 from liex_lab.sessions.provenance import Provenance
 from liex_lab.sessions.reading import reading_from
 from liex_lab.tables.rows import LOST
@@ -30,7 +31,9 @@ if TYPE_CHECKING:
     from liex_lab.sessions.session import Session
 
 FILE = "observations.npz"
-_LATER = ("covered", "beside")  # columns that sessions of earlier versions do not hold
+_LATER = ("covered", "beside", "behind")  # columns that sessions of earlier versions do not hold
+_BYTES_PER_JOINT = 1 << 10  # of a frame; several times what there are
+_SPARE_BYTES = 1 << 26  # for the skeleton and its mesh
 _BLOCK = 16_384  # frames that are in memory at a time
 
 
@@ -78,7 +81,11 @@ def read_skeleton(session: Session) -> Skeleton | None:
     path = session.path / FILE
     if not path.is_file():
         return None
-    with reading_from(path), path.open("rb") as file, np.load(file, allow_pickle=False) as kept:
+    with (
+        reading_from(path),
+        _opened(path, session) as file,
+        np.load(file, allow_pickle=False) as kept,
+    ):
         return Skeleton.from_table(json.loads(kept["subject"].tobytes())["skeleton"], str(path))
 
 
@@ -101,7 +108,11 @@ def read_evidence(session: Session) -> tuple[Observations, Subject]:
             f"{session.path} does not hold what its single frames said ({FILE}), as sessions of "
             "earlier versions; run `liex run` on the recording again"
         )
-    with reading_from(path), path.open("rb") as file, np.load(file, allow_pickle=False) as kept:
+    with (
+        reading_from(path),
+        _opened(path, session) as file,
+        np.load(file, allow_pickle=False) as kept,
+    ):
         facts = json.loads(kept["subject"].tobytes())
         skeleton = Skeleton.from_table(facts["skeleton"], str(path))
         none = Observations.empty(skeleton, np.zeros(len(session.frames), np.int64))
@@ -125,6 +136,14 @@ def read_evidence(session: Session) -> tuple[Observations, Subject]:
             None if stretch is None else float(stretch),
         )
     return seen, subject
+
+
+def _opened(path: Path, session: Session) -> IO[bytes]:
+    """The file, open, once it is known to be no larger than so many frames and joints make it."""
+    n_joints = len(session.metadata["animal"]["joints"])
+    n_frames = session.metadata["frames"]["n_frames"]
+    check_npz(path, _SPARE_BYTES + n_frames * (n_joints + 1) * _BYTES_PER_JOINT)
+    return path.open("rb")
 
 
 def _check_shapes(seen: Observations, n_frames: int) -> None:

@@ -1,13 +1,8 @@
-"""Report of a session that could not be measured (failed.json): the reason and what to do about it.
-
-Also the atomic write that all small JSON files of a session use: write under another name, fsync,
-rename.
-"""
+"""Report of a session that could not be measured (failed.json): the reason and what to do."""
 
 from __future__ import annotations
 
 import json
-import os
 import platform
 import traceback
 from datetime import UTC, datetime
@@ -16,7 +11,8 @@ from typing import Any
 
 from liex_lab.errors import LiexError
 from liex_lab.runtime.disk import is_full, why_full
-from liex_lab.runtime.durable import sync_folder
+from liex_lab.runtime.durable import write_whole
+from liex_lab.runtime.places import unlinked
 from liex_lab.sessions.provenance import versions
 
 FAILED_FILE = "failed.json"
@@ -74,33 +70,8 @@ def write_failure(folder: Path, failure: dict[str, Any]) -> None:
         folder: the session folder; made if needed.
         failure: what `describe_failure` returned.
     """
-    folder.mkdir(parents=True, exist_ok=True)
+    unlinked(folder).mkdir(parents=True, exist_ok=True)
     write_whole(folder / FAILED_FILE, json.dumps(failure, indent=2, default=str) + "\n")
-
-
-def write_whole(path: Path, text: str) -> None:
-    """Write a text file atomically, so that nobody ever reads half of it.
-
-    It is written under another name beside its place, synchronised to disk and renamed. After a
-    power cut it is the old one or the new one.
-
-    Args:
-        path: the file; one that is there is replaced.
-        text: its content, written as UTF-8.
-    """
-    beside = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        with beside.open("w", encoding="utf-8") as file:
-            file.write(text)
-            file.flush()
-            os.fsync(file.fileno())
-        beside.replace(path)
-        sync_folder(path.parent)
-    except BaseException as error:
-        if isinstance(error, OSError) and error.filename is None:
-            error.filename = str(path)  # writing does not tell what was written
-        beside.unlink(missing_ok=True)
-        raise
 
 
 def read_failure(folder: Path) -> dict[str, Any] | None:

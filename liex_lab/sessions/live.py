@@ -12,7 +12,8 @@ from liex_lab.body.skeleton import Skeleton
 from liex_lab.geometry import SE3
 from liex_lab.optics.camera import Camera
 from liex_lab.recordings.frame import DepthFrame
-from liex_lab.sessions.rrd import DEPTH, IMAGE, MM_PER_UNIT, SKELETON
+from liex_lab.sessions.rrd import SKELETON
+from liex_lab.sessions.rrd_depth import DEPTH, IMAGE, MM_PER_UNIT
 from liex_lab.tracking.track import Track
 
 _DEPTH_EVERY = 5  # frames; a picture takes longer to send than a skeleton

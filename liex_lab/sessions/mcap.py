@@ -1,9 +1,10 @@
 """MCAP log of a session for Foxglove: depth, camera, skeleton, transforms, action states; metres.
 
 Messages follow Foxglove's schemas (RawImage 16UC1 in mm, CameraCalibration, FrameTransforms,
-SceneUpdate, PosesInFrame, ImageAnnotations, Log) and one JSON schema of our own for actions. Depth
-streams in as it comes; everything small is written at the end from the same track the tables are
-made of.
+SceneUpdate, PosesInFrame, ImageAnnotations, Log) and one JSON schema of our own for actions.
+Pictures are whole, for Foxglove shows one image; where the still scene stands behind cut-outs,
+Zstandard finds it in the picture before, some 50 pictures to a chunk. Depth streams in as it comes;
+everything small is written at the end from the same track the tables are made of.
 """
 
 from __future__ import annotations
@@ -33,6 +34,10 @@ Array = NDArray[np.float64]
 
 _SECOND = 10**9
 _BLOCK = 8192  # frames of a track that are in memory
+# level (0 is the usual one) and bytes of the chunks: whole pictures, one to a chunk; and those that
+# are alike but for a cut-out
+_WHOLE = (0, 128 * 1024)
+_ALIKE = (9, 32 * 1024 * 1024)
 _ACTION_SCHEMA = {
     "title": "liex_lab.ActionState",
     "description": "The action that begins now; an empty word ends the last one.",
@@ -62,24 +67,31 @@ class McapWriter:
     """
 
     def __init__(
-        self, path: Path, origin: Provenance, *, level: int = 0, chunk_size: int = 128 * 1024
+        self,
+        path: Path,
+        origin: Provenance,
+        *,
+        level: int | None = None,
+        chunk_size: int | None = None,
     ) -> None:
         """Open the file.
 
         Args:
             path: the file to write.
             origin: camera, its position and the skeleton.
-            level: Zstandard compression level, 0 for the usual one, 22 for the smallest file.
-            chunk_size: bytes packed at once.
+            level: Zstandard compression level, 0 for the usual one, 22 for the smallest file; None
+                takes what suits the pictures that are kept.
+            chunk_size: bytes packed at once; None as well.
         """
+        usual = _WHOLE if origin.background is None else _ALIKE
         self._origin = origin
         self._context = (
             foxglove.Context()
         )  # the global one would also receive every other writer's messages
         options = MCAPWriteOptions(
             compression=MCAPCompression.Zstd,
-            compression_level=level,
-            chunk_size=chunk_size,
+            compression_level=usual[0] if level is None else level,
+            chunk_size=usual[1] if chunk_size is None else chunk_size,
             compression_threads=0,
             profile="liex_lab",
         )
@@ -104,14 +116,15 @@ class McapWriter:
 
         Args:
             times_ns: times of the n frames, ns.
-            depth: n pictures (H, W) uint16 mm, 0 where unread.
+            depth: n pictures (H, W) uint16 mm, 0 where unread; none where depth is not kept.
 
         Raises:
             OSError: the system refused to write.
         """
-        for time_ns, image in zip(times_ns, depth, strict=True):
+        for time_ns in times_ns:
             if self._calibrated_ns is None or time_ns - self._calibrated_ns >= _SECOND:
                 self._log_camera(int(time_ns))
+        for time_ns, image in zip(times_ns, depth, strict=False):
             height, width = image.shape
             message = messages.RawImage(
                 timestamp=_stamp(time_ns),

@@ -8,8 +8,10 @@ from typing import Any
 
 from liex_lab.catalog import sha256
 from liex_lab.errors import SessionError
+from liex_lab.runtime.places import unlinked
 from liex_lab.sessions.checkpoint import OWN
 from liex_lab.sessions.failure import FAILED_FILE
+from liex_lab.sessions.older import aside_folder, part_folder
 
 _HASHED = {".parquet", ".csv", ".json", ".toml"}
 
@@ -25,11 +27,15 @@ def check_place(path: Path, overwrite: bool) -> None:
 
     Raises:
         SessionError: the session may not be written there.
+        PlaceError: the session's place, or one beside it that is needed, is a symbolic link.
     """
+    for place in (path, part_folder(path), aside_folder(path)):
+        unlinked(place)
     nearest = next((folder for folder in path.parents if folder.exists()), None)
     if nearest is not None and not nearest.is_dir():
         raise SessionError(
-            f"{nearest} is a file, and a session needs a folder; choose another place with --out"
+            f"{nearest} is a file, and a session needs a folder; choose another place (--out, "
+            "in Python out=)"
         )
     if not path.exists() or (
         path.is_dir() and {entry.name for entry in path.iterdir()} <= {FAILED_FILE}
@@ -37,13 +43,13 @@ def check_place(path: Path, overwrite: bool) -> None:
         return  # what failed before may be replaced
     if not (path / "session.json").is_file():
         raise SessionError(
-            f"{path} exists and is not a session, so it is left alone; choose another place with "
-            "--out"
+            f"{path} exists and is not a session, so it is left alone; choose another place "
+            "(--out, in Python out=)"
         )
     if not overwrite:
         raise SessionError(
-            f"the session {path} exists already; choose another place with --out, or say "
-            "--overwrite"
+            f"the session {path} exists already; choose another place (--out, in Python out=), or "
+            "say --overwrite (in Python overwrite=True)"
         )
 
 

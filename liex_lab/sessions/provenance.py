@@ -16,11 +16,15 @@ from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from liex_lab.arena.outline import UNKNOWN, Arena
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.errors import SessionError
 from liex_lab.geometry import SE3
 from liex_lab.optics.camera import Camera
+from liex_lab.runtime.places import storable
 
 if TYPE_CHECKING:
     from liex_lab.arena.floor import Floor
@@ -30,7 +34,7 @@ if TYPE_CHECKING:
     from liex_lab.recordings.recording import Recording
     from liex_lab.recordings.timestamps import Gap
 
-SCHEMA_VERSION = 5
+SCHEMA_VERSION = 6
 _PACKAGES = (
     "liex_lab",
     "numpy",
@@ -73,8 +77,10 @@ class Provenance:
         arena: the shape of the floor.
         zones: those that a person has drawn on it.
         scene: floor, region, fixtures and how many animals move; None where there is no floor.
-        replay_depth: whether the replay is to hold the depth.
+        replay_depth: how much of the depth the replay is to hold: 'animal', 'arena', 'all', 'none'.
         replay_candidates: whether it is to hold every hypothesis of single frames.
+        background: (H, W) uint16 mm, the still scene before which cut-outs are shown; None where
+            whole pictures are kept, or none.
     """
 
     name: str
@@ -99,8 +105,9 @@ class Provenance:
     arena: Arena = UNKNOWN
     zones: Sequence[Zone] = ()
     scene: Scene | None = None
-    replay_depth: bool = True
+    replay_depth: str = "all"
     replay_candidates: bool = False
+    background: NDArray[np.uint16] | None = field(default=None, compare=False)
 
     @staticmethod
     def of(
@@ -125,7 +132,7 @@ class Provenance:
             "batch": stated.batch,
         }
         known: dict[str, Any] = {
-            "name": stated.name or recording.name,
+            "name": storable(stated.name or recording.name),
             "skeleton": skeleton,
             "camera": recording.camera,
             "T_arena_camera": floor.T_arena_camera,
@@ -137,9 +144,9 @@ class Provenance:
             "individual": stated.individual,
             "n_frames": len(recording),
             "gaps": [*recording.gaps, *recording.faults],
-            "problems": list(recording.problems),
+            "problems": [storable(problem) for problem in recording.problems],
             "truncated": recording.truncated,
-            "subject": {name: str(value) for name, value in subject.items() if value},
+            "subject": {name: storable(str(value)) for name, value in subject.items() if value},
             "session_start_time": stated.session_start_time
             or entries.get("session_start_time")
             or "",

@@ -18,6 +18,7 @@ from liex_lab.sessions.provenance import Provenance, package_version
 from liex_lab.tables import schema as tables
 from liex_lab.tables.rows import Rows, median_step, stop_times
 from liex_lab.tables.schema import Column
+from liex_lab.tables.spreadsheets import write_csv
 from liex_lab.tracking.track import Flip
 
 if TYPE_CHECKING:
@@ -77,9 +78,7 @@ class Results:
                 continue
             if name == "summary":
                 tables.check_described(result.columns, schema, name)
-                result.map(tables.harmless).to_csv(
-                    folder / "summary.csv", index=False, lineterminator="\n"
-                )
+                write_csv(result, folder / "summary.csv")
             else:
                 tables.write_table(
                     folder / f"{name}.parquet", schema, tables.from_pandas(result), described

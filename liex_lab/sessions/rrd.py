@@ -1,9 +1,7 @@
 """Rerun replay log (.rrd): depth, skeleton, scalars and actions on timelines `frame` and `time`.
 
-Lengths are metres, the arena is right-handed with z up. Depth is stored without loss: RVL (Wilson
-2017, run-length and variable-length coding), or PNG where sensor noise makes that smaller. Depth
-streams in as it comes; everything small is written at the end from the same track the tables are
-made of.
+Lengths are metres, the arena is right-handed with z up. Depth streams in as it comes (see
+`rrd_depth`); everything small is written at the end from the same track the tables are made of.
 """
 
 from __future__ import annotations
@@ -24,24 +22,23 @@ from numpy.typing import NDArray
 from liex_lab.actions import colours
 from liex_lab.errors import SessionError
 from liex_lab.geometry import so3
-from liex_lab.recordings.rvl import rvl_message
 from liex_lab.runtime.disk import probe_full
 from liex_lab.runtime.memory import blocks
 from liex_lab.sessions.joining import RRD_HEAD, rrd_messages
 from liex_lab.sessions.provenance import Provenance
 from liex_lab.sessions.rrd_body import log_body, send_body
+from liex_lab.sessions.rrd_depth import IMAGE, MM_PER_UNIT, DepthColumns, timeline
 from liex_lab.tables.rows import Rows, constant_runs, frame_count, stop_times
 
 if TYPE_CHECKING:
     import pandas as pd
 
+    from liex_lab.sessions.cutouts import Boxes
     from liex_lab.tracking.observations import Observations
 
 Array = NDArray[np.float64]
 DepthBatch = Sequence[NDArray[np.uint16]]
 
-DEPTH = "arena/camera/image/depth"
-IMAGE = "arena/camera/image"
 OVERLAY = "arena/camera/image/overlay"
 SKELETON = "arena/skeleton"
 ROOT = "arena/root"
@@ -50,28 +47,16 @@ FLOOR = "arena/floor"
 CANDIDATES = "arena/candidates"
 ACTIONS = "ethogram/predicted"
 TRACKING = "ethogram/tracking"
-_LARGE = 0.54  # bytes per pixel: 166 kB for 640 x 480
-_PACKED_FURTHER = 0.93  # by Rerun, which packs what it writes: RVL so much, PNG not at all
-_NOISY_PNG = (
-    16,
-    1,
-    17,
-    2,
-)  # OpenCV's IMWRITE_PNG_COMPRESSION 1 and IMWRITE_PNG_STRATEGY 2, HUFFMAN_ONLY
-# pictures, and their bytes, in one message: for each message the index that ends the file takes
-# some 5 kB of memory
-_TOGETHER = 64
-_TOGETHER_BYTES = 1 << 23
 _BLOCK = 8192  # frames of small things sent in one go
 # turns in which a flush is waited for, and how long a file may stand still, where the disk has room
 _TURN_S = 2.0
 _PATIENCE_S = 120.0
-MM_PER_UNIT = 1000.0  # our depth is in mm, the scene in metres
 
 PALETTE = tuple(int(colour[1:], 16) for colour in colours.PALETTE)
 _FLAG_COLOURS = {
     "doubtful": 0xCCBB44,
     "not_found": 0xEE6677,
+    "hidden": 0xAA3377,
     "no_depth": 0xBBBBBB,
     "corrected": 0x4477AA,
 }
@@ -101,9 +86,7 @@ class ReplayWriter:
     ) -> None:
         self._origin = origin
         self._first_ns: int | None = None
-        self._waiting: list[
-            tuple[int, int, NDArray[np.uint8], str]
-        ] = []  # frame, ns since the first, depth, its kind
+        self._depth = DepthColumns(origin)
         stream = rr.RecordingStream(
             "liex_lab", recording_id=origin.recording_id, send_properties=False
         )
@@ -128,38 +111,38 @@ class ReplayWriter:
         """
         self._first_ns = first_ns
 
-    def add(self, frame_index: Sequence[int], times_ns: Sequence[int], depth: DepthBatch) -> None:
-        """Write depth of consecutive frames; nothing where the replay is to be without depth.
+    def add(
+        self,
+        frame_index: Sequence[int],
+        times_ns: Sequence[int],
+        depth: DepthBatch,
+        boxes: Boxes | None = None,
+    ) -> None:
+        """Write depth of consecutive frames; nothing where there is none.
 
         Args:
             frame_index: the camera's count of the n frames.
             times_ns: their times, ns.
-            depth: n pictures (H, W) uint16 mm, 0 where unread.
+            depth: n pictures (H, W) uint16 mm, 0 where unread; none where depth is not kept.
+            boxes: (n, K, 4) left, top, right and bottom of the cut-outs, px, all 0 for none; None
+                where whole pictures are kept. It is the same for all frames of a replay.
         """
-        if not self._origin.replay_depth:
+        if not depth:
             return
         if self._first_ns is None:
             self._first_ns = int(times_ns[0])
-            self._log_depth_kind(depth[0])
-        for index, time_ns, image in zip(frame_index, times_ns, depth, strict=True):
-            self._waiting.append((int(index), int(time_ns) - self._first_ns, *packed(image)))
-            if (
-                len(self._waiting) == _TOGETHER
-                or sum(blob.nbytes for _, _, blob, _ in self._waiting) > _TOGETHER_BYTES
-            ):
+            self._depth.log_kind(self._stream, depth[0], whole=boxes is None)
+        elapsed = [int(time_ns) - self._first_ns for time_ns in times_ns]
+        for k in range(len(depth)):
+            if self._depth.take(frame_index[k], elapsed[k], depth[k], _row(boxes, k)):
                 self._send_depth()
 
     def _send_depth(self) -> None:
         """Write the depth that waits."""
-        if self._waiting:
-            index, elapsed, blobs, kinds = zip(*self._waiting, strict=True)
-            columns = rr.EncodedDepthImage.columns(blob=blobs, media_type=kinds)
-            self._stream.send_columns(
-                DEPTH, _timeline(np.array(index), np.array(elapsed)), [*columns]
-            )
+        n_messages = self._depth.send(self._stream)
+        if n_messages:
             self._flush()
-            self._n_sent += 1
-            self._waiting.clear()
+            self._n_sent += n_messages
 
     def finish(
         self,
@@ -210,7 +193,7 @@ class ReplayWriter:
             )
             for part in blocks(len(index), _BLOCK):
                 columns = rr.Scalars.columns(scalars=values[part])
-                self._stream.send_columns(entity, _timeline(index[part], elapsed[part]), [*columns])
+                self._stream.send_columns(entity, timeline(index[part], elapsed[part]), [*columns])
             self._flush()
         self._log_lanes(rows, bouts, words)
         self._log_worst(rows, index, elapsed)
@@ -337,17 +320,6 @@ class ReplayWriter:
         drawn = [(zone.name, zone.outline_mm(), colour) for zone, colour in zones]
         return ([("", walls, _WALL)] if len(walls) else []) + drawn
 
-    def _log_depth_kind(self, first: NDArray[np.uint16]) -> None:
-        """What holds for every depth image: unit, colours, layout."""
-        look: dict[str, Any] = {
-            "meter": MM_PER_UNIT,
-            "colormap": "viridis",
-            "point_fill_ratio": 0.25,
-            "depth_range": colour_range(first, self._origin.floor_distance_mm),
-        }
-        kind = rr.EncodedDepthImage.from_fields(**look)
-        self._stream.log(DEPTH, kind, static=True)
-
     def _log_skeleton(
         self, rows: Rows, index: NDArray[np.int64], elapsed: NDArray[np.int64]
     ) -> None:
@@ -384,7 +356,7 @@ class ReplayWriter:
         girth = float(self._origin.animal_size.get("girth", 1.0))
         carriers = log_body(self._stream, skeleton, girth) if skeleton.surface else []
         for part in blocks(track.n_frames, _BLOCK):
-            when = _timeline(index[part], elapsed[part])
+            when = timeline(index[part], elapsed[part])
             seen = track[part].posed
             self._send_points(
                 SKELETON,
@@ -459,7 +431,7 @@ class ReplayWriter:
             columns = rr.Transform3D.columns(
                 translation=track.root_mm[where] / 1000.0, quaternion=xyzw
             )
-            self._stream.send_columns(ROOT, _timeline(index[where], elapsed[where]), [*columns])
+            self._stream.send_columns(ROOT, timeline(index[where], elapsed[where]), [*columns])
 
     def _log_candidates(
         self, seen: Observations, index: NDArray[np.int64], elapsed: NDArray[np.int64]
@@ -474,7 +446,7 @@ class ReplayWriter:
                 known = seen.known[part, h]
                 joints = seen[part].joints_as(h, range(seen.skeleton.n_joints))[known] / MM_PER_UNIT
                 strips = rr.LineStrips3D.columns(strips=joints[:, edges].reshape(-1, 2, 3))
-                when = _timeline(index[part], elapsed[part])
+                when = timeline(index[part], elapsed[part])
                 self._stream.send_columns(
                     entity, when, [*strips.partition(np.where(known, len(edges), 0))]
                 )
@@ -488,7 +460,7 @@ class ReplayWriter:
             return
         notes = [f"frame {index[k]}: joint error to be expected {error[k]:.1f} mm" for k in worst]
         columns = rr.TextLog.columns(text=notes, level=["INFO"] * len(notes))
-        self._stream.send_columns("log/worst", _timeline(index[worst], elapsed[worst]), [*columns])
+        self._stream.send_columns("log/worst", timeline(index[worst], elapsed[worst]), [*columns])
 
     def _log_lanes(self, rows: Rows, bouts: pd.DataFrame, words: Sequence[str]) -> None:
         """The lane of the actions, and the lane of frames to distrust."""
@@ -538,7 +510,7 @@ class ReplayWriter:
         elapsed = np.rint(np.array(times) * 1e9).astype(np.int64)
         self._stream.send_columns(
             entity,
-            _timeline(np.array(frames), elapsed),
+            timeline(np.array(frames), elapsed),
             [*rr.StateChange.columns(state=list(words))],
         )
 
@@ -585,56 +557,8 @@ class _Renamed:
         return getattr(self._to, name)
 
 
-def packed(depth: NDArray[np.uint16]) -> tuple[NDArray[np.uint8], str]:
-    """Encode a depth picture without loss.
-
-    RVL takes half of what raw pictures do and is quick. Where noise makes it large, beyond 0.54
-    bytes per pixel, PNG is taken if it is smaller (Huffman coding alone: noise has no runs to look
-    for).
-
-    Args:
-        depth: (H, W) uint16 mm, 0 where unread.
-
-    Returns:
-        The bytes, and their media type: 'application/rvl' or 'image/png'.
-    """
-    import cv2
-
-    rvl = rvl_message(depth)
-    if len(rvl) > _LARGE * depth.size:
-        png = cv2.imencode(".png", depth, _NOISY_PNG)[1].ravel()
-        if len(png) < _PACKED_FURTHER * len(rvl):
-            return png, "image/png"
-    return rvl, "application/rvl"
-
-
-def colour_range(depth: NDArray[np.uint16], floor_distance_mm: float) -> tuple[float, float]:
-    """Range of depth over which the colours spread: the floor of the first frame, and 80 mm above.
-
-    A floor tilted by 10 degrees is covered, but not the walls.
-
-    Args:
-        depth: (H, W) uint16 mm of the first frame, 0 where unread.
-        floor_distance_mm: distance of the camera from the floor, mm.
-
-    Returns:
-        (near, far), mm.
-    """
-    read = depth[depth > 0]
-    near, far = (
-        np.percentile(read, [2.0, 98.0]) if len(read) else (floor_distance_mm, floor_distance_mm)
-    )
-    near = (
-        max(float(near), floor_distance_mm - 60.0) - 80.0
-    )  # a floor tilted by 10 degrees, but not the walls
-    return max(near, 1.0), max(float(far), near + 10.0) + 10.0
-
-
-def _timeline(index: NDArray[np.int64], elapsed_ns: NDArray[np.int64]) -> list[rr.TimeColumn]:
-    return [
-        rr.TimeColumn("frame", sequence=index),
-        rr.TimeColumn("time", duration=elapsed_ns.astype("timedelta64[ns]")),
-    ]
+def _row(boxes: Boxes | None, k: int) -> Boxes | None:
+    return None if boxes is None else boxes[k]
 
 
 def _rgba(colours: Sequence[int]) -> NDArray[np.uint32]:

@@ -10,7 +10,7 @@ import json
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from functools import cached_property
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -28,11 +28,11 @@ from liex_lab.sessions.corrections import (
     read_log,
     with_description,
 )
+from liex_lab.sessions.document import read_document
 from liex_lab.sessions.older import put_back_session
-from liex_lab.sessions.provenance import SCHEMA_VERSION
 from liex_lab.sessions.reading import reading_from
-from liex_lab.sessions.thumbnails import FOLDER
-from liex_lab.tables.schema import as_it_was
+from liex_lab.tables.checks import check_footer, check_rows
+from liex_lab.tables.spreadsheets import read_harmless
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -56,6 +56,7 @@ FILES = (
     "session.rrd",
     "session.mcap",
     "observations.npz",
+    "cutouts.npz",
     "replay.rbl",
     "foxglove.json",
 )
@@ -66,6 +67,7 @@ _OPTIONAL = {
     "activity.parquet",
     "zones.parquet",
     "observations.npz",
+    "cutouts.npz",
     "replay.rbl",
     "foxglove.json",
 }
@@ -125,19 +127,7 @@ class Session:
             raise SessionError(
                 f"a session is a folder that `liex run` wrote, but {folder} {what}; check the path"
             )
-        try:
-            metadata = json.loads(document.read_text(encoding="utf-8"))
-            found = int(metadata["schema_version"])
-            _keep_inside(metadata)
-        except (ValueError, KeyError, TypeError, OverflowError, RecursionError):
-            raise SessionError(
-                f"{document} is damaged and cannot be read; run `liex run` on the recording again"
-            ) from None
-        if found > SCHEMA_VERSION:
-            raise SessionError(
-                f"{folder} was written by a newer liex_lab (session schema {found}, this one reads "
-                f"up to {SCHEMA_VERSION}); upgrade with `pip install -U liex_lab`"
-            )
+        metadata = read_document(document)
         for name in FILES:
             if name not in _OPTIONAL and not (folder / name).is_file():
                 raise SessionError(
@@ -145,7 +135,27 @@ class Session:
                 )
         log = Log("") if raw else read_log(folder)
         fitting = log if applies(log, folder, metadata) else None
-        return Session(folder, metadata, fitting, log.described)
+        session = Session(folder, metadata, fitting, log.described)
+        session._check_tables()
+        return session
+
+    def _check_tables(self) -> None:
+        """Raises SessionError where a table's file is not of this session's frames and joints."""
+        n_frames = self.metadata["frames"]["n_frames"]
+        n_joints = len(self.metadata["animal"]["joints"])
+        for path in sorted(self.path.glob("*.parquet")):
+            with reading_from(self.file(path.name)) as own:
+                check_footer(own, path.stem, n_frames, n_joints)
+
+    def __repr__(self) -> str:
+        frames = self.metadata.get("frames", {}).get("n_frames", "unknown")
+        corrected = ", corrected" if self.log.files else ""
+        tables = ", ".join(sorted(path.stem for path in self.path.glob("*.parquet")))
+        return (
+            f"<Session {self.metadata.get('session_id', self.path.stem)}: "
+            f"{self.metadata.get('animal', {}).get('name', 'animal')}, {frames} frames"
+            f"{corrected}; tables {tables}, summary>"
+        )
 
     @property
     def name(self) -> str:
@@ -215,8 +225,6 @@ class Session:
         Raises:
             SessionError: the session was written without behaviour measures.
         """
-        import pandas as pd
-
         path = self.file("summary.csv")
         if not path.is_file():
             raise SessionError(
@@ -224,8 +232,7 @@ class Session:
                 "measures"
             )
         with reading_from(path):
-            table = pd.read_csv(path, dtype={"session_id": "str", "individual": "str"})
-            return table.map(as_it_was)
+            return read_harmless(path, ("session_id", "individual"))
 
     @cached_property
     def columns(self) -> pd.DataFrame:
@@ -233,7 +240,10 @@ class Session:
         import pandas as pd
 
         with reading_from(self.file("columns.json")) as path:
-            return pd.DataFrame(json.loads(path.read_text(encoding="utf-8")))
+            found = pd.DataFrame(json.loads(path.read_text(encoding="utf-8")))
+            if not {"table", "name", "unit", "meaning"} <= set(found.columns):
+                raise ValueError("it does not describe columns")
+            return found
 
     @cached_property
     def camera(self) -> Camera:
@@ -285,9 +295,9 @@ class Session:
             if path.is_file():
                 with reading_from(path):
                     known = pq.read_schema(path).names
-                    other.__dict__[name] = _narrow(
-                        path, [column for column in columns if column in known]
-                    )
+                    found = _narrow(path, [column for column in columns if column in known])
+                    check_rows(name, found, self.metadata["animal"]["joints"])
+                    other.__dict__[name] = found
         return other
 
     def table(
@@ -313,9 +323,11 @@ class Session:
         with reading_from(path):
             if frame_index is None:
                 found = pd.read_parquet(path, columns=columns)
-                said = self.described if name == "sessions" else {}
-                return found.assign(**{key: said[key] for key in said if key in found})
-            return _rows_of(path, columns, frame_index)
+            else:
+                found = _rows_of(path, columns, frame_index)
+            check_rows(name, found, self.metadata["animal"]["joints"])
+            said = self.described if name == "sessions" else {}
+            return found.assign(**{key: said[key] for key in said if key in found})
 
 
 def _narrow(path: Path, columns: list[str]) -> pd.DataFrame:
@@ -347,15 +359,3 @@ def _rows_of(path: Path, columns: list[str] | None, frame_index: list[int]) -> p
     rest()
     rows = pd.concat(found, ignore_index=True)
     return rows if columns is None else rows[columns]
-
-
-def _keep_inside(metadata: dict[str, Any]) -> None:
-    """Sections that others rely on have the right kind; the pictures that it names are in the
-    session's own folder.
-    """
-    for name, kind in {"session_id": str, "camera": dict, "animal": dict}.items():
-        if name in metadata and not isinstance(metadata[name], kind):
-            raise TypeError(name)
-    kept = metadata.get("thumbnails", [])
-    if any(PurePosixPath(entry["file"]).parts[:-1] != (FOLDER,) for entry in kept):
-        raise ValueError("a picture outside of the session")

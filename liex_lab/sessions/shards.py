@@ -15,14 +15,15 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING
 
-from liex_lab.sessions.buffer import Columnar
+from liex_lab.runtime.durable import sync_folder, sync_tree, write_whole
 from liex_lab.sessions.checkpoint import LOGS, STRETCHES, Checkpoint, Columns
-from liex_lab.sessions.failure import write_whole
+from liex_lab.sessions.cutouts import PictureKeeper
 from liex_lab.sessions.provenance import Provenance
 from liex_lab.sessions.writer import seen_rows
 
 if TYPE_CHECKING:
     from liex_lab.recordings.frame import DepthFrame
+    from liex_lab.tracking.observations import Observations
 
 _SIZES = "stretch.json"
 _SEEN = "seen"
@@ -91,13 +92,14 @@ class ShardWriter:
         replay, messages = (self._folder / log for log in LOGS)
         self._replay = ReplayWriter(replay, origin)
         self._mcap = McapWriter(messages, origin)
+        self._keeper = PictureKeeper(origin)
         if first_ns is not None:
             self._replay.go_on(first_ns)
 
     def __enter__(self) -> ShardWriter:
         return self
 
-    def add(self, frames: Sequence[DepthFrame], seen: Columnar) -> None:
+    def add(self, frames: Sequence[DepthFrame], seen: Observations) -> None:
         """Write the next frames.
 
         Args:
@@ -106,11 +108,11 @@ class ShardWriter:
         """
         from liex_lab.recordings.rvl import to_millimetres
 
-        depth = [to_millimetres(frame.depth) for frame in frames]
+        depth, boxes = self._keeper.keep([to_millimetres(frame.depth) for frame in frames], seen)
         times = [int(frame.time_ns) for frame in frames]
-        self._replay.add([int(frame.index) for frame in frames], times, depth)
+        self._replay.add([int(frame.index) for frame in frames], times, depth, boxes)
         self._mcap.add(times, depth)
-        self._seen.append(seen_rows(frames, seen))
+        self._seen.append(seen_rows(frames, seen, [] if boxes is None else [boxes]))
 
     def __exit__(
         self,
@@ -137,4 +139,6 @@ class ShardWriter:
         if is_whole(self._whole):  # somebody else was quicker
             return
         shutil.rmtree(self._whole, ignore_errors=True)
+        sync_tree(self._folder)
         self._folder.rename(self._whole)
+        sync_folder(self._whole.parent)

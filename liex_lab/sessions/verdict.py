@@ -45,6 +45,7 @@ class Verdict:
             where nobody has to.
         cautions: what else to distrust.
         accepted: whether the plan says to measure all the same (`estimation.accept_misfit`).
+        n_hidden: frames in which the animal is behind or under something.
     """
 
     n_frames: int
@@ -56,6 +57,7 @@ class Verdict:
     reasons: tuple[str, ...] = ()
     cautions: tuple[str, ...] = ()
     accepted: bool = False
+    n_hidden: int = 0
 
     @staticmethod
     def of(
@@ -88,6 +90,9 @@ class Verdict:
         n_posed = int(track.posed.sum())
         errors = track.predicted_error_mm[track.observed]
         doubtful = int((track.flag == "doubtful").sum())
+        n_hidden = int((track.flag == "hidden").sum())
+        n_depth -= n_hidden  # it is known why there is no pose
+        n_in_view = min(n_in_view, n_depth)
         reasons = list(misfits)
         if n_trusted < _LEAST_SHARE * n_depth:
             reasons.append(f"an animal is measured in {n_trusted} of {n_depth} frames only")
@@ -99,6 +104,8 @@ class Verdict:
         said = list(cautions)
         if n_animals > 1:
             said.append(f"{n_animals} animals are in view and one of them is followed")
+        if n_hidden:
+            said.append(f"the animal is hidden in {n_hidden:,} frames")
         if doubtful > _DOUBTFUL_SHARE * track.n_frames:
             said.append(f"{doubtful} poses are doubtful")
         return Verdict(
@@ -111,6 +118,7 @@ class Verdict:
             tuple(reasons),
             tuple(said),
             accepted,
+            n_hidden,
         )
 
     @property
@@ -171,4 +179,11 @@ def verdict_in(document: Mapping[str, Any]) -> Mapping[str, Any]:
     """
     unsaid = {"look_at_it": False, "accepted": False, "reasons": [], "cautions": [], "sentence": ""}
     found = document.get("verdict")
-    return {**unsaid, **found} if isinstance(found, Mapping) else unsaid
+    if not isinstance(found, Mapping):
+        return unsaid
+    return {
+        **unsaid,
+        **{
+            name: one for name, one in found.items() if isinstance(one, type(unsaid.get(name, one)))
+        },
+    }

@@ -9,6 +9,7 @@ import socket
 import subprocess
 import sys
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -46,13 +47,14 @@ def has_screen() -> bool:
     )
 
 
-def replays_with(replay: Path) -> list[Path]:
+def replays_with(replay: Path, more: Sequence[Path] = ()) -> list[Path]:
     """Files to open for a session's replay, in order.
 
     Where there are corrections, their replay comes first, for the first file's layout holds.
 
     Args:
         replay: the session's own .rrd, or one that lies somewhere by itself.
+        more: further files of the same replay.
     """
     from liex_lab.sessions.corrections import REPLAY
     from liex_lab.sessions.session import Session
@@ -60,11 +62,13 @@ def replays_with(replay: Path) -> list[Path]:
     try:
         corrected = Session.open(replay.parent).file(REPLAY)
     except LiexError:  # a replay that lies somewhere by itself
-        return [replay]
-    return [corrected, replay] if corrected.is_file() else [replay]
+        return [replay, *more]
+    return [*([corrected] if corrected.is_file() else []), replay, *more]
 
 
-def show_replay(replay: Path, at_s: float, *, headless: bool = False) -> Shown:
+def show_replay(
+    replay: Path, at_s: float, more: Sequence[Path] = (), *, headless: bool = False
+) -> Shown:
     """Open a replay in a window at a moment; returns the viewer.
 
     The viewer listens on 127.0.0.1 alone and ends with this process.
@@ -72,6 +76,7 @@ def show_replay(replay: Path, at_s: float, *, headless: bool = False) -> Shown:
     Args:
         replay: the .rrd file.
         at_s: the moment, s since its first frame.
+        more: further files of the same replay.
         headless: show no window, for tests.
 
     Raises:
@@ -96,7 +101,7 @@ def show_replay(replay: Path, at_s: float, *, headless: bool = False) -> Shown:
     while time.monotonic() < ends and process.poll() is None:
         try:
             client = ViewerClient.connect(f"rerun+http://127.0.0.1:{port}/proxy")
-            for file in replays_with(replay):
+            for file in replays_with(replay, more):
                 client.open(str(file.resolve()))
             client.set_time("time", duration=at_s, play_state="paused")
             return Shown(process, client)

@@ -28,9 +28,11 @@ from liex_lab.errors import LiexError, SessionError
 from liex_lab.runtime.disk import is_full, probe_full, why_full
 from liex_lab.runtime.durable import put_in_place, sync_tree
 from liex_lab.runtime.memory import Allocator, on_disk, peak_memory_mb, rest
+from liex_lab.runtime.places import unlinked_tree
 from liex_lab.sessions.buffer import Columnar, TrackBuffer, columns_of
 from liex_lab.sessions.checkpoint import LOGS, Checkpoint
 from liex_lab.sessions.corrections import FOLDER
+from liex_lab.sessions.cutouts import Boxes, PictureKeeper, write_boxes
 from liex_lab.sessions.evidence import write_evidence
 from liex_lab.sessions.older import (
     aside_folder,
@@ -47,6 +49,7 @@ from liex_lab.sessions.thumbnails import Keepsakes
 from liex_lab.tables import schema
 from liex_lab.tables.rows import Rows, rows_only
 from liex_lab.tables.schema import Column
+from liex_lab.tracking.observations import Observations
 from liex_lab.tracking.track import Flip, Track, Tracked
 
 if TYPE_CHECKING:
@@ -54,11 +57,11 @@ if TYPE_CHECKING:
 
     from liex_lab.recordings.frame import DepthFrame
     from liex_lab.sessions.session import Session
-    from liex_lab.tracking.observations import Observations
     from liex_lab.tracking.offline import Subject
 
 INDEX = "frame_index"
 TIMES = "frame_time_ns"
+BOXES = "kept_box_px"
 _BEHIND = 4  # batches of 16 frames that the logs may be behind, both together
 Kept = TypeVar("Kept")
 
@@ -116,6 +119,7 @@ class SessionWriter:
         self._flips: Sequence[Flip] = ()
         self._candidates: Observations | None = None
         self._keepsakes = Keepsakes()
+        self._keeper = PictureKeeper(origin)
         self._done = False
         self._folder = part_folder(path)
         self._checkpoint = unfinished(path, origin)
@@ -201,7 +205,8 @@ class SessionWriter:
             frames: the next frames.
             track_part: their rows of the track, unless `close` gets the whole track.
             seen: their observations, one row per frame, kept on disk until the session is whole: an
-                interrupted run can go on from there, see `seen`.
+                interrupted run can go on from there, see `seen`. They say where the animal is,
+                around which the depth is kept.
 
         Raises:
             SessionError: the track part is of other frames, or a log could not be written.
@@ -216,22 +221,29 @@ class SessionWriter:
             _check_times(np.array(times, np.int64), track_part)
             self._held.append(track_part)
         index = [int(frame.index) for frame in frames]
+        boxes: list[Boxes] = []
         for start in range(
             0, len(frames), 16
         ):  # bounds the copies, however many frames come at once
             part = slice(start, start + 16)
             depth = [to_millimetres(frame.depth) for frame in frames[part]]
+            found = seen[part] if isinstance(seen, Observations) else None
+            kept, cuts = self._keeper.keep(depth, found)
             self._drain(_BEHIND)
             replay, messages = (self._loggers[log] for log in LOGS)
-            self._logging.append(replay.submit(self._replay.add, index[part], times[part], depth))
-            self._logging.append(messages.submit(self._mcap.add, times[part], depth))
+            self._logging.append(
+                replay.submit(self._replay.add, index[part], times[part], kept, cuts)
+            )
+            self._logging.append(messages.submit(self._mcap.add, times[part], kept))
             for image in depth:
                 self._keepsakes.add(image)
+            if cuts is not None:
+                boxes.append(cuts)
         self._rows = None
         self._index.extend(index)
         self._times_ns.extend(times)
         if seen is not None:
-            self._checkpoint.seen.append(seen_rows(frames, seen))
+            self._checkpoint.seen.append(seen_rows(frames, seen, boxes))
         if self._checkpoint.due:
             self._take_down()
         self._seconds += time.perf_counter() - began
@@ -245,7 +257,7 @@ class SessionWriter:
         kept = self._checkpoint.seen.read()
         return kind(
             self.origin.skeleton,
-            *(values for name, values in kept.items() if name not in (INDEX, TIMES)),
+            *(values for name, values in kept.items() if name not in (INDEX, TIMES, BOXES)),
         )
 
     def _drain(self, behind: int = 0) -> None:
@@ -408,6 +420,9 @@ class SessionWriter:
         self._replay.finish(rows, kinematics, bouts, words, problems, self._candidates)
         self._mcap.finish(rows, bouts, words, problems)
         self._checkpoint.join_logs()
+        kept = self._checkpoint.seen.read()
+        if BOXES in kept:
+            write_boxes(self._folder, kept[BOXES])
         self.note(
             actions={word: (actions or {}).get(word, "") for word in words}, **dict(record or {})
         )
@@ -465,7 +480,7 @@ class SessionWriter:
         copy = self._folder / FOLDER
         shutil.rmtree(copy, ignore_errors=True)
         if made is not None:  # they apply again where the poses came out the same
-            shutil.copytree(made, copy)
+            shutil.copytree(unlinked_tree(made), copy)
             sync_tree(copy)
         self._checkpoint.drop_parts()
         put_in_place(self._folder, self.path, aside_folder(self.path))
@@ -505,18 +520,23 @@ def full_disk(folder: Path, error: BaseException | None) -> str | None:
     return None if found is None else why_full(found, folder.parent)
 
 
-def seen_rows(frames: Sequence[DepthFrame], seen: Columnar) -> dict[str, NDArray[Any]]:
+def seen_rows(
+    frames: Sequence[DepthFrame], seen: Columnar, boxes: Sequence[Boxes] = ()
+) -> dict[str, NDArray[Any]]:
     """Columns kept on disk of consecutive frames: observations, camera's frame count, time (ns).
 
     Args:
         frames: n consecutive frames.
         seen: their observations, n rows.
+        boxes: where their kept pictures are not the background, in order; none where whole pictures
+            are kept.
 
     Returns:
         Arrays (n, ...) by name.
     """
     index, times = ([getattr(frame, name) for frame in frames] for name in ("index", "time_ns"))
-    return {**columns_of(seen), INDEX: np.array(index, np.int64), TIMES: np.array(times, np.int64)}
+    counted = {INDEX: np.array(index, np.int64), TIMES: np.array(times, np.int64)}
+    return {**columns_of(seen), **counted, **({BOXES: np.concatenate(boxes)} if boxes else {})}
 
 
 def unfinished(path: Path, origin: Provenance) -> Checkpoint:

@@ -34,9 +34,12 @@ Array = NDArray[np.float64]
 # median steps; a longer one means that frames are missing (as in recordings.timestamps)
 GAP_FACTOR = 1.5
 _Found = tuple[
-    float, float, int, int, int, str
-]  # start_s, stop_s, start_frame, stop_frame, frames missing, reason
-LOST = ("no_depth", "tracker_lost")  # reasons of gaps that are not the camera's
+    float, float, int, int, int, str, float, float
+]  # start_s, stop_s, start_frame, stop_frame, frames missing, reason, x mm, y mm
+_SPAN_NAMES = ("start_s", "stop_s", "start_frame", "stop_frame")
+_NOWHERE = (float("nan"), float("nan"))
+HIDDEN = "hidden"
+LOST = ("no_depth", HIDDEN, "tracker_lost")  # reasons of gaps that are not the camera's
 _NEAR = 0.1  # of the spine: how near a joint must be to count in its score
 
 
@@ -185,16 +188,20 @@ class Rows:
         time = self.time_s
         count = frame_count(self.frame_index)
         found = self._camera_gaps()
-        lost = np.where(self.track.observed, "", np.where(self.track.flag == "no_depth", *LOST))
+        observed = self.track.observed
+        flag = np.where(np.isin(self.track.flag, LOST), self.track.flag, LOST[-1])
+        lost = np.where(observed, "", flag)
+        seen_at = np.flatnonzero(observed)
         stops = stop_times(time)
         for start, stop, reason in constant_runs(lost):
             if reason:
                 span = (time[start], stops[stop - 1], int(count[start]), int(count[stop]))
-                found.append((*span, stop - start, str(reason)))
+                place = self._last_place(seen_at, start) if reason == HIDDEN else _NOWHERE
+                found.append((*span, stop - start, str(reason), *place))
         found.sort()
-        names = ("start_s", "stop_s", "start_frame", "stop_frame", "n_frames_missing", "reason")
+        names = (*_SPAN_NAMES, "n_frames_missing", "reason", "x_mm", "y_mm")
         values: Iterable[Any] = zip(*found, strict=True) if found else ([] for _ in names)
-        kinds = (float, float, np.int64, np.int64, np.int64, str)
+        kinds = (float, float, np.int64, np.int64, np.int64, str, float, float)
         return {
             **self._who,
             **{n: np.array(v, k) for n, v, k in zip(names, values, kinds, strict=True)},
@@ -247,8 +254,21 @@ class Rows:
                 )
             else:
                 span = (float(time[row]), float(stops[row]), frame, frame + 1)
-            found.append((*span, gap.n_frames_missing, gap.reason))
+            found.append((*span, gap.n_frames_missing, gap.reason, *_NOWHERE))
         return found
+
+    def _last_place(self, seen_at: NDArray[np.int64], row: int) -> tuple[float, float]:
+        """Where (x, y) mm the animal was seen last before a row, or first after it.
+
+        Args:
+            seen_at: rows in which a pose was measured, in order.
+            row: the first row of a gap.
+        """
+        if not len(seen_at):
+            return _NOWHERE
+        last = seen_at[max(0, int(np.searchsorted(seen_at, row)) - 1)]
+        x, y = self.track.centroid_mm[last, :2]
+        return float(x), float(y)
 
     @property
     def _who(self) -> dict[str, str]:

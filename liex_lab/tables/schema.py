@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     import pandas as pd
     import pyarrow as pa
 
-_BEGINS_FORMULA = ("=", "+", "-", "@", "\t", "\r", "\n")
 ROWS_PER_GROUP = 100_000  # a block of the widest table then takes some 20 MB
 Block = Mapping[str, Any]  # column -> one value for all rows, or an array
 
@@ -240,8 +239,9 @@ FRAMES = columns(
         "string",
         "",
         "empty when the pose is trusted; doubtful: its predicted error is large, or the picture "
-        "contradicts it; corrected: a person placed joints of it; not_found or no_depth: nothing "
-        "was measured, and there is no pose where it is not bridged",
+        "contradicts it; corrected: a person placed joints of it; hidden, not_found or no_depth: "
+        "nothing was measured, and there is no pose where it is not bridged; hidden: the animal is "
+        "behind or under something, whole or so much of it that nobody knows how it lies",
         "",
         "tracker",
     ),
@@ -400,8 +400,24 @@ GAPS = columns(
         "camera_dropped: never recorded, start_frame = stop_frame = the next frame; "
         "clock_jumped: the camera was stopped, or its clock set, before the frame; "
         "stamp_repeated, stamp_out_of_order: this frame's own time stamp could not be true and "
-        "was moved; no_depth: recorded without any depth; tracker_lost: nothing in the frame "
-        "looks like the animal",
+        "was moved; no_depth: recorded without any depth; hidden: the animal went behind or under "
+        "something; tracker_lost: nothing in the frame looks like the animal",
+    ),
+    (
+        "x_mm",
+        "float64",
+        "mm",
+        f"where the animal was last seen before it was hidden, else empty; {_AXES}",
+        "",
+        "tracker",
+    ),
+    (
+        "y_mm",
+        "float64",
+        "mm",
+        f"where the animal was last seen before it was hidden, else empty; {_AXES}",
+        "",
+        "tracker",
     ),
 )
 
@@ -622,35 +638,6 @@ class Words:
     def __getitem__(self, rows: slice) -> Words:
         """Some consecutive rows."""
         return Words(self.codes[rows], self.words)
-
-
-def harmless(value: Any) -> Any:
-    """A cell that no spreadsheet takes for a formula (CSV injection).
-
-    Args:
-        value: a cell of any kind; only text that begins with =, +, -, @, tab or line end is
-            changed.
-
-    Returns:
-        The cell; such text with an apostrophe before it.
-    """
-    return f"'{value}" if isinstance(value, str) and value[:1] in _BEGINS_FORMULA else value
-
-
-def as_it_was(value: Any) -> Any:
-    """The inverse of `harmless`.
-
-    Args:
-        value: a cell of any kind.
-
-    Returns:
-        What `harmless` was given.
-    """
-    return (
-        value[1:]
-        if isinstance(value, str) and value[:1] == "'" and value[1:2] in _BEGINS_FORMULA
-        else value
-    )
 
 
 def to_pandas(schema: Sequence[Column], block: Block, copy: bool = True) -> pd.DataFrame:

@@ -49,6 +49,7 @@ class Observations:
         has_depth: (n,) True where anything was read.
         covered: (n, H) share of the silhouette that the rendered body covers.
         beside: (n, H) share of the rendered body that lies beside the silhouette.
+        behind: (n, H) share of the component's outline that ends at something nearer.
     """
 
     skeleton: Skeleton
@@ -66,6 +67,7 @@ class Observations:
     has_depth: NDArray[np.bool_]
     covered: Small
     beside: Small
+    behind: Small
 
     @staticmethod
     def empty(skeleton: Skeleton, times_ns: NDArray[np.int64]) -> Observations:
@@ -100,6 +102,7 @@ class Observations:
             nothing(3),
             nothing(2),
             np.ones(n, np.bool_),
+            nothing(),
             nothing(),
             nothing(),
         )

@@ -35,7 +35,16 @@ from liex_lab.tracking.motion_model import TrackingParameters
 from liex_lab.tracking.observations import Observations, joints_of, reversed_pose
 from liex_lab.tracking.smoother import Curve, smooth
 from liex_lab.tracking.track import Flip, Track, Tracked
-from liex_lab.tracking.trust import MOST_ERROR, contradicted, elsewhere
+from liex_lab.tracking.trust import (
+    MOST_ERROR,
+    MOSTLY,
+    WHOLE,
+    contradicted,
+    elsewhere,
+    gone_behind,
+    share_in_view,
+    usual_pixels,
+)
 
 Array = NDArray[np.float64]
 
@@ -136,14 +145,16 @@ def track_whole(
         _write(subject, track[rows], curve, tuning)
         used[rows] = curve.used
 
-    shown = seen.along(seen.n_px, path)
-    usual_px = float(np.median(shown[path >= 0])) if (path >= 0).any() else 0.0
+    usual_px = usual_pixels(seen, path)
+    in_view = share_in_view(seen, path, usual_px)
+    path[in_view < MOSTLY] = NONE  # of half an animal nobody knows how it lies
     for rows in blocks(len(seen), _BLOCK):
         draw(rows)
     for _ in range(_TIMES):
         taken = path == NONE
         for rows in blocks(len(seen), _BLOCK):
             _admit(subject, seen[rows], path[rows], error[rows], track[rows], usual_px)
+        path[in_view < MOSTLY] = NONE
         taken &= path != NONE
         for rows in blocks(len(seen), _BLOCK):
             if taken[max(0, rows.start - MARGIN) : rows.stop + MARGIN].any():
@@ -160,8 +171,10 @@ def track_whole(
             subject.length_mm,
             usual_px,
         )
-    bridged &= ~strayed  # what is in view is measured, or it has no pose
-    strayed |= contradicted(seen, path, subject.length_mm)
+    hidden = gone_behind(seen, measured, usual_px)
+    bridged &= ~strayed & ~hidden  # what is in view is measured, or it has no pose
+    hidden |= (in_view < MOSTLY) & ~bridged
+    strayed |= contradicted(seen, path, subject.length_mm) | (in_view < WHOLE)
     for rows in blocks(len(seen), _BLOCK):
         _mask_and_flag(
             subject,
@@ -173,6 +186,7 @@ def track_whole(
             bridged[rows],
             strayed[rows],
         )
+        track.flag[rows][hidden[rows] & (track.flag[rows] == "not_found")] = "hidden"
     flips = _flips(seen, track)
     return Tracked(
         track, tuple(sorted([*flips, *corrections], key=lambda flip: (flip.start, flip.source)))
@@ -275,6 +289,9 @@ def to_track(
     track = Track.empty(subject.skeleton, seen.times_ns[told])
     _write(subject, track, curve[told], tuning)
     strayed = contradicted(seen, path, subject.length_mm)
+    in_view = share_in_view(seen, path, usual_pixels(seen, path))
+    strayed |= in_view < WHOLE
+    measured &= in_view >= MOSTLY
     _mask_and_flag(
         subject,
         track,

@@ -30,6 +30,10 @@ FLAGS = {
     "not_found": (
         "the frame holds depth, but nothing in it looks like the animal; the row is NaN, or bridged"
     ),
+    "hidden": (
+        "the animal is behind or under something, whole or so much of it that nobody knows how it "
+        "lies; the row is NaN"
+    ),
     "corrected": "a person placed joints of this pose; the others follow as the bones allow",
     "no_depth": "the frame holds no depth at all; the row is NaN, or bridged",
 }

@@ -24,6 +24,7 @@ from liex_lab.runtime.memory import Allocator
 from liex_lab.runtime.threads import threads
 from liex_lab.tracking.motion_model import TrackingParameters
 from liex_lab.tracking.observations import Observations
+from liex_lab.tracking.occluders import behind_something
 from liex_lab.tracking.occlusion import OcclusionCorrection
 from liex_lab.tracking.offline import Subject, single_frames, track_whole
 from liex_lab.tracking.residual import Agreement, BodyResidual
@@ -232,6 +233,7 @@ class FrameTracker:
         seen.error_mm[:, h] = chosen.error_mm
         seen.score[:, h] = chosen.score
         seen.n_px[found, h] = crops.n_px[found]
+        seen.behind[found, h] = behind_something(crops[found], self.scene.cleared(depths[found]))
         if not len(found):
             return
         centre = self.scene.middles(crops[found], self.estimator.model.method.camera_view)

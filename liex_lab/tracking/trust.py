@@ -30,6 +30,15 @@ _MOST_BESIDE = 0.6
 # an animal is in full view where it shows this share of the usual pixels, at least and at most
 _LEAST_SHOWN = 0.6
 _MOST_SHOWN = 1.6
+# an animal is partly behind something where so much of its outline ends there, and it shows less
+# than this share of its usual pixels; what lies before it is there for some frames at least
+_BEHIND = 0.03
+WHOLE = 0.95
+_FRAMES = 2  # before and after
+MOSTLY = 0.7  # of it must be in view to tell how it lies
+# it has gone behind something where it showed less than this share shortly before it was gone
+_GOING = 0.8
+_SHORTLY_S = 0.5
 # a pose lies elsewhere if its joints are so far from every pose that the frame itself allows: so
 # many predicted errors, and this share of the length
 _TIMES_ERROR = 4.0
@@ -61,6 +70,72 @@ def contradicted(
             | (seen.along(seen.covered, path) < _LEAST_COVERED)
             | (seen.along(seen.beside, path) > _MOST_BESIDE)
         )
+
+
+def usual_pixels(seen: Observations, path: NDArray[np.int64]) -> float:
+    """The pixels that the animal usually shows, the median along a path; 0 where it is empty.
+
+    Args:
+        seen: hypotheses (n, H) of the frames.
+        path: (n,) which of them is meant, negative for none.
+    """
+    taken = path >= 0
+    shown = seen.along(seen.n_px, path)
+    return float(np.median(shown[taken])) if taken.any() else 0.0
+
+
+def share_in_view(seen: Observations, path: NDArray[np.int64], usual_px: float) -> Array:
+    """The share (n,) of an animal that is in view where something stands before the rest of it.
+
+    Args:
+        seen: hypotheses (n, H) of consecutive frames.
+        path: (n,) which of them is meant, negative for none, which takes the first.
+        usual_px: pixels that the animal usually shows.
+
+    Returns:
+        1 where nothing is before it, or there is no hypothesis.
+    """
+    meant = np.where((path < 0) & seen.known[:, 0], 0, path)
+    behind = np.nan_to_num(seen.along(seen.behind, meant))
+    near = np.pad(behind, _FRAMES)
+    most = np.max([near[k : k + len(behind)] for k in range(2 * _FRAMES + 1)], axis=0)
+    shown = seen.along(seen.n_px, meant) / max(usual_px, 1.0)
+    return np.where((most > _BEHIND) & (meant >= 0), np.minimum(shown, 1.0), 1.0)
+
+
+def gone_behind(
+    seen: Observations, measured: NDArray[np.bool_], usual_px: float
+) -> NDArray[np.bool_]:
+    """Whether (n,) the animal is hidden: it went behind or under something and is not back yet.
+
+    A stretch without a measured pose, in which nothing of the animal's size is in view for a while,
+    and just before which less and less of the animal was seen beside something nearer. Where a
+    recording begins with such a stretch, what is seen just after it says so.
+
+    Args:
+        seen: hypotheses (n, H) of all frames.
+        measured: (n,) whether a pose was measured.
+        usual_px: pixels that the animal usually shows.
+    """
+    hidden = np.zeros(len(seen), np.bool_)
+    known = np.asarray(seen.known.any(axis=1))
+    shown = np.where(known, seen.n_px.max(axis=1), 0) / max(usual_px, 1.0)
+    behind = np.where(known, np.nan_to_num(seen.behind).max(axis=1), 0.0)
+    seconds = seen.seconds
+    edges = np.flatnonzero(np.diff(np.concatenate([[1], measured, [1]]).astype(np.int8)))
+    for start, stop in zip(edges[::2], edges[1::2], strict=True):
+        gone = start + np.flatnonzero(~known[start:stop] & seen.has_depth[start:stop])
+        if not len(gone):
+            continue
+        before = np.flatnonzero(known[: gone[0]])
+        if len(before):
+            near = before[seconds[before] >= seconds[gone[0]] - _SHORTLY_S]
+        else:
+            after = gone[0] + np.flatnonzero(known[gone[0] :])
+            near = after[seconds[after] <= seconds[after[:1]] + _SHORTLY_S]
+        if len(near) and shown[near].min() < _GOING and behind[near].max() > _BEHIND:
+            hidden[start:stop] = True
+    return hidden
 
 
 def elsewhere(

@@ -177,7 +177,7 @@ def run_product(recording: TrueRecording, plan: Plan) -> Outcome:
     from liex_lab.sessions import Session
     from liex_lab.sessions.verdict import verdict_in
 
-    quick = plan.with_settings(["replay.depth=false"])
+    quick = plan.with_settings(["replay.depth=none"])
     with tempfile.TemporaryDirectory(prefix="liex-scenes-") as folder:
         try:
             measure_session(recording, quick, folder)
@@ -206,7 +206,7 @@ def read_individuals(session: Session) -> list[Individual]:
         One each, in the frame of the camera that took the pictures.
     """
     T_camera_arena = session.T_arena_camera.inverse()
-    mirrored = bool((session.metadata.get("optics") or {}).get("mirrored"))
+    mirrored = bool((session.metadata["camera"].get("optics") or {}).get("mirrored"))
     n_joints = len(session.poses["joint"].unique())
     found = []
     for name, frames in session.frames.groupby("individual", sort=True):

@@ -16,7 +16,7 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from liex_lab.errors import MissingPackageError, StudyError
+from liex_lab.errors import MissingPackageError, StudyError, how_to_install
 from liex_lab.plan.study import PlannedSession
 from liex_lab.sessions.failure import describe_failure
 
@@ -268,8 +268,7 @@ def slurm_cluster(table: SlurmTable, scratch: str) -> Any:
         from dask_jobqueue import SLURMCluster
     except ImportError:
         raise MissingPackageError(
-            "workers on Slurm need the package dask-jobqueue; install it with `pip install "
-            "'liex_lab[slurm]'`"
+            f"workers on Slurm need the package dask-jobqueue; {how_to_install('slurm')}"
         ) from None
     from distributed import Security
 

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from liex_lab.errors import StudyError
 from liex_lab.plan.study import DERIVED, RAW, STUDY_FILE, Study
-from liex_lab.sessions.failure import write_whole
+from liex_lab.runtime.durable import write_whole
 
 _FILES = (".mcap", ".bag", ".db3", ".oni", ".tar.gz", ".tgz", ".avi", ".mkv")
 _FOLDERS = (
@@ -56,7 +56,10 @@ def begin_study(folder: str | Path, overwrite: bool = False) -> Path:
         )
     file = root / STUDY_FILE
     if file.exists() and not overwrite:
-        raise StudyError(f"{file} exists already; change it by hand, or say --overwrite")
+        raise StudyError(
+            f"{file} exists already; change it by hand, or say "
+            "--overwrite (in Python overwrite=True)"
+        )
     raw = root / RAW if (root / RAW).is_dir() else root
     found = find_recordings(raw)
     if not found:

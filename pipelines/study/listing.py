@@ -81,5 +81,5 @@ def _measured(folder: Path) -> Entry:
         who = {name: str(row[name]) for name in WHO if isinstance(row.get(name), str) and row[name]}
         reason = to_look_at(verdict_in(session.metadata))
         return Entry(session.name, "done", reason, folder=folder, who=who)
-    except (LiexError, IndexError) as error:
+    except LiexError as error:
         return Entry(folder.name, "failed", str(error))

@@ -12,9 +12,10 @@ from typing import Any, Protocol
 
 from liex_lab.errors import StudyError
 from liex_lab.plan.study import Study
+from liex_lab.runtime.lock import locked
+from liex_lab.runtime.places import unlinked_below
 from liex_lab.runtime.progress import Board
 from liex_lab.sessions.corrections import Description
-from liex_lab.sessions.lock import locked
 
 from ..compiling import compile_ahead
 from ..correct import correct_session
@@ -79,6 +80,8 @@ def run_study(
     before = standings(study, retry=retry, only=only, again=again)
     if dry_run:
         return before
+    for place in (study.cohort_folder, *(one.session.folder for one in before)):
+        unlinked_below(study.results, place)
     study.cohort_folder.mkdir(parents=True, exist_ok=True)
     with locked(
         study.cohort_folder / ".lock",

@@ -106,7 +106,15 @@ def standing(session: PlannedSession) -> SessionStatus:
             why = next(filter(None, (check() for check in _checks(session, document))), "")
             if not why:
                 said = _described_anew(session, document)
-        except (OSError, ValueError, LiexError, AttributeError, TypeError):
+        except (
+            OSError,
+            ValueError,
+            LiexError,
+            AttributeError,
+            TypeError,
+            KeyError,
+            RecursionError,
+        ):
             document = {}
             why = "its session.json cannot be read"
         if said:

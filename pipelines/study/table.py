@@ -8,8 +8,10 @@ from pathlib import Path
 from typing import Any
 
 from liex_lab.plan.study import Study
-from liex_lab.sessions.failure import write_whole
-from liex_lab.tables.schema import columns, dictionary, harmless, write_table
+from liex_lab.runtime.durable import replacing, write_whole
+from liex_lab.runtime.places import unlinked_below
+from liex_lab.tables.schema import columns, dictionary, write_table
+from liex_lab.tables.spreadsheets import harmless
 
 from .status import SessionStatus
 
@@ -59,13 +61,12 @@ def write_study_table(study: Study, standings: Sequence[SessionStatus]) -> Path:
     import io
 
     folder = study.cohort_folder
-    folder.mkdir(parents=True, exist_ok=True)
+    unlinked_below(study.results, folder).mkdir(parents=True, exist_ok=True)
     rows = study_rows(study, standings)
     names = [column.name for column in STUDY_SESSIONS]
     block = {name: [row[name] for row in rows] for name in names}
-    part = folder / f".{TABLE}.parquet.part"
-    write_table(part, STUDY_SESSIONS, [block], {"study": study.name})
-    part.replace(folder / f"{TABLE}.parquet")
+    with replacing(folder / f"{TABLE}.parquet") as part:
+        write_table(part, STUDY_SESSIONS, [block], {"study": study.name})
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(names)
@@ -92,7 +93,8 @@ def _row(study: Study, one: SessionStatus) -> dict[str, Any]:
     session = one.session
     failure = one.failure or {}
     document = _document(session.folder) if one.state == "done" else {}
-    frames = document.get("frames", {})
+    counted = document.get("frames")
+    frames = counted if isinstance(counted, dict) else {}
     return {
         "session_id": session.id,
         "subject_id": session.animal.id,
@@ -115,7 +117,7 @@ def _row(study: Study, one: SessionStatus) -> dict[str, Any]:
 def _document(folder: Path) -> dict[str, Any]:
     try:
         found = json.loads((folder / "session.json").read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+    except (OSError, ValueError, RecursionError):
         return {}
     return found if isinstance(found, dict) else {}
 

@@ -1,5 +1,5 @@
 """The fault campaign, run by hand: python -m tests.campaign kills|workers|faults|broken|fuzz
-(figures in the README).
+(figures in docs/evidence.md).
 
 What it does at random moments it does from a seed, but for the moments themselves, which the
 machine's load decides.

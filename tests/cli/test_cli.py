@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import signal
 import subprocess
 import sys
@@ -21,7 +22,7 @@ from typer.testing import CliRunner
 
 import liex_lab
 from liex_lab import api, cli
-from liex_lab.cli.options import told_scores
+from liex_lab.cli.options import tell_scores
 from liex_lab.errors import RecordingError
 from liex_lab.plan import Plan
 from liex_lab.sessions.verdict import Verdict
@@ -476,12 +477,33 @@ def test_info_tells_versions_and_plans_and_prints_a_plan_to_copy() -> None:
     )
 
 
-def test_scores_of_a_trained_recogniser_are_sentences() -> None:
-    go = {"f1": 0.5, "precision": 0.25, "recall": 1.0, "segment_f1_50": 0.5, "bouts": 1}
-    report = {"animals": 2, "macro_f1": 0.5, "segment_f1_50": 0.5, "per_action": {"go": go}}
-    first, second = told_scores(report)
-    assert "macro F1 of the frames 0.50" in first
-    assert second.endswith("25% of what was called so is, 100% of it was found; 1 bout")
-    alone = told_scores({"animals": 1, "note": "one animal only"})
-    assert alone == ["animals: 1", "note: one animal only"]
-    assert told_scores({}) == []
+def test_scores_of_a_trained_recogniser_are_a_table(capsys: pytest.CaptureFixture[str]) -> None:
+    go = {"f1": 0.5, "precision": 0.25, "recall": 1.0, "segment_f1_50": 0.5, "bouts": 7}
+    tell_scores({"animals": 2, "macro_f1": 0.5, "segment_f1_50": 0.5, "per_action": {"go": go}})
+    told = capsys.readouterr().out
+    assert "macro F1 of the frames 0.50" in told
+    (row,) = [line for line in told.splitlines() if "go" in line]
+    assert [cell.strip() for cell in row.split("│")[1:-1]] == ["go", "7", "0.50", "25%", "100%"]
+    tell_scores({"animals": 1, "note": "one animal only"})
+    assert capsys.readouterr().out == "animals: 1\nnote: one animal only\n"
+    tell_scores({})
+    assert capsys.readouterr().out == ""
+
+
+def test_train_actions_keeps_its_scores_as_json(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    report = {"animals": 1, "note": "one animal only"}
+    job(monkeypatch, "training.action_model", train_actions=lambda out, **how: (out, report))
+    kept = tmp_path / "scores.json"
+    result = CliRunner().invoke(cli.app, ["train", "actions", "--json", str(kept)])
+    assert result.output == "animals: 1\nnote: one animal only\nmodel: mouse-actions.skops\n"
+    assert json.loads(kept.read_text()) == report
+
+
+def test_help_shows_the_verbs_in_the_order_of_work() -> None:
+    told = CliRunner().invoke(cli.app, ["--help"]).output
+    verbs = re.findall(r"^  ([a-z]+)  ", told, re.MULTILINE)
+    start = ["demo", "doctor", "run", "show"]
+    assert verbs[:4] == start
+    assert verbs.index("cohort") < verbs.index("compare") < verbs.index("evaluate")

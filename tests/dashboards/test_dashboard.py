@@ -259,7 +259,7 @@ def test_without_dash_a_sentence_says_what_to_install(
         monkeypatch.delitem(sys.modules, name)
     ran = CliRunner().invoke(cli.app, ["dashboard", str(study)])
     assert isinstance(ran.exception, LiexError)
-    assert "pip install 'liex_lab[dashboard]'" in str(ran.exception)
+    assert "pip install '.[dashboard]'" in str(ran.exception)
 
 
 def test_what_is_not_there_is_told(data: StudyData) -> None:

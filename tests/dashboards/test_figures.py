@@ -1,62 +1,343 @@
-"""Marks stand where their numbers say."""
+"""Figures say what the tables say: times, lengths, and every n."""
 
 from __future__ import annotations
 
 import re
+from pathlib import Path
+from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
-from liex_lab.dashboards.report import svg as figures
-from liex_lab.dashboards.report.svg import Scale
+from liex_lab.dashboards.figures import actions, groups, places, sets, times
+from liex_lab.dashboards.figures.pictures import DepthReader
+from liex_lab.dashboards.figures.seen import Seen, animals
+from liex_lab.dashboards.figures.style import drawing, image_bytes, on_page, scale_bar, sheet
+from liex_lab.dashboards.report.contact_sheet import picture, shade
+
+from liex_lab.actions.colours import action_colours
+from liex_lab.api import compare_groups, draw_figures
+from liex_lab.arena.outline import Arena
+from liex_lab.arena.zones import Zone
+from liex_lab.behaviour.cohort import compare
+from liex_lab.errors import SessionError
+from liex_lab.sessions import Session
+from tests.sessions.walking_mouse import FLOOR_MM, WalkingMouse, steady, write
+
+MOUSE = WalkingMouse(steady(9.0), rear_s=(2.0, 3.0), lost=(60, 61))
+BOWL = Arena("round", (0.0, 0.0), 210.0, None, None, 0.5, 1.0, "wall")
+NEST = Zone("nest <1>", circle_mm=(100.0, 0.0, 60.0))
 
 
-@pytest.mark.parametrize(("low", "high"), [(0.0, 1.0), (0.0, 217.3), (-3.0, 0.002), (5.0, 5.01)])
-def test_ticks_are_round_and_inside(low, high):
-    ticks = Scale(low, high, 0.0, 100.0).ticks(5)
-    assert 2 <= len(ticks) <= 7
-    assert all(low - 1e-9 <= tick <= high + 1e-9 for tick in ticks)
-    steps = np.diff(ticks)
-    np.testing.assert_allclose(steps, steps[0])
-    assert "-0" not in [f"{tick:g}" for tick in ticks]
+@pytest.fixture(scope="module")
+def session(tmp_path_factory: pytest.TempPathFactory) -> Session:
+    return write(
+        tmp_path_factory.mktemp("figures") / "circle.liex", MOUSE, arena=BOWL, zones=(NEST,)
+    )
 
 
-def test_a_curve_is_broken_where_a_value_is_unknown():
-    values = np.array([1.0, 2.0, np.nan, 3.0, np.nan, 1.0, 1.0])
-    paths = figures._broken(np.arange(7.0), values)
-    assert [len(re.findall(r"[ML]", path)) for path in paths] == [2, 1, 2]
+@pytest.fixture(scope="module")
+def seen(session: Session) -> Seen:
+    (one,) = animals(session)
+    return one
+
+
+def text_of(figure: Any) -> str:
+    """Every text of a figure."""
+    with drawing():
+        svg = image_bytes(figure, "svg").decode()
+    return " | ".join(re.findall(r"<text[^>]*>([^<]*)</text>", svg))
+
+
+def numbers(pattern: str, figure: Any) -> list[int]:
+    return [int(n.replace(",", "")) for n in re.findall(pattern, text_of(figure))]
+
+
+def test_the_time_on_the_map_is_the_observed_time(session, seen):
+    found = places.occupancy_of(seen)
+    assert found.observed_s == pytest.approx(session.summary["observed_s"].iloc[0], rel=1e-6)
+    assert f"{found.observed_s:.1f} s observed" in text_of(places.occupancy_map(seen))
+
+
+def test_every_n_of_a_title_is_that_of_the_table(session, seen):
+    posed = int(np.isfinite(session.kinematics["x_mm"]).sum())
+    assert posed == 268
+    assert numbers(r"n = ([\d,]+) frames", places.occupancy_map(seen)) == [posed]
+    assert numbers(r"n = ([\d,]+) frames", places.trajectory(seen)) == [posed]
+    assert numbers(r"n = ([\d,]+) bouts?", times.ethogram(seen)) == [len(session.bouts)]
+    assert numbers(r"n = ([\d,]+) bouts?", actions.time_budget(seen)) == [len(session.bouts)]
+    n = int(session.table("transitions")["n"].sum())
+    assert numbers(r"n = ([\d,]+) transitions?", actions.transitions(seen)) == [n]
+    known = int(np.isfinite(session.kinematics["speed_mm_s"]).sum())
+    assert numbers(r"n = ([\d,]+) frames", times.speed_distribution(seen)) == [known]
+
+
+def test_a_scale_bar_is_as_long_as_it_says(seen):
+    with drawing():
+        figure = places.trajectory(seen)
+        assert figure is not None
+        axes = figure.axes[0]
+        (bar,) = [line for line in axes.get_lines() if line.get_gid() == "scale-bar"]
+        (said,) = [text.get_text() for text in axes.texts if text.get_text().endswith("mm")]
+        (mm,) = re.findall(r"([\d.]+) mm", said)
+        assert np.ptp(bar.get_xdata()) == pytest.approx(float(mm))
+        # and on paper it is that long in the measure of the walls
+        (walls,) = [line for line in axes.get_lines() if line.get_gid() == "arena"]
+        paper = axes.transData.transform(np.column_stack(walls.get_data()))
+        bar_px = np.ptp(axes.transData.transform(np.column_stack(bar.get_data()))[:, 0])
+        assert np.ptp(paper[:, 0]) / bar_px == pytest.approx(2 * 210.0 / float(mm), rel=0.01)
+
+
+@pytest.mark.parametrize("extent", [30.0, 420.0, 1500.0, 9000.0])
+def test_a_scale_bar_fits_its_panel(extent):
+    with drawing():
+        axes = sheet(50.0, 50.0).subplots()
+        axes.set_xlim(0.0, extent)
+        assert 0.0 < scale_bar(axes) < 0.5 * extent
+
+
+def test_the_shares_of_the_budget_are_those_of_the_summary(session, seen):
+    with drawing():
+        figure = actions.time_budget(seen)
+    assert figure is not None
+    drawn = [bar.get_width() for bar in figure.axes[0].patches]
+    row = session.summary.iloc[0]
+    np.testing.assert_allclose(drawn, [100.0 * row[f"{word}_share"] for word in seen.words])
+
+
+def test_an_action_has_its_colour_in_every_figure(session, seen):
+    colours = action_colours(seen.words)
+    seen_words = set(session.bouts["action"])
+    with drawing():
+        for draw in (times.ethogram, actions.time_budget, actions.activity, actions.transitions):
+            svg = image_bytes(draw(seen), "svg").decode().lower()  # type: ignore[arg-type]
+            assert all(colours[str(word)].lower() in svg for word in seen_words), draw
+
+
+def test_a_bar_of_the_ethogram_stands_at_its_time(session, seen):
+    with drawing():
+        figure = times.ethogram(seen)
+    assert figure is not None
+    word = str(session.bouts["action"].iloc[0])
+    own = session.bouts[session.bouts["action"] == word]
+    (bars,) = [c for c in figure.axes[0].collections if c.get_gid() == f"bouts of {word}"]
+    drawn = sorted(
+        (path.vertices[:, 0].min(), path.vertices[:, 0].max()) for path in bars.get_paths()
+    )
+    np.testing.assert_allclose(drawn, own[["start_s", "stop_s"]].to_numpy(float))
+
+
+def test_the_way_summed_up_is_the_distance_of_the_summary(session, seen):
+    _, metres, _ = times.walked(seen)
+    assert metres[-1] == pytest.approx(session.summary["distance_m"].iloc[0], rel=1e-6)
+    assert (np.diff(metres) >= 0).all()
+
+
+def test_the_distribution_holds_all_of_the_time(seen):
+    with drawing():
+        figure = times.speed_distribution(seen)
+    assert figure is not None
+    assert sum(bar.get_height() for bar in figure.axes[0].patches) == pytest.approx(100.0)
 
 
 def test_a_long_curve_keeps_its_peaks_and_its_holes():
     values = np.zeros(100_000)
     values[54_321] = 9.0
     values[20_000:30_000] = np.nan
-    paths = figures._paths(np.arange(100_000.0), values)
-    assert len(paths) == 2
-    points = sum(len(re.findall(r"[ML]", path)) for path in paths)
-    assert points < 2600
-    assert " 9.0" in "".join(paths)
+    rows = times.kept_rows(values, 1200)
+    assert len(rows) < 2600
+    assert 54_321 in rows
+    assert np.isnan(values[rows]).sum() > 100
 
 
-def test_a_bar_stands_at_its_time():
-    time = figures.time_scale(10.0)
-    svg = figures.lanes([(2.5, 5.0, "rear")], ["rear", "walk"], [], time)
-    found = re.search(r'fill="#[0-9A-Fa-f]{6}" x="([\d.]+)" y="[\d.]+" width="([\d.]+)"', svg)
-    assert found
-    x, width = map(float, found.groups())
-    assert x == pytest.approx(float(time(2.5)), abs=0.01)
-    assert width == pytest.approx(float(time(5.0) - time(2.5)), abs=0.02)
+def test_bouts_nearer_than_a_hair_are_one_bar():
+    spans = [(0.0, 1.0), (1.01, 1.02), (5.0, 6.0)]
+    assert times.joined(spans, 0.05) == [(0.0, 1.02), (5.0, 6.0)]
+    assert times.joined(spans, 0.0) == spans
+
+
+def test_the_arenas_floor_is_at_height_zero_and_a_fixture_as_high_as_it_is(session):
+    camera = session.camera
+    depth = np.full((camera.height, camera.width), round(FLOOR_MM), np.uint16)
+    depth[20:30, 40:50] = round(FLOOR_MM) - 60
+    heights, x_mm, y_mm = places.arena_heights(session, [depth, depth])
+    known = heights[np.isfinite(heights)]
+    assert np.median(known) == pytest.approx(0.0, abs=0.6)
+    assert np.nanmax(heights) == pytest.approx(60.0, abs=1.0)
+    assert (np.diff(x_mm) > 0).all()
+    assert (np.diff(y_mm) > 0).all()
+
+
+def test_the_animal_is_not_in_the_map_of_the_arena(session):
+    with DepthReader(session) as reader:
+        pictures = [reader.picture(row) for row in range(0, 270, 30)]
+    heights, _, _ = places.arena_heights(session, [one for one in pictures if one is not None])
+    assert np.nanmax(heights) < 15.0  # the mouse is 25 mm high
+
+
+def test_what_the_tables_say_twice_is_the_same_bytes(session, tmp_path):
+    some = ["occupancy", "ethogram", "transitions"]
+    asked = {"only": some, "formats": ("svg", "pdf", "png")}
+    first = draw_figures(session.path, out=tmp_path / "a", **asked)
+    again = draw_figures(session.path, out=tmp_path / "b", **asked)
+    assert len(first["files"]) == 9
+    for one, other in zip(first["files"], again["files"], strict=True):
+        assert one.read_bytes() == other.read_bytes(), one.name
+
+
+def test_every_figure_has_something_to_show_of_a_usual_session(session, tmp_path):
+    found = draw_figures(session.path, formats=["svg"], out=tmp_path)
+    assert found["empty"] == ["onsets"]  # it takes five bouts
+    assert {path.stem for path in found["files"]} == set(sets.OF_SESSION) - {"onsets"}
+
+
+def test_texts_stay_texts_that_can_be_edited(session, tmp_path):
+    draw_figures(session.path, only=["occupancy"], out=tmp_path)
+    svg = (tmp_path / "occupancy.svg").read_text(encoding="utf-8")
+    assert "Occupancy, circle" in svg
+    assert "nest &lt;1&gt;" in svg
+    assert 'width="252.' in svg  # 89 mm in points
+    assert "Date" not in svg
+    pdf = (tmp_path / "occupancy.pdf").read_bytes()
+    assert b"/Type3" not in pdf
+    assert b"CreationDate" not in pdf
+
+
+def test_a_dollar_in_a_name_is_a_dollar(tmp_path):
+    mouse = write(tmp_path / "d.liex", MOUSE, name="a$b$ <c>")
+    (one,) = animals(mouse)
+    with drawing():
+        svg = image_bytes(times.ethogram(one), "svg")  # type: ignore[arg-type]
+    assert "a$b$ &lt;c&gt;" in svg.decode()
+    assert "a$b$ &lt;c&gt;" in on_page(svg, "x", "y <z>")
+    assert 'aria-label="y &lt;z&gt;"' in on_page(svg, "x", "y <z>")
+
+
+def test_an_empty_session_is_a_sentence_and_no_file(tmp_path):
+    lost = write(tmp_path / "lost.liex", WalkingMouse(steady(1.0), lost=tuple(range(30))))
+    with pytest.raises(SessionError, match=r"nothing to draw of occupancy: no pose was found"):
+        draw_figures(lost.path, only=["occupancy"], out=tmp_path / "none")
+    assert not (tmp_path / "none").exists()
+    found = draw_figures(lost.path, formats=["svg"], out=tmp_path / "some")
+    assert {"occupancy", "trajectory", "speed", "curves"} <= set(found["empty"])
+
+
+@pytest.mark.parametrize(
+    ("asked", "said"),
+    [
+        ({"only": ["occupanzy"]}, "did you mean 'occupancy'"),
+        ({"formats": ["jpg"]}, "svg, pdf, png, got 'jpg'"),
+    ],
+)
+def test_a_wrong_name_is_a_sentence(session, tmp_path, asked, said):
+    with pytest.raises(SessionError, match=said):
+        draw_figures(session.path, out=tmp_path / "none", **asked)
+    assert not (tmp_path / "none").exists()
+
+
+def test_of_several_animals_each_has_its_figures(session):
+    """Rows of another animal are not drawn as this one's."""
+    frames = pd.concat([session.frames, session.frames.assign(individual="mouse_2")])
+    moved = session.kinematics
+    moved = pd.concat([moved, moved.assign(individual="mouse_2", x_mm=np.nan, y_mm=np.nan)])
+    both = Session(session.path, session.metadata)
+    both.__dict__.update(frames=frames, kinematics=moved)
+    first = Seen(both, "mouse_1", alone=False)
+    second = Seen(both, "mouse_2", alone=False)
+    assert places.occupancy_of(first).n == 268
+    assert places.occupancy_of(second).n == 0
+    assert "circle, mouse_1" in text_of(places.occupancy_map(first))
+
+
+@pytest.fixture(scope="module")
+def study(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two groups of three mice; those of the second are faster."""
+    folder = tmp_path_factory.mktemp("study")
+    for group, speed in (("control", 150.0), ("drug", 250.0)):
+        for k in range(3):
+            mouse = WalkingMouse(steady(4.0), speed_mm_s=speed + 10.0 * k, rear_s=(1.0, 2.0))
+            name = f"{group}{k}"
+            facts = {"subject_id": name, "group": group}
+            write(folder / f"{name}.liex", mouse, name=name, subject=facts, arena=BOWL)
+    return folder
+
+
+@pytest.mark.slow
+def test_a_comparison_draws_every_animal_and_the_interval_of_the_table(study, tmp_path):
+    found = compare_groups([study], tmp_path / "cmp", ["mean_speed_mm_s", "rear_count"])
+    names = {path.name for path in found["figures"]}
+    assert {"compare_mean_speed_mm_s.svg", "compare_mean_speed_mm_s.pdf", "effects.svg"} <= names
+    assert {"occupancy_groups.svg", "occupancy_subjects.svg", "distances.svg"} <= names
+    table, stats, sessions = sets.read_comparison(tmp_path / "cmp")
+    assert len(sessions) == 6
+    with drawing():
+        figure = groups.comparison(table, stats, "mean_speed_mm_s", "mm/s")
+    assert figure is not None
+    left, right = figure.axes
+    for group in ("control", "drug"):
+        (marks,) = [line for line in left.get_lines() if line.get_gid() == f"animals {group}"]
+        own = table.loc[table["group"] == group, "mean_speed_mm_s"]
+        np.testing.assert_allclose(sorted(marks.get_ydata()), sorted(0.1 * own))  # cm/s
+    (interval,) = [line for line in right.get_lines() if line.get_gid() == "interval 0"]
+    row = stats[stats["measure"] == "mean_speed_mm_s"].iloc[0]
+    np.testing.assert_allclose(interval.get_xdata(), [0.1 * row["ci_low"], 0.1 * row["ci_high"]])
+    said = text_of(figure)
+    assert "n = 6 animals, 6 sessions" in said
+    assert "n = 3 and 3 animals" in said
+    assert f"g {row['effect_size']:.2f}" in said
+
+
+def test_the_mean_of_a_group_counts_every_subject_alike(study):
+    sessions = [Session.open(path) for path in sorted(study.glob("*.liex"))]
+    seen = [one for session in sessions for one in animals(session)]
+    both = groups.by_group(seen)
+    assert {name: len(subjects) for name, subjects in both.items()} == {"control": 3, "drug": 3}
+    text = text_of(groups.occupancy_by_group(seen))
+    assert "control, n = 3 subjects" in text
+    each = np.mean(
+        [places.occupancy_of(one).observed_s for one in both["control"].values() for one in one]
+    )
+    assert f"mean of {each:.1f} s each" in text
+
+
+def test_a_study_has_its_figures(study, tmp_path):
+    found = draw_figures(study, formats=["svg"], out=tmp_path)
+    assert {path.stem for path in found["files"]} == set(sets.OF_STUDY)
+    assert "n = 6 sessions" in (tmp_path / "ethograms.svg").read_text(encoding="utf-8")
+
+
+def test_a_damaged_comparison_is_a_sentence(study, tmp_path):
+    (tmp_path / sets.COMPARISON_FILE).write_text("{", encoding="utf-8")
+    with pytest.raises(SessionError, match="compare again"):
+        draw_figures(tmp_path)
+
+
+def test_a_refused_test_is_drawn_hollow(study):
+    table = pd.DataFrame(
+        {
+            "session_id": list("abcd"),
+            "subject_id": list("abcd"),
+            "group": ["x", "x", "y", "y"],
+            "speed": [1.0, 2.0, 3.0, 4.0],
+        }
+    )
+    stats = compare(table, ["speed"])
+    with drawing():
+        figure = groups.comparison(table, stats, "speed", "")
+    assert figure is not None
+    assert "no test" in text_of(figure)
 
 
 def test_near_is_light_and_unread_is_grey():
     depth = np.array([[700, 700, 700, 700], [700, 650, 650, 0]], np.uint16)
-    rgb = figures.shade(depth, 80.0).astype(int)
+    rgb = shade(depth, 80.0).astype(int)
     assert rgb[1, 1].sum() > rgb[0, 0].sum()
     assert rgb[1, 3].tolist() == [90, 90, 90]
 
 
 def test_a_skeleton_is_drawn_on_its_pixels():
     depth = np.full((20, 20), 700, np.uint16)
-    svg = figures.picture(
+    svg = picture(
         depth, np.array([[104.0, 55.0], [110.0, 60.0]]), [(0, 1)], left=100, top=50, reach_mm=60.0
     )
     assert 'x1="4.5" y1="5.5" x2="10.5" y2="10.5"' in svg

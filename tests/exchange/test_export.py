@@ -5,6 +5,7 @@ sentence.
 from __future__ import annotations
 
 import json
+import shutil
 from datetime import datetime
 from importlib import import_module
 from pathlib import Path
@@ -21,7 +22,6 @@ from typer.testing import CliRunner
 from liex_lab import cli
 from liex_lab.errors import SessionError
 from liex_lab.exchange import TARGETS, export
-from liex_lab.exchange.export import _EXTRA
 from liex_lab.exchange.movement import to_movement
 from liex_lab.exchange.poses import Poses
 from liex_lab.sessions import Session
@@ -54,6 +54,35 @@ def test_every_table_comes_back_from_csv_as_it_was(session, out):
         for entry in json.loads((folder / "columns.json").read_text())
     }
     assert ("bouts", "path_mm") in described
+
+
+def test_every_table_is_a_sheet_of_the_workbook_and_texts_are_no_formulas(session, tmp_path):
+    copy = tmp_path / "copy.liex"
+    shutil.copytree(session.path, copy)
+    facts = pd.read_parquet(copy / "sessions.parquet")
+    facts.assign(subject_id="=1+1").to_parquet(copy / "sessions.parquet")
+    path = export(Session.open(copy), "xlsx", tmp_path)
+    sheets = pd.read_excel(path, sheet_name=None)
+    names = sorted(file.stem for file in session.path.glob("*.parquet"))
+    assert list(sheets) == ["summary", *names, "columns"]
+    assert sheets["sessions"].subject_id[0] == "=1+1"
+    for name in ("frames", "poses", "kinematics", "bouts"):
+        stored = session.table(name)
+        numbers = stored.select_dtypes("number").columns
+        assert sheets[name].columns.tolist() == stored.columns.tolist()
+        np.testing.assert_allclose(  # Excel has 16 digits
+            sheets[name][numbers].to_numpy(float), stored[numbers].to_numpy(float), rtol=1e-15
+        )
+    stamps = sheets["frames"]["time_ns"]
+    assert [int(stamp) for stamp in stamps] == session.frames["time_ns"].tolist()
+    assert {"table", "name", "unit", "meaning"} <= set(sheets["columns"].columns)
+
+
+def test_a_table_longer_than_a_sheet_is_refused_in_a_sentence(session, tmp_path, monkeypatch):
+    monkeypatch.setattr("liex_lab.exchange.tables_xlsx.MAX_ROWS", 100)
+    with pytest.raises(SessionError, match=r"at most 100 rows .* export it as csv"):
+        export(session, "xlsx", tmp_path)
+    assert not list(tmp_path.iterdir())
 
 
 def test_deeplabcut_s_tables_have_its_header_and_a_row_for_every_frame(session, out):
@@ -186,7 +215,7 @@ def test_missing_packages_are_named(session, tmp_path, monkeypatch):
     monkeypatch.setattr(import_module("liex_lab.exchange.nwb"), "write", missing)
     with pytest.raises(SessionError, match="pynwb is missing") as told:
         export(session, "nwb", tmp_path)
-    assert _EXTRA in str(told.value)
+    assert "pip install '.[exchange]'" in str(told.value)
 
 
 def test_the_verb_writes_beside_the_session_or_where_it_is_told(session, tmp_path):
@@ -195,7 +224,7 @@ def test_the_verb_writes_beside_the_session_or_where_it_is_told(session, tmp_pat
     )
     assert ran.exit_code == 0, ran.output
     assert (tmp_path / "circle_csv" / "poses.csv").is_file()
-    assert set(TARGETS) == {"nwb", "boris", "dlc", "movement", "sleap", "csv"}
+    assert set(TARGETS) == {"nwb", "boris", "dlc", "movement", "sleap", "csv", "xlsx"}
 
 
 def test_a_session_without_any_pose_can_be_exported(tmp_path):

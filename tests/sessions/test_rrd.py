@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 import liex_lab.sessions.rrd as replay
+import liex_lab.sessions.rrd_depth as depth_of
 from liex_lab.arena.outline import Arena
 from liex_lab.arena.zones import Zone
 from liex_lab.body.pose import Pose
@@ -62,7 +63,7 @@ def session(tmp_path_factory, strict):
 
 def test_the_expected_entities_are_there_on_both_timelines(session):
     for entity in (
-        replay.DEPTH,
+        depth_of.DEPTH,
         f"{replay.SKELETON}/joints",
         f"{replay.SKELETON}/bones",
         f"{replay.OVERLAY}/joints",
@@ -128,7 +129,7 @@ def unpacked(blob, kind):
 
 
 def test_depth_is_held_as_it_is(session):
-    columns = columns_of(session, replay.DEPTH)
+    columns = columns_of(session, depth_of.DEPTH)
     assert columns["frame"] == list(range(len(MOUSE.times_s)))
     assert columns["EncodedDepthImage:meter"] == [[1000.0]]
     kinds = [row[0] for row in columns["EncodedDepthImage:media_type"]]
@@ -149,16 +150,16 @@ def test_a_noisy_frame_takes_less_than_180_kilobytes_and_without_depth_next_to_n
         return replace(frame, depth=np.maximum(frame.depth + noise, 0).astype(np.float32))
 
     sizes = {}
-    for depth in (True, False):
+    for depth in ("all", "none"):
         place = tmp_path / f"{depth}.liex"
         with SessionWriter(place, mouse.provenance(replay_depth=depth)) as writer:
             for frames, track in mouse.chunks(12):
                 writer.add([noisy(frame) for frame in frames], track)
             writer.close()
         sizes[depth] = (place / "session.rrd").stat().st_size / 24
-    assert sizes[True] < 180_000
+    assert sizes["all"] < 180_000
     assert (
-        sizes[False] < 12_000
+        sizes["none"] < 12_000
     )  # of so short a session most is the scene and the body, which are there once
 
 
@@ -172,7 +173,7 @@ def test_whatever_the_noise_the_picture_comes_out_as_it_went_in():
         depth = (step_mm * np.rint((700.0 + rng.normal(0.0, sd_mm, (120, 160))) / step_mm)).astype(
             np.uint16
         )
-        blob, kind = replay.packed(depth)
+        blob, kind = depth_of.packed(depth)
         kinds.add(kind)
         np.testing.assert_array_equal(unpacked(blob, kind), depth)
     assert kinds == {"application/rvl", "image/png"}
@@ -265,10 +266,10 @@ def test_the_action_lane_changes_where_the_bouts_do_and_ends_empty(session):
 def test_the_colours_spread_over_the_floor_and_an_animal_on_it():
     depth = np.full((40, 40), 700, np.uint16)
     depth[10:14, 10:20] = 660
-    near, far = replay.colour_range(depth, 700.0)
+    near, far = depth_of.colour_range(depth, 700.0)
     assert near < 640
     assert 700 < far < 730
-    assert replay.colour_range(np.zeros((4, 4), np.uint16), 700.0)[1] > 700
+    assert depth_of.colour_range(np.zeros((4, 4), np.uint16), 700.0)[1] > 700
 
 
 def test_a_blueprint_travels_inside_and_both_layouts_lie_beside(tmp_path, strict):

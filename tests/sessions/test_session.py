@@ -276,7 +276,7 @@ def test_a_newer_session_asks_for_an_upgrade(session, tmp_path):
         (None, "holds no session.json"),
         ("{", "damaged"),
         ("[]", "damaged"),
-        ('{"schema_version": 1}', "lacks plan"),
+        ('{"schema_version": 1}', "session_id"),
     ],
 )
 def test_what_is_not_a_session_is_refused_with_a_sentence(tmp_path, content, says):

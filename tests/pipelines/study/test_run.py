@@ -324,7 +324,7 @@ def test_dry_run_changes_nothing(tmp_path: Path) -> None:
 
 
 def test_two_runs_of_a_study_at_once_are_refused(tmp_path: Path) -> None:
-    from liex_lab.sessions.lock import take_lock
+    from liex_lab.runtime.lock import take_lock
 
     file = make_study(tmp_path, ["good"])
     folder = Study.load(file).cohort_folder

@@ -1,4 +1,4 @@
-"""An animal of the user's own, as README.md has it: a TOML, then train, evaluate and run."""
+"""An animal of the user's own, as docs/tutorials/own-animal.md has it: train, evaluate, run."""
 
 from __future__ import annotations
 

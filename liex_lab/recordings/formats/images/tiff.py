@@ -8,6 +8,8 @@ first bad page, for what follows cannot be told from noise.
 from __future__ import annotations
 
 import logging
+import lzma
+import zlib
 from dataclasses import dataclass, field
 from pathlib import Path
 from threading import Lock
@@ -26,10 +28,16 @@ from liex_lab.recordings.formats.images.stack import (
 )
 from liex_lab.runtime.progress import Progress
 
+_SPARE = 1 << 20  # bytes
+_LZMA = (34925,)
+_LZMA_MEMORY = 1 << 28  # bytes; the largest of its usual levels takes 64 MB
+_UNPACKERS = (8, 32946, 50013, *_LZMA)  # codes of compression: DEFLATE, LZMA
+
 # tifffile reports damage twice, as an exception and in the log; the log would come out between our
 # sentences
 logging.getLogger("tifffile").addHandler(logging.NullHandler())
 
+_LEAST_DIRECTORY = 30  # bytes: one that describes a picture has more
 _SIGNATURES = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 
 
@@ -113,9 +121,26 @@ class TiffStack:
             self._open_path = page.path
         assert self._open is not None
         try:
+            self._check_unpacked(self._open, page.page)
             return self._open.asarray(key=page.page)
+        except _LargerThanStatedError:
+            return None
         except Exception:  # damage inside compressed data comes out as almost any exception
             return _decode_with_opencv(page)
+
+    def _check_unpacked(self, tif: tifffile.TiffFile, number: int) -> None:
+        """Raises where a packed piece is larger than the picture when it is unpacked.
+
+        tifffile unpacks whole pieces of DEFLATE and LZMA in memory, of any size.
+        """
+        page: Any = tif.pages[number]
+        if page.compression not in _UNPACKERS:
+            return
+        most = 4 * self.width * self.height + _SPARE
+        for offset, count in zip(page.dataoffsets, page.databytecounts, strict=True):
+            tif.filehandle.seek(offset)
+            if not _fits(tif.filehandle.read(count), page.compression, most):
+                raise _LargerThanStatedError
 
     def label(self, index: int) -> str:
         """Name of a picture, for a sentence.
@@ -134,6 +159,33 @@ class TiffStack:
         if self._open is not None:
             self._open.close()
         self._open = self._open_path = None
+
+
+class _LargerThanStatedError(Exception):
+    """A packed piece of a picture that holds more than the picture."""
+
+
+def _fits(packed: bytes, compression: int, most: int) -> bool:
+    """Whether a packed piece has at most so many bytes when it is unpacked."""
+    unpacked = 0
+    try:
+        if compression in _LZMA:
+            unpacker = lzma.LZMADecompressor(memlimit=_LZMA_MEMORY)
+            while unpacked <= most and not unpacker.eof:
+                unpacked += len(unpacker.decompress(packed, _SPARE))
+                packed = b""
+                if unpacker.needs_input:
+                    break
+        else:
+            state = zlib.decompressobj()
+            while unpacked <= most and packed and not state.eof:
+                unpacked += len(state.decompress(packed, _SPARE))
+                packed = state.unconsumed_tail
+    except lzma.LZMAError:
+        return False
+    except zlib.error:
+        return True  # damage is told by who unpacks it
+    return unpacked <= most
 
 
 def _decode_with_opencv(page: _Page) -> NDArray[Any] | None:
@@ -204,7 +256,11 @@ def _list_pages(path: Path) -> tuple[list[_Page], tuple[int, int] | None, bool]:
     try:
         with tifffile.TiffFile(path) as tif:
             page: Any
+            seen: set[int] = set()
             for page in tif.pages:
+                if page.offset in seen or len(listed) * _LEAST_DIRECTORY > size_bytes:
+                    return listed, size, False  # the list of directories leads back to itself
+                seen.add(page.offset)
                 listed.append(_describe(path, len(listed), page, size_bytes))
                 size = size or (int(page.imagewidth), int(page.imagelength))
             ends = _list_ends(tif)

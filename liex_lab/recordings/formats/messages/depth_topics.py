@@ -41,6 +41,7 @@ from liex_lab.recordings.formats.messages.messages import (
     DepthUnit,
     Parser,
 )
+from liex_lab.recordings.formats.messages.pack_facts import PackFacts
 from liex_lab.recordings.formats.messages.parsers import parser_of, plain_schema
 from liex_lab.recordings.frame import Depth
 from liex_lab.recordings.recording import Recording
@@ -246,14 +247,22 @@ def _open(
     order = np.argsort(np.array(chosen.log_ns, np.int64), kind="stable")
     monotone = make_monotone(_stamps(chosen, order, problems))
     problems += [monotone.problem] if monotone.problem else []
+    packed = PackFacts.of(file.notes)
+    problems += packed.problems
     start = start_of_clock(int(monotone.times_ns[0]))
     stated = {name: file.notes[name] for name in _FACTS if name in file.notes}
     metadata = ({"session_start_time": start} if start else {}) | stated | camera_file.metadata
     frames = _Frames(
-        file, chosen, order, the_camera, _step_mm(chosen, found.units), camera_file, problems
+        file,
+        chosen,
+        order,
+        the_camera,
+        _step_mm(chosen, found.units) * packed.step_mm,
+        camera_file,
+        problems,
     )
     return Recording(
-        name=path.resolve().stem,
+        name=packed.name(path.resolve().stem),
         format=kind,
         camera=the_camera,
         times_ns=monotone.times_ns,
@@ -261,9 +270,9 @@ def _open(
         sources=[path],
         problems=problems,
         truncated=not file.whole,
-        metadata=metadata,
+        metadata=metadata | packed.metadata,
         close=file.close,
-        faults=monotone.faults,
+        faults=packed.faults(monotone.faults),
         grow=grow,
     )
 
@@ -348,7 +357,8 @@ def _choose(file: MessageFile, found: _Found, topic: str | None) -> _Topic:
             choice = sorted(printable(depth.name) for depth in some)
             raise RecordingError(
                 f"{path} holds depth pictures on {len(some)} topics, {', '.join(choice)}; choose "
-                f"one with --topic {choice[0]}, or in a plan with recording.topic"
+                f"one with --topic {choice[0]} (in Python topic=), or in a plan with "
+                "recording.topic"
             )
     raise _no_depth(file)
 

@@ -291,6 +291,24 @@ class RosMessages(Messages):
         out.whole(len(png))
         return bytes(out.content) + png
 
+    def rvl_picture(self, time_ns: int, rvl: bytes) -> bytes:
+        """sensor_msgs/msg/CompressedImage of an RVL picture, as compressed_depth_image_transport.
+
+        Args:
+            time_ns: its stamp, ns; its seconds fit into 32 bits.
+            rvl: the payload, see `recordings.rvl.rvl_message`.
+
+        Returns:
+            The bytes of the message.
+
+        Raises:
+            RecordingError: the time is beyond 2038.
+        """
+        out = _Cdr(time_ns)
+        out.text("16UC1; compressedDepth rvl")
+        out.whole(len(rvl))
+        return bytes(out.content) + rvl
+
     def calibration(self, time_ns: int, camera: Camera) -> bytes:
         """sensor_msgs/msg/CameraInfo of the camera of the pictures.
 

@@ -5,6 +5,7 @@ Every picture closes its chunk (128 KiB), so that one frame is unpacked to read 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
 
@@ -20,6 +21,7 @@ from liex_lab.recordings.formats.messages.mcap_encoding import (
     Schema,
 )
 from liex_lab.recordings.frame import DepthFrame
+from liex_lab.recordings.rvl import rvl_message
 from liex_lab.recordings.writer import RecordingWriter, png_of, steps_of
 
 DEPTH_TOPIC = "/camera/depth"
@@ -43,7 +45,8 @@ class McapDepthWriter(RecordingWriter):
         camera: Camera,
         *,
         messages: Literal["foxglove", "ros"] = "foxglove",
-        packing: Literal["raw", "png"] = "raw",
+        packing: Literal["raw", "png", "rvl"] = "raw",
+        step_mm: float = 1.0,
         metadata: dict[str, Any] | None = None,
     ) -> None:
         """Open the file and register schemas and channels.
@@ -52,15 +55,18 @@ class McapDepthWriter(RecordingWriter):
             path: the .mcap file.
             camera: the camera of the frames.
             messages: "foxglove" for Foxglove's schemas in protobuf, "ros" for ROS 2's.
-            packing: "raw" or "png", of a picture within its chunk.
+            packing: "raw", "png", or of ROS's messages "rvl", of a picture within its chunk.
+            step_mm: mm of a stored step, of "png" and "rvl".
             metadata: facts of the recording, kept as text in a metadata record.
         """
         super().__init__(path, camera)
         self._packing = packing
+        self._step_mm = step_mm
         self._float = False
         self._n_off = 0
         self._calibrated_ns: int | None = None
-        self._messages: Messages = RosMessages() if messages == "ros" else FoxgloveMessages()
+        self._ros = RosMessages() if messages == "ros" else None
+        self._messages: Messages = self._ros or FoxgloveMessages()
         self._file = path.open("wb")
         self._writer = Writer(self._file, chunk_size=_CHUNK_BYTES)
         self._writer.start(self._messages.profile, "liex_lab")
@@ -84,8 +90,8 @@ class McapDepthWriter(RecordingWriter):
             frame: the frame, depth (H, W) float32 mm.
 
         Raises:
-            RecordingError: (png) its depth is not in whole mm of 16 bits, or (ros) its time is
-                beyond 2038.
+            RecordingError: (png, rvl) its depth is not in whole steps of 16 bits, or (ros) its time
+                is beyond 2038.
         """
         time_ns = frame.time_ns
         if self._calibrated_ns is None or time_ns - self._calibrated_ns >= _SECOND:
@@ -98,10 +104,11 @@ class McapDepthWriter(RecordingWriter):
         self._writer.add_message(channel, logged_ns, message, logged_ns)
 
     def _picture(self, frame: DepthFrame) -> bytes:
-        if self._packing == "png":
-            return self._messages.packed_picture(
-                frame.time_ns, png_of(steps_of(frame, 1.0, exact=True))
-            )
+        if self._packing != "raw":
+            exact = steps_of(frame, self._step_mm, exact=True)
+            if self._packing == "rvl" and self._ros is not None:
+                return self._ros.rvl_picture(frame.time_ns, rvl_message(exact).tobytes())
+            return self._messages.packed_picture(frame.time_ns, png_of(exact))
         steps = None if self._float else whole_steps(frame.depth, 1.0)
         if steps is not None:
             data = steps.astype("<u2", copy=False).tobytes()
@@ -114,6 +121,14 @@ class McapDepthWriter(RecordingWriter):
             encoding = "32FC1"
         size = self.camera.width, self.camera.height
         return self._messages.raw_picture(frame.time_ns, size, encoding, data)
+
+    def note(self, facts: Mapping[str, str]) -> None:
+        """Write facts that are known only when all frames were added, as a metadata record.
+
+        Args:
+            facts: texts by name.
+        """
+        self._writer.add_metadata(NOTES, dict(facts))
 
     def finish(self) -> None:
         """Write the index, and note in what unit depth was kept."""

@@ -267,7 +267,11 @@ class Db3File(MessageFile):
 
         Yields:
             The messages, up to the first that is damaged.
+
+        Raises:
+            RecordingError: what stands for the tables is something else.
         """
+        self._refuse_views()
         try:
             rows = self._base.execute(
                 "SELECT id, name, type, serialization_format FROM topics"
@@ -286,6 +290,22 @@ class Db3File(MessageFile):
                 progress(number, last, "looking through the recording (messages)")
         except (sqlite3.Error, KeyError, ValueError, TypeError, OverflowError):
             self.whole = False
+
+    def _refuse_views(self) -> None:
+        """Refuse tables that are made up when they are read: one that names itself never ends."""
+        try:
+            stored = self._base.execute(
+                "SELECT lower(name), type, lower(sql) FROM sqlite_master "
+                "WHERE lower(name) IN ('topics', 'messages')"
+            ).fetchall()
+        except (sqlite3.Error, ValueError, OverflowError):
+            return  # the walk says what it finds
+        for name, kind, made in stored:
+            if kind != "table" or "virtual" in str(made) or "generated" in str(made):
+                raise RecordingError(
+                    f"{self.path} is no ROS 2 bag: its {name} are not stored but worked out; give "
+                    "another file"
+                )
 
     def _fetch(self, number: int) -> memoryview:
         row = self._base.execute("SELECT data FROM messages WHERE id = ?", (number,)).fetchone()

@@ -8,7 +8,7 @@ then fed zeros, and each file is written only as far as its bytes are real.
 from __future__ import annotations
 
 import errno
-import os
+import shutil
 import tarfile
 import zlib
 from collections.abc import Sequence
@@ -27,7 +27,37 @@ _PIECE = 256  # packed bytes tried at once where there is damage
 _ENOUGH_ZEROS = (
     1 << 22
 )  # far more than the end of any tar; a walk that asks for more skips over what is missing
+_ALWAYS = 1 << 29  # bytes that are unpacked whatever they were packed to
+_MOST_TIMES = 200  # what more than that unpacks to: true pictures have noise
+_MOST_HEADER = 1 << 20  # bytes of a member's name and notes
+_MOST_NOTES = 1 << 28  # bytes of any file but the pictures: stamps of days
 _GZIP_MAGIC = b"\x1f\x8b"
+
+
+class _Member(tarfile.TarInfo):
+    """A member of an archive; tarfile reads long names and notes into memory, of any size."""
+
+    _LONG = (
+        tarfile.GNUTYPE_LONGNAME,
+        tarfile.GNUTYPE_LONGLINK,
+        tarfile.XHDTYPE,
+        tarfile.XGLTYPE,
+        tarfile.SOLARIS_XHDTYPE,
+    )
+
+    def _proc_member(self, tar: tarfile.TarFile) -> tarfile.TarInfo:
+        if self.type == tarfile.GNUTYPE_SPARSE:
+            raise RecordingError(
+                "the archive has a file with holes in it (GNU sparse); pack the session's folder "
+                "again, without --sparse"
+            )
+        if self.type in self._LONG and self.size > _MOST_HEADER:
+            raise RecordingError(
+                f"the archive has a name or note of {self.size} bytes, which no recording has; "
+                "pack the session's folder again"
+            )
+        found: tarfile.TarInfo = super()._proc_member(tar)  # type: ignore[misc]
+        return found
 
 
 @dataclass(frozen=True)
@@ -74,17 +104,30 @@ class _Patient:
         block = bytes(self._buffer[:n])
         del self._buffer[:n]
         self.n_true += len(block)
+        self._bound()
         self._n_zeros += n - len(block)
         if self._n_zeros > _ENOUGH_ZEROS:
             raise tarfile.ReadError("the archive ended long ago")
         return block + bytes(n - len(block))
+
+    def _bound(self, n_more: int = 0) -> None:
+        """Raises RecordingError where more comes out than of any recording, of what is packed."""
+        n = self.n_true + n_more
+        if n > _ALWAYS and n > _MOST_TIMES * max(self._file.tell(), 1):
+            raise RecordingError(
+                f"the archive unpacks to more than {_MOST_TIMES} times its size, which no "
+                "recording does; pack the session's folder again"
+            )
 
     def finish(self) -> None:
         """Read to the end.
 
         A tar is over before the gzip around it is, and only gzip's end tells that it is whole.
         """
+        n_more = 0
         while not self.ended:
+            n_more += len(self._buffer)
+            self._bound(n_more)
             self._buffer.clear()
             self._fill()
 
@@ -160,7 +203,7 @@ def unpack(archive: Path, wanted: Sequence[str], folder: Path, progress: Progres
     with archive.open("rb") as file:
         stream = _Patient(file, archive.stat().st_size, progress)
         try:
-            with tarfile.open(fileobj=stream, mode="r|", bufsize=_BLOCK) as tar:  # type: ignore[call-overload]
+            with tarfile.open(fileobj=stream, mode="r|", bufsize=_BLOCK, tarinfo=_Member) as tar:  # type: ignore[call-overload]
                 for member in tar:
                     name = PurePosixPath(member.name).name
                     if cut or not member.isfile() or name.startswith("._"):
@@ -172,6 +215,7 @@ def unpack(archive: Path, wanted: Sequence[str], folder: Path, progress: Progres
                         )
                     seen.add(name)
                     if name in wanted:
+                        _check_size(archive, member, folder)
                         files[name] = folder / name
                         cut = _copy(tar, member, files[name], stream)
         except tarfile.TarError:
@@ -183,6 +227,28 @@ def unpack(archive: Path, wanted: Sequence[str], folder: Path, progress: Progres
             cut = True
         stream.finish()
     return Unpacked(files, frozenset(seen), cut or not stream.whole)
+
+
+def _check_size(archive: Path, member: tarfile.TarInfo, folder: Path) -> None:
+    """Raises RecordingError where a member is too large for what it is, or for the disk."""
+    name = PurePosixPath(member.name).name
+    if member.issparse():
+        raise RecordingError(
+            f"{archive} has a file with holes in it, {name}; pack the session's folder again"
+        )
+    if PurePosixPath(name).suffix in (".json", ".txt", ".csv", ".toml"):
+        if member.size > _MOST_NOTES:
+            raise RecordingError(
+                f"{archive} has a {name} of {member.size / 1e9:.1f} GB, which holds no stamps or "
+                "notes; pack the session's folder again"
+            )
+        return
+    room = shutil.disk_usage(folder).free
+    if member.size > room:
+        raise RecordingError(
+            f"there is no room to unpack {member.size / 1e9:.1f} GB into {folder}, where "
+            f"{room / 1e9:.1f} GB are free; free some, or set TMPDIR to a folder on a larger disk"
+        )
 
 
 def _copy(tar: tarfile.TarFile, member: tarfile.TarInfo, to: Path, stream: _Patient) -> bool:
@@ -209,15 +275,3 @@ def _copy(tar: tarfile.TarFile, member: tarfile.TarInfo, to: Path, stream: _Pati
             ) from None
         raise
     return False
-
-
-def remove_tree(folder: Path) -> None:
-    """Remove a folder of unpacked files; files that are gone already do not matter.
-
-    Args:
-        folder: the folder; it has no folders in it, and need not exist.
-    """
-    for name in os.listdir(folder) if folder.is_dir() else []:
-        (folder / name).unlink(missing_ok=True)
-    if folder.is_dir():
-        folder.rmdir()

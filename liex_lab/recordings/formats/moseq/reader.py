@@ -7,7 +7,6 @@ an Azure Kinect; stamps lie beside the depth, or are the video's own, or follow 
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -22,7 +21,7 @@ from liex_lab.optics.camera import KINECT_V2, Camera, Lens
 from liex_lab.recordings.camera_file import CAMERA_FILE, CameraFile, rate
 from liex_lab.recordings.formats.images.folder import Pictures
 from liex_lab.recordings.formats.images.stack import Stack
-from liex_lab.recordings.formats.moseq.archive import Unpacked, remove_tree, unpack
+from liex_lab.recordings.formats.moseq.archive import Unpacked, unpack
 from liex_lab.recordings.formats.moseq.azure_kinect import azure_camera, mode_of, read_calibration
 from liex_lab.recordings.formats.moseq.metadata import (
     AZURE,
@@ -43,6 +42,7 @@ from liex_lab.recordings.timestamps import (
     median_step,
 )
 from liex_lab.runtime.progress import Progress, silent
+from liex_lab.runtime.scratch import Scratch
 
 DEPTH = "depth.dat"
 VIDEOS = ("depth.avi", "depth.mkv")
@@ -170,17 +170,17 @@ def open_moseq(
         return _Session(path, depth, found, camera, fps, progress).open(name, list(files.values()))
     # gzip has no random access, so the session is streamed once into a folder that lives as long as
     # the recording
-    folder = Path(tempfile.mkdtemp(prefix="liex-"))
+    scratch = Scratch()
     try:
-        found = unpack(path, (*DEPTHS, *names), folder, progress)
+        found = unpack(path, (*DEPTHS, *names), scratch.folder, progress)
         inside = next((found.files[name] for name in DEPTHS if name in found.files), None)
         if inside is None:
             raise _no_depth(path, found)
         return _Session(path, inside, found, camera, fps, progress).open(
-            _archive_name(path), [path], folder
+            _archive_name(path), [path], scratch
         )
     except BaseException:
-        remove_tree(folder)
+        scratch.close()
         raise
 
 
@@ -227,13 +227,14 @@ class _Session:
         self.problems = [*self.camera_file.problems, *self.metadata.problems]
         self.stamps = read_stamps(found.files, found.cut, self.problems)
 
-    def open(self, name: str, sources: list[Path], folder: Path | None = None) -> Recording:
+    def open(self, name: str, sources: list[Path], scratch: Scratch | None = None) -> Recording:
         """The recording.
 
         Args:
             name: its name.
             sources: the input's files.
-            folder: of unpacked files, removed on closing; None where nothing was unpacked.
+            scratch: folder of unpacked files, removed on closing; None where nothing was
+                unpacked.
 
         Returns:
             The recording.
@@ -242,8 +243,8 @@ class _Session:
 
         def close() -> None:
             stack.close()
-            if folder is not None:
-                remove_tree(folder)
+            if scratch is not None:
+                scratch.close()
 
         try:
             return self._recording(name, sources, stack, track, close)

@@ -7,7 +7,6 @@ OpenNI2's player opens them: one depth node with the properties that it wants, f
 from __future__ import annotations
 
 import math
-import os
 import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -25,6 +24,7 @@ from liex_lab.recordings.formats.oni import records
 from liex_lab.recordings.formats.oni._codec_kernels import pack_16z
 from liex_lab.recordings.frame import Depth
 from liex_lab.recordings.recording import Recording
+from liex_lab.runtime.durable import replacing
 from liex_lab.runtime.progress import Progress, silent
 
 Codec = Literal["16zT", "16zP", "NONE"]
@@ -291,13 +291,10 @@ def _in_place(path: Path) -> Iterator[Path]:
     """A name beside `path` to write under; the file gets its own when the block ends, and is gone
     where it fails.
     """
-    part = path.with_name(f"{path.name}.part-{os.getpid()}")
     try:
-        yield part
-        part.replace(path)
+        with replacing(path) as part:
+            yield part
     except OSError as error:
         raise RecordingError(
             f"{path} cannot be written ({error.strerror or error}); check the place"
         ) from None
-    finally:
-        part.unlink(missing_ok=True)

@@ -13,6 +13,9 @@ from pathlib import Path
 from typing import IO
 
 from liex_lab.errors import SessionError
+from liex_lab.runtime.places import unlinked
+
+_NO_LINKS = getattr(os, "O_NOFOLLOW", 0)
 
 
 def take_lock(path: Path) -> IO[bytes] | None:
@@ -26,8 +29,13 @@ def take_lock(path: Path) -> IO[bytes] | None:
 
     Returns:
         The open file; closing it releases the lock.
+
+    Raises:
+        PlaceError: a symbolic link lies there.
+        OSError: the file cannot be made.
     """
-    file = path.open("ab")
+    opened = os.open(unlinked(path), os.O_WRONLY | os.O_CREAT | os.O_APPEND | _NO_LINKS, 0o666)
+    file = os.fdopen(opened, "ab")
     try:
         _lock(file)
         same = os.path.samestat(os.fstat(file.fileno()), path.stat())

@@ -1,0 +1,430 @@
+"""Figures of many sessions: ethograms, budgets and ways by group, comparisons with every animal."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from liex_lab.actions.colours import action_colours
+from liex_lab.behaviour.design import animal_means
+from liex_lab.behaviour.occupancy import Occupancy, occupancy
+
+from ..units import counted, shown, titled
+from .places import aligned, extent_mm, occupancy_panels
+from .seen import Array, Seen
+from .style import (
+    GROUP_COLOURS,
+    GROUP_MARKS,
+    INK,
+    LEFT_MM,
+    LINE,
+    MUTED,
+    ONE_COLUMN_MM,
+    RIGHT_MM,
+    TWO_COLUMNS_MM,
+    action_key,
+    key_rows,
+    panel,
+    sheet,
+    time_unit,
+)
+from .times import joined, walked
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+NO_GROUP = "no group"
+
+
+def by_group(all_seen: Sequence[Seen]) -> dict[str, dict[str, list[Seen]]]:
+    """The sessions of each subject of each group, groups and subjects in order of their names.
+
+    Args:
+        all_seen: animals of sessions; one without a subject's name is a subject of its own.
+    """
+    out: dict[str, dict[str, list[Seen]]] = {}
+    for seen in sorted(all_seen, key=lambda one: (one.group, one.who)):
+        out.setdefault(seen.group or NO_GROUP, {}).setdefault(seen.who, []).append(seen)
+    return out
+
+
+def group_colour(name: str, names: Sequence[str]) -> str:
+    """The colour of a group among those of a study.
+
+    Args:
+        name: of the group.
+        names: of all groups.
+    """
+    return GROUP_COLOURS[sorted(names).index(name) % len(GROUP_COLOURS)]
+
+
+def ethograms(all_seen: Sequence[Seen]) -> Figure | None:
+    """A row for each session, in order of group; None where no session has bouts.
+
+    Args:
+        all_seen: the animals.
+    """
+    rows = [
+        (group, seen)
+        for group, subjects in by_group(all_seen).items()
+        for sessions in subjects.values()
+        for seen in sessions
+    ]
+    words = list(dict.fromkeys(word for _, seen in rows for word in seen.words))
+    if not any(len(seen.bouts) for _, seen in rows):
+        return None
+    duration = max(seen.duration_s for _, seen in rows)
+    unit, size = time_unit(duration)
+    height = max(3.4 * len(rows), 8.0)
+    keys = key_rows(words)
+    figure = sheet(TWO_COLUMNS_MM, height + 17.0 + 4.0 * keys)
+    width = TWO_COLUMNS_MM - LEFT_MM - RIGHT_MM - 8.0
+    axes = panel(figure, LEFT_MM + 8.0, 8.0 + 4.0 * keys, width, height)
+    n = sum(len(seen.bouts) for _, seen in rows)
+    axes.set_title(f"Ethograms, n = {counted(len(rows), 'session')}, {counted(n, 'bout')}")
+    colours = action_colours(words)
+    least = 0.05 * duration / width
+    for k, (_, seen) in enumerate(rows):
+        lost = [(float(a), float(b)) for a, b in seen.lost_s]
+        axes.broken_barh(
+            [(a / size, (b - a) / size) for a, b in joined(lost, least)],
+            (k - 0.42, 0.84),
+            facecolor="none",
+            edgecolor=MUTED,
+            linewidth=0.0,
+            hatch="//////",
+        )
+        for word in seen.words:
+            own = seen.bouts.loc[seen.bouts["action"] == word, ["start_s", "stop_s"]]
+            bars = joined([(float(a), float(b)) for a, b in own.to_numpy(float)], least)
+            axes.broken_barh(
+                [(a / size, max(b - a, least) / size) for a, b in bars],
+                (k - 0.42, 0.84),
+                facecolor=colours[word],
+            )
+    axes.set_ylim(len(rows) - 0.5, -0.5)
+    axes.set_yticks(
+        range(len(rows)), [f"{seen.session.name} · {group}" for group, seen in rows], size=5.0
+    )
+    axes.tick_params(axis="y", length=0)
+    axes.set_xlim(0.0, duration / size)
+    axes.set_xlabel(f"time, {unit}")
+    action_key(figure, colours)
+    return figure
+
+
+def occupancy_by_subject(all_seen: Sequence[Seen]) -> Figure | None:
+    """Heatmaps of every subject, its sessions added up; None where no place is known.
+
+    Args:
+        all_seen: the animals.
+    """
+    panels = []
+    for group, subjects in by_group(all_seen).items():
+        for who, sessions in subjects.items():
+            found = _added([_framed(seen, all_seen) for seen in sessions])
+            text = f"{who} ({group}), {found.observed_s:.1f} s\nn = {counted(found.n, 'frame')}"
+            panels.append((text, sessions[0].session, found))
+    n = len(panels)
+    return occupancy_panels(f"Occupancy by subject, n = {counted(n, 'subject')}", panels)
+
+
+def occupancy_by_group(all_seen: Sequence[Seen]) -> Figure | None:
+    """Heatmaps of every group: each subject counts alike; None where no place is known.
+
+    Args:
+        all_seen: the animals.
+    """
+    panels = []
+    for group, subjects in by_group(all_seen).items():
+        own = [_added([_framed(seen, all_seen) for seen in some]) for some in subjects.values()]
+        own = [found for found in own if found.n]
+        if not own:
+            continue
+        mean = replace(_added(own), time_s=np.mean([found.time_s for found in own], axis=0))
+        text = f"{group}, n = {counted(len(own), 'subject')}\nmean of {mean.observed_s:.1f} s each"
+        panels.append((text, next(iter(subjects.values()))[0].session, mean))
+    n = len(panels)
+    return occupancy_panels(f"Occupancy by group, n = {counted(n, 'group')}", panels)
+
+
+def budgets_by_group(all_seen: Sequence[Seen]) -> Figure | None:
+    """Share of the time in each action: every subject and the groups' means; None without actions.
+
+    Args:
+        all_seen: the animals.
+    """
+    groups = by_group(all_seen)
+    words = list(dict.fromkeys(word for seen in all_seen for word in seen.words))
+    shares = {
+        group: np.array([_budget(sessions, words) for sessions in subjects.values()])
+        for group, subjects in groups.items()
+    }
+    if not words or not any(np.isfinite(values).any() for values in shares.values()):
+        return None
+    step = 2.0 + 3.2 * len(groups)
+    figure = sheet(ONE_COLUMN_MM, step * len(words) + 26.0 + 3.5 * len(groups))
+    axes = panel(figure, LEFT_MM, 9.0, ONE_COLUMN_MM - LEFT_MM - RIGHT_MM, step * len(words))
+    lines = [f"{group}, n = {counted(len(values), 'subject')}" for group, values in shares.items()]
+    axes.set_title("\n".join(["Time budget: subjects, and the mean", *lines]), x=-0.5)
+    apart = 0.8 / len(groups)
+    for g, (group, values) in enumerate(shares.items()):
+        colour = group_colour(group, list(groups))
+        at = np.arange(len(words)) + (g - (len(groups) - 1) / 2) * apart
+        known = np.isfinite(values).any(axis=0)
+        mean = np.full(len(words), np.nan)
+        mean[known] = 100.0 * np.nanmean(values[:, known], axis=0)
+        axes.barh(at, np.nan_to_num(mean), 0.9 * apart, color=colour, alpha=0.35)
+        for one in values:
+            mark = GROUP_MARKS[g % len(GROUP_MARKS)]
+            axes.plot(100.0 * one, at, mark, color=colour, markersize=2.2, gid=f"subjects {group}")
+    axes.set_yticks(range(len(words)), [word.replace("_", " ") for word in words])
+    axes.set_ylim(len(words) - 0.5, -0.5)
+    axes.tick_params(axis="y", length=0)
+    axes.set_xlim(left=0.0)
+    axes.set_xlabel("share of the observed time, %")
+    return figure
+
+
+def distance_by_group(all_seen: Sequence[Seen]) -> Figure | None:
+    """Cumulative distance of every session, and each group's mean; None where no step is known.
+
+    Args:
+        all_seen: the animals.
+    """
+    groups = by_group(all_seen)
+    walks = {
+        group: [
+            walked(seen)
+            for sessions in subjects.values()
+            for seen in sessions
+            if seen.kinematics is not None and len(seen.kinematics)
+        ]
+        for group, subjects in groups.items()
+    }
+    if not any(n for some in walks.values() for _, _, n in some):
+        return None
+    duration = max(seen.duration_s for seen in all_seen)
+    unit, size = time_unit(duration)
+    figure = sheet(ONE_COLUMN_MM, 58.0 + 3.5 * len(groups))
+    axes = panel(figure, 12.0, 9.0, ONE_COLUMN_MM - 17.0, 40.0)
+    lines = [f"{group}, n = {counted(len(some), 'session')}" for group, some in walks.items()]
+    axes.set_title("\n".join(["Cumulative distance: sessions, and the mean", *lines]))
+    for group, some in walks.items():
+        colour = group_colour(group, list(groups))
+        for time_s, metres, _ in some:
+            rows = np.unique(np.linspace(0, len(time_s) - 1, min(len(time_s), 400)).astype(int))
+            axes.plot(time_s[rows] / size, metres[rows], color=colour, linewidth=0.5, alpha=0.5)
+        known = [one for one in some if one[2]]
+        if known:
+            # the mean ends with the shortest session, or it would fall where one drops out
+            shortest = min(float(time_s[-1]) for time_s, _, _ in known)
+            grid = np.linspace(0.0, shortest, 400)
+            mean = np.mean([np.interp(grid, time_s, metres) for time_s, metres, _ in known], axis=0)
+            axes.plot(grid / size, mean, color=colour, linewidth=1.5, label=group)
+    axes.set_xlim(0.0, duration / size)
+    axes.set_ylim(bottom=0.0)
+    axes.set_xlabel(f"time, {unit}")
+    axes.set_ylabel("distance, m")
+    axes.grid(color=LINE, linewidth=0.4)
+    axes.legend(loc="upper left")
+    return figure
+
+
+def comparison(table: pd.DataFrame, stats: pd.DataFrame, measure: str, unit: str) -> Figure | None:
+    """A measure by group: every session and animal, and the differences with 95 % intervals.
+
+    Args:
+        table: one row per session: subject_id, group and the measure, as `liex compare` keeps it in
+            sessions.csv.
+        stats: rows of the table `stats`.
+        measure: the column that is drawn.
+        unit: its unit in the table; "" for none.
+
+    Returns:
+        The figure; None where no session has a value.
+    """
+    if measure not in table:
+        return None
+    known = table[np.isfinite(table[measure].astype(float))].copy()
+    known["group"] = known["group"].fillna("").astype(str)
+    known = known[known["group"] != ""]
+    if known.empty:
+        return None
+    own = stats[stats["measure"] == measure]
+    names = sorted(set(known["group"]))
+    factor, read = shown(1.0, unit)
+    title = titled(measure, unit)
+    figure = sheet(TWO_COLUMNS_MM, 66.0)
+    left = panel(figure, 16.0, 14.0, 72.0, 42.0)
+    for k, name in enumerate(names):
+        rows = known[known["group"] == name]
+        _strip(left, k, rows, factor * rows[measure].to_numpy(float), name, names)
+    counts = [
+        f"{name}\n{counted(known.loc[known['group'] == name, 'subject_id'].nunique(), 'animal')}, "
+        f"{counted(int((known['group'] == name).sum()), 'session')}"
+        for name in names
+    ]
+    left.set_xticks(range(len(names)), counts)
+    left.set_xlim(-0.6, len(names) - 0.4)
+    left.set_ylabel(read or title)
+    n_animals = known.groupby("group")["subject_id"].nunique().sum()
+    left.set_title(
+        f"{title}, n = {counted(int(n_animals), 'animal')}, {counted(len(known), 'session')}"
+    )
+    left.grid(axis="y", color=LINE, linewidth=0.4)
+    right = panel(figure, 122.0, 14.0, 56.0, 42.0)
+    _differences(right, own, factor, read)
+    return figure
+
+
+def effects(stats: pd.DataFrame) -> Figure | None:
+    """Hedges' g of every measure and contrast with its interval; None where none can be given.
+
+    Args:
+        stats: the table `stats`.
+    """
+    known = stats[np.isfinite(stats["effect_size"].astype(float))].reset_index(drop=True)
+    if known.empty:
+        return None
+    figure = sheet(TWO_COLUMNS_MM, 4.2 * len(known) + 24.0)
+    axes = panel(figure, 78.0, 11.0, TWO_COLUMNS_MM - 84.0, 4.2 * len(known))
+    _intervals(axes, known, "effect_size", "effect_low", "effect_high", 1.0)
+    axes.set_yticks(
+        range(len(known)),
+        [
+            f"{str(m).replace('_', ' ')}: {c}, n = {a} and {b}"
+            for m, c, a, b in zip(
+                known["measure"],
+                known["contrast"],
+                known["n_units_first"],
+                known["n_units_second"],
+                strict=True,
+            )
+        ],
+        size=5.5,
+    )
+    axes.set_ylim(len(known) - 0.5, -0.5)
+    axes.set_title(f"Effect sizes, n = {counted(len(known), 'comparison')}", x=-0.8)
+    axes.set_xlabel("Hedges' g with its 95 % interval; hollow: no test")
+    return figure
+
+
+def _strip(
+    axes: Axes, k: int, rows: pd.DataFrame, values: Array, name: str, names: Sequence[str]
+) -> None:
+    """One group: a small mark per session, a large one per animal, a line for the animals' mean."""
+    import pandas as pd
+
+    animal, animals = pd.factorize(rows["subject_id"].astype(str))
+    means = animal_means(values, animal)
+    beside = np.linspace(-0.2, 0.2, len(animals)) if len(animals) > 1 else np.zeros(1)
+    colour = group_colour(name, names)
+    mark = GROUP_MARKS[k % len(GROUP_MARKS)]
+    axes.plot(k + beside[animal] + 0.03, values, mark, color=colour, markersize=2.0, alpha=0.5)
+    axes.plot(
+        k + beside,
+        means,
+        mark,
+        color=colour,
+        markersize=4.5,
+        linestyle="none",
+        gid=f"animals {name}",
+    )
+    axes.plot([k - 0.3, k + 0.3], [means.mean()] * 2, color=INK, linewidth=1.2, gid=f"mean {name}")
+
+
+def _differences(axes: Axes, own: pd.DataFrame, factor: float, unit: str) -> None:
+    """Each contrast's difference with its interval; effect size and n, or why there is no test."""
+    known = own[np.isfinite(own["estimate"].astype(float))].reset_index(drop=True)
+    if known.empty:
+        axes.set_axis_off()
+        axes.text(0.0, 0.5, "no difference can be given", transform=axes.transAxes)
+        return
+    _intervals(axes, known, "estimate", "ci_low", "ci_high", factor)
+    texts = []
+    for row in known.to_dict("records"):
+        g = f"g {row['effect_size']:.2f}" if np.isfinite(row["effect_size"]) else "no g"
+        p = f"p {row['p']:.2g}, corrected {row['p_fdr']:.2g}" if row["test"] else "no test"
+        texts.append(f"{g}; {p}")
+    for k, text in enumerate(texts):
+        axes.annotate(
+            text,
+            (0.5, k),
+            (0, 6),
+            xycoords=("axes fraction", "data"),
+            textcoords="offset points",
+            ha="center",
+            size=5.5,
+            color=MUTED,
+        )
+    axes.set_yticks(
+        range(len(known)),
+        [
+            f"{c}\nn = {a} and {b} {u.split(',')[0]}s"
+            for c, a, b, u in zip(
+                known["contrast"],
+                known["n_units_first"],
+                known["n_units_second"],
+                known["unit"].astype(str),
+                strict=True,
+            )
+        ],
+        size=5.5,
+    )
+    axes.set_ylim(len(known) - 0.4, -0.6)
+    axes.set_xlabel(f"difference{f', {unit}' if unit else ''}, with its 95 % interval")
+
+
+def _intervals(
+    axes: Axes, known: pd.DataFrame, middle: str, low: str, high: str, factor: float
+) -> None:
+    """Marks with their intervals, one row below the other; hollow where there is no test."""
+    at = factor * known[middle].to_numpy(float)
+    for k, (value, a, b, test) in enumerate(
+        zip(at, factor * known[low], factor * known[high], known["test"].astype(str), strict=True)
+    ):
+        if np.isfinite([a, b]).all():
+            axes.plot([a, b], [k, k], color=INK, linewidth=1.0, gid=f"interval {k}")
+        fill = INK if test and test != "nan" else "none"
+        axes.plot(value, k, "o", color=INK, markerfacecolor=fill, markersize=4.0)
+    axes.axvline(0.0, color=MUTED, linewidth=0.6, linestyle=(0, (3, 2)))
+    axes.spines["left"].set_visible(False)
+    axes.tick_params(axis="y", length=0)
+
+
+def _framed(seen: Seen, all_seen: Sequence[Seen]) -> Occupancy:
+    """The occupancy of a session on the grid that all sessions share."""
+    corners = [extent_mm(one.session, one.xy_mm, centred=True) for one in all_seen]
+    low = np.min([corner[0] for corner in corners], axis=0)
+    high = np.max([corner[1] for corner in corners], axis=0)
+    return occupancy(aligned(seen.session, seen.xy_mm), seen.hold_s, low, high)
+
+
+def _added(some: Sequence[Occupancy]) -> Occupancy:
+    """Occupancies of one grid, added up."""
+    total = np.sum([found.time_s for found in some], axis=0)
+    return replace(some[0], time_s=total, n=sum(found.n for found in some))
+
+
+def _budget(sessions: Sequence[Seen], words: Sequence[str]) -> list[float]:
+    """Share of a subject's time in each action: the mean of its sessions; NaN where unknown."""
+    rows = [
+        [
+            float(seen.summary[f"{word}_share"])
+            if seen.summary is not None and f"{word}_share" in seen.summary
+            else np.nan
+            for word in words
+        ]
+        for seen in sessions
+    ]
+    values = np.array(rows)
+    out = np.full(len(words), np.nan)
+    known = np.isfinite(values).any(axis=0)
+    out[known] = np.nanmean(values[:, known], axis=0)
+    return [float(value) for value in out]

@@ -1,0 +1,171 @@
+"""One animal of one session as figures take it: its rows of the tables, and what to call it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from liex_lab.behaviour.occupancy import hold_times
+from liex_lab.sessions import Session
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+Array = NDArray[np.float64]
+# the columns that are drawn, beyond those that every table has
+FRAMES = ("frame_index", "time_s", "gap_before", "predicted_error_mm", "spine_mm")
+KINEMATICS = (
+    "time_s",
+    "x_mm",
+    "y_mm",
+    "z_mm",
+    "step_mm",
+    "speed_mm_s",
+    "nose_height_mm",
+    "tail_beat_hz",
+    "bend_rad",
+)
+
+
+@dataclass(frozen=True)
+class Seen:
+    """An animal in a session.
+
+    Attributes:
+        session: the opened session.
+        individual: the animal's name in its tables.
+        alone: whether it is the session's only animal.
+        subject: the subject's name; "" where none is stated.
+        group: the group it is in; "" where none is stated.
+    """
+
+    session: Session
+    individual: str
+    alone: bool = True
+    subject: str = ""
+    group: str = ""
+
+    @property
+    def who(self) -> str:
+        """What titles call it: the subject, where one is stated, else the session."""
+        name = self.subject or self.session.name
+        return name if self.alone else f"{name}, {self.individual}"
+
+    @cached_property
+    def words(self) -> list[str]:
+        """The vocabulary, in the order in which it is coloured."""
+        return list(self.session.metadata.get("actions", {}))
+
+    @property
+    def duration_s(self) -> float:
+        """Length of the session, s."""
+        return float(self.session.metadata["frames"]["duration_s"])
+
+    @cached_property
+    def frames(self) -> pd.DataFrame:
+        """Its rows of the table `frames`."""
+        return self._own(self.session.frames)
+
+    @cached_property
+    def bouts(self) -> pd.DataFrame:
+        """Its rows of the table `bouts`."""
+        return self._own(self.session.bouts)
+
+    @cached_property
+    def kinematics(self) -> pd.DataFrame | None:
+        """Its rows of the table `kinematics`; None for a session without behaviour measures."""
+        if not self.session.has("kinematics.parquet"):
+            return None
+        return self._own(self.session.kinematics)
+
+    def table(self, name: str) -> pd.DataFrame | None:
+        """Its rows of another table; None where the session has none of that name.
+
+        Args:
+            name: of the table, such as 'transitions'.
+        """
+        if not self.session.has(f"{name}.parquet"):
+            return None
+        return self._own(self.session.table(name))
+
+    @cached_property
+    def summary(self) -> pd.Series[float] | None:
+        """Its row of the summary; None where there is none."""
+        if not self.session.has("summary.csv"):
+            return None
+        own = self._own(self.session.summary)
+        return own.iloc[0] if len(own) else None
+
+    @cached_property
+    def lost_s(self) -> Array:
+        """(k, 2) spans without a pose, or without frames of the camera, s."""
+        gaps = self._own(self.session.gaps)
+        empty = gaps[gaps["n_frames_missing"] > 0]  # the others are stamps that were moved
+        return empty[["start_s", "stop_s"]].to_numpy(float)
+
+    @cached_property
+    def xy_mm(self) -> Array:
+        """(n, 2) places of the body's centre, mm, arena frame; NaN without a pose."""
+        if self.kinematics is None:
+            return np.empty((0, 2))
+        return self.kinematics[["x_mm", "y_mm"]].to_numpy(float)
+
+    @cached_property
+    def hold_s(self) -> Array:
+        """(n,) how long each frame counts, s."""
+        if self.kinematics is None or not len(self.kinematics):
+            return np.empty(0)
+        return hold_times(self.kinematics["time_s"].to_numpy(float))
+
+    def column(self, name: str) -> Array:
+        """A column of `kinematics`, broken at gaps of the camera: no line is drawn across them.
+
+        Args:
+            name: of the column.
+        """
+        if self.kinematics is None or name not in self.kinematics:
+            return np.full(len(self.frames), np.nan)
+        return self.broken(self.kinematics[name])
+
+    def broken(self, values: pd.Series[float]) -> Array:
+        """Values of every frame with the first one after a gap of the camera taken out.
+
+        Args:
+            values: one for every frame.
+        """
+        whole = self.frames["gap_before"].to_numpy() == 0
+        return np.where(whole, values.to_numpy(float), np.nan)
+
+    def _own(self, table: pd.DataFrame) -> pd.DataFrame:
+        if self.alone or "individual" not in table:
+            return table
+        return table[table["individual"].astype(str) == self.individual].reset_index(drop=True)
+
+
+def animals(session: Session) -> list[Seen]:
+    """Every animal of a session; of long ones no more is read than what is drawn.
+
+    Args:
+        session: the opened session.
+    """
+    table = session.table("sessions")
+    names = [str(name) for name in table["individual"]] or [str(session.metadata["individual"])]
+    alone = len(set(names)) == 1
+    who = () if alone else ("individual",)
+    narrow = session.narrowed(frames=(*FRAMES, *who), kinematics=(*KINEMATICS, *who))
+    stated = {
+        key: [_text(value) for value in table[key]] if key in table else [""] * len(names)
+        for key in ("subject_id", "group")
+    }
+    rows = zip(names, stated["subject_id"] or [""], stated["group"] or [""], strict=True)
+    found = {name: Seen(narrow, name, alone, subject, group) for name, subject, group in rows}
+    return list(found.values())
+
+
+def _text(value: object) -> str:
+    """A stated name; "" where there is none."""
+    return value if isinstance(value, str) else ""

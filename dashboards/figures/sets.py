@@ -1,0 +1,313 @@
+"""Which figures there are of a session, a study and a comparison, and their files."""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from liex_lab.errors import SessionError
+from liex_lab.runtime.durable import sync_folder
+from liex_lab.runtime.progress import Progress, silent
+from liex_lab.sessions import Session
+
+from . import actions, groups, places, times
+from .pictures import DepthReader
+from .seen import Seen, animals
+from .style import FORMATS, drawing, image_bytes, on_page
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from matplotlib.figure import Figure
+
+FOLDER = "figures"
+PAGES = "figures.pdf"  # beside a report: a page for each figure
+COMPARISON_FILE = "comparison.json"
+_PICTURES = 9  # from which the arena without the animal is found
+OF_SESSION: dict[str, tuple[str, Callable[[Seen], Figure | None]]] = {
+    "ethogram": ("what the animal did when", times.ethogram),
+    "curves": ("speed, heights and predicted error over time", times.curves),
+    "occupancy": ("time per area of the floor, with walls and zones", places.occupancy_map),
+    "trajectory": ("way of the body's centre from above", places.trajectory),
+    "arena": ("heights of the arena above its floor", lambda seen: _arena(seen.session)),
+    "time_budget": ("share of the time in each action", actions.time_budget),
+    "activity": ("shares of the actions over the session", actions.activity),
+    "transitions": ("what follows upon what, against chance", actions.transitions),
+    "onsets": ("measures about the onsets of actions", actions.aligned_curves),
+    "distance": ("distance summed up over the session", times.cumulative_distance),
+    "speed": ("share of the time at each speed", times.speed_distribution),
+    "error": ("share of the time at each predicted error", times.error_distribution),
+}
+OF_STUDY: dict[str, tuple[str, Callable[[Sequence[Seen]], Figure | None]]] = {
+    "ethograms": ("a row for each session", groups.ethograms),
+    "occupancy_subjects": ("occupancy of every subject", groups.occupancy_by_subject),
+    "occupancy_groups": ("occupancy of every group", groups.occupancy_by_group),
+    "time_budgets": ("shares of the actions, every subject", groups.budgets_by_group),
+    "distances": ("cumulative distance, every session", groups.distance_by_group),
+}
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """A figure of a set.
+
+    Attributes:
+        name: of its files.
+        what: it shows.
+        figure: the figure; None where there is nothing to draw.
+    """
+
+    name: str
+    what: str
+    figure: Figure | None
+
+
+def session_figures(session: Session, only: Sequence[str] = ()) -> Iterator[Drawn]:
+    """Every figure of a session, one after the other; call it inside `style.drawing()`.
+
+    Of several animals each has its own, whose names end in the animal's.
+
+    Args:
+        session: the opened session.
+        only: names of `OF_SESSION`; () takes all.
+    """
+    for seen in animals(session):
+        for name in only or OF_SESSION:
+            what, draw = OF_SESSION[name]
+            own = name if seen.alone else f"{name}-{_file_name(seen.individual)}"
+            yield Drawn(own, what, draw(seen))
+
+
+def study_figures(sessions: Sequence[Session], only: Sequence[str] = ()) -> Iterator[Drawn]:
+    """Every figure of a study; call it inside `style.drawing()`.
+
+    Args:
+        sessions: the opened sessions.
+        only: names of `OF_STUDY`; () takes all.
+    """
+    yield from _of_many([seen for session in sessions for seen in animals(session)], only)
+
+
+def comparison_figures(
+    table: pd.DataFrame,
+    stats: pd.DataFrame,
+    sessions: Sequence[Session],
+    only: Sequence[str] = (),
+) -> Iterator[Drawn]:
+    """Every figure of a comparison; call it inside `style.drawing()`.
+
+    Args:
+        table: the comparison's sessions.csv.
+        stats: its table `stats`.
+        sessions: the opened sessions; () leaves out what needs them.
+        only: names of `OF_STUDY`, 'effects', or measures of `stats`; () takes all.
+    """
+    units = _units(sessions)
+    measures = list(dict.fromkeys(stats["measure"].astype(str)))
+    if not only or "effects" in only:
+        yield Drawn("effects", "effect sizes with their intervals", groups.effects(stats))
+    for measure in measures:
+        if not only or measure in only:
+            drawn = groups.comparison(table, stats, measure, units.get(measure, ""))
+            yield Drawn(f"compare_{_file_name(measure)}", "every animal, and the difference", drawn)
+    wanted = [name for name in OF_STUDY if not only or name in only]
+    if sessions and wanted:
+        yield from _of_many(_grouped(sessions, table), wanted)
+
+
+def _of_many(all_seen: Sequence[Seen], only: Sequence[str]) -> Iterator[Drawn]:
+    for name in only or OF_STUDY:
+        what, draw = OF_STUDY[name]
+        yield Drawn(name, what, draw(all_seen))
+
+
+def write_figures(
+    drawn: Iterator[Drawn], folder: Path, kinds: Sequence[str], progress: Progress = silent
+) -> tuple[list[Path], list[str]]:
+    """Write figures as files, each whole or not at all.
+
+    Args:
+        drawn: the figures, made while they are written.
+        folder: it is made where it is missing.
+        kinds: some of `FORMATS`.
+        progress: told which figure is drawn.
+
+    Returns:
+        The files, and the names of the figures of which there was nothing to draw.
+    """
+    files: list[Path] = []
+    empty: list[str] = []
+    with drawing():
+        for k, one in enumerate(drawn):
+            progress(k, None, "drawing figures")
+            if one.figure is None:
+                empty.append(one.name)
+                continue
+            for kind in kinds:
+                files.append(
+                    put_figure(folder, f"{one.name}.{kind}", image_bytes(one.figure, kind))
+                )
+    if files:
+        sync_folder(folder)
+    return files, empty
+
+
+def put_figure(folder: Path, name: str, content: bytes) -> Path:
+    """Write one file of a figure under another name and rename it; returns its path.
+
+    Args:
+        folder: the folder of figures; it is made where it is missing.
+        name: of the file.
+        content: its bytes.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    part = folder / f".{name}.part"
+    try:
+        part.write_bytes(content)
+        part.replace(folder / name)
+    finally:
+        part.unlink(missing_ok=True)
+    return folder / name
+
+
+def read_comparison(folder: Path) -> tuple[pd.DataFrame, pd.DataFrame, list[Session]]:
+    """What `liex compare` wrote: its sessions' table, its table `stats`, and the opened sessions.
+
+    A session that has gone from its place is left out.
+
+    Args:
+        folder: the folder of the comparison.
+
+    Raises:
+        SessionError: its files are missing or damaged.
+    """
+    import pandas as pd
+
+    try:
+        table = pd.read_csv(folder / "sessions.csv", dtype={"subject_id": "str", "group": "str"})
+        stats = pd.read_parquet(folder / "stats.parquet")
+        listed = json.loads((folder / COMPARISON_FILE).read_text(encoding="utf-8"))["sessions"]
+        places = [folder / str(place) for place in listed]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise SessionError(
+            f"{folder} should hold what `liex compare` writes, but: {error}; compare again"
+        ) from None
+    return table, stats, [Session.open(p) for p in places if (p / "session.json").is_file()]
+
+
+def check_names(only: Sequence[str], known: Sequence[str]) -> None:
+    """Refuse names of figures that there are not.
+
+    Args:
+        only: the names that are asked for.
+        known: the names that there are.
+
+    Raises:
+        SessionError: one is not known.
+    """
+    import difflib
+
+    for name in only:
+        if name not in known:
+            near = difflib.get_close_matches(name, known, 1)
+            hint = f"did you mean '{near[0]}'? " if near else ""
+            raise SessionError(
+                f"there is no figure '{name}' here: {hint}known are {', '.join(known)}"
+            )
+
+
+def check_kinds(kinds: Sequence[str]) -> None:
+    """Refuse formats that figures are not written in.
+
+    Args:
+        kinds: the formats that are asked for.
+
+    Raises:
+        SessionError: one is not known.
+    """
+    for kind in kinds:
+        if kind not in FORMATS:
+            raise SessionError(
+                f"figures are written as {', '.join(FORMATS)}, got '{kind}'; name one of these"
+            )
+
+
+def for_the_page(session: Session, folder: Path | None) -> dict[str, str]:
+    """Every figure of a session as an element of a page, by name; written as files on the way.
+
+    Each is an SVG, and a page of figures.pdf: a PDF of its own for each would embed the font anew,
+    which takes longer than everything else.
+
+    Args:
+        session: the opened session.
+        folder: where the files go; None writes none.
+    """
+    from matplotlib.backends.backend_pdf import PdfPages
+
+    made: dict[str, str] = {}
+    held = io.BytesIO()
+    with drawing():
+        pages = None if folder is None else PdfPages(held, metadata={"CreationDate": None})
+        for one in session_figures(session):
+            if one.figure is None:
+                continue
+            svg = image_bytes(one.figure, "svg")
+            if folder is not None and pages is not None:
+                put_figure(folder, f"{one.name}.svg", svg)
+                pages.savefig(one.figure)
+            made[one.name] = on_page(svg, one.name, f"{one.name.replace('_', ' ')}: {one.what}")
+        if pages is not None:
+            pages.close()
+    if folder is not None and made:
+        put_figure(folder, PAGES, held.getvalue())
+        for old in folder.glob("*.svg"):  # of the session as it was before a correction
+            if old.stem.split("-")[0] in OF_SESSION and old.stem not in made:
+                old.unlink()
+        sync_folder(folder)
+    return made
+
+
+def _arena(session: Session) -> Figure | None:
+    """The arena from some pictures of the session's replay; None where it keeps no depth."""
+    n = len(session.frames)
+    rows = np.unique(np.linspace(0, max(n - 1, 0), _PICTURES).astype(int)) if n else ()
+    with DepthReader(session) as reader:
+        found = [reader.picture(int(row)) for row in rows] if reader.whole else []
+    pictures: list[NDArray[np.uint16]] = [picture for picture in found if picture is not None]
+    return places.arena_map(session, pictures)
+
+
+def _grouped(sessions: Sequence[Session], table: pd.DataFrame) -> list[Seen]:
+    """The animals with the groups that a comparison puts them in; those in none are left out."""
+    group = {
+        (str(row["session_id"]), str(row["individual"])): row["group"]
+        for row in table.to_dict("records")
+    }
+    found = []
+    for session in sessions:
+        for seen in animals(session):
+            own: Any = group.get((session.name, seen.individual), "")
+            if isinstance(own, str) and own:
+                found.append(replace(seen, group=own))
+    return found
+
+
+def _units(sessions: Sequence[Session]) -> dict[str, str]:
+    """The unit of every column of the summaries."""
+    units: dict[str, str] = {}
+    for session in sessions:
+        own = session.columns[session.columns["table"] == "summary"]
+        for name, unit in zip(own["name"], own["unit"], strict=True):
+            units.setdefault(str(name), unit if isinstance(unit, str) else "")
+    return units
+
+
+def _file_name(name: str) -> str:
+    """A name as part of a file's name on every system."""
+    return "".join(c if c.isalnum() or c in "-_" else "_" for c in name)

@@ -1,0 +1,311 @@
+"""Figures over time: ethogram, curves, cumulative distance; and how speeds and errors spread."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from liex_lab.actions.colours import action_colours
+
+from ..units import counted, shown
+from .seen import Array, Seen
+from .style import (
+    BLUE,
+    GREEN,
+    INK,
+    LEFT_MM,
+    LINE,
+    MUTED,
+    ONE_COLUMN_MM,
+    PURPLE,
+    RED,
+    RIGHT_MM,
+    TWO_COLUMNS_MM,
+    halo,
+    panel,
+    sheet,
+    time_unit,
+)
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+# column of the kinematics, title, what it is, unit, colour, whether the axis begins at zero
+CURVES = (
+    ("speed_mm_s", "Speed", "of the body centre", "mm/s", BLUE, True),
+    ("nose_height_mm", "Nose height", "above the floor", "mm", GREEN, True),
+    ("z_mm", "Height", "of the body centre above the floor", "mm", GREEN, True),
+    ("tail_beat_hz", "Tail beat", "frequency", "Hz", PURPLE, True),
+    ("bend_rad", "Bend", "of the whole body, positive to the left", "rad", PURPLE, False),
+)
+_WALKING = ("speed_mm_s", "nose_height_mm")
+_SWIMMING = ("speed_mm_s", "z_mm", "bend_rad", "tail_beat_hz")
+_MOST_COLUMNS = 1200  # of a curve; more points than that cannot be told apart on a page
+_LANE_MM = 4.0
+_CURVE_MM = 17.0
+_HAIR_MM = 0.05  # bouts nearer than that are one bar on paper
+
+
+def drawn_curves(seen: Seen) -> list[tuple[str, str, str, str, str, bool]]:
+    """The rows of `CURVES` that fit the animal and that its session has.
+
+    Args:
+        seen: the animal.
+    """
+    moved = seen.kinematics
+    if moved is None:
+        return []
+    wanted = _SWIMMING if "tail_beat_hz" in moved else _WALKING
+    return [curve for curve in CURVES if curve[0] in wanted and curve[0] in moved]
+
+
+def ethogram(seen: Seen) -> Figure | None:
+    """A lane for each action, hatched where there is no pose; None where there is nothing to say.
+
+    Args:
+        seen: the animal.
+    """
+    words = seen.words
+    if not words and not len(seen.lost_s):
+        return None
+    height = _LANE_MM * max(len(words), 1)
+    figure = sheet(TWO_COLUMNS_MM, height + 15.0)
+    width = TWO_COLUMNS_MM - LEFT_MM - RIGHT_MM
+    axes = panel(figure, LEFT_MM, 8.0, width, height)
+    bouts = seen.bouts
+    axes.set_title(
+        f"Ethogram, {seen.who}, n = {counted(len(bouts), 'bout')}; hatched: no pose or no frame"
+    )
+    _, size = time_unit(seen.duration_s)
+    least = _HAIR_MM * seen.duration_s / width
+    spans = [(float(a), float(b)) for a, b in seen.lost_s]
+    axes.broken_barh(
+        [(a / size, (b - a) / size) for a, b in joined(spans, least)],
+        (-0.5, max(len(words), 1)),
+        facecolor="none",
+        edgecolor=MUTED,
+        linewidth=0.0,
+        hatch="//////",
+        gid="no pose",
+    )
+    for k, (word, colour) in enumerate(action_colours(words).items()):
+        own = bouts.loc[bouts["action"] == word, ["start_s", "stop_s"]].to_numpy(float)
+        bars = joined([(float(a), float(b)) for a, b in own], least)
+        axes.broken_barh(
+            [(a / size, max(b - a, least) / size) for a, b in bars],
+            (k - 0.38, 0.76),
+            facecolor=colour,
+            gid=f"bouts of {word}",
+        )
+    axes.set_ylim(max(len(words), 1) - 0.5, -0.5)
+    axes.set_yticks(range(len(words)), [word.replace("_", " ") for word in words])
+    axes.tick_params(axis="y", length=0)
+    _clock(axes, seen.duration_s)
+    return figure
+
+
+def curves(seen: Seen) -> Figure | None:
+    """What the body did, and the error to be expected, over time; None without any pose.
+
+    Args:
+        seen: the animal.
+    """
+    error = seen.broken(seen.frames["predicted_error_mm"])
+    rows: list[tuple[str, str, Array, str, bool]] = []
+    for name, title, what, unit, colour, from_zero in drawn_curves(seen):
+        values, unit = shown(seen.column(name), unit)
+        rows.append((f"{title} {what}", unit, values, colour, from_zero))
+    rows.append(("Predicted error of a joint", "mm", error, RED, True))
+    if not any(np.isfinite(values).any() for _, _, values, _, _ in rows):
+        return None
+    step = _CURVE_MM + 6.0
+    figure = sheet(TWO_COLUMNS_MM, len(rows) * step + 8.0)
+    width = TWO_COLUMNS_MM - LEFT_MM - RIGHT_MM
+    time_s = seen.frames["time_s"].to_numpy(float)
+    _, size = time_unit(seen.duration_s)
+    rearing = seen.bouts["action"].astype(str).str.startswith("rear")
+    rears = seen.bouts.loc[rearing, ["start_s", "stop_s"]].to_numpy(float)
+    for k, (title, unit, values, colour, from_zero) in enumerate(rows):
+        axes = panel(figure, LEFT_MM, 8.0 + (len(rows) - 1 - k) * step, width, _CURVE_MM)
+        n = int(np.isfinite(values).sum())
+        if title.startswith("Nose height") and len(rears):
+            title += "; rearing shaded"
+            for a, b in rears:
+                axes.axvspan(a / size, b / size, color=RED, alpha=0.2, linewidth=0.0)
+        axes.set_title(
+            f"{title}, {seen.who}, n = {counted(n, 'frame')}" if k == 0 else title, size=6.5
+        )
+        kept = kept_rows(values, _MOST_COLUMNS)
+        axes.plot(time_s[kept] / size, values[kept], color=colour)
+        axes.set_ylabel(unit)
+        axes.grid(axis="y", color=LINE, linewidth=0.4)
+        _clock(axes, seen.duration_s, last=k == len(rows) - 1)
+        if from_zero:
+            axes.set_ylim(bottom=min(0.0, float(np.nanmin(values)) if n else 0.0))
+    return figure
+
+
+def cumulative_distance(seen: Seen) -> Figure | None:
+    """The way that the animal went, summed up; None where no step is known.
+
+    Args:
+        seen: the animal.
+    """
+    known = seen.kinematics is not None and np.isfinite(seen.column("step_mm")).any()
+    if not known or seen.kinematics is None:
+        return None
+    time_s, metres, n = walked(seen)
+    _, size = time_unit(seen.duration_s)
+    figure = sheet(ONE_COLUMN_MM, 52.0)
+    axes = panel(figure, 12.0, 9.0, ONE_COLUMN_MM - 17.0, 33.0)
+    axes.set_title(f"Cumulative distance, {seen.who}\n{metres[-1]:.2f} m, n = {counted(n, 'step')}")
+    rows = kept_rows(metres, _MOST_COLUMNS)
+    axes.plot(time_s[rows] / size, metres[rows], color=BLUE, linewidth=1.0)
+    axes.set_ylabel("distance, m")
+    axes.set_ylim(bottom=0.0)
+    _clock(axes, seen.duration_s)
+    return figure
+
+
+def walked(seen: Seen) -> tuple[Array, Array, int]:
+    """Times (n,) s, distance until then (n,) m, and the number of steps that were seen.
+
+    Args:
+        seen: an animal with kinematics.
+    """
+    assert seen.kinematics is not None
+    step = seen.kinematics["step_mm"].to_numpy(float)
+    n = int(np.isfinite(step).sum())
+    time_s = seen.kinematics["time_s"].to_numpy(float)
+    return time_s, np.cumsum(np.nan_to_num(step)) / 1000.0, n
+
+
+def speed_distribution(seen: Seen) -> Figure | None:
+    """Share of the observed time at each speed; None where no speed is known.
+
+    Args:
+        seen: the animal.
+    """
+    if seen.kinematics is None or "speed_mm_s" not in seen.kinematics:
+        return None
+    values, unit = shown(seen.kinematics["speed_mm_s"].to_numpy(float), "mm/s")
+    return distribution("Speed", seen, values, seen.hold_s, unit, BLUE)
+
+
+def error_distribution(seen: Seen) -> Figure | None:
+    """Share of the observed time at each predicted error; None where no error is known.
+
+    Args:
+        seen: the animal.
+    """
+    from liex_lab.behaviour.occupancy import hold_times
+
+    values = seen.frames["predicted_error_mm"].to_numpy(float)
+    hold = hold_times(seen.frames["time_s"].to_numpy(float))
+    return distribution("Predicted error of a joint", seen, values, hold, "mm", RED)
+
+
+def distribution(
+    title: str, seen: Seen, values: Array, hold_s: Array, unit: str, colour: str
+) -> Figure | None:
+    """Histogram of values over the range that holds 99 % of them; a line marks the median.
+
+    Args:
+        title: what the values are.
+        seen: whose they are.
+        values: (n,) not negative; NaN is left out, and larger ones than the 99 % quantile count in
+            the last bin.
+        hold_s: (n,) how long each counts, s.
+        unit: their unit.
+        colour: of the bars.
+
+    Returns:
+        The figure; None where no value is known.
+    """
+    known = np.isfinite(values)
+    if not known.any():
+        return None
+    values = values[known]
+    top = max(float(np.quantile(values, 0.99)), 1e-6)
+    share, edges = np.histogram(
+        np.minimum(values, top), bins=30, range=(0.0, top), weights=hold_s[known]
+    )
+    share = 100.0 * share / max(share.sum(), 1e-9)
+    figure = sheet(ONE_COLUMN_MM, 52.0)
+    axes = panel(figure, 12.0, 9.0, ONE_COLUMN_MM - 17.0, 33.0)
+    axes.set_title(f"{title}, {seen.who}\nn = {counted(len(values), 'frame')}")
+    axes.bar(edges[:-1], share, np.diff(edges), align="edge", color=colour, gid="distribution")
+    median = float(np.median(values))
+    axes.axvline(median, color=INK, linewidth=0.7, linestyle=(0, (3, 2)))
+    right = median > 0.6 * top
+    text = axes.annotate(
+        f"median {median:.2f} {unit}",
+        (median, 0.96),
+        (-3 if right else 3, 0),
+        xycoords=("data", "axes fraction"),
+        textcoords="offset points",
+        ha="right" if right else "left",
+        va="top",
+        size=6.0,
+    )
+    halo(text)
+    axes.set_xlim(0.0, top)
+    axes.set_xlabel(unit)
+    axes.set_ylabel("share of the time, %")
+    return figure
+
+
+def joined(spans: Sequence[tuple[float, float]], least_s: float) -> list[tuple[float, float]]:
+    """Spans in order, those joined that are nearer than a hair on paper: an hour has thousands.
+
+    Args:
+        spans: start and stop of each, s, in order.
+        least_s: how far apart spans have to be to be two, s.
+    """
+    out: list[tuple[float, float]] = []
+    for start, stop in spans:
+        if out and start - out[-1][1] < least_s and stop - out[-1][0] < 40 * least_s:
+            out[-1] = (out[-1][0], stop)
+        else:
+            out.append((start, stop))
+    return out
+
+
+def kept_rows(y: Array, n_columns: int) -> NDArray[np.int64]:
+    """(k,) int64 rows of a curve to draw: all, or each column's lowest and highest.
+
+    Of a short curve all rows are kept. A column with an unknown value keeps that one, so that the
+    hole is seen (min-max decimation).
+
+    Args:
+        y: (n,) the curve; NaN where unknown.
+        n_columns: columns of the paper; a curve of more than twice as many values is long.
+    """
+    if len(y) <= 2 * n_columns:
+        return np.arange(len(y))
+    edges = np.linspace(0, len(y), n_columns + 1).astype(int)
+    rows: list[int] = []
+    for a, b in pairwise(edges):
+        part = y[a:b]
+        if np.isfinite(part).all():
+            rows += sorted({a + int(part.argmin()), a + int(part.argmax())})
+        else:  # a column with a hole shows the hole
+            rows += [a, a + int(np.flatnonzero(~np.isfinite(part))[0])]
+    return np.array(rows, np.int64)
+
+
+def _clock(axes: Axes, duration_s: float, last: bool = True) -> None:
+    """The axis of time, the same for all figures of a session; its numbers below the last one."""
+    unit, size = time_unit(duration_s)
+    axes.set_xlim(0.0, max(duration_s, 1e-3) / size)
+    axes.grid(axis="x", color=LINE, linewidth=0.4)
+    axes.set_axisbelow(True)
+    if last:
+        axes.set_xlabel(f"time, {unit}")
+    else:
+        axes.tick_params(axis="x", labelbottom=False)

@@ -1,0 +1,103 @@
+"""The report's contact sheet: depth pictures with the skeleton over them, as SVG text.
+
+A picture is a PNG of a few pixels inside an SVG, so that the skeleton stays sharp. Lengths on the
+paper are in units of the SVG's viewBox.
+"""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+_VIRIDIS = np.array(
+    [
+        [68, 1, 84],
+        [71, 44, 122],
+        [59, 81, 139],
+        [44, 113, 142],
+        [33, 144, 141],
+        [39, 173, 129],
+        [92, 200, 99],
+        [170, 220, 50],
+        [253, 231, 37],
+    ],
+    float,
+)
+
+
+def picture(
+    depth: NDArray[np.uint16],
+    uv: Array,
+    bones: Sequence[tuple[int, int]],
+    left: int,
+    top: int,
+    reach_mm: float,
+) -> str:
+    """A depth picture cut out of a frame, with the skeleton over it.
+
+    Near is light: from the floor around the animal to `reach_mm` above it, so that walls do not
+    take all the colours.
+
+    Args:
+        depth: (h, w) uint16 mm, 0 where unread.
+        uv: (J, 2) joints, px of the whole frame, counted from the centre of its first pixel.
+        bones: pairs of joints.
+        left: column of the frame at which the picture begins, px.
+        top: row of the frame at which the picture begins, px.
+        reach_mm: height above the floor from which on everything is light, mm.
+    """
+    h, w = depth.shape
+    points = (
+        uv - [left, top] + 0.5
+    )  # the paper counts from the corner of the picture, we from a pixel's centre
+    r = w / 70.0
+    parts = [f'<image href="{png_uri(shade(depth, reach_mm))}" width="{w}" height="{h}"/>']
+    for a, b in bones:
+        (x0, y0), (x1, y1) = points[a], points[b]
+        parts.append(
+            f'<line x1="{x0:.1f}" y1="{y0:.1f}" x2="{x1:.1f}" y2="{y1:.1f}" stroke="#fff" '
+            f'stroke-width="{0.8 * r:.2f}"/>'
+        )
+    for k, (x, y) in enumerate(points):
+        fill = "#fff" if k < len(points) - 1 else "#EE6677"
+        parts.append(
+            f'<circle cx="{x:.1f}" cy="{y:.1f}" r="{r:.2f}" fill="{fill}" stroke="#222" '
+            f'stroke-width="{0.25 * r:.2f}"/>'
+        )
+    return f'<svg viewBox="0 0 {w:g} {h:g}" role="img">{"".join(parts)}</svg>'
+
+
+def shade(depth: NDArray[np.uint16], reach_mm: float) -> NDArray[np.uint8]:
+    """Colours (h, w, 3) RGB uint8 of a depth picture: far dark, near light, unread grey (viridis).
+
+    Args:
+        depth: (h, w) uint16 mm, 0 where unread; the floor is taken at its 95 % quantile.
+        reach_mm: how much nearer than the floor is the lightest colour, mm.
+    """
+    read = depth > 0
+    if not read.any():
+        return np.full((*depth.shape, 3), 90, np.uint8)
+    far = float(np.percentile(depth[read], 95.0)) + 3.0
+    share = np.clip((far - depth) / reach_mm, 0.0, 1.0)
+    at = share * (len(_VIRIDIS) - 1)
+    low = np.minimum(at.astype(int), len(_VIRIDIS) - 2)
+    rgb = _VIRIDIS[low] + (at - low)[..., None] * (_VIRIDIS[low + 1] - _VIRIDIS[low])
+    rgb[~read] = 90.0
+    return rgb.astype(np.uint8)
+
+
+def png_uri(rgb: NDArray[np.uint8]) -> str:
+    """A picture as a data URI of a PNG.
+
+    Args:
+        rgb: (h, w, 3) uint8 RGB.
+    """
+    import cv2
+
+    _, encoded = cv2.imencode(".png", np.ascontiguousarray(rgb[..., ::-1]))
+    return "data:image/png;base64," + base64.b64encode(encoded.tobytes()).decode()

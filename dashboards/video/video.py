@@ -1,0 +1,276 @@
+"""Videos of sessions: one from beginning to end, several beside each other, or clips of an action.
+
+Clips are aligned: all begin a moment before the onset of their bout, and one that is over stands
+still and dimmed until the longest is. Of many bouts some are taken, evenly over all of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import ExitStack, closing
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from liex_lab.errors import SessionError
+from liex_lab.runtime.progress import Progress, silent
+from liex_lab.sessions import Session
+
+from ..figures.groups import NO_GROUP
+from ..units import counted
+from .encoder import Video, h264
+from .film import Film
+from .lettering import write
+
+_BEFORE_S = 0.5  # of a bout
+_AFTER_S = 0.5
+_LONGEST_S = 6.0  # of a clip
+_MOST = 12  # clips of a group
+_WHOLE_PX = 640
+_CELL_PX = 240
+_HEAD_PX = 26
+_GAP_PX = 3
+_DIMMED = 0.4
+_PAPER = 18
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A place of the grid: what is shown of a session, and when.
+
+    Attributes:
+        film: the session.
+        start_s: when it begins, s.
+        stop_s: when it ends, s.
+        title: written upon it.
+        animal: number of the animal that it goes with; None shows all of the arena.
+    """
+
+    film: Film
+    start_s: float
+    stop_s: float
+    title: str
+    animal: int | None = None
+
+    def picture(self, after_s: float, size: tuple[int, int]) -> NDArray[np.uint8]:
+        """The picture so long after the beginning; dimmed when it is over.
+
+        Args:
+            after_s: time from its beginning, s.
+            size: width and height, px.
+        """
+        over = self.start_s + after_s > self.stop_s
+        time_s = min(self.start_s + after_s, self.stop_s)
+        film = self.film
+        view = (
+            film.whole_view()
+            if self.animal is None
+            else film.near_view(film.row_at(time_s), self.animal)
+        )
+        shown = film.picture(time_s, view, _fitted(view.width, view.height, size), self.title)
+        placed = np.full((size[1], size[0], 3), _PAPER, np.uint8)
+        y = (size[1] - shown.shape[0]) // 2
+        x = (size[0] - shown.shape[1]) // 2
+        placed[y : y + shown.shape[0], x : x + shown.shape[1]] = shown
+        return (placed * _DIMMED).astype(np.uint8) if over else placed
+
+
+def scale_mm(sessions: Sequence[Session]) -> float:
+    """The one scale of heights of some sessions: what an animal on its hind legs reaches, mm.
+
+    Args:
+        sessions: the opened sessions.
+    """
+    lengths = [float(session.metadata["animal"].get("spine_mm") or np.nan) for session in sessions]
+    known = [length for length in lengths if np.isfinite(length) and length > 0]
+    return max(10.0 * float(np.ceil(max(known) / 10.0)), 20.0) if known else 80.0
+
+
+def write_session(
+    session: Session,
+    path: Path,
+    *,
+    start_s: float | None = None,
+    stop_s: float | None = None,
+    slower: float = 1.0,
+    progress: Progress = silent,
+) -> Path:
+    """Write a session, or a stretch of it, as a video; returns its path.
+
+    The video of a whole session has the session's own clock: its time t is time t of the tables.
+
+    Args:
+        session: the opened session.
+        path: the file to write.
+        start_s: where the stretch begins, s; None takes the whole session.
+        stop_s: where it ends, s; None goes on to the end.
+        slower: so many times slower than it was; above 1 is slow motion.
+        progress: told how far it is.
+
+    Raises:
+        SessionError: the session keeps no depth, the stretch is empty, or there is no encoder.
+    """
+    h264()
+    with closing(Film(session, scale_mm([session]))) as film:
+        end = float(film.time_s[-1]) + 1.0 / film.fps
+        low = 0.0 if start_s is None else max(start_s, 0.0)
+        high = end if stop_s is None else min(stop_s, end)
+        if not high > low:
+            raise SessionError(
+                f"the session {session.name} lasts {end:.2f} s, and {low:.2f} to {high:.2f} s is "
+                "no part of it; name other times"
+            )
+        near = start_s is not None or stop_s is not None
+        cell = Cell(film, low, high, session.name, 0 if near else None)
+        view = film.whole_view()
+        size = (480, 480) if near else _fitted(view.width, view.height, (_WHOLE_PX, _WHOLE_PX))
+        _write(path, film.fps, high - low, slower, lambda t: cell.picture(t, size), progress)
+    return path
+
+
+def write_clips(
+    sessions: Sequence[tuple[Session, str]],
+    path: Path,
+    actions: Sequence[str] = (),
+    *,
+    most: int = _MOST,
+    slower: float = 1.0,
+    progress: Progress = silent,
+) -> Path:
+    """Write clips of actions, or whole sessions, beside each other as one video; returns its path.
+
+    Args:
+        sessions: each opened session and its group; "" for none. Groups stand beside each other.
+        path: the file to write.
+        actions: words, or the beginnings of words (rear is rear_supported, too); () shows the
+            whole sessions.
+        most: clips of a group at most.
+        slower: so many times slower than it was.
+        progress: told how far it is.
+
+    Raises:
+        SessionError: no session keeps depth, no bout has such a name, or there is no encoder.
+    """
+    h264()
+    with ExitStack() as stack:
+        top_mm = scale_mm([session for session, _ in sessions])
+        blocks: dict[str, list[Cell]] = {}
+        for session, group in sessions:
+            film = stack.enter_context(closing(Film(session, top_mm)))
+            blocks.setdefault(group, []).extend(_cells(film, actions))
+        if not any(blocks.values()):
+            known = sorted({word for session, _ in sessions for word in session.bouts["action"]})
+            raise SessionError(
+                f"no bout is named {' or '.join(actions)} in {counted(len(sessions), 'session')}; "
+                f"named are {', '.join(map(str, known)) or 'none'}"
+            )
+        chosen = {name: _evenly(cells, most) for name, cells in sorted(blocks.items()) if cells}
+        cells = [cell for some in chosen.values() for cell in some]
+        fps = max(cell.film.fps for cell in cells)
+        longest = max(cell.stop_s - cell.start_s for cell in cells)
+        counts = {name: len(some) for name, some in blocks.items()}
+        grid = _Grid(chosen, counts, " or ".join(actions) or "session")
+        _write(path, fps, longest, slower, grid.picture, progress)
+    return path
+
+
+def matches(word: str, actions: Iterable[str]) -> bool:
+    """Whether a word is one of some actions, or a kind of one: rear_supported is a rear.
+
+    Args:
+        word: of the vocabulary.
+        actions: what is asked for.
+    """
+    return any(word == action or word.startswith(f"{action}_") for action in actions)
+
+
+class _Grid:
+    """Groups of clips beside each other, under headings with their n."""
+
+    def __init__(self, chosen: dict[str, list[Cell]], counts: dict[str, int], what: str) -> None:
+        self._chosen = chosen
+        self._counts = counts
+        self._what = what
+        n = max(len(cells) for cells in chosen.values())
+        self._columns = int(np.ceil(np.sqrt(n)))
+        self._rows = -(-n // self._columns)
+
+    def picture(self, after_s: float) -> NDArray[np.uint8]:
+        """All cells so long after their beginnings.
+
+        Args:
+            after_s: time from the beginnings, s.
+        """
+        step = _CELL_PX + _GAP_PX
+        wide = self._columns * step + 4 * _GAP_PX
+        out = np.full(
+            (_HEAD_PX + self._rows * step, max(wide * len(self._chosen), 2 * step), 3),
+            _PAPER,
+            np.uint8,
+        )
+        for b, (group, cells) in enumerate(self._chosen.items()):
+            name = group or (NO_GROUP if len(self._chosen) > 1 else "")
+            shown = len(cells)
+            n = self._counts[group]
+            of = f"{shown} of {n}" if shown < n else f"{n}"
+            head = ", ".join(
+                part for part in (name, self._what.replace("_", " "), f"n = {of}") if part
+            )
+            write(out, head, b * wide + 4, 5, 15)
+            for k, cell in enumerate(cells):
+                row, column = divmod(k, self._columns)
+                x = b * wide + column * step
+                y = _HEAD_PX + row * step
+                out[y : y + _CELL_PX, x : x + _CELL_PX] = cell.picture(
+                    after_s, (_CELL_PX, _CELL_PX)
+                )
+        return out
+
+
+def _cells(film: Film, actions: Sequence[str]) -> list[Cell]:
+    """The bouts of some actions in a session, or all of it where none is named."""
+    end = float(film.time_s[-1]) + 1.0 / film.fps
+    if not actions:
+        return [Cell(film, 0.0, end, film.session.name)]
+    found = []
+    for animal, seen in enumerate(film.seen):
+        for row in seen.bouts.itertuples():
+            if matches(str(row.action), actions):
+                start = max(float(row.start_s) - _BEFORE_S, 0.0)  # type: ignore[arg-type]
+                stop = min(float(row.stop_s) + _AFTER_S, end)  # type: ignore[arg-type]
+                found.append(Cell(film, start, min(stop, start + _LONGEST_S), seen.who, animal))
+    return found
+
+
+def _evenly(cells: list[Cell], most: int) -> list[Cell]:
+    """At most so many cells, evenly over all."""
+    if len(cells) <= most:
+        return cells
+    return [cells[int(k)] for k in np.unique(np.linspace(0, len(cells) - 1, most).round())]
+
+
+def _fitted(width: int, height: int, room: tuple[int, int]) -> tuple[int, int]:
+    """The largest size of this shape in a room, of even numbers of px."""
+    scale = min(room[0] / width, room[1] / height)
+    return max(int(width * scale) // 2 * 2, 2), max(int(height * scale) // 2 * 2, 2)
+
+
+def _write(
+    path: Path,
+    fps: float,
+    duration_s: float,
+    slower: float,
+    picture: Callable[[float], NDArray[np.uint8]],
+    progress: Progress,
+) -> None:
+    """Pictures at a steady rate, each of the frame that was there at its time."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    n = max(int(round(duration_s * fps * slower)), 1)
+    with Video(path, fps) as video:
+        for k in range(n):
+            if k % 20 == 0:
+                progress(k, n, "drawing the video")
+            video.add(picture(k / (fps * slower)))
+        progress(n, n, "drawing the video")

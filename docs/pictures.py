@@ -1,0 +1,142 @@
+"""The pictures of README.md, made again: `python docs/pictures.py`.
+
+It measures the bundled sample and three virtual animals, and wants a Chromium and, for the replay,
+Vulkan (.ci/run says which packages).
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import socket
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import cv2
+import matplotlib as mpl
+import matplotlib.pyplot as plt
+import numpy as np
+from liex_lab.dashboards.picture import photograph
+
+import liex_lab
+from liex_lab.api import run_demo, run_session
+
+REPOSITORY = Path(__file__).resolve().parents[1]
+STATIC = REPOSITORY / "docs" / "_static"
+ANIMALS = (
+    ("mouse", "synthetic:walk?seed=3&frames=150&sensor=kinect-v2", 20),
+    ("fish", "synthetic:swim?seed=2&frames=60", 40),
+    ("hand", "synthetic:gesture?seed=2&frames=60", 30),
+)
+
+
+def save_small(path: Path, rgb: Any, n_colours: int = 96) -> None:
+    """Write a picture with few colours, so that a clone stays small.
+
+    Args:
+        path: the PNG.
+        rgb: (H, W, 3) uint8.
+        n_colours: of its palette.
+    """
+    from PIL import Image
+
+    Image.fromarray(np.ascontiguousarray(rgb)).quantize(n_colours, dither=0).save(
+        path, optimize=True
+    )
+
+
+def relief(depth: Any) -> Any:
+    """Depth as grey levels, nearer is lighter, slopes shaded; (H, W) in 0 to 1.
+
+    Args:
+        depth: (H, W) mm, 0 where unread.
+    """
+    read = depth > 0
+    low, high = np.percentile(depth[read], [1, 99])
+    height = np.where(read, (high - depth) / max(high - low, 1.0), np.nan)
+    smooth = cv2.GaussianBlur(np.nan_to_num(height).astype(np.float32), (0, 0), 1.0)
+    shade = cv2.Sobel(smooth, cv2.CV_32F, 1, 0) + cv2.Sobel(smooth, cv2.CV_32F, 0, 1)
+    return np.clip(0.2 + 0.7 * height + 0.08 * shade, 0, 1)
+
+
+def draw_animals(folder: Path) -> None:
+    """A frame of each bundled animal as the camera sees it, with the skeleton that was measured.
+
+    Args:
+        folder: where the sessions are put.
+    """
+    figure, axes = plt.subplots(1, 3, figsize=(9, 3.2), layout="constrained")
+    for axis, (name, address, row) in zip(axes, ANIMALS, strict=True):
+        plan = liex_lab.Plan.load(name).with_settings(["replay.depth=false"])
+        session = liex_lab.Session.open(run_session(address, plan, folder, overwrite=True))
+        skeleton = liex_lab.Skeleton.load(name)
+        uv = session.poses[["u_px", "v_px"]].to_numpy(float).reshape(-1, skeleton.n_joints, 2)[row]
+        depth = liex_lab.open_recording(address).frame(row).depth
+        middle = (uv.min(axis=0) + uv.max(axis=0)) / 2
+        half = (1.1 if name == "mouse" else 0.75) * np.ptp(uv, axis=0).max()
+        left, top = np.maximum(middle - half, 0).astype(int)
+        right, bottom = (middle + half).astype(int)
+        cut = depth[top : bottom + 1, left : right + 1]
+        near = np.abs(cut - np.median(cut[cut > 0])) < 6 * half if name == "hand" else cut > 0
+        axis.imshow(
+            relief(np.where(near, cut, 0)),
+            cmap=mpl.colormaps["gray"].with_extremes(bad="black"),
+            extent=(left - 0.5, left + cut.shape[1] - 0.5, top + cut.shape[0] - 0.5, top - 0.5),
+            interpolation="nearest",
+        )
+        for child, parent in enumerate(skeleton.parents):
+            if parent >= 0:
+                axis.plot(*uv[[parent, child]].T, color="#E69F00", linewidth=1.6)
+        axis.plot(*uv.T, "o", color="#D55E00", markersize=3.5)
+        axis.set_title(f"{name}: {skeleton.n_joints} joints", fontsize=10)
+        axis.set_axis_off()
+    figure.canvas.draw()
+    save_small(STATIC / "animals.png", np.asarray(figure.canvas.buffer_rgba())[..., :3])
+
+
+def shoot_replay(session: Path, moment: int = 120) -> None:
+    """The replay as Rerun shows it, without a screen.
+
+    Args:
+        session: the session folder.
+        moment: the frame.
+    """
+    from rerun.experimental import ViewerClient
+
+    os.environ["RERUN_ANALYTICS"] = "0"
+    found = importlib.util.find_spec("rerun_cli")
+    assert found is not None
+    assert found.origin is not None
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    program = str(Path(found.origin).parent / "rerun")
+    with ViewerClient.spawn(
+        headless=True, port=port, hide_welcome_screen=True, executable_path=program
+    ) as viewer:
+        viewer.open(str(session / "session.rrd"))
+        for _ in range(5):  # chunks load on demand: the first pictures may be incomplete
+            viewer.set_time("frame", sequence=moment, play_state="paused")
+            png = viewer.take_screenshot()
+            time.sleep(0.7)
+    whole = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)
+    small = cv2.resize(whole, (1200, 675), interpolation=cv2.INTER_AREA)
+    save_small(STATIC / "replay.png", small[..., ::-1])
+
+
+def main() -> None:
+    """Make all three."""
+    with tempfile.TemporaryDirectory(prefix="liex-") as name:
+        folder = Path(name)
+        draw_animals(folder)
+        session = run_demo(folder)
+        photograph(session, REPOSITORY / "dashboards" / "assets" / "demo.png")
+        shoot_replay(session)
+    for path in (STATIC / "animals.png", STATIC / "replay.png"):
+        print(path, path.stat().st_size)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,292 @@
+"""The empty scene of one camera, and what stands before it in a picture.
+
+A pixel is foreground where its reading is nearer than the scene's limit. Foreground pixels are
+joined to 8-connected components of 4 x 4 blocks; the animal is the component whose area comes
+nearest to the animal's usual one, and its height map and image moments are cut by the kernels (see
+`height_maps`). How the scene is learned from a recording is in `background_segmenter`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from liex_lab.arena.floor import Floor
+from liex_lab.arena.scene import Scene, find_fixtures, region_corners, roughness
+from liex_lab.body.skeleton import MOUSE_VIEW, VIEWS, View
+from liex_lab.foreground import _height_map_kernels as kernels
+from liex_lab.foreground.cable import Cable
+from liex_lab.foreground.crop_camera import pack_crop_cameras
+from liex_lab.foreground.floor_level import FloorLevel
+from liex_lab.foreground.height_maps import HeightMaps
+from liex_lab.foreground.segmenter import Segmenter
+from liex_lab.foreground.standing import Standing
+from liex_lab.optics.camera import Camera
+from liex_lab.runtime.shapes import check_shapes
+from liex_lab.runtime.threads import threads
+
+Array = NDArray[np.float64]
+
+# of the logarithms, from posture to posture of one animal
+_AREA_SD = 0.25
+_VOLUME_SD = 0.2
+
+
+@dataclass(frozen=True)
+class StillScene(Segmenter):
+    """The empty scene of one camera, and the depth nearer than which a reading is the animal.
+
+    Attributes:
+        camera: the ideal pinhole camera of the recording.
+        floor: the floor plane in that camera's frame.
+        background: (H, W) float32 mm, depth of the empty scene, 0 where unknown.
+        limit: (H, W) float32 mm; a reading below it is in front of the background.
+        on_floor: (H, W) bool, the floor, under which nothing lies, as far as the picture shows it:
+            an animal stands on it with at least a part of its body.
+        area_mm2: the animal's usual area seen from above, mm^2; 0 while unknown.
+        volume_mm3: the animal's usual volume under its back, mm^3; 0 while unknown.
+        view: how such animals are looked at.
+        stride: only every so many-th row and column of the picture is looked at; H and W count
+            those.
+        standing: how the floor was found, None where it was given.
+        cable: how cables are told from the animal; None where it wears none.
+        level: brings frames to one level of the floor; None where it is still.
+    """
+
+    camera: Camera
+    floor: Floor
+    background: NDArray[np.float32]
+    limit: NDArray[np.float32]
+    on_floor: NDArray[np.bool_]
+    area_mm2: float = 0.0
+    volume_mm3: float = 0.0
+    view: View = MOUSE_VIEW
+    stride: int = 1
+    standing: Standing | None = None
+    level: FloorLevel | None = None
+    cable: Cable | None = None
+
+    @cached_property
+    def grid(self) -> Camera:
+        """The camera whose pixels are looked at: every `stride`-th of the picture."""
+        return self.camera.every(self.stride)
+
+    @cached_property
+    def grid_floor(self) -> Floor:
+        """The floor as that camera sees it."""
+        if self.stride == 1:
+            return self.floor
+        return Floor.from_plane(self.floor.normal, self.floor.distance_mm, self.grid)
+
+    def described(self) -> Scene:
+        """The scene as it is written to session.json, without its outline."""
+        floor = self.grid_floor
+        bare = floor.depth(self.grid.width, self.grid.height)
+        rough = roughness(self.background, bare, self.on_floor)
+        fixtures = find_fixtures(self.background, floor, self.grid, self.on_floor)
+        standing = self.standing
+        wander_mm = None if self.level is None else self.level.wander_mm
+        if standing is None:
+            return Scene(self.floor, roughness_mm=rough, fixtures=fixtures)
+        return Scene(
+            self.floor,
+            standing.origin,
+            standing.support if standing.moves else None,
+            standing.n_things,
+            standing.n_together,
+            rough,
+            region_corners(standing.region, self.stride),
+            fixtures=fixtures,
+            doubts=(standing.doubt,) if standing.doubt else (),
+            wander_mm=wander_mm,
+            tethered=self.cable is not None,
+        )
+
+    def every(self, step: int) -> Self:
+        """The same segmenter for pictures of every `step`-th row and column.
+
+        Args:
+            step: pixels from one to the next, at least 1.
+        """
+        camera = self.camera.every(step)
+        cut = (slice(None, None, step), slice(None, None, step))
+        floor = Floor.from_plane(self.floor.normal, self.floor.distance_mm, camera)
+        return replace(
+            self,
+            camera=camera,
+            floor=floor,
+            background=np.ascontiguousarray(self.background[cut]),
+            limit=np.ascontiguousarray(self.limit[cut]),
+            on_floor=np.ascontiguousarray(self.on_floor[cut]),
+            level=None if self.level is None else self.level.every(step),
+            cable=None if self.cable is None else self.cable.every(step),
+        )
+
+    def misfit(self, crops: HeightMaps) -> Array:
+        """How unlike the animal each height map (n,) is in size: squared standard deviations.
+
+        The sum of ((log a - log a0) / 0.25)^2 over area and ((log v - log v0) / 0.2)^2 over volume,
+        from posture to posture of one animal. An animal that swims or is held up is judged by its
+        area alone: what is below it is not its own.
+
+        Args:
+            crops: n height maps.
+        """
+        area = np.maximum(crops.blobs.area_mm2, 1.0)
+        volume = np.maximum(crops.blobs.volume_mm3, 1.0)
+        if (
+            self.view.frame != VIEWS[0]
+        ):  # what is below an animal that swims or is held up is not its own
+            return (np.log(area / self.area_mm2) / _AREA_SD) ** 2
+        return (np.log(area / self.area_mm2) / _AREA_SD) ** 2 + (
+            np.log(volume / self.volume_mm3) / _VOLUME_SD
+        ) ** 2
+
+    def view_rotation(self, camera_view: bool) -> Array:
+        """Rotation (3, 3) of T_view_camera: the arena's, or that of an upright camera frame.
+
+        Args:
+            camera_view: whether heights are measured along the optical axis.
+        """
+        return np.diag([1.0, -1.0, -1.0]) if camera_view else self.floor.T_arena_camera.rotation
+
+    def planes(self, crops: HeightMaps, camera_view: bool = False) -> Array:
+        """The plane above which each height map is measured: the floor, or one behind the animal.
+
+        Args:
+            crops: n height maps.
+            camera_view: as they were extracted.
+
+        Returns:
+            (n, 3) a, b, c of 1 / z = a u + b v + c, per mm, u and v in pixels of the picture.
+        """
+        if not camera_view:
+            return np.tile(self.floor.inverse_depth, (len(crops.step), 1))
+        level = np.zeros((len(crops.step), 3))
+        level[:, 2] = 1.0 / crops.distance
+        return level
+
+    def middles(self, crops: HeightMaps, camera_view: bool = False) -> Array:
+        """The centroid (n, 3) mm of what each height map shows, in the arena frame.
+
+        Args:
+            crops: n height maps.
+            camera_view: as they were extracted.
+        """
+        middle = crops.centroid
+        if camera_view:  # the view's frame is not the arena's
+            middle[:, 2] -= crops.distance
+            middle = self.floor.T_arena_camera @ (middle @ self.view_rotation(camera_view))
+        return middle
+
+    def crop_cameras(self, crops: HeightMaps, camera_view: bool = False) -> Array:
+        """The crop cameras of height maps.
+
+        Each says how its map was cut: intrinsics, T_view_camera, origin and step of the crop.
+
+        Args:
+            crops: n height maps.
+            camera_view: as they were extracted.
+
+        Returns:
+            (n, 17), packed as `CropCamera`.
+        """
+        camera = self.camera
+        return pack_crop_cameras(
+            np.array([camera.fx, camera.fy, camera.cx, camera.cy]),
+            self.view_rotation(camera_view),
+            crops.distance,
+            crops.origin,
+            crops.step,
+        )
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """That the animal wears a cable, and that the floor's depth wandered."""
+        said = []
+        if self.cable is not None:
+            said.append("the animal wears a cable, which was cut out of the pictures")
+        if self.level is not None:
+            said.append(
+                f"the depth of the floor wandered by {self.level.wander_mm:.1f} mm, as of a sensor "
+                "that warms up, and was brought back to where it was at the beginning"
+            )
+        return tuple(said)
+
+    def cleared(self, depths: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Whole pictures without what the animal wears: 0 where a cable is.
+
+        Args:
+            depths: (n, H, W) float32 mm, whole pictures.
+        """
+        if self.cable is None:
+            return depths
+        thinned = depths[:, :: self.stride, :: self.stride]
+        worn = self.cable.cut(thinned, self.limit) != thinned
+        for axis in (1, 2):
+            worn = np.repeat(worn, self.stride, axis=axis)
+        return np.where(worn[:, : depths.shape[1], : depths.shape[2]], np.float32(0), depths)
+
+    def _check(self, depths: NDArray[np.float32]) -> None:
+        """Refuse frames of another size than those that the scene was learned from."""
+        check_shapes("frames of this scene", ("depths", depths, ("n", *self.limit.shape)))
+
+    def _extract(
+        self,
+        depths: NDArray[np.float32],
+        size: float,
+        parallel: bool,
+        camera_view: bool,
+        n_things: int,
+    ) -> HeightMaps:
+        """Height maps of the components whose areas are nearest to the animal's own.
+
+        Heights are measured above the floor, or (camera_view) from the view's behind_mm behind the
+        animal's mean depth, as the paper's features see them.
+
+        Args:
+            depths: (n, H, W) float32 mm, whole pictures, or a sample of them with the scene's own
+                stride.
+            size: the animal's spine length over the skeleton's home length; scales the smoothing.
+            parallel: whether to use all threads, else one.
+            camera_view: whether heights are measured along the optical axis.
+            n_things: candidates a frame, 1 or 2.
+
+        Returns:
+            The rows (n) of the likeliest components, and then (n_things 2) those of the next;
+            origin, step and n_px are in pixels of the whole picture.
+        """
+        if depths.shape[1:] != self.limit.shape:
+            depths = depths[:, :: self.stride, :: self.stride]
+        self._check(depths)
+        if self.level is not None:
+            depths = self.level.brought_back(depths)
+        if self.cable is not None:
+            depths = self.cable.cut(depths, self.limit)
+        crops = HeightMaps.blank(n_things * len(depths), self.floor.distance_mm)
+        grid = self.grid
+        with threads(parallel):
+            kernels.extract_all(
+                depths,
+                self.limit,
+                self.on_floor,
+                self.area_mm2,
+                n_things,
+                camera_view,
+                kernels.Sight(
+                    np.array([grid.fx, grid.fy, grid.cx, grid.cy]),
+                    self.grid_floor.inverse_depth,
+                    self.view_rotation(camera_view),
+                    behind_mm=self.view.behind_mm if camera_view else 0.0,
+                    smooth_mm=self.view.smooth_mm * size,
+                ),
+                crops.rows,
+            )
+        if self.stride > 1:  # told in pixels of the picture
+            for values, factor in ((crops.origin, 1), (crops.step, 1), (crops.n_px, self.stride)):
+                values *= self.stride * factor
+        return crops

@@ -1,0 +1,88 @@
+"""Ctrl-C, SIGTERM and SIGHUP: what is under way is put down within seconds, and said so.
+
+The signal becomes an exception, so that checkpoints are kept and temporary folders go. What does
+not end by itself, such as a kernel or a library's thread, is ended with the process after 4.5 s; a
+second signal ends it at once. What is on disk then is as after a kill, which every writer expects.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import FrameType
+
+_PATIENCE_S = 4.5
+_NAMES = ("SIGINT", "SIGTERM", "SIGHUP")
+_SAID = {"SIGINT": "interrupted (Ctrl-C)", "SIGTERM": "ended (SIGTERM)", "SIGHUP": "ended (SIGHUP)"}
+
+
+class Ended(BaseException):
+    """Raised in the main thread when the process is asked to end.
+
+    Attributes:
+        signal: the signal's number.
+    """
+
+    def __init__(self, number: int) -> None:
+        super().__init__(number)
+        self.signal = number
+
+    def __str__(self) -> str:
+        """One sentence for people."""
+        return (
+            f"{_SAID[signal.Signals(self.signal).name]}; the same command goes on where a "
+            "measurement was, or begins anew"
+        )
+
+    @property
+    def exit_code(self) -> int:
+        """128 and the signal's number, as shells have it: 130 for Ctrl-C, 143 for SIGTERM."""
+        return 128 + self.signal
+
+
+@contextmanager
+def ending() -> Iterator[None]:
+    """Within the block, signals that ask the process to end raise `Ended` in the main thread.
+
+    Signals that the process was started to ignore, as by nohup, are ignored.
+    """
+    asked: list[int] = []
+
+    def end(number: int, frame: FrameType | None) -> None:
+        error = Ended(number)
+        if asked:
+            os._exit(error.exit_code)
+        asked.append(number)
+        late = threading.Timer(_PATIENCE_S, _end_now, [error, asked])
+        late.daemon = True
+        late.start()
+        raise error
+
+    before = {}
+    for name in _NAMES:
+        number = getattr(signal, name, None)
+        if number is None or threading.current_thread() is not threading.main_thread():
+            continue
+        found = signal.getsignal(number)
+        if found in (signal.SIG_DFL, signal.default_int_handler):
+            before[number] = signal.signal(number, end)
+    try:
+        yield
+    finally:
+        if asked:
+            asked.append(0)  # the sentence is said by who catches the error
+        else:  # a second signal would still end it at once
+            for number, handler in before.items():
+                signal.signal(number, handler)
+
+
+def _end_now(error: Ended, asked: list[int]) -> None:
+    """End the process, whatever its threads are doing."""
+    if len(asked) == 1:
+        sys.stderr.write(f"liex: {error}\n")
+        sys.stderr.flush()
+    os._exit(error.exit_code)

@@ -1,0 +1,259 @@
+"""Cut-outs: what a session keeps of every depth picture, and the still scene that stands behind it.
+
+The scene's background is the farthest depth that keeps coming back in each pixel (see
+`foreground.background`). Of a frame, the boxes around the two likeliest things are kept as they
+were read, unread pixels as 0; outside of them a kept picture shows the background. A frame in which
+nothing was found is kept whole, for people will want to know why. A box holds the joints
+of the thing's pose, projected, and a square of 1.4 square roots of its pixels about its centroid,
+with a margin of 15 % of the spine all around:
+
+    box = hull(joints, centroid -+ 0.7 sqrt(n_px)) -+ (0.15 spine f / z + 4 px).
+
+It is made of what the single frame says alone, so it does not matter which process made it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from liex_lab.errors import RecordingError, SessionError
+from liex_lab.recordings.rvl import to_millimetres
+from liex_lab.sessions.reading import reading_from
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from liex_lab.recordings.recording import Recording
+    from liex_lab.sessions.provenance import Provenance
+    from liex_lab.sessions.session import Session
+    from liex_lab.tracking.observations import Observations
+
+Depth = NDArray[np.uint16]
+Boxes = NDArray[np.int16]
+
+FILE = "cutouts.npz"
+ANIMAL = "animal"
+ARENA = "arena"
+ALL = "all"
+NONE = "none"
+N_BOXES = 2  # things that a frame may hold
+_FRAMES = 16  # that show the background
+_REACH = 0.7  # of the square root of a thing's pixels, to each side of its centroid
+_MARGIN = 0.15  # of the spine
+_MARGIN_PX = 4.0
+
+
+def still_scene(recording: Recording) -> Depth:
+    """The background of the whole picture, outside of any region too, from 16 frames.
+
+    Args:
+        recording: an open recording.
+
+    Returns:
+        (H, W) uint16 mm, smoothed by a median of 3 x 3 pixels, 0 where nothing keeps coming back.
+    """
+    import cv2
+
+    from liex_lab.foreground.background import learn_background, sample_frames
+
+    learned = to_millimetres(learn_background(sample_frames(recording, _FRAMES))[0])
+    return np.asarray(cv2.medianBlur(learned, 3), np.uint16)  # specks of 16 frames are no scene
+
+
+class PictureKeeper:
+    """What is kept of a session's depth pictures, as its plan says.
+
+    Args:
+        origin: camera, animal, background, and how much of the depth is to be kept.
+    """
+
+    def __init__(self, origin: Provenance) -> None:
+        self._origin = origin
+        self._kept = origin.replay_depth
+
+    def keep(
+        self, depth: Sequence[Depth], seen: Observations | None
+    ) -> tuple[list[Depth], Boxes | None]:
+        """The pictures as they are kept, and where they are not the background.
+
+        Args:
+            depth: n pictures (H, W) uint16 mm, 0 where unread.
+            seen: the hypotheses of these n frames; None where nobody looked for an animal.
+
+        Returns:
+            The n pictures, none where no depth is kept; and boxes (n, K, 4) int16 of left, top,
+            right and bottom (px, the latter two exclusive, all 0 for no box), None where whole
+            pictures are kept.
+        """
+        if self._kept == NONE:
+            return [], None
+        background = self._origin.background
+        if self._kept == ALL or background is None or seen is None:
+            return list(depth), None
+        if self._kept == ARENA:
+            boxes = np.zeros((len(depth), N_BOXES, 4), np.int16)
+            boxes[:, 0] = self._arena
+            if self._region is None:
+                return list(depth), boxes
+            return [np.where(self._region, image, background) for image in depth], boxes
+        boxes = boxes_around(seen, self._origin)
+        camera = self._origin.camera
+        nothing = ~boxes.any(axis=(1, 2))
+        boxes[nothing, 0] = (0, 0, camera.width, camera.height)  # to be looked at why
+        return [
+            composed(image, cuts, background) for image, cuts in zip(depth, boxes, strict=True)
+        ], boxes
+
+    @cached_property
+    def _region(self) -> NDArray[np.bool_] | None:
+        """(H, W) the arena's region; None is the whole picture."""
+        from liex_lab.arena.scene import region_mask
+
+        scene = self._origin.scene
+        camera = self._origin.camera
+        if scene is None or not scene.region_px:
+            return None
+        return region_mask(scene.region_px, camera.width, camera.height)
+
+    @cached_property
+    def _arena(self) -> tuple[int, int, int, int]:
+        """The box of the region."""
+        if self._region is None:
+            return 0, 0, self._origin.camera.width, self._origin.camera.height
+        rows = np.flatnonzero(self._region.any(axis=1))
+        columns = np.flatnonzero(self._region.any(axis=0))
+        return int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1
+
+
+def boxes_around(seen: Observations, origin: Provenance) -> Boxes:
+    """The boxes around the things that single frames took for the animal.
+
+    Args:
+        seen: the hypotheses of n frames.
+        origin: camera, its place, and the animal's length.
+
+    Returns:
+        (n, 2, 4) int16 left, top, right, bottom, px; all 0 where there is no such thing.
+    """
+    camera = origin.camera
+    into = origin.T_arena_camera.inverse()
+    spine_mm = float(origin.animal_size.get("spine_mm") or origin.skeleton.length)
+    found = np.zeros((len(seen), N_BOXES, 4), np.int16)
+    for k in range(N_BOXES):
+        h = 2 * k  # the other hypothesis of each thing is the same one turned round
+        rows = np.flatnonzero(seen.known[:, h] & (seen.n_px[:, h] > 0))
+        if not len(rows):
+            continue
+        joints = seen.joints_as(h, range(seen.skeleton.n_joints))[rows].astype(np.float64)
+        centre = seen.centroid_px[rows, h].astype(np.float64)
+        reach = _REACH * np.sqrt(seen.n_px[rows, h].astype(np.float64))[:, None]
+        far = (into @ seen.centroid_mm[rows, h].astype(np.float64))[:, 2:]
+        margin = _MARGIN * spine_mm * camera.fx / np.maximum(far, 1.0) + _MARGIN_PX
+        with np.errstate(invalid="ignore"):
+            uv = camera.project(into @ joints.reshape(-1, 3)).reshape(len(rows), -1, 2)
+            low = np.fmin(np.fmin.reduce(uv, axis=1), centre - reach) - margin
+            high = np.fmax(np.fmax.reduce(uv, axis=1), centre + reach) + margin
+        size = np.array([camera.width, camera.height])
+        low, high = (
+            np.clip(np.nan_to_num(corner), 0, size).astype(np.int64)
+            for corner in (np.floor(low), np.ceil(high) + 1.0)
+        )
+        whole = (high > low).all(axis=1)
+        found[rows[whole], k] = np.hstack([low, high])[whole]
+    return found
+
+
+def composed(depth: Depth, boxes: Boxes, background: Depth) -> Depth:
+    """A picture inside its boxes, and the background outside of them.
+
+    Args:
+        depth: (H, W) uint16 mm, 0 where unread.
+        boxes: (K, 4) left, top, right, bottom, px.
+        background: (H, W) uint16 mm.
+
+    Returns:
+        (H, W) uint16 mm, a picture of its own.
+    """
+    picture = background.copy()
+    for left, top, right, bottom in boxes.tolist():
+        picture[top:bottom, left:right] = depth[top:bottom, left:right]
+    return picture
+
+
+def write_boxes(folder: Path, boxes: Boxes) -> None:
+    """Write cutouts.npz.
+
+    Args:
+        folder: the session's folder.
+        boxes: (n, K, 4) of every frame.
+    """
+    np.savez_compressed(folder / FILE, boxes=boxes)
+
+
+def open_pictures(session: Session) -> Recording:
+    """The depth pictures that a session keeps, as a recording; a session's pictures are read here.
+
+    Outside of its boxes a picture shows the still scene, see `Kept`.
+
+    Args:
+        session: the session.
+
+    Returns:
+        The recording of session.mcap; its rows are those of the table `frames`.
+
+    Raises:
+        SessionError: the session keeps no depth.
+        RecordingError: session.mcap cannot be read.
+    """
+    from liex_lab.recordings import open_recording
+
+    try:
+        return open_recording(session.path / "session.mcap")
+    except RecordingError:
+        if session.metadata["plan"].get("replay", {}).get("depth") not in (NONE, False):
+            raise
+    raise SessionError(
+        f'{session.path} keeps no depth pictures, for its plan says replay.depth = "none"; run '
+        "`liex run` on the recording again with --set replay.depth=animal"
+    )
+
+
+class Kept:
+    """Where the pictures of a session are what the camera read, and not the still scene.
+
+    Args:
+        session: the session.
+
+    Raises:
+        SessionError: its file is damaged.
+    """
+
+    def __init__(self, session: Session) -> None:
+        self._boxes: Boxes | None = None
+        path = session.path / FILE
+        if path.is_file():
+            with reading_from(path), np.load(path, allow_pickle=False) as kept:
+                boxes: NDArray[Any] = kept["boxes"]
+                if boxes.ndim != 3 or boxes.shape[2] != 4 or len(boxes) != len(session.frames):
+                    raise ValueError(f"boxes are {boxes.shape}, not those of every frame")
+                self._boxes = boxes
+
+    def holds(self, row: int, u_px: float, v_px: float) -> bool:
+        """Whether a pixel of a frame was kept as it was read.
+
+        Args:
+            row: the frame's row in the table `frames`.
+            u_px: column, px; rounded.
+            v_px: row of the picture, px; rounded.
+        """
+        if self._boxes is None:  # whole pictures, as in sessions of earlier versions
+            return True
+        left, top, right, bottom = self._boxes[row].T
+        u = round(u_px)
+        v = round(v_px)
+        return bool(((left <= u) & (u < right) & (top <= v) & (v < bottom)).any())

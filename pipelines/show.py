@@ -1,0 +1,96 @@
+"""Whole depth pictures beside a session's replay, `liex show --depth all`.
+
+A session keeps cut-outs of the depth; the recording that it is linked to has all of it. Its
+pictures are written into a replay of their own, which Rerun shows as one with the session's.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from liex_lab.errors import LiexError, SessionError
+from liex_lab.plan import Plan
+from liex_lab.runtime.progress import Progress, silent
+
+from .build import build_recording
+
+if TYPE_CHECKING:
+    from liex_lab.recordings.recording import Recording
+    from liex_lab.sessions import Session
+
+_CHUNK = 32  # frames in memory at a time
+
+
+def whole_pictures(
+    session: str | Path, out: Path, recording: str | None = None, progress: Progress = silent
+) -> Path:
+    """Write the whole depth pictures of a session's recording into a replay.
+
+    Args:
+        session: the session folder.
+        out: the .rrd file to write.
+        recording: path of the recording, where it is no longer where the session says.
+        progress: told while the recording is hashed and read.
+
+    Returns:
+        `out`.
+
+    Raises:
+        SessionError: the session does not say where its recording is, it is not there any more, or
+            it is another one.
+        RecordingError: the recording cannot be read.
+    """
+    from liex_lab.recordings.rvl import to_millimetres
+    from liex_lab.sessions import Session
+    from liex_lab.sessions.cutouts import ALL
+    from liex_lab.sessions.evidence import provenance_of
+    from liex_lab.sessions.rrd import ReplayWriter
+    from liex_lab.sessions.tracks import skeleton_of
+
+    opened = Session.open(session, raw=True)
+    origin = replace(provenance_of(opened, skeleton_of(opened)), replay_depth=ALL)
+    with _recording_of(opened, recording, progress) as pictures:
+        replay = ReplayWriter(out, origin)
+        try:
+            for frames in pictures.chunks(_CHUNK):
+                replay.add(
+                    [frame.index for frame in frames],
+                    [frame.time_ns for frame in frames],
+                    [to_millimetres(frame.depth) for frame in frames],
+                )
+                progress(frames[-1].index + 1, len(pictures), "reading whole pictures")
+            replay.flushed()
+        finally:
+            replay.abandon()
+    return out
+
+
+def _recording_of(session: Session, stated: str | None, progress: Progress) -> Recording:
+    """The recording of a session, opened as it was when it was measured; its hash is the same."""
+    from liex_lab.sessions.source import linked_recording
+
+    where = stated or linked_recording(session)
+    if where is None:
+        raise SessionError(
+            f"{session.path} does not say where its recording is, as sessions of earlier versions; "
+            "name it with --recording"
+        )
+    if not where.startswith("synthetic:") and not Path(where).exists():
+        raise SessionError(
+            f"whole depth pictures are missing: the recording of {session.path.name} is not at "
+            f"{where} any more; say where it is with --recording"
+        )
+    recording = build_recording(where, Plan.from_toml(session.plan, "plan.toml"), progress)
+    try:
+        if recording.digest(progress) != session.metadata["input"]["sha256"]:
+            raise SessionError(
+                f"whole depth pictures are missing: {where} is not the recording that "
+                f"{session.path.name} was made of, its hash is another one; name the right one "
+                "with --recording"
+            )
+    except LiexError:
+        recording.close()
+        raise
+    return recording

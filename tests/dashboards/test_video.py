@@ -1,0 +1,197 @@
+"""A video shows the session at its own times, and says in a sentence where it cannot."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+from liex_lab.dashboards.video import encoder
+from liex_lab.dashboards.video.film import Film
+from liex_lab.dashboards.video.relief import Relief
+from liex_lab.dashboards.video.video import matches, scale_mm
+
+from liex_lab.api import export_video
+from liex_lab.errors import SessionError
+from liex_lab.exchange import export
+from liex_lab.exchange.boris import project
+from liex_lab.sessions import Session
+from tests.sessions.walking_mouse import FLOOR_MM, WalkingMouse, steady, write
+
+# two seconds and a gap of the camera
+MOUSE = WalkingMouse(np.delete(steady(3.0), slice(40, 46)), rear_s=(1.0, 2.0))
+
+
+@pytest.fixture
+def session(tmp_path: Path) -> Session:
+    return write(tmp_path / "circle.liex", MOUSE)
+
+
+def pictures(path: Path) -> tuple[list[np.ndarray], float]:
+    with av.open(str(path)) as box:
+        frames = [frame.to_ndarray(format="rgb24") for frame in box.decode(video=0)]
+        stream = box.streams.video[0]
+        assert stream.codec_context.name == "h264"
+        assert stream.average_rate is not None
+        return frames, float(stream.average_rate)
+
+
+def test_a_video_has_the_clock_of_the_session_also_across_a_gap(session):
+    path = export_video(session.path)
+    frames, fps = pictures(path)
+    assert path == session.path / "circle.mp4"
+    assert fps == pytest.approx(30.0, rel=0.01)
+    assert len(frames) / fps == pytest.approx(session.metadata["frames"]["duration_s"], abs=0.04)
+    assert not list(session.path.glob(".*part*"))
+
+
+def test_the_same_session_gives_the_same_bytes(session, tmp_path):
+    one = export_video(session.path, tmp_path / "a").read_bytes()
+    assert export_video(session.path, tmp_path / "b").read_bytes() == one
+
+
+def test_the_nose_is_drawn_where_the_table_says(session):
+    film = Film(session, 80.0)
+    try:
+        view = film.whole_view()
+        shown = film.picture(0.5, view, (4 * view.width, 4 * view.height), "")
+        u, v = film.uv[0][film.row_at(0.5)][-1]
+    finally:
+        film.close()
+    place = 4.0 * (np.array([u, v]) + 0.5 - [view.left, view.top])
+    red = (shown.astype(int) - [238, 102, 119]).__abs__().sum(axis=-1) < 60
+    y, x = np.nonzero(red)
+    assert np.hypot(x.mean() + 0.5 - place[0], y.mean() + 0.5 - place[1]) < 3.0
+
+
+def test_heights_are_counted_from_the_floor(session):
+    relief = Relief(session, 80.0)
+    depth = np.full((session.camera.height, session.camera.width), round(FLOOR_MM), np.uint16)
+    depth[10, 10] = round(FLOOR_MM) - 30
+    depth[0, 0] = 0
+    heights = relief.heights(depth)
+    assert heights[10, 10] == pytest.approx(30.0, abs=0.1)
+    assert heights[40, 60] == pytest.approx(0.0, abs=0.1)
+    assert np.isnan(heights[0, 0])
+
+
+def test_the_frame_that_is_shown_is_the_last_one_until_then(session):
+    film = Film(session, 80.0)
+    try:
+        assert film.row_at(0.0) == 0
+        assert film.row_at(39.5 / 30.0) == 39
+        assert film.row_at(45.5 / 30.0) == 39  # in the gap the last picture stands
+        assert film.row_at(46.0 / 30.0) == 40
+        assert film.row_at(99.0) == len(session.frames) - 1
+        rears = session.bouts[session.bouts["action"].str.startswith("rear")]
+        bout = next(rears.itertuples())
+        assert film.words_at(0.5 * (bout.start_s + bout.stop_s)) == [bout.action]
+    finally:
+        film.close()
+
+
+def test_groups_stand_beside_each_other_on_one_scale(tmp_path):
+    for name, group in (("a", "control"), ("b", "drug"), ("c", "drug")):
+        write(tmp_path / f"{name}.liex", MOUSE, name=name, subject={"group": group})
+    path = export_video([tmp_path], tmp_path, actions=["rear"])
+    assert path.name == "sessions_rear.mp4"
+    frames, _ = pictures(path)
+    alone = export_video([tmp_path], tmp_path, actions=["rear"], groups=["control"])
+    single, _ = pictures(alone)
+    assert frames[0].shape[1] > single[0].shape[1]
+    with pytest.raises(SessionError, match="their groups are control, drug"):
+        export_video([tmp_path], tmp_path, groups=["placebo"])
+
+
+def test_the_scale_holds_the_longest_animal(session):
+    assert scale_mm([session]) >= session.metadata["animal"]["spine_mm"]
+
+
+def test_a_kind_of_rear_is_a_rear():
+    assert matches("rear_supported", ["rear"])
+    assert matches("rear", ["rear"])
+    assert not matches("rearrange", ["rear"])
+    assert not matches("walk", ["rear"])
+
+
+def test_the_report_links_to_the_clips_that_were_made(session):
+    export_video(session.path, actions=["rear"])
+    page = (session.path / "report.html").read_text(encoding="utf-8")
+    assert '<a href="circle_rear.mp4">video</a>' in page
+
+
+def test_the_project_for_boris_names_the_video_that_was_made(session, tmp_path):
+    def media(found: dict) -> str:
+        (observation,) = found["observations"].values()
+        (name,) = observation["file"]["1"]
+        assert set(observation["media_info"]["length"]) == {name}
+        assert set(observation["media_info"]["fps"]) == {name}
+        return str(name)
+
+    assert media(project(session)) == session.metadata["input"]["name"]
+    video = export_video(session.path)
+    # beside the project by its name, so that the folder can be moved; else by its whole path
+    assert media(project(session, session.path)) == "circle.mp4"
+    assert Path(media(project(session, tmp_path / "elsewhere"))) == video.resolve()
+    export(session, "boris")
+    assert '"circle.mp4"' in (session.path / "circle.boris").read_text(encoding="utf-8")
+
+
+def test_without_an_encoder_there_is_a_sentence_and_no_file(session, monkeypatch):
+    monkeypatch.setattr(encoder, "_CODECS", ("no_such_codec", "nor_this"))
+    with pytest.raises(SessionError, match="neither no_such_codec nor nor_this"):
+        export_video(session.path)
+    assert not list(session.path.glob("*.mp4"))
+
+
+def test_a_session_without_depth_is_a_sentence(session):
+    (session.path / "session.mcap").unlink()
+    with pytest.raises(SessionError, match=r"lacks session\.mcap|keeps no depth"):
+        export_video(session.path)
+    session.metadata["plan"] = {"replay": {"depth": False}}
+    with pytest.raises(SessionError, match="without --no-depth"):
+        Film(session, 80.0)
+
+
+def test_a_session_without_any_pose_is_a_video_all_the_same(tmp_path):
+    lost = write(tmp_path / "lost.liex", WalkingMouse(steady(0.5), lost=tuple(range(15))))
+    frames, _ = pictures(export_video(lost.path))
+    assert len(frames) == 15
+    with pytest.raises(SessionError, match="no bout is named rear in 1 session; named are none"):
+        export_video(lost.path, actions=["rear"])
+
+
+@pytest.mark.parametrize(
+    ("asked", "said"),
+    [
+        ({"actions": ["swim"]}, "no bout is named swim"),
+        ({"start_s": 90.0}, "is no part of it"),
+        ({"slower": 0.0}, "above 0"),
+        ({"start_s": 1.0, "actions": ["rear"]}, "without actions"),
+    ],
+)
+def test_what_cannot_be_shown_is_a_sentence_and_leaves_nothing(session, asked, said):
+    with pytest.raises(SessionError, match=said):
+        export_video(session.path, **asked)
+    assert not list(session.path.glob("*.mp4*"))
+
+
+def test_a_stretch_is_as_long_as_it_is_times_how_slow(session):
+    path = export_video(session.path, start_s=0.5, stop_s=1.0, slower=2.0)
+    frames, fps = pictures(path)
+    assert path.name == "circle_from_0.50s_to_1.00s.mp4"
+    assert len(frames) / fps == pytest.approx(1.0, abs=0.05)
+    with pytest.raises(SessionError, match="exists already"):
+        export_video(session.path, start_s=0.5, stop_s=1.0)
+
+
+def test_a_video_that_breaks_off_leaves_nothing(tmp_path):
+    def breaks() -> None:
+        with encoder.Video(tmp_path / "v.mp4", 30.0) as video:
+            video.add(np.zeros((64, 64, 3), np.uint8))
+            raise RuntimeError("stop")
+
+    with pytest.raises(RuntimeError):
+        breaks()
+    assert list(tmp_path.iterdir()) == []

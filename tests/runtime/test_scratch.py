@@ -1,0 +1,64 @@
+"""A temporary folder goes with its process, however that one ends."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from liex_lab.runtime.scratch import Scratch, remove_stale
+
+KEEPS = """
+from liex_lab.runtime.scratch import Scratch
+import time
+scratch = Scratch()
+(scratch.folder / "big").write_bytes(bytes(1000))
+print(scratch.folder, flush=True)
+time.sleep(60)
+"""
+
+
+@pytest.fixture
+def temporary(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    monkeypatch.setattr("tempfile.tempdir", None)
+    return tmp_path
+
+
+def test_it_goes_when_it_is_closed(temporary: Path) -> None:
+    scratch = Scratch()
+    (scratch.folder / "a").write_text("x")
+    assert [scratch.folder] == list(temporary.iterdir())
+    scratch.close()
+    assert not list(temporary.iterdir())
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="signals differ")
+def test_what_a_killed_process_left_goes_with_the_next_and_what_is_in_use_stays(
+    temporary: Path,
+) -> None:
+    (temporary / "liex-scratch-mine").mkdir()  # of somebody who has not locked it yet
+    (temporary / "other").write_text("kept")
+    with subprocess.Popen([sys.executable, "-c", KEEPS], stdout=subprocess.PIPE, text=True) as one:
+        assert one.stdout is not None
+        left = Path(one.stdout.readline().strip())
+        remove_stale()
+        assert (left / "big").is_file()
+        os.kill(one.pid, signal.SIGKILL)
+        one.wait()
+    assert (left / "big").is_file()
+    Scratch().close()
+    assert {path.name for path in temporary.iterdir()} == {"liex-scratch-mine", "other"}
+
+
+def test_a_link_with_such_a_name_is_left_alone(temporary: Path) -> None:
+    precious = temporary / "precious"
+    precious.mkdir()
+    (precious / ".lock").write_text("")
+    (temporary / "liex-scratch-link").symlink_to(precious)
+    remove_stale()
+    assert (precious / ".lock").is_file()

@@ -1,0 +1,134 @@
+"""A process that is asked to end does so within five seconds, with a sentence and its exit code,
+and leaves no other process behind.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="signals differ")
+
+MAIN = """
+import sys, time, threading
+import liex_lab.cli.main
+cli = sys.modules["liex_lab.cli.main"]
+def work():
+    {work}
+cli.app = work
+cli.main()
+"""
+TIDY = """
+    try:
+        print("begun", flush=True); time.sleep(60)
+    finally:
+        print("tidied", flush=True)
+"""
+STUCK = """
+    threading.Thread(target=time.sleep, args=(60,)).start()
+    try:
+        print("begun", flush=True); time.sleep(60)
+    finally:
+        time.sleep(60)
+"""
+DEAF = """
+    print("begun", flush=True)
+    while True:
+        try:
+            time.sleep(60)
+        except BaseException:
+            pass
+"""
+
+
+def ended(work: str, *signals: int) -> tuple[int, str, str, float]:
+    """Exit code, output, errors and seconds of a process that is sent signals."""
+    code = MAIN.format(work=work.strip())
+    with subprocess.Popen(
+        [sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as running:
+        assert running.stdout is not None
+        assert running.stdout.readline() == "begun\n"
+        began = time.monotonic()
+        for number in signals:
+            running.send_signal(number)
+            time.sleep(0.2)
+        out, err = running.communicate(timeout=30)
+        return running.returncode, out, err, time.monotonic() - began
+
+
+@pytest.mark.parametrize(
+    ("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)]
+)
+def test_what_is_under_way_is_put_down_and_said(number: int, code: int) -> None:
+    returned, out, err, seconds = ended(TIDY, number)
+    assert returned == code
+    assert "tidied" in out
+    assert len(err.splitlines()) == 1
+    assert err.startswith("liex: ")
+    assert "same command" in err
+    assert seconds < 5.0
+
+
+@pytest.mark.parametrize("work", [STUCK, DEAF])
+def test_what_does_not_end_is_ended(work: str) -> None:
+    returned, _, err, seconds = ended(work, signal.SIGTERM)
+    assert returned == 143
+    assert err.count("ended (SIGTERM)") == 1
+    assert seconds < 6.0
+
+
+def test_a_second_signal_ends_it_at_once() -> None:
+    returned, _, _, seconds = ended(STUCK, signal.SIGINT, signal.SIGINT)
+    assert returned == 130
+    assert seconds < 2.0
+
+
+POOL = """
+import os, time, sys
+from liex_lab.pipelines.workers import Processes
+def do(k):
+    print(os.getpid(), flush=True)
+    time.sleep(60)
+if __name__ == "__main__":
+    {main}
+"""
+
+
+def alive(pid: int) -> bool:
+    """Whether a process is there and is no zombie."""
+    try:
+        return "\nState:\tZ" not in Path(f"/proc/{pid}/status").read_text()
+    except OSError:
+        return False
+
+
+@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="there is no /proc")
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
+@pytest.mark.parametrize("handled", [False, True])
+def test_no_worker_is_left_behind(number: int, handled: bool, tmp_path: Path) -> None:
+    work = "list(Processes(2, 1).each(do, [1, 2, 3]))"
+    if handled:
+        begin = "import liex_lab.cli.main; cli = sys.modules['liex_lab.cli.main']; "
+        work = f"{begin}cli.app = lambda: {work}; cli.main()"
+    script = tmp_path / "script.py"
+    script.write_text(POOL.format(main=work))
+    with subprocess.Popen(
+        [sys.executable, str(script)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as running:
+        assert running.stdout is not None
+        workers = [int(running.stdout.readline()) for _ in range(2)]
+        assert all(map(alive, workers))
+        os.kill(running.pid, number)
+        began = time.monotonic()
+        while any(map(alive, workers)) and time.monotonic() - began < 10.0:
+            time.sleep(0.1)
+        assert not any(map(alive, workers))
+        running.wait(10)
+    assert time.monotonic() - began < 6.0

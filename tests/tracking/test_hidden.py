@@ -1,0 +1,98 @@
+"""Hidden is a state: an animal that goes behind something is told from one that was not found."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from liex_lab.foreground.height_maps import CROP, HeightMaps
+from liex_lab.tables.rows import Rows
+from liex_lab.tracking.observations import Observations
+from liex_lab.tracking.occluders import behind_something
+from liex_lab.tracking.offline import track_whole
+from tests.tracking.stories import SUBJECT, lose, noisy, told, walk
+
+SECONDS = np.arange(150) / 30.0
+GONE = slice(60, 100)
+
+
+@pytest.fixture
+def seen() -> Observations:
+    """A mouse that walks, of which less and less is seen from frame 52 on, and nothing from 60."""
+    seen = told(SECONDS, noisy(walk(SECONDS), np.random.default_rng(3)))
+    seen.behind[:] = 0.0
+    for k, frame in enumerate(range(52, 60)):
+        seen.n_px[frame] = seen.n_px[frame] * (0.9 - 0.1 * k)
+        seen.behind[frame] = 0.1
+    lose(seen, GONE)
+    return seen
+
+
+def test_a_mouse_that_goes_under_a_roof_is_hidden_until_it_comes_back(seen: Observations) -> None:
+    track = track_whole(SUBJECT, seen).track
+    assert (track.flag[GONE] == "hidden").all()
+    assert np.isnan(track.joints_mm[GONE]).all()
+    assert (track.flag[:50] == "").all()
+    assert (track.flag[105:] == "").all()
+
+
+def test_of_a_mouse_that_is_mostly_behind_something_there_is_no_trusted_pose(
+    seen: Observations,
+) -> None:
+    track = track_whole(SUBJECT, seen).track
+    assert (track.flag[52:55] == "doubtful").all()
+    assert (track.flag[56:60] == "hidden").all()
+
+
+def test_a_mouse_that_is_lost_in_the_open_is_not_found(seen: Observations) -> None:
+    seen.behind[:] = 0.0
+    track = track_whole(SUBJECT, seen).track
+    assert not (track.flag == "hidden").any()
+    assert (track.flag[GONE] == "not_found").all()
+
+
+def test_observations_that_do_not_know_what_is_before_the_animal_are_as_before(
+    seen: Observations,
+) -> None:
+    before = track_whole(SUBJECT, seen).track
+    seen.behind[:] = np.nan
+    now = track_whole(SUBJECT, seen).track
+    assert not (now.flag == "hidden").any()
+    assert now.posed.sum() > before.posed.sum()
+
+
+def test_the_gap_says_where_the_animal_was_last_seen_and_since_when(seen: Observations) -> None:
+    track = track_whole(SUBJECT, seen).track
+    rows = Rows(track, np.arange(150), "session", "mouse")
+    gaps = rows.gaps()
+    at = list(gaps["reason"]).index("hidden")
+    first = int(gaps["start_frame"][at])
+    assert 52 <= first <= 60
+    assert gaps["start_s"][at] == pytest.approx(first / 30.0)
+    place = [gaps["x_mm"][at], gaps["y_mm"][at]]
+    np.testing.assert_allclose(place, track.centroid_mm[first - 1, :2])
+
+
+def roofed(roof_mm: float) -> np.ndarray:
+    """The share of a block's outline behind a roof over half of it, so far above the block."""
+    crops = HeightMaps.blank(1, 700.0)
+    crops.heights[0, 20:40, 20:40] = 16 * 25
+    crops.n_px[:] = 400
+    depth = np.full((1, CROP, CROP), 700.0, np.float32)
+    depth[0, 20:40, 20:40] = 675.0
+    depth[0, 10:60, 40:70] = 675.0 - roof_mm
+    return behind_something(crops, depth)
+
+
+def test_an_outline_under_a_roof_ends_there_and_beside_a_low_step_it_does_not() -> None:
+    assert roofed(60.0) == pytest.approx(0.25)
+    assert roofed(10.0) == 0.0
+
+
+def test_an_outline_that_leaves_the_picture_goes_on_outside() -> None:
+    crops = HeightMaps.blank(1, 700.0)
+    crops.heights[0, 1:21, 30:50] = 16 * 25
+    crops.n_px[:] = 400
+    depth = np.full((1, CROP, CROP), 700.0, np.float32)
+    depth[0, 1:21, 30:50] = 675.0
+    assert behind_something(crops, depth) == pytest.approx(0.25)
