@@ -19,6 +19,7 @@ from liex_lab.plan.study import Study
 from liex_lab.runtime.progress import Board, Progress, progress_board, silent, telling_of_compiling
 
 if TYPE_CHECKING:
+    from liex_lab.pipelines.arenas import ArenaOutcome
     from liex_lab.pipelines.study.status import SessionStatus
     from liex_lab.pipelines.verify import Finding
     from liex_lab.pipelines.workers import WorkerPool
@@ -83,6 +84,62 @@ def run_session(
             out,
             settings=settings,
             folder=folder,
+            overwrite=overwrite,
+            notes=notes,
+            blueprint=replay_blueprint,
+            report=write_views,
+            pool=pool,
+            progress=progress,
+        )
+
+
+def run_arenas(
+    recording: str | Path | Recording,
+    plan: Plan | None = None,
+    out: str | Path = ".",
+    *,
+    settings: Sequence[str] = (),
+    overwrite: bool = False,
+    notes: Mapping[str, Any] | None = None,
+    workers: int = 1,
+    pool: WorkerPool | None = None,
+    progress: Progress = silent,
+) -> list[ArenaOutcome]:
+    """Measure several arenas in one picture, each as a session of its own, in one pass.
+
+    Args:
+        recording: path of a recording, or address of a virtual one, or a recording that is open
+            already.
+        plan: lists the arenas, `[[arenas]]`, or says `arenas = "auto"`; None takes for each arena
+            the bundled plan that fits, with the arenas that `settings` say.
+        out: the folder into which the session folders `<recording's name>-<arena>.liex` are
+            written.
+        settings: changes of the plan where none is named.
+        overwrite: replace sessions that are there already.
+        notes: further facts for every session.json.
+        workers: processes that look at shards of a long recording side by side.
+        pool: a worker pool of the caller's own instead.
+        progress: told how far the work is.
+
+    Returns:
+        For each arena its session folder, or why it could not be measured.
+
+    Raises:
+        LiexError: the recording or the plan cannot be used, or arenas overlap.
+    """
+    from liex_lab.dashboards.replay.rerun_blueprint import replay_blueprint
+    from liex_lab.dashboards.report.views import write_views
+    from liex_lab.pipelines.arenas import measure_arenas
+    from liex_lab.pipelines.workers import Processes
+
+    if workers > 1 and pool is None:
+        pool = Processes(workers)
+    with telling_of_compiling(progress) as progress:
+        return measure_arenas(
+            recording,
+            plan,
+            out,
+            settings=settings,
             overwrite=overwrite,
             notes=notes,
             blueprint=replay_blueprint,
@@ -709,9 +766,11 @@ def run_tables(
     fresh: bool = False,
     rows: Sequence[str] = (),
     sealed: bool = False,
+    without: Sequence[str] = (),
+    nyu: Path | None = None,
     progress: Progress = silent,
 ) -> list[Path]:
-    """Make every row of Tables 1-3 of the Lie-X paper and its figures; returns the files written.
+    """Make every table and figure of the Lie-X paper on one page; returns the files written.
 
     Args:
         out: the folder that tables and figures are written into.
@@ -722,10 +781,17 @@ def run_tables(
         fresh: nothing kept is used; every variant is trained again, which takes long.
         rows: only these rows are trained and measured anew, the others kept; () is all.
         sealed: measure the sealed split, which is done once, when an issue ends.
+        without: `tracking` or `actions`, parts of the page that are not measured.
+        nyu: folder of the NYU hand data, counted for Table 2; None leaves it out.
         progress: told how far the work is.
     """
     from liex_lab.catalog import bundled_models
+    from liex_lab.dashboards.paper.confusion import draw_confusions
+    from liex_lab.dashboards.paper.key_frames import draw_key_frames
+    from liex_lab.dashboards.paper.page import write_page
     from liex_lab.dashboards.paper.plates import draw_figures
+    from liex_lab.dashboards.paper.tracking import draw_tracking
+    from liex_lab.pipelines.evaluation.paper.drawers import Drawers
     from liex_lab.pipelines.evaluation.paper.run import make_tables
 
     return make_tables(
@@ -736,6 +802,8 @@ def run_tables(
         fresh=fresh or bool(rows),
         rows=rows,
         sealed=sealed,
-        draw=draw_figures,
+        without=without,
+        nyu=nyu,
+        drawers=Drawers(draw_figures, draw_tracking, draw_confusions, draw_key_frames, write_page),
         progress=progress,
     )

@@ -16,12 +16,13 @@ from liex_lab.errors import PlanError
 from liex_lab.plan import Plan, known_plans
 from liex_lab.runtime.progress import Progress, silent
 
+from .regions import cut_out, region_of, stated_floor
+
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
     from liex_lab.actions.timeline import TimelineModel
-    from liex_lab.arena.floor import Floor
     from liex_lab.arena.outline import Arena
     from liex_lab.arena.scene import Scene
     from liex_lab.arena.zones import DrawnZone, Zone
@@ -49,7 +50,8 @@ def build_recording(
 ) -> Recording:
     """The recording as an ideal camera in air would have made it.
 
-    Lens distortion, the water's refraction and a mirror are undone whenever a frame is read.
+    Lens distortion, the water's refraction and a mirror are undone whenever a frame is read, and
+    what lies outside of the plan's region is cut out.
 
     Args:
         recording: a path or address, or a recording that is open already.
@@ -58,11 +60,12 @@ def build_recording(
 
     Raises:
         RecordingError: the recording cannot be opened.
+        PlanError: the plan's region is none in this picture.
     """
     from liex_lab.recordings.rectify import mirrored, rectified
 
     seen = rectified(open_planned(recording, plan, progress), build_water(plan))
-    return mirrored(seen) if plan.recording.mirrored else seen
+    return cut_out(mirrored(seen) if plan.recording.mirrored else seen, plan)
 
 
 def open_planned(
@@ -269,7 +272,8 @@ def build_scene(
 
     animal = plan.animal
     foreground = plan.foreground
-    region, floor = build_stated_scene(recording.camera, plan)
+    region = region_of(recording, plan)
+    floor = stated_floor(recording.camera, plan)
     if skeleton.view.foreground == FOREGROUNDS[1]:
         if region is not None or floor is not None:
             raise PlanError(
@@ -283,34 +287,6 @@ def build_scene(
     return BackgroundSubtraction.learn(
         recording, sizes, n_frames, foreground.min_height_mm, skeleton.view, floor, region
     )
-
-
-def build_stated_scene(camera: Camera, plan: Plan) -> tuple[NDArray[np.bool_] | None, Floor | None]:
-    """The region (H, W) outside of which nothing is looked at, and the floor, as the plan states
-    them.
-
-    Args:
-        camera: the ideal pinhole camera of the recording.
-        plan: its settings `arena.region` and `arena.floor`.
-
-    Returns:
-        None for what is not stated.
-
-    Raises:
-        PlanError: the region is no polygon in the picture, or the floor does not face the camera.
-    """
-    from liex_lab.arena.scene import plane_of, region_mask
-
-    stated = plan.arena
-    region = (
-        None if stated.region is None else region_mask(stated.region, camera.width, camera.height)
-    )
-    floor = (
-        None
-        if isinstance(stated.floor, str)
-        else plane_of(stated.floor.point, stated.floor.normal, camera)
-    )
-    return region, floor
 
 
 def build_provenance(

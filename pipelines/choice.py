@@ -29,6 +29,8 @@ USUAL = "mouse"  # tried first where no plan is named
 _HANDFUL = "foreground.n_background_frames=24"
 # of the predicted error of the pictures as they are: their mirror image fits a hand better
 _MIRRORED_BELOW = 0.75
+# of what stands out from the floor must lie under the body, where nothing moves, to be an animal
+_SOME_COVERED = 0.25
 
 
 @dataclass(frozen=True)
@@ -184,7 +186,24 @@ def fit_plan(
         return _right_way_round(found, progress)
     if fitting is None and cause is not None:
         raise cause
+    if fitting is None and tracker is not None and not _shows_an_animal(tracker):
+        raise MisfitError(
+            "no animal was found in the recording: nothing of an animal's size moves, and what "
+            "stands out from the floor is not like one; check that the animal is in view, or add "
+            "--accept to measure it all the same"
+        ) from None
     raise MisfitError(_refusal(plan, misfits, fitting)) from None
+
+
+def _shows_an_animal(tracker: FrameTracker) -> bool:
+    """Whether anything moved, or the body covers what stands still before the floor."""
+    from liex_lab.foreground.background_segmenter import BackgroundSubtraction
+
+    scene = tracker.scene
+    fit = tracker.sample_fit
+    if not isinstance(scene, BackgroundSubtraction) or scene.standing is None or fit is None:
+        return True
+    return scene.standing.moves or fit.covered >= _SOME_COVERED
 
 
 def look(recording: Recording, plan: Plan | str) -> Look:

@@ -15,8 +15,9 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from liex_lab.errors import printable
+from liex_lab.errors import LiexError, printable
 from liex_lab.plan import Plan
+from liex_lab.plan.plan import arena_lines
 from liex_lab.recordings.timestamps import DROPPED, Gap, unwritable_times
 from liex_lab.runtime.progress import Progress, silent
 
@@ -24,8 +25,10 @@ from .build import build_water
 from .choice import Proposal, propose_plan
 from .doctor_files import next_command, open_anyhow
 from .doctor_scene import SceneLook
+from .regions import arenas_of, cut_out, propose_arenas, stated_corners
 
 if TYPE_CHECKING:
+    from liex_lab.plan.sections import SeveralArenas
     from liex_lab.recordings.recording import Recording
 
 FINDINGS: Final = {  # key of the JSON: what it says; numbers that cannot be told are None
@@ -62,6 +65,7 @@ FINDINGS: Final = {  # key of the JSON: what it says; numbers that cannot be tol
     "animal_area_mm2": "seen from above",
     "animal_share": "of the frames looked at, in which it was found",
     "animal_sits_still": "whether it had become a part of the background",
+    "arenas": "lines of a plan for several arenas in the picture; empty where one is seen",
     "plan": "the bundled plan that fits, or the one that was named; None where none does",
     "plan_says": "how it fits, or what contradicts each plan",
     "n_animals": "things of the animal's size in view at once that its body fits",
@@ -116,6 +120,12 @@ def examine(
     with recording as opened:
         progress(0, None, "looking at frames spread over the recording")
         seen = rectified(opened, water)
+        misplaced: list[str] = []
+        try:
+            seen = cut_out(seen, plan)
+        except LiexError as error:
+            misplaced.append(str(error))
+            plan = plan.with_settings(["arena.region="])
         stride = stride_for(seen, plan.animal.spine_min_mm)
         sample = sample_frames(seen, _N_SAMPLED, stride)
         depth = _Depths(sample if seen is opened else sample_frames(opened, _N_RAW))
@@ -123,9 +133,19 @@ def examine(
         if depth.median_mm is not None:
             scene.at_scene()
         proposal = Proposal(None, "")
+        arenas: list[SeveralArenas] = []
+        if depth.median_mm is not None and (propose or plan.arenas is not None):
+            progress(0, None, "looking for several arenas")
+            arenas = _several(seen, plan, misplaced)
         if propose and depth.median_mm is not None:
             progress(0, None, "looking which plan fits")
-            proposal = propose_plan(seen, asked)
+            first = arenas[0] if arenas else None
+            one = (
+                seen
+                if first is None
+                else seen.masked(stated_corners(seen, plan, first.region), lent=True)
+            )
+            proposal = propose_plan(one, asked)
         lens = opened.camera
         found = {
             **_time_facts(opened),
@@ -136,6 +156,7 @@ def examine(
             "water": None if water is None else water.to_dict(),
             **depth.facts(),
             **scene.facts,
+            "arenas": [line for one in arenas for line in arena_lines(one)],
             "plan": proposal.plan,
             "plan_says": proposal.says,
             "n_animals": proposal.n_animals,
@@ -145,12 +166,30 @@ def examine(
                 *filter(None, [unwritable_times(opened.times_ns)]),
                 *_time_problems(opened),
                 *depth.problems(),
+                *misplaced,
                 *scene.problems,
                 *proposal.problems,
             ],
-            "next": next_command(path, proposal, missing),
+            "next": next_command(path, proposal, missing, len(arenas) if asked is None else 0),
         }
     return {key: found[key] for key in FINDINGS}
+
+
+def _several(seen: Recording, plan: Plan, misplaced: list[str]) -> list[SeveralArenas]:
+    """The several arenas of a picture, listed or proposed; what is wrong with them is told."""
+    from liex_lab.arena.region import masks_apart
+
+    try:
+        if plan.arenas is None:
+            return propose_arenas(seen, plan)
+        found = arenas_of(seen, plan)
+        corners = {one.name: stated_corners(seen, plan, one.region) for one in found}
+        masks_apart(corners, seen.width, seen.height)
+    except LiexError as error:
+        if plan.arenas is not None:
+            misplaced.append(str(error))
+        return []
+    return found
 
 
 def _asked(plan: Plan, fps: float | None, topic: str | None) -> Plan:
@@ -286,6 +325,11 @@ def print_report(findings: dict[str, Any]) -> None:
         console.print("no problems found", style="green")
     for problem in (*findings["missing"], *findings["problems"]):
         console.print(Text(printable(f"- {problem}"), style="yellow"), soft_wrap=True)
+    if findings["arenas"]:
+        told = "several arenas are seen; lines for a plan, with subject_id and group to be added:"
+        console.print(Text(told), soft_wrap=True)
+        for line in findings["arenas"]:
+            console.print(Text(line), soft_wrap=True)
     if findings["next"]:
         console.print(Text(printable(f"next: {findings['next']}")), soft_wrap=True)
 

@@ -98,13 +98,16 @@ def _guess_camera(recording: Recording) -> str:
     )
 
 
-def next_command(path: str | Path, proposal: Proposal, missing: list[str]) -> str:
+def next_command(
+    path: str | Path, proposal: Proposal, missing: list[str], n_arenas: int = 0
+) -> str:
     """What to type next; empty where no plan was looked for.
 
     Args:
         path: the recording.
         proposal: which plan fits.
         missing: what the files leave out, to be written first.
+        n_arenas: arenas that were seen in the picture, of which each is to be a session.
     """
     if not proposal.says:
         return ""
@@ -114,4 +117,5 @@ def next_command(path: str | Path, proposal: Proposal, missing: list[str]) -> st
     if proposal.plan is None:
         return f"liex doctor {where} again, once what is said above is put right"
     named = "" if proposal.plan == USUAL else f" --plan {shlex.quote(proposal.plan)}"
-    return f"liex run {where}{named}"
+    several = " --set arenas=auto" if n_arenas > 1 else ""
+    return f"liex run {where}{named}{several}"

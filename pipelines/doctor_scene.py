@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from liex_lab.errors import EstimationError, PlanError
 from liex_lab.plan import Plan
 
-from .build import build_stated_scene, build_zones
+from .build import build_zones
+from .regions import region_of, stated_floor
 
 if TYPE_CHECKING:
     from liex_lab.arena.floor import Floor
@@ -83,8 +84,9 @@ class SceneLook:
 
         grid = self.seen.camera.every(self.stride)
         try:
-            region, stated = build_stated_scene(self.seen.camera, self.plan)
-        except PlanError as error:
+            region = region_of(self.seen, self.plan)
+            stated = stated_floor(self.seen.camera, self.plan)
+        except (PlanError, EstimationError) as error:
             self.problems.append(str(error))
             return
         if region is not None:

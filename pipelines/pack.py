@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from liex_lab.errors import EstimationError, LiexError, ModelError, RecordingError
 from liex_lab.plan import Plan
+from liex_lab.runtime.places import inside
 from liex_lab.runtime.progress import Progress, silent
 
 from .build import build_recording, build_tracker, open_planned
@@ -151,7 +152,7 @@ def _target(
     from liex_lab.recordings.formats.messages.pack_facts import SUFFIX
 
     beside = Path(recording).parent if opened.sources else Path()
-    target = Path(to) if to is not None else beside / f"{opened.name}{SUFFIX}.mcap"
+    target = Path(to) if to is not None else inside(beside, opened.name, f"{SUFFIX}.mcap")
     if target.suffix.lower() != ".mcap":
         raise RecordingError(f"an archive is an MCAP file; give --to NAME.mcap, not {target.name}")
     if not target.parent.is_dir():
@@ -190,8 +191,10 @@ def _region(
     """
     from liex_lab.arena.scene import region_mask
 
-    if plan.arena.region is not None:
-        return region_mask(plan.arena.region, opened.width, opened.height), []
+    if corners := _stated(opened, plan):
+        return region_mask(corners, opened.width, opened.height), []
+    if plan.arenas is not None:
+        return None, ["whole pictures are kept, for the plan has several arenas in them"]
     try:
         seen = build_recording(recording, plan, progress)
     except LiexError as error:
@@ -207,6 +210,11 @@ def _region(
         region = _found_region(learned, seen.width, seen.height)
         if region is None:
             return None, ["whole pictures are kept, for no region of the arena stands out"]
+        if learned.scene.standing.n_together > 1:  # type: ignore[attr-defined]
+            return None, [
+                "whole pictures are kept, for more than one thing moves in them; name what is to "
+                "be kept with --region"
+            ]
         for share in _WIDER:
             mask = _wider(region, round(share * seen.width))
             inside = seen.seen_by(seen.camera, _within(mask), {}, lent=True)
@@ -219,6 +227,13 @@ def _region(
             "whole pictures are kept, for the arena alone would be measured otherwise; name the "
             "region to be kept with --region"
         ]
+
+
+def _stated(opened: Recording, plan: Plan) -> Sequence[Sequence[float]]:
+    """The corners (u, v) px of the plan's region in the recording's pictures; none without one."""
+    from .regions import stated_corners
+
+    return () if plan.arena.region is None else stated_corners(opened, plan, plan.arena.region)
 
 
 def _found_region(tracker: FrameTracker, width: int, height: int) -> Mask | None:
@@ -286,7 +301,7 @@ def _write(
         problems=list(opened.problems),
         moved={int(row): int(moved[row]) for row in np.flatnonzero(moved)},
         source={"name": opened.name, "format": opened.format, "sha256": opened.digest(progress)},
-        region_px=[list(corner) for corner in plan.arena.region or ()],
+        region_px=[list(corner) for corner in _stated(opened, plan)],
         n_px=0 if mask is None else int(mask.sum()),
     )
     whole = _Hash(step_mm)

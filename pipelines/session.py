@@ -11,13 +11,14 @@ from __future__ import annotations
 import time
 from collections.abc import Generator, Mapping, Sequence
 from contextlib import closing
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from liex_lab.errors import RecordingError
+from liex_lab.errors import PlanError, RecordingError
 from liex_lab.plan import Plan
 from liex_lab.runtime.memory import Allocator, rest
 from liex_lab.runtime.places import inside
@@ -35,6 +36,7 @@ from .build import (
 )
 from .choice import USUAL, Fitted, fit_plan
 from .compiling import compile_ahead
+from .regions import pinned
 from .shards import CHUNK, LENGTH, MEASURING, Shard, measure_shards
 from .workers import WorkerPool
 
@@ -99,13 +101,14 @@ def measure_session(
     """
     from liex_lab.recordings.timestamps import unwritable_times
     from liex_lab.sessions import SessionWriter
-    from liex_lab.sessions.checkpoint import check_free, hash_once
-    from liex_lab.sessions.older import part_folder, put_back_session
-    from liex_lab.sessions.place import check_place
-    from liex_lab.sessions.source import link_to
 
     started = time.perf_counter()
     first = plan or Plan.load(USUAL).with_settings(settings)
+    if first.arenas is not None:
+        raise PlanError(
+            "the plan lists several arenas, each of which becomes a session of its own; measure "
+            "them with `liex run`, or in Python with run_arenas"
+        )
     with (
         in_background(partial(build_estimator, first)) as estimator,
         build_recording(recording, first, progress) as opened,
@@ -113,50 +116,152 @@ def measure_session(
         folder = folder or inside(Path(out), first.session.name or opened.name, ".liex")
         if told := unwritable_times(opened.times_ns):
             raise RecordingError(f"of {opened.name} {told}")
-        put_back_session(folder)
-        check_place(folder, overwrite)
-        check_free(part_folder(folder))
+        check_unused(folder, overwrite)
         compile_ahead(first.animal.skeleton, progress)
         progress(0, None, "learning the background, the floor and the animal's size")
         unnamed = None if plan else settings
         fitted = fit_plan(opened, first, estimator, settings=unnamed, progress=progress)
-        opened = fitted.recording
-        plan = fitted.plan
-        tracker = fitted.tracker
-        build_recogniser(
-            plan, tracker.estimator.skeleton
-        )  # a slip in its name is told before any work is done
-        hash_once(opened, part_folder(folder), progress)
-        provenance = build_provenance(opened, plan, tracker, progress)
-        timings = {"prepare": time.perf_counter() - started, "track": 0.0}
-        if pool is not None and isinstance(recording, str | Path) and len(opened) > 2 * LENGTH:
-            whole = Shard(str(recording), plan, tracker, provenance, folder, 0, len(opened))
-            measure_shards(pool, whole, folder, progress)
+        prepared = prepare(fitted, folder, started, progress)
+        if pool is not None and isinstance(recording, str | Path):
+            prepared.measure_by(pool, str(recording), progress)
         with SessionWriter(
-            folder, provenance, overwrite=overwrite, blueprint=blueprint, report=report
+            folder, prepared.origin, overwrite=overwrite, blueprint=blueprint, report=report
         ) as writer:
-            writer.go_on(lambda row: opened.frame(row).depth)
-            with closing(_read_ahead(opened, writer.n_frames)) as chunks:
+            writer.go_on(lambda row: prepared.recording.frame(row).depth)
+            with closing(read_ahead(prepared.recording, writer.n_frames)) as chunks:
                 for frames in chunks:
-                    began = time.perf_counter()
-                    seen = tracker.observe(frames)
-                    timings["track"] += time.perf_counter() - began
-                    writer.add(frames, seen=seen)
+                    prepared.measure(frames, writer)
                     progress(frames[-1].index + 1, len(opened), MEASURING)
-            began = time.perf_counter()
-            verdict = make_track(writer, fitted)
-            timings["track"] += time.perf_counter() - began
-            if isinstance(recording, str | Path):
-                writer.note(input=link_to(recording, folder))
-            writer.note(problems=opened.problems, verdict=verdict.to_dict(), **dict(notes or {}))
-            session = conclude(writer, plan, timings)
+            session = prepared.finish(writer, recording, notes)
     return session.path
 
 
-def _read_ahead(opened: Recording, first: int) -> Generator[list[DepthFrame], None, None]:
+def check_unused(folder: Path, overwrite: bool) -> None:
+    """Refuse a session folder that is there already, or that another process writes.
+
+    Args:
+        folder: the session folder to be.
+        overwrite: replace a session that is there already.
+
+    Raises:
+        SessionError: it may not be written there.
+    """
+    from liex_lab.sessions.checkpoint import check_free
+    from liex_lab.sessions.older import part_folder, put_back_session
+    from liex_lab.sessions.place import check_place
+
+    put_back_session(folder)
+    check_place(folder, overwrite)
+    check_free(part_folder(folder))
+
+
+@dataclass
+class Prepared:
+    """A session whose scene is learned, ready to take frames.
+
+    Attributes:
+        fitted: plan, recording and tracker.
+        origin: provenance of the session.
+        folder: the session folder to be.
+        timings: seconds of `prepare` and `track`.
+    """
+
+    fitted: Fitted
+    origin: Provenance
+    folder: Path
+    timings: dict[str, float]
+
+    @property
+    def recording(self) -> Recording:
+        """The recording as it is measured."""
+        return self.fitted.recording
+
+    def measure(self, frames: list[DepthFrame], writer: SessionWriter) -> None:
+        """Measure consecutive frames and hand them to the session's writer.
+
+        Args:
+            frames: as this recording shows them.
+            writer: of the session.
+        """
+        began = time.perf_counter()
+        seen = self.fitted.tracker.observe(frames)
+        self.timings["track"] += time.perf_counter() - began
+        writer.add(frames, seen=seen)
+
+    def measure_by(self, pool: WorkerPool, recording: str, progress: Progress) -> None:
+        """Let workers measure the shards of a long recording (more than two shards).
+
+        Args:
+            pool: the workers.
+            recording: path or address, which each of them opens.
+            progress: told shard by shard.
+        """
+        n = len(self.recording)
+        if n <= 2 * LENGTH:
+            return
+        opened_as = pinned(self.fitted.plan, self.recording)
+        whole = Shard(recording, opened_as, self.fitted.tracker, self.origin, self.folder, 0, n)
+        measure_shards(pool, whole, self.folder, progress)
+
+    def finish(
+        self,
+        writer: SessionWriter,
+        source: str | Path | Recording,
+        notes: Mapping[str, Any] | None = None,
+    ) -> Session:
+        """Make track, behaviour and tables, and put the session in its place.
+
+        Args:
+            writer: has all frames.
+            source: path or address of the recording, to which the session links; one that was
+                handed over open has none.
+            notes: what session.json is to hold besides.
+        """
+        from liex_lab.sessions.source import link_to
+
+        began = time.perf_counter()
+        verdict = make_track(writer, self.fitted)
+        self.timings["track"] += time.perf_counter() - began
+        if isinstance(source, str | Path):
+            writer.note(input=link_to(source, self.folder))
+        writer.note(
+            problems=self.recording.problems, verdict=verdict.to_dict(), **dict(notes or {})
+        )
+        return conclude(writer, self.fitted.plan, self.timings)
+
+
+def prepare(fitted: Fitted, folder: Path, started: float, progress: Progress) -> Prepared:
+    """A session that is ready to take frames; a slip in the recogniser's name is told before.
+
+    Args:
+        fitted: plan, recording and tracker.
+        folder: the session folder to be.
+        started: when its preparation began, by `time.perf_counter`.
+        progress: told while the recording is hashed.
+
+    Raises:
+        ModelError: there is no such recogniser.
+        PlanError: it was made for another skeleton.
+    """
+    from liex_lab.sessions.checkpoint import hash_once
+    from liex_lab.sessions.older import part_folder
+
+    build_recogniser(fitted.plan, fitted.tracker.estimator.skeleton)
+    hash_once(fitted.recording, part_folder(folder), progress)
+    origin = build_provenance(fitted.recording, fitted.plan, fitted.tracker, progress)
+    return Prepared(
+        fitted, origin, folder, {"prepare": time.perf_counter() - started, "track": 0.0}
+    )
+
+
+def read_ahead(opened: Recording, first: int) -> Generator[list[DepthFrame], None, None]:
     """Chunks of frames from `first` on, the next read while one is measured.
 
     Rendered recordings are not read ahead, as rendering takes all cores.
+
+    Args:
+        opened: an open recording.
+        first: row of the first frame.
     """
     chunks = opened.chunks(CHUNK, first)
     yield from chunks if opened.format == "synthetic" else prefetch(chunks)

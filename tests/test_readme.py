@@ -105,7 +105,7 @@ def test_every_verb_option_setting_and_format_that_is_named_exists() -> None:
         if key not in ("parquet", "csv", "json", "toml", "rrd", "mcap", "rbl"):
             assert key in plan[table], f"{table}.{key}"
     formats = set(re.findall(r"--to ([a-z]+)\b", EVERYTHING)) - {"study", "live"}
-    assert {"csv", "xlsx", "nwb"} <= formats <= set(TARGETS)
+    assert {"csv", "xlsx", "nwb"} <= formats <= {*TARGETS, "video"}
 
 
 def test_every_python_example_runs(
@@ -162,3 +162,11 @@ def test_the_animal_of_ones_own_can_be_read(tmp_path: Path) -> None:
     gerbil = Skeleton.load(tmp_path / "gerbil.toml")
     assert (gerbil.name, gerbil.n_joints, gerbil.dof) == ("gerbil", 3, 8)
     assert gerbil.length == pytest.approx(75.0)
+
+
+def test_the_arenas_can_be_read() -> None:
+    (example,) = blocks("toml", PAGES["howto/arenas.md"])
+    arenas = Plan.from_toml(example).arenas
+    assert arenas is not None
+    assert not isinstance(arenas, str)
+    assert [one.name for one in arenas] == ["left", "right"]

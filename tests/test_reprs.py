@@ -23,6 +23,9 @@ def test_a_plan_says_what_is_unlike_the_defaults() -> None:
     plan = liex_lab.Plan()
     assert repr(plan) == "<Plan for the mouse, all else by default>"
     changed = plan.with_settings(["animal.spine_mm=65", "seed=3"])
+    assert repr(plan.with_settings(["arenas=auto"])) == (
+        "<Plan for the mouse; unlike the defaults: arenas=auto>"
+    )
     assert repr(changed) == (
         "<Plan for the mouse; unlike the defaults: seed=3, animal.spine_mm=65.0>"
     )

@@ -23,6 +23,7 @@ from .style import (
     SOFT,
     TWO_COLUMNS_MM,
     action_key,
+    heading,
     key_rows,
     panel,
     sheet,
@@ -58,7 +59,7 @@ def time_budget(seen: Seen) -> Figure | None:
     figure = sheet(ONE_COLUMN_MM, 4.0 * len(words) + 22.0)
     axes = panel(figure, LEFT_MM, 9.0, ONE_COLUMN_MM - LEFT_MM - 12.0, 4.0 * len(words))
     total = len(seen.bouts)
-    axes.set_title(f"Time budget, {seen.who}\nn = {counted(total, 'bout')}", x=-0.5)
+    heading(figure, f"Time budget, {seen.who}\nn = {counted(total, 'bout')}")
     axes.barh(range(len(words)), shares, 0.76, color=[colours[word] for word in words])
     for k, (share, n) in enumerate(zip(shares, n_bouts, strict=True)):
         count = "" if n is None else f"n = {n}"
@@ -154,14 +155,11 @@ def transitions(seen: Seen) -> Figure | None:
     graph = panel(figure, LEFT_MM + wide + 16.0, 4.0, wide - 6.0, wide - 6.0)
     _graph(graph, words, found, action_colours(seen.words))
     n = int(np.nansum(found["n"]))
-    figure.text(
-        0.01,
-        0.99,
+    heading(
+        figure,
         f"Transitions, {seen.who}, n = {counted(n, 'transition')}; % of a row's successors, "
         "in brackets by chance;\nblue: more, orange: less often than chance "
         f"(corrected p ≤ {CERTAIN:g})",
-        size=7.0,
-        va="top",
     )
     return figure
 
@@ -245,7 +243,14 @@ def _graph(axes: Axes, words: list[str], found: dict[str, Array], colours: dict[
                     alpha=0.85,
                 )
             )
-    axes.scatter(*place.T, s=size, c=[colours[word] for word in words], edgecolors=PAPER, zorder=3)
+    axes.scatter(
+        place[:, 0],
+        place[:, 1],
+        s=size,
+        c=[colours[word] for word in words],
+        edgecolors=PAPER,
+        zorder=3,
+    )
     for word, (x, y) in zip(words, place, strict=True):
         text = word.replace("_", " ")
         across = "left" if x > 0.1 else "right" if x < -0.1 else "center"
@@ -290,13 +295,7 @@ def aligned_curves(seen: Seen) -> Figure | None:
         axes.set_ylabel(f"{title.lower()}, {unit}")
         if line == lines - 1 or k + _BESIDE >= len(rows):
             axes.set_xlabel("time from the onset, s")
-    figure.text(
-        0.01,
-        0.995,
-        f"About the onsets, {seen.who}: median and quartiles over the bouts",
-        size=7.0,
-        va="top",
-    )
+    heading(figure, f"About the onsets, {seen.who}: median and quartiles over the bouts")
     return figure
 
 

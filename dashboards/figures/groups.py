@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -26,6 +26,7 @@ from .style import (
     RIGHT_MM,
     TWO_COLUMNS_MM,
     action_key,
+    heading,
     key_rows,
     panel,
     sheet,
@@ -168,10 +169,10 @@ def budgets_by_group(all_seen: Sequence[Seen]) -> Figure | None:
     if not words or not any(np.isfinite(values).any() for values in shares.values()):
         return None
     step = 2.0 + 3.2 * len(groups)
-    figure = sheet(ONE_COLUMN_MM, step * len(words) + 26.0 + 3.5 * len(groups))
+    figure = sheet(ONE_COLUMN_MM, step * len(words) + 16.0 + 4.0 * len(groups))
     axes = panel(figure, LEFT_MM, 9.0, ONE_COLUMN_MM - LEFT_MM - RIGHT_MM, step * len(words))
-    lines = [f"{group}, n = {counted(len(values), 'subject')}" for group, values in shares.items()]
-    axes.set_title("\n".join(["Time budget: subjects, and the mean", *lines]), x=-0.5)
+    n = sum(len(values) for values in shares.values())
+    heading(figure, f"Time budget: every subject, and the mean, n = {counted(n, 'subject')}")
     apart = 0.8 / len(groups)
     for g, (group, values) in enumerate(shares.items()):
         colour = group_colour(group, list(groups))
@@ -179,7 +180,8 @@ def budgets_by_group(all_seen: Sequence[Seen]) -> Figure | None:
         known = np.isfinite(values).any(axis=0)
         mean = np.full(len(words), np.nan)
         mean[known] = 100.0 * np.nanmean(values[:, known], axis=0)
-        axes.barh(at, np.nan_to_num(mean), 0.9 * apart, color=colour, alpha=0.35)
+        label = f"{group}, n = {counted(len(values), 'subject')}"
+        axes.barh(at, np.nan_to_num(mean), 0.9 * apart, color=colour, alpha=0.35, label=label)
         for one in values:
             mark = GROUP_MARKS[g % len(GROUP_MARKS)]
             axes.plot(100.0 * one, at, mark, color=colour, markersize=2.2, gid=f"subjects {group}")
@@ -188,6 +190,9 @@ def budgets_by_group(all_seen: Sequence[Seen]) -> Figure | None:
     axes.tick_params(axis="y", length=0)
     axes.set_xlim(left=0.0)
     axes.set_xlabel("share of the observed time, %")
+    figure.legend(
+        loc="upper left", bbox_to_anchor=(0.0, 1.0 - 5.0 / (figure.get_size_inches()[1] * 25.4))
+    )
     return figure
 
 
@@ -283,22 +288,23 @@ def comparison(table: pd.DataFrame, stats: pd.DataFrame, measure: str, unit: str
     return figure
 
 
-def effects(stats: pd.DataFrame) -> Figure | None:
+def effects(stats: pd.DataFrame, units: Mapping[str, str]) -> Figure | None:
     """Hedges' g of every measure and contrast with its interval; None where none can be given.
 
     Args:
         stats: the table `stats`.
+        units: column of the summary -> its unit.
     """
     known = stats[np.isfinite(stats["effect_size"].astype(float))].reset_index(drop=True)
     if known.empty:
         return None
-    figure = sheet(TWO_COLUMNS_MM, 4.2 * len(known) + 24.0)
+    figure = sheet(TWO_COLUMNS_MM, 4.2 * len(known) + 20.0)
     axes = panel(figure, 78.0, 11.0, TWO_COLUMNS_MM - 84.0, 4.2 * len(known))
     _intervals(axes, known, "effect_size", "effect_low", "effect_high", 1.0)
     axes.set_yticks(
         range(len(known)),
         [
-            f"{str(m).replace('_', ' ')}: {c}, n = {a} and {b}"
+            f"{titled(str(m), units.get(str(m), ''))}: {c}, n = {a} and {b}"
             for m, c, a, b in zip(
                 known["measure"],
                 known["contrast"],
@@ -310,7 +316,7 @@ def effects(stats: pd.DataFrame) -> Figure | None:
         size=5.5,
     )
     axes.set_ylim(len(known) - 0.5, -0.5)
-    axes.set_title(f"Effect sizes, n = {counted(len(known), 'comparison')}", x=-0.8)
+    heading(figure, f"Effect sizes, n = {counted(len(known), 'comparison')}")
     axes.set_xlabel("Hedges' g with its 95 % interval; hollow: no test")
     return figure
 
@@ -326,7 +332,8 @@ def _strip(
     beside = np.linspace(-0.2, 0.2, len(animals)) if len(animals) > 1 else np.zeros(1)
     colour = group_colour(name, names)
     mark = GROUP_MARKS[k % len(GROUP_MARKS)]
-    axes.plot(k + beside[animal] + 0.03, values, mark, color=colour, markersize=2.0, alpha=0.5)
+    if len(values) > len(animals):  # else the sessions are the animals
+        axes.plot(k + beside[animal] + 0.03, values, mark, color=colour, markersize=2.0, alpha=0.5)
     axes.plot(
         k + beside,
         means,

@@ -42,7 +42,9 @@ class DepthReader:
     def whole(self) -> bool:
         """Whether the session's replay keeps depth, beyond the thumbnails of the report."""
         plan = self._session.metadata.get("plan", {}).get("replay", {})
-        return bool(plan.get("depth", True)) and self._session.has("session.mcap")
+        # plans of earlier versions said whether there was to be depth at all
+        kept = plan.get("depth", True) not in (False, "none")
+        return kept and self._session.has("session.mcap")
 
     def picture(self, row: int) -> NDArray[np.uint16] | None:
         """(H, W) uint16 mm, 0 where unread; None where the session keeps none of this frame.

@@ -21,6 +21,7 @@ from .style import (
     TWO_COLUMNS_MM,
     floor_limits,
     halo,
+    heading,
     panel,
     scale_bar,
     sheet,
@@ -294,7 +295,7 @@ def occupancy_panels(title: str, panels: Sequence[tuple[str, Session, Occupancy]
         floor_limits(axes, *corners)
         axes.set_title(name, size=6.5)
         scale_bar(axes)
-    figure.text(0.01, 1.0, title, size=7.0, va="top")
+    heading(figure, title)
     _colour_bar(figure, image, "s/cm²")
     return figure
 
@@ -318,5 +319,5 @@ def _colour_bar(figure: Figure, image: Any, label: str) -> None:
     across, up = figure.get_size_inches() * 25.4
     axes = panel(figure, across - 14.0, 0.25 * up, 2.5, 0.45 * up)
     bar = figure.colorbar(image, cax=axes)
-    bar.outline.set_visible(False)  # type: ignore[operator]
+    bar.outline.set_visible(False)
     axes.set_title(label, size=6.0, color=INK)

@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.errors import SessionError
-from liex_lab.runtime.durable import sync_folder
+from liex_lab.runtime.durable import replacing
+from liex_lab.runtime.places import inside, safe_name, unlinked
 from liex_lab.runtime.progress import Progress, silent
 from liex_lab.sessions import Session
 
@@ -80,7 +81,7 @@ def session_figures(session: Session, only: Sequence[str] = ()) -> Iterator[Draw
     for seen in animals(session):
         for name in only or OF_SESSION:
             what, draw = OF_SESSION[name]
-            own = name if seen.alone else f"{name}-{_file_name(seen.individual)}"
+            own = name if seen.alone else safe_name(f"{name}-{seen.individual}")
             yield Drawn(own, what, draw(seen))
 
 
@@ -111,11 +112,11 @@ def comparison_figures(
     units = _units(sessions)
     measures = list(dict.fromkeys(stats["measure"].astype(str)))
     if not only or "effects" in only:
-        yield Drawn("effects", "effect sizes with their intervals", groups.effects(stats))
+        yield Drawn("effects", "effect sizes with their intervals", groups.effects(stats, units))
     for measure in measures:
         if not only or measure in only:
             drawn = groups.comparison(table, stats, measure, units.get(measure, ""))
-            yield Drawn(f"compare_{_file_name(measure)}", "every animal, and the difference", drawn)
+            yield Drawn(safe_name(f"compare_{measure}"), "every animal, and the difference", drawn)
     wanted = [name for name in OF_STUDY if not only or name in only]
     if sessions and wanted:
         yield from _of_many(_grouped(sessions, table), wanted)
@@ -153,8 +154,6 @@ def write_figures(
                 files.append(
                     put_figure(folder, f"{one.name}.{kind}", image_bytes(one.figure, kind))
                 )
-    if files:
-        sync_folder(folder)
     return files, empty
 
 
@@ -165,15 +164,16 @@ def put_figure(folder: Path, name: str, content: bytes) -> Path:
         folder: the folder of figures; it is made where it is missing.
         name: of the file.
         content: its bytes.
+
+    Raises:
+        PlaceError: a symbolic link lies there.
     """
-    folder.mkdir(parents=True, exist_ok=True)
-    part = folder / f".{name}.part"
-    try:
+    unlinked(folder).mkdir(parents=True, exist_ok=True)
+    stem, dot, kind = name.rpartition(".")
+    place = inside(folder, stem, f"{dot}{kind}")
+    with replacing(place) as part:
         part.write_bytes(content)
-        part.replace(folder / name)
-    finally:
-        part.unlink(missing_ok=True)
-    return folder / name
+    return place
 
 
 def read_comparison(folder: Path) -> tuple[pd.DataFrame, pd.DataFrame, list[Session]]:
@@ -269,7 +269,6 @@ def for_the_page(session: Session, folder: Path | None) -> dict[str, str]:
         for old in folder.glob("*.svg"):  # of the session as it was before a correction
             if old.stem.split("-")[0] in OF_SESSION and old.stem not in made:
                 old.unlink()
-        sync_folder(folder)
     return made
 
 
@@ -306,8 +305,3 @@ def _units(sessions: Sequence[Session]) -> dict[str, str]:
         for name, unit in zip(own["name"], own["unit"], strict=True):
             units.setdefault(str(name), unit if isinstance(unit, str) else "")
     return units
-
-
-def _file_name(name: str) -> str:
-    """A name as part of a file's name on every system."""
-    return "".join(c if c.isalnum() or c in "-_" else "_" for c in name)

@@ -94,7 +94,8 @@ def drawing() -> Iterator[None]:
     """
     from matplotlib import rc_context
 
-    with rc_context(_STYLE), warnings.catch_warnings():
+    style: Any = _STYLE  # matplotlib lists every name that a setting can have
+    with rc_context(style), warnings.catch_warnings():
         warnings.filterwarnings("ignore", "Glyph .* missing from", UserWarning)
         yield
 
@@ -126,6 +127,17 @@ def panel(
     across, up = figure.get_size_inches() * 25.4
     place = (left_mm / across, bottom_mm / up, width_mm / across, height_mm / up)
     return figure.add_axes(place)
+
+
+def heading(figure: Figure, text: str) -> None:
+    """A title over the whole width of a figure, at its upper left corner.
+
+    Args:
+        figure: the figure.
+        text: the title, perhaps of several lines.
+    """
+    across, up = figure.get_size_inches() * 25.4
+    figure.text(2.0 / across, 1.0 - 2.0 / up, text, size=7.0, va="top")
 
 
 def bar_length_mm(extent_mm: float) -> float:
@@ -190,14 +202,13 @@ def time_unit(duration_s: float) -> tuple[str, float]:
 
 
 def halo(text: Any) -> None:
-    """Let a text be read upon anything.
+    """Let a text be read upon anything: paper behind it, as an outline would make shapes of it.
 
     Args:
         text: matplotlib's text.
     """
-    from matplotlib.patheffects import withStroke
-
-    text.set_path_effects([withStroke(linewidth=1.5, foreground=PAPER)])
+    behind = {"boxstyle": "round,pad=0.15", "facecolor": PAPER, "alpha": 0.75, "linewidth": 0.0}
+    text.set_bbox(behind)
 
 
 def key_rows(words: Sequence[str]) -> int:
@@ -236,8 +247,8 @@ def image_bytes(figure: Figure, kind: str) -> bytes:
         "pdf": {"CreationDate": None},
         "png": {"Software": None},
     }
-    paper = {"facecolor": "white"} if kind == "png" else {}
-    figure.savefig(held, format=kind, metadata=undated[kind], **paper)
+    paper = "white" if kind == "png" else "none"
+    figure.savefig(held, format=kind, metadata=undated[kind], facecolor=paper)
     made = held.getvalue()
     if kind == "svg":
         return made.replace(_FACE.encode(), _FACES.encode())

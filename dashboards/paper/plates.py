@@ -1,7 +1,7 @@
-"""Figures 7, 8 and 13 to 16 of the Lie-X paper, from what `liex evaluate tables` measured; PNG.
+"""Figures 7 to 11 and 13 to 17 of the Lie-X paper, from what `liex evaluate tables` measured; PNG.
 
-Sensitivity, cumulative error, error per joint, ranked pose candidates, convergence. Nothing is
-computed here.
+Sensitivity, cumulative error, error per joint, poses beside the truth, ranked pose candidates,
+convergence, failures. Nothing is computed here.
 """
 
 from __future__ import annotations
@@ -14,24 +14,17 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from .looks import DPI, METHODS, TRUE
+from .poses import draw_failures, draw_poses
+
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 Array = NDArray[np.float64]
 
-_METHODS = {  # variant: (name in the legend, colour, line)
-    "default": ("liex_lab", "#AA3377", "-"),
-    "paper": ("Lie-X, the paper's variant", "#4477AA", "-"),
-    "paper-one-pose": ("one initial pose", "#4477AA", ":"),
-    "paper-no-metric": ("no learned metric", "#4477AA", "--"),
-    "rf": ("RF", "#228833", "-"),
-    "cnn": ("CNN", "#CCBB44", "-"),
-}
-_TRUE = "#66CCEE"
 _POSE = "#EE6677"
 _CHOSEN = "#DD2222"
-_DPI = 130
 _MOST_CANDIDATES = 40
 _MOST_STAGES = 8
 
@@ -60,11 +53,18 @@ def draw_figures(results: Mapping[str, Mapping[str, Any]], folder: Path) -> list
         written.append(
             _save(_convergence(one["illustration"]), folder / f"fig16_convergence_{animal}.png")
         )
+        if examples := one.get("examples"):
+            name = f"{'fig10' if animal == 'hand' else 'fig09'}_poses_{animal}.png"
+            written.append(draw_poses(animal, examples, folder / name, False))
+            name = f"{'fig11' if animal == 'hand' else 'fig09'}_poses_{animal}_side.png"
+            written.append(draw_poses(animal, examples, folder / name, True))
+        if failures := one.get("failures"):
+            written.append(draw_failures(animal, failures, folder / f"fig17_failures_{animal}.png"))
     return written
 
 
 def _save(figure: Figure, path: Path) -> Path:
-    figure.savefig(path, dpi=_DPI)
+    figure.savefig(path, dpi=DPI)
     return path
 
 
@@ -91,7 +91,7 @@ def _cumulative(results: Mapping[str, Mapping[str, Any]]) -> Figure:
                 if not len(error):
                     continue
                 share = np.linspace(0, 100 * (1 - numbers["lost_rate"]), len(error))
-                name, colour, style = _METHODS[variant]
+                name, colour, style = METHODS[variant]
                 panel.plot(error, share, style, color=colour, label=name, lw=1.6)
                 farthest = max(farthest, float(error[round(0.85 * (len(error) - 1))]))
             panel.set(
@@ -116,7 +116,7 @@ def _joint_errors(results: Mapping[str, Mapping[str, Any]]) -> Figure:
             for variant, row in one["rows"].items():
                 if not row["splits"][split]["joint_mm"]:
                     continue
-                name, colour, style = _METHODS[variant]
+                name, colour, style = METHODS[variant]
                 panel.plot(
                     joints,
                     row["splits"][split]["joint_mm"],
@@ -145,7 +145,7 @@ def _sensitivity(results: Mapping[str, Mapping[str, Any]]) -> Figure:
             panel = grid[line][column]
             for variant, curve in one["sensitivity"].items():
                 points = curve["curves"].get(number, [])
-                name, colour, _ = _METHODS[variant]
+                name, colour, _ = METHODS[variant]
                 if number in curve.get("left_out", {}):
                     reason = f"{name} {curve['left_out'][number]}"
                     panel.text(0.04, 0.04, fill(reason, 48), fontsize=6, transform=panel.transAxes)
@@ -221,7 +221,7 @@ def _candidates(illustration: Mapping[str, Any]) -> Figure:
             panel.set_axis_off()
             continue
         _animal(panel, illustration["heights"], _view(illustration))
-        _skeleton(panel, illustration["true_px"], illustration["edges"], _TRUE, 1.0)
+        _skeleton(panel, illustration["true_px"], illustration["edges"], TRUE, 1.0)
         _skeleton(panel, ranked["joints_px"][k], illustration["edges"], _POSE, 1.5)
         panel.set_title(f"{k + 1}: {ranked['score_mm'][k]:.2f} mm", color="#117733", fontsize=8)
         panel.set_xlabel(
@@ -248,7 +248,7 @@ def _convergence(illustration: Mapping[str, Any]) -> Figure:
     for k, step in enumerate(stages):
         panel = figure.add_subplot(grid[0, k])
         _animal(panel, illustration["heights"], _view(illustration))
-        _skeleton(panel, illustration["true_px"], illustration["edges"], _TRUE, 1.0)
+        _skeleton(panel, illustration["true_px"], illustration["edges"], TRUE, 1.0)
         _skeleton(panel, steps["joints_px"][step], illustration["edges"], _POSE, 1.5)
         panel.set_title(steps["names"][step], fontsize=8)
         panel.set_xlabel(f"{steps['example_mm'][step]:.1f} mm", fontsize=8)
@@ -258,14 +258,14 @@ def _convergence(illustration: Mapping[str, Any]) -> Figure:
         at,
         steps["low_mm"],
         steps["high_mm"],
-        color=_METHODS["paper"][1],
+        color=METHODS["paper"][1],
         alpha=0.2,
         lw=0,
         label="middle half of all candidates",
     )
-    panel.plot(at, steps["median_mm"], color=_METHODS["paper"][1], label="median of all candidates")
+    panel.plot(at, steps["median_mm"], color=METHODS["paper"][1], label="median of all candidates")
     panel.plot(
-        at, steps["best_mm"], color=_METHODS["default"][1], label="the candidate ranked first, mean"
+        at, steps["best_mm"], color=METHODS["default"][1], label="the candidate ranked first, mean"
     )
     shown = at if n <= 40 else at[:: -(-n // 40)]
     panel.set_xticks(shown, [steps["names"][k] for k in shown], rotation=60, fontsize=7, ha="right")

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.errors import SessionError
+from liex_lab.runtime.places import unlinked
 
 _CODECS = ("libx264", "libopenh264")
 _THREADS = 2  # always: their number is in what comes out
@@ -50,11 +51,12 @@ class Video:
 
     Raises:
         SessionError: there is no encoder.
+        PlaceError: a symbolic link lies there.
     """
 
     def __init__(self, path: Path, fps: float) -> None:
         self._codec = h264()
-        self._path = path
+        self._path = unlinked(path)
         self._part = path.with_name(f".{os.getpid()}.part-{path.name}")
         self._fps = Fraction(fps).limit_denominator(1001)
         self._box: Any = None

@@ -86,12 +86,15 @@ class Relief:
         smooth = cv2.resize(even, size, interpolation=cv2.INTER_CUBIC)
         share = np.clip(255.0 / self.top_mm * smooth, 0.0, 255.0).astype(np.uint8)
         colours = cv2.LUT(cv2.merge([share] * 3), self._colours[None])
-        light = cv2.resize(self._light(even), size, interpolation=cv2.INTER_LINEAR)
+        light = cv2.resize(
+            self._light(np.asarray(even, np.float32)), size, interpolation=cv2.INTER_LINEAR
+        )
         colours = cv2.multiply(colours, cv2.merge([light] * 3), scale=1.0 / _PLAIN)
         outside = _part(self._outside, left, top, side) > 0.5
         # a wall is no animal; one that rears at the wall is seen before it all the same
         wall = outside | (clipped > _WALLS_FROM * self.top_mm)
-        colours[_enlarged(wall, size)] //= 4
+        dim = _enlarged(wall, size)
+        colours[dim] = colours[dim] // 4
         colours[_enlarged(~read, size)] = _UNREAD
         return np.asarray(colours, np.uint8)
 

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.errors import SessionError
+from liex_lab.runtime.places import unlinked
 from liex_lab.runtime.progress import Progress, silent
 from liex_lab.sessions import Session
 
@@ -266,7 +267,7 @@ def _write(
     progress: Progress,
 ) -> None:
     """Pictures at a steady rate, each of the frame that was there at its time."""
-    path.parent.mkdir(parents=True, exist_ok=True)
+    unlinked(path).parent.mkdir(parents=True, exist_ok=True)
     n = max(int(round(duration_s * fps * slower)), 1)
     with Video(path, fps) as video:
         for k in range(n):

@@ -69,7 +69,8 @@ class Scene:
         doubts: sentences about why this may be wrong.
         wander_mm: range of the floor's depth over the recording, mm, as of a sensor that warms up;
             None where it is still.
-        tethered: whether the animal wears a cable, which is cut out of the pictures.
+        thin_above: whether something thin above the animal, a cable or bars, is cut out of the
+            pictures.
     """
 
     floor: Floor
@@ -83,7 +84,7 @@ class Scene:
     fixtures: tuple[Fixture, ...] = ()
     doubts: tuple[str, ...] = ()
     wander_mm: float | None = None
-    tethered: bool = False
+    thin_above: bool = False
 
     def to_dict(self) -> dict[str, Any]:
         """Plain numbers for session.json; the outline is there already, as `arena`."""
@@ -100,7 +101,7 @@ class Scene:
             "region_px": [[round(u, 1), round(v, 1)] for u, v in self.region_px],
             "n_moving": self.n_moving,
             "n_animals": self.n_animals,
-            "tethered": self.tethered,
+            "thin_above": self.thin_above,
             "fixtures": [
                 {
                     "centre_mm": [round(value, 1) for value in fixture.centre_mm],

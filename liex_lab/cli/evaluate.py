@@ -150,8 +150,18 @@ def evaluate_tables(
             "development looks at. To be run once, when an issue ends.",
         ),
     ] = False,
+    without: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--without", help="Leave out what other verbs measure: tracking or actions; repeatable."
+        ),
+    ] = None,
+    nyu: Annotated[
+        Path | None,
+        typer.Option("--nyu", metavar="FOLDER", help="Count the NYU hand data as well."),
+    ] = None,
 ) -> None:
-    """Every row of the paper's Tables 1 to 3 and its figures, measured now or kept from earlier."""
+    """Every table and figure of the paper on one page, DIR/index.html: measured now, or kept."""
     from liex_lab.api import run_tables
 
     with progress_bar() as progress:
@@ -163,6 +173,8 @@ def evaluate_tables(
             fresh=fresh,
             rows=rows or (),
             sealed=sealed,
+            without=without or (),
+            nyu=nyu,
             progress=progress,
         )
     for path in written:

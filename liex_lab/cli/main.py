@@ -9,8 +9,9 @@ import os
 import shlex
 import sys
 import traceback
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any, NoReturn
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
 
@@ -43,6 +44,9 @@ from liex_lab.errors import LiexError, MisfitError, printable
 from liex_lab.runtime.disk import is_full, why_full
 from liex_lab.runtime.progress import progress_bar
 from liex_lab.runtime.signals import Ended, ending
+
+if TYPE_CHECKING:
+    from liex_lab.pipelines.arenas import ArenaOutcome
 
 # the exit code of our own faults (EX_SOFTWARE); what the user can put right is 1, a wrong call 2
 FAULT = 70
@@ -137,6 +141,8 @@ def run(
     """Turn a recording into a session folder: poses, behaviour tables, replay, report.
 
     Ends with a line that says how it went, and with exit code 4 where someone has to look at it.
+    Several arenas in one picture (`[[arenas]]` of the plan, or --set arenas=auto) become a session
+    each.
     """
     from liex_lab.plan import Plan
 
@@ -145,8 +151,21 @@ def run(
     asked += [*["estimation.accept_misfit=true"] * accept, *(settings or [])]
     # first: a wrong plan or setting is told at once
     chosen = Plan.load(plan or "mouse").with_settings(asked)
-    from liex_lab.api import run_session
+    from liex_lab.api import run_arenas, run_session
 
+    if chosen.arenas is not None:
+        with progress_bar() as progress:
+            outcomes = run_arenas(
+                recording,
+                chosen if plan else None,
+                out,
+                settings=() if plan else asked,
+                overwrite=overwrite,
+                workers=workers,
+                progress=progress,
+            )
+        _tell_arenas(outcomes)
+        return
     with progress_bar() as progress:
         session = run_session(
             recording,
@@ -459,8 +478,28 @@ def _fault() -> NoReturn:
     _fail("this is a fault of liex_lab and not of yours; please report the lines above", FAULT)
 
 
+def _tell_arenas(outcomes: Sequence[ArenaOutcome]) -> None:
+    """What became of each arena; ends with the largest of their exit codes."""
+    code = 0
+    for one in outcomes:
+        say(f"arena {one.name}")
+        if one.error is not None:
+            typer.secho(f"liex: {printable(one.error)}", fg=typer.colors.RED, err=True)
+            code = max(code, one.error.exit_code)
+        if one.session is not None:
+            code = max(code, _told_session(one.session))
+    if code:
+        raise typer.Exit(code)
+
+
 def _tell_session(session: Path, further: str = "") -> None:
     """Where the session is, and how it went; exit code 4 where someone has to look at it."""
+    if code := _told_session(session, further):
+        raise typer.Exit(code)
+
+
+def _told_session(session: Path, further: str = "") -> int:
+    """Say where the session is, and how it went; returns the exit code."""
     from liex_lab.sessions.older import taken_from
     from liex_lab.sessions.verdict import read_verdict
 
@@ -478,5 +517,4 @@ def _tell_session(session: Path, further: str = "") -> None:
     if verdict["sentence"]:
         colour = typer.colors.YELLOW if verdict["look_at_it"] else None
         typer.secho(f"result:  {printable(verdict['sentence'])}", fg=colour)
-    if verdict["look_at_it"] and not verdict["accepted"]:
-        raise typer.Exit(MisfitError.exit_code)
+    return MisfitError.exit_code if verdict["look_at_it"] and not verdict["accepted"] else 0

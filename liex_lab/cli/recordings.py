@@ -78,7 +78,7 @@ def pack(
     whole: Annotated[bool, typer.Option("--whole", help="Keep whole pictures.")] = False,
     verify: Annotated[
         bool,
-        typer.Option("--verify", help="Read it again and compare; of an archive: with its hash."),
+        typer.Option("--verify", help="Read it again and compare, an archive with its hash."),
     ] = False,
     delete_original: Annotated[
         bool,

@@ -21,9 +21,9 @@ _ORDER = (START, SESSIONS, STUDIES, RECORDINGS, MODELS)
 # within its section a verb stands where people need it; one that is not named here stands last
 _OF_WORK = (
     *("demo", "doctor", "run", "show"),
-    *("report", "correct", "describe", "suggest", "export", "verify"),
+    *("report", "figures", "correct", "describe", "suggest", "export", "verify"),
     *("cohort", "compare", "dashboard"),
-    *("convert", "live"),
+    *("convert", "pack", "live"),
     *("info", "train", "evaluate"),
 )
 

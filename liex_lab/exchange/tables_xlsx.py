@@ -8,6 +8,7 @@ a sheet of Excel ends at 1,048,576 rows.
 from __future__ import annotations
 
 import math
+import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,6 +20,8 @@ if TYPE_CHECKING:
     from openpyxl import Workbook
 
 MAX_ROWS = 1_048_576  # of a sheet, its headings included
+_MOST_CHARACTERS = 32_767  # of a cell
+_UNWRITABLE = re.compile("[\\0-\\x08\\x0b\\x0c\\x0e-\\x1f\\ud800-\\udfff\\ufffe\\uffff]")  # in XML
 _EXACT = 10**15  # Excel has 15 digits; a longer whole number, a time in ns, is a text
 
 
@@ -74,6 +77,6 @@ def _cell(sheet: Any, value: Any) -> Any:
     text = str(value)
     if text in ("NaT", "<NA>"):
         return None
-    cell = WriteOnlyCell(sheet, value=text)
+    cell = WriteOnlyCell(sheet, value=_UNWRITABLE.sub("\ufffd", text)[:_MOST_CHARACTERS])
     cell.data_type = "s"
     return cell

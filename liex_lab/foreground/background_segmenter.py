@@ -219,29 +219,11 @@ class BackgroundSubtraction(StillScene):
                 scene = replace(scene, cable=cable)
         area, share = scene._moving_area(sample, spine_mm, min_height_mm)
         moves = share >= 0.5 or (share > 0.0 and standing.moves)
-        if share < 0.5:  # perhaps it sits in its own background: compare with the floor itself
-            bare_limit = np.where(
-                on_floor, np.maximum(bare - np.float32(min_height_mm), 0), limit
-            ).astype(np.float32)
-            still = replace(
-                scene, limit=bare_limit, background=np.where(on_floor, bare, background)
-            )
-            still_area, still_share = still.usual_area(sample, spine_mm)
-            rests = replace(still, area_mm2=still_area)
-            if still_share > share and not (
-                stands
-                and standing.moves
-                and area > 0.0
-                and (
-                    rests._stays_beside(replace(scene, area_mm2=area), sample)
-                    or not rests._is_like_an_animal(sample, spine_mm, min_height_mm)
-                )
-            ):
-                scene = still
-                area = still_area
-                share = still_share
-                moves = False
-        elif stands:
+        rests = scene._at_rest(sample, bare, spine_mm, min_height_mm, area, share)
+        if rests is not None:
+            scene, area, share = rests
+            moves = False
+        elif stands and share >= 0.5:
             scene, area = scene.with_its_still_part(sample, spine_mm, min_height_mm, area)
         # what was not seen moving is an animal only where it is as large and as high as one
         if stands and share > 0.0 and not moves:
@@ -256,6 +238,56 @@ class BackgroundSubtraction(StillScene):
             )
         scene = replace(scene, area_mm2=area)
         return replace(scene, volume_mm3=scene.usual_volume(sample)), sample
+
+    def _at_rest(
+        self,
+        sample: NDArray[np.float32],
+        bare: NDArray[np.float32],
+        spine_mm: tuple[float, float],
+        min_height_mm: float,
+        area: float,
+        share: float,
+    ) -> tuple[BackgroundSubtraction, float, float] | None:
+        """The scene with the bare floor as background, where an animal sits in its own background.
+
+        So it is where fewer than half of the frames show something that moves, or what most of them
+        show is no animal, as the specks of an edge that flickers.
+
+        Args:
+            sample: (n, H, W) float32 mm, frames at this scene's stride.
+            bare: (H, W) float32 mm, depth of the floor's plane.
+            spine_mm: lengths of the smallest and the largest animal to expect, mm.
+            min_height_mm: what stands out by less is not the animal.
+            area: usual area of what was found, mm^2.
+            share: of the frames that show it.
+
+        Returns:
+            The scene, the animal's area and the share of frames that show it; None where the scene
+            as it is is the better one.
+        """
+        stands = self.view.frame == VIEWS[0]
+        found = replace(self, area_mm2=area)
+        if share >= 0.5 and (
+            not stands or found._is_like_an_animal(sample, spine_mm, min_height_mm)
+        ):
+            return None
+        on_floor = self.on_floor if self.standing is None else self.standing.on_floor
+        limit = np.where(
+            on_floor, np.maximum(bare - np.float32(min_height_mm), 0), self.limit
+        ).astype(np.float32)
+        still = replace(self, limit=limit, background=np.where(on_floor, bare, self.background))
+        still_area, still_share = still.usual_area(sample, spine_mm)
+        if still_share <= (share if share < 0.5 else 0.0):
+            return None
+        rests = replace(still, area_mm2=still_area)
+        moves = stands and self.standing is not None and self.standing.moves and area > 0.0
+        if (share >= 0.5 or moves) and not rests._is_like_an_animal(
+            sample, spine_mm, min_height_mm
+        ):
+            return None
+        if share < 0.5 and moves and rests._stays_beside(found, sample):
+            return None
+        return still, still_area, still_share
 
     def _moving_area(
         self, sample: NDArray[np.float32], spine_mm: tuple[float, float], min_height_mm: float

@@ -75,8 +75,17 @@ class Standing:
 
 
 @dataclass(frozen=True)
-class _Thing:
-    """One thing that moves: where its ground is looked for, and what lies there."""
+class Thing:
+    """One thing that moves: where its ground is looked for, and what lies there.
+
+    Attributes:
+        rows: of the pixels around it.
+        columns: of the same.
+        depth: of the background there, mm.
+        area_mm2: of the thing seen from the camera.
+        volume_mm3: between it and the background.
+        frame: of the sample, in which it is seen.
+    """
 
     rows: NDArray[np.int64]
     columns: NDArray[np.int64]
@@ -86,12 +95,31 @@ class _Thing:
     frame: int
 
     def stands_on(self, floor: Floor) -> bool:
+        """Whether the ground around it lies on a plane.
+
+        Args:
+            floor: the plane.
+        """
         a, b, c = floor.inverse_depth
         inverse = a * self.columns + b * self.rows + c
         return bool(abs(np.median(floor.distance_mm * (1.0 - self.depth * inverse))) < _ON_MM)
 
     def share_on(self, patch: NDArray[np.bool_]) -> float:
+        """Share of the ground around it that is a part of a patch (H, W) bool.
+
+        Args:
+            patch: where it lies in the picture.
+        """
         return float(patch[self.rows, self.columns].mean())
+
+    def is_on(self, floor: Floor, patch: NDArray[np.bool_]) -> bool:
+        """Whether it stands on a patch (H, W) bool of a floor.
+
+        Args:
+            floor: the plane.
+            patch: where it lies in the picture.
+        """
+        return self.stands_on(floor) and self.share_on(patch) > _ON_SHARE
 
 
 def find_standing(
@@ -124,8 +152,7 @@ def find_standing(
             nothing stands on the floor that is stated.
     """
     areas = (view.area[0] * spine_mm[0] ** 2, view.area[1] * spine_mm[1] ** 2)
-    limit = background - np.maximum(np.float32(min_height_mm), 3.0 * spread)
-    things = _moving(sample, background, limit, camera, areas)
+    things = things_moving(sample, background, spread, camera, spine_mm, min_height_mm, view)
     standing = (
         _choose(background, camera, things, spine_mm[1], 4.0 * areas[0])
         if stated is None
@@ -141,10 +168,35 @@ def find_standing(
     )
 
 
+def things_moving(
+    sample: NDArray[np.float32],
+    background: NDArray[np.float32],
+    spread: NDArray[np.float32],
+    camera: Camera,
+    spine_mm: tuple[float, float],
+    min_height_mm: float,
+    view: View,
+) -> list[Thing]:
+    """Things of an animal's size that move, at most three of each frame; see `find_standing`.
+
+    Args:
+        sample: (n, H, W) float32 mm, frames spread over the recording, 0 where unread.
+        background: (H, W) float32 mm, 0 where unknown.
+        spread: (H, W) float32 mm, its standard deviation.
+        camera: whose pixels these are, free of lens distortion.
+        spine_mm: lengths of the smallest and the largest animal to expect, mm.
+        min_height_mm: what stands out from the background by less does not count.
+        view: how such animals are looked at.
+    """
+    areas = (view.area[0] * spine_mm[0] ** 2, view.area[1] * spine_mm[1] ** 2)
+    limit = background - np.maximum(np.float32(min_height_mm), 3.0 * spread)
+    return _moving(sample, background, limit, camera, areas)
+
+
 def _choose(
     background: NDArray[np.float32],
     camera: Camera,
-    things: list[_Thing],
+    things: list[Thing],
     longest_mm: float,
     least_mm2: float,
 ) -> Standing:
@@ -184,7 +236,7 @@ def _choose(
 
 
 def _as_stated(
-    floor: Floor, background: NDArray[np.float32], camera: Camera, things: list[_Thing]
+    floor: Floor, background: NDArray[np.float32], camera: Camera, things: list[Thing]
 ) -> Standing:
     """The floor that a person states.
 
@@ -204,7 +256,7 @@ def _as_stated(
 
 
 def _largest(
-    background: NDArray[np.float32], camera: Camera, things: list[_Thing]
+    background: NDArray[np.float32], camera: Camera, things: list[Thing]
 ) -> Standing | EstimationError:
     """The largest plane as the floor, or why it is none.
 
@@ -218,7 +270,7 @@ def _largest(
             raise
         return error
     on_floor = floor_region(background, floor.depth(camera.width, camera.height))
-    on = [thing.stands_on(floor) and thing.share_on(on_floor) > _ON_SHARE for thing in things]
+    on = [thing.is_on(floor, on_floor) for thing in things]
     return Standing(floor, on_floor, None, len(things), _share(things, on))
 
 
@@ -228,7 +280,7 @@ def _moving(
     limit: NDArray[np.float32],
     camera: Camera,
     areas: tuple[float, float],
-) -> list[_Thing]:
+) -> list[Thing]:
     """Things of an animal's area mm^2 in the frames (n, H, W), nearer than the limit (H, W).
 
     The largest few of each frame; of them, those that are not much smaller than the usual largest.
@@ -253,7 +305,7 @@ def _of_frame(
     limit: NDArray[np.float32],
     camera: Camera,
     areas: tuple[float, float],
-) -> Iterator[_Thing]:
+) -> Iterator[Thing]:
     """All such things of one frame."""
     import cv2
 
@@ -284,7 +336,7 @@ def _of_frame(
         near = (cv2.dilate(whole.astype(np.uint8), around) > 0) & (background[cut] > 0)
         rows, columns = np.nonzero(near)
         behind = background[cut][near].astype(float)
-        yield _Thing(
+        yield Thing(
             rows + cut[0].start,
             columns + cut[1].start,
             behind,
@@ -294,14 +346,14 @@ def _of_frame(
         )
 
 
-def _share(things: list[_Thing], chosen: list[bool]) -> float:
+def _share(things: list[Thing], chosen: list[bool]) -> float:
     """The share, by volume, of the things that were chosen; 0 where there are none."""
     volume = np.array([thing.volume_mm3 for thing in things])
     return float(volume[np.array(chosen)].sum() / volume.sum()) if things else 0.0
 
 
 def _stood_on(
-    grounds: list[Ground], things: list[_Thing], least: float
+    grounds: list[Ground], things: list[Thing], least: float
 ) -> tuple[Ground, float, str] | None:
     """The ground that the most things stand on, its share of them, and no doubt; None where none
     is better than what there is.
@@ -309,10 +361,7 @@ def _stood_on(
     best = None
     most = min(least + _BETTER, _SUPPORTED)
     for ground in grounds:
-        on = [
-            thing.stands_on(ground.floor) and thing.share_on(ground.patch) > _ON_SHARE
-            for thing in things
-        ]
+        on = [thing.is_on(ground.floor, ground.patch) for thing in things]
         share = _share(things, on)
         if share > most:
             best = ground

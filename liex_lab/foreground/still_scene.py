@@ -103,7 +103,7 @@ class StillScene(Segmenter):
             fixtures=fixtures,
             doubts=(standing.doubt,) if standing.doubt else (),
             wander_mm=wander_mm,
-            tethered=self.cable is not None,
+            thin_above=self.cable is not None,
         )
 
     def every(self, step: int) -> Self:
@@ -206,10 +206,12 @@ class StillScene(Segmenter):
 
     @property
     def remarks(self) -> tuple[str, ...]:
-        """That the animal wears a cable, and that the floor's depth wandered."""
+        """That a cable or bars were cut out, and that the floor's depth wandered."""
         said = []
         if self.cable is not None:
-            said.append("the animal wears a cable, which was cut out of the pictures")
+            said.append(
+                "something thin above the animal, a cable or bars, was cut out of the pictures"
+            )
         if self.level is not None:
             said.append(
                 f"the depth of the floor wandered by {self.level.wander_mm:.1f} mm, as of a sensor "

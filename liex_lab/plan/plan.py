@@ -14,9 +14,9 @@ import tomllib
 from collections.abc import Iterable
 from datetime import datetime
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, Literal, get_args
 
-from pydantic import Field, ValidationError
+from pydantic import Field, ValidationError, model_validator
 
 from liex_lab.errors import PlanError
 from liex_lab.plan.sections import (
@@ -30,12 +30,14 @@ from liex_lab.plan.sections import (
     RecordingOptions,
     Replay,
     SessionFacts,
+    SeveralArenas,
     Table,
     Tracking,
     WaterSurface,
 )
 
 _HERE = Path(__file__).resolve().parents[1]
+_MOST_ARENAS = 8  # in one picture
 _NOT_PLANS = {"slurm"}  # it says where sessions are measured, not how
 _HEADER = """\
 # A plan of liex_lab: everything a run depends on. Copy this file, change the copy, and name it:
@@ -54,6 +56,7 @@ class Plan(Table):
 
     Attributes:
         seed: all randomness of a run comes from this number.
+        arenas: several arenas in one picture; None is one.
         animal: what is in front of the camera.
         camera: intrinsics that overrule those of the recording.
         recording: how the file is read.
@@ -69,6 +72,14 @@ class Plan(Table):
     """
 
     seed: int = Field(0, ge=0, description="all randomness of a run comes from this number")
+    arenas: list[SeveralArenas] | Literal["auto"] | None = Field(
+        None,
+        description=(
+            "several arenas in one picture, each a session of its own: a table [[arenas]] with "
+            "name and region for each, and subject_id, group, ... of its animal; 'auto' proposes "
+            "them, as liex doctor prints them; not set: one arena"
+        ),
+    )
     animal: Animal = Animal()
     camera: CameraOverride = CameraOverride()
     recording: RecordingOptions = RecordingOptions()
@@ -82,17 +93,37 @@ class Plan(Table):
     behaviour: Behaviour = Behaviour()
     replay: Replay = Replay()
 
+    @model_validator(mode="after")
+    def _apart(self) -> Plan:
+        if self.arenas is None:
+            return self
+        if self.arena.region is not None:
+            raise ValueError(
+                "arena.region is for one arena and [[arenas]] for several; leave one of them out"
+            )
+        if self.arenas == "auto":
+            return self
+        if not 1 <= len(self.arenas) <= _MOST_ARENAS:
+            raise ValueError(f"[[arenas]] lists 1 to {_MOST_ARENAS} arenas, got {len(self.arenas)}")
+        names = [one.name.lower() for one in self.arenas]  # some file systems take A and a for one
+        twice = next((name for name in names if names.count(name) > 1), None)
+        if twice is not None:
+            raise ValueError(f"two [[arenas]] are called {twice}; give each a name of its own")
+        return self
+
     def __repr__(self) -> str:
         usual = Plan()
-        said = [f"seed={self.seed}"] if self.seed != usual.seed else []
-        for table in type(self).model_fields:
-            if table != "seed":
-                mine, other = getattr(self, table), getattr(usual, table)
+        said: list[str] = []
+        for name in type(self).model_fields:
+            mine, other = getattr(self, name), getattr(usual, name)
+            if isinstance(mine, Table):
                 said += [
-                    f"{table}.{key}={value!r}"
+                    f"{name}.{key}={value!r}"
                     for key, value in mine
-                    if value != getattr(other, key) and (table, key) != ("animal", "name")
+                    if value != getattr(other, key) and (name, key) != ("animal", "name")
                 ]
+            elif mine != other:
+                said.append(f"{name}={mine if isinstance(mine, int | str) else len(mine)}")
         unlike = f"; unlike the defaults: {', '.join(said)}" if said else ", all else by default"
         return f"<Plan for the {self.animal.name}{unlike}>"
 
@@ -192,13 +223,26 @@ class Plan(Table):
         for name, field in Plan.model_fields.items():
             value = getattr(self, name)
             if not isinstance(value, Table):
-                lines += [*_entry(name, value, field.description), ""]
+                told = None if isinstance(value, list) else value  # [[tables]] come last
+                lines += [*_entry(name, told, field.description), ""]
                 continue
             lines += [*_comment(" ".join((type(value).__doc__ or "").split())), f"[{name}]"]
             for key, inner in type(value).model_fields.items():
                 lines += _entry(key, getattr(value, key), inner.description)
             lines.append("")
+        if isinstance(self.arenas, list):
+            lines += [line for arena in self.arenas for line in [*arena_lines(arena), ""]]
         return "\n".join(lines).rstrip() + "\n"
+
+
+def arena_lines(arena: SeveralArenas) -> list[str]:
+    """One of several arenas as lines of a plan.
+
+    Args:
+        arena: the arena.
+    """
+    stated = arena.model_dump(exclude_none=True)
+    return ["[[arenas]]", *(f"{key} = {toml_value(value)}" for key, value in stated.items())]
 
 
 def plans_folder() -> Path:
@@ -268,14 +312,17 @@ def _nearest(word: str, known: list[str]) -> str:
 def _sentence(error: ValidationError) -> str:
     """The first complaint, as one sentence that says what to do."""
     first, *others = error.errors(include_url=False)
-    dotted = ".".join(str(part) for part in first["loc"])
+    # pydantic names the kinds that a value may have, which are none of the plan's own words
+    words = [str(part) for part in first["loc"] if "[" not in str(part)]
+    dotted = ".".join(word for word in words if word not in {"Region", "StatedFloor"})
     more = f" (and {len(others)} more)" if others else ""
     if first["type"] == "extra_forbidden":
         return _unknown(dotted) + more
     if first["type"] in {"model_type", "model_attributes_type"}:
         return f"[{dotted}] is a section with settings below it, got {first['input']!r}{more}"
     if first["type"] == "value_error" and dotted not in _settings():
-        return f"[{dotted}]: {first['msg'].removeprefix('Value error, ')}{more}"
+        where = f"[{dotted}]: " if dotted else ""
+        return f"{where}{first['msg'].removeprefix('Value error, ')}{more}"
     expected = first["msg"].removeprefix("Value error, ").replace("Input should", "should")
     got = (
         first["input"].isoformat() if isinstance(first["input"], datetime) else repr(first["input"])
@@ -286,7 +333,7 @@ def _sentence(error: ValidationError) -> str:
 
 
 def _entry(name: str, value: Any, description: str | None) -> list[str]:
-    text = "# " + name + " =" if value is None else f"{name} = {_literal(value)}"
+    text = "# " + name + " =" if value is None else f"{name} = {toml_value(value)}"
     return [*_comment(description or ""), text]
 
 
@@ -294,13 +341,18 @@ def _comment(text: str) -> list[str]:
     return textwrap.wrap(text, 116, initial_indent="# ", subsequent_indent="# ")
 
 
-def _literal(value: Any) -> str:
-    """A value as TOML writes it. JSON's string escapes are TOML's, but for DEL."""
+def toml_value(value: Any) -> str:
+    """A value as TOML writes it. JSON's string escapes are TOML's, but for DEL.
+
+    Args:
+        value: of a setting: a table, list, text, number or bool.
+    """
     if isinstance(value, Table):
-        inner = (f"{key} = {_literal(item)}" for key, item in value.model_dump().items())
-        return f"{{{', '.join(inner)}}}"
+        return toml_value(value.model_dump(exclude_none=True))
+    if isinstance(value, dict):
+        return f"{{{', '.join(f'{key} = {toml_value(item)}' for key, item in value.items())}}}"
     if isinstance(value, list):
-        return f"[{', '.join(_literal(item) for item in value)}]"
+        return f"[{', '.join(toml_value(item) for item in value)}]"
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, str):

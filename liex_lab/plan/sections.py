@@ -156,6 +156,61 @@ class StatedFloor(Table):
 Corner = Annotated[list[float], Field(min_length=2, max_length=2)]
 
 
+class Circle(Table):
+    """A circle: its centre [x, y] and its radius."""
+
+    centre: Corner
+    radius: Positive
+
+
+class Region(Table):
+    """Where an arena is in the picture: a polygon, a rectangle or a circle, in px or in mm.
+
+    Millimetres are those of the floor: the arena's frame, with its origin below the camera, x along
+    the picture's rows and y up the picture. A bare list of corners is a polygon in pixels.
+    """
+
+    polygon: list[Corner] | None = None
+    rectangle: Annotated[list[Corner], Field(min_length=2, max_length=2)] | None = None
+    circle: Circle | None = None
+    unit: Literal["px", "mm"] = "px"
+
+    @model_validator(mode="before")
+    @classmethod
+    def _of_corners(cls, value: Any) -> Any:
+        return {"polygon": value} if isinstance(value, list) else value
+
+    @model_validator(mode="after")
+    def _one_shape(self) -> Region:
+        shapes = (self.polygon, self.rectangle, self.circle)
+        if sum(shape is not None for shape in shapes) != 1:
+            raise ValueError(
+                "a region is one of polygon = [[x, y], [x, y], [x, y], ...], rectangle = [[x, y], "
+                "[x, y]] (two opposite corners) and circle = {centre = [x, y], radius = r}"
+            )
+        return self
+
+
+ArenaName = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]{0,63}$")]
+
+
+class SeveralArenas(Table):
+    """[[arenas]]: one of several arenas in the picture, which becomes a session of its own."""
+
+    name: ArenaName = Field(description="of the arena; its session is called NAME-ARENA")
+    region: Region = Field(
+        description="where it is, as arena.region says it; what lies outside is cut out"
+    )
+    spine_mm: Positive | None = Field(None, description="of its animal; not set: it is measured")
+    zones: str | None = Field(None, description="path of the TOML file with its zones")
+    individual: str | None = Field(None, description="name of its animal within the session")
+    subject_id: str | None = Field(None, description="its animal's identity across the study")
+    group: str | None = Field(None, description="experimental group of its animal")
+    cage: str | None = Field(None, description="home cage or tank of its animal")
+    sex: str | None = Field(None, description="sex of its animal")
+    batch: str | None = Field(None, description="batch of the experiment")
+
+
 class ArenaFacts(Table):
     """[arena]: where the arena is in the picture, and where in it the animal is."""
 
@@ -166,14 +221,15 @@ class ArenaFacts(Table):
             "z]}, mm in the camera's frame (x right, y down, z away)"
         ),
     )
-    region: list[Corner] | None = Field(
+    region: Region | None = Field(
         None,
         description=(
             "corners [x, y], pixels, of a polygon around the arena, outside of which nothing is "
-            "looked at; not set: the whole picture, or what lies around the floor that was found"
+            "looked at; or {rectangle = [[x, y], [x, y]]}, {circle = {centre = [x, y], radius = "
+            "r}}, {polygon = [...], unit = 'mm'} on the floor; not set: the whole picture, or what "
+            "lies around the floor that was found"
         ),
     )
-
     zones: str | None = Field(
         None,
         description=(

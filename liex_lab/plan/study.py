@@ -21,6 +21,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from liex_lab.errors import PlanError, StudyError
 from liex_lab.plan import Plan, known_plans
+from liex_lab.plan.sections import ArenaName, Region
 from liex_lab.runtime.places import named_beside
 
 # as in NeuroBlueprint: letters and digits alone, so that no name is a path, a formula or markup
@@ -77,6 +78,20 @@ class StudyAnimal(_Table):
     set: Settings = {}
 
 
+class StudyArena(_Table):
+    """One of several arenas in the pictures of the study's rig, a table [[arenas]].
+
+    Attributes:
+        name: of the arena, as sessions name it.
+        region: where it is in the picture, as arena.region of a plan says it.
+        set: settings of the plan for this arena, nested, such as its zones.
+    """
+
+    name: ArenaName
+    region: Region
+    set: Settings = {}
+
+
 class StudySession(_Table):
     """One recording of one animal, a table [[sessions]].
 
@@ -85,6 +100,7 @@ class StudySession(_Table):
         session: letters and digits, with key-value pairs after them, as in 01_date-20260821.
         recording: path below the study's folder, or address of a virtual recording.
         plan: a bundled plan or a path below the study's folder; None takes the study's.
+        arena: which of the study's arenas the animal is in; empty where the picture shows one.
         start_time: ISO 8601 with time zone; None takes what the recording says.
         exclude: why the session is left out; empty where it is not.
         set: settings of the plan for this session, nested.
@@ -94,6 +110,7 @@ class StudySession(_Table):
     session: SessionName
     recording: PathText
     plan: PathText | None = None
+    arena: Text = ""
     start_time: str | None = None
     exclude: Text = ""
     set: Settings = {}
@@ -108,6 +125,7 @@ class StudyTable(_Table):
         results: path below the study's folder that results go to.
         set: settings of the plan for all sessions, nested.
         animals: the animals.
+        arenas: several arenas in one picture, each recorded with an animal of its own.
         sessions: the sessions.
     """
 
@@ -116,6 +134,7 @@ class StudyTable(_Table):
     results: PathText = DERIVED
     set: Settings = {}
     animals: list[StudyAnimal] = []
+    arenas: list[StudyArena] = []
     sessions: list[StudySession] = []
 
     @model_validator(mode="after")
@@ -125,13 +144,28 @@ class StudyTable(_Table):
             if animal.id.lower() in known:  # some file systems take M01 and m01 for one
                 raise ValueError(f"the animal {animal.id} is listed twice; keep one")
             known.add(animal.id.lower())
+        arenas = [arena.name for arena in self.arenas]
+        if len(arenas) > len({name.lower() for name in arenas}):
+            raise ValueError("two [[arenas]] have the same name; give each its own")
         taken: set[tuple[str, str]] = set()
+        filmed: set[tuple[str, str]] = set()
         for one in self.sessions:
             if one.animal not in {animal.id for animal in self.animals}:
                 raise ValueError(
                     f"the session {one.session} is of {one.animal}, an animal that is not in "
                     "[[animals]]"
                 )
+            if one.arena and one.arena not in arenas:
+                raise ValueError(
+                    f"the session {one.session} of {one.animal} is in the arena {one.arena}, which "
+                    "is not in [[arenas]]"
+                )
+            if one.arena and (one.recording, one.arena) in filmed:
+                raise ValueError(
+                    f"two sessions are of the arena {one.arena} in {one.recording}; an arena holds "
+                    "one animal"
+                )
+            filmed.add((one.recording, one.arena))
             key = one.animal.lower(), one.session.lower()
             if key in taken:
                 raise ValueError(
@@ -316,7 +350,12 @@ class Study:
         }
         facts |= {"session_start_time": one.start_time} if one.start_time else {}
         table = plan.model_dump(exclude_none=True)
-        for settings in (self.table.set, animal.set, {"session": facts}, one.set):
+        arena = next((each for each in self.table.arenas if each.name == one.arena), None)
+        where: Settings = {}
+        if arena is not None:
+            region = arena.region.model_dump(exclude_none=True)
+            where = merged(arena.set, {"arena": {"region": region}})
+        for settings in (self.table.set, where, animal.set, {"session": facts}, one.set):
             table = merged(table, settings)
         for section, key in _PATHS:
             text = table.get(section, {}).get(key) if isinstance(table.get(section), dict) else None
@@ -324,6 +363,12 @@ class Study:
                 table[section][key] = str(
                     self.inside(text, f"{section}.{key}")
                 )  # workers run in other folders
+        if table.get("arenas") is not None:
+            raise StudyError(
+                f"{self.path}, session {id}: a session of a study is of one animal in one arena; "
+                'list [[arenas]] with name and region in the study and say arena = "NAME" in each '
+                "of [[sessions]]"
+            )
         try:
             return Plan.from_table(table, f"{self.path}, session {id}")
         except PlanError as error:
@@ -366,7 +411,11 @@ def _sentence(error: ValidationError) -> str:
 
 
 def _nearest(key: str, where: Sequence[Any]) -> str:
-    models: dict[str, type[BaseModel]] = {"animals": StudyAnimal, "sessions": StudySession}
+    models: dict[str, type[BaseModel]] = {
+        "animals": StudyAnimal,
+        "arenas": StudyArena,
+        "sessions": StudySession,
+    }
     model = models.get(str(where[0]), StudyTable) if len(where) > 1 else StudyTable
     near = difflib.get_close_matches(key, model.model_fields, 1)
     return f", did you mean {near[0]}" if near else ""

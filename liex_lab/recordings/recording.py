@@ -47,6 +47,8 @@ class Recording:
             with zone).
         optics: what was undone on reading (distortion, water, mirroring), empty where nothing was;
             see `rectify`.
+        region_px: (u, v) corners, pixels, of the polygon outside of which every picture was made
+            unread; () where the whole picture is there, see `masked`.
     """
 
     def __init__(
@@ -102,6 +104,7 @@ class Recording:
         self.truncated = truncated
         self.metadata: dict[str, Any] = {} if metadata is None else dict(metadata)
         self.optics: dict[str, Any] = {}
+        self.region_px: tuple[tuple[float, float], ...] = ()
         self._read = read
         self._sources = tuple(sources)
         self._stored = np.arange(len(self.times_ns)) if stored is None else stored
@@ -276,6 +279,7 @@ class Recording:
         )
         cut._whole = self._whole or self
         cut.optics = self.optics
+        cut.region_px = self.region_px
         return cut
 
     def seen_by(
@@ -301,12 +305,76 @@ class Recording:
             The recording through the other camera.
         """
         read = self._read
+        return self._through(camera, lambda number: change(read(number)), change, optics, lent)
+
+    def masked(self, region_px: Sequence[Sequence[float]], *, lent: bool = False) -> Recording:
+        """The same frames with everything outside of a polygon unread: an arena cut out of them.
+
+        Size and camera of the pictures stay as they are, so what is measured within keeps its
+        place. The input, and so the digest, stays the same.
+
+        Args:
+            region_px: (u, v) corners of the polygon, pixels.
+            lent: this recording stays open whatever becomes of the result.
+
+        Returns:
+            The recording of what lies inside.
+
+        Raises:
+            PlanError: the corners are no polygon in the picture.
+        """
+        from liex_lab.arena.scene import region_mask
+
+        inside = region_mask(region_px, self.width, self.height)
+        cut = self.seen_by(
+            self.camera,
+            lambda depth: np.where(inside, depth, np.float32(0)),
+            self.optics,
+            lent=lent,
+        )
+        cut.region_px = tuple((float(u), float(v)) for u, v in region_px)
+        return cut
+
+    def remembering(self, most_bytes: int) -> Recording:
+        """The same recording that keeps the first frames which are read, for several readers.
+
+        Closing the result closes this recording.
+
+        Args:
+            most_bytes: of kept frames; those read afterwards are decoded each time.
+        """
+        kept: dict[int, Depth] = {}
+        n_most = most_bytes // max(1, 4 * self.width * self.height)
+        read = self._read
+
+        def recall(number: int) -> Depth:
+            """Depth of a stored frame by its `number`."""
+            depth = kept.get(number)
+            if depth is None:
+                depth = read(number)
+                if len(kept) < n_most:
+                    kept[number] = depth
+            return depth
+
+        other = self._through(self.camera, recall, lambda depth: depth, self.optics, False)
+        other.region_px = self.region_px
+        return other
+
+    def _through(
+        self,
+        camera: Camera,
+        read: Callable[[int], Depth],
+        change: Callable[[Depth], Depth],
+        optics: dict[str, Any],
+        lent: bool,
+    ) -> Recording:
+        """The same frames read in another way."""
         other = Recording(
             name=self.name,
             format=self.format,
             camera=camera,
             times_ns=self.times_ns.copy(),
-            read=lambda number: change(read(number)),
+            read=read,
             sources=self._sources,
             problems=self.problems,
             truncated=self.truncated,
@@ -334,6 +402,7 @@ class Recording:
         more = None if self._grow is None else self._grow()
         if more is not None:
             more.camera = self.camera
+            more.region_px = self.region_px
             if self._close is not None:
                 self._close.detach()  # the files go on being read
         return more

@@ -229,19 +229,23 @@ class Kept:
     Args:
         session: the session.
 
+    Attributes:
+        boxes: (n, K, 4) left, top, right and bottom of every frame's cut-outs, px; None of a
+            session that keeps whole pictures, or none.
+
     Raises:
         SessionError: its file is damaged.
     """
 
     def __init__(self, session: Session) -> None:
-        self._boxes: Boxes | None = None
+        self.boxes: Boxes | None = None
         path = session.path / FILE
         if path.is_file():
             with reading_from(path), np.load(path, allow_pickle=False) as kept:
                 boxes: NDArray[Any] = kept["boxes"]
                 if boxes.ndim != 3 or boxes.shape[2] != 4 or len(boxes) != len(session.frames):
                     raise ValueError(f"boxes are {boxes.shape}, not those of every frame")
-                self._boxes = boxes
+                self.boxes = boxes
 
     def holds(self, row: int, u_px: float, v_px: float) -> bool:
         """Whether a pixel of a frame was kept as it was read.
@@ -251,9 +255,9 @@ class Kept:
             u_px: column, px; rounded.
             v_px: row of the picture, px; rounded.
         """
-        if self._boxes is None:  # whole pictures, as in sessions of earlier versions
+        if self.boxes is None:  # whole pictures, as in sessions of earlier versions
             return True
-        left, top, right, bottom = self._boxes[row].T
+        left, top, right, bottom = self.boxes[row].T
         u = round(u_px)
         v = round(v_px)
         return bool(((left <= u) & (u < right) & (top <= v) & (v < bottom)).any())

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from liex_lab.runtime.places import safe_name
 from liex_lab.sessions.session import Session
 
 
@@ -16,7 +17,7 @@ def video_path(folder: Path, name: str, what: str = "") -> Path:
         what: what of it is shown, such as an action; "" for all of it.
     """
     tail = "".join(c if c.isalnum() or c in "-_.+" else "_" for c in what)
-    return folder / (f"{name}_{tail}.mp4" if tail else f"{name}.mp4")
+    return folder / safe_name(f"{name}_{tail}" if tail else name, ".mp4")
 
 
 def stretch(start_s: float | None, stop_s: float | None) -> str:

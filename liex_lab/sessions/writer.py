@@ -495,10 +495,8 @@ class SessionWriter:
         """Close what is open; keep: what there is a checkpoint of."""
         self._stop_logging()
         for log in (self._replay, self._mcap):
-            try:
+            with suppress(Exception):  # an error is under way already; it is the one to tell
                 log.abandon()
-            except Exception:  # an error is under way already; it is the one to tell
-                continue
         self._checkpoint.leave(keep)
 
 

@@ -17,7 +17,12 @@ from liex_lab.tables.schema import ROOT_COVARIANCES, TABLES
 if TYPE_CHECKING:
     import pandas as pd
 
-_LATER = {"wall_distance_mm", "zone", "p_flip", "bridged", *ROOT_COVARIANCES}  # not in schema 1
+# columns that tables of schema 1 do not have; one that a later schema adds is listed here, too
+_LATER = {
+    "frames": {"wall_distance_mm", "zone", "p_flip", "bridged"},
+    "rotations": set(ROOT_COVARIANCES),
+    "gaps": {"x_mm", "y_mm"},
+}
 _ROWS_PER_BYTE = 8  # a frame's time stamp alone takes more
 _FEW = 10_000
 _SPANS = {"bouts", "gaps", "flips"}
@@ -63,7 +68,7 @@ def check_footer(path: Path, name: str, n_frames: int, n_joints: int) -> None:
     for column in TABLES.get(name, ()):
         leaf = found.get(column.name)
         if leaf is None:
-            if column.name not in _LATER:
+            if column.name not in _LATER.get(name, ()):
                 raise ValueError(f"it lacks the column {column.name}")
         elif leaf.physical_type != _STORED[column.dtype] or leaf.max_repetition_level:
             raise ValueError(f"its column {column.name} is not {column.dtype}")

@@ -22,7 +22,9 @@ from liex_lab.errors import LiexError, MisfitError
 from liex_lab.evaluation.scenes import SCENES_PROTOCOL, Individual, Tally
 from liex_lab.runtime.progress import Progress, silent
 
+from ..arenas import measure_arenas
 from ..build import plan_of
+from ..regions import propose_arenas
 from ..session import measure_session
 
 if TYPE_CHECKING:
@@ -180,20 +182,37 @@ def run_product(recording: TrueRecording, plan: Plan) -> Outcome:
     quick = plan.with_settings(["replay.depth=none"])
     with tempfile.TemporaryDirectory(prefix="liex-scenes-") as folder:
         try:
-            measure_session(recording, quick, folder)
+            refused = _measure(recording, quick, folder)
         except LiexError as error:
             return Outcome((), (str(error),), error.exit_code)
         sessions = [Session.open(path) for path in sorted(Path(folder).glob("*.liex"))]
         verdicts = [verdict_in(session.metadata) for session in sessions]
         return Outcome(
             tuple(one for session in sessions for one in read_individuals(session)),
-            tuple(
-                sentence
-                for session, verdict in zip(sessions, verdicts, strict=True)
-                for sentence in (verdict["sentence"], *session.metadata["problems"])
+            (
+                *(
+                    sentence
+                    for session, verdict in zip(sessions, verdicts, strict=True)
+                    for sentence in (verdict["sentence"], *session.metadata["problems"])
+                ),
+                *map(str, refused),
             ),
-            MisfitError.exit_code if any(verdict["look_at_it"] for verdict in verdicts) else 0,
+            max(
+                MisfitError.exit_code if any(verdict["look_at_it"] for verdict in verdicts) else 0,
+                *(error.exit_code for error in refused),
+                0,
+            ),
         )
+
+
+def _measure(recording: TrueRecording, plan: Plan, folder: str) -> list[LiexError]:
+    """Measure a recording, of several arenas each as a session; returns why arenas were refused."""
+    arenas = propose_arenas(recording, plan)
+    if not arenas:
+        measure_session(recording, plan, folder)
+        return []
+    outcomes = measure_arenas(recording, plan.model_copy(update={"arenas": arenas}), folder)
+    return [one.error for one in outcomes if one.error is not None]
 
 
 def read_individuals(session: Session) -> list[Individual]:

@@ -191,9 +191,8 @@ def act(
         sizes: size over home size by individual; those in it are taken, others are measured over up
             to 128 frames and added. None starts without any.
     """
-    stage = {"fish": _fish, "mouse": _mouse}[scenario.animal]
     rng = np.random.default_rng([scenario.individual, scenario.seed])
-    motion, rows, pose, girth, walls, species, camera, shape, wall_mm = stage(scenario, rng)
+    motion, rows, pose, girth, walls, species, camera, shape, wall_mm = staged(scenario, rng)
     window_px = _FISH_WINDOW if scenario.animal == "fish" else _MOUSE_WINDOW
     tracker = PatchObserver(estimator)
     sizes = {} if sizes is None else sizes
@@ -235,7 +234,7 @@ def act(
     )
 
 
-_Staged = tuple[
+Staged = tuple[
     Motion,
     NDArray[np.int64],
     Pose,
@@ -248,7 +247,22 @@ _Staged = tuple[
 ]
 
 
-def _fish(scenario: Scenario, rng: np.random.Generator) -> _Staged:
+def staged(scenario: Scenario, rng: np.random.Generator) -> Staged:
+    """A scenario acted, before anything is rendered.
+
+    Args:
+        scenario: what is to be acted.
+        rng: source of randomness, of the individual and the scenario.
+
+    Returns:
+        The motion on its 5 ms clock; its steps (n,) that are frames; poses (n), arena frame; girth
+        (n,); the wall that each frame shows, or None; species, camera and shape; distance (n,) from
+        the nearest wall, mm, or None.
+    """
+    return {"fish": _fish, "mouse": _mouse}[scenario.animal](scenario, rng)
+
+
+def _fish(scenario: Scenario, rng: np.random.Generator) -> Staged:
     """A fish in a tank: its motion, poses and camera."""
     species = FishSpecies()
     own = np.random.default_rng([scenario.individual, 0])
@@ -265,7 +279,7 @@ def _fish(scenario: Scenario, rng: np.random.Generator) -> _Staged:
     return motion, rows, pose, np.full(len(rows), fish.size), None, species, camera, shape, None
 
 
-def _mouse(scenario: Scenario, rng: np.random.Generator) -> _Staged:
+def _mouse(scenario: Scenario, rng: np.random.Generator) -> Staged:
     """A mouse in a box: its motion, poses, girth, camera, and wall distances, mm."""
     species = MouseSpecies()
     own = np.random.default_rng([scenario.individual, 0])

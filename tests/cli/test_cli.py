@@ -360,12 +360,15 @@ def test_evaluate_tables_names_what_it_wrote(
     ]
     result = CliRunner().invoke(cli.app, ["evaluate", "tables", *words])
     assert result.output == f"{tmp_path / 'tables.md'}\n"
-    fewer = {"n_frames": 50, "quick": True, "fresh": False, "rows": (), "sealed": False}
+    whole = {"without": (), "nyu": None}
+    fewer = {"n_frames": 50, "quick": True, "fresh": False, "rows": (), "sealed": False, **whole}
     assert seen == [tmp_path, ["mouse", "fish"], fewer]
     seen.clear()
-    CliRunner().invoke(cli.app, ["evaluate", "tables", *words[:4], "--row", "rf", "--sealed"])
+    more = ["--row", "rf", "--sealed", "--without", "tracking", "--nyu", str(tmp_path)]
+    CliRunner().invoke(cli.app, ["evaluate", "tables", *words[:4], *more])
     sealed = {"n_frames": None, "quick": False, "fresh": False, "rows": ["rf"], "sealed": True}
-    assert seen == [tmp_path, ["mouse"], sealed]
+    parts = {"without": ["tracking"], "nyu": tmp_path}
+    assert seen == [tmp_path, ["mouse"], sealed | parts]
 
 
 def test_the_help_of_the_tables_says_in_what_they_differ_from_the_paper() -> None:

@@ -9,6 +9,7 @@ import json
 import shutil
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
@@ -293,3 +294,48 @@ def test_a_damaged_ethogram_is_a_sentence(tmp_path: Path, monkeypatch: pytest.Mo
     monkeypatch.setattr(shown, "_of_one", lambda what, read, entry: {"damage": "run it again"})
     assert shown.ethograms(["b"]) == {}
     assert shown.damage("b") == "run it again"
+
+
+def test_a_session_that_cannot_be_read_in_any_way_is_a_sentence_in_its_row(tmp_path: Path) -> None:
+    shown = StudyData("x", lambda: [Entry("b", "done", folder=tmp_path / "b")])
+    (tmp_path / "b").mkdir()
+
+    def breaks(session: object) -> object:
+        raise ZeroDivisionError("a\nslip")
+
+    (entry,) = shown.done
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("liex_lab.sessions.Session.open", lambda folder: folder)
+        found = shown._of_one("quality", breaks, entry)
+    assert "cannot be shown (ZeroDivisionError: a)" in found["damage"]
+    assert "liex verify" in found["damage"]
+
+
+@pytest.mark.parametrize("origin", ["http://[", "http://[::1", "//", "\\"])
+def test_an_origin_that_is_no_address_is_refused(origin: str) -> None:
+    from flask import Flask
+    from liex_lab.dashboards.app.guard import guard
+
+    server = Flask("test")
+    guard(server, "", lambda: "default-src 'none'")
+    answer = server.test_client().get("/", headers={"Origin": origin, "Host": "127.0.0.1"})
+    assert answer.status_code == 403
+
+
+def test_a_report_that_is_a_link_elsewhere_is_not_shown(tmp_path: Path) -> None:
+    from flask import Flask
+    from liex_lab.dashboards.app.guard import add_downloads
+
+    folder = tmp_path / "b"
+    folder.mkdir()
+    (tmp_path / "secret").write_text("secret")
+    shown = StudyData("x", lambda: [Entry("b", "done", folder=folder)])
+    server = Flask("test")
+    add_downloads(server, shown)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(shown, "session", lambda key: SimpleNamespace(path=folder))
+        (folder / "report.html").write_text("fine")
+        assert server.test_client().get("/report/b").text == "fine"
+        (folder / "report.html").unlink()
+        (folder / "report.html").symlink_to(tmp_path / "secret")
+        assert server.test_client().get("/report/b").status_code == 404

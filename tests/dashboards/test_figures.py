@@ -20,7 +20,7 @@ from liex_lab.api import compare_groups, draw_figures
 from liex_lab.arena.outline import Arena
 from liex_lab.arena.zones import Zone
 from liex_lab.behaviour.cohort import compare
-from liex_lab.errors import SessionError
+from liex_lab.errors import PlaceError, SessionError
 from liex_lab.sessions import Session
 from tests.sessions.walking_mouse import FLOOR_MM, WalkingMouse, steady, write
 
@@ -110,7 +110,7 @@ def test_an_action_has_its_colour_in_every_figure(session, seen):
     seen_words = set(session.bouts["action"])
     with drawing():
         for draw in (times.ethogram, actions.time_budget, actions.activity, actions.transitions):
-            svg = image_bytes(draw(seen), "svg").decode().lower()  # type: ignore[arg-type]
+            svg = image_bytes(draw(seen), "svg").decode().lower()
             assert all(colours[str(word)].lower() in svg for word in seen_words), draw
 
 
@@ -177,7 +177,7 @@ def test_the_animal_is_not_in_the_map_of_the_arena(session):
 
 def test_what_the_tables_say_twice_is_the_same_bytes(session, tmp_path):
     some = ["occupancy", "ethogram", "transitions"]
-    asked = {"only": some, "formats": ("svg", "pdf", "png")}
+    asked: Any = {"only": some, "formats": ("svg", "pdf", "png")}
     first = draw_figures(session.path, out=tmp_path / "a", **asked)
     again = draw_figures(session.path, out=tmp_path / "b", **asked)
     assert len(first["files"]) == 9
@@ -195,7 +195,7 @@ def test_texts_stay_texts_that_can_be_edited(session, tmp_path):
     draw_figures(session.path, only=["occupancy"], out=tmp_path)
     svg = (tmp_path / "occupancy.svg").read_text(encoding="utf-8")
     assert "Occupancy, circle" in svg
-    assert "nest &lt;1&gt;" in svg
+    assert ">nest &lt;1&gt;</text>" in svg
     assert 'width="252.' in svg  # 89 mm in points
     assert "Date" not in svg
     pdf = (tmp_path / "occupancy.pdf").read_bytes()
@@ -203,11 +203,20 @@ def test_texts_stay_texts_that_can_be_edited(session, tmp_path):
     assert b"CreationDate" not in pdf
 
 
+def test_a_link_in_the_place_of_a_figure_is_not_written_through(session, tmp_path):
+    theirs = tmp_path / "theirs"
+    theirs.mkdir()
+    (tmp_path / "mine").symlink_to(theirs)
+    with pytest.raises(PlaceError, match="symbolic link"):
+        draw_figures(session.path, only=["speed"], out=tmp_path / "mine")
+    assert not list(theirs.iterdir())
+
+
 def test_a_dollar_in_a_name_is_a_dollar(tmp_path):
     mouse = write(tmp_path / "d.liex", MOUSE, name="a$b$ <c>")
     (one,) = animals(mouse)
     with drawing():
-        svg = image_bytes(times.ethogram(one), "svg")  # type: ignore[arg-type]
+        svg = image_bytes(times.ethogram(one), "svg")
     assert "a$b$ &lt;c&gt;" in svg.decode()
     assert "a$b$ &lt;c&gt;" in on_page(svg, "x", "y <z>")
     assert 'aria-label="y &lt;z&gt;"' in on_page(svg, "x", "y <z>")

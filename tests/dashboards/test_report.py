@@ -161,7 +161,7 @@ def test_the_matrix_and_the_zones_are_on_the_page(tmp_path):
     )
     assert "nest &lt;1&gt;" in page
     assert "nest <1>" not in page
-    assert "Transitions, z, n = 2 transitions" in page
+    assert re.search(r"Transitions, circle, n = 2 transitions", page)
 
 
 def test_a_measure_around_an_onset_is_what_the_frames_say():

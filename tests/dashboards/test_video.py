@@ -13,7 +13,7 @@ from liex_lab.dashboards.video.relief import Relief
 from liex_lab.dashboards.video.video import matches, scale_mm
 
 from liex_lab.api import export_video
-from liex_lab.errors import SessionError
+from liex_lab.errors import PlaceError, SessionError
 from liex_lab.exchange import export
 from liex_lab.exchange.boris import project
 from liex_lab.sessions import Session
@@ -149,9 +149,10 @@ def test_a_session_without_depth_is_a_sentence(session):
     (session.path / "session.mcap").unlink()
     with pytest.raises(SessionError, match=r"lacks session\.mcap|keeps no depth"):
         export_video(session.path)
-    session.metadata["plan"] = {"replay": {"depth": False}}
-    with pytest.raises(SessionError, match="without --no-depth"):
-        Film(session, 80.0)
+    for said in (False, "none"):
+        session.metadata["plan"] = {"replay": {"depth": said}}
+        with pytest.raises(SessionError, match="without --no-depth"):
+            Film(session, 80.0)
 
 
 def test_a_session_without_any_pose_is_a_video_all_the_same(tmp_path):
@@ -184,6 +185,15 @@ def test_a_stretch_is_as_long_as_it_is_times_how_slow(session):
     assert len(frames) / fps == pytest.approx(1.0, abs=0.05)
     with pytest.raises(SessionError, match="exists already"):
         export_video(session.path, start_s=0.5, stop_s=1.0)
+
+
+def test_a_link_in_the_place_of_a_video_is_not_written_through(session, tmp_path):
+    theirs = tmp_path / "theirs.mp4"
+    theirs.write_bytes(b"theirs")
+    (session.path / "circle.mp4").symlink_to(theirs)
+    with pytest.raises(PlaceError, match="symbolic link"):
+        export_video(session.path, overwrite=True)
+    assert theirs.read_bytes() == b"theirs"
 
 
 def test_a_video_that_breaks_off_leaves_nothing(tmp_path):

@@ -21,7 +21,7 @@ def mouse():
 
 
 def learned(wander_mm: float) -> tuple[BackgroundSubtraction, np.ndarray]:
-    """The scene, and heights of the mouse above the floor in each frame; the sensor drifts."""
+    """The scene of a sensor that drifts, and how high the mouse is above the floor by frame."""
     off = wander_mm * (1.0 - np.exp(-np.arange(N_FRAMES) / 16.0))
     shown = changed(
         mouse(), lambda k, depth: np.where(depth > 0, depth + np.float32(off[k]), np.float32(0))

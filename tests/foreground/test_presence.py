@@ -59,6 +59,17 @@ def test_an_animal_that_leaves_is_found_until_it_leaves():
     assert not there[14:].any()
 
 
+def test_specks_of_an_edge_that_flickers_are_no_animal_beside_one_that_sleeps():
+    _, busy, empty = filmed()
+    there = busy[5:6] > 0
+    asleep = np.where(there, busy[5:6] + empty - empty.mean(axis=0), 0.0)
+    specks = asleep.copy()
+    specks[::2, 20:26, 40:70] -= 70.0 * (specks[::2, 20:26, 40:70] > 0)
+    scene, seen = found(specks)
+    assert seen.all()
+    assert 900.0 < scene.area_mm2 < 2000.0
+
+
 @pytest.mark.parametrize("n_asleep", [41, 48])
 def test_an_animal_that_sleeps_for_most_or_all_of_the_time_is_found_whole(n_asleep):
     _, busy, empty = filmed()

@@ -24,10 +24,11 @@ from liex_lab.errors import PlaceError, SessionError
 from liex_lab.exchange import TARGETS, export
 from liex_lab.plan import Plan
 from liex_lab.runtime.lock import locked, take_lock
-from liex_lab.runtime.places import inside
+from liex_lab.runtime.places import inside, safe_name
 from liex_lab.sessions import Session
 from liex_lab.sessions.corrections import BoutEdit, Description
 from liex_lab.sessions.failure import describe_failure, write_failure
+from liex_lab.sessions.videos import video_path
 from tests.hostile_names import NAMES
 from tests.sessions.walking_mouse import WalkingMouse, steady, write
 
@@ -149,6 +150,19 @@ def test_sessions_reports_corrections_and_comparisons_stay_in_theirs(name: str, 
         "compared",
         "failed",
     }
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_figures_and_videos_stay_in_their_folder(name: str, tmp_path: Path) -> None:
+    from liex_lab.dashboards.figures.sets import put_figure
+
+    out = tmp_path / "out"
+    assert put_figure(out, f"{name}.svg", b"<svg/>").parent == out
+    assert len(list(out.iterdir())) == 1
+    for what in ("", name):
+        place = video_path(out, name, what)
+        assert place.parent == out
+        assert place.name == safe_name(place.name)
 
 
 def test_no_writer_follows_a_link_in_its_folder(measured: Session, root: Path) -> None:

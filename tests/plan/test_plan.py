@@ -147,3 +147,42 @@ def test_the_behaviour_section_holds_the_rules_of_the_mouse() -> None:
     from liex_lab.behaviour.bouts import MouseRules
 
     assert MouseRules(**Plan().behaviour.model_dump()) == MouseRules()
+
+
+SEVERAL = """
+[[arenas]]
+name = "left"
+region = [[10, 20], [200, 20], [200, 300]]
+subject_id = "m01"
+[[arenas]]
+name = "right"
+region = { circle = { centre = [100.0, 0.0], radius = 80.0 }, unit = "mm" }
+"""
+
+
+def test_several_arenas_survive_their_own_file() -> None:
+    plan = Plan.from_toml(SEVERAL)
+    assert plan.arenas is not None
+    assert plan.arenas != "auto"
+    assert [one.name for one in plan.arenas] == ["left", "right"]
+    assert Plan.from_toml(plan.to_toml()) == plan
+    auto = Plan().with_settings(["arenas=auto"])
+    assert auto.arenas == "auto"
+    assert Plan.from_toml(auto.to_toml()) == auto
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "says"),
+    [
+        ('"right"', '"Left"', "two [[arenas]] are called left"),
+        ('"right"', '"../right"', "arenas.1.name"),
+        ("radius = 80.0", "radius = -1", "greater than 0"),
+        ('unit = "mm"', "rectangle = [[0, 0], [9, 9]]", "a region is one of polygon"),
+        ("[[arenas]]", "[arena]\nregion = [[1, 2], [9, 2], [9, 9]]\n[[arenas]]", "leave one"),
+    ],
+)
+def test_a_slip_in_several_arenas_is_told_in_one_sentence(old: str, new: str, says: str) -> None:
+    with pytest.raises(PlanError) as caught:
+        Plan.from_toml(SEVERAL.replace(old, new, 1))
+    assert says in str(caught.value)
+    assert "\n" not in str(caught.value)

@@ -193,3 +193,59 @@ def check_study(table: dict[str, Any]) -> None:
             )
     except LiexError as error:
         assert "\n" not in str(error)  # noqa: PT017
+
+
+ARENAS = """
+[[arenas]]
+name = "left"
+region = [[10.0, 20.0], [200.0, 20.0], [200.0, 300.0], [10.0, 300.0]]
+[[arenas]]
+name = "right"
+region = { rectangle = [[210.0, 20.0], [400.0, 300.0]] }
+set = { foreground.min_height_mm = 8.0 }
+[[animals]]
+id = "m01"
+[[animals]]
+id = "m02"
+[[sessions]]
+animal = "m01"
+session = "01"
+recording = "rawdata/both.mcap"
+arena = "left"
+[[sessions]]
+animal = "m02"
+session = "01"
+recording = "rawdata/both.mcap"
+arena = "right"
+"""
+
+
+def test_animals_in_several_arenas_of_one_recording_are_sessions_of_their_own(
+    tmp_path: Path,
+) -> None:
+    left, right = study_of(ARENAS, tmp_path).sessions
+    assert left.recording == right.recording
+    assert left.folder != right.folder
+    assert left.plan.arena.region is not None
+    assert left.plan.arena.region.polygon is not None
+    assert right.plan.arena.region is not None
+    assert right.plan.arena.region.rectangle == [[210.0, 20.0], [400.0, 300.0]]
+    assert (left.plan.foreground.min_height_mm, right.plan.foreground.min_height_mm) == (7.0, 8.0)
+    assert (left.plan.session.subject_id, right.plan.session.subject_id) == ("m01", "m02")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "says"),
+    [
+        ('arena = "right"', 'arena = "middle"', "in the arena middle, which is not in"),
+        ('arena = "right"', 'arena = "left"', "two sessions are of the arena left"),
+        ('name = "right"', 'name = "Left"', "the same name"),
+        ("rectangle = [[210.0, 20.0], [400.0, 300.0]]", "unit = 'px'", "a region is one of"),
+        ("[[arenas]]", 'set = { arenas = "auto" }\n[[arenas]]', "one arena"),
+    ],
+)
+def test_a_slip_in_the_arenas_of_a_study_is_told(
+    tmp_path: Path, old: str, new: str, says: str
+) -> None:
+    with pytest.raises(StudyError, match=says):
+        read_whole(ARENAS.replace(old, new, 1), tmp_path)

@@ -279,3 +279,18 @@ def test_a_model_that_claims_more_numbers_than_it_has_is_refused(tmp_path: Path)
 def test_bundled_models_are_within_the_bounds() -> None:
     for path in sorted(MODELS.glob("*.npz")):
         check_npz(path, 1 << 30)
+
+
+def test_entities_of_xml_are_bounded_and_none_is_read_from_elsewhere(tmp_path: Path) -> None:
+    import xml.etree.ElementTree as ET
+
+    (tmp_path / "secret").write_text("secret")
+    laughs = "".join(
+        f'<!ENTITY l{k} "{f"&l{k - 1};" * 10}">' if k else '<!ENTITY l0 "ha">' for k in range(12)
+    )
+    began = time.monotonic()
+    with pytest.raises(ET.ParseError):
+        ET.fromstring(f"<!DOCTYPE a [{laughs}]><a>&l11;</a>")
+    with pytest.raises(ET.ParseError):
+        ET.fromstring(f'<!DOCTYPE a [<!ENTITY x SYSTEM "{tmp_path}/secret">]><a>&x;</a>')
+    assert time.monotonic() - began < MOST_S

@@ -19,6 +19,8 @@ class Results:
         sealed: the split is the one that is measured once.
         sensitivity: curves by variant, see `sensitivity.sensitivity`.
         illustration: of the default, see `illustrations.illustrate`.
+        examples: poses of all rows in fixed frames, see `examples.shown_poses`.
+        failures: by variant, those of the frames in which it errs most.
     """
 
     animal: str
@@ -29,3 +31,5 @@ class Results:
     sealed: bool = False
     sensitivity: dict[str, Any] = field(default_factory=dict)
     illustration: dict[str, Any] = field(default_factory=dict)
+    examples: list[dict[str, Any]] = field(default_factory=list)
+    failures: dict[str, list[dict[str, Any]]] = field(default_factory=dict)

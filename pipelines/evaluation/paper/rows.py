@@ -14,6 +14,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from liex_lab.errors import PlanError
 from liex_lab.evaluation.bootstrap import interval95
@@ -22,6 +23,8 @@ from liex_lab.runtime.progress import Progress, silent
 
 from ...build import plan_of
 from .common_view import CommonView, common_view, measured
+from .examples import examples_in, failures_in
+from .trained_by import baseline_of_today, paper_of_today
 
 if TYPE_CHECKING:
     from liex_lab.baselines.baseline import Baseline
@@ -29,6 +32,8 @@ if TYPE_CHECKING:
     from liex_lab.simulation.recording import TrueRecording
 
     Subject = PoseEstimator | Baseline
+
+Array = NDArray[np.float64]
 
 ROWS = ("default", "paper", "paper-one-pose", "paper-no-metric", "rf", "cnn")
 # trainings that a row is pooled over, where there are several
@@ -42,6 +47,8 @@ _QUANTILES = 101
 def runs_of(animal: str, variant: str, progress: Progress = silent) -> list[Subject]:
     """The runs of a row: its models, each with its draws of the initial poses.
 
+    A cached model that other code trained, or nobody knows which, is trained again.
+
     Args:
         animal: a bundled animal's name, or the path of a skeleton's TOML.
         variant: a name of `ROWS`.
@@ -50,14 +57,15 @@ def runs_of(animal: str, variant: str, progress: Progress = silent) -> list[Subj
     Raises:
         MissingPackageError: the CNN is asked for and torch is not installed.
     """
-    from ..pose import estimator_of, subject_of
+    from ...training.baselines import BASELINES
+    from ..pose import estimator_of
 
-    n = TRAINING_DRAWS.get(variant, 1)
-    if n == 1:
-        return [subject_of(animal, variant, progress)]
-    return runs_of_models(
-        variant, [estimator_of(animal, "paper", progress, draw=draw) for draw in range(n)]
-    )
+    if variant in BASELINES:
+        return [baseline_of_today(animal, variant, progress)]
+    if variant not in TRAINING_DRAWS:
+        return [estimator_of(animal, variant, progress)]
+    n = TRAINING_DRAWS[variant]
+    return runs_of_models(variant, [paper_of_today(animal, draw, progress) for draw in range(n)])
 
 
 def runs_of_models(variant: str, models: Sequence[PoseEstimator]) -> list[Subject]:
@@ -117,7 +125,7 @@ def measured_rows(
     views: Mapping[str, Sequence[CommonView]],
     progress: Progress,
 ) -> dict[str, dict[str, Any]]:
-    """The measured figures of each row: `splits` and `rate`.
+    """What is measured of each row: `splits` and `rate`, `examples` and `failures`.
 
     Args:
         animal: a bundled animal's name, or the path of a skeleton's TOML.
@@ -126,14 +134,18 @@ def measured_rows(
         views: what every row is given in each of them.
         progress: told recording by recording.
     """
-    rows: dict[str, dict[str, Any]] = {name: {"splits": {}} for name in runs}
+    rows: dict[str, dict[str, Any]] = {
+        name: {"splits": {}, "examples": [], "failures": []} for name in runs
+    }
     for split, sessions in tests.items():
-        errors = _errors_of(animal, runs, sessions, views[split], progress)
+        errors, first = _errors_of(animal, runs, sessions, views[split], progress)
         for name, of_runs in errors.items():
             rows[name]["splits"][split] = numbers_of(of_runs, views[split])
+            rows[name]["examples"] += examples_in(split, first[name], sessions)
+            rows[name]["failures"] += failures_in(split, first[name], sessions)
     progress(0, None, "timing")
-    first = {name: some[0] for name, some in runs.items()}
-    for name, rate in rates_of(animal, first, next(iter(tests.values()))).items():
+    timed = {name: some[0] for name, some in runs.items()}
+    for name, rate in rates_of(animal, timed, next(iter(tests.values()))).items():
         rows[name]["rate"] = rate
     return rows
 
@@ -144,14 +156,17 @@ def _errors_of(
     sessions: Sequence[TrueRecording],
     views: Sequence[CommonView],
     progress: Progress,
-) -> dict[str, list[PoseErrors]]:
-    """Errors of every run of every row over the frames of a split, in order."""
+) -> tuple[dict[str, list[PoseErrors]], dict[str, list[Array]]]:
+    """Errors of every run of every row over the frames of a split, in order; and the joints that
+    the first run of each finds in each recording.
+    """
     from ...build import build_scene
 
     plan = plan_of(animal)
     parts: dict[str, list[list[PoseErrors]]] = {
         name: [[] for _ in some] for name, some in runs.items()
     }
+    first: dict[str, list[Array]] = {name: [] for name in runs}
     skeleton = next(iter(runs.values()))[0].skeleton
     for k, (recording, view) in enumerate(zip(sessions, views, strict=True)):
         progress(k, len(sessions), f"measuring {recording.name}")
@@ -160,12 +175,15 @@ def _errors_of(
         for name, subjects in runs.items():
             for part, subject in zip(parts[name], subjects, strict=True):
                 joints, predicted_mm, quantiles = measured(subject, frames, scene, view, cut)
+                if subject is subjects[0]:
+                    first[name].append(joints)
                 part.append(
                     PoseErrors.compare(
                         joints, recording.joints_camera, skeleton.tip, predicted_mm, quantiles
                     )
                 )
-    return {name: [PoseErrors.join(part) for part in some] for name, some in parts.items()}
+    errors = {name: [PoseErrors.join(part) for part in some] for name, some in parts.items()}
+    return errors, first
 
 
 def numbers_of(runs: Sequence[PoseErrors], views: Sequence[CommonView]) -> dict[str, Any]:

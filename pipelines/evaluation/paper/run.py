@@ -15,16 +15,16 @@ from __future__ import annotations
 import hashlib
 import platform
 import shlex
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 from liex_lab.catalog import MODELS
-from liex_lab.errors import MissingPackageError, PlanError
+from liex_lab.errors import MissingPackageError
 from liex_lab.evaluation.pose import plain
 from liex_lab.runtime.progress import Progress, silent
 
+from .budget import Budget
 from .results import Results
 from .rows import ROWS, TRAINING_DRAWS
 
@@ -34,63 +34,12 @@ if TYPE_CHECKING:
     from liex_lab.simulation.recording import TrueRecording
 
     from .common_view import CommonView
+    from .drawers import Drawers
+    from .further import Further
     from .rows import Subject
 
 SWEPT = ("paper", "default")  # variants whose sensitivity is drawn
 _N_SESSIONS = 40
-_QUICK_FRAMES = 100
-Draw = Callable[[Mapping[str, Any], Path], list[Path]]
-
-
-@dataclass(frozen=True)
-class Budget:
-    """How much is measured, and of what.
-
-    Attributes:
-        n_frames: frames of each split, rounded up to whole recordings; None takes all.
-        fresh: rows that are trained and measured now; the others come from datasets/kept_results.
-        kept: results that fit are taken from there.
-        quick: every row is trained on next to nothing, to see that everything runs.
-        sealed: the sealed split is measured instead of the others.
-        n_illustrated: images behind the figures of candidates and convergence.
-    """
-
-    n_frames: int | None = None
-    fresh: tuple[str, ...] = ()
-    kept: bool = True
-    quick: bool = False
-    sealed: bool = False
-    n_illustrated: int = 128
-
-    @staticmethod
-    def of(
-        n_frames: int | None, quick: bool, fresh: bool, rows: Sequence[str], sealed: bool
-    ) -> Budget:
-        """What the options of the command line ask for.
-
-        Args:
-            n_frames: frames of each split; with any, nothing kept is used.
-            quick: every row is trained on next to nothing.
-            fresh: the rows are trained and measured now.
-            rows: names of rows; () takes all.
-            sealed: the sealed split; with it, nothing kept is used.
-
-        Raises:
-            PlanError: there is no such row.
-        """
-        if unknown := [row for row in rows if row not in ROWS]:
-            raise PlanError(f"there is no row '{unknown[0]}'; known are {', '.join(ROWS)}")
-        wanted = tuple(row for row in ROWS if not rows or row in rows or row == "default")
-        if quick:
-            return Budget(n_frames or _QUICK_FRAMES, wanted, False, True, sealed, 16)
-        whole = n_frames is None and not sealed
-        return Budget(
-            n_frames,
-            wanted if fresh or not whole else ("default",),
-            whole and not (fresh and not rows),
-            False,
-            sealed,
-        )
 
 
 def make_tables(
@@ -102,10 +51,12 @@ def make_tables(
     fresh: bool = False,
     rows: Sequence[str] = (),
     sealed: bool = False,
-    draw: Draw | None = None,
+    without: Sequence[str] = (),
+    nyu: Path | None = None,
+    drawers: Drawers | None = None,
     progress: Progress = silent,
 ) -> list[Path]:
-    """Write tables, figures and the form in which results are kept into a folder.
+    """Write tables, figures, their page, and the form in which results are kept into a folder.
 
     Args:
         out: the folder; it is made where it is missing.
@@ -116,18 +67,23 @@ def make_tables(
         fresh: rows are trained and measured now, not taken from kept results.
         rows: only these rows are, beside the default; () takes all.
         sealed: measure the sealed split instead of the others, as is done once when an issue ends.
-        draw: makes the figures from what `results` holds, by animal, in the folder.
+        without: parts that belong to other verbs and are left out, `tracking` or `actions`.
+        nyu: folder of the NYU hand data, for Table 2; None leaves it out.
+        drawers: make the figures and the page, of which `tracking`, `actions` and `nyu` are parts;
+            None makes neither.
         progress: told how far the job is.
 
     Returns:
         The paths of all files that were written.
 
     Raises:
-        PlanError: there is no such row.
+        PlanError: there is no such row, or part.
     """
     from .cached_results import keep_results
+    from .further import check_parts, measure_further
     from .table_text import write_tables
 
+    check_parts(without)
     budget = Budget.of(n_frames, quick, fresh, rows, sealed)
     command = _command(animals, n_frames, quick, fresh, rows, sealed)
     folder = Path(out)
@@ -137,10 +93,36 @@ def make_tables(
     for results in all_results:
         kept = _unmarked(results.rows), _unmarked(results.sensitivity)
         written.append(keep_results(folder / "kept", results.animal, *kept))
-    if draw is not None:
-        progress(0, None, "drawing")
-        written += draw({r.animal: vars(r) for r in all_results}, folder)
-    return written
+    if drawers is None:
+        return written
+    further = measure_further(
+        folder, without=without, nyu=nyu, quick=quick, drawers=drawers, progress=progress
+    )
+    progress(0, None, "drawing")
+    return written + _drawn(folder, all_results, further, quick, drawers)
+
+
+def _drawn(
+    folder: Path, results: Sequence[Results], further: Further, quick: bool, drawers: Drawers
+) -> list[Path]:
+    """All figures, and the page that holds them."""
+    from .deviations import DEVIATIONS
+    from .exhibits import exhibits
+    from .table_text import HOW, QUICK, SEALED
+
+    figures = drawers.figures({r.animal: vars(r) for r in results}, folder)
+    figures += [folder / name for name in further.figures]
+    about = {
+        "title": "Tables and figures of Lie-X, on rendered test frames",
+        "about": [HOW.replace("*", "")],
+        "warnings": [
+            *([QUICK.strip("*")] if quick else []),
+            *([SEALED.replace("*", "")] if any(r.sealed for r in results) else []),
+        ],
+        "differences": DEVIATIONS,
+    }
+    shown = exhibits(results, further, figures, quick)
+    return [*figures, drawers.page(about, shown, folder / "index.html")]
 
 
 def _command(
@@ -189,7 +171,7 @@ def results_of(animal: str, budget: Budget, command: str, progress: Progress) ->
     default = _subjects(animal, ["default"], budget, results, progress)
     chooser = cast("PoseEstimator", default["default"][0])
     views = common_views(animal, chooser, tests, progress)
-    kept = _kept(skeleton, budget, views, results)
+    kept = _kept(skeleton, budget, tests, views, results)
     wanted = [name for name in budget.fresh if name != "default"]
     runs = default | _subjects(animal, wanted, budget, results, progress)
     for name, row in measured_rows(animal, runs, tests, views, progress).items():
@@ -211,7 +193,23 @@ def results_of(animal: str, budget: Budget, command: str, progress: Progress) ->
     results.sensitivity = _sensitivities(skeleton, kept, budget, command, results, progress)
     progress(0, None, f"{skeleton.name}: candidates and convergence")
     results.illustration = illustrate(chooser.model, budget.n_illustrated)
+    results.examples, results.failures = _poses(results, tests)
     return results
+
+
+def _poses(
+    results: Results, tests: Mapping[str, Sequence[TrueRecording]]
+) -> tuple[list[dict[str, Any]], dict[str, list[dict[str, Any]]]]:
+    """The poses that are drawn: of all rows in the examples, and where two rows err most."""
+    from .examples import shown_poses
+
+    examples = {name: row["examples"] for name, row in results.rows.items() if "examples" in row}
+    failures = {
+        name: shown_poses(some, {name: some}, tests)
+        for name in SWEPT[::-1]
+        if (some := results.rows.get(name, {}).get("failures"))
+    }
+    return shown_poses(examples["default"], examples, tests), failures
 
 
 def _tests(skeleton: Skeleton, budget: Budget) -> dict[str, Sequence[TrueRecording]]:
@@ -230,11 +228,13 @@ def _tests(skeleton: Skeleton, budget: Budget) -> dict[str, Sequence[TrueRecordi
 def _kept(
     skeleton: Skeleton,
     budget: Budget,
+    tests: Mapping[str, Sequence[TrueRecording]],
     views: Mapping[str, Sequence[CommonView]],
     results: Results,
 ) -> Mapping[str, Any]:
     """Kept rows that fit go into the results, why another does not into `missing`; the curves."""
     from .cached_results import kept_results, why_refused
+    from .kept_examples import examples_of_kept
 
     if not budget.kept:
         for name in ROWS:
@@ -254,6 +254,8 @@ def _kept(
             results.missing[name] = f"{why}; {_anew(skeleton.name, name)} measures it"
         else:
             results.rows[name] = {**row, "origin": "kept"}
+            if found := examples_of_kept(skeleton.name, name, row, tests, views):
+                results.rows[name]["examples"] = found
     return cast("Mapping[str, Any]", kept["sensitivity"])
 
 

@@ -19,55 +19,11 @@ from typing import TYPE_CHECKING, Any
 from liex_lab.evaluation.pose import POSE_PROTOCOL, plain
 
 from .deviations import DEVIATIONS, HAND
+from .published import OTHERS_FPS, OTHERS_MM, PUBLISHED_FPS, PUBLISHED_MM, TITLES
 
 if TYPE_CHECKING:
     from .results import Results
 
-TITLES = {
-    "default": "liex_lab (default)",
-    "paper": "Lie-X, the paper's variant",
-    "paper-one-pose": "Lie-X without multiple initial poses",
-    "paper-no-metric": "Lie-X without the learned metric",
-    "rf": "RF",
-    "cnn": "CNN",
-}
-# Lie-X, Tables 1 and 2: mean joint error, real recordings, another camera and other animals
-PUBLISHED_MM = {
-    "fish": {
-        "paper": 0.68,
-        "paper-one-pose": 3.28,
-        "paper-no-metric": 1.71,
-        "rf": 1.28,
-        "cnn": 0.79,
-    },
-    "mouse": {
-        "paper": 6.64,
-        "paper-one-pose": 13.27,
-        "paper-no-metric": 9.82,
-        "rf": 12.24,
-        "cnn": 9.17,
-    },
-    "hand": {
-        "paper": 14.51,
-        "paper-one-pose": 20.50,
-        "paper-no-metric": 16.72,
-        "rf": 24.81,
-        "cnn": 18.82,
-    },
-}
-OTHERS_MM = {
-    "Tompson et al.": 21.0,
-    "Oberweger et al. (a)": 20.0,
-    "Oberweger et al. (b)": 16.5,
-    "Zhou et al.": 16.9,
-}
-PUBLISHED_FPS = {"fish": 83.0, "mouse": 267.0, "hand": 123.0}
-OTHERS_FPS = {
-    "Tompson et al.": 30,
-    "Oberweger et al. (a)": 5000,
-    "Oberweger et al. (b)": 400,
-    "Zhou et al.": 125,
-}
 _COLUMNS = (
     "animal",
     "split",
@@ -109,11 +65,11 @@ _FLAT = (
     "n_frames",
     "n_recordings",
 )
-_QUICK = (
+QUICK = (
     "**A quick run: few frames, and every row but the default trained on next to nothing. Its "
     "numbers say that everything runs, and nothing about the methods.**"
 )
-_HOW = (
+HOW = (
     "The test frames are rendered, with arenas and animals that no model has seen; the cameras of "
     "other-camera (and of a quarter of sealed) have focal lengths and resolutions that no model "
     "was trained on, those of the other splits are of the makes that all learned from, at places "
@@ -131,7 +87,7 @@ _HOW = (
     "too, on frames in memory; those of a kept row are of another run, so compare its ratio to "
     "the default, which was timed beside it."
 )
-_SEALED = (
+SEALED = (
     "**The sealed split.** Its recordings are looked at once, when an issue ends: whoever chooses "
     "anything by these numbers breaks the seal for everybody."
 )
@@ -161,29 +117,39 @@ def write_tables(folder: Path, results: Sequence[Results], quick: bool) -> list[
             written.append(_write_csv(folder / f"table{number}.csv", rows))
     text = [
         "# Tables 1 to 3 of Lie-X, on rendered test frames",
-        *([_QUICK] if quick else []),
-        *([_SEALED] if any(r.sealed for r in results) else []),
-        _HOW,
+        *([QUICK] if quick else []),
+        *([SEALED] if any(r.sealed for r in results) else []),
+        HOW,
         POSE_PROTOCOL,
     ]
     for number, part in ((1, first), (2, second)):
         for r in part:
             text += [
                 f"## Table {number}: {r.animal}, joint error in mm",
-                _table(r),
+                _grid(*error_table(r)),
                 *([HAND] if r.animal == "hand" else []),
-                *_words(r, quick),
+                *words(r, quick),
             ]
     text += [
         "## Table 3: frames per second",
-        _rate_table(results),
+        _grid(*rate_table(results)),
         "## How each row was made",
-        _origins(results),
+        _grid(*origin_table(results)),
         "## What differs from the paper",
         "\n".join(f"- {sentence}" for sentence in DEVIATIONS),
     ]
     (folder / "tables.md").write_text("\n\n".join(text) + "\n", encoding="utf-8")
-    content = plain({r.animal: vars(r) for r in results})
+    # the poses are with the rows; what is drawn of them holds pictures
+    content = plain(
+        {
+            r.animal: {
+                name: value
+                for name, value in vars(r).items()
+                if name not in ("examples", "failures")
+            }
+            for r in results
+        }
+    )
     (folder / "results.json").write_text(
         json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8"
     )
@@ -262,8 +228,15 @@ def _number(value: float | None, digits: int = 2) -> str:
     return "" if value is None else f"{value:.{digits}f}"
 
 
-def _table(results: Results) -> str:
-    """One animal: a row for each method; for each split median with interval, mean, and objects."""
+def error_table(results: Results) -> tuple[list[str], list[list[str]]]:
+    """One animal: a row for each method; for each split median with interval, mean, and objects.
+
+    Args:
+        results: of the animal.
+
+    Returns:
+        The head, and the rows.
+    """
     head = ["method"]
     for split in results.splits:
         head += [f"{split}: median (95 %)", "mean", "wrong object (alone)", "flips"]
@@ -284,7 +257,7 @@ def _table(results: Results) -> str:
         for title, value in OTHERS_MM.items():
             empty = [""] * (4 * len(results.splits))
             rows.append([title, *empty, "", _number(value), "published"])
-    return _grid([*head, "frames", "published, other data: mean", ""], rows)
+    return [*head, "frames", "published, other data: mean", ""], rows
 
 
 def _cells(numbers: dict[str, Any]) -> list[str]:
@@ -300,9 +273,15 @@ def _cells(numbers: dict[str, Any]) -> list[str]:
     ]
 
 
-def _words(results: Results, quick: bool) -> list[str]:
-    """Which rows are missing and, unless the run was quick, where the order is not the paper's, in
-    sentences.
+def words(results: Results, quick: bool) -> list[str]:
+    """Which rows are missing and, unless the run was quick, where the order is not the paper's.
+
+    Args:
+        results: of one animal.
+        quick: the rows were trained on next to nothing.
+
+    Returns:
+        Sentences.
     """
     sentences = [
         f"{TITLES.get(variant, variant)} was not measured: {why}."
@@ -350,7 +329,15 @@ def _turned_pairs(results: Results) -> Iterator[str]:
             )
 
 
-def _rate_table(results: Sequence[Results]) -> str:
+def rate_table(results: Sequence[Results]) -> tuple[list[str], list[list[str]]]:
+    """Frames per second of each method.
+
+    Args:
+        results: of all animals.
+
+    Returns:
+        The head, and the rows.
+    """
     rows = []
     for r in results:
         for variant, row in r.rows.items():
@@ -370,14 +357,19 @@ def _rate_table(results: Sequence[Results]) -> str:
             )
     for title, value in OTHERS_FPS.items() if any(r.animal == "hand" for r in results) else ():
         rows.append(["hand", title, "", "", "", "", f"{_number(value, 0)} (GPU)", "published"])
-    return _grid(
-        ["animal", "method", "frames/s", "ratio to default", "picture", "cores", "published", ""],
-        rows,
-    )
+    head = ["animal", "method", "frames/s", "ratio to default", "picture", "cores", "published", ""]
+    return head, rows
 
 
-def _origins(results: Sequence[Results]) -> str:
-    """Command, seed, version and amount of training of each row."""
+def origin_table(results: Sequence[Results]) -> tuple[list[str], list[list[str]]]:
+    """Command, seed, version and amount of training of each row.
+
+    Args:
+        results: of all animals.
+
+    Returns:
+        The head, and the rows.
+    """
     rows = []
     for r in results:
         for variant, row in r.rows.items():
@@ -395,16 +387,5 @@ def _origins(results: Sequence[Results]) -> str:
                     f"`{made['command']}`",
                 ]
             )
-    return _grid(
-        [
-            "animal",
-            "method",
-            "",
-            "training images",
-            "seed (trainings)",
-            "version (code)",
-            "machine",
-            "command",
-        ],
-        rows,
-    )
+    head = ["animal", "method", "", "training images", "seed (trainings)", "version (code)"]
+    return [*head, "machine", "command"], rows

@@ -6,30 +6,42 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 from pathlib import Path
 from typing import Any
 
 import numba
 import numpy as np
 import pytest
+from liex_lab.dashboards.paper.confusion import draw_confusions
+from liex_lab.dashboards.paper.key_frames import draw_key_frames
+from liex_lab.dashboards.paper.page import write_page
 from liex_lab.dashboards.paper.plates import draw_figures
+from liex_lab.dashboards.paper.tracking import draw_tracking
 from liex_lab.pipelines.evaluation import pose
 from liex_lab.pipelines.evaluation.paper import (
     cached_results,
     common_view,
+    examples,
+    exhibits,
     fingerprints,
+    kept_examples,
     quick,
     rows,
     run,
     table_text,
+    trained_by,
 )
 from liex_lab.pipelines.evaluation.paper.deviations import DEVIATIONS
+from liex_lab.pipelines.evaluation.paper.drawers import Drawers
+from liex_lab.pipelines.evaluation.paper.further import PARTS, Further
 from liex_lab.pipelines.evaluation.paper.sensitivity import (
     Sweep,
     chosen_values,
     with_value,
     without_void,
 )
+from liex_lab.pipelines.training import pose_model
 from liex_lab.pipelines.training.baselines import training_of
 
 from liex_lab.baselines.forest import ForestPlan, train_forests
@@ -51,9 +63,13 @@ FIGURES = [
     "error_per_joint.png",
     "fig07_sensitivity.png",
     "fig08_cumulative_error.png",
+    "fig09_poses_mouse.png",
+    "fig09_poses_mouse_side.png",
     "fig13_candidates_mouse.png",
     "fig16_convergence_mouse.png",
+    "fig17_failures_mouse.png",
 ]
+DRAWERS = Drawers(draw_figures, draw_tracking, draw_confusions, draw_key_frames, write_page)
 
 
 class SmallWorld(simulator.MouseSimulator):
@@ -102,7 +118,9 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
         )
         patch.setattr(rows, "_RATE_FRAMES", 8)
         patch.setattr(rows, "_RATE_REPEATS", 1)
-        written = run.make_tables(out, ["mouse"], quick=True, n_frames=20, draw=draw_figures)
+        written = run.make_tables(
+            out, ["mouse"], quick=True, n_frames=20, without=PARTS, drawers=DRAWERS
+        )
     assert all(path.is_file() for path in written)
     return out
 
@@ -150,6 +168,135 @@ def test_every_figure_is_a_picture(made):
         picture = np.asarray(cv2.imread(str(made / name)))
         assert min(picture.shape[:2]) > 250
         assert picture.std() > 10
+
+
+@pytest.mark.slow
+def test_the_page_holds_every_table_and_figure_with_a_sentence_and_asks_no_other_machine(made):
+    page = (made / "index.html").read_text(encoding="utf-8")
+    labels = [*(f"Table {k}" for k in (1, 2, 3)), *(f"Fig. {k}" for k in range(1, 21))]
+    assert re.findall(r"<h2>([^<]+)<span>", page) == labels
+    sections = page.split("<section ")[1:-1]
+    for section in sections:
+        (said,) = re.findall(r'<p class="said">(.+?)</p>', section)
+        assert len(said) > 20
+    assert page.count("data:image/png;base64,") == len(FIGURES) - 1  # error per joint is not theirs
+    assert not re.findall(r"""(?:src|href)=["'](?!data:|#)""", page)
+    assert "url(" not in page
+    assert "A quick run" in page
+    told = dict(zip(labels, sections, strict=True))
+    assert "Lie-X without the learned metric" in told["Table 1"]
+    assert "Not made: the hand was not asked for" in told["Fig. 10"]
+    for label, verb in (("Fig. 18", "tracking"), ("Fig. 19", "actions"), ("Fig. 20", "actions")):
+        assert f"it was left out; `liex evaluate {verb}" in told[label]
+    assert "liex evaluate nyu" in told["Table 2"]
+
+
+@pytest.mark.slow
+def test_kept_rows_keep_their_poses_in_the_examples(made):
+    kept = json.loads((made / "kept" / "mouse.json").read_text())["rows"]
+    recordings = {split: SmallWorld().test_split(split) for split in ("clean", "hard")}
+    places = [
+        {"split": split, "recording": k, "frame": i}
+        for split, some in recordings.items()
+        for k, i in examples.example_frames(some)
+    ]
+    assert len(places) == 4
+    for name, row in kept.items():
+        assert [{key: one[key] for key in places[0]} for one in row["examples"]] == places
+        again = kept_examples.examples_of_kept("mouse", name, row, recordings, {})
+        assert again == row["examples"]
+        shown = examples.shown_poses(places, {name: again}, recordings)
+        for one in shown:
+            recording = recordings[one["split"]][one["recording"]]
+            np.testing.assert_array_equal(one["truth"], recording.joints_camera[one["frame"]])
+            uv = one["camera"].project(one["truth"]).round().astype(int)
+            assert (one["depth"][uv[:, 1], uv[:, 0]] > 0).mean() > 0.5
+        worst = row["failures"][0]
+        assert worst["error_mm"] >= max(0.0, row["splits"]["clean"]["median_mm"])
+
+
+def test_a_kept_row_without_poses_gets_them_only_from_the_very_model_it_was_measured_with(
+    monkeypatch,
+):
+    recordings = {"hard": SmallWorld().test_split("hard")[:1]}
+    chooser = PoseEstimator.load("mouse")
+    views = rows.common_views("mouse", chooser, recordings, silent)
+    monkeypatch.setattr(fingerprints, "model_digests", lambda *_: ["a"])
+    monkeypatch.setattr(pose, "subject_of", lambda *_: chooser)
+    found, refused = (
+        kept_examples.examples_of_kept(
+            "mouse", "rf", {"made": {"models": [digest]}}, recordings, views
+        )
+        for digest in ("a", "b")
+    )
+    assert refused == []
+    ((k, i),) = examples.example_frames(recordings["hard"])
+    (one,) = found
+    assert (one["recording"], one["frame"]) == (k, i)
+    off = np.array(one["joints_mm"]) - recordings["hard"][0].joints_camera[i]
+    assert np.linalg.norm(off, axis=-1).mean() < 15
+
+
+def test_every_figure_of_the_paper_is_made_or_said_to_be_a_drawing():
+    told = exhibits.exhibits([], Further(), [], quick=False)
+    assert len(told) == 23
+    for one in told:
+        drawing = one["title"] == "Drawing"
+        assert drawing == (one["label"].removeprefix("Fig. ") in exhibits.DRAWINGS)
+        assert one["said"].endswith(".")
+        assert drawing or "Same" in one["said"] or one["label"] in ("Fig. 12", "Fig. 14", "Fig. 15")
+
+
+def test_a_part_that_is_none_is_refused_before_anything_is_measured(tmp_path):
+    with pytest.raises(PlanError, match=r"no part 'speed'.*tracking, actions"):
+        run.make_tables(tmp_path / "out", ["mouse"], without=["speed"])
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_cached_model_of_other_or_unknown_code_is_trained_again(tmp_path):
+    path = tmp_path / "mouse-paper-0.npz"
+    told = tmp_path / "mouse-paper-0.trained-by.json"
+    path.write_bytes(b"unknown")
+    trained_by.forget_unless_of(path, "today")
+    assert not path.exists()  # nobody knows which code trained it
+    path.write_bytes(b"model")
+    trained_by.note(path, "today")
+    trained_by.forget_unless_of(path, "today")
+    assert path.exists()
+    trained_by.forget_unless_of(path, "tomorrow")
+    assert not path.exists()
+    assert not told.exists()
+    path.write_bytes(b"model")
+    trained_by.note(path, "today")
+    path.write_bytes(b"another")
+    trained_by.forget_unless_of(path, "today")
+    assert not path.exists()  # the note is of another file
+    path.write_bytes(b"model")
+    told.write_text("no json")
+    assert not trained_by.is_of(path, "today")
+
+
+@pytest.mark.parametrize("variant", ["paper", "paper-one-pose", "paper-no-metric"])
+def test_a_row_that_is_measured_anew_does_not_take_a_model_without_a_note(
+    variant, monkeypatch, tmp_path
+):
+    monkeypatch.setenv("LIEX_CACHE", str(tmp_path))
+    trained_now = []
+
+    def cached(animal: str, name: str, progress: Any = silent, draw: int = 0) -> Any:
+        path = pose_model.cache_path(animal, name, draw)
+        if not path.is_file():
+            trained_now.append(draw)
+            path.write_bytes(b"fresh")
+        return path
+
+    monkeypatch.setattr(pose_model, "cached_model", cached)
+    monkeypatch.setattr("liex_lab.estimation.model.Model.load", lambda path: trained("paper").model)
+    pose_model.cache_path("mouse", "paper").write_bytes(b"of older code")
+    rows.runs_of("mouse", variant)
+    assert trained_now == [0, 1, 2]
+    rows.runs_of("mouse", variant)
+    assert trained_now == [0, 1, 2]  # now it is known
 
 
 @pytest.mark.slow
@@ -296,21 +443,21 @@ def test_words_follow_the_numbers():
         "rf": 6.0,
         "paper-one-pose": 7.0,
     }
-    (sentence,) = table_text._words(results_with(order), quick=False)
+    (sentence,) = table_text.words(results_with(order), quick=False)
     assert "in another order" in sentence
-    (turned,) = table_text._words(results_with(order | {"rf": 4.5}), quick=False)
+    (turned,) = table_text.words(results_with(order | {"rf": 4.5}), quick=False)
     assert "on the same object" in turned
     assert (
         "RF is ahead on clean (median 4.50 against 5.00 mm), hard (median 5.50 against 6.00 mm)."
         in turned
     )
-    ahead, *others = table_text._words(results_with(order | {"cnn": 1.5}), quick=False)
+    ahead, *others = table_text.words(results_with(order | {"cnn": 1.5}), quick=False)
     assert ahead == (
         "CNN is ahead of the default on clean (median 1.50 against 2.00 mm), hard (median 2.50 "
         "against 3.00 mm)."
     )
     assert len(others) == 1  # and of the paper's variant
-    (unsure,) = table_text._words(results_with(order | {"rf": 4.5}, half=0.6), quick=False)
+    (unsure,) = table_text.words(results_with(order | {"rf": 4.5}, half=0.6), quick=False)
     assert "ahead" not in unsure  # the intervals overlap
 
 

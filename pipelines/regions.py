@@ -1,0 +1,193 @@
+"""Regions that a plan states, placed in the pictures of a recording, and arenas that it proposes.
+
+An arena is cut out of a picture by making everything outside of its region unread: the size of the
+picture and its camera stay, so that whatever is measured within keeps its place and a session of an
+arena among several is that of a recording which shows nothing else. Regions in millimetres need the
+floor, which is found in the whole picture, or stated.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from liex_lab.errors import PlanError
+from liex_lab.plan import Plan
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from liex_lab.arena.floor import Floor
+    from liex_lab.arena.region import Corners
+    from liex_lab.optics.camera import Camera
+    from liex_lab.plan.sections import Region, SeveralArenas
+    from liex_lab.recordings.recording import Recording
+
+_N_SAMPLED = 96
+
+
+def cut_out(recording: Recording, plan: Plan) -> Recording:
+    """The recording with all but the plan's region unread; itself where the plan states none.
+
+    Args:
+        recording: an ideal pinhole's recording.
+        plan: its setting `arena.region`.
+
+    Raises:
+        PlanError: the region is none in this picture.
+        EstimationError: it is stated in millimetres, and no floor is found.
+    """
+    if plan.arena.region is None or recording.region_px:
+        return recording
+    return recording.masked(stated_corners(recording, plan, plan.arena.region))
+
+
+def stated_corners(recording: Recording, plan: Plan, region: Region) -> Corners:
+    """The corners (u, v) px of a region in the pictures of a recording.
+
+    Args:
+        recording: an ideal pinhole's recording, of the whole picture.
+        plan: states the floor, or the animals that stand on it.
+        region: the region.
+    """
+    from liex_lab.arena.region import region_corners_px
+
+    floor = None if region.unit == "px" else _floor_of_picture(recording, plan)
+    return region_corners_px(region, recording.camera, floor)
+
+
+def pinned(plan: Plan, recording: Recording) -> Plan:
+    """The plan with its region in pixels, where it is stated in another way.
+
+    Args:
+        plan: the plan.
+        recording: the recording, cut out.
+    """
+    if not recording.region_px:
+        return plan
+    corners = [list(corner) for corner in recording.region_px]
+    return plan.with_settings([f"arena.region={corners}"])
+
+
+def stated_floor(camera: Camera, plan: Plan) -> Floor | None:
+    """The floor that the plan states, None where it is to be found.
+
+    Args:
+        camera: the ideal pinhole camera of the recording.
+        plan: its setting `arena.floor`.
+
+    Raises:
+        PlanError: the floor does not face the camera.
+    """
+    from liex_lab.arena.scene import plane_of
+
+    floor = plan.arena.floor
+    return None if isinstance(floor, str) else plane_of(floor.point, floor.normal, camera)
+
+
+def region_of(recording: Recording, plan: Plan) -> NDArray[np.bool_] | None:
+    """Where (H, W) in the picture is looked at; None where everywhere.
+
+    Args:
+        recording: an ideal pinhole's recording, cut out or not.
+        plan: its setting `arena.region`.
+
+    Raises:
+        PlanError: the region is none in this picture.
+    """
+    from liex_lab.arena.scene import region_mask
+
+    corners = recording.region_px
+    if not corners and plan.arena.region is not None:
+        corners = stated_corners(recording, plan, plan.arena.region)
+    return region_mask(corners, recording.width, recording.height) if corners else None
+
+
+def _floor_of_picture(recording: Recording, plan: Plan) -> Floor:
+    """The floor on which animals stand in the whole picture, or the one that the plan states."""
+    from liex_lab.arena.floor import Floor
+    from liex_lab.body.skeleton import Skeleton
+    from liex_lab.foreground.background import learn_background, sample_frames, stride_for
+    from liex_lab.foreground.standing import find_standing
+
+    stated = stated_floor(recording.camera, plan)
+    if stated is not None:
+        return stated
+    animal = plan.animal
+    stride = stride_for(recording, animal.spine_min_mm)
+    sample = sample_frames(recording, _N_SAMPLED, stride)
+    background, spread, _ = learn_background(sample)
+    found = find_standing(
+        sample,
+        background,
+        spread,
+        recording.camera.every(stride),
+        (animal.spine_min_mm, animal.spine_max_mm),
+        plan.foreground.min_height_mm,
+        Skeleton.load(animal.skeleton).view,
+    ).floor
+    return Floor.from_plane(found.normal, found.distance_mm, recording.camera)
+
+
+def arenas_of(recording: Recording, plan: Plan) -> list[SeveralArenas]:
+    """The several arenas of a picture, as the plan lists them or as they are proposed.
+
+    Args:
+        recording: an ideal pinhole's recording, of the whole picture.
+        plan: its setting `arenas`.
+
+    Raises:
+        PlanError: it says 'auto', and fewer than two are seen.
+    """
+    if plan.arenas != "auto":
+        return list(plan.arenas or ())
+    found = propose_arenas(recording, plan)
+    if len(found) < 2:
+        raise PlanError(
+            "arenas = 'auto' proposes several arenas in which animals move, and fewer than two are "
+            "seen in this picture; leave the line out, or list them as [[arenas]] with name and "
+            "region"
+        )
+    return found
+
+
+def propose_arenas(recording: Recording, plan: Plan) -> list[SeveralArenas]:
+    """The arenas in which animals are seen moving, from left to right and top to bottom.
+
+    Args:
+        recording: an ideal pinhole's recording, of the whole picture.
+        plan: the animals' sizes and the foreground's thresholds.
+
+    Returns:
+        Two to eight of them with a polygon each that touches no other; [] where only one is seen.
+    """
+    from liex_lab.body.skeleton import VIEWS, Skeleton
+    from liex_lab.foreground.background import learn_background, sample_frames, stride_for
+    from liex_lab.foreground.several import arenas_apart
+    from liex_lab.plan.sections import SeveralArenas
+
+    animal = plan.animal
+    view = Skeleton.load(animal.skeleton).view
+    if view.frame != VIEWS[0] or recording.region_px:
+        return []
+    stride = stride_for(recording, animal.spine_min_mm)
+    sample = sample_frames(recording, _N_SAMPLED, stride)
+    background, spread, _ = learn_background(sample)
+    outlines = arenas_apart(
+        sample,
+        background,
+        spread,
+        recording.camera.every(stride),
+        (animal.spine_min_mm, animal.spine_max_mm),
+        plan.foreground.min_height_mm,
+        view,
+    )
+    return [
+        SeveralArenas.model_validate(
+            {
+                "name": f"arena{k}",
+                "region": [[float(stride * u), float(stride * v)] for u, v in corners],
+            }
+        )
+        for k, corners in enumerate(outlines, 1)
+    ]

@@ -1,0 +1,106 @@
+"""Cables are cut out of pictures, and what wears none is not touched."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from liex_lab.arena.floor import Floor
+from liex_lab.foreground.cable import Cable
+from liex_lab.optics.camera import Camera
+
+CAMERA = Camera(365.0, 365.0, 159.5, 119.5, 320, 240)
+FLOOR_MM = 660.0
+FLOOR = Floor.from_plane(np.array([0.0, 0.0, 1.0]), FLOOR_MM, CAMERA)
+LIMIT = np.full((240, 320), FLOOR_MM - 7.0, np.float32)
+LONGEST_MM = 115.0
+AREA_MM2 = 190.0
+BODY_MM = 25.0
+
+
+def drawn(heights: np.ndarray) -> np.ndarray:
+    return (FLOOR_MM - heights).astype(np.float32)
+
+
+def mouse(x: float = 0.0, tail: bool = True) -> np.ndarray:
+    """Heights (H, W) mm of half an ellipsoid with a snout and a tail, x px to the right."""
+    v, u = np.mgrid[:240, :320]
+    along = (u - 150.0 - x) * FLOOR_MM / 365.0 / 32.0
+    across = (v - 120.0) * FLOOR_MM / 365.0 / 14.0
+    heights = BODY_MM * np.sqrt(np.maximum(1.0 - along**2 - across**2, 0.0))
+    snout = (abs(v - 120) <= 1) & (u > 160 + x) & (u < 174 + x)
+    heights = np.where(snout, np.maximum(heights, 12.0), heights)
+    if tail:
+        heights[120, int(95 + x) : int(134 + x)] = 9.0
+    return heights
+
+
+def cabled(heights: np.ndarray, x: float = 0.0, over: bool = False) -> np.ndarray:
+    """The same with a cable from the head to 260 mm above the floor, in the picture's upper left or
+    right.
+    """
+    out = heights.copy()
+    for s in np.linspace(0.0, 1.0, 400):
+        u = int(164 + x + (-90 if over else 90) * s)
+        v = int(118 - 60 * s)
+        high = 34.0 + 226.0 * s
+        out[v : v + 3, u : u + 3] = np.maximum(out[v : v + 3, u : u + 3], high)
+    return out
+
+
+def told(pictures: list[np.ndarray]) -> Cable | None:
+    return Cable.find(np.stack(pictures), LIMIT, CAMERA, FLOOR, LONGEST_MM, AREA_MM2)
+
+
+def test_a_cable_is_found_where_an_animal_wears_one_and_not_where_it_does_not() -> None:
+    assert told([drawn(cabled(mouse(x), x)) for x in range(0, 40, 5)]) is not None
+    assert told([drawn(mouse(x)) for x in range(0, 40, 5)]) is None
+    assert told([drawn(np.zeros((240, 320)))]) is None
+
+
+def test_an_edge_that_flickers_high_above_is_no_cable() -> None:
+    heights = mouse()
+    heights[40:42, 60:260] = 160.0
+    assert told([drawn(heights)] * 6) is None
+
+
+def test_something_that_hangs_there_in_few_frames_is_no_cable() -> None:
+    bare = [drawn(mouse(x)) for x in range(0, 40, 5)]
+    assert told([*bare, drawn(cabled(mouse()))]) is None
+
+
+def test_without_its_cable_the_animal_looks_as_before() -> None:
+    cable = Cable(CAMERA, FLOOR, 138.0)
+    for over in (False, True):
+        bare = drawn(mouse())
+        cut = cable.cut(drawn(cabled(mouse(), over=over))[None], LIMIT)[0]
+        animal = bare < LIMIT
+        left = (cut > 0) & (cut < LIMIT)
+        assert (left & animal).sum() > 0.85 * animal.sum()
+        assert (left & ~animal).sum() < 0.05 * animal.sum()
+        both = left & animal
+        assert np.abs(cut - bare)[both].max() < 12.0
+        assert np.abs(cut - bare)[both].mean() < 0.5
+
+
+def test_a_picture_without_a_cable_is_the_same_to_the_last_bit() -> None:
+    rng = np.random.default_rng(4)
+    picture = drawn(mouse()) + rng.normal(0.0, 1.5, (240, 320)).astype(np.float32)
+    picture[rng.random((240, 320)) < 0.02] = 0.0
+    cut = Cable(CAMERA, FLOOR, 138.0).cut(picture[None], LIMIT)
+    np.testing.assert_array_equal(cut[0], picture)
+
+
+def test_a_rearing_animal_keeps_its_head() -> None:
+    heights = mouse(tail=False)
+    v, u = np.mgrid[:240, :320]
+    head = np.hypot(u - 160, v - 120) < 6.0
+    heights = np.where(head, 80.0, heights)
+    picture = drawn(heights)
+    np.testing.assert_array_equal(Cable(CAMERA, FLOOR, 138.0).cut(picture[None], LIMIT)[0], picture)
+
+
+def test_every_second_pixel_tells_the_same() -> None:
+    cable = Cable(CAMERA, FLOOR, 138.0)
+    picture = drawn(cabled(mouse()))[::2, ::2]
+    cut = cable.every(2).cut(picture[None], LIMIT[::2, ::2])[0]
+    assert ((cut > 0) & (cut < FLOOR_MM - 100.0)).sum() == 0

@@ -1,0 +1,209 @@
+"""What a session keeps of its depth: cut-outs before the still scene, in both replays."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import liex_lab.sessions.rrd_depth as depth_of
+from liex_lab.body.pose import Pose
+from liex_lab.errors import SessionError
+from liex_lab.geometry import SE3
+from liex_lab.recordings.rvl import to_millimetres, unpack_rvl
+from liex_lab.sessions import Session, SessionWriter, correcting
+from liex_lab.sessions.cutouts import FILE, Kept, PictureKeeper, boxes_around, open_pictures
+from liex_lab.sessions.source import link_to, linked_recording
+from liex_lab.tracking.observations import Observations
+from tests.sessions.test_rrd import columns_of
+from tests.sessions.walking_mouse import FLOOR_MM, WalkingMouse, steady
+
+MOUSE = WalkingMouse(steady(2.0))
+UNSEEN = 7
+BACKGROUND = np.full((MOUSE.camera.height, MOUSE.camera.width), round(FLOOR_MM), np.uint16)
+
+
+def observed(mouse: WalkingMouse) -> Observations:
+    """What single frames say: the mouse where it is, but for one frame in which nothing is."""
+    track = mouse.track()
+    seen = Observations.empty(mouse.skeleton, mouse.times_ns)
+    pose = Pose(SE3(track.root_rotation, track.root_mm), track.angles_rad, track.scale)
+    middle = track.joints_mm.mean(axis=1)
+    for h in (0, 1):
+        seen.put_pose(h, pose)
+        seen.score[:, h] = 1.0
+        seen.n_px[:, h] = 100
+        seen.centroid_mm[:, h] = middle
+        seen.centroid_px[:, h] = mouse.camera.project(mouse.T_arena_camera.inverse() @ middle)
+    seen.score[UNSEEN] = np.nan
+    seen.n_px[UNSEEN] = 0
+    return seen
+
+
+SEEN = observed(MOUSE)
+
+
+def written(folder: Path, depth: str) -> Session:
+    """A session that keeps so much of the depth."""
+    background = BACKGROUND if depth in ("animal", "arena") else None
+    origin = MOUSE.provenance(
+        replay_depth=depth,
+        background=background,
+        plan_toml=f'[replay]\ndepth = "{depth}"\n',
+    )
+    with SessionWriter(folder, origin) as writer:
+        done = 0
+        for frames, track in MOUSE.chunks(20):
+            writer.add(frames, track, SEEN[done : done + len(frames)])
+            done += len(frames)
+        return writer.close()
+
+
+@pytest.fixture(scope="module")
+def session(tmp_path_factory: pytest.TempPathFactory) -> Session:
+    return written(tmp_path_factory.mktemp("cut") / "circle.liex", "animal")
+
+
+def test_a_box_holds_the_joints_and_the_animals_pixels_and_lies_in_the_picture() -> None:
+    boxes = boxes_around(SEEN, MOUSE.provenance())
+    uv = MOUSE.track().uv_px
+    for row in range(len(SEEN)):
+        left, top, right, bottom = boxes[row, 0]
+        if row == UNSEEN:
+            assert not boxes[row].any()
+            continue
+        assert 0 <= left < right <= MOUSE.camera.width
+        assert 0 <= top < bottom <= MOUSE.camera.height
+        assert left <= uv[row, :, 0].min() - 4 or left == 0
+        assert right > uv[row, :, 0].max() + 4 or right == MOUSE.camera.width
+        assert not boxes[row, 1].any(), "there is one thing only"
+    assert (boxes[:, 0, 2] - boxes[:, 0, 0]).max() < MOUSE.camera.width / 2
+
+
+def test_boxes_do_not_depend_on_how_frames_come_together() -> None:
+    whole = boxes_around(SEEN, MOUSE.provenance())
+    parts = [boxes_around(SEEN[k : k + 7], MOUSE.provenance()) for k in range(0, len(SEEN), 7)]
+    np.testing.assert_array_equal(np.concatenate(parts), whole)
+
+
+def test_a_kept_picture_is_as_read_in_its_box_and_the_still_scene_elsewhere(
+    session: Session,
+) -> None:
+    kept = Kept(session)
+    assert kept.boxes is not None
+    n_unread = 0
+    with open_pictures(session) as pictures:
+        assert pictures.times_ns.tolist() == MOUSE.times_ns.tolist()
+        for row in range(len(MOUSE.times_s)):
+            read = to_millimetres(MOUSE.frame(row).depth)
+            held = pictures.frame(row).depth.astype(np.uint16)
+            left, top, right, bottom = kept.boxes[row, 0]
+            inside = np.zeros(read.shape, bool)
+            inside[top:bottom, left:right] = True
+            np.testing.assert_array_equal(held[inside], read[inside])
+            np.testing.assert_array_equal(held[~inside], BACKGROUND[~inside])
+            n_unread += int((held[inside] == 0).sum())
+            assert inside.all() == (row == UNSEEN), "where nothing was found it is kept whole"
+    assert n_unread > 0, "unread pixels stay unread"
+
+
+def test_in_the_replay_a_cut_out_is_seen_by_a_camera_of_its_own(session: Session) -> None:
+    boxes = Kept(session).boxes
+    assert boxes is not None
+    pictures = columns_of(session, f"{depth_of.CUTOUTS}/1/depth")
+    lenses = columns_of(session, f"{depth_of.CUTOUTS}/1")
+    places = columns_of(session, f"{depth_of.PLACES}/1")
+    assert pictures["frame"] == lenses["frame"] == places["frame"] == list(range(len(SEEN)))
+    for row in (0, UNSEEN, 40):
+        left, top, right, bottom = (int(x) for x in boxes[row, 0])
+        blob = np.asarray(pictures["EncodedDepthImage:blob"][row][0], np.uint8).tobytes()
+        width, height = struct.unpack_from("<II", blob, 12)
+        assert (width, height) == (right - left, bottom - top)
+        assert lenses["Pinhole:resolution"][row][0] == [right - left, bottom - top]
+        cut = unpack_rvl(blob[20:], width, height)
+        read = to_millimetres(MOUSE.frame(row).depth)
+        np.testing.assert_array_equal(cut, read[top:bottom, left:right])
+        lens = np.array(lenses["Pinhole:image_from_camera"][row][0]).reshape(3, 3).T
+        point = np.linalg.inv(lens) @ [3.0, 5.0, 1.0]
+        np.testing.assert_allclose(
+            point, MOUSE.camera.unproject([left + 3.0, top + 5.0], 1.0), atol=1e-6
+        )
+        assert places["Transform3D:translation"][row][0] == [left, top, 0.0]
+        assert places["Transform3D:child_frame"][row] == [depth_of.cutout_frame(0)]
+    scene = columns_of(session, depth_of.BACKGROUND)
+    assert len(scene["EncodedDepthImage:blob"]) == 1, "the still scene is there once"
+
+
+def test_a_session_with_cut_outs_is_a_fraction_of_one_with_whole_pictures(
+    session: Session, tmp_path: Path
+) -> None:
+    whole = written(tmp_path / "whole.liex", "all")
+    assert Kept(whole).boxes is None
+    assert not (whole.path / FILE).exists()
+    for name in ("session.mcap", "session.rrd"):
+        assert (session.path / name).stat().st_size < 0.75 * (whole.path / name).stat().st_size
+
+
+def test_the_region_of_an_arena_is_kept_in_every_frame(tmp_path: Path) -> None:
+    session = written(tmp_path / "arena.liex", "arena")
+    boxes = Kept(session).boxes
+    assert boxes is not None
+    assert (boxes[:, 0] == [0, 0, MOUSE.camera.width, MOUSE.camera.height]).all()
+
+
+def test_without_depth_neither_replay_holds_any_and_it_is_said_why(tmp_path: Path) -> None:
+    session = written(tmp_path / "none.liex", "none")
+    with pytest.raises(SessionError, match="keeps no depth pictures, for its plan says replay"):
+        open_pictures(session)
+    with pytest.raises(SessionError, match="keeps no depth pictures"):
+        correcting.joint_move_at_pixel(session, 3, "neck", 40.0, 30.0)
+
+
+def test_a_joint_cannot_be_put_where_the_still_scene_is_shown(session: Session) -> None:
+    boxes = Kept(session).boxes
+    assert boxes is not None
+    left, top, right, bottom = boxes[3, 0]
+    u, v = (0, 0) if left > 0 or top > 0 else (right, bottom)
+    with pytest.raises(SessionError, match="outside of the cut-out that the session keeps"):
+        correcting.joint_move_at_pixel(session, 3, "neck", float(u), float(v))
+    uv = MOUSE.track().uv_px[3, 1]
+    moved = correcting.joint_move_at_pixel(session, 3, MOUSE.skeleton.names[1], *uv)
+    assert moved.frame == 3
+
+
+def test_damaged_boxes_are_told_in_a_sentence(session: Session, tmp_path: Path) -> None:
+    import shutil
+
+    copy = tmp_path / "copy.liex"
+    shutil.copytree(session.path, copy)
+    for content in (b"nothing", b""):
+        (copy / FILE).write_bytes(content)
+        with pytest.raises(SessionError, match=r"cutouts\.npz is damaged and cannot be read"):
+            Kept(Session.open(copy))
+    np.savez(copy / FILE, boxes=np.zeros((3, 2, 4), np.int16))
+    with pytest.raises(SessionError, match="not those of every frame"):
+        Kept(Session.open(copy))
+
+
+def test_nobody_looked_so_everything_is_kept() -> None:
+    keeper = PictureKeeper(MOUSE.provenance(replay_depth="animal", background=BACKGROUND))
+    depth = [to_millimetres(MOUSE.frame(0).depth)]
+    kept, boxes = keeper.keep(depth, None)
+    assert boxes is None
+    assert kept[0] is depth[0]
+
+
+def test_a_session_says_where_its_recording_is_also_when_both_were_moved(
+    session: Session, tmp_path: Path
+) -> None:
+    folder = tmp_path / "here" / "out" / "a.liex"
+    recording = tmp_path / "here" / "raw" / "a.mcap"
+    link = link_to(recording, folder)
+    assert link == {"path": "../../raw/a.mcap"}
+    moved = Session(tmp_path / "there" / "out" / "a.liex", {**session.metadata, "input": link})
+    assert linked_recording(moved) == str(tmp_path / "there" / "raw" / "a.mcap")
+    assert linked_recording(session) is None, "sessions of earlier versions do not say"
+    virtual = {**session.metadata, "input": link_to("synthetic:walk?seed=3", folder)}
+    assert linked_recording(Session(folder, virtual)) == "synthetic:walk?seed=3"
