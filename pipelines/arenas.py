@@ -25,6 +25,7 @@ from liex_lab.runtime.progress import Progress, silent
 
 from .build import build_recording
 from .choice import USUAL, fit_plan
+from .compiling import compile_ahead
 from .regions import arenas_of, stated_corners
 from .session import Prepared, check_unused, prepare, read_ahead
 from .shards import MEASURING
@@ -132,6 +133,7 @@ def measure_arenas(
     with build_recording(recording, first, progress) as opened:
         if told := unwritable_times(opened.times_ns):
             raise RecordingError(f"of {opened.name} {told}")
+        compile_ahead(first.animal.skeleton, progress)
         shared = opened.remembering(_REMEMBERED_BYTES)
         arenas = arenas_of(shared, first)
         corners = {one.name: stated_corners(shared, first, one.region) for one in arenas}

@@ -35,6 +35,7 @@ from .build import (
     why_nameless,
 )
 from .choice import USUAL, Fitted, fit_plan
+from .compiling import compile_ahead
 from .regions import pinned
 from .shards import CHUNK, LENGTH, MEASURING, Shard, measure_shards
 from .workers import WorkerPool
@@ -116,6 +117,7 @@ def measure_session(
         if told := unwritable_times(opened.times_ns):
             raise RecordingError(f"of {opened.name} {told}")
         check_unused(folder, overwrite)
+        compile_ahead(first.animal.skeleton, progress)
         progress(0, None, "learning the background, the floor and the animal's size")
         unnamed = None if plan else settings
         fitted = fit_plan(opened, first, estimator, settings=unnamed, progress=progress)

@@ -17,6 +17,7 @@ from liex_lab.runtime.places import unlinked_below
 from liex_lab.runtime.progress import Board
 from liex_lab.sessions.corrections import Description
 
+from ..compiling import compile_ahead
 from ..correct import correct_session
 from .one_session import RunSession
 from .slurm import SlurmTable
@@ -121,4 +122,7 @@ def _measure(
             )
             shown.ended(result["id"], sentence, failed=failure is not None)
 
+        if not where["scheduler"] and not where["slurm"]:  # once, and not in every worker
+            for animal in sorted({one.session.plan.animal.skeleton for one in todo}):
+                compile_ahead(animal)
         measure_cohort(todo, run, told=shown.told, finished=finished, **where)
