@@ -183,7 +183,9 @@ class Checkpoint:
         """Note what is there, once it is on disk: a power cut leaves nothing that is not."""
         sync_tree(self.folder / _SEEN)
         for log, sizes in state.logs.items():
-            sync_file(self.part(log, len(sizes) - 1))
+            part = self.part(log, len(sizes) - 1)
+            if part.is_file():  # not yet, where nothing was written to it
+                sync_file(part)
         write_whole(self.folder / _STATE, json.dumps(vars(state)))
         self.state, self._last = state, self._clock()
 

@@ -15,6 +15,8 @@ import pytest
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="signals differ")
 
+SLACK_S = 4.0  # what a machine with other work may add
+
 MAIN = """
 import sys, time, threading
 import liex_lab.cli.main
@@ -73,7 +75,7 @@ def test_what_is_under_way_is_put_down_and_said(number: int, code: int) -> None:
     assert len(err.splitlines()) == 1
     assert err.startswith("liex: ")
     assert "same command" in err
-    assert seconds < 5.0
+    assert seconds < 5.0 + SLACK_S
 
 
 @pytest.mark.parametrize("work", [STUCK, DEAF])
@@ -81,13 +83,13 @@ def test_what_does_not_end_is_ended(work: str) -> None:
     returned, _, err, seconds = ended(work, signal.SIGTERM)
     assert returned == 143
     assert err.count("ended (SIGTERM)") == 1
-    assert seconds < 6.0
+    assert seconds < 6.0 + SLACK_S
 
 
 def test_a_second_signal_ends_it_at_once() -> None:
     returned, _, _, seconds = ended(STUCK, signal.SIGINT, signal.SIGINT)
     assert returned == 130
-    assert seconds < 2.0
+    assert seconds < 2.0 + SLACK_S
 
 
 POOL = """
@@ -131,4 +133,4 @@ def test_no_worker_is_left_behind(number: int, handled: bool, tmp_path: Path) ->
             time.sleep(0.1)
         assert not any(map(alive, workers))
         running.wait(10)
-    assert time.monotonic() - began < 6.0
+    assert time.monotonic() - began < 6.0 + SLACK_S
