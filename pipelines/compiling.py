@@ -57,7 +57,7 @@ def compile_ahead(animal: str, progress: Progress = silent) -> bool:
     progress(0, len(rows), COMPILING)
     rows = sorted(rows, key=lambda row: -row["cpu_s"])  # the longest first, so that all end at once
     try:
-        for k, _ in enumerate(Processes(n_cores(), 1).each(compile_kernel, rows)):
+        for k, _ in enumerate(Processes(n_cores(), None).each(compile_kernel, rows)):
             progress(k + 1, len(rows), COMPILING)
         done.touch()
     except (LiexError, OSError):  # too little memory or disk: the run compiles what it calls

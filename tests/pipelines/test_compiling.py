@@ -76,7 +76,8 @@ class _Pool:
     asked: list[list[str]] = []  # noqa: RUF012
     broken = False
 
-    def __init__(self, n: int, threads: int = 0) -> None:
+    def __init__(self, n: int, threads: int | None = 0) -> None:
+        assert threads is None  # the environment is not touched while others compile
         self.n = n
 
     def each(self, do: Callable[[Any], Any], works: Sequence[Any]) -> Iterator[Any]:
