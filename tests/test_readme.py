@@ -165,7 +165,7 @@ def test_the_animal_of_ones_own_can_be_read(tmp_path: Path) -> None:
 
 
 def test_the_arenas_can_be_read() -> None:
-    (example,) = blocks("toml", PAGES["howto/arenas.md"])
+    example, _ = blocks("toml", PAGES["howto/arenas.md"])  # of a plan, and of a study
     arenas = Plan.from_toml(example).arenas
     assert arenas is not None
     assert not isinstance(arenas, str)
