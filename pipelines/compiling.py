@@ -103,8 +103,7 @@ def type_of(spelled: Any) -> Any:
     Args:
         spelled: text of a number's type, or a table.
     """
-    from numba.core import types
-
+    types = _numba_types()
     if isinstance(spelled, str):
         return types.none if spelled == "none" else getattr(types, _NUMBERS.get(spelled, spelled))
     if "array" in spelled:
@@ -122,6 +121,11 @@ def type_of(spelled: Any) -> Any:
 _NUMBERS = {"bool": "boolean"}
 
 
+def _numba_types() -> Any:
+    """The module of numba's types; its stubs know half of them."""
+    return importlib.import_module("numba.core.types")
+
+
 def spelling(kind: Any) -> Any:
     """How an argument's type is written in `kernels.json`.
 
@@ -132,8 +136,7 @@ def spelling(kind: Any) -> Any:
     Raises:
         TypeError: it is of another kind, such as a function's.
     """
-    from numba.core import types
-
+    types = _numba_types()
     if isinstance(kind, types.Array):
         return {"array": [spelling(kind.dtype), kind.ndim, kind.layout, kind.mutable]}
     if isinstance(kind, types.Omitted):
