@@ -49,11 +49,21 @@ DEAF = """
 """
 
 
+def heeding() -> None:
+    """In a new process: heed the signals, though the tests were started to ignore some (nohup)."""
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.SIG_DFL)
+
+
 def ended(work: str, *signals: int) -> tuple[int, str, str, float]:
     """Exit code, output, errors and seconds of a process that is sent signals."""
     code = MAIN.format(work=work.strip())
     with subprocess.Popen(
-        [sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        [sys.executable, "-c", code],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        preexec_fn=heeding,
     ) as running:
         assert running.stdout is not None
         assert running.stdout.readline() == "begun\n"
@@ -122,7 +132,11 @@ def test_no_worker_is_left_behind(number: int, handled: bool, tmp_path: Path) ->
     script = tmp_path / "script.py"
     script.write_text(POOL.format(main=work))
     with subprocess.Popen(
-        [sys.executable, str(script)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        [sys.executable, str(script)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        preexec_fn=heeding,
     ) as running:
         assert running.stdout is not None
         workers = [int(running.stdout.readline()) for _ in range(2)]
