@@ -133,7 +133,12 @@ def test_interrupting_leaves_without_a_traceback() -> None:
     wait = BREAK.format("print('begun', flush=True); import time; time.sleep(30)")
     command = [sys.executable, "-c", wait, "info", "--plan", "mouse"]
     with subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        command,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        # heeded, though the tests may have been started to ignore it
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     ) as running:
         assert running.stdout is not None
         assert running.stderr is not None
