@@ -12,17 +12,19 @@ from __future__ import annotations
 import hashlib
 import importlib
 import json
-import multiprocessing
-from collections.abc import Mapping, Sequence
+import subprocess
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 from liex_lab.catalog import MODELS
-from liex_lab.errors import LiexError
 from liex_lab.runtime.progress import COMPILING, Progress, silent
 
-from .workers import Processes, n_cores
+from .workers import n_cores
 
 KERNELS = Path(__file__).with_name("kernels.json")
 _FEWEST_CORES = 2
@@ -37,8 +39,8 @@ def compile_ahead(animal: str, progress: Progress = silent) -> bool:
         progress: told how many kernels are ready.
 
     Returns:
-        Whether anything was compiled. Not on a single core, in a process that may not start others,
-        and where numba is told not to compile.
+        Whether all were compiled. Nothing is on a single core, and where numba is told not to
+        compile.
     """
     import numba
 
@@ -46,7 +48,6 @@ def compile_ahead(animal: str, progress: Progress = silent) -> bool:
     if (
         not rows
         or n_cores() < _FEWEST_CORES
-        or multiprocessing.current_process().daemon
         or numba.config.DISABLE_JIT
         or numba.config.BOUNDSCHECK
     ):
@@ -54,15 +55,83 @@ def compile_ahead(animal: str, progress: Progress = silent) -> bool:
     done = _mark(animal, rows)
     if done is None or done.is_file():
         return False
+    shares = _shares([row["cpu_s"] for row in rows], n_cores())
+    ready: list[None] = []
+
+    def tell() -> None:
+        """One more kernel is there."""
+        ready.append(None)
+        progress(len(ready), len(rows), COMPILING)
+
     progress(0, len(rows), COMPILING)
-    rows = sorted(rows, key=lambda row: -row["cpu_s"])  # the longest first, so that all end at once
-    try:
-        for k, _ in enumerate(Processes(n_cores(), None).each(compile_kernel, rows)):
-            progress(k + 1, len(rows), COMPILING)
-        done.touch()
-    except (LiexError, OSError):  # too little memory or disk: the run compiles what it calls
-        return False
-    return True
+    whole = _Compilers(animal, shares).run(tell)
+    if whole:
+        with suppress(OSError):
+            done.touch()
+    return whole
+
+
+def _shares(costs: Sequence[float], n: int) -> list[list[int]]:
+    """Rows in n shares that take about as long: the longest first, to who has least to do."""
+    shares: list[list[int]] = [[] for _ in range(n)]
+    spent = [0.0] * n
+    for row in sorted(range(len(costs)), key=lambda row: -costs[row]):
+        least = spent.index(min(spent))
+        shares[least].append(row)
+        spent[least] += costs[row]
+    return [share for share in shares if share]
+
+
+class _Compilers:
+    """Processes that compile the rows of a list, each its share.
+
+    They are started by their own command, and not by `multiprocessing`, which would run the script
+    of somebody who calls `run_session` in it once more in each of them.
+    """
+
+    def __init__(self, animal: str, shares: Sequence[Sequence[int]]) -> None:
+        self._commands = [
+            [sys.executable, "-m", __name__, animal, *map(str, share)] for share in shares
+        ]
+        self._running: list[subprocess.Popen[str]] = []
+
+    def run(self, tell: Callable[[], None]) -> bool:
+        """Wait until all are done; whether all ended well.
+
+        Args:
+            tell: called after each kernel.
+        """
+        try:
+            for command in self._commands:
+                self._running.append(
+                    subprocess.Popen(
+                        command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
+                    )
+                )
+            with ThreadPoolExecutor(len(self._running)) as listeners:
+                try:
+                    return all(list(listeners.map(lambda one: _listen(one, tell), self._running)))
+                finally:
+                    self._end()  # before the listeners are waited for
+        except OSError:  # too little memory or too many processes: the run compiles what it calls
+            return False
+        finally:
+            self._end()
+
+    def _end(self) -> None:
+        """End those that still run; the others do not mind."""
+        for one in self._running:
+            one.kill()
+            one.wait()
+
+
+def _listen(process: subprocess.Popen[str], tell: Callable[[], None]) -> bool:
+    """Pass on each line of a process; whether it ended well."""
+    assert process.stdout is not None
+    with process.stdout as lines:
+        for _ in lines:
+            tell()
+    return process.wait() == 0
 
 
 @cache
@@ -173,3 +242,15 @@ def _mark(animal: str, rows: Sequence[Mapping[str, Any]]) -> Path | None:
         stat = path.stat()
         told.update(f"{path} {stat.st_mtime_ns} {stat.st_size}\n".encode())
     return Path(folder) / f"compiled-{told.hexdigest()[:_DIGITS]}"
+
+
+def main() -> None:
+    """Compile the kernels of an animal whose numbers in the list the command names."""
+    animal, *numbers = sys.argv[1:]
+    for number in numbers:
+        compile_kernel(listed_kernels(animal)[int(number)])
+        print(number, flush=True)
+
+
+if __name__ == "__main__":
+    main()

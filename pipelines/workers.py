@@ -11,7 +11,7 @@ import os
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Protocol, TypeVar
 
@@ -40,12 +40,11 @@ class Processes:
 
     Attributes:
         n: how many, at most one for each task.
-        threads: cores of each; 0 takes an equal share, None leaves them alone, as is needed while
-            another thread compiles: numba reads the environment whenever it does.
+        threads: cores of each; 0 takes an equal share.
     """
 
     n: int
-    threads: int | None = 0
+    threads: int = 0
 
     def each(self, do: Callable[[Work], Done], works: Sequence[Work]) -> Iterator[Done]:
         """What `do` makes of each of the tasks, as soon as it is there, in any order.
@@ -60,11 +59,11 @@ class Processes:
         if not works:
             return
         count = min(self.n, len(works))
-        share = max(1, n_cores() // count) if self.threads == 0 else self.threads
+        threads = self.threads or max(1, n_cores() // count)
         context = multiprocessing.get_context("spawn")  # numba's threads do not live through a fork
         others = {child.pid for child in multiprocessing.active_children() if child.pid}
         with (
-            nullcontext() if share is None else _cores_for_each(share),
+            _cores_for_each(threads),
             ProcessPoolExecutor(count, context, initializer=end_with_parent) as pool,
         ):
             try:

@@ -6,16 +6,16 @@ import importlib
 import json
 import subprocess
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable
+from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import ClassVar
 
 import pytest
 from liex_lab.pipelines import compiling
 from liex_lab.pipelines.compiling import KERNELS, compile_ahead, listed_kernels, spelling, type_of
 
 from liex_lab.catalog import find_sample
-from liex_lab.errors import SessionError
 
 # what a process called from Python; with a warm cache no kernel that others call is among them
 _CALLED = """
@@ -70,54 +70,71 @@ def test_a_run_calls_only_kernels_that_are_listed(tmp_path: Path) -> None:
     assert not missing, "run `python -m tests.kernels`"
 
 
-class _Pool:
+class _Compilers:
     """Stands for processes; notes what they are asked to compile."""
 
-    asked: list[list[str]] = []  # noqa: RUF012
-    broken = False
+    asked: ClassVar[list[list[list[int]]]] = []
+    ends_well = True
 
-    def __init__(self, n: int, threads: int | None = 0) -> None:
-        assert threads is None  # the environment is not touched while others compile
-        self.n = n
+    def __init__(self, animal: str, shares: list[list[int]]) -> None:
+        self._shares = shares
+        self.asked.append(shares)
 
-    def each(self, do: Callable[[Any], Any], works: Sequence[Any]) -> Iterator[Any]:
-        assert do is compiling.compile_kernel
-        if self.broken:
-            raise SessionError("a worker process ended without a word")
-        self.asked.append([work["kernel"] for work in works])
-        yield from works
+    def run(self, tell: Callable[[], None]) -> bool:
+        for _ in chain.from_iterable(self._shares):
+            tell()
+        return self.ends_well
 
 
 @pytest.fixture
-def pool(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> type[_Pool]:
-    class Pool(_Pool):
-        asked: list[list[str]] = []  # noqa: RUF012
+def compilers(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> type[_Compilers]:
+    class Compilers(_Compilers):
+        asked: ClassVar[list[list[list[int]]]] = []
 
-    monkeypatch.setattr(compiling, "Processes", Pool)
+    monkeypatch.setattr(compiling, "_Compilers", Compilers)
     monkeypatch.setattr(compiling, "n_cores", lambda: 2)
     monkeypatch.setattr(compiling, "_mark", lambda animal, rows: tmp_path / "mark")
-    return Pool
+    return Compilers
 
 
-def test_a_machine_compiles_once_the_longest_kernel_first(pool: type[_Pool]) -> None:
+def test_a_machine_compiles_once_and_each_core_about_as_long(compilers: type[_Compilers]) -> None:
     told: list[int] = []
     assert compile_ahead("mouse", lambda done, total, what: told.append(done))
     assert not compile_ahead("mouse")
-    assert len(pool.asked) == 1
-    cost = {row["kernel"]: row["cpu_s"] for row in listed_kernels("mouse")}
-    assert [cost[kernel] for kernel in pool.asked[0]] == sorted(cost.values(), reverse=True)
+    cost = [row["cpu_s"] for row in listed_kernels("mouse")]
+    (shares,) = compilers.asked
+    assert sorted(chain.from_iterable(shares)) == list(range(len(cost)))
+    spent = [sum(cost[row] for row in share) for share in shares]
+    assert len(spent) == 2
+    assert max(spent) < 1.2 * min(spent)
     assert told == list(range(len(cost) + 1))
 
 
-def test_without_room_for_processes_the_run_compiles_what_it_calls(
-    pool: type[_Pool], monkeypatch: pytest.MonkeyPatch
+def test_what_did_not_end_well_is_tried_again(
+    compilers: type[_Compilers], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(pool, "broken", True)
+    monkeypatch.setattr(compilers, "ends_well", False)
     assert not compile_ahead("mouse")
-    monkeypatch.setattr(pool, "broken", False)
+    monkeypatch.setattr(compilers, "ends_well", True)
+    assert compile_ahead("mouse")
+    assert len(compilers.asked) == 2
+
+
+def test_on_one_core_the_run_compiles_what_it_calls(
+    compilers: type[_Compilers], monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(compiling, "n_cores", lambda: 1)
     assert not compile_ahead("mouse")
-    assert not pool.asked
+    assert not compilers.asked
+
+
+def test_processes_compile_and_tell_of_every_kernel() -> None:
+    kernels = [row["kernel"].split(":")[1] for row in listed_kernels("mouse")]
+    shares = [[kernels.index("place_joints")], [kernels.index("number_nodes")]]
+    told: list[None] = []
+    assert compiling._Compilers("mouse", shares).run(lambda: told.append(None))
+    assert len(told) == 2
+    assert not compiling._Compilers("mouse", [[10_000]]).run(lambda: None)
 
 
 def test_a_kernel_that_is_called_otherwise_now_is_left_to_the_run() -> None:
