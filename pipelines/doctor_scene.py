@@ -80,7 +80,7 @@ class SceneLook:
         from liex_lab.arena.outline import find_arena
         from liex_lab.body.skeleton import Skeleton
         from liex_lab.foreground.background import learn_background
-        from liex_lab.foreground.standing import find_standing
+        from liex_lab.foreground.standing import SampledScene, find_standing
 
         grid = self.seen.camera.every(self.stride)
         try:
@@ -96,7 +96,7 @@ class SceneLook:
         background, spread, _ = learn_background(self.sample)
         animal = self.plan.animal
         try:
-            standing = find_standing(
+            scene = SampledScene(
                 self.sample,
                 background,
                 spread,
@@ -104,6 +104,9 @@ class SceneLook:
                 (animal.spine_min_mm, animal.spine_max_mm),
                 self.plan.foreground.min_height_mm,
                 Skeleton.load(animal.skeleton).view,
+            )
+            standing = find_standing(
+                scene,
                 None
                 if stated is None
                 else Floor.from_plane(stated.normal, stated.distance_mm, grid),

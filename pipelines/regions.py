@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
     from liex_lab.arena.floor import Floor
     from liex_lab.arena.region import Corners
+    from liex_lab.foreground.standing import SampledScene
     from liex_lab.optics.camera import Camera
     from liex_lab.plan.sections import Region, SeveralArenas
     from liex_lab.recordings.recording import Recording
@@ -106,18 +107,26 @@ def region_of(recording: Recording, plan: Plan) -> NDArray[np.bool_] | None:
 def _floor_of_picture(recording: Recording, plan: Plan) -> Floor:
     """The floor on which animals stand in the whole picture, or the one that the plan states."""
     from liex_lab.arena.floor import Floor
-    from liex_lab.body.skeleton import Skeleton
-    from liex_lab.foreground.background import learn_background, sample_frames, stride_for
     from liex_lab.foreground.standing import find_standing
 
     stated = stated_floor(recording.camera, plan)
     if stated is not None:
         return stated
+    found = find_standing(_sampled(recording, plan)[0]).floor
+    return Floor.from_plane(found.normal, found.distance_mm, recording.camera)
+
+
+def _sampled(recording: Recording, plan: Plan) -> tuple[SampledScene, int]:
+    """Frames spread over a recording with their background, and the stride of their pixels."""
+    from liex_lab.body.skeleton import Skeleton
+    from liex_lab.foreground.background import learn_background, sample_frames, stride_for
+    from liex_lab.foreground.standing import SampledScene
+
     animal = plan.animal
     stride = stride_for(recording, animal.spine_min_mm)
     sample = sample_frames(recording, _N_SAMPLED, stride)
     background, spread, _ = learn_background(sample)
-    found = find_standing(
+    scene = SampledScene(
         sample,
         background,
         spread,
@@ -125,8 +134,8 @@ def _floor_of_picture(recording: Recording, plan: Plan) -> Floor:
         (animal.spine_min_mm, animal.spine_max_mm),
         plan.foreground.min_height_mm,
         Skeleton.load(animal.skeleton).view,
-    ).floor
-    return Floor.from_plane(found.normal, found.distance_mm, recording.camera)
+    )
+    return scene, stride
 
 
 def arenas_of(recording: Recording, plan: Plan) -> list[SeveralArenas]:
@@ -162,26 +171,13 @@ def propose_arenas(recording: Recording, plan: Plan) -> list[SeveralArenas]:
         Two to eight of them with a polygon each that touches no other; [] where only one is seen.
     """
     from liex_lab.body.skeleton import VIEWS, Skeleton
-    from liex_lab.foreground.background import learn_background, sample_frames, stride_for
     from liex_lab.foreground.several import arenas_apart
     from liex_lab.plan.sections import SeveralArenas
 
-    animal = plan.animal
-    view = Skeleton.load(animal.skeleton).view
+    view = Skeleton.load(plan.animal.skeleton).view
     if view.frame != VIEWS[0] or recording.region_px:
         return []
-    stride = stride_for(recording, animal.spine_min_mm)
-    sample = sample_frames(recording, _N_SAMPLED, stride)
-    background, spread, _ = learn_background(sample)
-    outlines = arenas_apart(
-        sample,
-        background,
-        spread,
-        recording.camera.every(stride),
-        (animal.spine_min_mm, animal.spine_max_mm),
-        plan.foreground.min_height_mm,
-        view,
-    )
+    scene, stride = _sampled(recording, plan)
     return [
         SeveralArenas.model_validate(
             {
@@ -189,5 +185,5 @@ def propose_arenas(recording: Recording, plan: Plan) -> list[SeveralArenas]:
                 "region": [[float(stride * u), float(stride * v)] for u, v in corners],
             }
         )
-        for k, corners in enumerate(outlines, 1)
+        for k, corners in enumerate(arenas_apart(scene), 1)
     ]

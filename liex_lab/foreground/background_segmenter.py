@@ -28,7 +28,7 @@ from liex_lab.foreground._blob_kernels import MAX_BLOBS
 from liex_lab.foreground.background import learn_background, sample_frames, stride_for
 from liex_lab.foreground.cable import Cable
 from liex_lab.foreground.floor_level import FloorLevel, wandering
-from liex_lab.foreground.standing import Standing, find_standing
+from liex_lab.foreground.standing import SampledScene, Standing, find_standing
 from liex_lab.foreground.still_scene import StillScene
 from liex_lab.foreground.unread_floor import unread_floor
 from liex_lab.optics.camera import Camera
@@ -83,9 +83,8 @@ class _Ground:
         """
         background, spread, near = learn_background(sample)
         _check_background(sample, background)
-        standing = find_standing(
-            sample, background, spread, camera, spine_mm, min_height_mm, view, stated
-        )
+        seen = SampledScene(sample, background, spread, camera, spine_mm, min_height_mm, view)
+        standing = find_standing(seen, stated)
         if region is not None:
             standing = replace(standing, region=region, on_floor=standing.on_floor & region)
         if standing.region is not None:  # what lies around is not looked at
@@ -170,10 +169,10 @@ class BackgroundSubtraction(StillScene):
         stands = view.frame == VIEWS[0]  # one that floats may be seen before anything
         ground = _Ground.learn(sample, grid, spine_mm, min_height_mm, view, stated, cut)
         level = None
-        if stands and (wander := wandering(ground.level.of(sample))) is not None:
+        levels = ground.level.of(sample) if stands else np.empty(0)
+        if stands and (wander := wandering(levels)) is not None:
             first, range_mm = wander
-            levels = ground.level.of(sample) - first
-            sample = ground.level.brought_back(sample, levels)
+            sample = ground.level.brought_back(sample, levels - first)
             ground = _Ground.learn(sample, grid, spine_mm, min_height_mm, view, stated, cut)
             level = replace(ground.level, wander_mm=range_mm)
         background = ground.background

@@ -9,12 +9,9 @@ Voronoi cell), so that no two regions meet.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from liex_lab.arena.grounds import Ground, flat_grounds
-from liex_lab.body.skeleton import View
-from liex_lab.foreground.standing import things_moving
-from liex_lab.optics.camera import Camera
+from liex_lab.foreground.standing import SampledScene, things_moving
 
 _MOST = 8
 _LEAST_THINGS = 3  # seen moving on a ground
@@ -24,35 +21,21 @@ _APART_PX = 2.0  # between two regions at least
 _SMOOTH_PX = 1.5  # by which a polygon may leave its region
 
 
-def arenas_apart(
-    sample: NDArray[np.float32],
-    background: NDArray[np.float32],
-    spread: NDArray[np.float32],
-    camera: Camera,
-    spine_mm: tuple[float, float],
-    min_height_mm: float,
-    view: View,
-) -> list[list[tuple[int, int]]]:
+def arenas_apart(scene: SampledScene) -> list[list[tuple[int, int]]]:
     """The outlines of several arenas.
 
     Args:
-        sample: (n, H, W) float32 mm, frames spread over the recording, 0 where unread.
-        background: (H, W) float32 mm, 0 where unknown.
-        spread: (H, W) float32 mm, its standard deviation.
-        camera: whose pixels these are, free of lens distortion.
-        spine_mm: lengths of the smallest and the largest animal to expect, mm.
-        min_height_mm: what stands out from the background by less does not count.
-        view: how such animals are looked at.
+        scene: sampled frames and their background.
 
     Returns:
-        (u, v) corners of each, pixels of `camera`, row by row from the top left; [] where there are
-        fewer than two or more than eight.
+        (u, v) corners of each, pixels of the scene's camera, row by row from the top left; [] where
+        there are fewer than two or more than eight.
     """
-    things = things_moving(sample, background, spread, camera, spine_mm, min_height_mm, view)
-    least_mm2 = 4.0 * view.area[0] * spine_mm[0] ** 2
+    camera = scene.camera
+    things = things_moving(scene)
     stood_on: list[Ground] = []
     others: list[Ground] = []
-    for ground in flat_grounds(background, camera, least_mm2):
+    for ground in flat_grounds(scene.background, camera, scene.least_ground_mm2):
         n = sum(thing.is_on(ground.floor, ground.patch) for thing in things)
         (stood_on if n >= _LEAST_THINGS else others).append(ground)
     stood_on = _one_each(stood_on)
@@ -67,7 +50,7 @@ def arenas_apart(
     if not 2 <= len(stood_on) <= _MOST:
         return []
     reach = [
-        spine_mm[1] * float(np.sqrt(camera.fx * camera.fy)) / ground.floor.distance_mm
+        scene.spine_mm[1] * float(np.sqrt(camera.fx * camera.fy)) / ground.floor.distance_mm
         for ground in stood_on
     ]
     return _outlines(stood_on, reach)

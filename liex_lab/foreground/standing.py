@@ -122,26 +122,45 @@ class Thing:
         return self.stands_on(floor) and self.share_on(patch) > _ON_SHARE
 
 
-def find_standing(
-    sample: NDArray[np.float32],
-    background: NDArray[np.float32],
-    spread: NDArray[np.float32],
-    camera: Camera,
-    spine_mm: tuple[float, float],
-    min_height_mm: float,
-    view: View,
-    stated: Floor | None = None,
-) -> Standing:
-    """The floor on which what moves stands.
+@dataclass(frozen=True)
+class SampledScene:
+    """Frames spread over a recording, what they say of the empty scene, and what is looked for.
 
-    Args:
-        sample: (n, H, W) float32 mm, frames spread over the recording, 0 where unread.
+    Attributes:
+        sample: (n, H, W) float32 mm, the frames, 0 where unread.
         background: (H, W) float32 mm, 0 where unknown.
         spread: (H, W) float32 mm, its standard deviation.
         camera: whose pixels these are, free of lens distortion.
         spine_mm: lengths of the smallest and the largest animal to expect, mm.
         min_height_mm: what stands out from the background by less does not count.
         view: how such animals are looked at.
+    """
+
+    sample: NDArray[np.float32]
+    background: NDArray[np.float32]
+    spread: NDArray[np.float32]
+    camera: Camera
+    spine_mm: tuple[float, float]
+    min_height_mm: float
+    view: View
+
+    @property
+    def areas_mm2(self) -> tuple[float, float]:
+        """Areas of the smallest and the largest animal as they are seen, mm^2."""
+        low, high = self.view.area
+        return low * self.spine_mm[0] ** 2, high * self.spine_mm[1] ** 2
+
+    @property
+    def least_ground_mm2(self) -> float:
+        """Area of the smallest ground that such an animal can stand on, mm^2."""
+        return 4.0 * self.areas_mm2[0]
+
+
+def find_standing(scene: SampledScene, stated: Floor | None = None) -> Standing:
+    """The floor on which what moves stands.
+
+    Args:
+        scene: sampled frames and their background.
         stated: the floor where a person states it, in the pixels of the camera; None finds it.
 
     Returns:
@@ -151,12 +170,11 @@ def find_standing(
         EstimationError: nothing flat faces the camera, too little of the picture is readable, or
             nothing stands on the floor that is stated.
     """
-    areas = (view.area[0] * spine_mm[0] ** 2, view.area[1] * spine_mm[1] ** 2)
-    things = things_moving(sample, background, spread, camera, spine_mm, min_height_mm, view)
+    things = things_moving(scene)
     standing = (
-        _choose(background, camera, things, spine_mm[1], 4.0 * areas[0])
+        _choose(scene, things)
         if stated is None
-        else _as_stated(stated, background, camera, things)
+        else _as_stated(stated, scene.background, scene.camera, things)
     )
     if not things:
         return standing
@@ -168,39 +186,21 @@ def find_standing(
     )
 
 
-def things_moving(
-    sample: NDArray[np.float32],
-    background: NDArray[np.float32],
-    spread: NDArray[np.float32],
-    camera: Camera,
-    spine_mm: tuple[float, float],
-    min_height_mm: float,
-    view: View,
-) -> list[Thing]:
+def things_moving(scene: SampledScene) -> list[Thing]:
     """Things of an animal's size that move, at most three of each frame; see `find_standing`.
 
     Args:
-        sample: (n, H, W) float32 mm, frames spread over the recording, 0 where unread.
-        background: (H, W) float32 mm, 0 where unknown.
-        spread: (H, W) float32 mm, its standard deviation.
-        camera: whose pixels these are, free of lens distortion.
-        spine_mm: lengths of the smallest and the largest animal to expect, mm.
-        min_height_mm: what stands out from the background by less does not count.
-        view: how such animals are looked at.
+        scene: sampled frames and their background.
     """
-    areas = (view.area[0] * spine_mm[0] ** 2, view.area[1] * spine_mm[1] ** 2)
-    limit = background - np.maximum(np.float32(min_height_mm), 3.0 * spread)
-    return _moving(sample, background, limit, camera, areas)
+    margin = np.maximum(np.float32(scene.min_height_mm), 3.0 * scene.spread)
+    limit = scene.background - margin
+    return _moving(scene.sample, scene.background, limit, scene.camera, scene.areas_mm2)
 
 
-def _choose(
-    background: NDArray[np.float32],
-    camera: Camera,
-    things: list[Thing],
-    longest_mm: float,
-    least_mm2: float,
-) -> Standing:
-    """The largest plane, or another ground of at least so many mm^2 where that is better."""
+def _choose(scene: SampledScene, things: list[Thing]) -> Standing:
+    """The largest plane, or another ground of a size to stand on where that is better."""
+    background = scene.background
+    camera = scene.camera
     largest = _largest(background, camera, things)
     if (
         isinstance(largest, Standing)
@@ -208,7 +208,7 @@ def _choose(
         and len(things) >= _MIN_THINGS
     ):
         return largest
-    grounds = flat_grounds(background, camera, least_mm2)
+    grounds = flat_grounds(background, camera, scene.least_ground_mm2)
     if len(things) >= _MIN_THINGS:
         least = largest.support if isinstance(largest, Standing) else 0.0
         chosen = _stood_on(grounds, things, least)
@@ -217,7 +217,7 @@ def _choose(
     if chosen is not None:
         ground, support, doubt = chosen
         # an animal that leans over the edge is still looked at
-        reach = longest_mm * np.sqrt(camera.fx * camera.fy) / ground.floor.distance_mm
+        reach = scene.spine_mm[1] * np.sqrt(camera.fx * camera.fy) / ground.floor.distance_mm
         on_floor = ground.region(0.0)
         region = ground.region(float(reach))
         origin = WALLED if doubt else STOOD_ON

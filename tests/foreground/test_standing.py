@@ -97,19 +97,22 @@ def test_in_an_ordinary_scene_the_floor_is_the_largest_plane_to_the_last_bit():
 
 def test_where_nothing_moves_the_walled_ground_is_taken_and_said_to_be_in_doubt():
     from liex_lab.body.skeleton import MOUSE_VIEW
-    from liex_lab.foreground.standing import find_standing
+    from liex_lab.foreground.standing import SampledScene, Standing, find_standing
+
+    def stood_on(frames: np.ndarray, still: np.ndarray) -> Standing:
+        spread = np.zeros_like(still)
+        scene = SampledScene(frames, still, spread, mouse.camera, SPINES, 7.0, MOUSE_VIEW)
+        return find_standing(scene)
 
     still = stage(height_mm=700.0, raised_mm=480.0).still
     empty = np.tile(still, (6, 1, 1))
     mouse = walk(stage(height_mm=700.0, raised_mm=480.0), 2)
-    found = find_standing(empty, still, np.zeros_like(still), mouse.camera, SPINES, 7.0, MOUSE_VIEW)
+    found = stood_on(empty, still)
     assert found.floor.distance_mm == pytest.approx(700.0, abs=2.0)
     assert "nothing of an animal's size was seen moving" in found.doubt
     assert np.isnan(found.support)
     low = replace(mouse.scene, still=np.where(still > 900.0, np.float32(0), still)).still
-    ordinary = find_standing(
-        np.tile(low, (6, 1, 1)), low, np.zeros_like(low), mouse.camera, SPINES, 7.0, MOUSE_VIEW
-    )
+    ordinary = stood_on(np.tile(low, (6, 1, 1)), low)
     assert ordinary.region is None  # walls enclose the largest plane itself
 
 
