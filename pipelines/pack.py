@@ -27,6 +27,7 @@ from .build import build_recording, build_tracker, open_planned
 from .convert import in_place, largest_step
 
 if TYPE_CHECKING:
+    from liex_lab.arena.region import Corners
     from liex_lab.recordings.frame import Depth
     from liex_lab.recordings.recording import Recording
     from liex_lab.tracking.tracker import FrameTracker
@@ -111,9 +112,10 @@ def pack(
                 "would change them; keep the recording, or write it with `liex convert --to "
                 f"{opened.name}.mcap`"
             )
-        mask, notes = (None, []) if whole else _region(recording, opened, plan, progress)
+        corners = () if whole else _stated(opened, plan)
+        mask, notes = (None, []) if whole else _region(recording, opened, plan, corners, progress)
         with in_place(target) as part:
-            digest = _write(opened, part, step_mm, mask, plan, progress)
+            digest = _write(opened, part, step_mm, mask, corners, progress)
             if verify or delete_original:
                 _compare(opened, part, mask, digest, progress)
         done = Packed(
@@ -183,15 +185,19 @@ def _check_deletable(opened: Recording) -> None:
 
 
 def _region(
-    recording: str | Path, opened: Recording, plan: Plan, progress: Progress
+    recording: str | Path,
+    opened: Recording,
+    plan: Plan,
+    corners: Corners,
+    progress: Progress,
 ) -> tuple[Mask | None, list[str]]:
-    """The pixels to keep (H, W), None for all, and a note on why.
+    """The pixels to keep (H, W), None for all, and a note on why; those within corners, if stated.
 
     A region that was found is kept where the tracker learned from it is that of whole pictures.
     """
     from liex_lab.arena.scene import region_mask
 
-    if corners := _stated(opened, plan):
+    if corners:
         return region_mask(corners, opened.width, opened.height), []
     if plan.arenas is not None:
         return None, ["whole pictures are kept, for the plan has several arenas in them"]
@@ -217,9 +223,9 @@ def _region(
             ]
         for share in _WIDER:
             mask = _wider(region, round(share * seen.width))
-            inside = seen.seen_by(seen.camera, _within(mask), {}, lent=True)
+            cut = seen.seen_by(seen.camera, _within(mask), {}, lent=True)
             try:
-                if _alike(learned, build_tracker(inside, plan)):
+                if _alike(learned, build_tracker(cut, plan)):
                     return mask, []
             except EstimationError:
                 continue
@@ -229,7 +235,7 @@ def _region(
         ]
 
 
-def _stated(opened: Recording, plan: Plan) -> Sequence[Sequence[float]]:
+def _stated(opened: Recording, plan: Plan) -> Corners:
     """The corners (u, v) px of the plan's region in the recording's pictures; none without one."""
     from .regions import stated_corners
 
@@ -287,7 +293,7 @@ def _write(
     part: Path,
     step_mm: float,
     mask: Mask | None,
-    plan: Plan,
+    corners: Corners,
     progress: Progress,
 ) -> str:
     """Write the archive; returns the hash that it states."""
@@ -301,7 +307,7 @@ def _write(
         problems=list(opened.problems),
         moved={int(row): int(moved[row]) for row in np.flatnonzero(moved)},
         source={"name": opened.name, "format": opened.format, "sha256": opened.digest(progress)},
-        region_px=[list(corner) for corner in _stated(opened, plan)],
+        region_px=[list(corner) for corner in corners],
         n_px=0 if mask is None else int(mask.sum()),
     )
     whole = _Hash(step_mm)
