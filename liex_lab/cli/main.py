@@ -153,21 +153,9 @@ def run(
     chosen = Plan.load(plan or "mouse").with_settings(asked)
     from liex_lab.api import run_arenas, run_session
 
-    if chosen.arenas is not None:
-        with progress_bar() as progress:
-            outcomes = run_arenas(
-                recording,
-                chosen if plan else None,
-                out,
-                settings=() if plan else asked,
-                overwrite=overwrite,
-                workers=workers,
-                progress=progress,
-            )
-        _tell_arenas(outcomes)
-        return
+    measure = run_session if chosen.arenas is None else run_arenas
     with progress_bar() as progress:
-        session = run_session(
+        measured = measure(
             recording,
             chosen if plan else None,
             out,
@@ -176,7 +164,10 @@ def run(
             workers=workers,
             progress=progress,
         )
-    _tell_session(session)
+    if isinstance(measured, Path):
+        _tell_session(measured)
+    else:
+        _tell_arenas(measured)
 
 
 @app.command(rich_help_panel=START)

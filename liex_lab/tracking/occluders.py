@@ -58,14 +58,14 @@ def _share_behind(heights, origin, step, depths, nearer_mm, reach_px, out):
                     if heights[i, r + dr, c + dc] > 0:
                         continue
                     n_edges += 1
-                    n_behind += z > 0 and _is_behind(
+                    n_behind += z > 0 and is_behind(
                         depths[i], v, u, dr, dc, z - nearer_mm, reach_px
                     )
         out[i] = n_behind / max(n_edges, 1)
 
 
 @njit(cache=True)
-def _is_behind(depth, v, u, dv, du, nearer, reach_px):
+def is_behind(depth, v, u, dv, du, nearer, reach_px):
     """Whether, in one direction, a reading nearer than `nearer` or the picture's edge is near."""
     for k in range(1, reach_px + 1):
         row = v + k * dv

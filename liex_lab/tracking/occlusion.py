@@ -23,6 +23,7 @@ from liex_lab.foreground.segmenter import Segmenter
 from liex_lab.geometry import SE3
 from liex_lab.runtime.shapes import check_shapes
 from liex_lab.tracking.observations import joints_of
+from liex_lab.tracking.occluders import is_behind
 
 Array = NDArray[np.float64]
 
@@ -175,12 +176,7 @@ def _look(heights, origin, step, distance, depths, ends, before, out):
 @njit(cache=True)
 def _beside(depth, v, u, step, nearer):
     """Whether a pixel lies within three crop pixels of a nearer one or of the picture's edge."""
-    for k in range(1, _REACH_PX + 1):
-        for dv, du in ((k, 0), (-k, 0), (0, k), (0, -k)):
-            row = v + dv * step
-            column = u + du * step
-            if not (0 <= row < depth.shape[0] and 0 <= column < depth.shape[1]):
-                return True
-            if 0 < depth[row, column] < nearer:
-                return True
+    for dv, du in ((1, 0), (-1, 0), (0, 1), (0, -1)):
+        if is_behind(depth, v, u, step * dv, step * du, nearer, _REACH_PX):
+            return True
     return False

@@ -286,10 +286,7 @@ class RosMessages(Messages):
         Raises:
             RecordingError: the time is beyond 2038.
         """
-        out = _Cdr(time_ns)
-        out.text("16UC1; png compressed ")
-        out.whole(len(png))
-        return bytes(out.content) + png
+        return _compressed_image(time_ns, "16UC1; png compressed ", png)
 
     def rvl_picture(self, time_ns: int, rvl: bytes) -> bytes:
         """sensor_msgs/msg/CompressedImage of an RVL picture, as compressed_depth_image_transport.
@@ -304,10 +301,7 @@ class RosMessages(Messages):
         Raises:
             RecordingError: the time is beyond 2038.
         """
-        out = _Cdr(time_ns)
-        out.text("16UC1; compressedDepth rvl")
-        out.whole(len(rvl))
-        return bytes(out.content) + rvl
+        return _compressed_image(time_ns, "16UC1; compressedDepth rvl", rvl)
 
     def calibration(self, time_ns: int, camera: Camera) -> bytes:
         """sensor_msgs/msg/CameraInfo of the camera of the pictures.
@@ -333,6 +327,14 @@ class RosMessages(Messages):
         out.whole(0, 0, 0, 0, 0, 0)  # not binned, the whole picture
         out.small(0)
         return bytes(out.content)
+
+
+def _compressed_image(time_ns: int, how: str, packed: bytes) -> bytes:
+    """sensor_msgs/msg/CompressedImage of a picture that is packed in some way."""
+    out = _Cdr(time_ns)
+    out.text(how)
+    out.whole(len(packed))
+    return bytes(out.content) + packed
 
 
 class _Cdr:
