@@ -17,17 +17,11 @@ from numpy.typing import NDArray
 
 from liex_lab.behaviour.design import animal_means
 
+from ..figures.style import INK, LINE, MUTED, RED
 from ..figures.times import kept_rows
 from ..report.contact_sheet import Array, png_uri, shade
 from .data import GREY, NO_POSE, OTHER, Ethogram, raster
 
-INK = "#1f2328"
-MUTED = "#626a73"
-LINE = "#d9dbd7"
-BLUE = "#4477AA"
-GREEN = "#228833"
-RED = "#EE6677"
-PURPLE = "#AA3377"
 # Okabe and Ito's colours; beside them every group has its own mark
 GROUP_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 GROUP_MARKS = ("circle", "square", "diamond", "triangle-up", "cross", "x", "star")

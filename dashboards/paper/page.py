@@ -11,7 +11,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from liex_lab.sessions.failure import write_whole
+from liex_lab.runtime.durable import write_whole
+
+from ..pages import page
 
 TEMPLATES = Path(__file__).parent / "templates"
 _DPI_SHOWN = 0.72  # of a picture's pixels, so that its letters are as large as the page's
@@ -29,15 +31,6 @@ def write_page(about: Mapping[str, Any], exhibits: Sequence[Mapping[str, Any]], 
     Returns:
         `path`.
     """
-    from jinja2 import Environment, FileSystemLoader, StrictUndefined
-
-    pages = Environment(
-        loader=FileSystemLoader(TEMPLATES),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
     shown = [
         {
             **one,
@@ -47,7 +40,7 @@ def write_page(about: Mapping[str, Any], exhibits: Sequence[Mapping[str, Any]], 
         }
         for one in exhibits
     ]
-    write_whole(path, pages.get_template("page.html.j2").render(**about, exhibits=shown))
+    write_whole(path, page(TEMPLATES / "page.html.j2", **about, exhibits=shown))
     return path
 
 

@@ -20,6 +20,7 @@ from liex_lab.sessions.videos import found_video
 
 from ..figures.seen import FRAMES, KINEMATICS
 from ..figures.sets import FOLDER, for_the_page
+from ..pages import page
 from ..units import counted, shown, titled
 from .charts import pictures
 from .methods import methods, optics, spine_mm
@@ -64,17 +65,9 @@ def render(session: Session, figures: Path | None = None) -> str:
         session: the opened session.
         figures: the folder for the figures as files; None writes none.
     """
-    from jinja2 import Environment, FileSystemLoader, StrictUndefined
-
-    pages = Environment(
-        loader=FileSystemLoader(TEMPLATES),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
     words = list(session.metadata.get("actions", {}))
-    return pages.get_template("report.html.j2").render(
+    return page(
+        TEMPLATES / "report.html.j2",
         name=session.name,
         animal=session.metadata["animal"]["name"],
         headline=headline(session),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import os
+from contextlib import ExitStack
 from fractions import Fraction
 from pathlib import Path
 from types import TracebackType
@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.errors import SessionError
+from liex_lab.runtime.durable import replacing
 from liex_lab.runtime.places import unlinked
 
 _CODECS = ("libx264", "libopenh264")
@@ -57,7 +58,7 @@ class Video:
     def __init__(self, path: Path, fps: float) -> None:
         self._codec = h264()
         self._path = unlinked(path)
-        self._part = path.with_name(f".{os.getpid()}.part-{path.name}")
+        self._files = ExitStack()
         self._fps = Fraction(fps).limit_denominator(1001)
         self._box: Any = None
         self._stream: Any = None
@@ -75,7 +76,9 @@ class Video:
 
         height, width = (n - n % 2 for n in picture.shape[:2])
         if self._box is None:
-            self._box = av.open(str(self._part), "w", format="mp4", options=_box_options())
+            part = self._files.enter_context(replacing(self._path))
+            self._box = av.open(str(part), "w", format="mp4", options=_box_options())
+            self._files.push(self._end)
             self._stream = self._box.add_stream(self._codec, rate=self._fps)
             self._stream.width = width
             self._stream.height = height
@@ -94,15 +97,18 @@ class Video:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        try:
-            if self._box is not None:
-                if kind is None:
-                    self._box.mux(self._stream.encode())
-                self._box.close()
-                if kind is None:
-                    os.replace(self._part, self._path)
-        finally:
-            self._part.unlink(missing_ok=True)
+        self._files.__exit__(kind, error, trace)
+
+    def _end(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Close the box, after the last pictures where all went well."""
+        if kind is None:
+            self._box.mux(self._stream.encode())
+        self._box.close()
 
 
 def _box_options() -> dict[str, str]:
