@@ -27,7 +27,7 @@ SOURCES = {
     "fish": "synthetic:swim?seed=5&frames=120",
     "hand": "synthetic:gesture?seed=5&frames=60",
 }
-_LEFT_OUT = ("liex_lab.recordings.", "liex_lab.simulation.")
+LEFT_OUT = ("liex_lab.recordings.", "liex_lab.simulation.")
 
 
 def called_kernels(arguments: list[str]) -> list[dict[str, Any]]:
@@ -50,7 +50,7 @@ def called_kernels(arguments: list[str]) -> list[dict[str, Any]]:
         def on_end(self, event: Any) -> None:
             spent = time.process_time() - began.stack.pop()
             kernel = event.data["dispatcher"].py_func
-            if not began.stack and not kernel.__module__.startswith(_LEFT_OUT):
+            if not began.stack and not kernel.__module__.startswith(LEFT_OUT):
                 rows.append(
                     {
                         "kernel": f"{kernel.__module__}:{kernel.__qualname__}",

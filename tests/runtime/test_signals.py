@@ -55,16 +55,21 @@ def heeding() -> None:
         signal.signal(number, signal.SIG_DFL)
 
 
-def ended(work: str, *signals: int) -> tuple[int, str, str, float]:
-    """Exit code, output, errors and seconds of a process that is sent signals."""
-    code = MAIN.format(work=work.strip())
-    with subprocess.Popen(
-        [sys.executable, "-c", code],
+def started(*arguments: str) -> subprocess.Popen[str]:
+    """A process of Python that heeds signals."""
+    return subprocess.Popen(
+        [sys.executable, *arguments],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
         preexec_fn=heeding,
-    ) as running:
+    )
+
+
+def ended(work: str, *signals: int) -> tuple[int, str, str, float]:
+    """Exit code, output, errors and seconds of a process that is sent signals."""
+    code = MAIN.format(work=work.strip())
+    with started("-c", code) as running:
         assert running.stdout is not None
         assert running.stdout.readline() == "begun\n"
         began = time.monotonic()
@@ -131,13 +136,7 @@ def test_no_worker_is_left_behind(number: int, handled: bool, tmp_path: Path) ->
         work = f"{begin}cli.app = lambda: {work}; cli.main()"
     script = tmp_path / "script.py"
     script.write_text(POOL.format(main=work))
-    with subprocess.Popen(
-        [sys.executable, str(script)],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        preexec_fn=heeding,
-    ) as running:
+    with started(str(script)) as running:
         assert running.stdout is not None
         workers = [int(running.stdout.readline()) for _ in range(2)]
         assert all(map(alive, workers))
