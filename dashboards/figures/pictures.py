@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.sessions import Session
+from liex_lab.sessions.cutouts import meant_to_keep_depth
 
 from ..app.frames import Frames
 
@@ -41,10 +42,7 @@ class DepthReader:
     @property
     def whole(self) -> bool:
         """Whether the session's replay keeps depth, beyond the thumbnails of the report."""
-        plan = self._session.metadata.get("plan", {}).get("replay", {})
-        # plans of earlier versions said whether there was to be depth at all
-        kept = plan.get("depth", True) not in (False, "none")
-        return kept and self._session.has("session.mcap")
+        return meant_to_keep_depth(self._session) and self._session.has("session.mcap")
 
     def picture(self, row: int) -> NDArray[np.uint16] | None:
         """(H, W) uint16 mm, 0 where unread; None where the session keeps none of this frame.

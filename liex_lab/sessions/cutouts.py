@@ -195,6 +195,16 @@ def write_boxes(folder: Path, boxes: Boxes) -> None:
     np.savez_compressed(folder / FILE, boxes=boxes)
 
 
+def meant_to_keep_depth(session: Session) -> bool:
+    """Whether a session's plan lets its replay keep depth.
+
+    Args:
+        session: the session; plans of earlier versions say true or false, or nothing.
+    """
+    plan = session.metadata.get("plan", {})
+    return plan.get("replay", {}).get("depth", ALL) not in (NONE, False)
+
+
 def open_pictures(session: Session) -> Recording:
     """The depth pictures that a session keeps, as a recording; a session's pictures are read here.
 
@@ -215,7 +225,7 @@ def open_pictures(session: Session) -> Recording:
     try:
         return open_recording(session.path / "session.mcap")
     except RecordingError:
-        if session.metadata["plan"].get("replay", {}).get("depth") not in (NONE, False):
+        if meant_to_keep_depth(session):
             raise
     raise SessionError(
         f'{session.path} keeps no depth pictures, for its plan says replay.depth = "none"; run '
