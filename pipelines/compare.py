@@ -54,9 +54,9 @@ def compare_sessions(
         SessionError: there are no two groups, or a folder, column, engine or CSV cannot be used.
     """
     from liex_lab.behaviour.cohort import ENGINES, STATS, collect, compare, methods, usual_measures
+    from liex_lab.runtime.spreadsheets import write_csv
     from liex_lab.sessions import Session
     from liex_lab.tables.schema import dictionary, from_pandas, write_table
-    from liex_lab.tables.spreadsheets import write_csv
 
     if engine not in ENGINES:
         raise SessionError(f"the engine is one of {', '.join(ENGINES)}, got '{engine}'")

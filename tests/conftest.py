@@ -5,15 +5,30 @@ integration.
 from __future__ import annotations
 
 import os
-from collections.abc import Generator
+import shutil
+from collections.abc import Generator, Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
 from hypothesis import settings
 
+if TYPE_CHECKING:
+    from playwright.sync_api import Browser
+
 REPOSITORY = Path(__file__).resolve().parents[1]
 REFERENCE_DATA = REPOSITORY.parent / "shared" / "data"
 ABSENT = "reference data absent"  # the one reason for which a test may skip in CI
+
+_CHROMIUM_FLAGS = [
+    "--no-sandbox",
+    "--disable-gpu",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+]
 
 settings.register_profile("suite", derandomize=True, deadline=None, max_examples=50, database=None)
 settings.load_profile("suite")
@@ -25,6 +40,24 @@ def reference_data() -> Path:
     if not REFERENCE_DATA.is_dir():
         pytest.skip(ABSENT)
     return REFERENCE_DATA
+
+
+@pytest.fixture(scope="session")
+def browser() -> Iterator[Browser]:
+    """The Chromium of this machine; one is never downloaded. There is one for all tests, since
+    Playwright's synchronous interface can be open once in a thread.
+    """
+    from playwright.sync_api import sync_playwright
+
+    chromium = shutil.which("chromium")
+    if chromium is None:
+        pytest.skip("no chromium is installed: apt install chromium")
+    with sync_playwright() as playwright:
+        started = playwright.chromium.launch(
+            executable_path=chromium, headless=True, args=_CHROMIUM_FLAGS
+        )
+        yield started
+        started.close()
 
 
 def excuse(report: pytest.TestReport | pytest.CollectReport) -> str:

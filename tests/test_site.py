@@ -4,7 +4,6 @@ and a page asks no other machine for anything.
 
 from __future__ import annotations
 
-import contextlib
 import functools
 import http.server
 import os
@@ -15,12 +14,15 @@ import sys
 import threading
 from collections.abc import Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
 
 from tests.conftest import REPOSITORY
 
-_FLAGS = ["--no-sandbox", "--disable-gpu", "--disable-background-networking", "--disable-sync"]
+if TYPE_CHECKING:
+    from playwright.sync_api import Browser
+
 LOOKED_AT = (
     "index.html",
     "start.html",
@@ -88,31 +90,24 @@ def test_generated_pages_hold_what_the_program_says(site: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_page_asks_no_other_machine_and_fits_a_phone(site: Path, address: str) -> None:
-    from playwright.sync_api import sync_playwright
-
-    chromium = shutil.which("chromium")
-    if chromium is None:
-        pytest.skip("needs chromium: apt install chromium")
+def test_a_page_asks_no_other_machine_and_fits_a_phone(
+    site: Path, address: str, browser: Browser
+) -> None:
     asked: list[str] = []
     broken: list[str] = []
-    with contextlib.ExitStack() as stack:
-        player = stack.enter_context(sync_playwright())
-        browser = player.chromium.launch(executable_path=chromium, headless=True, args=_FLAGS)
-        for width in (1280, 390):
-            page = browser.new_page(viewport={"width": width, "height": 800})
-            page.on("request", lambda request: asked.append(request.url))
-            page.on("pageerror", lambda error: broken.append(str(error)))
-            page.on(
-                "response",
-                lambda answer: broken.append(answer.url) if answer.status >= 400 else None,
-            )
-            for name in LOOKED_AT:
-                page.goto(f"{address}/{name}", wait_until="networkidle")
-                wide = page.evaluate("document.documentElement.scrollWidth")
-                assert wide <= width, f"{name} is {wide} px wide on {width}"
-            page.close()
-        browser.close()
+    for width in (1280, 390):
+        page = browser.new_page(viewport={"width": width, "height": 800})
+        page.on("request", lambda request: asked.append(request.url))
+        page.on("pageerror", lambda error: broken.append(str(error)))
+        page.on(
+            "response",
+            lambda answer: broken.append(answer.url) if answer.status >= 400 else None,
+        )
+        for name in LOOKED_AT:
+            page.goto(f"{address}/{name}", wait_until="networkidle")
+            wide = page.evaluate("document.documentElement.scrollWidth")
+            assert wide <= width, f"{name} is {wide} px wide on {width}"
+        page.close()
     assert asked
     assert [url for url in asked if not url.startswith((address, "data:", "blob:"))] == []
     assert broken == []

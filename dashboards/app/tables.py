@@ -15,7 +15,7 @@ import numpy as np
 from dash import dcc, html
 
 from liex_lab.errors import SessionError
-from liex_lab.tables.spreadsheets import harmless_table
+from liex_lab.runtime.spreadsheets import harmless_table
 
 from .data import DONE, StudyData
 from .parts import aria, download

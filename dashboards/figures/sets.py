@@ -12,10 +12,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from liex_lab.behaviour.cohort import WHO
 from liex_lab.errors import SessionError
 from liex_lab.runtime.durable import replacing
 from liex_lab.runtime.places import inside, safe_name, unlinked
 from liex_lab.runtime.progress import Progress, silent
+from liex_lab.runtime.spreadsheets import read_harmless
 from liex_lab.sessions import Session
 
 from . import actions, groups, places, times
@@ -190,7 +192,7 @@ def read_comparison(folder: Path) -> tuple[pd.DataFrame, pd.DataFrame, list[Sess
     import pandas as pd
 
     try:
-        table = pd.read_csv(folder / "sessions.csv", dtype={"subject_id": "str", "group": "str"})
+        table = read_harmless(folder / "sessions.csv", ("session_id", "individual", *WHO))
         stats = pd.read_parquet(folder / "stats.parquet")
         listed = json.loads((folder / COMPARISON_FILE).read_text(encoding="utf-8"))["sessions"]
         places = [folder / str(place) for place in listed]

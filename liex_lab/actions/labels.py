@@ -16,12 +16,14 @@ from numpy.typing import NDArray
 
 from liex_lab.actions.ethogram import UNLABELLED
 from liex_lab.errors import LiexError, one_line
+from liex_lab.runtime.spreadsheets import read_named
 from liex_lab.tracking.track import Track
 
 Array = NDArray[np.float64]
 
 HUMAN = "human"
 _NEEDED = ("action", "start_s", "stop_s")
+_TEXTS = ("session_id", "individual", "action")  # names: 007 and NA are names, too
 
 
 def read_labels(path: str | Path) -> pd.DataFrame:
@@ -40,7 +42,9 @@ def read_labels(path: str | Path) -> pd.DataFrame:
     """
     source = Path(path)
     try:
-        table = pd.read_parquet(source) if source.suffix == ".parquet" else pd.read_csv(source)
+        table = (
+            pd.read_parquet(source) if source.suffix == ".parquet" else read_named(source, _TEXTS)
+        )
     except (OSError, ValueError) as error:
         raise LiexError(
             f"{source} should be a table of bouts, as CSV or parquet, but: {one_line(error)}"

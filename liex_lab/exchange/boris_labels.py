@@ -18,6 +18,7 @@ import pandas as pd
 
 from liex_lab.actions.labels import HUMAN, checked
 from liex_lab.errors import LiexError, one_line
+from liex_lab.runtime.spreadsheets import read_named
 
 _STATE = "State event"
 _MOST_BYTES = 1 << 28  # unpacked
@@ -94,7 +95,8 @@ def boris_export_labels(path: str | Path) -> pd.DataFrame:
     """
     source = Path(path)
     try:
-        table = pd.read_csv(source, sep="\t" if source.suffix == ".tsv" else ",")
+        names = ("Observation id", "Subject", "Behavior")
+        table = read_named(source, names, "\t" if source.suffix == ".tsv" else ",")
     except (OSError, ValueError) as error:
         raise LiexError(f"{source} should be an export of BORIS, but: {one_line(error)}") from None
     wanted = {

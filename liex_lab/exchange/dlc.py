@@ -13,8 +13,8 @@ import numpy as np
 import pandas as pd
 
 from liex_lab.exchange.poses import Array, Poses, write_times
+from liex_lab.runtime.spreadsheets import write_csv
 from liex_lab.sessions import Session
-from liex_lab.tables.spreadsheets import write_csv
 
 SCORER = "liex_lab"
 

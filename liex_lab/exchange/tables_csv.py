@@ -9,9 +9,9 @@ import shutil
 from pathlib import Path
 
 from liex_lab.runtime.places import inside
+from liex_lab.runtime.spreadsheets import copy_harmless, write_csv
 from liex_lab.sessions import Session
 from liex_lab.sessions.reading import reading_from
-from liex_lab.tables.spreadsheets import copy_harmless, write_csv
 
 
 def write(session: Session, path: Path) -> None:

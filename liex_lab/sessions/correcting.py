@@ -287,17 +287,20 @@ def labelled_bouts(session: Session, labels: Any) -> list[BoutEdit]:
             session_id.
 
     Raises:
-        SessionError: none of the labels lies within the session.
+        SessionError: the labels are of several recordings and not of this one, or none of them
+            lies within the session.
     """
     from liex_lab.actions.ethogram import Ethogram
     from liex_lab.actions.labels import words_of
 
     time_ns, time_s = (session.frames[name].to_numpy() for name in ("time_ns", "time_s"))
-    named = (
-        session.name
-        if "session_id" in labels and session.name in set(labels["session_id"].astype(str))
-        else ""
-    )
+    of = set(labels["session_id"].astype(str)) if "session_id" in labels else set()
+    named = session.name if session.name in of else ""
+    if not named and len(of) > 1:
+        raise SessionError(
+            f"these labels are of {', '.join(sorted(of)[:5])} and of none named {session.name}; "
+            "give the session's name as session_id (in BORIS: the observation's name)"
+        )
     bouts = Ethogram.of_words(words_of(labels, time_s, named), time_ns).bouts
     if not bouts:
         raise SessionError(

@@ -14,11 +14,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from liex_lab.runtime.spreadsheets import write_csv
 from liex_lab.sessions.provenance import Provenance, package_version
 from liex_lab.tables import schema as tables
 from liex_lab.tables.rows import Rows, median_step, stop_times
 from liex_lab.tables.schema import Column
-from liex_lab.tables.spreadsheets import write_csv
 from liex_lab.tracking.track import Flip
 
 if TYPE_CHECKING:

@@ -21,6 +21,7 @@ from liex_lab.errors import SessionError
 from liex_lab.geometry import SE3
 from liex_lab.optics.camera import Camera
 from liex_lab.runtime.memory import rest
+from liex_lab.runtime.spreadsheets import read_harmless
 from liex_lab.sessions.corrections import (
     Log,
     applies,
@@ -32,7 +33,6 @@ from liex_lab.sessions.document import read_document
 from liex_lab.sessions.older import put_back_session
 from liex_lab.sessions.reading import reading_from
 from liex_lab.tables.checks import check_footer, check_rows
-from liex_lab.tables.spreadsheets import read_harmless
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -10,8 +10,8 @@ from typing import Any
 from liex_lab.plan.study import Study
 from liex_lab.runtime.durable import replacing, write_whole
 from liex_lab.runtime.places import unlinked_below
+from liex_lab.runtime.spreadsheets import harmless
 from liex_lab.tables.schema import columns, dictionary, write_table
-from liex_lab.tables.spreadsheets import harmless
 
 from .status import SessionStatus
 

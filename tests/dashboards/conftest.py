@@ -4,23 +4,13 @@ kept.
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import pytest
-from playwright.sync_api import Browser, Page, Route, expect, sync_playwright
+from playwright.sync_api import Browser, Page, Route, expect
 
 _PATIENCE_MS = 30_000  # of a busy machine
-_FLAGS = [
-    "--no-sandbox",
-    "--disable-gpu",
-    "--disable-quic",
-    "--no-first-run",
-    "--disable-background-networking",
-    "--disable-component-update",
-    "--disable-sync",
-]
 
 
 @dataclass
@@ -55,22 +45,10 @@ def watch(page: Page) -> Watched:
     return watched
 
 
-@pytest.fixture(scope="session")
-def browser() -> Iterator[Browser]:
-    """The Chromium of this machine; one is never downloaded."""
-    chromium = shutil.which("chromium")
-    if chromium is None:
-        pytest.skip("no chromium is installed")
-    expect.set_options(timeout=_PATIENCE_MS)
-    with sync_playwright() as playwright:
-        started = playwright.chromium.launch(executable_path=chromium, headless=True, args=_FLAGS)
-        yield started
-        started.close()
-
-
 @pytest.fixture
 def watched(browser: Browser) -> Iterator[Watched]:
     """A page on a screen of 1400 x 900."""
+    expect.set_options(timeout=_PATIENCE_MS)
     page = browser.new_page(viewport={"width": 1400, "height": 900}, accept_downloads=True)
     page.set_default_timeout(_PATIENCE_MS)
     yield watch(page)

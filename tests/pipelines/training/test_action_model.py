@@ -90,6 +90,16 @@ def test_an_ethogram_goes_to_boris_and_comes_back_as_a_humans(
     assert list(back.columns) == list(own.columns)[: len(back.columns)]
 
 
+def test_labels_of_several_other_recordings_are_not_taken(session: Session, tmp_path: Path) -> None:
+    path = tmp_path / "labels.csv"
+    path.write_text("session_id,action,start_s,stop_s\n007,dig,0.5,1.0\n07,rest,1.5,2.0\n")
+    labels = read_any_labels(path)
+    assert list(labels["session_id"]) == ["007", "07"]
+    with pytest.raises(LiexError, match=f"of 007, 07 and of none named {session.name}"):
+        labelled_bouts(session, labels)
+    assert labelled_bouts(session, labels.assign(session_id=[session.name, "07"]))
+
+
 def test_a_recogniser_learns_new_words_from_labelled_sessions(
     session: Session, labels: Path, tmp_path: Path
 ) -> None:

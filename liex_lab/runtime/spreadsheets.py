@@ -80,6 +80,28 @@ def write_csv(table: pd.DataFrame, path: Path, *, index: bool = False) -> None:
     harmless_table(table).to_csv(path, index=index, lineterminator="\n")
 
 
+def read_named(path: Path, texts: tuple[str, ...], separator: str = ",") -> pd.DataFrame:
+    """Read a CSV file some columns of which are names: '', 007 and NA are names like any other.
+
+    Args:
+        path: the file.
+        texts: columns that are text whatever they look like; those that are there.
+        separator: what stands between cells.
+
+    Raises:
+        OSError: the file cannot be read.
+        ValueError: it is no such table.
+    """
+    import pandas as pd
+
+    table = pd.read_csv(path, sep=separator)
+    names = [name for name in texts if name in table]
+    if names:
+        said = pd.read_csv(path, sep=separator, usecols=names, dtype="str", keep_default_na=False)
+        table = table.assign(**{name: said[name] for name in names})
+    return table
+
+
 def read_harmless(path: Path, texts: tuple[str, ...] = ()) -> pd.DataFrame:
     """Read a CSV file that `write_csv` wrote, cells and headings as they were before.
 
@@ -89,7 +111,7 @@ def read_harmless(path: Path, texts: tuple[str, ...] = ()) -> pd.DataFrame:
     """
     import pandas as pd
 
-    table = pd.read_csv(path, dtype=dict.fromkeys(texts, "str"))
+    table = read_named(path, texts)
     table.columns = pd.Index([as_it_was(name) for name in table.columns])
     return table.map(as_it_was)
 

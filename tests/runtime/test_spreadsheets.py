@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from liex_lab.tables.spreadsheets import (
+from liex_lab.runtime.spreadsheets import (
     as_it_was,
     copy_harmless,
     harmless,
@@ -86,3 +86,12 @@ def test_a_copy_of_a_foreign_file_is_harmless_and_keeps_its_numbers(tmp_path: Pa
     assert (tmp_path / "b.csv").read_text() == (
         "session_id,'=x,d\n'=cmd|calc!A0,-1.50,1e-3\n'=kept,+2,\n"
     )
+
+
+@pytest.mark.parametrize("name", ["", "NA", "nan", "None", "007", "1e3", "-1"])
+def test_a_name_is_text_whatever_it_looks_like(name: str, tmp_path: Path) -> None:
+    path = tmp_path / "a.csv"
+    write_csv(pd.DataFrame({"session_id": [name], "distance_m": [1.5]}), path)
+    again = read_harmless(path, ("session_id",))
+    assert again["session_id"].tolist() == [name]
+    assert again["distance_m"].tolist() == [1.5]
