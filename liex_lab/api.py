@@ -271,7 +271,7 @@ def draw_figures(
             folder of a comparison.
         only: names of figures, such as 'occupancy'; of a comparison its measures, too; () takes
             all.
-        formats: some of svg, pdf and png.
+        formats: some of svg, pdf and png; 'pages' is one file figures.pdf of all of them.
         out: the folder for them; None takes `figures` beside what they are of.
         progress: told which figure is drawn.
 
