@@ -99,9 +99,6 @@ def measure_session(
         MisfitError: the recording shows something else than the plan's animal.
         EstimationError: no animal is found.
     """
-    from liex_lab.recordings.timestamps import unwritable_times
-    from liex_lab.sessions import SessionWriter
-
     started = time.perf_counter()
     first = plan or Plan.load(USUAL).with_settings(settings)
     if first.arenas is not None:
@@ -113,6 +110,9 @@ def measure_session(
         in_background(partial(build_estimator, first)) as estimator,
         build_recording(recording, first, progress) as opened,
     ):
+        from liex_lab.recordings.timestamps import unwritable_times
+        from liex_lab.sessions import SessionWriter
+
         folder = folder or inside(Path(out), first.session.name or opened.name, ".liex")
         if told := unwritable_times(opened.times_ns):
             raise RecordingError(f"of {opened.name} {told}")
