@@ -20,6 +20,7 @@ import numpy as np
 
 from liex_lab.errors import PlanError, RecordingError
 from liex_lab.plan import Plan
+from liex_lab.recordings.frame import in_one_block
 from liex_lab.runtime.memory import Allocator, rest
 from liex_lab.runtime.places import inside
 from liex_lab.runtime.progress import Progress, silent
@@ -264,7 +265,10 @@ def read_ahead(opened: Recording, first: int) -> Generator[list[DepthFrame], Non
         first: row of the first frame.
     """
     chunks = opened.chunks(CHUNK, first)
-    yield from chunks if opened.format == "synthetic" else prefetch(chunks)
+    if opened.format == "synthetic":
+        yield from chunks
+    else:
+        yield from prefetch(in_one_block(frames) for frames in chunks)
 
 
 def make_track(writer: SessionWriter, fitted: Fitted) -> Verdict:
