@@ -17,6 +17,7 @@ from liex_lab.errors import MissingPackageError, how_to_install
 from liex_lab.plan import Plan
 from liex_lab.plan.study import Study
 from liex_lab.runtime.progress import Board, Progress, progress_board, silent, telling_of_compiling
+from liex_lab.runtime.threads import imported_ahead
 
 if TYPE_CHECKING:
     from liex_lab.pipelines.arenas import ArenaOutcome
@@ -27,6 +28,9 @@ if TYPE_CHECKING:
     from liex_lab.sessions.corrections import Correction
 
 DEMO = "mouse_walk.mcap"
+# what a run needs after its first frames, and takes seconds to import: of the replay, of the table
+# `transitions`, of the figures
+_HEAVY = ("pandas", "rerun", "scipy.stats", "matplotlib.figure", "matplotlib.backends.backend_svg")
 
 
 def run_session(
@@ -70,14 +74,12 @@ def run_session(
         LiexError: the recording, the plan or the animal in it cannot be used; the message says what
             to do.
     """
-    from liex_lab.dashboards.replay.rerun_blueprint import replay_blueprint
-    from liex_lab.dashboards.report.views import write_views
     from liex_lab.pipelines.session import measure_session
     from liex_lab.pipelines.workers import Processes
 
     if workers > 1 and pool is None:
         pool = Processes(workers)
-    with telling_of_compiling(progress) as progress:
+    with imported_ahead(*_HEAVY), telling_of_compiling(progress) as progress:
         return measure_session(
             recording,
             plan,
@@ -86,8 +88,8 @@ def run_session(
             folder=folder,
             overwrite=overwrite,
             notes=notes,
-            blueprint=replay_blueprint,
-            report=write_views,
+            blueprint=_layout,
+            report=_views,
             pool=pool,
             progress=progress,
         )
@@ -127,14 +129,12 @@ def run_arenas(
     Raises:
         LiexError: the recording or the plan cannot be used, or arenas overlap.
     """
-    from liex_lab.dashboards.replay.rerun_blueprint import replay_blueprint
-    from liex_lab.dashboards.report.views import write_views
     from liex_lab.pipelines.arenas import measure_arenas
     from liex_lab.pipelines.workers import Processes
 
     if workers > 1 and pool is None:
         pool = Processes(workers)
-    with telling_of_compiling(progress) as progress:
+    with imported_ahead(*_HEAVY), telling_of_compiling(progress) as progress:
         return measure_arenas(
             recording,
             plan,
@@ -142,8 +142,8 @@ def run_arenas(
             settings=settings,
             overwrite=overwrite,
             notes=notes,
-            blueprint=replay_blueprint,
-            report=write_views,
+            blueprint=_layout,
+            report=_views,
             pool=pool,
             progress=progress,
         )
@@ -175,8 +175,6 @@ def correct_session(
     Raises:
         SessionError: a correction cannot be applied, or another program is correcting the session.
     """
-    from liex_lab.dashboards.replay.rerun_blueprint import replay_blueprint
-    from liex_lab.dashboards.report.views import write_views
     from liex_lab.pipelines.correct import correct_session as job
 
     return job(
@@ -184,8 +182,8 @@ def correct_session(
         what,
         undo=undo,
         author=author,
-        blueprint=replay_blueprint,
-        report=write_views,
+        blueprint=_layout,
+        report=_views,
         progress=progress,
     )
 
@@ -271,7 +269,7 @@ def draw_figures(
             folder of a comparison.
         only: names of figures, such as 'occupancy'; of a comparison its measures, too; () takes
             all.
-        formats: some of svg, pdf and png.
+        formats: some of svg, pdf and png; 'pages' is one file figures.pdf of all of them.
         out: the folder for them; None takes `figures` beside what they are of.
         progress: told which figure is drawn.
 
@@ -807,3 +805,17 @@ def run_tables(
         drawers=Drawers(draw_figures, draw_tracking, draw_confusions, draw_key_frames, write_page),
         progress=progress,
     )
+
+
+def _layout(session: dict[str, Any]) -> Any:
+    """The Rerun layout of a session.json; it is imported when it is wanted."""
+    from liex_lab.dashboards.replay.rerun_blueprint import replay_blueprint
+
+    return replay_blueprint(session)
+
+
+def _views(folder: Path) -> Path:
+    """Report and layouts of a session's folder; they are imported when they are wanted."""
+    from liex_lab.dashboards.report.views import write_views
+
+    return write_views(folder)

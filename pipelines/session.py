@@ -20,6 +20,7 @@ import numpy as np
 
 from liex_lab.errors import PlanError, RecordingError
 from liex_lab.plan import Plan
+from liex_lab.recordings.frame import in_one_block
 from liex_lab.runtime.memory import Allocator, rest
 from liex_lab.runtime.places import inside
 from liex_lab.runtime.progress import Progress, silent
@@ -99,9 +100,6 @@ def measure_session(
         MisfitError: the recording shows something else than the plan's animal.
         EstimationError: no animal is found.
     """
-    from liex_lab.recordings.timestamps import unwritable_times
-    from liex_lab.sessions import SessionWriter
-
     started = time.perf_counter()
     first = plan or Plan.load(USUAL).with_settings(settings)
     if first.arenas is not None:
@@ -113,6 +111,9 @@ def measure_session(
         in_background(partial(build_estimator, first)) as estimator,
         build_recording(recording, first, progress) as opened,
     ):
+        from liex_lab.recordings.timestamps import unwritable_times
+        from liex_lab.sessions import SessionWriter
+
         folder = folder or inside(Path(out), first.session.name or opened.name, ".liex")
         if told := unwritable_times(opened.times_ns):
             raise RecordingError(f"of {opened.name} {told}")
@@ -264,7 +265,10 @@ def read_ahead(opened: Recording, first: int) -> Generator[list[DepthFrame], Non
         first: row of the first frame.
     """
     chunks = opened.chunks(CHUNK, first)
-    yield from chunks if opened.format == "synthetic" else prefetch(chunks)
+    if opened.format == "synthetic":
+        yield from chunks
+    else:
+        yield from prefetch(in_one_block(frames) for frames in chunks)
 
 
 def make_track(writer: SessionWriter, fitted: Fitted) -> Verdict:

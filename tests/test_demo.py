@@ -52,7 +52,8 @@ def test_the_folder_is_whole(session: Session) -> None:
         "mouse_walk.mp4",
     }
     drawn = {path.name for path in (session.path / "figures").iterdir()}
-    assert {"figures.pdf", "occupancy.svg", "ethogram.svg", "arena.svg"} <= drawn
+    assert {"occupancy.svg", "ethogram.svg", "arena.svg"} <= drawn
+    assert all(name.endswith(".svg") for name in drawn)  # other formats are asked for
     # nothing is wrong with it; bouts that contradicted their definition are said to be refused
     refused = session.metadata.get("refused_bouts", {}).get("bouts", [])
     assert len(session.metadata["problems"]) == bool(refused)

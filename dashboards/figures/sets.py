@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -27,10 +28,13 @@ from .style import FORMATS, drawing, image_bytes, on_page
 
 if TYPE_CHECKING:
     import pandas as pd
+    from matplotlib.backends.backend_pdf import PdfPages
     from matplotlib.figure import Figure
 
 FOLDER = "figures"
-PAGES = "figures.pdf"  # beside a report: a page for each figure
+PAGES = "pages"  # the format that is one file of all figures, a page for each
+KINDS = (*FORMATS, PAGES)
+_PAGES_FILE = "figures.pdf"
 COMPARISON_FILE = "comparison.json"
 _PICTURES = 9  # from which the arena without the animal is found
 OF_SESSION: dict[str, tuple[str, Callable[[Seen], Figure | None]]] = {
@@ -138,7 +142,7 @@ def write_figures(
     Args:
         drawn: the figures, made while they are written.
         folder: it is made where it is missing.
-        kinds: some of `FORMATS`.
+        kinds: some of `KINDS`.
         progress: told which figure is drawn.
 
     Returns:
@@ -146,17 +150,40 @@ def write_figures(
     """
     files: list[Path] = []
     empty: list[str] = []
-    with drawing():
+    alone = [kind for kind in kinds if kind != PAGES]
+    with drawing(), _one_pdf(folder if PAGES in kinds else None) as pages:
         for k, one in enumerate(drawn):
             progress(k, None, "drawing figures")
             if one.figure is None:
                 empty.append(one.name)
                 continue
-            for kind in kinds:
-                files.append(
-                    put_figure(folder, f"{one.name}.{kind}", image_bytes(one.figure, kind))
-                )
+            for kind in alone:
+                content = image_bytes(one.figure, kind)
+                files.append(put_figure(folder, f"{one.name}.{kind}", content))
+            if pages is not None:
+                pages.savefig(one.figure)
+    if PAGES in kinds and (folder / _PAGES_FILE).is_file():
+        files.append(folder / _PAGES_FILE)
     return files, empty
+
+
+@contextmanager
+def _one_pdf(folder: Path | None) -> Iterator[PdfPages | None]:
+    """All figures of a folder as one PDF, which is written when the block ends; None for none.
+
+    The font is embedded once: a PDF of its own for each figure takes several times as long.
+    """
+    if folder is None:
+        yield None
+        return
+    from matplotlib.backends.backend_pdf import PdfPages
+
+    held = io.BytesIO()
+    with PdfPages(held, metadata={"CreationDate": None}) as pages:
+        yield pages
+        n_pages = pages.get_pagecount()
+    if n_pages:
+        put_figure(folder, _PAGES_FILE, held.getvalue())
 
 
 def put_figure(folder: Path, name: str, content: bytes) -> Path:
@@ -234,44 +261,48 @@ def check_kinds(kinds: Sequence[str]) -> None:
         SessionError: one is not known.
     """
     for kind in kinds:
-        if kind not in FORMATS:
+        if kind not in KINDS:
             raise SessionError(
-                f"figures are written as {', '.join(FORMATS)}, got '{kind}'; name one of these"
+                f"figures are written as {', '.join(KINDS)}, got '{kind}'; name one of these"
             )
 
 
 def for_the_page(session: Session, folder: Path | None) -> dict[str, str]:
-    """Every figure of a session as an element of a page, by name; written as files on the way.
+    """Every figure of a session as an element of a page, by name; written as SVG on the way.
 
-    Each is an SVG, and a page of figures.pdf: a PDF of its own for each would embed the font anew,
-    which takes longer than everything else.
+    Files of other formats that lie there already, of the session as it was before a correction,
+    are drawn anew, too. No others are made: they cost as much again as the whole report.
 
     Args:
         session: the opened session.
         folder: where the files go; None writes none.
     """
-    from matplotlib.backends.backend_pdf import PdfPages
-
     made: dict[str, str] = {}
-    held = io.BytesIO()
-    with drawing():
-        pages = None if folder is None else PdfPages(held, metadata={"CreationDate": None})
+    there = set() if folder is None else {path.name for path in _files(folder)}
+    with drawing(), _one_pdf(folder if _PAGES_FILE in there else None) as pages:
         for one in session_figures(session):
             if one.figure is None:
                 continue
             svg = image_bytes(one.figure, "svg")
-            if folder is not None and pages is not None:
-                put_figure(folder, f"{one.name}.svg", svg)
-                pages.savefig(one.figure)
             made[one.name] = on_page(svg, one.name, f"{one.name.replace('_', ' ')}: {one.what}")
-        if pages is not None:
-            pages.close()
+            if folder is None:
+                continue
+            put_figure(folder, f"{one.name}.svg", svg)
+            for kind in FORMATS:
+                if kind != "svg" and (name := f"{one.name}.{kind}") in there:
+                    put_figure(folder, name, image_bytes(one.figure, kind))
+            if pages is not None:
+                pages.savefig(one.figure)
     if folder is not None and made:
-        put_figure(folder, PAGES, held.getvalue())
-        for old in folder.glob("*.svg"):  # of the session as it was before a correction
+        for old in _files(folder):  # of which there is nothing to draw any more
             if old.stem.split("-")[0] in OF_SESSION and old.stem not in made:
                 old.unlink()
     return made
+
+
+def _files(folder: Path) -> list[Path]:
+    """The files of figures in a folder, in the order of their names."""
+    return sorted(path for kind in FORMATS for path in folder.glob(f"*.{kind}"))
 
 
 def _arena(session: Session) -> Figure | None:

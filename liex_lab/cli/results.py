@@ -87,7 +87,11 @@ def figures(
     ] = None,
     formats: Annotated[
         list[str] | None,
-        typer.Option("--format", metavar="FORMAT", help="svg, pdf or png; repeatable."),
+        typer.Option(
+            "--format",
+            metavar="FORMAT",
+            help="svg, pdf or png, or pages: one PDF of all; repeatable.",
+        ),
     ] = None,
     out: Annotated[
         Path | None,

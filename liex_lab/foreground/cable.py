@@ -31,6 +31,7 @@ _LINK_PX = 2  # a cable that is unread for so long is still one
 _JOINED_PX = 3  # a cable this near to a body leads to it
 _LEAST_RUN_MM = 40.0  # it is so long in the picture
 _LEAST_SHARE = 0.3  # of the frames with something wide: an edge that flickers is not there so often
+_NEARLY = 1.00001  # what rounding may change
 
 
 @dataclass(frozen=True)
@@ -70,6 +71,8 @@ class Cable:
             None where too few frames show a cable that leads to something of an animal's size.
         """
         cable = Cable(camera, floor, _TALLER * longest_mm)
+        if not cable._rises(sample, limit):
+            return None
         least_px = area_mm2 * camera.fx * camera.fy / floor.distance_mm**2
         told = [cable._leads_to_one(depth, limit, least_px) for depth in sample]
         with_one = [leads for leads in told if leads is not None]
@@ -118,6 +121,14 @@ class Cable:
     def _side(self) -> int:
         """Width in pixels, odd, of the square that no cable fills."""
         return max(3, int(_WIDE_MM / self._px_mm + 0.5) | 1)
+
+    def _rises(self, sample: Depths, limit: Depths) -> bool:
+        """Whether anything in a sample (n, H, W) perhaps reaches higher than an animal does."""
+        with np.errstate(divide="ignore"):
+            above = (1.0 - self.tall_mm / self.floor.distance_mm) / self._inverse
+        above = np.where(self._inverse > 0, _NEARLY * above, np.inf)
+        nearer = np.minimum(above, limit).astype(np.float32)
+        return any(bool(((depth > 0) & (depth < nearer)).any()) for depth in sample)
 
     def _heights(self, depth: Depths, limit: Depths) -> tuple[Depths, Depths]:
         """Heights (H, W) mm of what stands out in a picture, and of those the wide ones."""

@@ -31,6 +31,42 @@ class DepthFrame:
     depth: Depth
 
 
+def in_one_block(frames: Sequence[DepthFrame]) -> list[DepthFrame]:
+    """The same frames, their depth copied into one array, which `stacked` then need not do.
+
+    Args:
+        frames: at least one, of one size.
+    """
+    block = np.stack([frame.depth for frame in frames])
+    return [
+        DepthFrame(frame.index, frame.time_ns, depth)
+        for frame, depth in zip(frames, block, strict=True)
+    ]
+
+
+def stacked(frames: Sequence[DepthFrame]) -> NDArray[np.float32]:
+    """Depth of frames as one array, not copied where they are those of one `in_one_block`.
+
+    Args:
+        frames: at least one, of one size.
+
+    Returns:
+        (n, H, W) float32 mm; not to be written to.
+    """
+    block = frames[0].depth.base
+    if (
+        isinstance(block, np.ndarray)
+        and block.shape == (len(frames), *frames[0].depth.shape)
+        and block.dtype == np.float32
+        and all(
+            frame.depth.base is block and frame.depth.ctypes.data == row.ctypes.data
+            for frame, row in zip(frames, block, strict=True)
+        )
+    ):
+        return block
+    return np.stack([frame.depth for frame in frames])
+
+
 def depth_mm(stored: NDArray[Any], unit_mm: float = 1.0, unread: Sequence[float] = (0.0,)) -> Depth:
     """Depth in millimetres of stored values, by a linear law.
 

@@ -1,10 +1,11 @@
-"""Threads of numba kernels and of BLAS, prefetching of an iterator, a task in the background."""
+"""Threads of numba kernels and of BLAS, prefetching of an iterator, tasks in the background."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from importlib import import_module
 from typing import TypeVar
 
 Item = TypeVar("Item")
@@ -51,6 +52,32 @@ def in_background(make: Callable[[], Item]) -> Iterator[Callable[[], Item]]:
         yield coming.result
     finally:
         maker.shutdown(wait=False)
+
+
+@contextmanager
+def imported_ahead(*modules: str) -> Iterator[None]:
+    """Import modules one after another, on a thread of its own, while the block runs.
+
+    Who imports one of them meanwhile waits until it is there. One that is missing is told of by who
+    wants it.
+
+    Args:
+        modules: their dotted names, in the order in which they will be wanted.
+    """
+
+    def fetch() -> None:
+        for name in modules:
+            if left:
+                return
+            with suppress(ImportError):
+                import_module(name)
+
+    left: list[bool] = []
+    with in_background(fetch):
+        try:
+            yield
+        finally:
+            left.append(True)
 
 
 @contextmanager

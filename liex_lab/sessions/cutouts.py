@@ -220,10 +220,10 @@ def open_pictures(session: Session) -> Recording:
         SessionError: the session keeps no depth.
         RecordingError: session.mcap cannot be read.
     """
-    from liex_lab.recordings import open_recording
+    from liex_lab.recordings.formats.messages.mcap_index import open_replay
 
     try:
-        return open_recording(session.path / "session.mcap")
+        return open_replay(session.path / "session.mcap")
     except RecordingError:
         if meant_to_keep_depth(session):
             raise

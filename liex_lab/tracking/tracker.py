@@ -19,7 +19,7 @@ from liex_lab.errors import EstimationError
 from liex_lab.estimation.estimator import Estimates, PoseEstimator
 from liex_lab.foreground.background_segmenter import BackgroundSubtraction
 from liex_lab.foreground.segmenter import Segmenter
-from liex_lab.recordings.frame import DepthFrame
+from liex_lab.recordings.frame import DepthFrame, stacked
 from liex_lab.runtime.memory import Allocator
 from liex_lab.runtime.threads import threads
 from liex_lab.tracking.motion_model import TrackingParameters
@@ -168,15 +168,17 @@ class FrameTracker:
         Returns:
             Observations of n frames, arena frame.
         """
-        depths = np.stack([frame.depth for frame in frames])
+        depths = stacked(frames)
         times = np.array([frame.time_ns for frame in frames], np.int64)
         seen = Observations.empty(self.estimator.skeleton, times)
-        seen.has_depth[:] = (depths > 0).any(axis=(1, 2))
+        seen.has_depth[:] = depths.max(axis=(1, 2)) > 0
         with threads(
             len(frames) > 1
         ):  # kernels share frames out: of one, the other cores would only wait
-            for h, estimates in enumerate(self.estimator.hypotheses(depths, self.scene, self.size)):
-                self._put(seen, h, estimates, depths)
+            hypotheses = self.estimator.hypotheses(depths, self.scene, self.size)
+            cleared = self.scene.cleared(depths)
+            for h, estimates in enumerate(hypotheses):
+                self._put(seen, h, estimates, depths, cleared)
         return seen
 
     def follow(self, frames: Sequence[DepthFrame]) -> Track:
@@ -217,9 +219,16 @@ class FrameTracker:
         return track_whole(self.subject, seen, corrections, allocate=allocate)
 
     def _put(
-        self, seen: Observations, h: int, estimates: Estimates, depths: NDArray[np.float32]
+        self,
+        seen: Observations,
+        h: int,
+        estimates: Estimates,
+        depths: NDArray[np.float32],
+        cleared: NDArray[np.float32],
     ) -> None:
-        """Put estimates in as hypothesis h, with their component's pixels and centroid."""
+        """Put estimates in as hypothesis h, with their component's pixels and centroid; `cleared`
+        are the pictures without what the animal wears.
+        """
         found = np.flatnonzero(estimates.found)
         chosen = estimates.chosen
         crops = estimates.crops
@@ -233,7 +242,8 @@ class FrameTracker:
         seen.error_mm[:, h] = chosen.error_mm
         seen.score[:, h] = chosen.score
         seen.n_px[found, h] = crops.n_px[found]
-        seen.behind[found, h] = behind_something(crops[found], self.scene.cleared(depths[found]))
+        # of all frames, as those without it are thrown away for less than pictures are copied
+        seen.behind[found, h] = behind_something(crops, cleared)[found]
         if not len(found):
             return
         centre = self.scene.middles(crops[found], self.estimator.model.method.camera_view)

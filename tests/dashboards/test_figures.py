@@ -185,6 +185,28 @@ def test_what_the_tables_say_twice_is_the_same_bytes(session, tmp_path):
         assert one.read_bytes() == other.read_bytes(), one.name
 
 
+def test_pages_are_one_pdf_of_all_figures(session, tmp_path):
+    asked: Any = {"only": ["occupancy", "speed"], "formats": ["pages"]}
+    first = draw_figures(session.path, out=tmp_path / "a", **asked)
+    again = draw_figures(session.path, out=tmp_path / "b", **asked)
+    assert first["files"] == [tmp_path / "a" / "figures.pdf"]
+    assert first["files"][0].read_bytes() == again["files"][0].read_bytes()
+    assert b"/Count 2" in first["files"][0].read_bytes()
+
+
+def test_a_report_made_again_draws_anew_what_lies_beside_it(session, tmp_path):
+    names = {"occupancy.pdf", "figures.pdf", "onsets.png"}
+    for name in names:
+        (tmp_path / name).write_bytes(b"of the tables before a correction")
+    (tmp_path / "mine.pdf").write_bytes(b"mine")
+    sets.for_the_page(session, tmp_path)
+    drawn = {path.name for path in tmp_path.iterdir() if path.suffix != ".svg"}
+    assert drawn == {"occupancy.pdf", "figures.pdf", "mine.pdf"}  # no onsets are to be drawn
+    assert (tmp_path / "occupancy.pdf").read_bytes().startswith(b"%PDF")
+    assert (tmp_path / "figures.pdf").read_bytes().startswith(b"%PDF")
+    assert (tmp_path / "mine.pdf").read_bytes() == b"mine"
+
+
 def test_every_figure_has_something_to_show_of_a_usual_session(session, tmp_path):
     found = draw_figures(session.path, formats=["svg"], out=tmp_path)
     assert found["empty"] == ["onsets"]  # it takes five bouts
@@ -235,7 +257,7 @@ def test_an_empty_session_is_a_sentence_and_no_file(tmp_path):
     ("asked", "said"),
     [
         ({"only": ["occupanzy"]}, "did you mean 'occupancy'"),
-        ({"formats": ["jpg"]}, "svg, pdf, png, got 'jpg'"),
+        ({"formats": ["jpg"]}, "svg, pdf, png, pages, got 'jpg'"),
     ],
 )
 def test_a_wrong_name_is_a_sentence(session, tmp_path, asked, said):

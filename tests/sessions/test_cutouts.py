@@ -7,11 +7,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from mcap.reader import make_reader
 
 import liex_lab.sessions.rrd_depth as depth_of
 from liex_lab.body.pose import Pose
-from liex_lab.errors import SessionError
+from liex_lab.errors import RecordingError, SessionError
 from liex_lab.geometry import SE3
+from liex_lab.recordings import open_recording
+from liex_lab.recordings.formats.messages.mcap import McapFile
 from liex_lab.recordings.rvl import to_millimetres, unpack_rvl
 from liex_lab.sessions import Session, SessionWriter, correcting
 from liex_lab.sessions.cutouts import FILE, Kept, PictureKeeper, boxes_around, open_pictures
@@ -107,6 +110,51 @@ def test_a_kept_picture_is_as_read_in_its_box_and_the_still_scene_elsewhere(
             n_unread += int((held[inside] == 0).sum())
             assert inside.all() == (row == UNSEEN), "where nothing was found it is kept whole"
     assert n_unread > 0, "unread pixels stay unread"
+
+
+def test_pictures_are_opened_by_the_index_and_unpacked_when_they_are_wanted(
+    session: Session, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    unpacked: list[int] = []
+    unpack = McapFile.unpack
+
+    def counting(file: McapFile, number: int) -> memoryview:
+        unpacked.append(number)
+        return unpack(file, number)
+
+    monkeypatch.setattr(McapFile, "unpack", counting)
+    with open_pictures(session) as pictures:
+        assert set(unpacked) <= {0}, "what the first messages say lies in the first chunk"
+        assert len(pictures) == len(MOUSE.times_s)
+    with open_recording(session.path / "session.mcap") as walked:
+        np.testing.assert_array_equal(pictures.times_ns, walked.times_ns)
+        assert pictures.camera == walked.camera
+
+
+def test_of_a_damaged_replay_no_picture_is_taken_for_another_one(tmp_path: Path) -> None:
+    whole = written(tmp_path / "whole.liex", "all")
+    path = whole.path / "session.mcap"
+    with open_pictures(whole) as pictures:
+        before = [pictures.frame(row).depth for row in range(len(pictures))]
+    with path.open("rb") as file:
+        summary = make_reader(file).get_summary()
+    assert summary is not None
+    bad = summary.chunk_indexes[1]
+    content = bytearray(path.read_bytes())
+    for at in range(bad.chunk_start_offset + 80, bad.chunk_start_offset + 400):
+        content[at] ^= 0xFF
+    path.write_bytes(content)
+    n_refused = 0
+    with open_pictures(Session.open(whole.path)) as pictures:
+        assert len(pictures) == len(before)
+        for row, depth in enumerate(before):
+            if bad.message_start_time <= pictures.times_ns[row] <= bad.message_end_time:
+                n_refused += 1
+                with pytest.raises(RecordingError, match="is damaged"):
+                    pictures.frame(row)
+            else:
+                np.testing.assert_array_equal(pictures.frame(row).depth, depth)
+    assert 0 < n_refused < len(before)
 
 
 def test_in_the_replay_a_cut_out_is_seen_by_a_camera_of_its_own(session: Session) -> None:

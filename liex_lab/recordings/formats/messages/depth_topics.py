@@ -319,6 +319,10 @@ def _walk(file: MessageFile, found: _Found, progress: Progress) -> None:
 def _note(found: _Found, envelope: Envelope, parse: Parser) -> bool:
     """Take note of a message; False where it is the first picture of a topic and not depth."""
     channel = envelope.channel
+    if envelope.data is None:
+        if channel in found.depths:
+            found.depths[channel].add(envelope, envelope.log_time_ns)
+        return True
     message = parse(envelope.data)
     if isinstance(message, Calibration):
         found.calibrations[channel.topic] = message

@@ -40,8 +40,8 @@ from liex_lab.runtime.progress import Progress, silent
 
 MAGIC = b"\x89MCAP0\r\n"
 NOTES = "liex_lab"  # the name of the metadata record in files of our own making
-_RECORD = struct.Struct("<BQ")  # opcode, length of what follows
-_MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
+RECORD = struct.Struct("<BQ")  # opcode, length of what follows
+MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
 _FOOTER = struct.Struct(
     "<BQQQI"
 )  # its record: opcode, length, where the summary and its offsets begin, CRC
@@ -54,7 +54,7 @@ _THREADS = 2
 _SMALL_CHUNK = 1 << 23
 _FACTS = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA)
 _LARGEST_FACT = 1 << 24  # bytes of one of them
-_DAMAGE = (
+DAMAGE = (
     McapError,
     KeyError,
     ValueError,
@@ -90,13 +90,25 @@ def open_mcap(
     Raises:
         RecordingError: the file is no MCAP file, or holds no depth that can be chosen.
     """
+    return open_topic(McapFile(path, open_file(path)), "mcap", camera, topic, progress)
+
+
+def open_file(path: Path) -> IO[bytes]:
+    """Open a file that begins as an MCAP file does.
+
+    Args:
+        path: the file.
+
+    Raises:
+        RecordingError: it begins otherwise.
+    """
     file = path.open("rb")
     if file.read(len(MAGIC)) != MAGIC:
         file.close()
         raise RecordingError(
             f"{path} is named like an MCAP file but holds something else; give another file"
         )
-    return open_topic(McapFile(path, file), "mcap", camera, topic, progress)
+    return file
 
 
 class McapFile(MessageFile):
@@ -112,6 +124,7 @@ class McapFile(MessageFile):
         super().__init__(path, file)
         self._by_id: dict[int, Channel] = {}
         self._schemas: dict[int, str] = {0: "no schema"}
+        self.listed: list[tuple[int, int]] = []  # where the indexes of its chunks begin and end
         self._coming: dict[
             int, Future[bytes]
         ] = {}  # chunks that are being unpacked, by where their content begins
@@ -160,7 +173,7 @@ class McapFile(MessageFile):
     ) -> Iterator[Envelope]:
         at = self._sure[0]
         footer = False
-        while at + _RECORD.size <= self.size and not footer:
+        while at + RECORD.size <= self.size and not footer:
             opcode, start, end = self._record(at)
             whole = end <= self.size and opcode != 0
             if (end > self.size and (opcode != Opcode.CHUNK or self.starts)) or opcode == 0:
@@ -190,7 +203,7 @@ class McapFile(MessageFile):
         """
         n = bisect_right(self.starts, at)
         for later in self.starts[n : n + _THREADS]:
-            if later + _RECORD.size + _CHUNK.size > self.size:
+            if later + RECORD.size + _CHUNK.size > self.size:
                 return
             opcode, start, end = self._record(later)
             if opcode != Opcode.CHUNK or start in self._coming:
@@ -208,8 +221,8 @@ class McapFile(MessageFile):
     def _record(self, at: int) -> tuple[int, int, int]:
         """What kind of record begins at `at`, and where its content begins and ends."""
         self.file.seek(at)
-        opcode, length = _RECORD.unpack(self.file.read(_RECORD.size))
-        return opcode, at + _RECORD.size, at + _RECORD.size + length
+        opcode, length = RECORD.unpack(self.file.read(RECORD.size))
+        return opcode, at + RECORD.size, at + RECORD.size + length
 
     def _learn_ending(self) -> None:
         """The schemas, channels and places of chunks that a finished file repeats: where the first
@@ -217,6 +230,7 @@ class McapFile(MessageFile):
         damaged itself teaches nothing.
         """
         self.starts = []
+        self.listed = []
         try:
             ending = self.size - _FOOTER.size - len(MAGIC)
             self.file.seek(max(0, ending))
@@ -230,11 +244,12 @@ class McapFile(MessageFile):
             while at < ending:
                 kind, start, end = self._record(at)
                 if kind == Opcode.CHUNK_INDEX:
+                    self.listed.append((start, end))
                     self.starts.append(struct.unpack("<QQQ", self.file.read(24))[2])
                 elif kind in _FACTS and end - start <= _LARGEST_FACT:
                     self._learn(kind, ReadDataStream(BytesIO(self.file.read(end - start))))
                 at = end
-        except _DAMAGE:
+        except DAMAGE:
             pass  # the walk says what it finds
         self.starts.sort()
 
@@ -258,10 +273,10 @@ class McapFile(MessageFile):
             self.whole = False
             return
         at = 0
-        while at + _RECORD.size <= len(data):
-            opcode, length = _RECORD.unpack_from(data, at)
-            begin = at + _RECORD.size
-            at = at + _RECORD.size + length
+        while at + RECORD.size <= len(data):
+            opcode, length = RECORD.unpack_from(data, at)
+            begin = at + RECORD.size
+            at = at + RECORD.size + length
             if at > len(data) or opcode == 0:
                 break
             yield from self._take(opcode, data[begin:at], Place(number, begin, length), wanted)
@@ -287,15 +302,15 @@ class McapFile(MessageFile):
     ) -> Iterator[Envelope]:
         try:
             if opcode == Opcode.MESSAGE:
-                number, _, log_time_ns, _ = _MESSAGE.unpack_from(payload)
+                number, _, log_time_ns, _ = MESSAGE.unpack_from(payload)
                 channel = self._by_id[number]
                 if wanted(channel):
-                    head = _MESSAGE.size
+                    head = MESSAGE.size
                     inner = Place(place.chunk, place.offset + head, place.length - head)
                     yield Envelope(channel, log_time_ns, inner, payload[head:])
             elif opcode in _FACTS:
                 self._learn(opcode, ReadDataStream(BytesIO(payload)))
-        except _DAMAGE:
+        except DAMAGE:
             self.whole = False
 
     def _learn(self, opcode: int, stream: ReadDataStream) -> None:

@@ -57,13 +57,14 @@ class Envelope(NamedTuple):
         channel: topic, schema and encoding.
         log_time_ns: time of logging, ns.
         place: where its data lies, to fetch it again.
-        data: its bytes.
+        data: its bytes; None of one that is fetched when it is wanted, whose stamp is the time of
+            logging.
     """
 
     channel: Channel
     log_time_ns: int
     place: Place
-    data: memoryview
+    data: memoryview | None
 
 
 class Chunk(NamedTuple):
@@ -244,7 +245,13 @@ def _inflate(packed: bytes, packing: str, size: int) -> bytes:
     if packing == "zstd":
         import zstandard
 
-        with zstandard.ZstdDecompressor().stream_reader(packed) as reader:
+        unpacker = zstandard.ZstdDecompressor()
+        if zstandard.frame_content_size(packed) == size:  # in one go, and no more than that
+            try:
+                return unpacker.decompress(packed)
+            except zstandard.ZstdError:
+                pass  # it is cut
+        with unpacker.stream_reader(packed) as reader:
             return reader.read(size)
     if packing == "lz4":
         import lz4.frame
