@@ -1,4 +1,4 @@
-"""Depth picture of any frame of a session, as it is kept there, with the skeleton over it."""
+"""Depth picture of any frame of a session, as it is kept there."""
 
 from __future__ import annotations
 
@@ -10,13 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.errors import LiexError
+from liex_lab.sessions import cutouts
+from liex_lab.sessions.seeking import SeekablePictures
 
 if TYPE_CHECKING:
     from liex_lab.recordings.recording import Recording
     from liex_lab.sessions import Session
 
 _HELD = 3  # session.mcap files that stay open
-_LEAST_PX = 16
 
 
 class Frames:
@@ -28,6 +29,7 @@ class Frames:
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._open: dict[str, tuple[Any, ExitStack, Recording]] = {}
+        self._seekable: dict[str, tuple[Any, SeekablePictures | None, NDArray[Any]]] = {}
 
     def depth(self, key: str, session: Session, row: int) -> NDArray[np.uint16] | None:
         """(H, W) uint16 mm, 0 where unread; None where the session keeps no depth of this frame.
@@ -40,19 +42,20 @@ class Frames:
             session: the opened session.
             row: the frame's row in the table `frames`.
         """
-        from liex_lab.sessions.cutouts import open_pictures
-
         path = session.path / "session.mcap"
         with self._lock:
             try:
                 found = path.stat()
                 stamp = (found.st_mtime_ns, found.st_size, found.st_ino)
+                sought = self._sought(key, session, stamp, row)
+                if sought is not None:
+                    return sought
                 known = self._open.pop(key, None)
                 if known is None or known[0] != stamp:
                     if known is not None:
                         known[1].close()
                     stack = ExitStack()
-                    known = (stamp, stack, stack.enter_context(open_pictures(session)))
+                    known = (stamp, stack, stack.enter_context(cutouts.open_pictures(session)))
                 self._open[key] = known
                 while len(self._open) > _HELD:
                     self._open.pop(next(iter(self._open)))[1].close()
@@ -60,64 +63,39 @@ class Frames:
             except (LiexError, OSError, IndexError):
                 return _kept(session, row)
 
+    def _sought(
+        self, key: str, session: Session, stamp: Any, row: int
+    ) -> NDArray[np.uint16] | None:
+        """The picture by the index of its file; None where that does not know it."""
+        known = self._seekable.pop(key, None)
+        if known is None or known[0] != stamp:
+            if known is not None and known[1] is not None:
+                known[1].close()
+            times_ns = session.table("frames", ["time_ns"])["time_ns"].to_numpy(np.int64)
+            try:
+                pictures = SeekablePictures(session.path / "session.mcap", session.camera)
+                known = (stamp, pictures, times_ns)
+            except LiexError:
+                known = (stamp, None, times_ns)
+        self._seekable[key] = known
+        while len(self._seekable) > _HELD:
+            old = self._seekable.pop(next(iter(self._seekable)))[1]
+            if old is not None:
+                old.close()
+        _, pictures_there, times_ns = known
+        if pictures_there is None or not 0 <= row < len(times_ns):
+            return None
+        return pictures_there.at(int(times_ns[row]))
+
     def close(self) -> None:
         """Close the files that are open."""
         with self._lock:
+            while self._seekable:
+                pictures = self._seekable.popitem()[1][1]
+                if pictures is not None:
+                    pictures.close()
             while self._open:
                 self._open.popitem()[1][1].close()
-
-    def figure(self, key: str, session: Session, row: int, *, whole: bool) -> dict[str, Any]:
-        """The picture of a frame with its skeleton, as plotly takes it.
-
-        Args:
-            key: the session's name in the study.
-            session: the opened session.
-            row: the frame's row in the table `frames`.
-            whole: the whole picture, else what is around the animal.
-        """
-        from . import plots
-
-        depth = self.depth(key, session, row)
-        index = int(session.frames["frame_index"].iloc[row])
-        joints = session.table("poses", ["frame_index", "joint", "u_px", "v_px"], [index])
-        uv = joints[["u_px", "v_px"]].to_numpy(float)
-        posed = len(uv) > 0 and bool(np.isfinite(uv).all())
-        if depth is None:
-            height = session.camera.height
-            width = session.camera.width
-            depth = np.zeros((height, width), np.uint16)
-        left, top, cut = (0, 0, depth) if whole or not posed else _around(depth, uv)
-        bones = [(int(a), int(b)) for a, b in session.metadata["animal"]["bones"]] if posed else []
-        reach_mm = 0.9 * float(np.nan_to_num(session.frames["spine_mm"].median(), nan=80.0))
-        names = [str(name) for name in joints["joint"]] if posed else []
-        shown = plots.frame_picture(cut, uv if posed else uv[:0], names, bones, left, top, reach_mm)
-        if not posed:
-            shown["layout"]["annotations"] = [
-                {
-                    "text": "no pose in this frame",
-                    "showarrow": False,
-                    "xref": "paper",
-                    "yref": "paper",
-                    "x": 0.5,
-                    "y": 0.97,
-                    "font": {"color": "#fff", "size": 13},
-                    "bgcolor": "rgba(0,0,0,0.6)",
-                    "borderpad": 4,
-                }
-            ]
-        return shown
-
-
-def _around(depth: NDArray[np.uint16], uv: np.ndarray) -> tuple[int, int, NDArray[np.uint16]]:
-    """The square around a skeleton (J, 2) px: left, top, and what of it is in the picture."""
-    centre = uv.mean(axis=0)
-    half = max(1.6 * float(np.linalg.norm(uv - centre, axis=1).max()), _LEAST_PX)
-    height, width = depth.shape
-    left, right = (int(np.clip(round(centre[0] + side * half), 0, width)) for side in (-1, 1))
-    top, bottom = (int(np.clip(round(centre[1] + side * half), 0, height)) for side in (-1, 1))
-    if right - left < 2 or bottom - top < 2:
-        return 0, 0, depth
-    return left, top, depth[top:bottom, left:right]
 
 
 def _kept(session: Session, row: int) -> NDArray[np.uint16] | None:
