@@ -42,7 +42,7 @@ _MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
 _CHUNK = struct.Struct("<QQQII")  # first and last time, unpacked size, its CRC, length of a name
 _INDEX = struct.Struct("<QQQQ")  # first and last time, where the chunk's record is, its length
 _LARGEST_SUMMARY = 1 << 28  # bytes
-_DAMAGE = (struct.error, DamagedChunk, ValueError, TypeError, KeyError, UnicodeDecodeError)
+_DAMAGE = (struct.error, DamagedChunk, ValueError, TypeError, KeyError, OverflowError, OSError)
 
 
 class SeekablePictures:
@@ -152,7 +152,8 @@ class SeekablePictures:
                 channel, _, log_ns, _ = _MESSAGE.unpack_from(data, at)
                 if channel == self._channel and log_ns == time_ns:
                     message = self._parse(memoryview(data)[at + _MESSAGE.size : at + length])
-                    assert isinstance(message, DepthMessage)
+                    if not isinstance(message, DepthMessage):
+                        return None
                     depth = decode(message, self._camera, 1.0, 1.0)
                     return None if depth is None else np.asarray(depth, np.uint16)
             at += length
