@@ -105,6 +105,7 @@ def make_app(
     add_downloads(app.server, data)
     add_routes(app.server, desks, None if saver is None else Clerk(desks, saver))
     if reviews is not None:
+        page_review.register(app)
         page_review.add_reviews(app.server, page_review.Reviews(data, desks, reviews))
     return app
 
@@ -188,7 +189,7 @@ def _page(data: StudyData, path: str, search: str, **may: bool) -> list[Any]:
         if path == "/ethograms":
             return page_study.ethograms_page(data)
         if path == "/review":
-            return page_review.review_page()
+            return page_review.review_page(data)
         if path == "/groups":
             return page_groups.groups_page(data)
         if path.startswith("/session/"):
@@ -239,11 +240,6 @@ def _register(app: Dash, data: StudyData, **may: bool) -> None:
         except LiexError as error:
             return tables.sentence(name, str(error))
 
-    app.clientside_callback(
-        ClientsideFunction("liex", "review"),
-        Output("page", "title"),
-        Input("page", "children"),
-    )
     app.clientside_callback(
         ClientsideFunction("liex", "draw"),
         Output({"part": "rows", "table": MATCH}, "className"),

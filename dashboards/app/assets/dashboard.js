@@ -89,9 +89,9 @@
     return window.dash_clientside.no_update;
   }
 
-  async function review(page) {
-    if (document.getElementById("review")) await (await import("/assets/review.mjs")).start();
-    return window.dash_clientside.no_update;
+  async function review() {
+    await (await import("/assets/review.mjs")).start();
+    return "review is-open";
   }
 
   window.dash_clientside = Object.assign({}, window.dash_clientside, { liex: { draw: draw, open: open, moment: moment, again: again, review: review } });
