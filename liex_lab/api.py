@@ -155,6 +155,7 @@ def correct_session(
     *,
     undo: Sequence[int] = (),
     author: str = "",
+    report: bool = True,
     progress: Progress = silent,
 ) -> Path:
     """Add corrections to a session, or take some back by their numbers; tables and report follow.
@@ -167,6 +168,8 @@ def correct_session(
         what: corrections made by the functions of `liex_lab.sessions.correcting`.
         undo: numbers of corrections to take back.
         author: whose corrections they are; "" takes who is logged in.
+        report: whether report and figures are made again, too; of many corrections in a row the
+            last one is enough.
         progress: told how far the work is.
 
     Returns:
@@ -183,7 +186,7 @@ def correct_session(
         undo=undo,
         author=author,
         blueprint=_layout,
-        report=_views,
+        report=_views if report else None,
         progress=progress,
     )
 
@@ -547,8 +550,12 @@ def serve_dashboard(
             f"the dashboard needs {error.name}; {how_to_install('dashboard')}"
         ) from None
     from liex_lab.dashboards.app.data import StudyData
+    from liex_lab.dashboards.report.views import write_views
+    from liex_lab.pipelines.training.action_model import suggest
+    from liex_lab.sessions.review import FOLDER as REVIEWS
     from liex_lab.sessions.viewer import show_replay
 
+    place = Path(study) if Path(study).is_dir() else Path(study).parent
     name, look = list_sessions(study)
     data = StudyData(name, look)
     data.warm(progress)
@@ -564,9 +571,17 @@ def serve_dashboard(
             undo: numbers of corrections to take back.
             author: whose corrections they are.
         """
-        correct_session(folder, what, undo=undo, author=author)
+        correct_session(folder, what, undo=undo, author=author, report=False)
 
-    app = make_app(data, token=token, show_replay=show_replay if alone else None, correct=correct)
+    app = make_app(
+        data,
+        token=token,
+        show_replay=show_replay if alone else None,
+        correct=correct,
+        report=write_views,
+        suggest=suggest,
+        reviews=place / REVIEWS,
+    )
     serve(app, host, port, lambda found: told(address(host, found, token)))
 
 

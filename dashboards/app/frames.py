@@ -1,4 +1,4 @@
-"""Depth picture of any frame of a session, as it is kept there, with the skeleton over it."""
+"""Depth picture of any frame of a session, as it is kept there."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.errors import LiexError
+from liex_lab.sessions import cutouts
 
 if TYPE_CHECKING:
     from liex_lab.recordings.recording import Recording
     from liex_lab.sessions import Session
 
 _HELD = 3  # session.mcap files that stay open
-_LEAST_PX = 16
 
 
 class Frames:
@@ -40,8 +40,6 @@ class Frames:
             session: the opened session.
             row: the frame's row in the table `frames`.
         """
-        from liex_lab.sessions.cutouts import open_pictures
-
         path = session.path / "session.mcap"
         with self._lock:
             try:
@@ -52,7 +50,7 @@ class Frames:
                     if known is not None:
                         known[1].close()
                     stack = ExitStack()
-                    known = (stamp, stack, stack.enter_context(open_pictures(session)))
+                    known = (stamp, stack, stack.enter_context(cutouts.open_pictures(session)))
                 self._open[key] = known
                 while len(self._open) > _HELD:
                     self._open.pop(next(iter(self._open)))[1].close()
@@ -65,59 +63,6 @@ class Frames:
         with self._lock:
             while self._open:
                 self._open.popitem()[1][1].close()
-
-    def figure(self, key: str, session: Session, row: int, *, whole: bool) -> dict[str, Any]:
-        """The picture of a frame with its skeleton, as plotly takes it.
-
-        Args:
-            key: the session's name in the study.
-            session: the opened session.
-            row: the frame's row in the table `frames`.
-            whole: the whole picture, else what is around the animal.
-        """
-        from . import plots
-
-        depth = self.depth(key, session, row)
-        index = int(session.frames["frame_index"].iloc[row])
-        joints = session.table("poses", ["frame_index", "joint", "u_px", "v_px"], [index])
-        uv = joints[["u_px", "v_px"]].to_numpy(float)
-        posed = len(uv) > 0 and bool(np.isfinite(uv).all())
-        if depth is None:
-            height = session.camera.height
-            width = session.camera.width
-            depth = np.zeros((height, width), np.uint16)
-        left, top, cut = (0, 0, depth) if whole or not posed else _around(depth, uv)
-        bones = [(int(a), int(b)) for a, b in session.metadata["animal"]["bones"]] if posed else []
-        reach_mm = 0.9 * float(np.nan_to_num(session.frames["spine_mm"].median(), nan=80.0))
-        names = [str(name) for name in joints["joint"]] if posed else []
-        shown = plots.frame_picture(cut, uv if posed else uv[:0], names, bones, left, top, reach_mm)
-        if not posed:
-            shown["layout"]["annotations"] = [
-                {
-                    "text": "no pose in this frame",
-                    "showarrow": False,
-                    "xref": "paper",
-                    "yref": "paper",
-                    "x": 0.5,
-                    "y": 0.97,
-                    "font": {"color": "#fff", "size": 13},
-                    "bgcolor": "rgba(0,0,0,0.6)",
-                    "borderpad": 4,
-                }
-            ]
-        return shown
-
-
-def _around(depth: NDArray[np.uint16], uv: np.ndarray) -> tuple[int, int, NDArray[np.uint16]]:
-    """The square around a skeleton (J, 2) px: left, top, and what of it is in the picture."""
-    centre = uv.mean(axis=0)
-    half = max(1.6 * float(np.linalg.norm(uv - centre, axis=1).max()), _LEAST_PX)
-    height, width = depth.shape
-    left, right = (int(np.clip(round(centre[0] + side * half), 0, width)) for side in (-1, 1))
-    top, bottom = (int(np.clip(round(centre[1] + side * half), 0, height)) for side in (-1, 1))
-    if right - left < 2 or bottom - top < 2:
-        return 0, 0, depth
-    return left, top, depth[top:bottom, left:right]
 
 
 def _kept(session: Session, row: int) -> NDArray[np.uint16] | None:

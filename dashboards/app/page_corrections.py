@@ -5,8 +5,6 @@ Corrections lie beside the session, never over it; `liex_lab.sessions.correcting
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import Any
 
 from dash import ALL, Dash, Input, Output, State, ctx, dcc, html, no_update
@@ -17,9 +15,8 @@ from liex_lab.sessions.corrections import Correction, author_name, read_log
 
 from .data import StudyData
 from .parts import aria
-from .tables import session_address
+from .saver import Saver
 
-Correct = Callable[[Path, Sequence[Correction], Sequence[int], str], object]
 _DEEDS = (
     ("flip", "Exchange head and tail in the span"),
     ("rename", "Rename the bout at this moment"),
@@ -32,12 +29,11 @@ _DEEDS = (
 _PLACE = ("u", "v", "x", "y", "z")
 
 
-def panel(session: Session, opened: bool) -> html.Details:
+def panel(session: Session) -> html.Details:
     """The form, closed until it is wanted, and the corrections that were made.
 
     Args:
         session: the opened session.
-        opened: whether the form is open.
     """
     titles = dict(_DEEDS)
 
@@ -53,13 +49,11 @@ def panel(session: Session, opened: bool) -> html.Details:
             [html.Span(title), dcc.Input(id=f"correct-{name}", type="number", step="any")]
         )
 
-    def choice(name: str, title: str, words: list[str]) -> html.Label:
-        """A list of `words` for the entry `name`, headed `title`."""
-        options = [{"label": word.replace("_", " "), "value": word} for word in words]
+    def choice(name: str, title: str, options: Any) -> html.Label:
+        """A list of `options` for the entry `name`, headed `title`."""
         chooser = dcc.Dropdown(id=f"correct-{name}", options=options, placeholder="choose")
         return html.Label([html.Span(title), chooser])
 
-    words = list(session.metadata.get("actions") or {})
     here = [
         html.Button(f"{word} here", id=f"correct-{word}-here", n_clicks=0, type="button")
         for word in ("from", "to")
@@ -67,9 +61,8 @@ def panel(session: Session, opened: bool) -> html.Details:
     return html.Details(
         id="correct",
         className="correct",
-        open=opened,
         children=[
-            html.Summary("Correct this session"),
+            html.Summary("Correct by numbers, and what was corrected"),
             html.P(
                 "Corrections lie beside the session, never over it, and are applied whenever it "
                 "is read.",
@@ -85,7 +78,7 @@ def panel(session: Session, opened: bool) -> html.Details:
             ),
             _row(
                 "bouts",
-                choice("action", "Action", words),
+                choice("action", "Action", _options(session)),
                 html.Label([html.Span("or a new word"), dcc.Input(id="correct-new", type="text")]),
                 do("rename"),
                 do("recut"),
@@ -98,7 +91,9 @@ def panel(session: Session, opened: bool) -> html.Details:
             ),
             _row(
                 "a joint by its pixel",
-                choice("joint", "Joint", list(session.metadata["animal"]["joints"])),
+                choice(
+                    "joint", "Joint", [str(name) for name in session.metadata["animal"]["joints"]]
+                ),
                 field("u", "pixel u"),
                 field("v", "v"),
                 do("pixel"),
@@ -120,17 +115,27 @@ def panel(session: Session, opened: bool) -> html.Details:
                 ),
             ),
             html.P(id="correct-said", className="problems", role="alert", hidden=True),
-            _made(session),
+            html.Div(made(session), id="correct-made"),
         ],
     )
+
+
+def _options(session: Session) -> list[dict[str, str]]:
+    """The words that a bout may get, as a list to choose from."""
+    words = list(session.metadata.get("actions") or {})
+    return [{"label": word.replace("_", " "), "value": word} for word in words]
 
 
 def _row(name: str, *parts: Any) -> html.Div:
     return html.Div(list(parts), className="tools", role="group", **aria(label=name))
 
 
-def _made(session: Session) -> html.Div:
-    """The corrections that stand, each with a button that takes it back."""
+def made(session: Session) -> html.Div:
+    """The corrections that stand, each with a button that takes it back.
+
+    Args:
+        session: the opened session.
+    """
     standing = read_log(session.path).standing
     if not standing:
         return html.Div(html.P("No corrections so far.", className="muted"))
@@ -210,20 +215,23 @@ def asked_for(session: Session, what: str, at_s: float, told: dict[str, Any]) ->
     return correcting.joint_move(session, frame, word("joint"), number("x", "y", "z"))
 
 
-def register(app: Dash, data: StudyData, correct: Correct) -> None:
+def register(app: Dash, data: StudyData, saver: Saver) -> None:
     """Register what happens in the form.
 
     Args:
         app: the dashboard.
         data: the study.
-        correct: adds corrections to the session in a folder, or takes some back, by whom.
+        saver: saves corrections, one after the other.
     """
     names = ("from", "to", "action", "new", "joint", *_PLACE)
 
     @app.callback(
-        Output("url", "href", allow_duplicate=True),
+        Output("corrections-made", "data", allow_duplicate=True),
         Output("correct-said", "children"),
         Output("correct-said", "hidden"),
+        Output("correct-action", "options"),
+        Output("correct-action", "value"),
+        Output("correct-new", "value"),
         Input({"part": "correct", "what": ALL}, "n_clicks"),
         Input({"part": "undo", "number": ALL}, "n_clicks"),
         State("moment", "value"),
@@ -236,7 +244,7 @@ def register(app: Dash, data: StudyData, correct: Correct) -> None:
     def do(
         _deeds: Any, _undone: Any, at_s: float | None, key: str, by: str | None, *values: Any
     ) -> Any:
-        """Make or take back a correction, and load the page anew; or say what is wrong.
+        """Make or take back a correction, and let the page follow; or say what is wrong.
 
         Args:
             _deeds: numbers of clicks on the buttons of corrections.
@@ -248,35 +256,21 @@ def register(app: Dash, data: StudyData, correct: Correct) -> None:
         """
         asked = ctx.triggered_id
         if not isinstance(asked, dict) or not ctx.triggered[0]["value"]:
-            return no_update, no_update, no_update
+            return (no_update,) * 6
         moment = float(at_s or 0.0)
         try:
             session = data.session(key)
             if asked["part"] == "undo":
-                correct(session.path, (), (int(asked["number"]),), by or "")
+                ticket = saver.take_back(session.path, int(asked["number"]), by or "")
             else:
                 told = dict(zip(names, values, strict=True))
-                correct(
-                    session.path, (asked_for(session, asked["what"], moment, told),), (), by or ""
-                )
+                what = asked_for(session, asked["what"], moment, told)
+                ticket = saver.add(session.path, what, by or "")
+            saver.wait(ticket)
         except LiexError as error:
-            return no_update, str(error), False
-        made = len(
-            read_log(session.path).entries
-        )  # so that the address is another one and the page is made anew
-        return f"{session_address(key, moment)}&corrections={made}", "", True
-
-    @app.callback(
-        Output("correct-u", "value"),
-        Output("correct-v", "value"),
-        Input("frame-picture", "clickData"),
-        prevent_initial_call=True,
-    )
-    def point(click: dict[str, Any] | None) -> Any:
-        """Pixel (u, v) of plotly's `click` on the picture, px."""
-        if not click:
-            return no_update, no_update
-        return tuple(round(float(click["points"][0][axis]), 2) for axis in ("x", "y"))
+            return no_update, str(error), False, *(no_update,) * 3
+        made_now = f"{len(read_log(session.path).entries)} by numbers"
+        return made_now, "", True, _options(data.session(key)), None, ""
 
     for word in ("from", "to"):
 

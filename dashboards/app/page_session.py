@@ -9,7 +9,19 @@ from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
 import numpy as np
-from dash import ALL, Dash, Input, Output, Patch, State, ctx, dcc, html, no_update
+from dash import (
+    ALL,
+    ClientsideFunction,
+    Dash,
+    Input,
+    Output,
+    Patch,
+    State,
+    ctx,
+    dcc,
+    html,
+    no_update,
+)
 
 from liex_lab.errors import LiexError, SessionError
 
@@ -18,7 +30,6 @@ from ..report.quality import warnings
 from ..units import counted, shown
 from . import page_corrections, plots
 from .data import StudyData, colours_of, shown_words
-from .frames import Frames
 from .parts import aria, download, graph
 from .tables import block, number, session_address, session_tables
 
@@ -59,9 +70,7 @@ def session_page(
     key: str,
     at_s: float,
     *,
-    may_show: bool,
     may_correct: bool,
-    correcting: bool = False,
 ) -> list[Any]:
     """Content of a session's page at a moment.
 
@@ -69,26 +78,18 @@ def session_page(
         data: the study.
         key: the session's name in the study.
         at_s: the moment, s since its first frame.
-        may_show: whether a button opens the replay.
         may_correct: whether there is a form for corrections.
-        correcting: whether that form is open.
 
     Raises:
         SessionError: the session cannot be opened.
     """
     session = data.session(key)
-    one = data.ethograms([key]).get(key)
-    if one is None:
-        raise SessionError(f"the bouts of '{key}' cannot be read; {data.damage(key)}")
     entry = data.entries[key]
-    curves = traces(session)
-    coloured = colours_of(shown_words([one]), one.vocabulary)
     who = ", ".join(
         f"{name.replace('_', ' ')} {value}" for name, value in entry.who.items() if value
     )
     frames = session.metadata["frames"]
-    size = plots.time_unit(one.duration_s)[1]
-    whole = plots.whole_session(one, coloured, curves)
+    size = plots.time_unit(float(frames["duration_s"]))[1]
     said = [html.Li(sentence) for sentence in warnings(session)]
     return [
         html.P(
@@ -113,33 +114,28 @@ def session_page(
         ),
         dcc.Store(id="session-key", data=key),
         dcc.Store(id="session-unit-s", data=size),
+        dcc.Store(id="corrections-made", data=""),
+        _steps(at_s),
+        html.Div(id="desk", className="desk", role="region", **aria(label="look and correct")),
+        html.Div(html.P("The curves follow ...", className="muted"), id="session-figures"),
+        *([page_corrections.panel(session)] if may_correct else []),
+        html.H2("Bouts"),
+        block(f"bouts/{key}", "Bouts of the session"),
+        *_more(data, key, session),
+    ]
+
+
+def _figures(data: StudyData, key: str, may_show: bool) -> list[Any]:
+    """What comes after the first picture, for it keeps a browser busy: curves, numbers, replay."""
+    whole = _whole(data, key, data.session(key))
+    return [
         html.H2("The whole session"),
         html.P("A click goes to that moment.", className="muted"),
         graph("whole", whole, "actions, speed and predicted error over the whole session"),
-        _steps(at_s),
         html.Div(
             className="pair moment",
             children=[
-                html.Div(
-                    [
-                        dcc.RadioItems(
-                            id="picture-of",
-                            value="animal",
-                            inline=True,
-                            className="choice",
-                            options=[
-                                {"label": "around the animal", "value": "animal"},
-                                {"label": "whole picture", "value": "frame"},
-                            ],
-                        ),
-                        graph(
-                            "frame-picture",
-                            plots.empty("Reading the frame ...", 380),
-                            "depth picture with the skeleton",
-                        ),
-                        html.Dl(id="frame-facts", className="facts"),
-                    ]
-                ),
+                html.Div([html.H3("This frame"), html.Dl(id="frame-facts", className="facts")]),
                 html.Div(
                     [
                         graph(
@@ -152,11 +148,16 @@ def session_page(
                 ),
             ],
         ),
-        *([page_corrections.panel(session, correcting)] if may_correct else []),
-        html.H2("Bouts"),
-        block(f"bouts/{key}", "Bouts of the session"),
-        *_more(data, key, session),
     ]
+
+
+def _whole(data: StudyData, key: str, session: Session) -> dict[str, Any]:
+    """The figure of the whole session."""
+    one = data.ethograms([key]).get(key)
+    if one is None:
+        raise SessionError(f"the bouts of '{key}' cannot be read; {data.damage(key)}")
+    coloured = colours_of(shown_words([one]), one.vocabulary)
+    return plots.whole_session(one, coloured, traces(session))
 
 
 def failed_page(data: StudyData, key: str) -> list[Any]:
@@ -331,13 +332,12 @@ def facts(session: Session, row: int) -> list[Any]:
     return items
 
 
-def register(app: Dash, data: StudyData, frames: Frames, show_replay: ShowReplay | None) -> None:
+def register(app: Dash, data: StudyData, show_replay: ShowReplay | None) -> None:
     """Register what happens on a session's page.
 
     Args:
         app: the dashboard.
         data: the study.
-        frames: the depth pictures.
         show_replay: opens the replay of a .rrd at a time (s); None where it cannot be opened from
             here.
     """
@@ -379,16 +379,17 @@ def register(app: Dash, data: StudyData, frames: Frames, show_replay: ShowReplay
         Output("frame-facts", "children"),
         Output("whole", "figure"),
         Output("replay-command", "children"),
-        Output("moment-link", "children"),
         Input("moment", "value"),
+        Input("corrections-made", "data"),
         State("session-key", "data"),
         State("session-unit-s", "data"),
     )
-    def follow(at_s: float | None, key: str, unit_s: float) -> tuple[Any, ...]:
+    def follow(at_s: float | None, _made: str, key: str, unit_s: float) -> tuple[Any, ...]:
         """All that shows the moment.
 
         Args:
             at_s: the moment, s.
+            _made: changes with every correction.
             key: the session's name in the study.
             unit_s: seconds per unit of the whole session's axis.
         """
@@ -398,27 +399,84 @@ def register(app: Dash, data: StudyData, frames: Frames, show_replay: ShowReplay
         marked = Patch()
         marked["layout"]["shapes"] = [plots.cursor(moment / unit_s)]
         command = f"liex show {shlex.quote(str(session.path))} --at {moment:.3f}"
-        link = html.A("link to this moment", href=session_address(key, moment))
         return (
             plots.around(traces(session), moment, _HALF_S),
             facts(session, row),
             marked,
             command,
-            link,
         )
 
     @app.callback(
-        Output("frame-picture", "figure"),
+        Output("moment-link", "children"),
         Input("moment", "value"),
-        Input("picture-of", "value"),
         State("session-key", "data"),
     )
-    def show(at_s: float | None, of: str, key: str) -> Any:
-        """Picture of the frame nearest to `at_s` in the session `key`; `of`: animal or frame."""
+    def link(at_s: float | None, key: str) -> html.A:
+        """A link to the moment `at_s` (s) of the session `key`."""
+        return html.A("link to this moment", href=session_address(key, float(at_s or 0.0)))
+
+    @app.callback(
+        Output("session-figures", "children"),
+        Input("desk", "className"),
+        State("session-key", "data"),
+        prevent_initial_call=True,
+    )
+    def figures(_opened: str, key: str) -> list[Any]:
+        """The figures of the session `key`, once its first picture is there (`_opened`)."""
+        try:
+            return _figures(data, key, show_replay is not None)
+        except LiexError as error:
+            return [html.P(str(error), className="problems", role="alert")]
+
+    @app.callback(
+        Output("whole", "figure", allow_duplicate=True),
+        Output("correct-made", "children"),
+        Input("corrections-made", "data"),
+        State("session-key", "data"),
+        State("moment", "value"),
+        State("session-unit-s", "data"),
+        prevent_initial_call=True,
+    )
+    def again(_made: str, key: str, at_s: float | None, unit_s: float) -> Any:
+        """The curves and the list of corrections of the session `key` once more were made.
+
+        Args:
+            _made: changes with every correction.
+            key: the session's name in the study.
+            at_s: the present moment, s.
+            unit_s: seconds per unit of the whole session's axis.
+        """
         session = data.session(key)
-        return frames.figure(
-            key, session, nearest_row(session, float(at_s or 0.0)), whole=of == "frame"
-        )
+        figure = _whole(data, key, session)
+        figure["layout"]["shapes"] = [plots.cursor(float(at_s or 0.0) / unit_s)]
+        return figure, page_corrections.made(session)
+
+    @app.callback(
+        Output({"part": "order", "table": ALL}, "data", allow_duplicate=True),
+        Input("corrections-made", "data"),
+        State({"part": "order", "table": ALL}, "data"),
+        prevent_initial_call=True,
+    )
+    def tables_again(made: str, orders: list[dict[str, Any]]) -> list[dict[str, Any]]:
+        """Let every table of the page be filled again, in the `orders` that it had."""
+        return [{**order, "made": made} for order in orders]
+
+    app.clientside_callback(
+        ClientsideFunction("liex", "open"),
+        Output("desk", "className"),
+        Input("session-key", "data"),
+        State("moment", "value"),
+    )
+    app.clientside_callback(
+        ClientsideFunction("liex", "again"),
+        Output("desk", "lang"),
+        Input("corrections-made", "data"),
+    )
+    app.clientside_callback(
+        ClientsideFunction("liex", "moment"),
+        Output("desk", "tabIndex"),
+        Input("moment", "value"),
+    )
 
     @app.callback(
         Output("replay-said", "children"),

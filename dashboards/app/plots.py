@@ -13,13 +13,12 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
 from liex_lab.behaviour.design import animal_means
 
-from ..figures.style import INK, LINE, MUTED, RED
+from ..figures.style import INK, LINE, MUTED
 from ..figures.times import kept_rows
-from ..report.contact_sheet import Array, png_uri, shade
+from ..report.contact_sheet import Array
 from .data import GREY, NO_POSE, OTHER, Ethogram, raster
 
 # Okabe and Ito's colours; beside them every group has its own mark
@@ -450,97 +449,6 @@ def cursor(at: float) -> dict[str, Any]:
         "y1": 1,
         "yref": "paper",
         "line": {"color": INK, "width": 1.4, "dash": "dot"},
-    }
-
-
-def frame_picture(
-    depth: NDArray[np.uint16],
-    uv: Array,
-    names: Sequence[str],
-    bones: Sequence[tuple[int, int]],
-    left: int,
-    top: int,
-    reach_mm: float,
-) -> dict[str, Any]:
-    """A depth picture with the skeleton over it.
-
-    The axes count the whole frame's pixels, (0, 0) the centre of the first. Every pixel can be
-    clicked.
-
-    Args:
-        depth: (h, w) uint16 mm, 0 where unread, cut out of the frame.
-        uv: (J, 2) joints, px of the whole frame; (0, 2) draws none.
-        names: names of the J joints.
-        bones: pairs of joints.
-        left: column of the frame at which the picture begins, px.
-        top: row of the frame at which the picture begins, px.
-        reach_mm: height above the floor around the animal from which on everything is light, mm.
-    """
-    h, w = depth.shape
-    picture = {
-        "source": png_uri(shade(depth, reach_mm)),
-        "xref": "x",
-        "yref": "y",
-        "x": left - 0.5,
-        "y": top - 0.5,
-        "sizex": w,
-        "sizey": h,
-        "sizing": "stretch",
-        "layer": "below",
-    }
-    x: list[float | None] = []
-    y: list[float | None] = []
-    for a, b in bones:
-        x += [uv[a, 0], uv[b, 0], None]
-        y += [uv[a, 1], uv[b, 1], None]
-    fill = ["#ffffff"] * (len(uv) - 1) + [RED]
-    data = [
-        {
-            "type": "heatmap",
-            "z": np.zeros((h, w), np.uint8),
-            "x0": left,
-            "dx": 1,
-            "y0": top,
-            "dy": 1,
-            "opacity": 0,
-            "showscale": False,
-            "hoverinfo": "none",
-        },  # so that every pixel can be clicked
-        {
-            "type": "scatter",
-            "mode": "lines",
-            "x": x,
-            "y": y,
-            "line": {"color": "#fff", "width": 2},
-            "hoverinfo": "skip",
-        },
-        {
-            "type": "scatter",
-            "mode": "markers",
-            "x": uv[:, 0],
-            "y": uv[:, 1],
-            "text": [text(name) for name in names],
-            "marker": {"color": fill, "size": 9, "line": {"color": "#222", "width": 1}},
-            "hovertemplate": "%{text}: u %{x:.1f}, v %{y:.1f} px<extra></extra>",
-        },
-    ]
-    hidden = {"showgrid": False, "zeroline": False, "showticklabels": False, "ticks": ""}
-    return {
-        "data": data,
-        "layout": _layout(
-            380,
-            images=[picture],
-            showlegend=False,
-            hoverdistance=5,
-            margin={"l": 4, "r": 4, "t": 4, "b": 4},
-            xaxis={**hidden, "range": [left - 0.5, left + w - 0.5], "constrain": "domain"},
-            yaxis={
-                **hidden,
-                "range": [top + h - 0.5, top - 0.5],
-                "scaleanchor": "x",
-                "constrain": "domain",
-            },
-        ),
     }
 
 

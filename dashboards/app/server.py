@@ -17,22 +17,30 @@ from dash import ALL, MATCH, ClientsideFunction, Dash, Input, Output, State, dcc
 from liex_lab.errors import LiexError
 from liex_lab.runtime.signals import Ended
 
-from . import page_corrections, page_groups, page_session, page_study, tables
+from . import page_corrections, page_groups, page_review, page_session, page_study, tables
 from .data import StudyData
+from .desk import Desks, Suggest
+from .desk_routes import Clerk, add_routes
 from .frames import Frames
 from .guard import LOOPBACK, add_downloads, guard
-from .page_corrections import Correct
 from .page_session import ShowReplay
 from .parts import aria
+from .saver import Correct, Report, Saver
 
 _ASSETS = Path(__file__).parent / "assets"
-_PAGES = (("/", "Sessions"), ("/ethograms", "Ethograms"), ("/groups", "Groups"))
+_PAGES = (
+    ("/", "Sessions"),
+    ("/ethograms", "Ethograms"),
+    ("/groups", "Groups"),
+    ("/review", "Review"),
+)
 _INDEX = """<!doctype html>
 <html lang="en">
 <head>{%metas%}<meta name="viewport" content="width=device-width, initial-scale=1">
 <title>{%title%}</title>{%css%}</head>
 <body>{%app_entry%}<footer hidden>{%config%}{%scripts%}{%renderer%}</footer></body>
 </html>"""
+_SAVER = "liex_saver"
 _POLICY = (
     "default-src 'none'; script-src 'self' {hashes}; style-src 'self' 'unsafe-inline'; img-src "
     "'self' data: blob:; connect-src 'self'; font-src 'self' data:; base-uri 'none'; form-action "
@@ -46,6 +54,9 @@ def make_app(
     token: str = "",
     show_replay: ShowReplay | None = None,
     correct: Correct | None = None,
+    report: Report | None = None,
+    suggest: Suggest | None = None,
+    reviews: Path | None = None,
 ) -> Dash:
     """The dashboard of a study, not yet served.
 
@@ -56,10 +67,15 @@ def make_app(
             command is shown.
         correct: adds corrections to the session in a folder, or takes some back; None: the pages
             only show.
+        report: makes the report of the session in a folder again, after it was corrected; None
+            where `correct` does.
+        suggest: finds the stretches of a session whose actions are least certain; None finds none.
+        reviews: folder of blinded reviews, made with the first one; None takes none.
     """
     app = Dash(
         "liex_lab_dashboard",
         assets_folder=str(_ASSETS),
+        assets_ignore=r".*\.mjs$",  # modules are fetched by whoever imports them
         serve_locally=True,
         suppress_callback_exceptions=True,
         title=f"{data.name} · liex_lab",
@@ -69,12 +85,15 @@ def make_app(
         compress=False,
     )
     app.layout = _shell(data)
-    _register(app, data, may_show=show_replay is not None, may_correct=correct is not None)
+    _register(app, data, may_correct=correct is not None)
     page_study.register(app, data)
     page_groups.register(app, data)
-    page_session.register(app, data, Frames(), show_replay)
-    if correct is not None:
-        page_corrections.register(app, data, correct)
+    page_session.register(app, data, show_replay)
+    saver = Saver(correct, report) if correct is not None else None
+    desks = Desks(data.session, Frames(), suggest)
+    if saver is not None:
+        page_corrections.register(app, data, saver)
+    app.server.extensions[_SAVER] = saver
     hashes: list[str] = []
 
     def policy() -> str:
@@ -84,6 +103,10 @@ def make_app(
 
     guard(app.server, token, policy)
     add_downloads(app.server, data)
+    add_routes(app.server, desks, None if saver is None else Clerk(desks, saver))
+    if reviews is not None:
+        page_review.register(app)
+        page_review.add_reviews(app.server, page_review.Reviews(data, desks, reviews))
     return app
 
 
@@ -120,6 +143,9 @@ def serve(app: Dash, host: str, port: int, told: Callable[[int], None]) -> None:
             raise
     finally:
         server.server_close()
+        saver: Saver | None = app.server.extensions.get(_SAVER)
+        if saver is not None:
+            saver.finish()  # what was taken is saved
 
 
 def address(host: str, port: int, token: str) -> str:
@@ -162,15 +188,15 @@ def _page(data: StudyData, path: str, search: str, **may: bool) -> list[Any]:
             return page_study.sessions_page(data)
         if path == "/ethograms":
             return page_study.ethograms_page(data)
+        if path == "/review":
+            return page_review.review_page(data)
         if path == "/groups":
             return page_groups.groups_page(data)
         if path.startswith("/session/"):
             key = unquote(path.removeprefix("/session/"))
             if key not in {entry.key for entry in data.done}:
                 return page_session.failed_page(data, key)
-            return page_session.session_page(
-                data, key, _moment(search), correcting="corrections=" in search, **may
-            )
+            return page_session.session_page(data, key, _moment(search), **may)
     except LiexError as error:
         return [html.H1("This cannot be shown"), html.P(str(error))]
     return [html.H1("No such page"), html.P(dcc.Link("Sessions", href="/"))]

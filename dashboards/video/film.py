@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from liex_lab.actions.colours import action_colours
 from liex_lab.errors import SessionError
+from liex_lab.optics.camera import Camera
 from liex_lab.sessions import Session
 
 from ..figures.pictures import DepthReader
@@ -39,6 +40,34 @@ class View:
     top: int
     width: int
     height: int
+
+
+def way_of(joints: Array, camera: Camera) -> tuple[Array, int]:
+    """Where a view that goes smoothly with an animal has its middle, and how far it reaches.
+
+    Args:
+        joints: (n, J, 2) joints of every frame, px; NaN without a pose.
+        camera: the depth camera.
+
+    Returns:
+        The smoothed middle (n, 2), px, the last known one without a pose, and half the side of a
+        square that holds the animal, px.
+    """
+    middle = joints.mean(axis=1)
+    known = np.isfinite(middle).all(axis=1)
+    rows = np.arange(len(middle))
+    if not known.any():
+        still = np.tile([camera.width / 2, camera.height / 2], (len(middle), 1))
+        return still, max(camera.height // 2, _LEAST_PX)
+    whole = np.column_stack([np.interp(rows, rows[known], middle[known, axis]) for axis in (0, 1)])
+    width = min(15, len(rows) | 1)
+    padded = np.pad(whole, ((width // 2, width // 2), (0, 0)), mode="edge")
+    kernel = np.ones(width) / width
+    smooth = np.column_stack(
+        [np.convolve(padded[:, axis], kernel, "valid")[: len(rows)] for axis in (0, 1)]
+    )
+    length = np.linalg.norm(np.diff(joints[known], axis=1), axis=-1).sum(axis=1)
+    return smooth, max(int(_REACH * float(np.quantile(length, 0.95)) * 0.6), _LEAST_PX)
 
 
 class Film:
@@ -141,29 +170,7 @@ class Film:
     @cached_property
     def _ways(self) -> list[tuple[Array, int]]:
         """Of each animal the smoothed middle (n, 2), px, and half the side of the square, px."""
-        camera = self.session.camera
-        found = []
-        for joints in self.uv:
-            middle = joints.mean(axis=1)
-            known = np.isfinite(middle).all(axis=1)
-            rows = np.arange(len(middle))
-            if not known.any():
-                middle = np.tile([camera.width / 2, camera.height / 2], (len(middle), 1))
-                found.append((middle, max(camera.height // 2, _LEAST_PX)))
-                continue
-            whole = np.column_stack(
-                [np.interp(rows, rows[known], middle[known, axis]) for axis in (0, 1)]
-            )
-            width = min(15, len(rows) | 1)
-            padded = np.pad(whole, ((width // 2, width // 2), (0, 0)), mode="edge")
-            kernel = np.ones(width) / width
-            smooth = np.column_stack(
-                [np.convolve(padded[:, axis], kernel, "valid")[: len(rows)] for axis in (0, 1)]
-            )
-            length = np.linalg.norm(np.diff(joints[known], axis=1), axis=-1).sum(axis=1)
-            half = max(int(_REACH * float(np.quantile(length, 0.95)) * 0.6), _LEAST_PX)
-            found.append((smooth, half))
-        return found
+        return [way_of(joints, self.session.camera) for joints in self.uv]
 
     def words_at(self, time_s: float) -> list[str]:
         """The action of each animal at a time; "" where none is named.

@@ -25,6 +25,7 @@ from liex_lab.sessions.evidence import read_evidence, read_flips
 from liex_lab.sessions.tracks import track_of
 from liex_lab.tables.rows import frame_count
 from liex_lab.tables.schema import BOUTS
+from liex_lab.tracking.following import let_follow
 from liex_lab.tracking.offline import MARGIN, track_whole
 from liex_lab.tracking.track import CORRECTED, Flip, Track
 
@@ -81,7 +82,14 @@ def corrected_track(session: Session, log: Log, skeleton: Skeleton) -> Corrected
     if spans:
         track, flips, turned = _turned_round(session, track, index, spans)
     moves: list[JointMove] = log.corrections(JointMove)
+    root = SE3(track.root_rotation.copy(), track.root_mm.copy())
+    was = Pose(root, track.angles_rad.copy(), track.scale)
     moved = place_joints(track, index, moves, session.camera, session.T_arena_camera)
+    if len(moved):
+        followed = let_follow(track, was, moved)
+        track.uv_px[followed] = session.camera.project(
+            session.T_arena_camera.inverse() @ track.joints_mm[followed]
+        )
     return CorrectedTrack(track, turned, moved, flips)
 
 

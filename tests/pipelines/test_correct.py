@@ -99,8 +99,13 @@ def test_a_joint_that_is_moved_takes_the_chain_along_and_bones_keep_their_length
     found = corrected(session, correcting.joint_move(session, row, "nose", target))
     was, now = track_of(session), track_of(found)
     assert np.linalg.norm(now.joints_mm[row, -1] - target) < 1.0
-    others = np.delete(np.arange(180), row)
+    others = np.r_[0 : row - 20, row + 21 : 180]
     np.testing.assert_array_equal(now.joints_mm[others], was.joints_mm[others])
+    away = np.linalg.norm(now.joints_mm - was.joints_mm, axis=-1)[:, -1]
+    assert (np.diff(away[row : row + 4]) < 0).all()  # the frames around follow, less and less
+    assert (np.diff(away[row - 3 : row + 1]) > 0).all()
+    seen = found.camera.project(found.T_arena_camera.inverse() @ now.joints_mm)
+    np.testing.assert_allclose(now.uv_px, seen, atol=1e-6)
     bones = np.linalg.norm(np.diff(now.joints_mm[row], axis=0), axis=1)
     np.testing.assert_allclose(
         bones, np.linalg.norm(np.diff(was.joints_mm[row], axis=0), axis=1), rtol=1e-9

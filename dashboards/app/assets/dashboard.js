@@ -70,5 +70,29 @@
     return "scroll";
   }
 
-  window.dash_clientside = Object.assign({}, window.dash_clientside, { liex: { draw: draw } });
+  // The desk is a module of its own, fetched when a session is opened.
+  let desk = null;
+
+  async function open(key, at) {  // figures keep a browser busy: they come after the first picture
+    desk = import("/assets/desk.mjs");
+    await (await desk).start(key, Number(at) || 0);
+    return "desk is-open";
+  }
+
+  function moment(at) {
+    if (desk) desk.then((module) => module.moment(at));
+    return window.dash_clientside.no_update;
+  }
+
+  function again(made) {  // a correction was made, here or in the form
+    if (desk && made) desk.then((module) => module.again(made));
+    return window.dash_clientside.no_update;
+  }
+
+  async function review() {
+    await (await import("/assets/review.mjs")).start();
+    return "review is-open";
+  }
+
+  window.dash_clientside = Object.assign({}, window.dash_clientside, { liex: { draw: draw, open: open, moment: moment, again: again, review: review } });
 })();

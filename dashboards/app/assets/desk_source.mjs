@@ -1,0 +1,129 @@
+// What a page shows of the frames of a session or of a clip: pictures and joints, asked for ahead and kept for a while.
+
+const ROWS = 512;  // joints of so many frames are asked for at a time
+const PICTURES = 240;  // that are kept
+const AT_ONCE = 4;  // pictures that are on their way
+const STEP = 16;  // boxes begin and end at multiples of so many pixels
+
+export async function json(address, options) {
+  const answer = await fetch(address, options);
+  let told;
+  try {
+    told = await answer.json();
+  } catch {
+    throw new Error(answer.ok ? "the dashboard's answer cannot be read" : `the dashboard answered ${answer.status}`);
+  }
+  if (!answer.ok) throw new Error(told.said || `the dashboard answered ${answer.status}`);
+  return told;
+}
+
+export class Source {
+  constructor(base) {
+    this.base = base;
+    this.chunks = new Map();
+    this.pictures = new Map();
+    this.wanted = [];
+    this.loading = 0;
+    this.changed = () => {};
+  }
+
+  async open() {
+    const [about, times] = await Promise.all([
+      json(`${this.base}/about`), fetch(`${this.base}/times`).then((answer) => answer.arrayBuffer())]);
+    this.about = about;
+    this.times = new Float64Array(times);
+    return about;
+  }
+
+  rowAt(time) {  // the frame whose time is nearest
+    let low = 0, high = this.times.length - 1;
+    while (low < high) {
+      const middle = (low + high) >> 1;
+      if (this.times[middle] < time) low = middle + 1; else high = middle;
+    }
+    return low > 0 && time - this.times[low - 1] <= this.times[low] - time ? low - 1 : low;
+  }
+
+  async load(chunk) {
+    const known = this.chunks.get(chunk);
+    if (known) return known;
+    const coming = json(`${this.base}/rows/${chunk * ROWS}/${(chunk + 1) * ROWS}`).then((rows) => {
+      if (this.chunks.get(chunk) === coming) this.chunks.set(chunk, rows);
+      this.changed();
+      return rows;
+    }, () => { this.chunks.delete(chunk); });
+    this.chunks.set(chunk, coming);
+    return coming;
+  }
+
+  at(row) {  // what is known of a frame; null until it has come
+    const chunk = Math.floor(row / ROWS), rows = this.chunks.get(chunk);
+    if (!rows || rows instanceof Promise) {
+      this.load(chunk);
+      return null;
+    }
+    const k = row - rows.first;
+    if (k % ROWS > ROWS - 90) this.load(chunk + 1);
+    return {
+      flag: rows.flag[k], error: rows.error_mm[k], pFlip: rows.p_flip[k], frame: rows.frame[k],
+      animals: rows.animals.map((one) => ({ uv: one.uv[k], middle: one.middle[k] })),
+    };
+  }
+
+  forgetRows() {  // after a correction; the ones of before are shown until the new ones come
+    const before = [...this.chunks.keys()];
+    const old = this.chunks;
+    this.chunks = new Map([...old].filter(([, rows]) => !(rows instanceof Promise)));
+    return Promise.all(before.map(async (chunk) => {
+      const rows = await json(`${this.base}/rows/${chunk * ROWS}/${(chunk + 1) * ROWS}`);
+      this.chunks.set(chunk, rows);
+    })).then(() => this.changed());
+  }
+
+  boxOf(view) {  // the part of the picture that a view needs, on a grid, so that one box serves many frames
+    const { width, height } = this.about;
+    const left = Math.max(0, Math.floor(view.left / STEP) * STEP), top = Math.max(0, Math.floor(view.top / STEP) * STEP);
+    const right = Math.min(width, Math.ceil((view.left + view.width) / STEP) * STEP);
+    const bottom = Math.min(height, Math.ceil((view.top + view.height) / STEP) * STEP);
+    return [left, top, Math.max(1, right - left), Math.max(1, bottom - top)];
+  }
+
+  picture(row, box) {  // {image, box} that covers the box; null until it has come
+    const known = this.pictures.get(row);
+    if (known && covers(known.box, box)) {
+      this.pictures.delete(row);
+      this.pictures.set(row, known);
+      return known.image.complete && known.image.naturalWidth ? known : null;
+    }
+    return null;
+  }
+
+  want(row, box, first = false) {
+    const known = this.pictures.get(row);
+    if ((known && covers(known.box, box)) || row < 0 || row >= this.times.length) return;
+    this.wanted = this.wanted.filter((one) => one.row !== row);
+    if (first) this.wanted.unshift({ row, box }); else this.wanted.push({ row, box });
+    this.pump();
+  }
+
+  drop() { this.wanted = []; }
+
+  pump() {
+    while (this.loading < AT_ONCE && this.wanted.length) {
+      const { row, box } = this.wanted.shift();
+      const image = new Image();
+      const kept = { image, box };
+      this.pictures.set(row, kept);
+      this.loading += 1;
+      const done = () => { this.loading -= 1; this.changed(); this.pump(); };
+      image.addEventListener("load", done);
+      image.addEventListener("error", () => { if (this.pictures.get(row) === kept) this.pictures.delete(row); done(); });
+      image.src = `${this.base}/frame/${row}.png?box=${box.join(",")}`;
+      while (this.pictures.size > PICTURES) this.pictures.delete(this.pictures.keys().next().value);
+    }
+  }
+}
+
+function covers(outer, inner) {
+  return outer[0] <= inner[0] && outer[1] <= inner[1] && outer[0] + outer[2] >= inner[0] + inner[2] && outer[1] + outer[3] >= inner[1] + inner[3];
+}

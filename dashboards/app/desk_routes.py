@@ -1,0 +1,265 @@
+"""Addresses of the page to correct in: JSON and pictures of a session, and corrections to it.
+
+A correction is checked at once and saved by the queue of `saver`; the page asks how far it is.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+from collections.abc import Callable
+from typing import Any
+
+from flask import Flask, Response, jsonify, request
+
+from liex_lab.errors import LiexError, SessionError
+from liex_lab.sessions import correcting
+from liex_lab.sessions.corrections import BoutEdit, Correction, FlipSpan, JointMove
+
+from .desk import Desk, Desks
+from .saver import Saver, Ticket
+
+_KEPT_TICKETS = 1000
+_PICTURE_S = 3600  # for so long a browser may keep a picture; its address says of which session
+
+
+class Clerk:
+    """Takes corrections from the page and remembers their tickets by number.
+
+    Args:
+        desks: the study's sessions.
+        saver: saves what is corrected.
+    """
+
+    def __init__(self, desks: Desks, saver: Saver) -> None:
+        self._desks = desks
+        self._saver = saver
+        self._lock = threading.Lock()
+        self._tickets: dict[int, tuple[str, Ticket]] = {}
+
+    def take(self, key: str, asked: dict[str, Any]) -> dict[str, Any]:
+        """Check what the page asks for and queue it; returns its ticket and what it says.
+
+        Args:
+            key: the session's name in the study.
+            asked: what (joint, action, flip, nothing, undo) with its numbers, and by.
+
+        Raises:
+            LiexError: it cannot be done.
+        """
+        desk = self._desks.of(key)
+        author = _text(asked, "by")
+        if asked.get("what") == "undo":
+            return self._undo(key, desk, asked, author)
+        what = asked_correction(desk, asked)
+        return self._kept(key, self._saver.add(desk.session.path, what, author))
+
+    def state(self, key: str) -> dict[str, Any]:
+        """Where the session's corrections are: unsaved, report, tickets, and the log.
+
+        Args:
+            key: the session's name in the study.
+
+        Raises:
+            SessionError: there is no such session.
+        """
+        desk = self._desks.of(key)
+        unsaved, old = self._saver.busy(desk.session.path)
+        with self._lock:
+            ours = {n: one for n, (of, one) in self._tickets.items() if of == key}
+        return {
+            "unsaved": unsaved,
+            "report_old": old,
+            "tickets": {
+                str(n): {"state": one.state, "said": one.said, "number": one.number}
+                for n, one in ours.items()
+            },
+            "log": desk.log(),
+        }
+
+    def _undo(self, key: str, desk: Desk, asked: dict[str, Any], author: str) -> dict[str, Any]:
+        """Take back a correction by its ticket or its number in the log."""
+        folder = desk.session.path
+        number = asked.get("number")
+        if "ticket" in asked:
+            with self._lock:
+                of, ticket = self._tickets.get(int(_number(asked, "ticket")), ("", None))
+            if ticket is None or of != key:
+                raise SessionError("that correction is not known here; take it back from the list")
+            if self._saver.drop(ticket):
+                return {"ticket": None, "said": f"{ticket.what} is not made"}
+            self._saver.wait(ticket)
+            number = ticket.number
+        if not isinstance(number, int) or isinstance(number, bool):
+            raise SessionError(f"a correction is taken back by its number, got {number!r}")
+        return self._kept(key, self._saver.take_back(folder, number, author))
+
+    def _kept(self, key: str, ticket: Ticket) -> dict[str, Any]:
+        with self._lock:
+            number = max(self._tickets, default=0) + 1
+            self._tickets[number] = (key, ticket)
+            while len(self._tickets) > _KEPT_TICKETS:
+                self._tickets.pop(next(iter(self._tickets)))
+        return {"ticket": number, "said": ticket.said}
+
+
+def asked_correction(desk: Desk, asked: dict[str, Any]) -> Correction:
+    """The correction that a key or the mouse asks for.
+
+    Args:
+        desk: the session as it is.
+        asked: what: joint (with row, joint, u, v), action (word, at_s, perhaps new), nothing (at_s)
+            or flip (at_s); the latter three with from_s and to_s where a span is marked.
+
+    Raises:
+        LiexError: it cannot be done.
+    """
+    what = asked.get("what")
+    if what == "joint":
+        return _joint(desk, asked)
+    marked = ("from_s" in asked and "to_s" in asked) or None
+    span = marked and (_number(asked, "from_s"), _number(asked, "to_s"))
+    at_s = _number(asked, "at_s")
+    if what == "flip":
+        return _flip(desk, at_s, span)
+    if what == "nothing":
+        return correcting.delete_bout(desk.session, at_s)
+    if what == "action":
+        return _action(desk, at_s, span, _text(asked, "word"), bool(asked.get("new")))
+    raise SessionError(
+        f"a correction is of a joint, an action, nothing, a flip, or an undo; got {what!r}"
+    )
+
+
+def _joint(desk: Desk, asked: dict[str, Any]) -> JointMove:
+    """A joint under a pixel."""
+    row = _number(asked, "row")
+    if not (row == int(row) and 0 <= row < len(desk.time_s)):
+        raise SessionError(f"there is no frame in row {row:g}; the session has {len(desk.time_s)}")
+    frame = int(desk.session.frames["frame_index"].iloc[int(row)])
+    pixel = _number(asked, "u"), _number(asked, "v")
+    return correcting.joint_move_at_pixel(desk.session, frame, _text(asked, "joint"), *pixel)
+
+
+def _action(
+    desk: Desk, at_s: float, span: tuple[float, float] | None, word: str, new: bool
+) -> BoutEdit:
+    """An action for the marked span, or else for the bout at the moment."""
+    if span is not None:
+        return correcting.add_bout(desk.session, word, *span, new_word=new)
+    try:
+        return correcting.rename_bout(desk.session, at_s, word, new_word=new)
+    except SessionError as error:
+        if "no bout holds" not in str(error):
+            raise
+        raise SessionError(
+            f"nothing is named at {at_s:.2f} s; mark the span with [ and ], then press the number"
+        ) from None
+
+
+def _flip(desk: Desk, at_s: float, span: tuple[float, float] | None) -> FlipSpan:
+    """Head and tail exchanged in the marked span, else in the doubtful one here, else here."""
+    if span is None:
+        flips = desk.session.flips
+        here = flips[(flips["start_s"] <= at_s) & (at_s <= flips["stop_s"])]
+        row = desk.row_at(at_s)
+        after = desk.time_s[row + 1] if row + 1 < len(desk.time_s) else desk.time_s[row] + 1.0
+        span = (float(desk.time_s[row]), float(after))
+        if len(here):
+            span = (float(here["start_s"].iloc[0]), max(float(here["stop_s"].iloc[0]), span[1]))
+    return correcting.flip_span(desk.session, *span)
+
+
+def add_routes(server: Flask, desks: Desks, clerk: Clerk | None) -> None:
+    """Add the addresses of the page to correct in.
+
+    Args:
+        server: the Flask server of the dashboard; its guard stands before these, too.
+        desks: the sessions.
+        clerk: takes corrections; None takes none.
+    """
+
+    def told(make: Callable[[], Any]) -> Response:
+        """JSON of what `make` returns, or 400 with a sentence."""
+        try:
+            return jsonify(make())
+        except LiexError as error:
+            answer = jsonify({"said": str(error)})
+            answer.status_code = 400
+            return answer
+
+    @server.get("/desk/<path:key>/about")
+    def desk_about(key: str) -> Response:
+        """What the page is told once of the session `key`."""
+        return told(lambda: {**desks.of(key).about(), "may_correct": clerk is not None})
+
+    @server.get("/desk/<path:key>/times")
+    def desk_times(key: str) -> Response:
+        """The times of all frames of the session `key`, s: little-endian float64."""
+        try:
+            times = desks.of(key).time_s
+        except LiexError as error:
+            return Response(str(error), 400, mimetype="text/plain")
+        return Response(times.astype("<f8").tobytes(), mimetype="application/octet-stream")
+
+    @server.get("/desk/<path:key>/rows/<int:first>/<int:stop>")
+    def desk_rows(key: str, first: int, stop: int) -> Response:
+        """What is drawn over the rows from `first` to before `stop` of the session `key`."""
+        return told(lambda: desks.of(key).rows(first, stop))
+
+    @server.get("/desk/<path:key>/bouts")
+    def desk_bouts(key: str) -> Response:
+        """The bouts of the session `key`."""
+        return told(lambda: desks.of(key).bouts())
+
+    @server.get("/desk/<path:key>/doubts")
+    def desk_doubts(key: str) -> Response:
+        """The doubtful places of the session `key`: its poses, or with ?of=actions its actions."""
+        if request.args.get("of") == "actions":
+            return told(lambda: desks.suggested(key))
+        return told(lambda: desks.of(key).doubts())
+
+    @server.get("/desk/<path:key>/frame/<int:row>.png")
+    def desk_frame(key: str, row: int) -> Response:
+        """The part ?box=left,top,width,height of the frame in a `row` of the session `key`."""
+        try:
+            box = [int(one) for one in request.args.get("box", "").split(",")]
+            if len(box) != 4 or max(map(abs, box)) > 1 << 16:
+                raise SessionError("a part of a picture is left, top, width and height in pixels")
+            png = desks.of(key).picture(row, box)
+        except (LiexError, ValueError) as error:
+            return Response(str(error), 400, mimetype="text/plain")
+        answer = Response(png, mimetype="image/png")
+        answer.headers["Cache-Control"] = f"private, max-age={_PICTURE_S}"
+        return answer
+
+    @server.get("/desk/<path:key>/state")
+    def desk_state(key: str) -> Response:
+        """Where the corrections of the session `key` are."""
+        if clerk is None:
+            return told(lambda: {"unsaved": 0, "report_old": False, "tickets": {}, "log": []})
+        return told(lambda: clerk.state(key))
+
+    @server.post("/desk/<path:key>/correct")
+    def desk_correct(key: str) -> Response:
+        """Take a correction of the session `key`, JSON as of `Clerk.take`."""
+        asked = request.get_json(silent=True)  # another site's form cannot send JSON
+        if clerk is None or not isinstance(asked, dict):
+            answer = jsonify({"said": "no correction is taken here"})
+            answer.status_code = 403 if clerk is None else 400
+            return answer
+        return told(lambda: clerk.take(key, asked))
+
+
+def _number(asked: dict[str, Any], name: str) -> float:
+    value = asked.get(name)
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise SessionError(f"this needs a number for {name}, got {value!r}")
+    return float(value)
+
+
+def _text(asked: dict[str, Any], name: str) -> str:
+    value = asked.get(name, "")
+    if not isinstance(value, str) or len(value) > 200:
+        raise SessionError(f"this needs a text of up to 200 letters for {name}")
+    return value.strip()

@@ -1,0 +1,300 @@
+"""The dashboard's blinded review: clips in random order, without group, subject or session.
+
+A rater's browser is told of a clip's number alone: pictures and joints come by that number, and
+what the program or others said comes when the rater has named the last clip.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from dash import ClientsideFunction, Dash, Input, Output, dcc, html
+from flask import Flask, Response, jsonify, request
+
+from liex_lab.actions.colours import action_colours
+from liex_lab.errors import LiexError, SessionError
+from liex_lab.sessions.review import (
+    Clip,
+    Review,
+    checked_name,
+    drawn_review,
+    read_review,
+    review_names,
+    write_review,
+)
+
+from .data import StudyData
+from .desk import Desk, Desks
+from .parts import aria
+
+_PICTURE_S = 600
+
+
+def review_page(data: StudyData) -> list[Any]:
+    """Content of the page; its script fills it.
+
+    Args:
+        data: the study.
+    """
+    return [
+        html.P("Study", className="kind"),
+        html.H1("Blinded review"),
+        html.P(
+            "Name what an animal does in clips of all sessions, drawn and shuffled by a seed. "
+            "Session, animal and group are not shown, nor what the program or others say, until "
+            "the last clip is named. Every answer is kept at once: leave when you like.",
+            className="muted",
+        ),
+        dcc.Store(id="review-study", data=data.name),
+        html.Div(id="review", className="review", role="region", **aria(label="blinded review")),
+    ]
+
+
+def register(app: Dash) -> None:
+    """Let the page's script begin when the page is opened.
+
+    Args:
+        app: the dashboard.
+    """
+    app.clientside_callback(
+        ClientsideFunction("liex", "review"),
+        Output("review", "className"),
+        Input("review-study", "data"),
+    )
+
+
+class Reviews:
+    """The reviews of a study, one file each.
+
+    Args:
+        data: the study.
+        desks: its sessions.
+        folder: where the files lie.
+    """
+
+    def __init__(self, data: StudyData, desks: Desks, folder: Path) -> None:
+        self._data = data
+        self._desks = desks
+        self._folder = folder
+        self._lock = threading.Lock()
+
+    def names(self) -> list[str]:
+        """Names of the reviews."""
+        return list(review_names(self._folder))
+
+    def begin(self, asked: dict[str, Any]) -> str:
+        """Go on with the review of a name, or draw a new one; returns its name.
+
+        Args:
+            asked: name, rater, n (clips) and seed.
+
+        Raises:
+            SessionError: something of that cannot be.
+        """
+        name = checked_name(str(asked.get("name", "")), "a review")
+        checked_name(str(asked.get("rater", "")), "a rater")
+        with self._lock:
+            if name in self.names():
+                return name
+            n, seed = (asked.get(key) for key in ("n", "seed"))
+            if type(n) is not int or type(seed) is not int or not 0 <= seed < 1 << 53:
+                raise SessionError("a review needs a number of clips and a seed, a whole number")
+            sessions = {entry.key: self._data.session(entry.key) for entry in self._data.done}
+            write_review(self._folder, drawn_review(name, sessions, n, seed))
+        return name
+
+    def told(self, name: str, rater: str) -> dict[str, Any]:
+        """What a rater may know: the words, the own order and answers; at the end the agreement.
+
+        Args:
+            name: the review.
+            rater: who asks.
+
+        Raises:
+            SessionError: there is no such review.
+        """
+        review = read_review(self._folder, name)
+        rater = checked_name(rater, "a rater")
+        colours = action_colours(review.words)
+        own = review.answers.get(rater, {})
+        found = {
+            "words": [
+                {"word": word, "title": word.replace("_", " "), "colour": colours[word]}
+                for word in review.words
+            ],
+            "order": review.order(rater),
+            "answers": {str(k): word for k, word in own.items()},
+            "done": review.done_by(rater),
+        }
+        return found | ({"agreements": _agreements(review)} if found["done"] else {})
+
+    def answer(self, name: str, asked: dict[str, Any]) -> dict[str, Any]:
+        """Keep an answer; returns what `told` says then.
+
+        Args:
+            name: the review.
+            asked: rater, clip and word.
+
+        Raises:
+            SessionError: something of that cannot be.
+        """
+        clip, word = asked.get("clip"), asked.get("word")
+        rater = str(asked.get("rater", ""))
+        if type(clip) is not int or not isinstance(word, str):
+            raise SessionError("an answer is the number of a clip and a word")
+        with self._lock:
+            review = read_review(self._folder, name).answered(rater, clip, word)
+            write_review(self._folder, review)
+        return self.told(name, rater)
+
+    def clip(self, name: str, number: int) -> tuple[Clip, Desk, int, int]:
+        """A clip, the desk of its session, its first row and the row after its last one.
+
+        Args:
+            name: the review.
+            number: number of the clip.
+
+        Raises:
+            SessionError: there is no such clip.
+        """
+        review = read_review(self._folder, name)
+        if not 0 <= number < len(review.clips):
+            raise SessionError(f"there is no clip {number}")
+        clip = review.clips[number]
+        desk = self._desks.of(clip.session)
+        first, stop = np.searchsorted(desk.time_s, [clip.start_s - 5e-4, clip.stop_s + 5e-4])
+        return clip, desk, int(first), max(int(stop), int(first) + 1)
+
+    def about(self, name: str, number: int) -> dict[str, Any]:
+        """What a clip's picture needs: size, joints and the moment that is to be named.
+
+        Args:
+            name: the review.
+            number: number of the clip.
+
+        Raises:
+            SessionError: there is no such clip.
+        """
+        clip, desk, first, stop = self.clip(name, number)
+        told = desk.about()
+        shown = ("frame_s", "width", "height", "joints", "bones")
+        return {
+            **{key: told[key] for key in shown},
+            "n": stop - first,
+            "duration_s": float(desk.time_s[stop - 1] - desk.time_s[first]),
+            "moment_s": float(clip.at_s - desk.time_s[first]),
+            "animals": [{"name": "", "half_px": one["half_px"]} for one in told["animals"]],
+        }
+
+
+def _agreements(review: Review) -> list[dict[str, Any]]:
+    return [
+        {
+            "first": a,
+            "second": b,
+            "n": found.n,
+            **{
+                key: None if math.isnan(value) else round(value, 4)
+                for key, value in (
+                    ("observed", found.observed),
+                    ("kappa", found.kappa),
+                    ("low", found.low),
+                    ("high", found.high),
+                )
+            },
+        }
+        for a, b, found in review.agreements()
+    ]
+
+
+def add_reviews(server: Flask, reviews: Reviews) -> None:
+    """Add the addresses of blinded reviews.
+
+    Args:
+        server: the Flask server of the dashboard; its guard stands before these, too.
+        reviews: the reviews of the study.
+    """
+
+    def told(make: Callable[[], Any]) -> Response:
+        """JSON of what `make` returns, or 400 with a sentence."""
+        try:
+            return jsonify(make())
+        except (LiexError, OSError) as error:
+            answer = jsonify({"said": str(error)})
+            answer.status_code = 400
+            return answer
+
+    def asked() -> dict[str, Any]:
+        """The JSON that was sent; another site's form cannot send any."""
+        sent = request.get_json(silent=True)
+        if not isinstance(sent, dict):
+            raise SessionError("this takes JSON")
+        return sent
+
+    @server.get("/reviews")
+    def review_list() -> Response:
+        """Names of the reviews."""
+        return told(reviews.names)
+
+    @server.post("/reviews")
+    def review_begin() -> Response:
+        """Begin a review, or go on with one."""
+        return told(lambda: {"name": reviews.begin(asked())})
+
+    @server.get("/reviews/<path:name>/state")
+    def review_state(name: str) -> Response:
+        """What ?rater= may know of the review `name`."""
+        return told(lambda: reviews.told(name, request.args.get("rater", "")))
+
+    @server.post("/reviews/<path:name>/answer")
+    def review_answer(name: str) -> Response:
+        """Keep an answer in the review `name`."""
+        return told(lambda: reviews.answer(name, asked()))
+
+    @server.get("/reviews/<path:name>/clip/<int:number>/about")
+    def clip_about(name: str, number: int) -> Response:
+        """What the picture of the clip `number` of the review `name` needs."""
+        return told(lambda: reviews.about(name, number))
+
+    @server.get("/reviews/<path:name>/clip/<int:number>/times")
+    def clip_times(name: str, number: int) -> Response:
+        """Times of the clip's frames since its first one, s: little-endian float64."""
+        try:
+            _, desk, first, stop = reviews.clip(name, number)
+        except LiexError as error:
+            return Response(str(error), 400, mimetype="text/plain")
+        times = desk.time_s[first:stop] - desk.time_s[first]
+        return Response(times.astype("<f8").tobytes(), mimetype="application/octet-stream")
+
+    @server.get("/reviews/<path:name>/clip/<int:number>/rows/<int:start>/<int:end>")
+    def clip_rows(name: str, number: int, start: int, end: int) -> Response:
+        """Joints and middles of the clip's frames from `start` to before `end`."""
+
+        def rows() -> dict[str, Any]:
+            """The rows, counted from the clip's first one."""
+            _, desk, first, stop = reviews.clip(name, number)
+            found = desk.rows(min(first + start, stop), min(first + end, stop))
+            n = len(found["flag"])
+            return {**found, "first": start, "frame": [0] * n, "flag": [""] * n}
+
+        return told(rows)
+
+    @server.get("/reviews/<path:name>/clip/<int:number>/frame/<int:row>.png")
+    def clip_frame(name: str, number: int, row: int) -> Response:
+        """The part ?box=left,top,width,height of a frame of the clip."""
+        try:
+            _, desk, first, stop = reviews.clip(name, number)
+            box = [int(one) for one in request.args.get("box", "").split(",")]
+            if len(box) != 4 or max(map(abs, box)) > 1 << 16 or not 0 <= row < stop - first:
+                raise SessionError("a part of a picture is left, top, width and height in pixels")
+            png = desk.picture(first + row, box)
+        except (LiexError, ValueError) as error:
+            return Response(str(error), 400, mimetype="text/plain")
+        answer = Response(png, mimetype="image/png")
+        answer.headers["Cache-Control"] = f"private, max-age={_PICTURE_S}"
+        return answer

@@ -1,0 +1,311 @@
+"""Blinded review: clips of a study in random order, named by people who do not see whose they are.
+
+A review is one JSON file. It holds the clips that were drawn, by whom each was called what, and
+what the program called the middle of each; it is written again, as a whole, with every answer, so
+that one left in the middle goes on where it was. A rater sees the clips in an order of their own,
+which follows from the review's seed and their name.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime
+from itertools import combinations
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from liex_lab.actions.agreement import Agreement, cohens_kappa
+from liex_lab.errors import SessionError
+from liex_lab.runtime.durable import write_whole
+from liex_lab.runtime.places import inside
+
+if TYPE_CHECKING:
+    from liex_lab.sessions.session import Session
+
+FOLDER = "reviews"
+ENDING = ".review.json"
+SCHEMA_VERSION = 1
+NO_NAME = ""  # what has no name
+PROGRAM = "the program"
+MOST_CLIPS = 500
+_NAME_LENGTH = 60
+_LEAST_S = 0.3  # a shorter time between bouts is not asked about
+
+
+@dataclass(frozen=True)
+class Clip:
+    """A moment of a session that is to be named, with some time before and after it.
+
+    Attributes:
+        session: the session's name in the study; no rater sees it.
+        at_s: the moment, s since the session's first frame.
+        start_s: start of what is shown, s.
+        stop_s: its stop, s.
+        program: what the program calls the moment; "" is no name.
+    """
+
+    session: str
+    at_s: float
+    start_s: float
+    stop_s: float
+    program: str
+
+
+@dataclass(frozen=True)
+class Review:
+    """The clips of a review, and what its raters called them.
+
+    Attributes:
+        name: name of the review.
+        seed: the clips and their orders follow from it.
+        words: the words that may be given; NO_NAME comes besides.
+        clips: the clips, in the order in which they were drawn.
+        answers: rater -> number of the clip -> word.
+        made_at: when it was begun, ISO 8601.
+    """
+
+    name: str
+    seed: int
+    words: tuple[str, ...]
+    clips: tuple[Clip, ...]
+    answers: Mapping[str, Mapping[int, str]] = field(default_factory=dict)
+    made_at: str = ""
+
+    def order(self, rater: str) -> list[int]:
+        """Numbers of the clips in the order in which a rater sees them.
+
+        Args:
+            rater: the rater's name.
+        """
+        mark = hashlib.sha256(f"{self.seed}\n{rater}".encode()).digest()
+        rng = np.random.default_rng(int.from_bytes(mark[:8], "little"))
+        return [int(k) for k in rng.permutation(len(self.clips))]
+
+    def done_by(self, rater: str) -> bool:
+        """Whether a rater has named every clip.
+
+        Args:
+            rater: the rater's name.
+        """
+        return len(self.answers.get(rater, {})) == len(self.clips)
+
+    def answered(self, rater: str, clip: int, word: str) -> Review:
+        """The review with an answer more, or another one in its place.
+
+        Args:
+            rater: the rater's name.
+            clip: number of the clip.
+            word: one of the review's words, or "" for no name.
+
+        Raises:
+            SessionError: the name, the clip or the word cannot be.
+        """
+        rater = checked_name(rater, "a rater")
+        if rater == PROGRAM:
+            raise SessionError(f"'{PROGRAM}' rates already; take another name")
+        if not 0 <= clip < len(self.clips):
+            raise SessionError(f"there is no clip {clip}; the review has {len(self.clips)}")
+        if word not in (*self.words, NO_NAME):
+            raise SessionError(
+                f"the review has no word '{word}'; known are {', '.join(self.words)}"
+            )
+        own = {**self.answers.get(rater, {}), clip: word}
+        return replace(self, answers={**self.answers, rater: own})
+
+    def agreements(self) -> list[tuple[str, str, Agreement]]:
+        """Agreement of every two raters who are done, and of each with the program."""
+        program = {k: clip.program for k, clip in enumerate(self.clips)}
+        raters = [name for name in self.answers if self.done_by(name)]
+        said = {**{name: self.answers[name] for name in raters}, PROGRAM: program}
+        found = []
+        for a, b in combinations(said, 2):
+            both = sorted(set(said[a]) & set(said[b]))
+            words = ([said[one][k] for k in both] for one in (a, b))
+            found.append((a, b, cohens_kappa(*words)))
+        return found
+
+    def to_json(self) -> str:
+        """The content of the review's file."""
+        document = {
+            "schema_version": SCHEMA_VERSION,
+            "name": self.name,
+            "seed": self.seed,
+            "made_at": self.made_at,
+            "words": list(self.words),
+            "clips": [vars(clip) for clip in self.clips],
+            "answers": {
+                rater: {str(k): word for k, word in own.items()}
+                for rater, own in self.answers.items()
+            },
+        }
+        return json.dumps(document, indent=1, ensure_ascii=False) + "\n"
+
+    @staticmethod
+    def from_json(text: str) -> Review:
+        """The review that `to_json` made into text.
+
+        Args:
+            text: the content of a review's file.
+
+        Raises:
+            ValueError: a value cannot be used.
+            KeyError: a key is missing.
+            TypeError: a value is of another type.
+        """
+        told = json.loads(text)
+        if int(told["schema_version"]) > SCHEMA_VERSION:
+            raise ValueError("it was written by a newer liex_lab")
+        clips = tuple(
+            Clip(
+                str(one["session"]),
+                float(one["at_s"]),
+                float(one["start_s"]),
+                float(one["stop_s"]),
+                str(one["program"]),
+            )
+            for one in told["clips"]
+        )
+        answers = {
+            str(rater): {int(k): str(word) for k, word in own.items()}
+            for rater, own in told["answers"].items()
+        }
+        words = tuple(str(word) for word in told["words"])
+        made_at = str(told["made_at"])
+        return Review(str(told["name"]), int(told["seed"]), words, clips, answers, made_at)
+
+
+def drawn_review(
+    name: str, sessions: Mapping[str, Session], n: int, seed: int, around_s: float = 1.0
+) -> Review:
+    """A review whose clips are drawn from some sessions.
+
+    The words of the program are taken in turn as long as they have bouts left, "no name" among
+    them, and of each word a bout at random, whatever the session; the moment lies at random in the
+    middle half of the bout. So rare actions are seen, too, and kappa is that of such a choice, not
+    of all the time.
+
+    Args:
+        name: name of the review.
+        sessions: the opened sessions by their names in the study.
+        n: how many clips are wanted.
+        seed: of the choice.
+        around_s: how much is shown before and after the moment, s.
+
+    Raises:
+        SessionError: the name or the number cannot be, or there are fewer bouts.
+    """
+    if not 1 <= n <= MOST_CLIPS:
+        raise SessionError(f"a review has 1 to {MOST_CLIPS} clips, got {n}")
+    rng = np.random.default_rng(seed)
+    bouts: dict[str, list[tuple[str, float, float, float]]] = {}
+    words: dict[str, None] = {}
+    for key, session in sessions.items():
+        words |= dict.fromkeys(session.metadata.get("actions") or {})
+        for word, start_s, stop_s, last_s in _bouts_of(session):
+            bouts.setdefault(word, []).append((key, start_s, stop_s, last_s))
+    left = {word: [own[k] for k in rng.permutation(len(own))] for word, own in bouts.items()}
+    turns = [sorted(left)[k] for k in rng.permutation(len(left))]
+    clips: list[Clip] = []
+    while len(clips) < n and any(left.values()):
+        for word in turns:
+            if left[word] and len(clips) < n:
+                key, start_s, stop_s, last_s = left[word].pop()
+                at_s = float(start_s + (0.25 + 0.5 * rng.random()) * (stop_s - start_s))
+                from_s = round(max(at_s - around_s, 0.0), 4)
+                to_s = round(min(at_s + around_s, last_s), 4)
+                clips.append(Clip(key, round(at_s, 4), from_s, to_s, word))
+    if len(clips) < n:
+        raise SessionError(
+            f"these sessions have {len(clips)} bouts, and {n} clips were asked for; ask for fewer"
+        )
+    shuffled = tuple(clips[k] for k in rng.permutation(n))
+    now = datetime.now(UTC).isoformat(timespec="seconds")
+    return Review(checked_name(name, "a review"), seed, tuple(words), shuffled, {}, now)
+
+
+def _bouts_of(session: Session) -> list[tuple[str, float, float, float]]:
+    """Word, start, stop and the session's end, s; what lies between bouts has no name."""
+    table = session.bouts.sort_values("start_s")
+    last_s = float(session.frames["time_s"].iloc[-1])
+    found = []
+    at_s = 0.0
+    for word, start, stop in zip(
+        table["action"].astype(str), table["start_s"], table["stop_s"], strict=True
+    ):
+        if start - at_s > _LEAST_S:
+            found.append((NO_NAME, at_s, float(start), last_s))
+        found.append((word, float(start), float(stop), last_s))
+        at_s = max(at_s, float(stop))
+    if last_s - at_s > _LEAST_S:
+        found.append((NO_NAME, at_s, last_s, last_s))
+    return found
+
+
+def checked_name(name: str, of: str) -> str:
+    """A name without spaces around it.
+
+    Args:
+        name: the name as somebody typed it.
+        of: what it is the name of, for the error message.
+
+    Raises:
+        SessionError: it is empty, too long, or cannot be printed.
+    """
+    plain = name.strip()
+    if not plain or len(plain) > _NAME_LENGTH or not plain.isprintable():
+        raise SessionError(f"{of} has a name of up to {_NAME_LENGTH} letters, got {name!r}")
+    return plain
+
+
+def write_review(folder: Path, review: Review) -> Path:
+    """Write a review over what it was before; returns its file.
+
+    Args:
+        folder: where the reviews of a study lie; made where it is not there.
+        review: the review.
+    """
+    folder.mkdir(exist_ok=True)
+    path = inside(folder, review.name, ENDING)
+    write_whole(path, review.to_json())
+    return path
+
+
+def read_review(folder: Path, name: str) -> Review:
+    """Read a review.
+
+    Args:
+        folder: where the reviews of a study lie.
+        name: its name.
+
+    Raises:
+        SessionError: there is none, or it is damaged.
+    """
+    path = inside(folder, name, ENDING)
+    try:
+        return Review.from_json(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise SessionError(f"there is no review '{name}' in {folder}") from None
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise SessionError(
+            f"{path} is damaged ({type(error).__name__}: {error}); put back a copy of it"
+        ) from None
+
+
+def review_names(folder: Path) -> Sequence[str]:
+    """Names of the reviews in a folder, those that cannot be read left out.
+
+    Args:
+        folder: where the reviews of a study lie; it need not be there.
+    """
+    found: list[Any] = []
+    for path in sorted(folder.glob(f"*{ENDING}")):
+        try:
+            found.append(Review.from_json(path.read_text(encoding="utf-8")).name)
+        except (OSError, ValueError, KeyError, TypeError, AttributeError):
+            continue
+    return found

@@ -1,0 +1,218 @@
+"""The page to correct in, in a real browser: joints dragged, actions named by keys, playing, taking
+back, doubtful places one after the other.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from playwright.sync_api import Locator, Page, expect
+
+from liex_lab.arena.outline import Arena
+from liex_lab.sessions import Session
+from liex_lab.sessions.corrections import read_log
+from tests.dashboards.conftest import Watched
+from tests.dashboards.served import Served
+from tests.sessions.walking_mouse import WalkingMouse, steady, write
+
+KEY = "walker"
+MOUSE = WalkingMouse(np.delete(steady(6.0), slice(40, 46)), rear_s=(2.0, 3.0), lost=(150, 151))
+
+
+def suggest(folder: Path) -> pd.DataFrame:
+    """Two stretches that a recogniser would be unsure of."""
+    rows = [(0.5, 1.0, "walk", "run", 0.4), (4.0, 4.5, "<b>walk</b>", "pause", 0.3)]
+    return pd.DataFrame(rows, columns=["start_s", "stop_s", "guess", "or_else", "uncertainty"])
+
+
+@pytest.fixture
+def served(tmp_path: Path) -> Served:
+    write(tmp_path / "study" / f"{KEY}.liex", MOUSE, name=KEY, arena=Arena("round", (0, 0), 220.0))
+    return Served(tmp_path / "study", suggest=suggest)
+
+
+def opened(served: Served, page: Page, at_s: float) -> Locator:
+    """The picture of the session's page, once it is there."""
+    page.goto(f"{served.address}/session/{KEY}?t={at_s}")
+    page.wait_for_selector("#desk.is-open")
+    expect(page.locator(".desk-saved")).to_contain_text("all saved")
+    stage = page.locator(".desk-stage")
+    stage.scroll_into_view_if_needed()
+    return stage
+
+
+def session(served: Served) -> Session:
+    return Session.open(served.study / f"{KEY}.liex")
+
+
+def until(page: Page, true: Callable[[], bool]) -> None:
+    """Wait for something that a page's own script may not be asked for, by its policy."""
+    end = time.monotonic() + 30.0
+    while not true():
+        assert time.monotonic() < end
+        page.wait_for_timeout(50)
+
+
+def joint_on_screen(page: Page, stage: Locator, row: int, joint: int) -> tuple[float, float]:
+    """Where a joint is drawn."""
+    at = page.evaluate(
+        """([row, joint]) => import('/assets/desk.mjs').then(module => module.drawn(row, joint))""",
+        [row, joint],
+    )
+    box = stage.bounding_box()
+    assert box is not None
+    assert at is not None
+    return box["x"] + at[0], box["y"] + at[1]
+
+
+def test_a_joint_is_dragged_and_its_frame_follows(served: Served, watched: Watched) -> None:
+    page = watched.page
+    stage = opened(served, page, 1.0)
+    row, nose = 30, len(MOUSE.skeleton.names) - 1
+    before = session(served).poses
+    page.wait_for_timeout(500)  # the view comes to rest
+    x, y = joint_on_screen(page, stage, row, nose)
+    page.mouse.move(x, y)
+    page.mouse.down()
+    page.mouse.move(x - 20, y + 8, steps=4)
+    page.mouse.up()
+    expect(page.locator(".desk-said")).to_contain_text("nose of frame 30 to")
+    expect(page.locator(".desk-saved")).to_contain_text("1 correction stands, all saved")
+    now = session(served)
+    assert now.frames["flag"].iloc[row] == "corrected"
+    place = [pose[["u_px", "v_px"]].to_numpy(float)[5 * row + nose] for pose in (before, now.poses)]
+    scale = page.evaluate("import('/assets/desk.mjs').then(module => module.drawn(0, 0, true))")
+    assert place[1] - place[0] == pytest.approx(np.array([-20, 8]) / scale, abs=1.0)
+    until(
+        page,
+        lambda: (
+            joint_on_screen(page, stage, row, nose)
+            == pytest.approx((x - 20, y + 8), abs=1.2 * scale)
+        ),
+    )
+    watched.nothing_went_wrong()
+
+
+def test_an_action_is_named_by_a_key_and_taken_back_by_another(
+    served: Served, watched: Watched
+) -> None:
+    page = watched.page
+    opened(served, page, 1.0)
+    was = session(served).bouts["action"].tolist()
+    words = page.locator(".desk-actions button").evaluate_all("all => all.map(a => a.dataset.word)")
+    new = next(word for word in words if word not in was)
+    expect(page.locator(".desk-actions button.is-now")).to_have_attribute("data-word", "walk")
+    page.keyboard.press(str(words.index(new) + 1))
+    expect(page.locator(".desk-actions button.is-now")).to_have_attribute("data-word", new)
+    expect(page.locator(".desk-saved")).to_contain_text("1 correction stands, all saved")
+    assert new in session(served).bouts["action"].tolist()
+    expect(page.locator("#correct-made")).to_contain_text(f"is {new}")
+    page.keyboard.press("u")
+    expect(page.locator(".desk-saved")).to_contain_text("0 corrections stand, all saved")
+    assert session(served).bouts["action"].tolist() == was
+    page.keyboard.press("u")
+    expect(page.locator(".desk-said")).to_contain_text("nothing of this visit is left")
+    opened(served, page, 4.0)
+    page.keyboard.press("[")  # a span of ten frames gets a bout of its own
+    for _ in range(9):
+        page.keyboard.press("ArrowRight")
+    page.keyboard.press("]")
+    expect(page.locator(".desk-said")).to_contain_text("marked 4.00 to 4.33 s")
+    page.keyboard.press(str(words.index(new) + 1))
+    expect(page.locator(".desk-saved")).to_contain_text("1 correction stands, all saved")
+    bouts = session(served).bouts
+    assert bouts[bouts["action"] == new]["duration_s"].tolist() == pytest.approx([1 / 3], abs=0.01)
+    page.keyboard.press("f")  # head and tail: this session has nothing to make the track of again
+    expect(page.locator(".desk-said.is-wrong")).to_be_visible()
+    assert len(read_log(served.study / f"{KEY}.liex").standing) == 1
+    watched.nothing_went_wrong()
+
+
+def test_it_plays_at_the_pace_that_is_asked_for(served: Served, watched: Watched) -> None:
+    page = watched.page
+    opened(served, page, 0.0)
+    page.wait_for_selector("#frame-facts dd")
+    clock = page.locator(".desk-clock")
+
+    def now() -> float:
+        return float(clock.inner_text().split(" ")[0])
+
+    page.keyboard.press(",")
+    page.keyboard.press(",")
+    expect(page.get_by_label("speed of playing")).to_have_value("0.25")
+    page.keyboard.press(" ")
+    expect(page.locator(".desk-play")).to_contain_text("Pause")
+    until(page, lambda: now() > 0.1)
+    began, at_s = time.monotonic(), now()
+    page.wait_for_timeout(1500)
+    pace = (now() - at_s) / (time.monotonic() - began)
+    assert 0.05 < pace < 0.35  # a busy machine may be slower, never faster
+    page.keyboard.press(" ")
+    stood = now()
+    expect(page.locator("#moment")).to_have_value(str(round(stood, 4)))  # the curves follow
+    page.keyboard.press("ArrowRight")
+    until(page, lambda: now() == pytest.approx(stood + 1 / 30, abs=0.002))
+    page.keyboard.press("ArrowLeft")
+    until(page, lambda: now() == pytest.approx(stood, abs=0.002))
+    page.get_by_label("speed of playing").select_option("4")
+    page.keyboard.press(" ")
+    until(page, lambda: now() == pytest.approx(float(MOUSE.times_s[-1]), abs=0.01))
+    expect(page.locator(".desk-play")).to_contain_text("Play")  # it ends by itself
+    watched.nothing_went_wrong()
+
+
+def test_places_in_doubt_are_worked_off_and_stay_so(served: Served, watched: Watched) -> None:
+    page = watched.page
+    opened(served, page, 0.0)
+    listed = page.locator(".desk-doubts li")
+    expect(listed).to_have_count(2)
+    assert "<b>walk</b> or pause?" in listed.nth(1).inner_text()  # names are text
+    page.keyboard.press("n")
+    expect(page.locator(".desk-said")).to_contain_text("0.50 to 1.00 s: walk or run?")
+    expect(page.locator(".desk-clock")).to_contain_text("0.7")
+    page.keyboard.press("k")
+    expect(page.locator(".desk-said")).to_contain_text("4.00 to 4.50 s")
+    expect(page.locator(".desk-side h3 .muted")).to_have_text("1 of 2 left")
+    opened(served, page, 0.0)
+    expect(page.locator(".desk-side h3 .muted")).to_have_text("1 of 2 left")
+    page.keyboard.press("n")
+    expect(page.locator(".desk-said")).to_contain_text("4.00 to 4.50 s")
+    page.keyboard.press("k")
+    expect(page.locator(".desk-said")).to_contain_text("all places in doubt have been looked at")
+    watched.nothing_went_wrong()
+
+
+def test_keys_belong_to_a_field_while_one_types_into_it(served: Served, watched: Watched) -> None:
+    page = watched.page
+    opened(served, page, 1.0)
+    page.get_by_text("Correct by numbers").click()
+    page.locator("#correct-new").fill("")
+    page.locator("#correct-new").type("f 1u")
+    expect(page.locator("#correct-new")).to_have_value("f 1u")
+    assert read_log(served.study / f"{KEY}.liex").entries == ()
+    expect(page.locator(".desk-play")).to_contain_text("Play")
+    watched.nothing_went_wrong()
+
+
+def test_the_page_stays_in_place_on_a_phone_and_in_the_dark(
+    served: Served, watched: Watched
+) -> None:
+    page = watched.page
+    page.set_viewport_size({"width": 390, "height": 800})
+    page.emulate_media(color_scheme="dark")
+    opened(served, page, 1.0)
+    page.wait_for_selector("#frame-facts dd")
+    assert page.evaluate("document.documentElement.scrollWidth") <= 390
+    ink, paper = (
+        sum(int(part) for part in colour.removeprefix("rgb(").rstrip(")").split(","))
+        for colour in page.evaluate(
+            "(of => [of.color, of.backgroundColor])(getComputedStyle(document.body))"
+        )
+    )
+    assert ink > paper + 300
+    watched.nothing_went_wrong()
