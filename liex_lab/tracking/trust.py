@@ -1,10 +1,11 @@
 """Which poses of a track the picture contradicts, whatever error the model predicts for them.
 
 An error of more than a quarter of the length is none to trust, whatever limit the plan states. Of a
-measured pose three numbers come from the picture itself (`residual.Agreement`): the distance
-between rendered body and readings, the share of the silhouette that the body covers, and the share
-of the body beside it. Of a pose that was smoothed or bridged, the distance from what the frame
-itself says is asked: while an animal is in full view, a pose that lies elsewhere is none.
+measured pose four numbers come from the picture itself (`residual.Agreement`): the distance between
+rendered body and readings, the same in the part of the body where it is largest, the share of the
+silhouette that the body covers, and the share of the body beside it. Of a pose that was smoothed or
+bridged, the distance from what the frame itself says is asked: while an animal is in full view, a
+pose that lies elsewhere is none.
 
 The limits were set on virtual recordings of the mouse, the fish and the hand with known truth; how,
 and what lies on either side of them, stands in `docs/trust.md`.
@@ -70,6 +71,7 @@ def contradicted(
     with np.errstate(invalid="ignore"):
         return np.asarray(
             (residual > limit)
+            | (seen.along(seen.part_mm, path) > MOST_RESIDUAL * length_mm)
             | (seen.along(seen.covered, path) < _LEAST_COVERED)
             | (seen.along(seen.beside, path) > _MOST_BESIDE)
         )
