@@ -7,7 +7,7 @@ height, d the camera's distance and a u + b v + c the inverse depth of the plane
 distance stand the two shares of the outlines: |S and B| / |S| of the silhouette S that the body B
 covers, and |B without S| / |B| of the body that lies beside it. For a trunk that fits hides a head
 that does not, the same median is taken over each part of the body, the pixels nearest to one of its
-joints in the picture, and the largest is told.
+joints in the picture and a twentieth of all at least, and the largest is told.
 """
 
 from __future__ import annotations
@@ -30,7 +30,10 @@ Array = NDArray[np.float64]
 
 _GIRTHS = np.linspace(0.75, 1.35, 13)  # of the default body at the animal's size
 _MIN_OVERLAP_PX = 20
-_MIN_PART_PX = 8  # of a part that both cover
+# a part of fewer pixels, or of a lesser share of all that both cover, says nothing: a finger that
+# lies wrong is no wrong hand
+_MIN_PART_PX = 8
+_MIN_PART = 0.05
 
 
 @dataclass(frozen=True)
@@ -236,6 +239,6 @@ def _worst_part(offset, part, n_parts):
             if part[k] == j:
                 own[n] = offset[k]
                 n += 1
-        if n >= _MIN_PART_PX:
+        if n >= max(_MIN_PART_PX, _MIN_PART * len(offset)):
             worst = max(worst, np.median(own[:n]))
     return worst
