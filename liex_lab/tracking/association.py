@@ -2,7 +2,9 @@
 
 The most probable path of a hidden Markov model whose states are the hypotheses of each frame and
 "missed": minimise sum_t score_t / score_mm (capped) + transition costs + missed-detection costs, by
-dynamic programming with a beam of 24 (Viterbi 1967; kernels in `_association_kernels`). Head and
+dynamic programming with a beam of 24 (Viterbi 1967; kernels in `_association_kernels`). Of an
+animal of a build that the metric does not know, score_mm is larger, and an animal that goes tail
+first for long is the less likely of two ways round (`backward_cost`). Head and
 tail are told apart on that path by the forward-backward algorithm over two states (Rabiner 1989),
 which gives the flip posterior. Lie-X has no such step: its tracker is a particle filter (section
 4.2).
@@ -26,6 +28,22 @@ Array = NDArray[np.float64]
 _BEAM = 24  # chains under way
 _JOINTS = 8  # so many say how far an animal has moved
 _BLOCK = 16_384  # frames that are in memory at a time
+_BESIDE = 256  # and beside them, for velocities
+# how badly the metric takes an animal's build is asked of some frames, of those in which the body
+# covers the outline, hardly lies beside it, and is near to the readings (of the length)
+_SAMPLE = 2048
+_FEWEST = 12
+_AGREES_COVERED = 0.5
+_AGREES_BESIDE = 0.3
+_AGREES_RESIDUAL = 0.06
+# nats that the best pose of a known build scores at most, in the median of a recording
+_ORDINARY = 2.5
+# an animal backs up at so many lengths a second at most; going tail first at twice that costs so
+# many nats a second; what moves faster is another thing that was taken for it
+_AROUND_S = 0.2
+_BACKS_UP = 0.6
+_BACKWARD = 60.0
+_JUMPS = 25.0
 NONE = kernels.NONE
 
 
@@ -69,6 +87,8 @@ class HypothesisAssociation:
 
     def __init__(self, skeleton: Skeleton, length_mm: float, tuning: AssociationCosts) -> None:
         self._tuning = tuning
+        self._skeleton = skeleton
+        self._length_mm = length_mm
         self._score_mm = tuning.score_mm * skeleton.relative_size
         n = skeleton.n_joints
         self._joints = sorted({round(k) for k in np.linspace(0, n - 1, min(n, _JOINTS))})
@@ -112,7 +132,9 @@ class HypothesisAssociation:
             (n,) int64 index of the hypothesis, `NONE` where the frame was passed by.
         """
         n, h = seen.score.shape
-        emission = self._emission(seen, allocate)
+        joints = self.joints(seen) if joints is None else joints
+        check_shapes("hypotheses", ("joints", joints, (n, h, len(self._joints), 3)))
+        emission = self._emission(seen, joints, allocate)
         if told is not None:
             emission[: len(told)][np.arange(h) != told[:, None]] = np.inf
         missed_cost = np.concatenate(
@@ -120,8 +142,6 @@ class HypothesisAssociation:
         )
         cost = allocate((n, h), float)
         parent = allocate((n, h, 2), np.int64)
-        joints = self.joints(seen) if joints is None else joints
-        check_shapes("hypotheses", ("joints", joints, (n, h, len(self._joints), 3)))
         chains = kernels.Chains(np.zeros((_BEAM, 2), np.int64), cost, parent)
         frames = kernels.Hypotheses(seen.seconds, joints, seen.error_mm, emission, missed_cost)
         n_beam = 0
@@ -132,14 +152,48 @@ class HypothesisAssociation:
             kernels.trace_back(chains.beam[0, 0], chains.beam[0, 1], parent, 0, path)
         return path
 
-    def _emission(self, seen: Observations, allocate: Allocator) -> Array:
-        """Emission cost (n, H) of each hypothesis, nats: its capped score; NaN without."""
+    def _emission(
+        self, seen: Observations, joints: NDArray[np.float32], allocate: Allocator
+    ) -> Array:
+        """Emission cost (n, H) of each hypothesis, nats: its capped score, and what it costs an
+        animal to go tail first; NaN without.
+        """
         cost = allocate(seen.score.shape, float)
+        score_mm = self._score_mm * self._strangeness(seen) ** 2
         for rows in blocks(len(cost), _BLOCK):
             cost[rows] = np.minimum(
-                seen.score[rows].astype(float) / self._score_mm, self._tuning.score_most
+                seen.score[rows].astype(float) / score_mm, self._tuning.score_most
             )
+            if self._skeleton.is_chain:
+                first = max(0, rows.start - _BESIDE)
+                around = slice(first, rows.stop + _BESIDE)
+                ahead = joints[around, :, -1] - joints[around, :, 0]
+                backward = backward_cost(seen[around], ahead, self._length_mm)
+                cost[rows] += backward[rows.start - first :][: rows.stop - rows.start]
         return cost
+
+    def _strangeness(self, seen: Observations) -> float:
+        """How many times worse than ordinary the metric scores the poses of this animal, 1 or more.
+
+        The metric knows the builds that it was trained on. Of another build every pose scores
+        badly: the frame would be passed by though the picture agrees with the body. And what the
+        score says of head against tail is worth less: it is right in some two of three frames, for
+        many frames running. So the unit of the scores grows by the square of this factor, the
+        median of the best scores of those frames in which the picture does agree, over what is
+        ordinary.
+        """
+        some = seen[:: max(1, len(seen) // _SAMPLE)]
+        best = np.where(some.known, some.score, np.inf).argmin(axis=1)
+        with np.errstate(invalid="ignore"):
+            agrees = (
+                (some.along(some.covered, best) > _AGREES_COVERED)
+                & (some.along(some.beside, best) < _AGREES_BESIDE)
+                & (some.along(some.residual_mm, best) < _AGREES_RESIDUAL * self._length_mm)
+            )
+        if agrees.sum() < _FEWEST:
+            return 1.0
+        usual = float(np.median(some.along(some.score, best)[agrees]))
+        return max(1.0, usual / (_ORDINARY * self._score_mm))
 
     def doubt(
         self,
@@ -166,7 +220,13 @@ class HypothesisAssociation:
         """
         rows = np.arange(len(path))
         other = np.where(path >= 0, path ^ 1, NONE)
-        emission = self._emission(seen, allocate)
+        joints = self.joints(seen) if joints is None else joints
+        check_shapes(
+            "hypotheses",
+            ("joints", joints, (*seen.score.shape, len(self._joints), 3)),
+            ("path", path, (len(joints),)),
+        )
+        emission = self._emission(seen, joints, allocate)
         here = np.where(path >= 0, emission[rows, np.maximum(path, 0)], 0.0)
         turned = np.where(path >= 0, emission[rows, np.maximum(other, 0)], 0.0)
         evidence = np.where(np.isfinite(turned), turned, self._tuning.score_most + here) - here
@@ -174,12 +234,6 @@ class HypothesisAssociation:
         doubt = np.zeros(len(path))
         if not len(used):
             return doubt
-        joints = self.joints(seen) if joints is None else joints
-        check_shapes(
-            "hypotheses",
-            ("joints", joints, (*seen.score.shape, len(self._joints), 3)),
-            ("path", path, (len(joints),)),
-        )
         one, two = (allocate((len(used), *joints.shape[2:]), joints.dtype) for _ in range(2))
         for part in blocks(len(used), _BLOCK):
             taken = path[used[part]]
@@ -199,3 +253,31 @@ class HypothesisAssociation:
         )
         doubt[:] = np.interp(rows, used, at_used)
         return doubt
+
+
+def backward_cost(seen: Observations, ahead: NDArray[np.float32], length_mm: float) -> Array:
+    """What it costs (n, H) each hypothesis to go tail first, nats.
+
+    Animals back up, but slowly and not for long. The velocity of what is seen, by its centroid
+    within 0.2 s before and after, is held against the direction from base to tip.
+
+    Args:
+        seen: hypotheses (n, H) of consecutive frames.
+        ahead: (n, H, 3) mm from base to tip of each.
+        length_mm: of the animal.
+    """
+    seconds = seen.seconds
+    first = np.searchsorted(seconds, seconds - _AROUND_S)
+    last = np.searchsorted(seconds, seconds + _AROUND_S, side="right") - 1
+    centre = seen.centroid_mm.astype(float) / length_mm
+    with np.errstate(invalid="ignore", divide="ignore"):
+        velocity = (centre[last] - centre[first]) / (seconds[last] - seconds[first])[:, None, None]
+        backward = -(velocity * ahead).sum(axis=-1) / np.linalg.norm(ahead, axis=-1)
+        share = np.clip((backward - _BACKS_UP) / _BACKS_UP, 0.0, 1.0)
+        share[~(np.linalg.norm(velocity, axis=-1) < _JUMPS)] = 0.0
+    # only which way round is in question, not whether it is the animal
+    other = np.arange(share.shape[1]) ^ 1
+    share = np.where(seen.known & seen.known[:, other], np.nan_to_num(share), 0.0)
+    share -= np.minimum(share, share[:, other])
+    step = np.minimum(np.diff(seconds, prepend=seconds[:1]), _AROUND_S)
+    return np.asarray(_BACKWARD * step[:, None] * share)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from liex_lab.tracking.association import NONE, HypothesisAssociation
+from liex_lab.tracking.association import NONE, HypothesisAssociation, backward_cost
 from liex_lab.tracking.motion_model import TrackingParameters
 from liex_lab.tracking.observations import Observations
 from tests.tracking.stories import MOUSE, lose, told, walk
@@ -39,6 +39,61 @@ def test_a_decision_that_was_given_out_stands():
 def test_a_path_through_good_frames_is_as_ever():
     seen = told(CLOCK, walk(CLOCK))
     assert (CHAIN.path(seen) == 0).all()
+
+
+def in_agreement(seen: Observations) -> Observations:
+    """The rendered body lies where the animal is seen."""
+    seen.covered[:, :2] = 0.8
+    seen.beside[:, :2] = 0.1
+    seen.residual_mm[:, :2] = 1.5
+    seen.centroid_mm[:, :2] = CHAIN.joints(seen)[:, :2].mean(axis=2)
+    return seen
+
+
+def test_an_animal_that_the_metric_does_not_know_is_not_passed_by():
+    seen = in_agreement(told(CLOCK, walk(CLOCK)))
+    seen.score[:, :2] += 12.0  # of every pose: it is the build, not the pose
+    assert (CHAIN.path(seen) == 0).all()
+
+
+def test_what_the_picture_does_not_agree_with_is_passed_by_whatever_all_of_it_scores():
+    seen = in_agreement(told(CLOCK, walk(CLOCK)))
+    seen.score[:, :2] += 12.0
+    seen.covered[:] = 0.2
+    assert (CHAIN.path(seen) != NONE).sum() <= 1  # a path has one frame at least
+
+
+def test_head_and_tail_of_an_animal_that_the_metric_does_not_know_are_told_by_the_way_it_goes():
+    clock = np.arange(60) / 30.0
+    wrong = np.random.default_rng(3).random(60) < 0.6  # the score alone would turn it round
+    seen = in_agreement(told(clock, walk(clock), flipped=wrong))
+    seen.score[:, 0] = 14.0
+    seen.score[:, 1] = 24.0
+    path = CHAIN.path(seen)
+    ends = np.stack([seen.joints_as(h, [0, MOUSE.tip]) for h in (0, 1)], axis=1)
+    ends = ends[np.arange(60), path].astype(float)
+    true = walk(clock).joints(MOUSE)
+    along = np.einsum("nd,nd->n", ends[:, 1] - ends[:, 0], true[:, MOUSE.tip] - true[:, 0])
+    assert (along > 0).all()
+
+
+@pytest.mark.parametrize("direction", [1.0, -1.0])
+def test_going_tail_first_costs_by_the_second_and_backing_up_slowly_costs_nothing(direction):
+    for rate in (15.0, 30.0, 120.0):
+        clock = np.arange(0.0, 1.0, 1.0 / rate)
+        seen = Observations.empty(MOUSE, np.round(1e9 * clock).astype(np.int64))
+        seen.score[:, :2] = 1.0
+        ahead = np.zeros((len(clock), 4, 3), np.float32)
+        ahead[:, 0, 0] = direction
+        ahead[:, 1, 0] = -direction
+        for lengths_s, cost in ((0.5, 0.0), (-0.5, 0.0), (2.0, 60.0)):
+            seen.centroid_mm[:, :2] = (lengths_s * MOUSE.length * clock[:, None] * [1, 0, 0])[
+                :, None
+            ]
+            total = backward_cost(seen, ahead, MOUSE.length).sum(axis=0)
+            wrong = int(direction * lengths_s > 0)
+            assert total[wrong] == pytest.approx(cost, rel=0.1)
+            assert total[1 - wrong] == 0.0
 
 
 def test_joints_of_another_number_are_refused():

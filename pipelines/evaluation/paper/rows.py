@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -94,96 +94,82 @@ def runs_of_models(variant: str, models: Sequence[PoseEstimator]) -> list[Subjec
     ]
 
 
-def common_views(
-    animal: str,
-    chooser: PoseEstimator,
-    tests: Mapping[str, Sequence[TrueRecording]],
-    progress: Progress,
-) -> dict[str, list[CommonView]]:
-    """What every row is given, by split and recording.
-
-    Args:
-        animal: a bundled animal's name, or the path of a skeleton's TOML.
-        chooser: the default estimator.
-        tests: recordings with their truth by split.
-        progress: told recording by recording.
-    """
-    plan = plan_of(animal)
-    views: dict[str, list[CommonView]] = {}
-    for split, sessions in tests.items():
-        views[split] = []
-        for k, recording in enumerate(sessions):
-            progress(k, len(sessions), f"choosing the object in {recording.name}")
-            views[split].append(common_view(recording, plan, chooser)[2])
-    return views
-
-
 def measured_rows(
     animal: str,
     runs: Mapping[str, Sequence[Subject]],
+    chooser: PoseEstimator,
     tests: Mapping[str, Sequence[TrueRecording]],
-    views: Mapping[str, Sequence[CommonView]],
     progress: Progress,
-) -> dict[str, dict[str, Any]]:
-    """What is measured of each row: `splits` and `rate`, `examples` and `failures`.
+) -> tuple[dict[str, dict[str, Any]], dict[str, list[CommonView]]]:
+    """What is measured of each row, and what each was given.
+
+    Every recording is rendered and its scene learned once.
 
     Args:
         animal: a bundled animal's name, or the path of a skeleton's TOML.
         runs: estimators and baselines by variant; `default` is among them.
+        chooser: the default estimator.
         tests: recordings with their truth by split.
-        views: what every row is given in each of them.
         progress: told recording by recording.
+
+    Returns:
+        By row `splits` and `rate`, `examples` and `failures`; and by split the view of each of its
+        recordings.
     """
     rows: dict[str, dict[str, Any]] = {
         name: {"splits": {}, "examples": [], "failures": []} for name in runs
     }
+    views: dict[str, list[CommonView]] = {}
     for split, sessions in tests.items():
-        errors, first = _errors_of(animal, runs, sessions, views[split], progress)
-        for name, of_runs in errors.items():
-            rows[name]["splits"][split] = numbers_of(of_runs, views[split])
-            rows[name]["examples"] += examples_in(split, first[name], sessions)
-            rows[name]["failures"] += failures_in(split, first[name], sessions)
+        measured_ones = []
+        for k, recording in enumerate(sessions):
+            progress(k, len(sessions), f"measuring {recording.name}")
+            measured_ones.append(_measure(recording, animal, runs, chooser))
+        views[split] = [one.view for one in measured_ones]
+        for name in runs:
+            errors = [
+                PoseErrors.join(list(of_run))
+                for of_run in zip(*(one.errors[name] for one in measured_ones), strict=True)
+            ]
+            first = [one.first[name] for one in measured_ones]
+            rows[name]["splits"][split] = numbers_of(errors, views[split])
+            rows[name]["examples"] += examples_in(split, first, sessions)
+            rows[name]["failures"] += failures_in(split, first, sessions)
     progress(0, None, "timing")
     timed = {name: some[0] for name, some in runs.items()}
     for name, rate in rates_of(animal, timed, next(iter(tests.values()))).items():
         rows[name]["rate"] = rate
-    return rows
+    return rows, views
 
 
-def _errors_of(
+class _Measured(NamedTuple):
+    """One recording: what every row is given; by row the errors of its runs, and the joints (n, J,
+    3) mm that the first of them finds.
+    """
+
+    view: CommonView
+    errors: dict[str, list[PoseErrors]]
+    first: dict[str, Array]
+
+
+def _measure(
+    recording: TrueRecording,
     animal: str,
     runs: Mapping[str, Sequence[Subject]],
-    sessions: Sequence[TrueRecording],
-    views: Sequence[CommonView],
-    progress: Progress,
-) -> tuple[dict[str, list[PoseErrors]], dict[str, list[Array]]]:
-    """Errors of every run of every row over the frames of a split, in order; and the joints that
-    the first run of each finds in each recording.
-    """
-    from ...build import build_scene
-
-    plan = plan_of(animal)
-    parts: dict[str, list[list[PoseErrors]]] = {
-        name: [[] for _ in some] for name, some in runs.items()
-    }
-    first: dict[str, list[Array]] = {name: [] for name in runs}
-    skeleton = next(iter(runs.values()))[0].skeleton
-    for k, (recording, view) in enumerate(zip(sessions, views, strict=True)):
-        progress(k, len(sessions), f"measuring {recording.name}")
-        scene, frames = build_scene(recording, plan, skeleton, len(recording))
-        cut: dict[Any, Any] = {}
-        for name, subjects in runs.items():
-            for part, subject in zip(parts[name], subjects, strict=True):
-                joints, predicted_mm, quantiles = measured(subject, frames, scene, view, cut)
-                if subject is subjects[0]:
-                    first[name].append(joints)
-                part.append(
-                    PoseErrors.compare(
-                        joints, recording.joints_camera, skeleton.tip, predicted_mm, quantiles
-                    )
-                )
-    errors = {name: [PoseErrors.join(part) for part in some] for name, some in parts.items()}
-    return errors, first
+    chooser: PoseEstimator,
+) -> _Measured:
+    scene, frames, view = common_view(recording, plan_of(animal), chooser)
+    out = _Measured(view, {name: [] for name in runs}, {})
+    cut: dict[Any, Any] = {}
+    tip = chooser.skeleton.tip
+    for name, subjects in runs.items():
+        for subject in subjects:
+            joints, predicted_mm, quantiles = measured(subject, frames, scene, view, cut)
+            out.first.setdefault(name, joints)
+            out.errors[name].append(
+                PoseErrors.compare(joints, recording.joints_camera, tip, predicted_mm, quantiles)
+            )
+    return out
 
 
 def numbers_of(runs: Sequence[PoseErrors], views: Sequence[CommonView]) -> dict[str, Any]:

@@ -163,18 +163,18 @@ def results_of(animal: str, budget: Budget, command: str, progress: Progress) ->
     from liex_lab.body.skeleton import Skeleton
 
     from .illustrations import illustrate
-    from .rows import common_views, measured_rows
+    from .rows import measured_rows
 
     skeleton = Skeleton.load(animal)
     tests = _tests(skeleton, budget)
     results = Results(skeleton.name, list(skeleton.names), list(tests), sealed=budget.sealed)
     default = _subjects(animal, ["default"], budget, results, progress)
     chooser = cast("PoseEstimator", default["default"][0])
-    views = common_views(animal, chooser, tests, progress)
-    kept = _kept(skeleton, budget, tests, views, results)
     wanted = [name for name in budget.fresh if name != "default"]
     runs = default | _subjects(animal, wanted, budget, results, progress)
-    for name, row in measured_rows(animal, runs, tests, views, progress).items():
+    rows, views = measured_rows(animal, runs, chooser, tests, progress)
+    kept = _kept(skeleton, budget, tests, views, results)
+    for name, row in rows.items():
         made = {"quick": True} if budget.quick else made_from(name, skeleton)
         known = {} if budget.quick else hashes_of(animal, name)
         n_models = 1 if budget.quick else TRAINING_DRAWS.get(name, 1)

@@ -18,6 +18,7 @@ from liex_lab.dashboards.paper.key_frames import draw_key_frames
 from liex_lab.dashboards.paper.page import write_page
 from liex_lab.dashboards.paper.plates import draw_figures
 from liex_lab.dashboards.paper.tracking import draw_tracking
+from liex_lab.pipelines.build import plan_of
 from liex_lab.pipelines.evaluation import pose
 from liex_lab.pipelines.evaluation.paper import (
     cached_results,
@@ -220,7 +221,8 @@ def test_a_kept_row_without_poses_gets_them_only_from_the_very_model_it_was_meas
 ):
     recordings = {"hard": SmallWorld().test_split("hard")[:1]}
     chooser = PoseEstimator.load("mouse")
-    views = rows.common_views("mouse", chooser, recordings, silent)
+    view = common_view.common_view(recordings["hard"][0], plan_of("mouse"), chooser)[2]
+    views = {"hard": [view]}
     monkeypatch.setattr(fingerprints, "model_digests", lambda *_: ["a"])
     monkeypatch.setattr(pose, "subject_of", lambda *_: chooser)
     found, refused = (
@@ -401,7 +403,6 @@ def test_the_hash_of_code_is_of_what_it_does_not_of_how_it_is_told():
 
 @pytest.mark.slow
 def test_every_row_measures_the_object_that_the_default_chooses():
-    from liex_lab.pipelines.build import plan_of
 
     recording = SmallWorld().test_split("hard")[0]
     chooser = PoseEstimator.load("mouse")
