@@ -124,14 +124,11 @@ def draw_hidden(axes: Axes, session: Session) -> None:
     if "x_mm" not in gaps:  # sessions of earlier versions do not say where
         return
     hidden = gaps[(gaps["reason"] == "hidden") & gaps["x_mm"].notna()]
-    for row in hidden.itertuples():
-        axes.plot(row.x_mm, row.y_mm, "x", color=INK, markersize=4, gid="hidden")
+    columns = hidden[["x_mm", "y_mm", "start_s", "stop_s"]].to_numpy(float)
+    for x, y, start, stop in columns:
+        axes.plot(x, y, "x", color=INK, markersize=4, gid="hidden")
         text = axes.annotate(
-            f"hidden {row.stop_s - row.start_s:.1f} s",
-            (row.x_mm, row.y_mm),
-            (3, 2),
-            textcoords="offset points",
-            size=6.0,
+            f"hidden {stop - start:.1f} s", (x, y), (3, 2), textcoords="offset points", size=6.0
         )
         halo(text)
 
