@@ -351,12 +351,17 @@ def _write(subject: Subject, track: Track, curve: Curve, tuning: TrackingParamet
     track.scale[:] = pose.scale
     stretch = motion.usual_stretch if subject.stretch_sd is None else subject.stretch_sd
     away = stretch_of(stretch, curve.joints)
+    height = motion.unseen_height * subject.length_mm
     track.sd_mm[:] = np.hypot(
         (curve.error_mm / ERROR_PER_SD)[:, None] * np.array(subject.joint_share), away
     )
-    track.predicted_error_mm[:] = np.hypot(curve.error_mm, ERROR_PER_SD * away.mean(axis=1))
+    # sd_mm is what speeds and headings are made of; a height that is off throughout changes none
+    constant = np.hypot(ERROR_PER_SD * away.mean(axis=1), MEAN_PER_SD * height)
+    track.predicted_error_mm[:] = np.hypot(curve.error_mm, constant)
     calibration = np.array(motion.root_calibration)
+    up = height * pose.root.rotation[:, 2]  # of the arena, in the root's own frame
     track.cov_root[:] = covariance_of_root(curve) * (calibration[:, None] * calibration)
+    track.cov_root[:, 3:, 3:] += up[:, :, None] * up[:, None, :]
     track.sd_angles_rad[:] = (curve.sd_bend * motion.bend_calibration)[
         :, None
     ] * subject.skeleton.axes
@@ -431,6 +436,7 @@ def stretch_of(stretch_sd: float, joints: Array) -> Array:
     return np.asarray(stretch_sd * np.linalg.norm(joints - joints[:, :1], axis=-1) / np.sqrt(3.0))
 
 
+MEAN_PER_SD = 0.8  # the mean of |x| over the standard deviation of a Gaussian x, sqrt(2 / pi)
 # a mean distance in space over the standard deviation along one axis: 1.6 of a Gaussian, but tails
 # are heavier
 ERROR_PER_SD = 1.4

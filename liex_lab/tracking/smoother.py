@@ -72,6 +72,9 @@ class Motion:
             with: how far the body lies from the depth seen, over its length, and the standard
             deviation of the logarithm of the size that single frames estimate.
         usual_stretch: that share in a session of which neither is known.
+        unseen_height: standard deviation, over the length, of the height of the joints as a whole:
+            a camera sees the back of an animal, and how far below it the midline lies is a matter
+            of its build.
         root_calibration: calibration factors of the root's rotation about (3) and position along
             (3) its
             own axes, over what that leaves.
@@ -92,6 +95,7 @@ class Motion:
     calibration: tuple[tuple[float, float], ...]
     stretch: tuple[float, float] = (0.0, 0.0)
     usual_stretch: float = 0.0
+    unseen_height: float = 0.0
     root_calibration: tuple[float, float, float, float, float, float] = (1.0,) * 6
     bend_calibration: tuple[float, float, float] = (1.0,) * 3
 

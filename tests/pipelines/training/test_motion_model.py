@@ -10,11 +10,13 @@ import numpy as np
 import pytest
 from liex_lab.pipelines.training.motion_model import (
     Seen,
+    calibrate_height,
     calibrate_joints,
     calibrate_roots,
     changed,
     search,
     train_tracking,
+    with_motion,
 )
 
 from liex_lab.geometry import so3
@@ -118,6 +120,39 @@ def test_who_is_taken_for_smaller_has_wider_intervals_and_who_is_not_has_none(me
     assert tuning.motion.stretch[1] > 0
     assert alike.motion.stretch == (0.0, 0.0), "what tells nothing is not used"
     assert np.ptp(covered(sequences, tuning)) < 0.5 * np.ptp(covered(sequences, alike))
+
+
+def test_heights_that_are_off_throughout_a_recording_are_covered(measured):
+    tuning = TrackingParameters.of("mouse")
+    builds = [
+        replace(measured[k % 2], truth=np.add(measured[k % 2].truth, [0.0, 0.0, up_mm]))
+        for k, up_mm in enumerate((-9.0, -4.0, 5.0, 7.0, 10.0))
+    ]
+    height = calibrate_height(builds, tuning).motion.unseen_height
+    inside = []
+    for each in builds:
+        track = track_whole(each.subject, each.seen, (), tuning).track
+        sd = np.hypot(track.sd_mm, height * each.subject.length_mm)
+        inside.append(np.abs(track.joints_mm - each.truth)[..., 2] <= 1.645 * sd)
+    assert 0.85 < np.mean(inside) < 0.95
+    assert calibrate_height([], tuning).motion.unseen_height == 0.0
+
+
+def test_a_height_nobody_sees_is_in_the_error_and_upright_in_the_roots_covariance(measured):
+    each = measured[0]
+    plain = TrackingParameters.of("mouse")
+    higher = with_motion(plain, unseen_height=0.1)
+    before, after = (track_whole(each.subject, each.seen, (), one).track for one in (plain, higher))
+    there = before.posed & after.posed
+    R = before.root_rotation[there]
+    more = after.cov_root[there] - before.cov_root[there]
+    upright = R @ more[:, 3:, 3:] @ np.swapaxes(R, 1, 2)
+    sd_mm = 0.1 * each.subject.length_mm
+    np.testing.assert_allclose(upright - np.diag([0.0, 0.0, sd_mm**2]), 0.0, atol=1e-6)
+    np.testing.assert_allclose(
+        after.predicted_error_mm[there], np.hypot(before.predicted_error_mm[there], 0.8 * sd_mm)
+    )
+    np.testing.assert_array_equal(after.sd_mm[there], before.sd_mm[there])
 
 
 @pytest.mark.slow
