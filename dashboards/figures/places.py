@@ -93,6 +93,46 @@ def draw_outlines(axes: Axes, session: Session, named: bool = True, centred: boo
         halo(text)
 
 
+def draw_region(axes: Axes, session: Session) -> None:
+    """The region outside of which nothing was looked at, on the floor, where it was not all.
+
+    Args:
+        axes: a panel whose axes count millimetres.
+        session: the opened session.
+    """
+    corners = session.metadata.get("scene", {}).get("region_px", [])
+    if len(corners) < 3:
+        return
+    rays = session.camera.unproject(np.asarray(corners, float), np.ones(len(corners)))
+    place = session.T_arena_camera
+    ways = rays @ place.rotation.T
+    if (ways[:, 2] >= 0).any():  # a corner above the horizon is nowhere on the floor
+        return
+    on_floor = place.translation + ways * (-place.translation[2] / ways[:, 2])[:, None]
+    closed = np.vstack([on_floor, on_floor[:1]])
+    axes.plot(*closed[:, :2].T, color=MUTED, linewidth=0.7, linestyle=":", gid="region")
+
+
+def draw_hidden(axes: Axes, session: Session) -> None:
+    """Where animals were last seen before they were hidden, with for how long.
+
+    Args:
+        axes: a panel whose axes count millimetres.
+        session: the opened session.
+    """
+    gaps = session.gaps
+    if "x_mm" not in gaps:  # sessions of earlier versions do not say where
+        return
+    hidden = gaps[(gaps["reason"] == "hidden") & gaps["x_mm"].notna()]
+    columns = hidden[["x_mm", "y_mm", "start_s", "stop_s"]].to_numpy(float)
+    for x, y, start, stop in columns:
+        axes.plot(x, y, "x", color=INK, markersize=4, gid="hidden")
+        text = axes.annotate(
+            f"hidden {stop - start:.1f} s", (x, y), (3, 2), textcoords="offset points", size=6.0
+        )
+        halo(text)
+
+
 def draw_occupancy(axes: Axes, found: Occupancy, most: float) -> Any:
     """The heatmap of an occupancy, cells where the animal never was left empty; returns the image.
 
@@ -139,6 +179,7 @@ def occupancy_map(seen: Seen) -> Figure | None:
     figure, axes = _floor_sheet(title)
     image = draw_occupancy(axes, found, _most(found))
     draw_outlines(axes, seen.session)
+    draw_hidden(axes, seen.session)
     floor_limits(axes, *extent_mm(seen.session, seen.xy_mm))
     scale_bar(axes)
     _colour_bar(figure, image, "s/cm²")
@@ -254,6 +295,8 @@ def arena_map(session: Session, depth: Sequence[NDArray[np.uint16]]) -> Figure |
         interpolation="none",
     )
     draw_outlines(axes, session)
+    draw_region(axes, session)
+    draw_hidden(axes, session)
     for fixture in fixtures:
         place = fixture["centre_mm"][:2]
         axes.plot(*place, "+", color=PAPER, markersize=4)

@@ -214,6 +214,28 @@ def _refit(points: Array, depth: Array, plane: Array) -> tuple[Array, float]:
     return np.asarray(fitted, float), float(near.mean())
 
 
+def fit_plane(background: NDArray[np.float32], where: NDArray[np.bool_], camera: Camera) -> Floor:
+    """The plane of some pixels, by least squares on inverse depth.
+
+    Args:
+        background: (H, W) float32 mm.
+        where: (H, W) bool, readable pixels, at least three that are in no line.
+        camera: that took it, free of lens distortion.
+
+    Returns:
+        The plane.
+    """
+    rows, columns = np.nonzero(where)
+    middle = np.array([background.shape[1] / 2.0, background.shape[0] / 2.0])
+    points = np.stack(
+        [(columns - middle[0]) / middle[0], (rows - middle[1]) / middle[0], np.ones(len(rows))],
+        axis=1,
+    )
+    inverse = 1.0 / background[where].astype(float)
+    plane = np.linalg.lstsq(points.T @ points, points.T @ inverse, rcond=None)[0]
+    return _in_pixels(np.asarray(plane, float), middle, camera)
+
+
 def floor_region(background: NDArray[np.float32], bare: NDArray[np.float32]) -> NDArray[np.bool_]:
     """Where the floor lies: the convex hull of the largest part of the background on the plane.
 

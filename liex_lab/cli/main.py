@@ -183,7 +183,8 @@ def doctor(
         typer.Option(
             "--region",
             metavar='"X,Y X,Y ..."',
-            help="Look only inside this polygon, corners in pixels.",
+            help="Look only inside this polygon, corners in pixels, or 'circle X,Y R'; a last word "
+            "mm: millimetres on the floor.",
         ),
     ] = None,
     plan: WhichPlan = None,

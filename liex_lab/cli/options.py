@@ -52,21 +52,39 @@ JsonFile = Annotated[
 
 
 def region_setting(region: str | None) -> list[str]:
-    """The setting of a plan that a region "x,y x,y x,y" stands for; none where none is given."""
+    """The setting of a plan that a region stands for; none where none is given.
+
+    Args:
+        region: "x,y x,y x,y", the corners of a polygon, or "circle x,y radius"; a last word mm says
+            that they count millimetres on the floor, not pixels.
+
+    Raises:
+        PlanError: it is neither.
+    """
     from liex_lab.errors import PlanError
 
     if region is None:
         return []
+    words = region.split()
+    unit = words.pop() if words and words[-1] in ("px", "mm") else "px"
     try:
-        corners = [[float(value) for value in corner.split(",")] for corner in region.split()]
+        if words[:1] == ["circle"]:
+            _, centre, radius = words
+            x, y = map(float, centre.split(","))
+            shape = f"circle = {{centre = [{x}, {y}], radius = {float(radius)}}}"
+            return [f'arena.region={{{shape}, unit = "{unit}"}}']
+        corners = [[float(value) for value in corner.split(",")] for corner in words]
     except ValueError:
         corners = []
     if len(corners) < 3 or any(len(corner) != 2 for corner in corners):
         raise PlanError(
             "--region takes three or more corners in pixels, as in --region "
-            f"'60,40 260,40 260,200 60,200', got '{region}'"
+            "'60,40 260,40 260,200 60,200', or a circle, as in --region 'circle 160,120 90'; a "
+            f"last word mm makes both millimetres on the floor; got '{region}'"
         )
-    return [f"arena.region={corners}"]
+    if unit == "px":
+        return [f"arena.region={corners}"]
+    return [f'arena.region={{polygon = {corners}, unit = "mm"}}']
 
 
 def say(text: object) -> None:

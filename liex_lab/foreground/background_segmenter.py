@@ -20,23 +20,22 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from liex_lab.arena.floor import Floor, near_plane
+from liex_lab.arena.floor import Floor
 from liex_lab.body.skeleton import MOUSE_VIEW, VIEWS, View
 from liex_lab.errors import EstimationError
 from liex_lab.foreground import _height_map_kernels as kernels
 from liex_lab.foreground._blob_kernels import MAX_BLOBS
-from liex_lab.foreground.background import learn_background, sample_frames, stride_for
+from liex_lab.foreground.background import sample_frames, stride_for
+from liex_lab.foreground.bare_ground import SPREADS as SPREADS  # models are trained with it
+from liex_lab.foreground.bare_ground import BareGround, Wanted
 from liex_lab.foreground.cable import Cable
-from liex_lab.foreground.floor_level import FloorLevel, wandering
-from liex_lab.foreground.standing import SampledScene, Standing, find_standing
+from liex_lab.foreground.floor_level import FloorLevel
 from liex_lab.foreground.still_scene import StillScene
-from liex_lab.foreground.unread_floor import unread_floor
 from liex_lab.optics.camera import Camera
 from liex_lab.recordings.recording import Recording
 
 Array = NDArray[np.float64]
 
-SPREADS = 3.0  # an animal stands out by this many standard deviations of the background's own noise
 # of the frames: a lump that the animal touches that often is a part of it that keeps still
 _TOUCH_SHARE = 0.9
 _OTHER = 3.0  # times larger or smaller is another thing
@@ -45,61 +44,6 @@ _OTHER = 3.0  # times larger or smaller is another thing
 _LONGEST = 2.0
 _HIGHER = 1.4
 _LARGER = 1.5
-
-
-@dataclass(frozen=True)
-class _Ground:
-    """What a sample of frames says of the empty scene.
-
-    Attributes:
-        background: (H, W) float32 mm, 0 where unknown.
-        spread: (H, W) float32 mm, its standard deviation.
-        near: (H, W) float32 mm, the nearest usual depth.
-        standing: the floor that was found.
-        px_mm2: area of a pixel on it, mm^2.
-    """
-
-    background: NDArray[np.float32]
-    spread: NDArray[np.float32]
-    near: NDArray[np.float32]
-    standing: Standing
-    px_mm2: float
-
-    @staticmethod
-    def learn(
-        sample: NDArray[np.float32],
-        camera: Camera,
-        spine_mm: tuple[float, float],
-        min_height_mm: float,
-        view: View,
-        stated: Floor | None,
-        region: NDArray[np.bool_] | None,
-    ) -> _Ground:
-        """The ground in a sample (n, H, W) mm; region (H, W) is where it is looked at, if stated.
-
-        Raises:
-            EstimationError: no depth was read, nothing comes back often enough, or no floor was
-                found.
-        """
-        background, spread, near = learn_background(sample)
-        _check_background(sample, background)
-        seen = SampledScene(sample, background, spread, camera, spine_mm, min_height_mm, view)
-        standing = find_standing(seen, stated)
-        if region is not None:
-            standing = replace(standing, region=region, on_floor=standing.on_floor & region)
-        if standing.region is not None:  # what lies around is not looked at
-            background = np.where(standing.region, background, np.float32(0))
-            near = np.where(standing.region, near, np.float32(0))
-        px_mm2 = standing.floor.distance_mm**2 / (camera.fx * camera.fy)
-        return _Ground(background, spread, near, standing, px_mm2)
-
-    @property
-    def level(self) -> FloorLevel:
-        """The level of its bare floor."""
-        bare = self.standing.floor.depth(*self.background.shape[::-1])
-        return FloorLevel.on(
-            self.background, self.standing.on_floor & near_plane(self.background, bare)
-        )
 
 
 @dataclass(frozen=True)
@@ -159,89 +103,105 @@ class BackgroundSubtraction(StillScene):
             EstimationError: no depth was read, nothing comes back often enough to be a background,
                 no floor was found, or nothing of an animal's size stands on it.
         """
+        wanted = Wanted(spine_mm, min_height_mm, view)
         stride = stride_for(recording, spine_mm[0])
         sample = sample_frames(recording, n_frames, stride)
+        cut = None
         if region is not None:
-            sample *= region[::stride, ::stride]
-        grid = recording.camera.every(stride)
-        stated = None if floor is None else Floor.from_plane(floor.normal, floor.distance_mm, grid)
-        cut = None if region is None else region[::stride, ::stride]
-        stands = view.frame == VIEWS[0]  # one that floats may be seen before anything
-        ground = _Ground.learn(sample, grid, spine_mm, min_height_mm, view, stated, cut)
-        level = None
-        levels = ground.level.of(sample) if stands else np.empty(0)
-        if stands and (wander := wandering(levels)) is not None:
-            first, range_mm = wander
-            sample = ground.level.brought_back(sample, levels - first)
-            ground = _Ground.learn(sample, grid, spine_mm, min_height_mm, view, stated, cut)
-            level = replace(ground.level, wander_mm=range_mm)
-        background = ground.background
-        spread = ground.spread
-        near = ground.near
-        standing = ground.standing
-        seen = standing.floor
-        floor = (
-            seen
-            if stride == 1
-            else Floor.from_plane(seen.normal, seen.distance_mm, recording.camera)
+            cut = region[::stride, ::stride]
+            sample *= cut
+        ground, sample, level = BareGround.steady(
+            sample, recording.camera.every(stride), wanted, floor, cut
         )
-        bare = seen.depth(grid.width, grid.height)
-        on_floor = standing.on_floor
-        if stands:
-            least_px = view.area[0] * spine_mm[0] ** 2 / ground.px_mm2
-            dark = unread_floor(sample, background, bare, on_floor, min_height_mm, least_px)
-            background = np.where(dark, np.float32(0), background)
-            spread = np.where(dark, np.float32(0), spread)
-        background = np.where((background == 0) & on_floor, bare, background)
-        # the rims and walls around the floor flicker between near and far: there, nearer than ever
-        # is what counts
-        behind = np.where(on_floor, background, near)
-        margin = np.maximum(np.float32(min_height_mm), np.float32(SPREADS) * spread)
-        limit = np.maximum(behind - margin, 0).astype(np.float32)
-        over = on_floor if stands else np.ones_like(on_floor)
-        scene = BackgroundSubtraction(
-            recording.camera,
-            floor,
+        scene = BackgroundSubtraction._empty(recording.camera, stride, ground, sample, level)
+        if wanted.stands:
+            scene, sample = scene._without_cable(sample, wanted)
+        scene = scene._with_its_animal(sample, wanted)
+        return replace(scene, volume_mm3=scene.usual_volume(sample)), sample
+
+    @staticmethod
+    def _empty(
+        camera: Camera,
+        stride: int,
+        ground: BareGround,
+        sample: NDArray[np.float32],
+        level: FloorLevel | None,
+    ) -> BackgroundSubtraction:
+        """The scene of a ground, of whose animal nothing is known yet.
+
+        Args:
+            camera: the ideal pinhole camera of the recording.
+            stride: of the pixels that are looked at.
+            ground: what was learned of the empty scene.
+            sample: (n, H, W) float32 mm, the frames that it was learned from.
+            level: brings frames to one level of the floor; None where it is still.
+        """
+        background, limit = ground.background_and_limit(sample)
+        on_floor = ground.standing.on_floor
+        seen = ground.standing.floor
+        return BackgroundSubtraction(
+            camera,
+            seen if stride == 1 else Floor.from_plane(seen.normal, seen.distance_mm, camera),
             background,
             limit,
-            over,
-            view=view,
+            on_floor if ground.wanted.stands else np.ones_like(on_floor),
+            view=ground.wanted.view,
             stride=stride,
-            standing=standing,
+            standing=ground.standing,
             level=level,
         )
-        if stands:
-            smallest = view.area[0] * spine_mm[0] ** 2
-            cable = Cable.find(sample, limit, grid, seen, spine_mm[1], smallest)
-            if cable is not None:
-                sample = cable.cut(sample, limit)
-                scene = replace(scene, cable=cable)
+
+    def _without_cable(
+        self, sample: NDArray[np.float32], wanted: Wanted
+    ) -> tuple[BackgroundSubtraction, NDArray[np.float32]]:
+        """The scene and the sample (n, H, W) mm with cables cut out, themselves where are none."""
+        floor = self.grid_floor if self.standing is None else self.standing.floor
+        cable = Cable.find(
+            sample, self.limit, self.grid, floor, wanted.spine_mm[1], wanted.smallest_mm2
+        )
+        if cable is None:
+            return self, sample
+        return replace(self, cable=cable), cable.cut(sample, self.limit)
+
+    def _with_its_animal(
+        self, sample: NDArray[np.float32], wanted: Wanted
+    ) -> BackgroundSubtraction:
+        """The scene with the usual area of its animal, and the floor under one that keeps still.
+
+        Args:
+            sample: (n, H, W) float32 mm, frames at this scene's stride.
+            wanted: what animal is expected.
+
+        Raises:
+            EstimationError: nothing of an animal's size stands on the floor.
+        """
+        spine_mm = wanted.spine_mm
+        min_height_mm = wanted.min_height_mm
+        scene = self
         area, share = scene._moving_area(sample, spine_mm, min_height_mm)
-        moves = share >= 0.5 or (share > 0.0 and standing.moves)
-        rests = scene._at_rest(sample, bare, spine_mm, min_height_mm, area, share)
+        moves = share >= 0.5 or (share > 0.0 and self.standing is not None and self.standing.moves)
+        rests = scene._at_rest(sample, spine_mm, min_height_mm, area, share)
         if rests is not None:
             scene, area, share = rests
             moves = False
-        elif stands and share >= 0.5:
+        elif wanted.stands and share >= 0.5:
             scene, area = scene.with_its_still_part(sample, spine_mm, min_height_mm, area)
         # what was not seen moving is an animal only where it is as large and as high as one
-        if stands and share > 0.0 and not moves:
+        if wanted.stands and share > 0.0 and not moves:
             seen_as = replace(scene, area_mm2=area)
             share = share if seen_as._is_like_an_animal(sample, spine_mm, min_height_mm) else 0.0
         if share == 0.0:
             raise EstimationError(
                 f"no animal was found in {len(sample)} frames spread over the recording: nothing "
-                f"between {view.area[0] * spine_mm[0] ** 2:.0f} and "
-                f"{view.area[1] * spine_mm[1] ** 2:.0f} mm^2 stands on the floor; check the depth "
-                "unit, or set animal.spine_min_mm and spine_max_mm in the plan"
+                f"between {wanted.smallest_mm2:.0f} and {wanted.largest_mm2:.0f} mm^2 stands on "
+                "the floor; check the depth unit, or set animal.spine_min_mm and spine_max_mm in "
+                "the plan"
             )
-        scene = replace(scene, area_mm2=area)
-        return replace(scene, volume_mm3=scene.usual_volume(sample)), sample
+        return replace(scene, area_mm2=area)
 
     def _at_rest(
         self,
         sample: NDArray[np.float32],
-        bare: NDArray[np.float32],
         spine_mm: tuple[float, float],
         min_height_mm: float,
         area: float,
@@ -254,7 +214,6 @@ class BackgroundSubtraction(StillScene):
 
         Args:
             sample: (n, H, W) float32 mm, frames at this scene's stride.
-            bare: (H, W) float32 mm, depth of the floor's plane.
             spine_mm: lengths of the smallest and the largest animal to expect, mm.
             min_height_mm: what stands out by less is not the animal.
             area: usual area of what was found, mm^2.
@@ -271,6 +230,8 @@ class BackgroundSubtraction(StillScene):
         ):
             return None
         on_floor = self.on_floor if self.standing is None else self.standing.on_floor
+        floor = self.grid_floor if self.standing is None else self.standing.floor
+        bare = floor.depth(self.grid.width, self.grid.height)
         limit = np.where(
             on_floor, np.maximum(bare - np.float32(min_height_mm), 0), self.limit
         ).astype(np.float32)
@@ -451,18 +412,3 @@ class BackgroundSubtraction(StillScene):
             n_blobs[start : start + 16] = crops.n_blobs
         alone = n_blobs == 1 if (n_blobs == 1).sum() >= 5 else n_blobs > 0
         return float(np.median(volume[alone]))
-
-
-def _check_background(sample: NDArray[np.float32], background: NDArray[np.float32]) -> None:
-    """Refuse a sample (n, H, W) mm of frames from which no background (H, W) mm can be learned."""
-    n = len(sample)
-    if not (sample > 0).any():
-        raise EstimationError(
-            f"no depth was read in {n} frames spread over the recording; check the camera, its "
-            "range and its cable"
-        )
-    if not (background > 0).any():
-        raise EstimationError(
-            f"a background is what keeps coming back, and {n} frame{'' if n == 1 else 's'} cannot "
-            "tell; record some seconds at least"
-        )

@@ -16,10 +16,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from liex_lab.arena.floor import Floor, find_floor, floor_region
+from liex_lab.arena.floor import Floor, find_floor, fit_plane, floor_region
 from liex_lab.arena.grounds import Ground, flat_grounds
 from liex_lab.arena.scene import LARGEST, STATED, STOOD_ON, WALLED
-from liex_lab.body.skeleton import View
+from liex_lab.body.skeleton import VIEWS, View
 from liex_lab.errors import EstimationError
 from liex_lab.optics.camera import Camera
 
@@ -37,6 +37,12 @@ _RAISED_MM = 30.0  # and it must lie so far above the largest plane
 _CLEARLY = 1.5  # times the least height by which an animal stands out is not noise
 _LEAST_PX = 9
 _A_FRAME = 3  # things of a frame, the largest
+# the plane of a floor and of what lies a step beside it is neither's: where the ground under what
+# moves lies so far from the plane, the plane is fitted to that ground alone
+_STEP_MM = 2.5
+_LEVEL_MM = 3.0  # so near to it is that ground
+_EVEN_MM = 1.5  # and so near must what moves then stand
+_ROUNDS = 4
 _SMALLER = 1.0 / 3.0  # of the usual volume of the largest: less is another thing
 
 
@@ -100,9 +106,17 @@ class Thing:
         Args:
             floor: the plane.
         """
+        return bool(abs(self.above(floor)) < _ON_MM)
+
+    def above(self, floor: Floor) -> float:
+        """Height of the ground around it above a plane, mm, the median.
+
+        Args:
+            floor: the plane.
+        """
         a, b, c = floor.inverse_depth
         inverse = a * self.columns + b * self.rows + c
-        return bool(abs(np.median(floor.distance_mm * (1.0 - self.depth * inverse))) < _ON_MM)
+        return float(np.median(floor.distance_mm * (1.0 - self.depth * inverse)))
 
     def share_on(self, patch: NDArray[np.bool_]) -> float:
         """Share of the ground around it that is a part of a patch (H, W) bool.
@@ -172,7 +186,7 @@ def find_standing(scene: SampledScene, stated: Floor | None = None) -> Standing:
     """
     things = things_moving(scene)
     standing = (
-        _choose(scene, things)
+        _levelled(_choose(scene, things), scene, things)
         if stated is None
         else _as_stated(stated, scene.background, scene.camera, things)
     )
@@ -233,6 +247,35 @@ def _choose(scene: SampledScene, things: list[Thing]) -> Standing:
         "plane, and no other ground is better; state arena.floor in the plan"
     )
     return replace(largest, doubt=doubt)
+
+
+def _levelled(standing: Standing, scene: SampledScene, things: list[Thing]) -> Standing:
+    """The same with the plane of the ground that things stand on, where a step parts it from more.
+
+    An arena's floor is often a few millimetres higher than the bench that it lies on, and a plane
+    that is fitted to both runs between them.
+    """
+    floor = standing.floor
+    on = [thing for thing in things if thing.is_on(floor, standing.on_floor)]
+    if scene.view.frame != VIEWS[0] or len(on) < _MIN_THINGS:
+        return standing
+    step_mm = float(np.median([thing.above(floor) for thing in on]))
+    if abs(step_mm) < _STEP_MM:
+        return standing
+    camera = scene.camera
+    own = Floor.from_plane(floor.normal, floor.distance_mm - step_mm, camera)
+    for _ in range(_ROUNDS):
+        bare = own.depth(camera.width, camera.height)
+        ground = standing.on_floor & (scene.background > 0)
+        ground &= np.abs(scene.background - bare) < _LEVEL_MM
+        if (scene.background[ground] ** 2).sum() < scene.least_ground_mm2 * camera.fx * camera.fy:
+            return standing
+        own = fit_plane(scene.background, ground, camera)
+    left = np.median([abs(thing.above(own)) for thing in on])
+    if left > _EVEN_MM:
+        return standing
+    on_floor = floor_region(scene.background, own.depth(camera.width, camera.height))
+    return replace(standing, floor=own, on_floor=on_floor)
 
 
 def _as_stated(

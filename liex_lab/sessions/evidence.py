@@ -31,7 +31,8 @@ if TYPE_CHECKING:
     from liex_lab.sessions.session import Session
 
 FILE = "observations.npz"
-_LATER = ("covered", "beside", "behind")  # columns that sessions of earlier versions do not hold
+# columns that sessions of earlier versions do not hold
+_LATER = ("covered", "beside", "behind", "part_mm")
 _BYTES_PER_JOINT = 1 << 10  # of a frame; several times what there are
 _SPARE_BYTES = 1 << 26  # for the skeleton and its mesh
 _BLOCK = 16_384  # frames that are in memory at a time

@@ -28,6 +28,9 @@ from liex_lab.sessions.joining import RRD_HEAD, rrd_messages
 from liex_lab.sessions.provenance import Provenance
 from liex_lab.sessions.rrd_body import log_body, send_body
 from liex_lab.sessions.rrd_depth import IMAGE, MM_PER_UNIT, DepthColumns, timeline
+from liex_lab.sessions.rrd_scene import FLOOR as FLOOR
+from liex_lab.sessions.rrd_scene import OVERLAY as OVERLAY
+from liex_lab.sessions.rrd_scene import log_hidden_places, log_surroundings
 from liex_lab.tables.rows import Rows, constant_runs, frame_count, stop_times
 
 if TYPE_CHECKING:
@@ -39,11 +42,9 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 DepthBatch = Sequence[NDArray[np.uint16]]
 
-OVERLAY = "arena/camera/image/overlay"
 SKELETON = "arena/skeleton"
 ROOT = "arena/root"
 UNCERTAINTY = "arena/uncertainty"
-FLOOR = "arena/floor"
 CANDIDATES = "arena/candidates"
 ACTIONS = "ethogram/predicted"
 TRACKING = "ethogram/tracking"
@@ -95,6 +96,7 @@ class ReplayWriter:
         self._path = path
         self._n_sent = 0
         self._broken = False
+        self._corrected = corrected
         self._checked = 0
         self._n_found = 0
         self._stream.save(path)
@@ -102,6 +104,8 @@ class ReplayWriter:
             self._stream.send_blueprint(blueprint)
         if not corrected:
             self._log_scene()
+            if origin.scene is not None:
+                log_surroundings(self._stream, origin.scene)
 
     def go_on(self, first_ns: int) -> None:
         """Continue another file's timeline.
@@ -197,6 +201,8 @@ class ReplayWriter:
             self._flush()
         self._log_lanes(rows, bouts, words)
         self._log_worst(rows, index, elapsed)
+        if not self._corrected:
+            log_hidden_places(self._stream, rows)
         for problem in problems:
             self._stream.log("log", rr.TextLog(problem, level=rr.TextLogLevel.WARN), static=True)
         self._stream.send_property(

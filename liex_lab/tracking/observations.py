@@ -50,6 +50,7 @@ class Observations:
         covered: (n, H) share of the silhouette that the rendered body covers.
         beside: (n, H) share of the rendered body that lies beside the silhouette.
         behind: (n, H) share of the component's outline that ends at something nearer.
+        part_mm: (n, H) that distance in the part of the body where it is largest, mm.
     """
 
     skeleton: Skeleton
@@ -68,6 +69,7 @@ class Observations:
     covered: Small
     beside: Small
     behind: Small
+    part_mm: Small
 
     @staticmethod
     def empty(skeleton: Skeleton, times_ns: NDArray[np.int64]) -> Observations:
@@ -102,6 +104,7 @@ class Observations:
             nothing(3),
             nothing(2),
             np.ones(n, np.bool_),
+            nothing(),
             nothing(),
             nothing(),
             nothing(),

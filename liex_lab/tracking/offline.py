@@ -186,7 +186,7 @@ def track_whole(
             bridged[rows],
             strayed[rows],
         )
-        track.flag[rows][hidden[rows] & (track.flag[rows] == "not_found")] = "hidden"
+        hide(track[rows], hidden[rows])
     flips = _flips(seen, track)
     return Tracked(
         track, tuple(sorted([*flips, *corrections], key=lambda flip: (flip.start, flip.source)))
@@ -267,6 +267,7 @@ def to_track(
     ahead: bool = False,
     told: slice = slice(None),
     tuning: TrackingParameters | None = None,
+    usual_px: float | None = None,
 ) -> Track:
     """The rows of a track that a smoothed curve gives: measured, bridged over a gap, or missing.
 
@@ -279,9 +280,11 @@ def to_track(
         ahead: the curve also goes on for up to `bridge_s` after the last measurement (prediction).
         told: only these rows are returned; gaps are judged by all n.
         tuning: motion parameters with the calibration factors; None takes the animal's own.
+        usual_px: pixels that the animal usually shows; None takes the median of these frames.
 
     Returns:
-        A track of the rows `told`; NaN where nothing was measured or bridged.
+        A track of the rows `told`; NaN where nothing was measured or bridged, flagged as hidden
+        where too little of the animal is in view beside something nearer.
     """
     tuning = tuning or TrackingParameters.of(subject.skeleton.name)
     measured = curve.used & (path >= 0)
@@ -289,7 +292,7 @@ def to_track(
     track = Track.empty(subject.skeleton, seen.times_ns[told])
     _write(subject, track, curve[told], tuning)
     strayed = contradicted(seen, path, subject.length_mm)
-    in_view = share_in_view(seen, path, usual_pixels(seen, path))
+    in_view = share_in_view(seen, path, usual_pixels(seen, path) if usual_px is None else usual_px)
     strayed |= in_view < WHOLE
     measured &= in_view >= MOSTLY
     _mask_and_flag(
@@ -302,7 +305,39 @@ def to_track(
         bridged[told],
         strayed[told],
     )
+    hide(track, (in_view < MOSTLY)[told] & ~bridged[told])
     return track
+
+
+def hide(track: Track, hidden: NDArray[np.bool_]) -> None:
+    """Flag rows (n,) of a track in which nothing was measured as hidden, in place.
+
+    Args:
+        track: n rows.
+        hidden: where the animal is behind or under something; what was bridged there is no pose.
+    """
+    hidden = hidden & (track.flag == "not_found")
+    _mask(track, hidden)
+    track.bridged[hidden] = False
+    track.flag[hidden] = "hidden"
+
+
+def _mask(track: Track, rows: NDArray[np.bool_]) -> None:
+    """Take the pose, with its spread and projection, out of rows (n,) of a track."""
+    for column in (
+        track.joints_mm,
+        track.uv_px,
+        track.predicted_error_mm,
+        track.root_rotation,
+        track.root_mm,
+        track.angles_rad,
+        track.scale,
+        track.sd_mm,
+        track.cov_root,
+        track.sd_angles_rad,
+        track.p_flip,
+    ):
+        column[rows] = np.nan
 
 
 def _write(subject: Subject, track: Track, curve: Curve, tuning: TrackingParameters) -> None:
@@ -349,18 +384,7 @@ def _mask_and_flag(
     (strayed, (n,)).
     """
     there = measured | bridged
-    for column in (
-        track.joints_mm,
-        track.predicted_error_mm,
-        track.root_rotation,
-        track.root_mm,
-        track.angles_rad,
-        track.scale,
-        track.sd_mm,
-        track.cov_root,
-        track.sd_angles_rad,
-    ):
-        column[~there] = np.nan
+    _mask(track, ~there)
     track.uv_px[there] = subject.camera.project(
         subject.T_arena_camera.inverse() @ track.joints_mm[there]
     )

@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 from liex_lab.tracking.association import NONE, HypothesisAssociation
 from liex_lab.tracking.motion_model import TrackingParameters
 from liex_lab.tracking.observations import Observations
-from liex_lab.tracking.offline import Subject, to_track
+from liex_lab.tracking.offline import Subject, hide, to_track
 from liex_lab.tracking.smoother import smooth
 from liex_lab.tracking.track import Track
+from liex_lab.tracking.trust import Watch
 
 # frames that have a say in which hypothesis is the animal, and before the one that is told in where
 # exactly it is
@@ -49,6 +50,7 @@ class OnlineTracker:
         self._path: NDArray[np.int64] = np.zeros(0, np.int64)
         # of the window's hypotheses, those that the chain goes by
         self._joints: NDArray[np.float32] | None = None
+        self._watch = Watch()
 
     def add(self, seen: Observations) -> Track | None:
         """The rows that have become due with these frames.
@@ -103,6 +105,16 @@ class OnlineTracker:
             self._subject.skeleton, seen.seconds, pose, error, self._subject.length_mm, self._motion
         )
         self._told += n
-        return to_track(
-            self._subject, seen, path, curve, doubt, ahead=True, told=slice(told, told + n)
+        due = slice(told, told + n)
+        track = to_track(
+            self._subject,
+            seen,
+            path,
+            curve,
+            doubt,
+            ahead=True,
+            told=due,
+            usual_px=self._watch.usual_px,
         )
+        hide(track, self._watch.gone(seen[due], path[due], track.observed))
+        return track

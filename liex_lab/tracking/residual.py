@@ -5,7 +5,9 @@ skeleton whose girth is found once per recording by a grid search from 0.75 to 1
 are those of the height maps, taken back to depth: z = (1 - h / d) / (a u + b v + c), with h the
 height, d the camera's distance and a u + b v + c the inverse depth of the plane. Beside the
 distance stand the two shares of the outlines: |S and B| / |S| of the silhouette S that the body B
-covers, and |B without S| / |B| of the body that lies beside it.
+covers, and |B without S| / |B| of the body that lies beside it. For a trunk that fits hides a head
+that does not, the same median is taken over each part of the body, the pixels nearest to one of its
+joints in the picture and a twentieth of all at least, and the largest is told.
 """
 
 from __future__ import annotations
@@ -22,11 +24,16 @@ from liex_lab.foreground.height_maps import CROP, HeightMaps
 from liex_lab.foreground.segmenter import Segmenter
 from liex_lab.geometry import SE3
 from liex_lab.runtime.shapes import check_shapes
+from liex_lab.tracking.observations import joints_of
 
 Array = NDArray[np.float64]
 
 _GIRTHS = np.linspace(0.75, 1.35, 13)  # of the default body at the animal's size
 _MIN_OVERLAP_PX = 20
+# a part of fewer pixels, or of a lesser share of all that both cover, says nothing: a finger that
+# lies wrong is no wrong hand
+_MIN_PART_PX = 8
+_MIN_PART = 0.05
 
 
 @dataclass(frozen=True)
@@ -39,11 +46,14 @@ class Agreement:
         covered: (n,) share (0 to 1) of the silhouette's pixels that the body covers.
         beside: (n,) share (0 to 1) of the body's pixels on which nothing of the animal was read; 1
             where the body is nowhere in the height map.
+        part_mm: (n,) that difference in the part of the body where it is largest, mm; NaN as in
+            `residual_mm`.
     """
 
     residual_mm: Array
     covered: Array
     beside: Array
+    part_mm: Array
 
 
 @dataclass(frozen=True)
@@ -87,11 +97,16 @@ class BodyResidual:
         n = len(pose_arena.scale)
         check_shapes("poses", ("heights", crops.heights, (n, CROP, CROP)))
         if n == 0:
-            return Agreement(np.zeros(0), np.zeros(0), np.zeros(0))
+            return Agreement(np.zeros(0), np.zeros(0), np.zeros(0), np.zeros(0))
         rendered = render_crops(self.surface, pose_arena, self.girth, crops, scene)
-        out = np.empty((3, n))
+        out = np.empty((4, n))
         planes = scene.planes(crops, self.camera_view)
-        _compare(rendered, crops.heights, crops.origin, crops.step, planes, crops.distance, out)
+        joints = scene.camera.project(
+            scene.floor.T_arena_camera.inverse() @ joints_of(self.surface.skeleton, pose_arena)
+        )
+        _compare(
+            rendered, crops.heights, crops.origin, crops.step, planes, crops.distance, joints, out
+        )
         return Agreement(*out)
 
     @staticmethod
@@ -165,14 +180,16 @@ def render_crops(
 
 
 @njit(cache=True, parallel=True)
-def _compare(rendered, heights, origin, step, planes, distance, out):
+def _compare(rendered, heights, origin, step, planes, distance, joints, out):
     """Median |rendered - observed| depth, mm, over pixels where both are, the share of the observed
-    pixels that are covered, and the share of the rendered ones that lie beside, into out (3, n).
+    pixels that are covered, the share of the rendered ones that lie beside, and the largest median
+    of a part of the body, into out (4, n). joints (n, J, 2) are px of the picture.
     """
     for i in prange(rendered.shape[0]):
         size = rendered.shape[1]
         plane = planes[i]
         offset = np.empty(size * size)
+        part = np.empty(size * size, np.int64)
         n = 0
         n_read = 0
         n_drawn = 0
@@ -187,7 +204,41 @@ def _compare(rendered, heights, origin, step, planes, distance, out):
                         plane[0] * u + plane[1] * v + plane[2]
                     )
                     offset[n] = abs(rendered[i, r, c] - observed)
+                    part[n] = _nearest(joints[i], u, v)
                     n += 1
-        out[0, i] = np.median(offset[:n]) if n >= _MIN_OVERLAP_PX else np.nan
+        enough = n >= _MIN_OVERLAP_PX
+        out[0, i] = np.median(offset[:n]) if enough else np.nan
         out[1, i] = n / max(n_read, 1)
         out[2, i] = 1.0 - n / max(n_drawn, 1)
+        out[3, i] = _worst_part(offset[:n], part[:n], joints.shape[1]) if enough else np.nan
+
+
+@njit(cache=True)
+def _nearest(joints, u, v):
+    """Which of the joints (J, 2) px is nearest to a pixel."""
+    best = 0
+    least = np.inf
+    for j in range(len(joints)):
+        off2 = (joints[j, 0] - u) ** 2 + (joints[j, 1] - v) ** 2
+        if off2 < least:
+            best = j
+            least = off2
+    return best
+
+
+@njit(cache=True)
+def _worst_part(offset, part, n_parts):
+    """The largest median of the offsets (k,) of one part, of those with enough pixels; 0 if none
+    has.
+    """
+    worst = 0.0
+    own = np.empty(len(offset))
+    for j in range(n_parts):
+        n = 0
+        for k in range(len(offset)):
+            if part[k] == j:
+                own[n] = offset[k]
+                n += 1
+        if n >= max(_MIN_PART_PX, _MIN_PART * len(offset)):
+            worst = max(worst, np.median(own[:n]))
+    return worst

@@ -250,14 +250,14 @@ class FrameTracker:
         seen.centroid_mm[found, h] = centre
         from_camera = self.scene.floor.T_arena_camera.inverse() @ centre
         seen.centroid_px[found, h] = self.scene.camera.project(from_camera)
-        columns = (seen.residual_mm, seen.covered, seen.beside)
+        columns = (seen.residual_mm, seen.covered, seen.beside, seen.part_mm)
         if h % 2:  # the body turned round covers the same pixels, nearly
             for column in columns:
                 column[found, h] = column[found, h - 1]
             return
         told = self.body.agreement(pose[found], crops[found], self.scene)
         for column, values in zip(
-            columns, (told.residual_mm, told.covered, told.beside), strict=True
+            columns, (told.residual_mm, told.covered, told.beside, told.part_mm), strict=True
         ):
             column[found, h] = values
 

@@ -1,16 +1,19 @@
 """Which poses of a track the picture contradicts, whatever error the model predicts for them.
 
 An error of more than a quarter of the length is none to trust, whatever limit the plan states. Of a
-measured pose three numbers come from the picture itself (`residual.Agreement`): the distance
-between rendered body and readings, the share of the silhouette that the body covers, and the share
-of the body beside it. Of a pose that was smoothed or bridged, the distance from what the frame
-itself says is asked: while an animal is in full view, a pose that lies elsewhere is none.
+measured pose four numbers come from the picture itself (`residual.Agreement`): the distance between
+rendered body and readings, the same in the part of the body where it is largest, the share of the
+silhouette that the body covers, and the share of the body beside it. Of a pose that was smoothed or
+bridged, the distance from what the frame itself says is asked: while an animal is in full view, a
+pose that lies elsewhere is none.
 
 The limits were set on virtual recordings of the mouse, the fish and the hand with known truth; how,
 and what lies on either side of them, stands in `docs/trust.md`.
 """
 
 from __future__ import annotations
+
+from collections import deque
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,6 +42,7 @@ MOSTLY = 0.7  # of it must be in view to tell how it lies
 # it has gone behind something where it showed less than this share shortly before it was gone
 _GOING = 0.8
 _SHORTLY_S = 0.5
+_REMEMBERED = 900  # measured frames that say, while the recording goes on, what it usually shows
 # a pose lies elsewhere if its joints are so far from every pose that the frame itself allows: so
 # many predicted errors, and this share of the length
 _TIMES_ERROR = 4.0
@@ -67,6 +71,7 @@ def contradicted(
     with np.errstate(invalid="ignore"):
         return np.asarray(
             (residual > limit)
+            | (seen.along(seen.part_mm, path) > MOST_RESIDUAL * length_mm)
             | (seen.along(seen.covered, path) < _LEAST_COVERED)
             | (seen.along(seen.beside, path) > _MOST_BESIDE)
         )
@@ -133,9 +138,65 @@ def gone_behind(
         else:
             after = gone[0] + np.flatnonzero(known[gone[0] :])
             near = after[seconds[after] <= seconds[after[:1]] + _SHORTLY_S]
-        if len(near) and shown[near].min() < _GOING and behind[near].max() > _BEHIND:
+        if _was_going(shown[near], behind[near]):
             hidden[start:stop] = True
     return hidden
+
+
+def _was_going(shown: Array, behind: Array) -> bool:
+    """Whether frames (k,) show an animal that goes behind something: less of it, and an outline
+    that ends at what is nearer.
+    """
+    return len(shown) > 0 and bool(shown.min() < _GOING and behind.max() > _BEHIND)
+
+
+class Watch:
+    """The same while the recording goes on, told frame by frame from the past alone.
+
+    What comes after cannot be asked: a recording that begins with a hidden animal is of one that
+    was not found.
+    """
+
+    def __init__(self) -> None:
+        self._shown: deque[int] = deque(maxlen=_REMEMBERED)  # pixels of measured frames
+        # of the frames shortly before this one in which something was in view: s, px, share behind
+        self._near: deque[tuple[float, int, float]] = deque()
+        self._lost = False
+        self._gone = False
+
+    @property
+    def usual_px(self) -> float | None:
+        """Pixels that the animal usually shows; None before the first measurement."""
+        return float(np.median(self._shown)) if self._shown else None
+
+    def gone(
+        self, seen: Observations, path: NDArray[np.int64], measured: NDArray[np.bool_]
+    ) -> NDArray[np.bool_]:
+        """Whether (n,) the animal is hidden in the next frames, see `gone_behind`.
+
+        Args:
+            seen: hypotheses (n, H) of consecutive frames, the first the one after the last.
+            path: (n,) which of them is meant, negative for none.
+            measured: (n,) whether a pose was measured.
+        """
+        known = np.asarray(seen.known.any(axis=1))
+        behind = np.nan_to_num(seen.behind)
+        hidden = np.zeros(len(seen), np.bool_)
+        for k, time_ns in enumerate(seen.times_ns):
+            now_s = 1e-9 * float(time_ns)
+            if measured[k]:
+                self._shown.append(int(seen.n_px[k, path[k]]))
+                self._lost = self._gone = False
+            if known[k]:
+                self._near.append((now_s, int(seen.n_px[k].max()), float(behind[k].max())))
+            while self._near and self._near[0][0] < now_s - _SHORTLY_S:
+                self._near.popleft()
+            if not known[k] and seen.has_depth[k] and not self._lost:
+                _, shown, near = np.array([*self._near]).reshape(-1, 3).T
+                self._lost = True
+                self._gone = _was_going(shown / max(self.usual_px or 0.0, 1.0), near)
+            hidden[k] = self._gone
+        return hidden
 
 
 def elsewhere(

@@ -106,6 +106,62 @@ def test_the_doctor_takes_a_region_and_says_what_is_wrong_with_it(tmp_path):
     assert "three or more corners" in f"{wrong.output}{wrong.exception}"
 
 
+@pytest.mark.parametrize(
+    ("words", "setting"),
+    [
+        ("1,2 30,2 30,40", "arena.region=[[1.0, 2.0], [30.0, 2.0], [30.0, 40.0]]"),
+        ("circle 0,-5 140 mm", "arena.region.circle={centre=[0.0, -5.0], radius=140.0}"),
+        ("circle 160,120 90", "arena.region.circle={centre=[160.0, 120.0], radius=90.0}"),
+        ("-90,-90 90,-90 0,90 mm", "arena.region.polygon=[[-90.0,-90.0],[90.0,-90.0],[0.0,90.0]]"),
+    ],
+)
+def test_a_region_on_the_command_line_is_what_a_plan_states(words, setting):
+    from liex_lab.cli.options import region_setting
+
+    unit = ["arena.region.unit=mm"] if words.endswith("mm") else []
+    (told,) = region_setting(words)
+    assert Plan().with_settings([told]) == Plan().with_settings([setting, *unit])
+
+
+@pytest.mark.parametrize("words", ["circle 160,120", "circle 1 2 3", "circle a,b 9", "mm", ""])
+def test_a_region_on_the_command_line_that_is_none_is_told_how_to_write_one(words):
+    from liex_lab.cli.options import region_setting
+
+    with pytest.raises(PlanError, match=r"'circle 160,120 90'; a last word mm"):
+        region_setting(words)
+
+
+def test_the_doctor_looks_within_a_circle_of_millimetres_and_says_where_it_is_none():
+    from liex_lab.cli.main import app
+
+    walk = "synthetic:walk?frames=30&seed=3"
+    inside = CliRunner().invoke(app, ["doctor", walk, "--region", "circle 0,0 150 mm"])
+    assert inside.exit_code == 0, inside.output
+    outside = CliRunner().invoke(app, ["doctor", walk, "--region", "circle 9000,0 150 mm"])
+    told = " ".join(f"{outside.output}{outside.exception}".split())
+    assert "arena.region lies outside the picture" in told
+
+
+@pytest.mark.parametrize("command", ["doctor", "run"])
+def test_a_preset_of_another_resolution_is_told_by_the_commands(command, tmp_path):
+    from liex_lab.cli.main import app
+
+    said = CliRunner().invoke(
+        app,
+        [
+            command,
+            "synthetic:walk?frames=3",
+            *("--set", "camera.preset=azure-nfov"),
+            *(["--out", str(tmp_path)] if command == "run" else []),
+        ],
+    )
+    assert said.exit_code != 0
+    told = " ".join(f"{said.output}{said.exception}".split())
+    assert "takes pictures of 640 x 576 px, but these have 512 x 424" in told
+    assert "Traceback" not in told
+    assert not list(tmp_path.iterdir())
+
+
 def test_rough_ground_is_told_by_its_spread():
     from liex_lab.arena.scene import roughness
 

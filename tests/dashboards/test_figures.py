@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -166,6 +167,39 @@ def test_the_arenas_floor_is_at_height_zero_and_a_fixture_as_high_as_it_is(sessi
     assert np.nanmax(heights) == pytest.approx(60.0, abs=1.0)
     assert (np.diff(x_mm) > 0).all()
     assert (np.diff(y_mm) > 0).all()
+
+
+def test_the_region_and_where_the_animal_hid_are_drawn_on_the_floor(session):
+    from matplotlib.figure import Figure
+
+    camera = session.camera
+    foot = [camera.cx, camera.cy]
+    aside = [camera.cx + 0.1 * camera.fx, camera.cy]
+    gaps = pd.DataFrame(
+        {
+            "reason": ["hidden", "tracker_lost", "hidden"],
+            "x_mm": [30.0, 50.0, np.nan],
+            "y_mm": [-20.0, 1.0, np.nan],
+            "start_s": [2.0, 0.0, 4.0],
+            "stop_s": [3.5, 1.0, 5.0],
+        }
+    )
+    seen: Any = SimpleNamespace(
+        camera=camera,
+        T_arena_camera=session.T_arena_camera,
+        metadata={"scene": {"region_px": [foot, aside, [camera.cx, 0.0]]}},
+        gaps=gaps,
+    )
+    axes = Figure().add_subplot()
+    places.draw_region(axes, seen)
+    places.draw_hidden(axes, seen)
+    (region,) = [line for line in axes.get_lines() if line.get_gid() == "region"]
+    corners = np.column_stack(region.get_data())
+    np.testing.assert_allclose(corners[0], 0.0, atol=1e-6)  # below the camera
+    assert np.hypot(*corners[1]) == pytest.approx(0.1 * FLOOR_MM, rel=1e-3)
+    (hid,) = [line for line in axes.get_lines() if line.get_gid() == "hidden"]
+    np.testing.assert_allclose(np.column_stack(hid.get_data()), [[30.0, -20.0]])
+    assert [text.get_text() for text in axes.texts] == ["hidden 1.5 s"]
 
 
 def test_the_animal_is_not_in_the_map_of_the_arena(session):

@@ -62,6 +62,18 @@ def test_the_floor_is_where_the_mouse_walks(name):
     assert not scene.standing.doubt
 
 
+@pytest.mark.parametrize("tilt_deg", [0.0, 20.0])
+def test_an_arena_whose_floor_lies_a_little_above_the_bench_has_its_own_plane(tilt_deg):
+    """The largest plane runs between the two, for they are less than a floor's flatness apart."""
+    mouse = walk(stage(height_mm=700.0, raised_mm=6.0, wall_mm=60.0, tilt_deg=tilt_deg), N_FRAMES)
+    between = find_floor(np.asarray(mouse.scene.still), mouse.camera)
+    assert abs(between.distance_mm - mouse.floor.distance_mm) > 2.0
+    scene, _ = BackgroundSubtraction.learn(mouse, SPINES, N_FRAMES)
+    assert scene.floor.distance_mm == pytest.approx(mouse.floor.distance_mm, abs=1.2)
+    angle = np.degrees(np.arccos(np.clip(scene.floor.normal @ mouse.floor.normal, -1, 1)))
+    assert angle < 0.3
+
+
 def test_an_arena_on_a_table_has_its_own_outline_and_nothing_else_is_looked_at():
     mouse = walk(stage(height_mm=700.0, raised_mm=480.0), N_FRAMES)
     scene, _ = BackgroundSubtraction.learn(mouse, SPINES, N_FRAMES)

@@ -195,7 +195,7 @@ def test_the_best_of_several_is_the_one_with_the_least_error_for_its_length() ->
 
 
 def agreement(n: int, covered: float) -> Agreement:
-    return Agreement(np.full(n, 1.5), np.full(n, covered), np.full(n, 0.05))
+    return Agreement(np.full(n, 1.5), np.full(n, covered), np.full(n, 0.05), np.full(n, 3.0))
 
 
 def test_two_animals_are_two_where_the_second_fits_as_well_as_the_first() -> None:

@@ -10,6 +10,8 @@ from liex_lab.tables.rows import Rows
 from liex_lab.tracking.observations import Observations
 from liex_lab.tracking.occluders import behind_something
 from liex_lab.tracking.offline import track_whole
+from liex_lab.tracking.online import OnlineTracker
+from liex_lab.tracking.track import Track
 from tests.tracking.stories import SUBJECT, lose, noisy, told, walk
 
 SECONDS = np.arange(150) / 30.0
@@ -26,6 +28,13 @@ def seen() -> Observations:
         seen.behind[frame] = 0.1
     lose(seen, GONE)
     return seen
+
+
+def live_track(seen: Observations, lag: int) -> Track:
+    """What a tracker that sees no more than `lag` frames ahead says of each frame."""
+    online = OnlineTracker(SUBJECT, lag)
+    parts = [*(online.add(seen[k : k + 1]) for k in range(len(seen))), online.close()]
+    return Track.join([part for part in parts if part is not None])
 
 
 def test_a_mouse_that_goes_under_a_roof_is_hidden_until_it_comes_back(seen: Observations) -> None:
@@ -71,6 +80,40 @@ def test_the_gap_says_where_the_animal_was_last_seen_and_since_when(seen: Observ
     assert gaps["start_s"][at] == pytest.approx(first / 30.0)
     place = [gaps["x_mm"][at], gaps["y_mm"][at]]
     np.testing.assert_allclose(place, track.centroid_mm[first - 1, :2])
+
+
+@pytest.mark.parametrize("lag", [0, 6])
+def test_the_live_track_says_hidden_as_the_whole_recording_does(
+    seen: Observations, lag: int
+) -> None:
+    live = live_track(seen, lag)
+    assert (live.flag[GONE] == "hidden").all()
+    assert np.isnan(live.joints_mm[GONE]).all()
+    assert np.isnan(live.uv_px[GONE]).all()
+    assert not live.bridged[GONE].any()
+    assert (live.flag[56:60] == "hidden").all()
+    assert not (live.flag[:52] == "hidden").any()
+    assert not (live.flag[105:] == "hidden").any()
+    assert np.isfinite(live.joints_mm[105:]).all()
+
+
+def test_a_mouse_that_stays_under_a_roof_for_longer_than_the_live_window_stays_hidden() -> None:
+    seconds = np.arange(300) / 30.0
+    seen = told(seconds, noisy(walk(seconds), np.random.default_rng(3)))
+    seen.behind[:] = 0.0
+    seen.n_px[55:60] = 500
+    seen.behind[55:60] = 0.1
+    lose(seen, slice(60, 290))
+    live = live_track(seen, 0)
+    assert (live.flag[60:290] == "hidden").all()
+    assert (live.flag[292:] != "hidden").all()
+
+
+def test_a_mouse_that_is_lost_in_the_open_is_not_found_live_either(seen: Observations) -> None:
+    seen.behind[:] = 0.0
+    live = live_track(seen, 0)
+    assert not (live.flag == "hidden").any()
+    assert (live.flag[GONE] == "not_found").all()
 
 
 def roofed(roof_mm: float) -> np.ndarray:

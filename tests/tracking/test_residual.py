@@ -124,3 +124,17 @@ def test_frames_that_no_body_covers_leave_the_girth_as_it_is(clean, surface):
     mixed.root.translation[0] = clean.pose.root.translation[0]
     alone = BodyResidual.fit(surface, clean.pose[slice(0, 1)], crops[slice(0, 1)], SCENE)
     assert BodyResidual.fit(surface, mixed, crops, SCENE).girth == alone.girth
+
+
+def test_a_head_that_lies_too_low_is_told_though_the_trunk_fits(clean, surface):
+    """The median over the whole body does not see it, that over its parts does."""
+    crops = SCENE.extract(clean.depths, 1.0)
+    body = BodyResidual(surface)
+    bowed = replace(clean.pose, angles=clean.pose.angles.copy())
+    bowed.angles[:, 3, 1] += 0.7  # the neck, about its own y axis
+    right = body.agreement(clean.pose, crops, SCENE)
+    wrong = body.agreement(bowed, crops, SCENE)
+    assert right.part_mm.max() < 2.0
+    assert (right.part_mm >= right.residual_mm).all()
+    assert np.median(wrong.part_mm) > 3.0
+    assert np.median(wrong.residual_mm) < 0.4 * np.median(wrong.part_mm)

@@ -35,12 +35,12 @@ def test_poses_that_fit_the_picture_are_trusted(seen: Observations) -> None:
 
 @pytest.mark.parametrize(
     ("column", "value"),
-    [("residual_mm", 12.0), ("covered", 0.2), ("beside", 0.8)],
+    [("residual_mm", 12.0), ("covered", 0.2), ("beside", 0.8), ("part_mm", 14.0)],
 )
 def test_a_frame_that_the_picture_contradicts_is_doubtful(
     seen: Observations, column: str, value: float
 ) -> None:
-    """Whichever of the three says so, and only in the frames in which it does."""
+    """Whichever of the four says so, and only in the frames in which it does."""
     getattr(seen, column)[50:53] = value
     assert np.flatnonzero(contradicted(seen, FIRST, MOUSE.length)).tolist() == [50, 51, 52]
     track = track_whole(SUBJECT, seen).track
@@ -63,7 +63,7 @@ def test_a_noisy_session_has_larger_residuals_and_a_quiet_one_smaller(seen: Obse
 
 def test_what_nobody_compared_contradicts_nothing(seen: Observations) -> None:
     """Sessions of earlier versions do not hold how the outlines lie over each other."""
-    for column in (seen.residual_mm, seen.covered, seen.beside):
+    for column in (seen.residual_mm, seen.covered, seen.beside, seen.part_mm):
         column[:] = np.nan
     assert not contradicted(seen, FIRST, MOUSE.length).any()
 
