@@ -21,7 +21,7 @@ from liex_lab.errors import LiexError, SessionError
 from liex_lab.sessions import Session
 from liex_lab.sessions.corrections import author_name, read_log
 
-from ..figures.seen import animals
+from ..figures.seen import animals, joints_in_picture
 from ..video.film import way_of
 from ..video.relief import Relief
 from ..video.video import scale_mm
@@ -74,14 +74,7 @@ class Desk:
     @cached_property
     def uv(self) -> list[Array]:
         """Of each animal the joints (n, J, 2), px; NaN without a pose."""
-        names = ["u_px", "v_px", *(["individual"] if len(self._seen) > 1 else [])]
-        table = self.session.table("poses", names)
-        n = len(self.time_s)
-        found = []
-        for seen in self._seen:
-            own = table if seen.alone else table[table["individual"].astype(str) == seen.individual]
-            found.append(own[["u_px", "v_px"]].to_numpy(float).reshape(n, -1, 2))
-        return found
+        return joints_in_picture(self._seen, len(self.time_s))
 
     @cached_property
     def _ways(self) -> list[tuple[Array, int]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -169,3 +170,22 @@ def animals(session: Session) -> list[Seen]:
 def _text(value: object) -> str:
     """A stated name; "" where there is none."""
     return value if isinstance(value, str) else ""
+
+
+def joints_in_picture(all_seen: Sequence[Seen], n: int) -> list[Array]:
+    """Where the joints of each animal of a session lie in its pictures.
+
+    Args:
+        all_seen: the animals of one session, see `animals`.
+        n: frames of the session.
+
+    Returns:
+        Of each animal (n, J, 2) px; NaN without a pose.
+    """
+    names = ["u_px", "v_px", *([] if all_seen[0].alone else ["individual"])]
+    table = all_seen[0].session.table("poses", names)
+    found = []
+    for seen in all_seen:
+        own = table if seen.alone else table[table["individual"].astype(str) == seen.individual]
+        found.append(own[["u_px", "v_px"]].to_numpy(float).reshape(n, -1, 2))
+    return found

@@ -14,7 +14,7 @@ from liex_lab.optics.camera import Camera
 from liex_lab.sessions import Session
 
 from ..figures.pictures import DepthReader
-from ..figures.seen import Array, Seen, animals
+from ..figures.seen import Array, Seen, animals, joints_in_picture
 from .lettering import text_width, write
 from .relief import Relief
 
@@ -113,13 +113,7 @@ class Film:
     @cached_property
     def uv(self) -> list[Array]:
         """Of each animal the joints (n, J, 2), px; NaN without a pose."""
-        table = self.session.table("poses")
-        n = len(self.time_s)
-        found = []
-        for seen in self.seen:
-            own = table if seen.alone else table[table["individual"].astype(str) == seen.individual]
-            found.append(own[["u_px", "v_px"]].to_numpy(float).reshape(n, -1, 2))
-        return found
+        return joints_in_picture(self.seen, len(self.time_s))
 
     def row_at(self, time_s: float) -> int:
         """The row of the frame that is shown at a time.

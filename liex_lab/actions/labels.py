@@ -94,6 +94,15 @@ def _numbers(column: pd.Series) -> NDArray[np.float64]:
     )
 
 
+def sessions_named(table: pd.DataFrame) -> set[str]:
+    """The sessions that labels say they are of; none where they do not say.
+
+    Args:
+        table: bouts, checked.
+    """
+    return set(table["session_id"].astype(str)) if "session_id" in table else set()
+
+
 def words_of(
     table: pd.DataFrame, time_s: NDArray[np.float64], session_id: str = ""
 ) -> NDArray[np.str_]:

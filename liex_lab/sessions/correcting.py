@@ -291,10 +291,10 @@ def labelled_bouts(session: Session, labels: Any) -> list[BoutEdit]:
             lies within the session.
     """
     from liex_lab.actions.ethogram import Ethogram
-    from liex_lab.actions.labels import words_of
+    from liex_lab.actions.labels import sessions_named, words_of
 
     time_ns, time_s = (session.frames[name].to_numpy() for name in ("time_ns", "time_s"))
-    of = set(labels["session_id"].astype(str)) if "session_id" in labels else set()
+    of = sessions_named(labels)
     named = session.name if session.name in of else ""
     if not named and len(of) > 1:
         raise SessionError(

@@ -149,7 +149,7 @@ def labelled_sessions(
     import pandas as pd
 
     from liex_lab.actions.ethogram import UNLABELLED
-    from liex_lab.actions.labels import LabelledTrack, words_of
+    from liex_lab.actions.labels import LabelledTrack, sessions_named, words_of
     from liex_lab.sessions import Session
 
     table = pd.concat([read_any_labels(path) for path in labels]) if labels else None
@@ -158,7 +158,7 @@ def labelled_sessions(
         session = Session.open(path)
         own = session.bouts[session.bouts["source"] == "human"] if table is None else table
         track = track_of(session)
-        named = session.name if table is not None and session.name in _sessions_named(table) else ""
+        named = session.name if table is not None and session.name in sessions_named(table) else ""
         if table is not None and not named and len(sessions) > 1:
             raise LiexError(
                 f"the labels name no recording {session.name}; give each session's name as "
@@ -175,10 +175,6 @@ def labelled_sessions(
             LabelledTrack(track, words, str(about["subject_id"]) or session.name, wall_of(session))
         )
     return tracks
-
-
-def _sessions_named(table: pd.DataFrame) -> set[str]:
-    return set(table["session_id"].astype(str)) if "session_id" in table else set()
 
 
 def read_any_labels(path: str | Path) -> pd.DataFrame:
