@@ -119,6 +119,7 @@ class HypothesisAssociation:
         told: NDArray[np.int64] | None = None,
         joints: NDArray[np.float32] | None = None,
         allocate: Allocator = np.empty,
+        emission: Array | None = None,
     ) -> NDArray[np.int64]:
         """The most probable path: which hypothesis of each frame is the animal, or `NONE`.
 
@@ -127,6 +128,7 @@ class HypothesisAssociation:
             told: (m,) decisions of the first m frames that stand, None where all are open.
             joints: what `joints` gave, where it is at hand.
             allocate: allocator of intermediate arrays.
+            emission: what `emission` gave, where it is at hand.
 
         Returns:
             (n,) int64 index of the hypothesis, `NONE` where the frame was passed by.
@@ -134,8 +136,9 @@ class HypothesisAssociation:
         n, h = seen.score.shape
         joints = self.joints(seen) if joints is None else joints
         check_shapes("hypotheses", ("joints", joints, (n, h, len(self._joints), 3)))
-        emission = self._emission(seen, joints, allocate)
+        emission = self.emission(seen, joints, allocate) if emission is None else emission
         if told is not None:
+            emission = emission.copy()
             emission[: len(told)][np.arange(h) != told[:, None]] = np.inf
         missed_cost = np.concatenate(
             [[0.0], np.cumsum(np.where(seen.known.any(axis=1), self._tuning.none, 0.0))]
@@ -152,11 +155,19 @@ class HypothesisAssociation:
             kernels.trace_back(chains.beam[0, 0], chains.beam[0, 1], parent, 0, path)
         return path
 
-    def _emission(
-        self, seen: Observations, joints: NDArray[np.float32], allocate: Allocator
+    def emission(
+        self, seen: Observations, joints: NDArray[np.float32], allocate: Allocator = np.empty
     ) -> Array:
-        """Emission cost (n, H) of each hypothesis, nats: its capped score, and what it costs an
-        animal to go tail first; NaN without.
+        """Emission cost of each hypothesis: its capped score, and what it costs an animal to go
+        tail first.
+
+        Args:
+            seen: hypotheses (n, H).
+            joints: what `joints` gave.
+            allocate: allocator of the result.
+
+        Returns:
+            (n, H) nats; NaN where there is no hypothesis.
         """
         cost = allocate(seen.score.shape, float)
         score_mm = self._score_mm * self._strangeness(seen) ** 2
@@ -201,6 +212,7 @@ class HypothesisAssociation:
         path: NDArray[np.int64],
         joints: NDArray[np.float32] | None = None,
         allocate: Allocator = np.empty,
+        emission: Array | None = None,
     ) -> Array:
         """Flip posterior (n,): probability that head and tail are exchanged on this path.
 
@@ -214,6 +226,7 @@ class HypothesisAssociation:
             path: (n,) from `path`.
             joints: what `joints` gave, where it is at hand.
             allocate: allocator of intermediate arrays.
+            emission: what `emission` gave, where it is at hand.
 
         Returns:
             (n,) probabilities; 0 throughout where the path is empty.
@@ -226,7 +239,7 @@ class HypothesisAssociation:
             ("joints", joints, (*seen.score.shape, len(self._joints), 3)),
             ("path", path, (len(joints),)),
         )
-        emission = self._emission(seen, joints, allocate)
+        emission = self.emission(seen, joints, allocate) if emission is None else emission
         here = np.where(path >= 0, emission[rows, np.maximum(path, 0)], 0.0)
         turned = np.where(path >= 0, emission[rows, np.maximum(other, 0)], 0.0)
         evidence = np.where(np.isfinite(turned), turned, self._tuning.score_most + here) - here

@@ -118,9 +118,10 @@ def track_whole(
     tuning = tuning or TrackingParameters.of(subject.skeleton.name)
     chain = HypothesisAssociation(subject.skeleton, subject.length_mm, tuning.chain)
     joints = chain.joints(seen, allocate)
-    path = chain.path(seen, joints=joints, allocate=allocate)
-    doubt = chain.doubt(seen, path, joints, allocate)
-    del joints
+    emission = chain.emission(seen, joints, allocate)
+    path = chain.path(seen, joints=joints, allocate=allocate, emission=emission)
+    doubt = chain.doubt(seen, path, joints, allocate, emission)
+    del joints, emission
     error = seen.along(seen.error_mm, path)
     turned = _turn_round(seen, path, doubt, corrections)
     track = Track.empty(subject.skeleton, seen.times_ns, allocate=allocate)

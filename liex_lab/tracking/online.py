@@ -89,9 +89,11 @@ class OnlineTracker:
         assert self._seen is not None
         seen = self._seen
         told = self._told
-        path = self._chain.path(seen, self._path[:told], self._joints)
+        assert self._joints is not None
+        emission = self._chain.emission(seen, self._joints)
+        path = self._chain.path(seen, self._path[:told], self._joints, emission=emission)
         self._path[told : told + n] = path[told : told + n]
-        doubt = self._chain.doubt(seen, path, self._joints)
+        doubt = self._chain.doubt(seen, path, self._joints, emission=emission)
         first = max(0, told - _BEFORE)
         if (path[first:] == NONE).all():  # what is known of the animal lies further back
             first = 0
