@@ -525,8 +525,8 @@ def serve_dashboard(
 ) -> None:
     """Serve a study, or a folder with sessions in it, to browsers until interrupted.
 
-    On a host other than this machine alone, every visitor has to know a token, which is part of the
-    address, and no replay is opened.
+    Every visitor has to know a token, new each time, which is part of the address. On a host other
+    than this machine alone no replay is opened.
 
     Args:
         study: a study file, its folder, or a folder with sessions in it.
@@ -560,7 +560,7 @@ def serve_dashboard(
     data = StudyData(name, look)
     data.warm(progress)
     alone = host in LOOPBACK
-    token = "" if alone else secrets.token_urlsafe(24)
+    token = secrets.token_urlsafe(24)
 
     def correct(folder: Path, what: Sequence[Correction], undo: Sequence[int], author: str) -> None:
         """Correct a session on behalf of the dashboard.
@@ -576,6 +576,7 @@ def serve_dashboard(
     app = make_app(
         data,
         token=token,
+        alone=alone,
         show_replay=show_replay if alone else None,
         correct=correct,
         report=write_views,

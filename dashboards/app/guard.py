@@ -1,19 +1,21 @@
 """Access control of the dashboard: host and origin check, token cookie, content security policy.
 
-It answers this machine alone, unless started with a token, and its pages load nothing from
-elsewhere.
+It answers who knows the token, and its pages load nothing from elsewhere. A fault of ours is a line
+on the terminal and a sentence for the visitor.
 """
 
 from __future__ import annotations
 
 import hmac
+import sys
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any
-from urllib.parse import urlsplit
+from urllib.parse import urlencode, urlsplit
 
 from flask import Flask, Response, abort, redirect, request, stream_with_context
+from werkzeug.exceptions import HTTPException
 
-from liex_lab.errors import LiexError
+from liex_lab.errors import LiexError, printable
 
 from . import tables
 from .data import StudyData
@@ -22,29 +24,34 @@ if TYPE_CHECKING:
     import pandas as pd
 
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
+MOST_BYTES = 4 << 20  # of what a visitor sends: corrections are some hundred bytes each
 _COOKIE = "liex_dashboard"
 # a report needs no script, so it has none
 _REPORT = "default-src 'none'; style-src 'unsafe-inline'; img-src data:"
 
 
-def guard(server: Flask, token: str, page_policy: Callable[[], str]) -> None:
+def guard(server: Flask, token: str, page_policy: Callable[[], str], *, alone: bool = True) -> None:
     """Refuse requests of others, and set the security headers of every answer.
 
-    With a token those are refused that do not know it, without one those to any name but this
-    machine's. A name that is not this machine's would be another site's whose address was bent to
-    us (DNS rebinding); an origin that is not ours another site's page that sends forms here (CSRF).
+    Those are refused that do not know the token: other accounts of this machine reach its loopback
+    as its owner does. On this machine alone so are those to any other name, which would be another
+    site's whose address was bent to us (DNS rebinding); an origin that is not ours is another
+    site's page that sends forms here (CSRF).
 
     Args:
         server: the Flask server of the dashboard.
-        token: what every visitor has to know; empty on this machine alone.
+        token: what every visitor has to know; empty asks for none.
         page_policy: makes the content security policy of the pages.
+        alone: only this machine is answered.
     """
+    server.config["MAX_CONTENT_LENGTH"] = MOST_BYTES
+    _answer_faults(server)
 
     @server.before_request
     def allowed() -> Any:
         """Let a request through, or answer it with 401, 403 or the cookie that holds the token."""
         name = _site(f"//{request.host}", name=True)
-        if not token and name not in LOOPBACK:
+        if alone and name not in LOOPBACK:
             abort(Response("This dashboard answers on 127.0.0.1 only.", 403, mimetype="text/plain"))
         origin = request.headers.get("Origin")
         if origin and _site(origin) != request.host:
@@ -57,10 +64,12 @@ def guard(server: Flask, token: str, page_policy: Callable[[], str]) -> None:
             return None
         told = request.args.get("token", "")
         if told and hmac.compare_digest(told.encode(), token.encode()):
-            answer = redirect(request.path)
-            answer.set_cookie(_COOKIE, token, httponly=True, samesite="Strict")
+            rest = {name: value for name, value in request.args.items() if name != "token"}
+            answer = redirect(request.path + ("?" + urlencode(rest) if rest else ""))
+            # lax: whoever comes by the page that --open writes has the cookie at once
+            answer.set_cookie(_cookie(), token, httponly=True, samesite="Lax")
             return answer
-        if not hmac.compare_digest(request.cookies.get(_COOKIE, "").encode(), token.encode()):
+        if not hmac.compare_digest(request.cookies.get(_cookie(), "").encode(), token.encode()):
             said = "Open the address that `liex dashboard` printed, with its token."
             abort(Response(said, 401, mimetype="text/plain"))
         return None
@@ -72,6 +81,37 @@ def guard(server: Flask, token: str, page_policy: Callable[[], str]) -> None:
         response.headers["X-Content-Type-Options"] = "nosniff"
         response.headers["Referrer-Policy"] = "no-referrer"
         return response
+
+
+def _cookie() -> str:
+    """The cookie's name with the port: cookies are a host's, and each dashboard has its token."""
+    _, _, port = request.host.rpartition(":")
+    return f"{_COOKIE}_{port}" if port.isdigit() else _COOKIE
+
+
+def _answer_faults(server: Flask) -> None:
+    """Answer with a sentence where a request fails, and tell the terminal in one line.
+
+    Args:
+        server: the Flask server of the dashboard.
+    """
+
+    @server.errorhandler(413)
+    def too_large(_: HTTPException) -> Response:
+        """More was sent than any page of ours sends."""
+        said = f"The dashboard takes at most {MOST_BYTES >> 20} MB at a time."
+        return Response(said, 413, mimetype="text/plain")
+
+    @server.errorhandler(Exception)
+    def fault(error: Exception) -> Any:
+        """A request that no page of ours makes, or a fault of ours."""
+        if isinstance(error, HTTPException):
+            return error
+        told = printable(f"{type(error).__name__}: {error}")[:300]
+        where = printable(request.path)[:200]
+        print(f"dashboard: {where} could not be answered ({told})", file=sys.stderr)
+        said = "This request cannot be answered; load the page again. The terminal says why."
+        return Response(said, 500, mimetype="text/plain")
 
 
 def _site(address: str, name: bool = False) -> str | None:

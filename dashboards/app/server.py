@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import logging
 import signal
+import socket
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -41,6 +42,7 @@ _INDEX = """<!doctype html>
 <body>{%app_entry%}<footer hidden>{%config%}{%scripts%}{%renderer%}</footer></body>
 </html>"""
 _SAVER = "liex_saver"
+_EVERYWHERE = ("", "0.0.0.0", "::")  # addresses to listen on that nobody can open
 _POLICY = (
     "default-src 'none'; script-src 'self' {hashes}; style-src 'self' 'unsafe-inline'; img-src "
     "'self' data: blob:; connect-src 'self'; font-src 'self' data:; base-uri 'none'; form-action "
@@ -52,6 +54,7 @@ def make_app(
     data: StudyData,
     *,
     token: str = "",
+    alone: bool = True,
     show_replay: ShowReplay | None = None,
     correct: Correct | None = None,
     report: Report | None = None,
@@ -62,7 +65,8 @@ def make_app(
 
     Args:
         data: the study.
-        token: what every visitor has to know; empty on this machine alone.
+        token: what every visitor has to know; empty asks for none.
+        alone: only this machine is answered.
         show_replay: opens the replay of a .rrd at a time (s), or raises LiexError; None: only the
             command is shown.
         correct: adds corrections to the session in a folder, or takes some back; None: the pages
@@ -101,7 +105,7 @@ def make_app(
             hashes.extend(f"'{one.strip(chr(39))}'" for one in app.csp_hashes())
         return _POLICY.format(hashes=" ".join(hashes))
 
-    guard(app.server, token, policy)
+    guard(app.server, token, policy, alone=alone)
     add_downloads(app.server, data)
     add_routes(app.server, desks, None if saver is None else Clerk(desks, saver))
     if reviews is not None:
@@ -122,11 +126,11 @@ def serve(app: Dash, host: str, port: int, told: Callable[[int], None]) -> None:
     Raises:
         LiexError: the server cannot listen there.
     """
-    from werkzeug.serving import make_server
+    from .listener import Listener
 
     logging.getLogger("werkzeug").setLevel(logging.ERROR)
     try:
-        server = make_server(host, port, app.server, threaded=True)
+        server = Listener(host, port, app.server)
     except (OSError, SystemExit) as error:
         why = getattr(error, "strerror", None) or "in use"
         raise LiexError(
@@ -152,11 +156,13 @@ def address(host: str, port: int, token: str) -> str:
     """What to type into a browser.
 
     Args:
-        host: the address the server listens on.
+        host: the address the server listens on; for all of this machine's, its name is shown.
         port: its port.
         token: what every visitor has to know; may be empty.
     """
-    shown = "127.0.0.1" if host in (*LOOPBACK, "") else host
+    shown = "127.0.0.1" if host in LOOPBACK else host
+    if host in _EVERYWHERE:
+        shown = socket.gethostname()
     return f"http://{f'[{shown}]' if ':' in shown else shown}:{port}/" + (
         f"?token={token}" if token else ""
     )

@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import shlex
+import webbrowser
+from contextlib import ExitStack
+from html import escape
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -67,6 +71,12 @@ def cohort(
         )
     from liex_lab.api import run_study
 
+    if scheduler is not None:
+        from liex_lab.pipelines.study.dask_cluster import is_encrypted
+
+        if not is_encrypted(scheduler):
+            say(f"what goes to and from {scheduler} is not encrypted, and each side runs what the")
+            say("other sends: a scheduler for a network that you trust, or tls://")
     standings = run_study(
         study,
         workers=workers,
@@ -93,7 +103,7 @@ def dashboard(
     host: Annotated[
         str,
         typer.Option(
-            "--host", help="Another address than this machine's own; visitors then need a token."
+            "--host", help="Another address than this machine's own; traffic is not encrypted."
         ),
     ] = "127.0.0.1",
     port: Annotated[
@@ -104,15 +114,28 @@ def dashboard(
     """Look at a study in the browser: sessions, ethograms, groups, any frame; Ctrl+C ends it."""
     from liex_lab.api import serve_dashboard
 
-    def told(address: str) -> None:
-        say(f"dashboard: {address}   (Ctrl+C ends it)")
-        if open_browser:
-            import webbrowser
+    with progress_bar() as progress, ExitStack() as stack:
 
-            webbrowser.open(address)
+        def told(address: str) -> None:
+            """Say the dashboard's `address`, and open it where that was asked for."""
+            say(f"dashboard: {address}   (Ctrl+C ends it)")
+            if open_browser:  # by a file: other accounts see what a program is started with
+                folder = stack.enter_context(TemporaryDirectory(prefix="liex-"))
+                webbrowser.open(page_that_opens(address, Path(folder)).as_uri())
 
-    with progress_bar() as progress:
         serve_dashboard(study, host=host, port=port, told=told, progress=progress)
+
+
+def page_that_opens(address: str, folder: Path) -> Path:
+    """Write a page that leads on to an address; returns its path.
+
+    Args:
+        address: where to, with what nobody else may know.
+        folder: a folder that only this account can read.
+    """
+    page = folder / "dashboard.html"
+    page.write_text(f'<meta http-equiv="refresh" content="0;url={escape(address)}">')
+    return page
 
 
 def verify(

@@ -8,6 +8,7 @@ each. A session that more than three workers died of is quarantined. Dask is imp
 
 from __future__ import annotations
 
+import logging
 import os
 import tempfile
 import time
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
 TOPIC = "liex-progress"
 _DEATHS = 3  # of workers, before a session is held to be what kills them
 _TOLD_EVERY_S = 0.5
+_ENCRYPTED, _OPEN = ("tls", "wss"), ("tcp", "ws", "ucx")  # how a scheduler can be spoken to
 
 Told = Callable[
     [str, int, int | None, str], None
@@ -63,7 +65,7 @@ def measure_cohort(
         finished: is given each result as soon as it is there.
 
     Raises:
-        StudyError: no scheduler answers.
+        StudyError: no scheduler answers, or it ends before the study does.
         MissingPackageError: Slurm is asked for and dask-jobqueue is not installed.
     """
     planned = {one.session.id: one.session for one in todo}
@@ -117,6 +119,11 @@ def _results(
     del submitted
     for future in completed:
         session = sessions[future.key]
+        if future.cancelled() or future.status == "lost":  # nobody here takes one back
+            raise StudyError(
+                "the Dask scheduler ended before the study did; the sessions that were measured "
+                "are kept, and the same command goes on with the rest once a scheduler answers"
+            )
         error = future.exception()
         result = _died(session, error) if error is not None else future.result()
         future.release()  # what a worker holds would be made again if it died
@@ -183,6 +190,24 @@ class Workers:
                 yield future.result()
 
 
+def is_encrypted(scheduler: str) -> bool:
+    """Whether what is sent to a scheduler is encrypted.
+
+    Args:
+        scheduler: its address, as in tcp://10.0.0.1:8786.
+
+    Raises:
+        StudyError: it is no address of a scheduler.
+    """
+    kind, found, place = scheduler.rpartition("://")  # tcp where it says nothing
+    if not place or (found and kind not in _ENCRYPTED + _OPEN):
+        raise StudyError(
+            f"{scheduler!r} is no address of a Dask scheduler; expected one as in "
+            "tcp://10.0.0.1:8786 or tls://10.0.0.1:8786, which `dask scheduler` prints"
+        )
+    return kind in _ENCRYPTED
+
+
 @contextmanager
 def _client(
     n_tasks: int, workers: int, threads: int, scheduler: str | None, slurm: SlurmTable | None
@@ -191,6 +216,7 @@ def _client(
     import dask
     from distributed import Client
 
+    logging.getLogger("distributed.client").setLevel(logging.CRITICAL)  # we say what is lost
     # one session at a worker at a time: what waits there is held to have killed it, too
     settings = {
         "distributed.scheduler.allowed-failures": _DEATHS,
@@ -200,6 +226,9 @@ def _client(
         # a machine that is busy or was put to sleep is not a dead one
         "distributed.scheduler.worker-ttl": "3600s",
         "distributed.comm.timeouts.connect": "120s",
+        # plain HTTP that would tell ids and paths to every account of the machine
+        "distributed.scheduler.http.routes": [],
+        "distributed.worker.http.routes": [],
     }
     with ExitStack() as stack:
         stack.enter_context(dask.config.set(settings))
@@ -244,8 +273,9 @@ def local_cluster(n_tasks: int, workers: int, threads: int, scratch: str) -> Clu
         host="127.0.0.1",
         dashboard_address=None,
         scheduler_kwargs={
-            "dashboard_address": "127.0.0.1:0"
-        },  # any port: another study's may have the usual one
+            "dashboard": False,
+            "dashboard_address": "127.0.0.1:0",  # any port: another study's may have the usual one
+        },
         memory_limit=0,
         local_directory=scratch,
         silence_logs=50,
@@ -276,7 +306,7 @@ def slurm_cluster(table: SlurmTable, scratch: str) -> Any:
     shared.mkdir(mode=0o700, parents=True, exist_ok=True)
     return SLURMCluster(
         **slurm_options(table, scratch),
-        scheduler_options={"dashboard_address": None},
+        scheduler_options={"dashboard": False, "dashboard_address": None},
         security=Security.temporary(),
         shared_temp_directory=str(shared),
         silence_logs=50,
@@ -293,6 +323,7 @@ def slurm_options(table: SlurmTable, scratch: str) -> dict[str, Any]:
     exports = [
         f"export {name}={value}" for name, value in worker_environment(table.cores_per_job).items()
     ]
+    exports.append("export DASK_DISTRIBUTED__WORKER__HTTP__ROUTES='[]'")
     return {
         "queue": table.partition,
         "account": table.account,

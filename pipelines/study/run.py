@@ -68,7 +68,7 @@ def run_study(
         describe: writes descriptions into a session, `liex_lab.api.correct_session`.
 
     Raises:
-        StudyError: both scheduler and slurm are given, or no scheduler answers.
+        StudyError: both scheduler and slurm are given, or no scheduler answers at that address.
         SessionError: another process measures the study.
         LiexError: an id in `only` is none of the study's.
     """
@@ -76,6 +76,10 @@ def run_study(
         raise StudyError(
             "the workers are found either with --scheduler or with --slurm; leave one of them out"
         )
+    if scheduler:
+        from .dask_cluster import is_encrypted
+
+        is_encrypted(scheduler)  # an address that is none ends here
     table = SlurmTable.load(slurm) if slurm else None
     before = standings(study, retry=retry, only=only, again=again)
     if dry_run:

@@ -7,9 +7,12 @@ from __future__ import annotations
 import io
 import json
 import shutil
+import socket
 import sys
+import threading
 from pathlib import Path
 from types import SimpleNamespace
+from urllib.request import urlopen
 
 import numpy as np
 import pandas as pd
@@ -18,6 +21,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from liex_lab.dashboards.app import plots, tables
 from liex_lab.dashboards.app.data import GREY, Ethogram, StudyData, colours_of, raster
+from liex_lab.dashboards.app.guard import MOST_BYTES
+from liex_lab.dashboards.app.listener import MOST, Handler, Listener
 from liex_lab.dashboards.app.page_session import moved_to
 from liex_lab.dashboards.app.server import address, make_app
 from liex_lab.pipelines.study.listing import list_sessions
@@ -216,21 +221,76 @@ def test_this_machine_alone_may_ask_and_no_other_site(data: StudyData) -> None:
 
 
 def test_on_another_address_a_token_is_asked_for(data: StudyData) -> None:
-    app = make_app(data, token="right")
+    app = make_app(data, token="right", alone=False)
     browser = app.server.test_client()
     for path in ("/", "/csv/sessions.csv", "/_dash-layout", "/?token=wrong"):
         assert browser.get(path, headers={"Host": "lab:1"}).status_code == 401
-    let_in = browser.get("/?token=right", headers={"Host": "lab:1"})
+    let_in = browser.get("/session/a?token=right&t=1.5", headers={"Host": "lab:1"})
     assert let_in.status_code == 302
     assert "HttpOnly" in let_in.headers["Set-Cookie"]
-    assert "token" not in let_in.headers["Location"]
-    browser.set_cookie("liex_dashboard", "right", domain="lab")
+    assert let_in.headers["Location"] == "/session/a?t=1.5"
     assert browser.get("/csv/sessions.csv", headers={"Host": "lab:1"}).status_code == 200
-    assert address("0.0.0.0", 5, "right") == "http://0.0.0.0:5/?token=right"
+    assert browser.get("/csv/sessions.csv", headers={"Host": "lab:2"}).status_code == 401  # another
+    assert address("0.0.0.0", 5, "right") == f"http://{socket.gethostname()}:5/?token=right"
     assert address("127.0.0.1", 5, "") == "http://127.0.0.1:5/"
 
 
-def test_the_token_is_new_each_time_and_only_where_others_can_ask(
+def test_another_account_of_this_machine_neither_reads_nor_corrects(data: StudyData) -> None:
+    browser = make_app(data, token="right").server.test_client()
+    here = {"Host": "127.0.0.1:8050"}
+    for path in ("/", "/csv/sessions.csv", "/_dash-layout", "/assets/desk.mjs", "/review"):
+        assert browser.get(path, headers=here).status_code == 401
+    assert browser.post("/_dash-update-component", headers=here, json={}).status_code == 401
+    known = {"Host": "evil.example:8050"}  # an address that was bent to this machine
+    assert browser.get("/?token=right", headers=known).status_code == 403
+    assert browser.get("/?token=right", headers=here).status_code == 302
+    assert browser.get("/csv/sessions.csv", headers=here).status_code == 200
+
+
+def test_what_no_page_sends_is_answered_with_a_sentence_and_no_traceback(
+    data: StudyData, capsys: pytest.CaptureFixture[str]
+) -> None:
+    browser = make_app(data).server.test_client()
+    large = browser.post(
+        "/_dash-update-component",
+        data=b"0" * (MOST_BYTES + 1),
+        content_type="application/json",
+    )
+    assert large.status_code == 413
+    assert "at most 4 MB" in large.text
+    for body in (b"{", b"[]", b"null", b'{"output": 3}', b'{"output": "page.children"}', b"\xff"):
+        answer = browser.post("/_dash-update-component", data=body, content_type="application/json")
+        assert 400 <= answer.status_code <= 500
+        assert "Traceback" not in answer.text
+    told = capsys.readouterr()
+    assert "Traceback" not in told.err + told.out
+    assert "dashboard: /_dash-update-component could not be answered" in told.err
+
+
+def test_connections_that_say_nothing_are_closed_and_there_are_not_more_than_so_many(
+    data: StudyData, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Handler, "timeout", 1.0)
+    server = Listener("127.0.0.1", 0, make_app(data).server)
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    before = threading.active_count()
+    silent = [socket.create_connection(("127.0.0.1", server.port)) for _ in range(MOST + 30)]
+    try:
+        for one in silent:
+            one.settimeout(30.0)
+        assert [one.recv(1) for one in silent[-30:]] == [b""] * 30  # closed at once
+        assert threading.active_count() <= before + MOST
+        assert [one.recv(1) for one in silent[:-30]] == [b""] * MOST  # closed after their time
+        with urlopen(f"http://127.0.0.1:{server.port}/_favicon.ico", timeout=30) as answer:
+            assert answer.status == 200
+    finally:
+        for one in silent:
+            one.close()
+        server.shutdown()
+        server.server_close()
+
+
+def test_the_token_is_new_each_time_on_this_machine_as_elsewhere(
     study: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     made: list[dict[str, object]] = []
@@ -244,10 +304,10 @@ def test_the_token_is_new_each_time_and_only_where_others_can_ask(
     said: list[str] = []
     for host in ("127.0.0.1", "0.0.0.0", "0.0.0.0"):
         api.serve_dashboard(study, host=host, port=5, told=said.append)
-    assert made[0]["token"] == ""
+    assert [how["alone"] for how in made] == [True, False, False]
     assert made[0]["show_replay"] is not None
-    assert made[1]["token"] != made[2]["token"]
-    assert len(str(made[1]["token"])) >= 32
+    assert len({how["token"] for how in made}) == 3
+    assert all(len(str(how["token"])) >= 32 for how in made)
     assert made[1]["show_replay"] is None  # a viewer would open where nobody looks
     assert said[1].endswith(str(made[1]["token"]))
 

@@ -6,10 +6,12 @@ from __future__ import annotations
 
 import csv
 import time
+from pathlib import Path
 
 import pytest
 from playwright.sync_api import Page, expect
 
+from liex_lab.cli.study import page_that_opens
 from liex_lab.sessions import Session
 from liex_lab.sessions.corrections import read_log
 from tests.dashboards import copies
@@ -54,6 +56,19 @@ def test_two_hundred_sessions_open_in_seconds_are_sorted_filtered_and_had_as_csv
         table = list(csv.DictReader(file))
     assert len(table) == N_SESSIONS
     assert {row["group"] for row in table} == set(copies.GROUPS)
+    watched.nothing_went_wrong()
+
+
+def test_the_page_that_open_writes_leads_into_a_dashboard_with_a_token(
+    tmp_path: Path, watched: Watched
+) -> None:
+    served = Served(copies.study(tmp_path / "study", 2), token="right")
+    page = watched.page
+    page.goto(page_that_opens(f"{served.address}/?token=right", tmp_path).as_uri())
+    expect(page.locator("tbody tr")).to_have_count(2)
+    assert page.url == f"{served.address}/"  # the token is in no history
+    page.get_by_role("link", name="Ethograms").click()
+    page.wait_for_selector("#ethograms image")
     watched.nothing_went_wrong()
 
 
