@@ -165,6 +165,7 @@ def fit_plan(
     try:
         tracker = build_tracker(recording, plan, estimator_of)
         misfits = misfits_of(tracker.sample_fit, plan)
+        misfits = (*tracker.scene.doubts, *misfits) if misfits else ()
     except EstimationError as error:
         cause = error
         misfits = (str(error).partition("; ")[0],)

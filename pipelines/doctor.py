@@ -222,7 +222,7 @@ def _dropped(recording: Recording) -> list[Gap]:
 
 
 def _time_problems(recording: Recording) -> list[str]:
-    found = []
+    found = list(recording.clock_doubts)
     gaps = _dropped(recording)
     if jumps := [gap for gap in recording.gaps if gap not in gaps]:
         found.append(

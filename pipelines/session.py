@@ -292,6 +292,7 @@ def make_track(writer: SessionWriter, fitted: Fitted) -> Verdict:
         tracked.track,
         whole,
         misfits=fitted.misfits,
+        doubts=(*tracker.scene.doubts, *fitted.recording.clock_doubts),
         n_animals=1 if fit is None else fit.n_animals,
         cautions=(*fitted.notes, *tracker.scene.remarks),
         accepted=fitted.plan.estimation.accept_misfit,

@@ -25,6 +25,16 @@ _LENGTH_PX = 64.0
 _MAX_STRIDE = 4
 
 
+def sampled(n: int, most: int) -> NDArray[np.int64]:
+    """Indices of frames spread evenly over a recording.
+
+    Args:
+        n: frames of the recording.
+        most: frames at most; all where the recording has fewer.
+    """
+    return np.unique(np.linspace(0, n - 1, min(most, n)).astype(np.int64))
+
+
 def sample_frames(recording: Recording, n_frames: int, stride: int = 1) -> NDArray[np.float32]:
     """Frames spread evenly over a recording, thinned to every `stride`-th pixel.
 
@@ -36,9 +46,7 @@ def sample_frames(recording: Recording, n_frames: int, stride: int = 1) -> NDArr
     Returns:
         (n, ceil(H / stride), ceil(W / stride)) float32 mm, 0 where unread.
     """
-    chosen = np.unique(
-        np.linspace(0, len(recording) - 1, min(n_frames, len(recording))).astype(int)
-    )
+    chosen = sampled(len(recording), n_frames)
     sample = np.empty(
         (len(chosen), -(-recording.height // stride), -(-recording.width // stride)), np.float32
     )

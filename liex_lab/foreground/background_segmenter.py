@@ -25,11 +25,12 @@ from liex_lab.body.skeleton import MOUSE_VIEW, VIEWS, View
 from liex_lab.errors import EstimationError
 from liex_lab.foreground import _height_map_kernels as kernels
 from liex_lab.foreground._blob_kernels import MAX_BLOBS
-from liex_lab.foreground.background import sample_frames, stride_for
+from liex_lab.foreground.background import sample_frames, sampled, stride_for
 from liex_lab.foreground.bare_ground import SPREADS as SPREADS  # models are trained with it
 from liex_lab.foreground.bare_ground import BareGround, Wanted
 from liex_lab.foreground.cable import Cable
 from liex_lab.foreground.floor_level import FloorLevel
+from liex_lab.foreground.scene_change import SceneChange
 from liex_lab.foreground.still_scene import StillScene
 from liex_lab.optics.camera import Camera
 from liex_lab.recordings.recording import Recording
@@ -117,7 +118,11 @@ class BackgroundSubtraction(StillScene):
         if wanted.stands:
             scene, sample = scene._without_cable(sample, wanted)
         scene = scene._with_its_animal(sample, wanted)
-        return replace(scene, volume_mm3=scene.usual_volume(sample)), sample
+        times_s = recording.times_ns[sampled(len(recording), n_frames)]
+        changed = SceneChange.find(
+            sample, (times_s - recording.times_ns[0]) * 1e-9, scene.grid, scene.area_mm2
+        )
+        return replace(scene, volume_mm3=scene.usual_volume(sample), changed=changed), sample
 
     @staticmethod
     def _empty(

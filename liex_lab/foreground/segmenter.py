@@ -87,6 +87,11 @@ class Segmenter(ABC):
         """What was found in the pictures and undone, in sentences; nothing where they are clean."""
         return ()
 
+    @property
+    def doubts(self) -> tuple[str, ...]:
+        """Why what is measured here may be wrong all the same, in sentences; usually none."""
+        return ()
+
     @abstractmethod
     def crop_cameras(self, crops: HeightMaps, camera_view: bool = False) -> Array:
         """The crop cameras (n, 17) of height maps, packed as `CropCamera`.

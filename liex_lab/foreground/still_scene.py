@@ -23,6 +23,7 @@ from liex_lab.foreground.cable import Cable
 from liex_lab.foreground.crop_camera import pack_crop_cameras
 from liex_lab.foreground.floor_level import FloorLevel
 from liex_lab.foreground.height_maps import HeightMaps
+from liex_lab.foreground.scene_change import SceneChange
 from liex_lab.foreground.segmenter import Segmenter
 from liex_lab.foreground.standing import Standing
 from liex_lab.optics.camera import Camera
@@ -55,6 +56,7 @@ class StillScene(Segmenter):
         standing: how the floor was found, None where it was given.
         cable: how cables are told from the animal; None where it wears none.
         level: brings frames to one level of the floor; None where it is still.
+        changed: what is elsewhere from some time on; None where the scene keeps still.
     """
 
     camera: Camera
@@ -69,6 +71,7 @@ class StillScene(Segmenter):
     standing: Standing | None = None
     level: FloorLevel | None = None
     cable: Cable | None = None
+    changed: SceneChange | None = None
 
     @cached_property
     def grid(self) -> Camera:
@@ -91,7 +94,7 @@ class StillScene(Segmenter):
         standing = self.standing
         wander_mm = None if self.level is None else self.level.wander_mm
         if standing is None:
-            return Scene(self.floor, roughness_mm=rough, fixtures=fixtures)
+            return Scene(self.floor, roughness_mm=rough, fixtures=fixtures, doubts=self.doubts)
         return Scene(
             self.floor,
             standing.origin,
@@ -101,7 +104,7 @@ class StillScene(Segmenter):
             rough,
             region_corners(standing.region, self.stride),
             fixtures=fixtures,
-            doubts=(standing.doubt,) if standing.doubt else (),
+            doubts=((standing.doubt,) if standing.doubt else ()) + self.doubts,
             wander_mm=wander_mm,
             thin_above=self.cable is not None,
         )
@@ -218,6 +221,11 @@ class StillScene(Segmenter):
                 "that warms up, and was brought back to where it was at the beginning"
             )
         return tuple(said)
+
+    @property
+    def doubts(self) -> tuple[str, ...]:
+        """That the camera was pushed, or the scene rearranged, while it recorded."""
+        return () if self.changed is None else (self.changed.sentence,)
 
     def cleared(self, depths: NDArray[np.float32]) -> NDArray[np.float32]:
         """Whole pictures without what the animal wears: 0 where a cable is.

@@ -21,7 +21,15 @@ from numpy.typing import NDArray
 from liex_lab.errors import RecordingError
 from liex_lab.optics.camera import Camera
 from liex_lab.recordings.frame import Depth, DepthFrame
-from liex_lab.recordings.timestamps import FAULTS, JUMPED, Gap, find_faults, find_gaps, median_step
+from liex_lab.recordings.timestamps import (
+    FAULTS,
+    JUMPED,
+    Gap,
+    clock_doubts,
+    find_faults,
+    find_gaps,
+    median_step,
+)
 from liex_lab.runtime.progress import Progress, silent
 
 Times = NDArray[np.int64]
@@ -158,6 +166,11 @@ class Recording:
         One over the median step between neighbouring frames.
         """
         return 1e9 / self._step_ns if self._step_ns else float("nan")
+
+    @property
+    def clock_doubts(self) -> tuple[str, ...]:
+        """Why its times are not to be relied on, in sentences; usually none."""
+        return clock_doubts(self._step_ns, self._faults)
 
     @property
     def duration_s(self) -> float:

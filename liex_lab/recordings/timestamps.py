@@ -62,6 +62,8 @@ class Gap:
     reason: str = DROPPED
 
 
+PLAUSIBLE_HZ = (0.5, 2000.0)  # of a depth camera that watches an animal
+_MOST_MOVED = 0.25  # of the stamps may be repeated or out of order, as of a busy computer
 FAULTS = ("", "stamp_repeated", "stamp_out_of_order", JUMPED)  # what `MonotoneTimes.faults` counts
 # their places in it
 _REPEATED = 1
@@ -95,6 +97,32 @@ def median_step(times_ns: Times) -> int:
         The step, ns; 0 for fewer than two frames.
     """
     return int(np.median(np.diff(times_ns))) if len(times_ns) > 1 else 0
+
+
+def clock_doubts(step_ns: int, faults: NDArray[np.uint8]) -> tuple[str, ...]:
+    """Why the times of a recording are not to be relied on.
+
+    Args:
+        step_ns: the median step, ns; 0 where there is none.
+        faults: (n,) uint8 index into `FAULTS`, as in `MonotoneTimes.faults`.
+
+    Returns:
+        Sentences; none where the clock is like a camera's.
+    """
+    found = []
+    hz = 1e9 / max(step_ns, 1)
+    if step_ns > 0 and not PLAUSIBLE_HZ[0] <= hz <= PLAUSIBLE_HZ[1]:
+        found.append(
+            f"by its time stamps the camera made {hz:,.{0 if hz > 10 else 3}f} frames/s: they are "
+            "in another unit than it says, and speeds and durations are wrong by that"
+        )
+    n_moved = int(np.isin(faults, (_REPEATED, _OUT_OF_ORDER)).sum())
+    if n_moved > _MOST_MOVED * len(faults):
+        found.append(
+            f"{n_moved} of {len(faults)} time stamps are repeated or out of order: times are "
+            "guesses, and speeds with them"
+        )
+    return tuple(found)
 
 
 def find_gaps(times_ns: Times, step_ns: int) -> list[Gap]:

@@ -65,6 +65,7 @@ class Verdict:
         seen: Observations,
         *,
         misfits: Sequence[str] = (),
+        doubts: Sequence[str] = (),
         n_animals: int = 1,
         cautions: Sequence[str] = (),
         accepted: bool = False,
@@ -75,6 +76,7 @@ class Verdict:
             track: one row for every frame.
             seen: what the single frames said.
             misfits: how the scene does not fit the plan.
+            doubts: why its scene or its clock is not to be relied on.
             n_animals: how many animals were counted in the frames that were learned from.
             cautions: what is to be said besides.
             accepted: whether the plan says to measure all the same.
@@ -93,7 +95,7 @@ class Verdict:
         n_hidden = int((track.flag == "hidden").sum())
         n_depth -= n_hidden  # it is known why there is no pose
         n_in_view = min(n_in_view, n_depth)
-        reasons = list(misfits)
+        reasons = [*misfits, *doubts]
         if n_trusted < _LEAST_SHARE * n_depth:
             reasons.append(f"an animal is measured in {n_trusted} of {n_depth} frames only")
         elif n_trusted < _MEASURED_SHARE * n_in_view:

@@ -16,6 +16,7 @@ from liex_lab.recordings.timestamp_files import name_times, read_column_times, r
 from liex_lab.recordings.timestamps import (
     FAULTS,
     Gap,
+    clock_doubts,
     find_faults,
     find_gaps,
     from_rate,
@@ -309,3 +310,26 @@ def test_a_start_needs_a_zone_to_be_a_moment() -> None:
     assert start_of_day(None) is None
     assert start_of_clock(1_760_000_000 * 10**9) == "2025-10-09T08:53:20+00:00"
     assert start_of_clock(666_649_624_588_800) is None  # a week since some machine was switched on
+
+
+@pytest.mark.parametrize(
+    ("step_ns", "said"),
+    [
+        (33_333_333, ""),
+        (2_000_000, ""),  # 500 frames/s
+        (500_000_000, ""),  # 2 frames/s
+        (33_333, "30,000 frames/s"),  # microseconds, written as nanoseconds
+        (33_333_333_333, "0.030 frames/s"),
+        (0, ""),
+    ],
+)
+def test_a_rate_that_no_camera_has_is_doubted(step_ns: int, said: str) -> None:
+    found = clock_doubts(step_ns, np.zeros(50, np.uint8))
+    assert [said in one for one in found] == ([True] if said else [])
+
+
+def test_a_clock_that_often_stands_still_is_doubted() -> None:
+    moved = make_monotone(np.repeat(np.arange(20, dtype=np.int64) * 66_000_000, 2))
+    assert "20 of 40 time stamps are repeated" in clock_doubts(33_000_000, moved.faults)[0]
+    few = make_monotone(np.r_[0:30, 29].astype(np.int64) * 33_000_000)
+    assert clock_doubts(33_000_000, few.faults) == ()

@@ -31,6 +31,13 @@ def test_an_animal_that_is_measured_throughout_needs_no_look() -> None:
     assert "look at it" not in verdict.sentence
 
 
+def test_a_scene_or_clock_that_is_not_to_be_relied_on_is_a_reason_to_look() -> None:
+    seen = told(SECONDS, walk(SECONDS))
+    verdict = Verdict.of(tracked(seen), seen, doubts=["the camera was pushed"])
+    assert verdict.look_at_it
+    assert verdict.sentence.endswith("look at it: the camera was pushed")
+
+
 def test_an_animal_that_leaves_for_half_of_the_time_needs_none_either() -> None:
     seen = told(SECONDS, walk(SECONDS))
     lose(seen, slice(90, 200))

@@ -13,7 +13,7 @@ from typing import Any
 
 from liex_lab.errors import RecordingError
 from liex_lab.recordings.timestamp_files import CSV_COLUMNS, read_column_times, read_csv_times
-from liex_lab.recordings.timestamps import Times, median_step, start_of_day
+from liex_lab.recordings.timestamps import PLAUSIBLE_HZ, Times, median_step, start_of_day
 
 STAMPS = {"depth_ts.txt": 10**6, "timestamps.csv": 10**9}  # file: nanoseconds in its unit
 METADATA = "metadata.json"
@@ -40,7 +40,6 @@ _CAMERA_WORDS = {  # word in a camera's name: which one it is; the first that is
     "kinectone": KINECT,
     "kinectforwindowsv2": KINECT,
 }
-_PLAUSIBLE_HZ = (0.5, 2000.0)
 
 
 @dataclass(frozen=True)
@@ -185,7 +184,7 @@ def read_stamps(files: dict[str, Path], cut: bool, problems: list[str]) -> tuple
         problems.append(f"{name} holds no time stamp")
         return None
     step = median_step(times)
-    if not named and step > 0 and not _PLAUSIBLE_HZ[0] <= 1e9 / step <= _PLAUSIBLE_HZ[1]:
+    if not named and step > 0 and not PLAUSIBLE_HZ[0] <= 1e9 / step <= PLAUSIBLE_HZ[1]:
         problems.append(
             f"the stamps in {name} were taken as "
             f"{'milli' if name == 'depth_ts.txt' else ''}seconds, as MoSeq writes them, which "
