@@ -12,9 +12,9 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from liex_lab.exchange.poses import Array, Poses, write_times
 from liex_lab.runtime.spreadsheets import write_csv
 from liex_lab.sessions import Session
+from liex_lab.sessions.pose_arrays import Array, Poses
 
 SCORER = "liex_lab"
 
@@ -26,12 +26,12 @@ def write(session: Session, path: Path) -> None:
         session: the session.
         path: the folder to make.
     """
-    poses = Poses.of(session)
+    poses = session.pose_arrays()
     path.mkdir()
     write_csv(table(poses, poses.xyz_mm, "xyz"), path / "poses_3d.csv", index=True)
     flat = np.concatenate([poses.uv_px, poses.score[..., None]], axis=-1)
     write_csv(table(poses, flat, ("x", "y", "likelihood")), path / "poses_2d.csv", index=True)
-    write_times(path / "times.csv", poses)
+    _write_times(path / "times.csv", poses)
     write_csv(session.bouts, path / "bouts.csv")
 
 
@@ -50,3 +50,16 @@ def table(poses: Poses, values: Array, coords: str | tuple[str, ...]) -> pd.Data
         [[SCORER], list(poses.joints), list(coords)], names=["scorer", "bodyparts", "coords"]
     )
     return pd.DataFrame(values.reshape(len(values), -1), index=poses.frame_index, columns=columns)
+
+
+def _write_times(path: Path, poses: Poses) -> None:
+    """Write a CSV with the true time of each row, for formats that do not hold times.
+
+    Args:
+        path: the CSV file to write: frame_index, time_s with nine decimals.
+        poses: the session's poses.
+    """
+    lines = [
+        f"{index},{time:.9f}" for index, time in zip(poses.frame_index, poses.time_s, strict=True)
+    ]
+    path.write_text("\n".join(["frame_index,time_s", *lines]) + "\n", encoding="utf-8")

@@ -15,8 +15,8 @@ from uuid import NAMESPACE_URL, uuid5
 import numpy as np
 
 from liex_lab.errors import SessionError
-from liex_lab.exchange.poses import Poses
 from liex_lab.sessions import Session
+from liex_lab.sessions.pose_arrays import Poses
 
 if TYPE_CHECKING:
     from pynwb import NWBFile
@@ -76,7 +76,7 @@ def build(session: Session) -> NWBFile:
     module = made.create_processing_module(
         "behavior", "pose estimates, rotations and actions by liex_lab"
     )
-    poses = Poses.of(session)
+    poses = session.pose_arrays()
     _add_poses(made, module, session, poses, version)
     _add_rotations(module, session, poses)
     _add_intervals(made, session)

@@ -12,7 +12,6 @@ from pathlib import Path
 
 import numpy as np
 
-from liex_lab.exchange.poses import Poses
 from liex_lab.sessions import Session
 
 
@@ -27,7 +26,7 @@ def write(session: Session, path: Path) -> None:
     """
     import h5py
 
-    poses = Poses.of(session)
+    poses = session.pose_arrays()
     seen = np.isfinite(poses.uv_px[:, :, 0])
     order = {
         "tracks": ("track", "xy", "node", "frame"),

@@ -31,11 +31,13 @@ from liex_lab.sessions.corrections import (
 )
 from liex_lab.sessions.document import read_document
 from liex_lab.sessions.older import put_back_session
+from liex_lab.sessions.pose_arrays import COLUMNS, Poses, dataset_of
 from liex_lab.sessions.reading import reading_from
 from liex_lab.tables.checks import check_footer, check_rows
 
 if TYPE_CHECKING:
     import pandas as pd
+    import xarray
 
 FILES = (
     "session.json",
@@ -219,6 +221,21 @@ class Session:
         return self.table("flips")
 
     @cached_property
+    def transitions(self) -> pd.DataFrame:
+        """Table `transitions`, one row per pair of actions: how often one followed the other."""
+        return self.table("transitions")
+
+    @cached_property
+    def activity(self) -> pd.DataFrame:
+        """Table `activity`, one row per bin of time: distance (mm) and share of each action."""
+        return self.table("activity")
+
+    @cached_property
+    def zone_visits(self) -> pd.DataFrame:
+        """Table `zones`, one row per zone: time in it (s), entries, latency (s)."""
+        return self.table("zones")
+
+    @cached_property
     def summary(self) -> pd.DataFrame:
         """The behaviour summary, one row per animal.
 
@@ -328,6 +345,21 @@ class Session:
             check_rows(name, found, self.metadata["animal"]["joints"])
             said = self.described if name == "sessions" else {}
             return found.assign(**{key: said[key] for key in said if key in found})
+
+    def to_xarray(self) -> xarray.Dataset:
+        """The poses as a labelled data set, in the form of the Python package movement.
+
+        The dimensions are time (s since the first frame), space (x, y, z; mm, arena frame),
+        keypoints and individuals; the variables position, confidence, sd_mm and action.
+
+        Raises:
+            MissingPackageError: xarray is not installed.
+        """
+        return dataset_of(self.pose_arrays(), self.bouts, self.metadata, self.path.name)
+
+    def pose_arrays(self) -> Poses:
+        """The poses as arrays by frame and joint, NaN where there is no pose."""
+        return Poses.of(self.metadata, self.table("poses", COLUMNS))
 
 
 def _narrow(path: Path, columns: list[str]) -> pd.DataFrame:

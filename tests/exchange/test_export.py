@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import sys
 from datetime import datetime
 from importlib import import_module
 from pathlib import Path
@@ -20,10 +21,8 @@ from pynwb import NWBHDF5IO
 from typer.testing import CliRunner
 
 from liex_lab import cli
-from liex_lab.errors import SessionError
+from liex_lab.errors import MissingPackageError, SessionError
 from liex_lab.exchange import TARGETS, export
-from liex_lab.exchange.movement import to_movement
-from liex_lab.exchange.poses import Poses
 from liex_lab.sessions import Session
 from tests.sessions.walking_mouse import WalkingMouse, steady, write
 
@@ -91,7 +90,7 @@ def test_deeplabcut_s_tables_have_its_header_and_a_row_for_every_frame(session, 
     assert [line.split(",")[0] for line in lines[:3]] == ["scorer", "bodyparts", "coords"]
     solid = pd.read_csv(folder / "poses_3d.csv", header=[0, 1, 2], index_col=0)
     flat = pd.read_csv(folder / "poses_2d.csv", header=[0, 1, 2], index_col=0)
-    poses = Poses.of(session)
+    poses = session.pose_arrays()
     np.testing.assert_array_equal(solid["liex_lab"]["nose"].to_numpy(), poses.xyz_mm[:, -1])
     np.testing.assert_array_equal(
         flat["liex_lab"]["nose"][["x", "y"]].to_numpy(), poses.uv_px[:, -1]
@@ -103,9 +102,18 @@ def test_deeplabcut_s_tables_have_its_header_and_a_row_for_every_frame(session, 
     assert len(solid) == len(flat) == len(times) == 116
 
 
+def test_every_table_of_a_session_is_an_attribute_and_arrays_need_xarray(session, monkeypatch):
+    tables = {"transitions": "transitions", "activity": "activity", "zone_visits": "zones"}
+    for attribute, name in tables.items():
+        pd.testing.assert_frame_equal(getattr(session, attribute), session.table(name))
+    monkeypatch.setitem(sys.modules, "xarray", None)
+    with pytest.raises(MissingPackageError, match="labelled data set needs xarray"):
+        session.to_xarray()
+
+
 def test_movement_s_data_set_has_the_true_times_and_the_actions(session, out):
     data = xarray.load_dataset(export(session, "movement", out), engine="h5netcdf")
-    xarray.testing.assert_equal(data, to_movement(session))
+    xarray.testing.assert_equal(data, session.to_xarray())
     np.testing.assert_array_equal(data["time"], session.frames["time_s"])
     assert data["position"].dims == ("time", "space", "keypoints", "individuals")
     nose = data["position"].sel(keypoints="nose", individuals="mouse_1", space="z")
@@ -118,7 +126,7 @@ def test_movement_s_data_set_has_the_true_times_and_the_actions(session, out):
 
 def test_sleap_s_arrays_have_its_shapes(session, out):
     path = export(session, "sleap", out)
-    poses = Poses.of(session)
+    poses = session.pose_arrays()
     with h5py.File(path) as file:
         assert file["tracks"].shape == (1, 2, 5, 116)
         np.testing.assert_array_equal(file["tracks"][0].transpose(2, 1, 0), poses.uv_px)
@@ -155,7 +163,7 @@ def test_boris_gets_two_rows_for_every_bout(session, out):
 
 
 def test_pynwb_reads_poses_times_rotations_and_actions(session, nwb):
-    poses = Poses.of(session)
+    poses = session.pose_arrays()
     with NWBHDF5IO(nwb, "r") as file:
         read = file.read()
         module = read.processing["behavior"]

@@ -9,7 +9,6 @@ from movement.io import load_poses
 from movement.validators.datasets import ValidPosesInputs
 
 from liex_lab.exchange import export
-from liex_lab.exchange.poses import Poses
 
 
 def test_movement_takes_the_netcdf_for_its_own(session, tmp_path):
@@ -22,7 +21,7 @@ def test_movement_takes_the_netcdf_for_its_own(session, tmp_path):
 
 
 def test_movement_reads_our_deeplabcut_sleap_and_nwb_files(session, tmp_path):
-    poses = Poses.of(session)
+    poses = session.pose_arrays()
     dlc = load_poses.from_dlc_file(export(session, "dlc", tmp_path) / "poses_2d.csv")
     np.testing.assert_allclose(
         dlc["position"][..., 0].transpose("time", "keypoints", "space"), poses.uv_px, rtol=1e-6
@@ -42,7 +41,7 @@ def test_movement_reads_our_deeplabcut_sleap_and_nwb_files(session, tmp_path):
 
 
 def test_sleap_io_reads_the_analysis_file(session, tmp_path):
-    poses = Poses.of(session)
+    poses = session.pose_arrays()
     labels = sleap_io.load_file(str(export(session, "sleap", tmp_path)))
     assert [node.name for node in labels.skeletons[0].nodes] == list(poses.joints)
     assert len(labels.skeletons[0].edges) == len(poses.bones)

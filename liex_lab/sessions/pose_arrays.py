@@ -1,0 +1,148 @@
+"""A session's poses as plain arrays, and as a labelled data set of xarray."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from liex_lab.errors import MissingPackageError, how_to_install
+
+if TYPE_CHECKING:
+    import pandas as pd
+    import xarray
+
+Array = NDArray[np.float64]
+COLUMNS = [
+    "frame_index",
+    "time_s",
+    "joint",
+    "x_mm",
+    "y_mm",
+    "z_mm",
+    "u_px",
+    "v_px",
+    "score",
+    "sd_mm",
+]
+
+
+@dataclass(frozen=True)
+class Poses:
+    """Poses of one animal, one row for every recorded frame; NaN where there is no pose.
+
+    Attributes:
+        individual: the animal's name.
+        joints: names of the J joints.
+        bones: pairs of joint indices, parent and child.
+        frame_index: (n,) int64, the camera's frame count.
+        time_s: (n,) s since the first frame.
+        xyz_mm: (n, J, 3) mm, arena frame.
+        uv_px: (n, J, 2) px of the depth picture; (0, 0) is the centre of the top-left pixel.
+        score: (n, J) probability that the joint lies within 10 % of the spine's length of the
+            truth.
+        sd_mm: (n, J) standard deviation of the joint along one axis, mm.
+    """
+
+    individual: str
+    joints: tuple[str, ...]
+    bones: tuple[tuple[int, int], ...]
+    frame_index: NDArray[np.int64]
+    time_s: Array
+    xyz_mm: Array
+    uv_px: Array
+    score: Array
+    sd_mm: Array
+
+    @staticmethod
+    def of(about: Mapping[str, Any], table: pd.DataFrame) -> Poses:
+        """The poses of a session, see `Session.pose_arrays`.
+
+        Args:
+            about: content of session.json.
+            table: table `poses` with the columns `COLUMNS` at least.
+        """
+        joints = tuple(about["animal"]["joints"])
+        n = len(joints)
+        shape = (-1, len(joints))
+
+        def array(*names: str) -> Array:
+            columns = [table[name].to_numpy(float).reshape(shape) for name in names]
+            return np.stack(columns, axis=-1) if len(names) > 1 else columns[0]
+
+        return Poses(
+            about["individual"],
+            joints,
+            tuple((int(a), int(b)) for a, b in about["animal"]["bones"]),
+            table["frame_index"].to_numpy()[::n],
+            table["time_s"].to_numpy(float)[::n],
+            array("x_mm", "y_mm", "z_mm"),
+            array("u_px", "v_px"),
+            array("score"),
+            array("sd_mm"),
+        )
+
+
+def dataset_of(
+    poses: Poses, bouts: pd.DataFrame, about: Mapping[str, Any], source: str
+) -> xarray.Dataset:
+    """A session as the poses data set of the Python package movement, see `Session.to_xarray`.
+
+    The dimensions are time (s since the first frame), space (x, y, z; mm, arena frame), keypoints
+    and individuals; the variables position, confidence, sd_mm and action.
+
+    Args:
+        poses: its poses.
+        bouts: its table `bouts`.
+        about: content of session.json.
+        source: name of its folder.
+
+    Raises:
+        MissingPackageError: xarray is not installed.
+    """
+    try:
+        import xarray
+    except ModuleNotFoundError:
+        raise MissingPackageError(
+            f"a labelled data set needs xarray; {how_to_install('exchange')}"
+        ) from None
+
+    dims = ("time", "space", "keypoints", "individuals")
+    rate = about["frames"]["fps_median"]
+    attrs: dict[str, Any] = {
+        "source_software": "liex_lab",
+        "ds_type": "poses",
+        "time_unit": "seconds",
+        "source_file": source,
+        "space_unit": "mm",
+        "axes": "arena: z up from the floor",
+        **({"fps": float(rate)} if rate else {}),
+    }
+    return xarray.Dataset(
+        data_vars={
+            "position": (dims, np.moveaxis(poses.xyz_mm, 1, 2)[..., None]),
+            "confidence": (("time", "keypoints", "individuals"), poses.score[..., None]),
+            "sd_mm": (("time", "keypoints", "individuals"), poses.sd_mm[..., None]),
+            "action": (("time", "individuals"), _actions(poses, bouts)[:, None]),
+        },
+        coords={
+            "time": poses.time_s,
+            "space": ["x", "y", "z"],
+            "keypoints": list(poses.joints),
+            "individuals": [poses.individual],
+        },
+        attrs=attrs,
+    )
+
+
+def _actions(poses: Poses, bouts: pd.DataFrame) -> np.ndarray[Any, Any]:
+    """(n,) the action of every frame, empty where it has none."""
+    out = np.full(len(poses.frame_index), "", dtype=object)
+    starts = np.searchsorted(poses.frame_index, bouts["start_frame"].to_numpy())
+    stops = np.searchsorted(poses.frame_index, bouts["stop_frame"].to_numpy())
+    for start, stop, action in zip(starts, stops, bouts["action"], strict=True):
+        out[start:stop] = action
+    return out.astype(str)
