@@ -194,6 +194,7 @@ class SceneLook:
         size.
         """
         from liex_lab.body.skeleton import Skeleton
+        from liex_lab.foreground.background import sampled
         from liex_lab.foreground.background_segmenter import BackgroundSubtraction
         from liex_lab.recordings.recording import Recording
 
@@ -203,7 +204,7 @@ class SceneLook:
             name=self.seen.name,
             format="sample",
             camera=self.seen.camera.every(self.stride),
-            times_ns=np.arange(len(self.sample)),
+            times_ns=self.seen.times_ns[sampled(len(self.seen), len(self.sample))],
             read=lambda k: self.sample[k],
         )
         view = Skeleton.load(animal.skeleton).view
@@ -226,6 +227,7 @@ class SceneLook:
                 continue
             if factor == 1.0:
                 self.facts["scene"] = scene.described().to_dict()
+                self.problems.extend(scene.doubts)
             elif scene.standing is not None and not scene.standing.moves:
                 continue  # a thing of another size that keeps still is a thing
             crops = scene.extract(sample, 1.0)
