@@ -97,7 +97,7 @@ def _results(
     finished: Finished,
     shared: int,
 ) -> Iterator[dict[str, Any]]:
-    from distributed import as_completed
+    from distributed import CancelledError, as_completed
 
     run_id = f"{os.getpid()}-{time.monotonic_ns()}"
     submitted = [
@@ -119,13 +119,14 @@ def _results(
     del submitted
     for future in completed:
         session = sessions[future.key]
-        if future.cancelled() or future.status == "lost":  # nobody here takes one back
+        try:  # a result that a dying worker took with it is waited for until it is made again
+            error = future.exception()
+            result = _died(session, error) if error is not None else future.result()
+        except CancelledError:  # by the client, as nobody here takes a session back
             raise StudyError(
                 "the Dask scheduler ended before the study did; the sessions that were measured "
                 "are kept, and the same command goes on with the rest once a scheduler answers"
-            )
-        error = future.exception()
-        result = _died(session, error) if error is not None else future.result()
+            ) from None
         future.release()  # what a worker holds would be made again if it died
         finished(result)
         yield result

@@ -111,7 +111,7 @@ POOL = """
 import os, time, sys
 from liex_lab.pipelines.workers import Processes
 def do(k):
-    print(os.getpid(), flush=True)
+    os.write(1, b"%d\\n" % os.getpid())  # in one piece: two workers write at once
     time.sleep(60)
 if __name__ == "__main__":
     {main}
