@@ -216,12 +216,17 @@ def follow_live(
         latency_median_ms and latency_p95_ms (None where there is none), n_measured, n_bridged.
 
     Raises:
-        LiexError: the source is over before it has a frame, or cannot be read.
+        LiexError: the source is over before it has a frame, or cannot be read, or there is no
+            screen for a viewer.
     """
+    from liex_lab.dashboards.replay.rerun_blueprint import live_blueprint
     from liex_lab.pipelines.live import follow_live as job
     from liex_lab.pipelines.live import open_live
     from liex_lab.sessions.live import LiveView
+    from liex_lab.sessions.viewer import need_screen
 
+    if to == "viewer":  # before minutes are waited for
+        need_screen("write a file with --to NAME.rrd, which any viewer opens")
     arriving = open_live(source, plan, replay=replay, patience_s=patience_s)
     numbers, _ = job(
         arriving,
@@ -233,6 +238,7 @@ def follow_live(
             tracker.subject.T_arena_camera,
             tracker.subject.skeleton,
             to,
+            live_blueprint(tracker.subject.length_mm / 1000.0),
         ),
     )
     return numbers

@@ -38,6 +38,50 @@ def write_blueprint(session: Session) -> Path:
     return path
 
 
+def live_blueprint(body_m: float) -> Any:
+    """The layout of a stream of skeletons: the scene, the picture, and the predicted error below.
+
+    Args:
+        body_m: length of the animal's body, m.
+    """
+    import rerun.blueprint as rrb
+
+    from liex_lab.sessions.live import ERROR
+    from liex_lab.sessions.rrd import SKELETON
+
+    picture = rrb.Spatial2DView(
+        origin="arena/camera/image",
+        contents=["$origin/**", f"+ /{SKELETON}/**"],
+        name="depth with the skeleton",
+    )
+    scene = rrb.Spatial3DView(
+        origin="arena",
+        name="3D: the animal, followed (metres)",
+        eye_controls=_followed(body_m, SKELETON),
+        line_grid=rrb.LineGrid3D(visible=False),
+    )
+    error = rrb.TimeSeriesView(origin=ERROR, name="predicted error (mm)")
+    return rrb.Blueprint(
+        rrb.Vertical(rrb.Horizontal(scene, picture), error, row_shares=[4, 1]),
+        rrb.TimePanel(timeline="time", state="collapsed"),
+        rrb.SelectionPanel(state="collapsed"),
+        rrb.BlueprintPanel(state="collapsed"),
+    )
+
+
+def _followed(body_m: float, skeleton: str) -> Any:
+    """The eye that goes with an animal of that length: its skeleton's entity."""
+    import rerun.blueprint as rrb
+
+    return rrb.EyeControls3D(
+        kind=rrb.Eye3DKind.Orbital,
+        position=body_m * np.array([0.8, -2.6, 2.2]),
+        look_target=[0.0, 0.0, 0.0],
+        eye_up=[0.0, 0.0, 1.0],
+        tracking_entity=f"/{skeleton}/joints",
+    )
+
+
 def replay_blueprint(session: dict[str, Any]) -> Any:
     """A Rerun blueprint; handed to `SessionWriter` as `blueprint`.
 
@@ -71,13 +115,7 @@ def replay_blueprint(session: dict[str, Any]) -> Any:
             *(f"- /arena/{name}/**" for name in measured),
         ],
         name="3D: the animal, followed (metres)",
-        eye_controls=rrb.EyeControls3D(
-            kind=rrb.Eye3DKind.Orbital,
-            position=body_m * np.array([0.8, -2.6, 2.2]),
-            look_target=[0.0, 0.0, 0.0],
-            eye_up=[0.0, 0.0, 1.0],
-            tracking_entity=f"/{at(SKELETON)}/joints",
-        ),
+        eye_controls=_followed(body_m, at(SKELETON)),
         line_grid=rrb.LineGrid3D(visible=False),
     )
     in_picture: Any = {

@@ -385,6 +385,13 @@ def live(
             source, chosen, replay=replay, to=to, patience_s=patience_s, progress=progress
         )
     tell_numbers(result, json_file)
+    if not result["n_live"]:
+        say(
+            "no latency: frames that came while background, floor and size were learned were still "
+            "being made up for when the recording was over"
+        )
+    if to.endswith(".rrd"):
+        say(f"replay: {to}; Rerun's viewer opens it: rerun {to}")
 
 
 app.command(rich_help_panel=START)(show)

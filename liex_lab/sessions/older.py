@@ -27,7 +27,7 @@ def part_folder(path: Path) -> Path:
     Args:
         path: the session folder to be.
     """
-    return path.with_name(f"{path.name}.part")
+    return _named(path).with_name(f"{_named(path).name}.part")
 
 
 def aside_folder(path: Path) -> Path:
@@ -36,7 +36,12 @@ def aside_folder(path: Path) -> Path:
     Args:
         path: the session folder.
     """
-    return path.with_name(f"{path.name}.old")
+    return _named(path).with_name(f"{_named(path).name}.old")
+
+
+def _named(path: Path) -> Path:
+    """The folder by a name of its own, which "." and ".." are not."""
+    return path if path.name not in ("", "..") else path.resolve()
 
 
 def put_back_session(path: Path) -> bool:

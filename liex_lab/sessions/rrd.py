@@ -65,8 +65,8 @@ _WALL = 0x9AA0A6
 _WORST = 12
 _HOLDS_95 = 2.795  # standard deviations of a Gaussian in space
 _SPREAD = [255, 170, 60, 140]
-_BONE = [255, 255, 255, 255]
-_JOINT = [255, 80, 60, 255]
+BONE_COLOUR = [255, 255, 255, 255]
+JOINT_COLOUR = [255, 80, 60, 255]
 
 
 class ReplayWriter:
@@ -334,7 +334,7 @@ class ReplayWriter:
         skeleton = rows.track.skeleton
         names = [rr.AnnotationInfo(id=j, label=name) for j, name in enumerate(skeleton.names)]
         bones = rr.ClassDescription(
-            info=rr.AnnotationInfo(id=1, label=skeleton.name, color=_BONE),
+            info=rr.AnnotationInfo(id=1, label=skeleton.name, color=BONE_COLOUR),
             keypoint_annotations=names,
         )
         radii = {
@@ -349,11 +349,11 @@ class ReplayWriter:
             self._stream.log(entity, rr.AnnotationContext([bones]), static=True)
             self._stream.log(
                 f"{entity}/joints",
-                dot.from_fields(radii=thick, colors=_JOINT, show_labels=False),
+                dot.from_fields(radii=thick, colors=JOINT_COLOUR, show_labels=False),
                 static=True,
             )
             self._stream.log(
-                f"{entity}/bones", line.from_fields(radii=thin, colors=_BONE), static=True
+                f"{entity}/bones", line.from_fields(radii=thin, colors=BONE_COLOUR), static=True
             )
         look = rr.Ellipsoids3D.from_fields(
             colors=_SPREAD, fill_mode="majorwireframe", line_radii=0.0003

@@ -47,6 +47,19 @@ def has_screen() -> bool:
     )
 
 
+def need_screen(instead: str) -> None:
+    """Go on only where a window can be shown.
+
+    Args:
+        instead: what to do where it cannot.
+
+    Raises:
+        LiexError: there is no screen.
+    """
+    if not has_screen():
+        raise LiexError(f"Rerun needs a screen and there is none here; {instead}")
+
+
 def replays_with(replay: Path, more: Sequence[Path] = ()) -> list[Path]:
     """Files to open for a session's replay, in order.
 
@@ -84,15 +97,11 @@ def show_replay(
     """
     if not replay.is_file():
         raise LiexError(f"there is no replay {replay}; run `liex run` on the recording again")
-    if not headless and not has_screen():
-        raise LiexError(
-            f"Rerun needs a screen and there is none here; open {replay} on a computer that has one"
-        )
+    if not headless:
+        need_screen(f"open {replay} on a computer that has one")
     from rerun.experimental import ViewerClient
 
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = int(probe.getsockname()[1])
+    port = _free_port()
     process = _begin(
         "--port", str(port), "--hide-welcome-screen", *(["--headless"] if headless else [])
     )
@@ -114,7 +123,37 @@ def show_replay(
     )
 
 
-def _begin(*arguments: str) -> subprocess.Popen[bytes]:
+def begin_viewer() -> str:
+    """Open a viewer that shows what is sent to it, and stays when this process ends.
+
+    Returns:
+        Its address. It listens on 127.0.0.1 alone.
+
+    Raises:
+        LiexError: there is no screen, or the viewer does not come up within 30 s.
+    """
+    need_screen("have it written to a file, or name the address of a viewer elsewhere")
+    port = _free_port()
+    process = _begin("--port", str(port), "--hide-welcome-screen", stays=True)
+    ends = time.monotonic() + _PATIENCE_S
+    while time.monotonic() < ends and process.poll() is None:
+        try:
+            socket.create_connection(("127.0.0.1", port), timeout=1.0).close()
+        except OSError:  # not up yet
+            time.sleep(0.1)
+        else:
+            return f"rerun+http://127.0.0.1:{port}/proxy"
+    _end(process)
+    raise LiexError("Rerun's viewer did not open; have it written to a file NAME.rrd instead")
+
+
+def _free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def _begin(*arguments: str, stays: bool = False) -> subprocess.Popen[bytes]:
     # RERUN_ANALYTICS: what a laboratory looks at is nobody else's business
     command = [sys.executable, "-m", "rerun", *arguments, "--bind", "127.0.0.1"]
     viewer = subprocess.Popen(
@@ -125,7 +164,8 @@ def _begin(*arguments: str) -> subprocess.Popen[bytes]:
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
     )
-    atexit.register(_end, viewer)
+    if not stays:
+        atexit.register(_end, viewer)
     return viewer
 
 

@@ -5,7 +5,7 @@ which hand it is.
 from __future__ import annotations
 
 import gc
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -40,7 +40,7 @@ class Pretended:
     """Stands in for a tracker: the fit is all that is looked at."""
 
     sample_fit: SampleFit
-    scene: Any = field(default_factory=lambda: SimpleNamespace(doubts=()))
+    scene: Any
     doubtful_mm: float = 5.0
 
 
@@ -54,7 +54,8 @@ def looks(monkeypatch: pytest.MonkeyPatch, **fits: SampleFit | str | None) -> No
             raise EstimationError(found or "no animal was found; check the plan")
         hand = plan.animal.name == "hand"
         floor: Any = SimpleNamespace()
-        return Pretended(found, *([HandSegmenter(KINECT_V2, floor, floor)] if hand else []))
+        no_doubts = SimpleNamespace(doubts=())
+        return Pretended(found, HandSegmenter(KINECT_V2, floor, floor) if hand else no_doubts)
 
     monkeypatch.setattr(choice, "build_tracker", build_tracker)
 

@@ -199,3 +199,13 @@ def test_corrections_that_were_taken_over_and_removed_by_hand_do_not_come_back(
     check_whole(place)
     shutil.rmtree(place / "corrected")
     assert not again(place).log.entries
+
+
+def test_a_session_is_opened_from_within_its_own_folder(
+    place: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (place / "deeper").mkdir()
+    for within, path in ((place, "."), (place / "deeper", "..")):
+        monkeypatch.chdir(within)
+        assert not put_back_session(Path(path))
+        assert len(Session.open(path).frames) == 12
