@@ -24,7 +24,7 @@ true_mm = session.T_arena_camera @ truth.joints_camera
 n_joints = len(truth.skeleton.names)
 poses = session.poses
 measured = poses[["x_mm", "y_mm", "z_mm"]].to_numpy().reshape(-1, n_joints, 3)
-sd = poses.sd_mm.to_numpy().reshape(-1, n_joints)
+sd = poses.sd_z_mm.to_numpy().reshape(-1, n_joints)
 
 # %%
 # The nose's height, with the band that should hold it nine times in ten (1.64 standard deviations

@@ -54,7 +54,7 @@ class Followed:
     Attributes:
         joints: (n, J, 3) estimated joints, mm; NaN where there is no pose.
         truth: (n, J, 3) true joints, mm, in the same frame.
-        sd_mm: (n, J) estimated standard deviation of each joint along one axis, mm.
+        sd_mm: (n, J, 3) estimated standard deviation of each joint along x, y and z, mm.
         frames_per_s: speed of the tracker, reading excluded.
         tip: the joint that the base's heading points at.
     """
@@ -83,8 +83,8 @@ class Followed:
     @property
     def covered(self) -> NDArray[np.bool_]:
         """(m,) bool, whether each known joint coordinate lies within its 90 % interval."""
-        inside = np.abs(self.joints - self.truth) <= _Z90 * self.sd_mm[..., None]
-        return inside[np.isfinite(self.joints) & np.isfinite(self.sd_mm)[..., None]]
+        inside = np.abs(self.joints - self.truth) <= _Z90 * self.sd_mm
+        return inside[np.isfinite(self.joints) & np.isfinite(self.sd_mm)]
 
     def in_view(self, events: Sequence[Event], length_mm: float) -> Array:
         """Errors of the frames in which at least half of the animal is seen.

@@ -16,18 +16,6 @@ if TYPE_CHECKING:
     import xarray
 
 Array = NDArray[np.float64]
-COLUMNS = [
-    "frame_index",
-    "time_s",
-    "joint",
-    "x_mm",
-    "y_mm",
-    "z_mm",
-    "u_px",
-    "v_px",
-    "score",
-    "sd_mm",
-]
 
 
 @dataclass(frozen=True)
@@ -44,7 +32,7 @@ class Poses:
         uv_px: (n, J, 2) px of the depth picture; (0, 0) is the centre of the top-left pixel.
         score: (n, J) probability that the joint lies within 10 % of the spine's length of the
             truth.
-        sd_mm: (n, J) standard deviation of the joint along one axis, mm.
+        sd_mm: (n, J, 3) standard deviation of x, y and z, mm; see the columns sd_mm and sd_z_mm.
     """
 
     individual: str
@@ -63,7 +51,7 @@ class Poses:
 
         Args:
             about: content of session.json.
-            table: table `poses` with the columns `COLUMNS` at least.
+            table: table `poses`.
         """
         joints = tuple(about["animal"]["joints"])
         n = len(joints)
@@ -73,6 +61,7 @@ class Poses:
             columns = [table[name].to_numpy(float).reshape(shape) for name in names]
             return np.stack(columns, axis=-1) if len(names) > 1 else columns[0]
 
+        sd = array("sd_mm")
         return Poses(
             about["individual"],
             joints,
@@ -82,8 +71,17 @@ class Poses:
             array("x_mm", "y_mm", "z_mm"),
             array("u_px", "v_px"),
             array("score"),
-            array("sd_mm"),
+            np.stack([sd, sd, heights_sd(table).reshape(shape)], axis=-1),
         )
+
+
+def heights_sd(poses: pd.DataFrame) -> Array:
+    """Standard deviation (m,) of the heights of the table `poses`, mm; of an older one `sd_mm`.
+
+    Args:
+        poses: all columns, m rows.
+    """
+    return poses["sd_z_mm" if "sd_z_mm" in poses else "sd_mm"].to_numpy(float)
 
 
 def dataset_of(
@@ -125,7 +123,7 @@ def dataset_of(
         data_vars={
             "position": (dims, np.moveaxis(poses.xyz_mm, 1, 2)[..., None]),
             "confidence": (("time", "keypoints", "individuals"), poses.score[..., None]),
-            "sd_mm": (("time", "keypoints", "individuals"), poses.sd_mm[..., None]),
+            "sd_mm": (dims, np.moveaxis(poses.sd_mm, 1, 2)[..., None]),
             "action": (("time", "individuals"), _actions(poses, bouts)[:, None]),
         },
         coords={

@@ -373,7 +373,7 @@ class ReplayWriter:
                 rr.LineStrips3D,
             )
             send_body(self._stream, track, part, when, carriers)
-            self._send_spheres(when, track.joints_mm[part][seen], track.sd_mm[part][seen], seen)
+            self._send_spread(when, track.joints_mm[part][seen], track.sd_xyz_mm[part][seen], seen)
             # the 2D view counts from the corner of the picture, we from a pixel's centre
             self._send_points(
                 OVERLAY, when, track.uv_px[part][seen] + 0.5, seen, rr.Points2D, rr.LineStrips2D
@@ -407,15 +407,15 @@ class ReplayWriter:
         self._stream.send_columns(f"{entity}/joints", when, [*dots.partition(n_dots)])
         self._stream.send_columns(f"{entity}/bones", when, [*strips.partition(n_bones)])
 
-    def _send_spheres(
+    def _send_spread(
         self, when: list[rr.TimeColumn], joints_mm: Array, sd_mm: Array, seen: NDArray[np.bool_]
     ) -> None:
-        """Sphere around each joint that holds it with 95 %; joints_mm (k, J, 3), sd_mm (k, J).
+        """Ellipsoid around each joint that holds it with 95 %; joints_mm, sd_mm (k, J, 3).
 
-        The radius is 2.795 standard deviations of an isotropic Gaussian in space (a chi
-        distribution with 3 degrees of freedom). `seen` marks the k frames out of those of `when`.
+        The half axes are 2.795 standard deviations of a Gaussian in space (a chi distribution with
+        3 degrees of freedom). `seen` marks the k frames out of those of `when`.
         """
-        size = np.repeat(_HOLDS_95 * np.nan_to_num(sd_mm).reshape(-1, 1), 3, axis=1) / MM_PER_UNIT
+        size = _HOLDS_95 * np.nan_to_num(sd_mm).reshape(-1, 3) / MM_PER_UNIT
         spheres = rr.Ellipsoids3D.columns(
             half_sizes=size, centers=joints_mm.reshape(-1, 3) / MM_PER_UNIT
         )

@@ -31,7 +31,7 @@ from liex_lab.sessions.corrections import (
 )
 from liex_lab.sessions.document import read_document
 from liex_lab.sessions.older import put_back_session
-from liex_lab.sessions.pose_arrays import COLUMNS, Poses, dataset_of
+from liex_lab.sessions.pose_arrays import Poses, dataset_of
 from liex_lab.sessions.reading import reading_from
 from liex_lab.tables.checks import check_footer, check_rows
 
@@ -359,7 +359,7 @@ class Session:
 
     def pose_arrays(self) -> Poses:
         """The poses as arrays by frame and joint, NaN where there is no pose."""
-        return Poses.of(self.metadata, self.table("poses", COLUMNS))
+        return Poses.of(self.metadata, self.table("poses"))
 
 
 def _narrow(path: Path, columns: list[str]) -> pd.DataFrame:

@@ -143,8 +143,11 @@ class Rows:
             ),
             **{f"{axis}_mm": track.joints_mm[:, :, k].ravel() for k, axis in enumerate("xyz")},
             **{f"{axis}_px": track.uv_px[:, :, k].ravel() for k, axis in enumerate("uv")},
-            "score": nearness(track.sd_mm, _NEAR * track.spine_mm[:, None]).ravel(),
+            "score": nearness(
+                np.sqrt((track.sd_xyz_mm**2).mean(axis=-1)), _NEAR * track.spine_mm[:, None]
+            ).ravel(),
             "sd_mm": track.sd_mm.ravel(),
+            "sd_z_mm": track.sd_z_mm.ravel(),
         }
 
     def _rotation_rows(self, part: slice) -> Block:

@@ -334,6 +334,7 @@ def _mask(track: Track, rows: NDArray[np.bool_]) -> None:
         track.angles_rad,
         track.scale,
         track.sd_mm,
+        track.sd_z_mm,
         track.cov_root,
         track.sd_angles_rad,
         track.p_flip,
@@ -357,6 +358,7 @@ def _write(subject: Subject, track: Track, curve: Curve, tuning: TrackingParamet
         (curve.error_mm / ERROR_PER_SD)[:, None] * np.array(subject.joint_share), away
     )
     # sd_mm is what speeds and headings are made of; a height that is off throughout changes none
+    track.sd_z_mm[:] = np.hypot(track.sd_mm, height)
     constant = np.hypot(ERROR_PER_SD * away.mean(axis=1), MEAN_PER_SD * height)
     track.predicted_error_mm[:] = np.hypot(curve.error_mm, constant)
     calibration = np.array(motion.root_calibration)

@@ -48,7 +48,9 @@ class Track:
         times_ns: (n,) int64.
         joints_mm: (n, J, 3) arena frame.
         uv_px: (n, J, 2) pixels of the depth image.
-        sd_mm: (n, J) standard deviation of each joint along one axis, mm.
+        sd_mm: (n, J) standard deviation of each joint along one axis, mm; speeds are made of it.
+        sd_z_mm: (n, J) that of its height: `sd_mm`, and by how much all heights of a recording may
+            be wrong, as a camera sees the back only.
         root_rotation: (n, 3, 3) rotation of T_arena_root.
         root_mm: (n, 3) translation of T_arena_root.
         cov_root: (n, 6, 6) covariance of the root's turn, rad, and shift, mm, about and along its
@@ -73,6 +75,7 @@ class Track:
     joints_mm: Array
     uv_px: Array
     sd_mm: Array
+    sd_z_mm: Array
     root_rotation: Array
     root_mm: Array
     cov_root: Array
@@ -131,6 +134,7 @@ class Track:
             np.asarray(times_ns, np.int64),
             unknown(j, 3),
             unknown(j, 2),
+            unknown(j),
             unknown(j),
             unknown(3, 3),
             unknown(3),
@@ -192,6 +196,11 @@ class Track:
     def sd_root(self) -> Array:
         """(n, 6) standard deviations of the root's turn, rad, and shift, mm, on its own axes."""
         return np.asarray(np.sqrt(np.diagonal(self.cov_root, axis1=1, axis2=2)))
+
+    @property
+    def sd_xyz_mm(self) -> Array:
+        """(n, J, 3) standard deviation of each joint along x, y and z, mm."""
+        return np.stack([self.sd_mm, self.sd_mm, self.sd_z_mm], axis=-1)
 
     @property
     def spine_mm(self) -> Array:

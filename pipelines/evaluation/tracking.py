@@ -201,7 +201,7 @@ def follow_sequence(
     def put(name: str, track: Track, spent: float) -> None:
         """Keep row `name`: its `track` of n frames in the true arena frame, made in `spent` s."""
         found[name] = Followed(
-            T @ track.joints_mm, recording.joints_arena, track.sd_mm, n / spent, tip
+            T @ track.joints_mm, recording.joints_arena, track.sd_xyz_mm, n / spent, tip
         )
 
     began = time.perf_counter()

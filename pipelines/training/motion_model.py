@@ -105,9 +105,7 @@ class Seen:
                 counts as an error of half the length.
         """
         length = self.subject.length_mm
-        return (
-            Followed(joints, self.truth, joints[..., 0], 1.0).in_view(self.events, length) / length
-        )
+        return Followed(joints, self.truth, joints, 1.0).in_view(self.events, length) / length
 
 
 def train_tracking(

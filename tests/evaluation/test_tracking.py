@@ -17,7 +17,7 @@ def followed(off_mm: np.ndarray, sd_mm: float = 1.0) -> Followed:
     """Every joint is off by so much along y."""
     joints = TRUTH.copy()
     joints[..., 1] += off_mm[:, None]
-    return Followed(joints, TRUTH, np.full((N, J), sd_mm), 100.0)
+    return Followed(joints, TRUTH, np.full((N, J, 3), sd_mm), 100.0)
 
 
 def test_errors_ratios_and_losses_are_counted_over_the_right_frames():

@@ -85,6 +85,7 @@ class WalkingMouse:
             joints_mm=joints,
             uv_px=uv,
             sd_mm=np.full(joints.shape[:2], self.sd_mm),
+            sd_z_mm=np.full(joints.shape[:2], 1.25 * self.sd_mm),
             root_rotation=rotation,
             root_mm=pose.root.translation,
             cov_root=np.tile(np.outer(SD_ROOT, SD_ROOT) * (0.8 * np.eye(6) + 0.2), (n, 1, 1)),

@@ -142,7 +142,7 @@ def _followed(
     return Followed(
         recording.T_arena_camera @ joints,
         recording.joints_arena,
-        error[:, None] * share / np.sqrt(3.0),
+        np.repeat((error[:, None] * share / np.sqrt(3.0))[..., None], 3, axis=-1),
         len(recording) / spent,
         skeleton.tip,
     )

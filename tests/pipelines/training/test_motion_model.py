@@ -130,10 +130,10 @@ def test_heights_that_are_off_throughout_a_recording_are_covered(measured):
     ]
     height = calibrate_height(builds, tuning).motion.unseen_height
     inside = []
+    higher = with_motion(tuning, unseen_height=height)
     for each in builds:
-        track = track_whole(each.subject, each.seen, (), tuning).track
-        sd = np.hypot(track.sd_mm, height * each.subject.length_mm)
-        inside.append(np.abs(track.joints_mm - each.truth)[..., 2] <= 1.645 * sd)
+        track = track_whole(each.subject, each.seen, (), higher).track
+        inside.append(np.abs(track.joints_mm - each.truth)[..., 2] <= 1.645 * track.sd_z_mm)
     assert 0.85 < np.mean(inside) < 0.95
     assert calibrate_height([], tuning).motion.unseen_height == 0.0
 
@@ -153,6 +153,8 @@ def test_a_height_nobody_sees_is_in_the_error_and_upright_in_the_roots_covarianc
         after.predicted_error_mm[there], np.hypot(before.predicted_error_mm[there], 0.8 * sd_mm)
     )
     np.testing.assert_array_equal(after.sd_mm[there], before.sd_mm[there])
+    np.testing.assert_array_equal(before.sd_z_mm[there], before.sd_mm[there])
+    np.testing.assert_allclose(after.sd_z_mm[there], np.hypot(before.sd_mm[there], sd_mm))
 
 
 @pytest.mark.slow
