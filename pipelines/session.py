@@ -288,13 +288,14 @@ def make_track(writer: SessionWriter, fitted: Fitted) -> Verdict:
     whole = writer.seen(Observations)
     tracked = tracker.track(whole, allocate=writer.allocate)
     fit = tracker.sample_fit
+    files = fitted.recording.files
     verdict = Verdict.of(
         tracked.track,
         whole,
         misfits=fitted.misfits,
-        doubts=(*tracker.scene.doubts, *fitted.recording.clock_doubts),
+        doubts=(*tracker.scene.doubts, *fitted.recording.clock_doubts, *files.rewritten()),
         n_animals=1 if fit is None else fit.n_animals,
-        cautions=(*fitted.notes, *tracker.scene.remarks),
+        cautions=(*fitted.notes, *tracker.scene.remarks, *files.grown()),
         accepted=fitted.plan.estimation.accept_misfit,
     )
     writer.take(tracked, whole, tracker.subject)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import weakref
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from liex_lab.errors import RecordingError
 from liex_lab.optics.camera import Camera
 from liex_lab.recordings.frame import Depth, DepthFrame
+from liex_lab.recordings.source_files import SourceFiles
 from liex_lab.recordings.timestamps import (
     FAULTS,
     JUMPED,
@@ -34,8 +35,6 @@ from liex_lab.runtime.progress import Progress, silent
 
 Times = NDArray[np.int64]
 
-_BLOCK = 1 << 20
-
 
 class Recording:
     """Depth frames in order of time, from one camera, read one at a time.
@@ -47,6 +46,7 @@ class Recording:
         name: name of the recording, usually that of its file or folder without the suffix.
         format: name of the format, such as "images", "moseq", "mcap", "oni" or "rosbag".
         camera: the camera of the depth pictures.
+        files: the files that it is read from; none where it is in no file. Its slices share them.
         times_ns: (n,) int64 time stamps on the recording's own clock, ns, strictly increasing;
             read-only.
         problems: sentences about what is odd in the file, also those found while reading.
@@ -67,7 +67,7 @@ class Recording:
         camera: Camera,
         times_ns: Times,
         read: Callable[[int], Depth],
-        sources: Sequence[Path] = (),
+        sources: Sequence[Path] | SourceFiles = (),
         problems: list[str] | None = None,
         truncated: bool = False,
         whole: NDArray[np.bool_] | None = None,
@@ -86,7 +86,7 @@ class Recording:
             camera: the camera of the depth pictures.
             times_ns: (n,) int64 stamps, ns, strictly increasing.
             read: turns a stored frame's number into depth (H, W) float32 mm, 0 where unread.
-            sources: the files of the input, for `digest`; empty for a recording that is in no file.
+            sources: the files of the input; empty for a recording that is in no file.
             problems: sentences about what is odd; the list is shared, so reading may append to it.
             truncated: whether the file is cut or damaged.
             whole: (n,) bool, which frames are whole; None for all.
@@ -114,12 +114,11 @@ class Recording:
         self.optics: dict[str, Any] = {}
         self.region_px: tuple[tuple[float, float], ...] = ()
         self._read = read
-        self._sources = tuple(sources)
+        self.files = sources if isinstance(sources, SourceFiles) else SourceFiles(sources)
         self._stored = np.arange(len(self.times_ns)) if stored is None else stored
         self._whole_frames = np.ones(len(self.times_ns), np.bool_) if whole is None else whole
         self._faults = np.zeros(len(self.times_ns), np.uint8) if faults is None else faults
         self._step_ns = median_step(self.times_ns) if step_ns is None else step_ns
-        self._digest: str | None = None
         self._whole: Recording | None = None
         self._grow = grow
         self._closed = False
@@ -137,7 +136,7 @@ class Recording:
     @property
     def sources(self) -> tuple[Path, ...]:
         """The files of the input; none of a recording that is in no file."""
-        return self._sources
+        return self.files.paths
 
     @property
     def stamp_faults(self) -> NDArray[np.uint8]:
@@ -281,7 +280,7 @@ class Recording:
             camera=self.camera,
             times_ns=self.times_ns[rows].copy(),
             read=self._read,
-            sources=self._sources,
+            sources=self.files,
             problems=self.problems,
             truncated=self.truncated,
             whole=self._whole_frames[rows],
@@ -388,7 +387,7 @@ class Recording:
             camera=camera,
             times_ns=self.times_ns.copy(),
             read=read,
-            sources=self._sources,
+            sources=self.files,
             problems=self.problems,
             truncated=self.truncated,
             whole=self._whole_frames,
@@ -421,7 +420,7 @@ class Recording:
         return more
 
     def digest(self, progress: Progress = silent) -> str:
-        """SHA-256 of the input, in hexadecimal.
+        """SHA-256 of the input, in hexadecimal; computed once and kept.
 
         Of one file its bytes; of several, their names, sizes and bytes in order of name. A
         recording that is in no file is hashed by its times and depths. A slice has the digest of
@@ -429,35 +428,10 @@ class Recording:
 
         Args:
             progress: told how many MB were read.
-
-        Returns:
-            64 hexadecimal digits; computed once and kept.
         """
-        if self._whole is not None:
-            return self._whole.digest(progress)
-        if self._digest is None:
-            self._digest = (
-                file_digest(self._sources, progress) if self._sources else self._content_digest()
-            )
-        return self._digest
-
-    @property
-    def stamp(self) -> list[list[str | int]]:
-        """Name, size (bytes) and modification time (ns) of each input file, in order.
-
-        It shows cheaply whether the input changed; empty without files.
-        """
-        whole = self._whole or self
-        found = [(path.name, path.stat()) for path in whole._sources]
-        return sorted([name, stat.st_size, stat.st_mtime_ns] for name, stat in found)
-
-    def take_digest(self, digest: str) -> None:
-        """Accept a digest that was computed before, for the input's files have not changed since.
-
-        Args:
-            digest: the SHA-256 of the input, in hexadecimal.
-        """
-        (self._whole or self)._digest = digest
+        if not self.files.paths and not self.files.has_digest:
+            self.files.take_digest((self._whole or self)._content_digest())
+        return self.files.digest(progress)
 
     def _content_digest(self) -> str:
         whole = hashlib.sha256(self.times_ns.astype("<i8").tobytes())
@@ -484,31 +458,3 @@ class Recording:
         at: TracebackType | None,
     ) -> None:
         self.close()
-
-
-def file_digest(files: Iterable[Path], progress: Progress = silent) -> str:
-    """SHA-256 of one file, or of several files together.
-
-    Of one file its bytes; of several, for each in order of name its name, its size and its bytes.
-
-    Args:
-        files: the paths of the files, in any order.
-        progress: told how many MB were read.
-
-    Returns:
-        64 hexadecimal digits.
-    """
-    ordered = sorted(files, key=lambda path: path.name)
-    sizes = [path.stat().st_size for path in ordered]
-    whole = hashlib.sha256()
-    done = 0
-    total = sum(sizes) // _BLOCK + 1
-    for path, size in zip(ordered, sizes, strict=True):
-        if len(ordered) > 1:
-            whole.update(f"{path.name}\0{size}\0".encode())
-        with path.open("rb") as file:
-            while block := file.read(_BLOCK):
-                whole.update(block)
-                done += len(block)
-                progress(done // _BLOCK, total, "reading the recording's hash (MB)")
-    return whole.hexdigest()

@@ -415,11 +415,11 @@ def hash_once(recording: Recording, folder: Path, progress: Progress) -> None:
         folder: the folder of the unfinished session.
         progress: told how many MB were read.
     """
-    stamp = recording.stamp
+    stamp = recording.files.stamp
     try:
         found = json.loads((folder / _INPUT).read_text(encoding="utf-8"))
         if stamp and found["stamp"] == stamp:
-            recording.take_digest(str(found["sha256"]))
+            recording.files.take_digest(str(found["sha256"]))
     except (OSError, ValueError, KeyError, TypeError):
         pass
     began = time.monotonic()

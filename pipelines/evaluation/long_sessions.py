@@ -56,7 +56,7 @@ def looped(short: Recording, n_frames: int) -> Recording:
         times_ns=_times(n_frames),
         read=lambda row: depth[there[row]],
     )
-    long.take_digest("0" * 64)
+    long.files.take_digest("0" * 64)
     return long
 
 

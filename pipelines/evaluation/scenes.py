@@ -154,7 +154,9 @@ def _measure_row(
     for k, seed in enumerate(seeds):
         recording = film(case.scene, seed, n_frames, family="train" if k % 2 else "other")
         # its content follows from these: it need not be rendered a second time to be hashed
-        recording.take_digest(hashlib.sha256(f"{recording.name} {n_frames}".encode()).hexdigest())
+        recording.files.take_digest(
+            hashlib.sha256(f"{recording.name} {n_frames}".encode()).hexdigest()
+        )
         truths = recording.animals
         fits = recording.skeleton.name == plan.animal.skeleton
         outcome = run_product(recording, plan)

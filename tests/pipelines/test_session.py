@@ -4,7 +4,9 @@ near the truth.
 
 from __future__ import annotations
 
+import os
 import shutil
+from itertools import count
 
 import numpy as np
 import pandas as pd
@@ -268,3 +270,19 @@ def test_the_shape_of_the_arena_is_found(session, mouse):
     if arena.kind != "open":
         assert arena.edge == "wall"
         assert session.frames["wall_distance_mm"].dropna().between(-5.0, 1000.0).all()
+
+
+def test_a_picture_that_is_written_to_during_the_run_is_a_reason_to_look_at_it(folder, tmp_path):
+    copy = shutil.copytree(folder, tmp_path / "walk")
+
+    written = count(1)
+
+    def progress(done: int, total: int | None, what: str) -> None:
+        os.utime(next(copy.glob("*.png")), ns=(0, 10**9 * next(written)))
+
+    made = run_session(
+        copy, Plan.load("mouse").with_settings(["replay.depth=none"]), tmp_path, progress=progress
+    )
+    verdict = Session.open(made).metadata["verdict"]
+    assert verdict["look_at_it"]
+    assert any(".png changed while the recording was measured" in r for r in verdict["reasons"])

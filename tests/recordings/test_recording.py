@@ -5,6 +5,7 @@ test_laws.py.
 from __future__ import annotations
 
 import hashlib
+import os
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +17,7 @@ from numpy.typing import NDArray
 from liex_lab.errors import RecordingError
 from liex_lab.recordings import DepthFrame, Recording, open_recording
 from liex_lab.recordings.frame import depth_mm
-from liex_lab.recordings.recording import file_digest
+from liex_lab.recordings.source_files import file_digest
 from tests.recordings.writers import (
     SMALL,
     depth_frames,
@@ -139,6 +140,30 @@ def test_a_boundary_between_files_is_part_of_the_digest(tmp_path: Path) -> None:
     (tmp_path / "a").write_bytes(b"1")
     (tmp_path / "b").write_bytes(b"23")
     assert file_digest([tmp_path / "b", tmp_path / "a"]) != before
+
+
+def test_what_happens_to_a_file_while_it_is_measured_is_known(tmp_path: Path) -> None:
+    path = write_mcap(tmp_path / "r.mcap", STORED)
+    content = path.read_bytes()
+    with open_recording(path) as recording:
+        files = recording[1:3].files
+        assert (files.rewritten(), files.grown()) == ((), ())
+        path.write_bytes(content + b"more")
+        assert files.rewritten() == ()
+        assert "r.mcap grew while the recording was measured" in files.grown()[0]
+        path.write_bytes(content[:-1] + b"x")
+        os.utime(path, ns=(0, 0))
+        assert "r.mcap changed while the recording was measured" in files.rewritten()[0]
+        assert files.grown() == ()
+        path.write_bytes(content[:-9])
+        assert files.rewritten()
+        path.unlink()
+        assert (files.rewritten(), files.grown()) == ((), ()), "what is open goes on being read"
+    folder = write_png_folder(tmp_path / "pictures", STORED)
+    with open_recording(folder) as recording:
+        for picture in sorted(folder.glob("*.png"))[:2]:
+            os.utime(picture, ns=(0, 0))
+        assert "2 files changed" in recording.files.rewritten()[0]
 
 
 def test_a_recording_without_a_file_is_known_by_its_content() -> None:
