@@ -15,6 +15,7 @@ lump on the floor that the moving animal touches in nearly every frame.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -45,6 +46,9 @@ _OTHER = 3.0  # times larger or smaller is another thing
 _LONGEST = 2.0
 _HIGHER = 1.4
 _LARGER = 1.5
+_KINDS = 4  # areas of things that are held against an animal
+_ALIKE = np.log(1.5)
+_IN_PLACE = 0.8  # of the frames must show it where it usually is
 
 
 @dataclass(frozen=True)
@@ -241,10 +245,11 @@ class BackgroundSubtraction(StillScene):
             on_floor, np.maximum(bare - np.float32(min_height_mm), 0), self.limit
         ).astype(np.float32)
         still = replace(self, limit=limit, background=np.where(on_floor, bare, self.background))
-        still_area, still_share = still.usual_area(sample, spine_mm)
+        kinds = _KINDS if share == 0.0 else 1  # what moves is the better evidence
+        rests, still_share = still._most_like_an_animal(sample, spine_mm, min_height_mm, kinds)
+        still_area = rests.area_mm2
         if still_share <= (share if share < 0.5 else 0.0):
             return None
-        rests = replace(still, area_mm2=still_area)
         moves = stands and self.standing is not None and self.standing.moves and area > 0.0
         if (share >= 0.5 or moves) and not rests._is_like_an_animal(
             sample, spine_mm, min_height_mm
@@ -275,6 +280,50 @@ class BackgroundSubtraction(StillScene):
             return area, share
         crops = replace(self, area_mm2=standing.thing_mm2).extract(sample, 1.0)
         return standing.thing_mm2, float(crops.found.mean())
+
+    def _most_like_an_animal(
+        self,
+        sample: NDArray[np.float32],
+        spine_mm: tuple[float, float],
+        min_height_mm: float,
+        kinds: int,
+    ) -> tuple[BackgroundSubtraction, float]:
+        """The scene with the area of what stands on its floor in most frames and is like an animal.
+
+        A wall's foot or a step along the floor's edge is in every frame, too, and longer than any
+        animal; what is tried after it must also keep its place, as specks of an edge do not. Where
+        nothing is like one, the area that most frames show.
+
+        Args:
+            sample: (n, H, W) float32 mm, frames at this scene's stride.
+            spine_mm: lengths of the smallest and the largest animal to expect, mm.
+            min_height_mm: what stands out by less is not the animal.
+            kinds: how many areas are tried.
+
+        Returns:
+            The scene with that area, and the share of the frames that show it.
+        """
+        tried: list[float] = []
+        first: tuple[BackgroundSubtraction, float] | None = None
+        while len(tried) < kinds:
+            area, share = self.usual_area(sample, spine_mm, tried)
+            if share == 0.0:
+                break
+            found = replace(self, area_mm2=area)
+            if found._is_like_an_animal(sample, spine_mm, min_height_mm) and (
+                not tried or found._keeps_its_place(sample)
+            ):
+                return found, share
+            first = first or (found, share)
+            tried.append(area)
+        return first or (self, 0.0)
+
+    def _keeps_its_place(self, sample: NDArray[np.float32]) -> bool:
+        """Whether what is found in a sample (n, H, W) mm lies in one place in most frames."""
+        crops = self.extract(sample, 1.0)
+        place = crops[crops.found].centroid[:, :2]
+        off = np.linalg.norm(place - np.median(place, axis=0), axis=1)
+        return bool((off < 0.5 * np.sqrt(self.area_mm2)).mean() > _IN_PLACE)
 
     def _stays_beside(self, moving: BackgroundSubtraction, sample: NDArray[np.float32]) -> bool:
         """Whether what stands on the bare floor is there beside what moves: another thing.
@@ -363,7 +412,10 @@ class BackgroundSubtraction(StillScene):
         return best, best_area
 
     def usual_area(
-        self, depths: NDArray[np.float32], spine_mm: tuple[float, float]
+        self,
+        depths: NDArray[np.float32],
+        spine_mm: tuple[float, float],
+        without_mm2: Sequence[float] = (),
     ) -> tuple[float, float]:
         """The area that most frames have a component of, and the share of frames that do.
 
@@ -375,6 +427,8 @@ class BackgroundSubtraction(StillScene):
             depths: (n, H, W) float32 mm, frames at this scene's stride.
             spine_mm: lengths of the smallest and the largest animal to expect, mm; they bound the
                 area.
+            without_mm2: areas that are not looked for, nor those that differ from them by less than
+                a half.
 
         Returns:
             The area, mm^2, and the share (0 to 1) of frames with a component within a factor of 4
@@ -388,6 +442,8 @@ class BackgroundSubtraction(StillScene):
         )
         low = self.view.area[0] * spine_mm[0] ** 2
         high = self.view.area[1] * spine_mm[1] ** 2
+        for other in without_mm2:
+            areas[np.abs(np.log(np.maximum(areas, 1e-9) / other)) < _ALIKE] = 0.0
         candidates = np.sort(areas[(areas > low) & (areas < high)])
         if not len(candidates):
             return 0.0, 0.0

@@ -97,3 +97,13 @@ def test_a_house_is_not_taken_for_the_animal_that_comes_late():
     _, there = found(pictures)
     assert there[32:].mean() > 0.9
     assert there[:32].mean() < 0.1
+
+
+def test_the_foot_of_a_wall_is_not_the_animal_that_sleeps_all_the_time():
+    _, busy, empty = filmed()
+    there = busy[5:6] > 0
+    asleep = np.where(there, busy[5:6] + empty - empty.mean(axis=0), 0.0)
+    asleep[:, 165:170, 95:225] -= np.where(asleep[:, 165:170, 95:225] > 0, 14.0, 0.0)
+    scene, seen = found(asleep)
+    assert seen.all()
+    assert 900.0 < scene.area_mm2 < 2000.0
