@@ -49,7 +49,7 @@ Array = NDArray[np.float64]
 Knots = tuple[tuple[float, float], ...]
 
 SEEDS = dict.fromkeys(("easy", "hard"), tuple(range(101, 109)))
-BUILD_SEEDS = tuple(range(201, 213))  # of animals of other builds
+BUILD_SEEDS = tuple(range(201, 230))  # of animals of other builds
 _BUILD_FRAMES = 120
 _EASY_WEIGHT = 2.0  # never worse than single frames where these are good
 _STEP = 0.5  # sd of the logarithm of a number that is changed
