@@ -33,7 +33,7 @@ KINEMATICS: tuple[Column, ...] = columns(
         "position_sd_mm",
         "float64",
         "mm",
-        f"{_SD} the body centre along one axis of the floor; its height: sd_z_mm of the poses",
+        f"{_SD} the body centre along one axis from one frame to another",
         "mean of the joints' sd_mm, whose errors in one frame count as one common error",
     ),
     (

@@ -27,6 +27,7 @@ FIRST = (
     "poses.z_mm",
     "poses.u_px",
     "poses.sd_mm",
+    "poses.sd_xy_mm",
     "poses.sd_z_mm",
     "kinematics.speed_mm_s",
     "kinematics.speed_sd_mm_s",

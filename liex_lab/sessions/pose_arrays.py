@@ -32,7 +32,7 @@ class Poses:
         uv_px: (n, J, 2) px of the depth picture; (0, 0) is the centre of the top-left pixel.
         score: (n, J) probability that the joint lies within 10 % of the spine's length of the
             truth.
-        sd_mm: (n, J, 3) standard deviation of x, y and z, mm; see the columns sd_mm and sd_z_mm.
+        sd_mm: (n, J, 3) standard deviation of x, y and z, mm; see the columns sd_xy_mm and sd_z_mm.
     """
 
     individual: str
@@ -61,7 +61,6 @@ class Poses:
             columns = [table[name].to_numpy(float).reshape(shape) for name in names]
             return np.stack(columns, axis=-1) if len(names) > 1 else columns[0]
 
-        sd = array("sd_mm")
         return Poses(
             about["individual"],
             joints,
@@ -71,17 +70,19 @@ class Poses:
             array("x_mm", "y_mm", "z_mm"),
             array("u_px", "v_px"),
             array("score"),
-            np.stack([sd, sd, heights_sd(table).reshape(shape)], axis=-1),
+            spreads(table).reshape(*shape, 3),
         )
 
 
-def heights_sd(poses: pd.DataFrame) -> Array:
-    """Standard deviation (m,) of the heights of the table `poses`, mm; of an older one `sd_mm`.
+def spreads(poses: pd.DataFrame) -> Array:
+    """Standard deviations (m, 3) of x, y and z of the table `poses`, mm; of an older one `sd_mm`.
 
     Args:
         poses: all columns, m rows.
     """
-    return poses["sd_z_mm" if "sd_z_mm" in poses else "sd_mm"].to_numpy(float)
+    names = [f"sd_{axes}_mm" for axes in ("xy", "xy", "z")]
+    told = [poses[name if name in poses else "sd_mm"].to_numpy(float) for name in names]
+    return np.stack(told, axis=-1)
 
 
 def dataset_of(

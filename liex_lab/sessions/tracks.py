@@ -11,7 +11,7 @@ from liex_lab.body.skeleton import Skeleton
 from liex_lab.errors import SessionError
 from liex_lab.geometry import so3
 from liex_lab.sessions.evidence import read_skeleton
-from liex_lab.sessions.pose_arrays import heights_sd
+from liex_lab.sessions.pose_arrays import spreads
 from liex_lab.tables.schema import ROOT_COVARIANCES
 from liex_lab.tracking.track import Track
 
@@ -65,7 +65,7 @@ def track_of(session: Session, skeleton: Skeleton | None = None) -> Track:
     track.joints_mm[:] = _columns(poses, [f"{a}_mm" for a in "xyz"]).reshape(n, j, 3)
     track.uv_px[:] = _columns(poses, ["u_px", "v_px"]).reshape(n, j, 2)
     track.sd_mm[:] = poses["sd_mm"].to_numpy(float).reshape(n, j)
-    track.sd_z_mm[:] = heights_sd(poses).reshape(n, j)
+    track.sd_xy_mm[:], _, track.sd_z_mm[:] = np.moveaxis(spreads(poses).reshape(n, j, 3), -1, 0)
     turns = _columns(rotations, [f"w{a}_rad" for a in "xyz"]).reshape(n, j + 1, 3)
     spread = _columns(rotations, [f"sd_w{a}_rad" for a in "xyz"]).reshape(n, j + 1, 3)
     track.angles_rad[:] = turns[:, 1:]

@@ -147,6 +147,7 @@ class Rows:
                 np.sqrt((track.sd_xyz_mm**2).mean(axis=-1)), _NEAR * track.spine_mm[:, None]
             ).ravel(),
             "sd_mm": track.sd_mm.ravel(),
+            "sd_xy_mm": track.sd_xy_mm.ravel(),
             "sd_z_mm": track.sd_z_mm.ravel(),
         }
 

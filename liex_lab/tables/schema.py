@@ -276,18 +276,27 @@ POSES = columns(
         "float64",
         "",
         "probability that the joint lies within 10 % of the spine's length of the truth",
-        "chi distribution with 3 degrees of freedom at 0.1 spine_mm / s, where s^2 is the mean of "
-        "2 sd_mm^2 and sd_z_mm^2",
-        "sd_mm, sd_z_mm",
+        "chi distribution with 3 degrees of freedom at 0.1 spine_mm / s, where s^2 = "
+        "(2 sd_xy_mm^2 + sd_z_mm^2) / 3",
+        "sd_xy_mm, sd_z_mm",
     ),
     (
         "sd_mm",
         "float64",
         "mm",
-        "standard deviation of x_mm and of y_mm, and of z_mm from one frame to another; speeds are "
-        "made of it",
+        "standard deviation of the joint along one axis from one frame to another; speeds are made "
+        "of it",
         "sqrt(trace of covariance / 3)",
         "posterior of the smoother",
+    ),
+    (
+        "sd_xy_mm",
+        "float64",
+        "mm",
+        "standard deviation of x_mm and of y_mm: where along an animal's outline its joints lie is "
+        "a matter of its build, and may be wrong by the same amount throughout a recording",
+        "sqrt(sd_mm^2 + s^2 / 2), s of animals of builds that no forest was trained on",
+        "posterior of the smoother, calibration",
     ),
     (
         "sd_z_mm",

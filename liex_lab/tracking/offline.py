@@ -334,6 +334,7 @@ def _mask(track: Track, rows: NDArray[np.bool_]) -> None:
         track.angles_rad,
         track.scale,
         track.sd_mm,
+        track.sd_xy_mm,
         track.sd_z_mm,
         track.cov_root,
         track.sd_angles_rad,
@@ -353,18 +354,26 @@ def _write(subject: Subject, track: Track, curve: Curve, tuning: TrackingParamet
     track.scale[:] = pose.scale
     stretch = motion.usual_stretch if subject.stretch_sd is None else subject.stretch_sd
     away = stretch_of(stretch, curve.joints)
+    # two of three axes: up, and along the body, whose direction on the floor is any
     height = motion.unseen_height * subject.length_mm
+    shift = motion.unseen_shift * subject.length_mm
     track.sd_mm[:] = np.hypot(
         (curve.error_mm / ERROR_PER_SD)[:, None] * np.array(subject.joint_share), away
     )
-    # sd_mm is what speeds and headings are made of; a height that is off throughout changes none
+    # sd_mm is what speeds and headings are made of; what is off throughout changes none
+    track.sd_xy_mm[:] = np.hypot(track.sd_mm, np.sqrt(0.5) * shift)
     track.sd_z_mm[:] = np.hypot(track.sd_mm, height)
-    constant = np.hypot(ERROR_PER_SD * away.mean(axis=1), MEAN_PER_SD * height)
+    constant = np.hypot(ERROR_PER_SD * away.mean(axis=1), MEAN_PER_SD * np.hypot(height, shift))
     track.predicted_error_mm[:] = np.hypot(curve.error_mm, constant)
     calibration = np.array(motion.root_calibration)
-    up = height * pose.root.rotation[:, 2]  # of the arena, in the root's own frame
+    R = pose.root.rotation
+    up = height * R[:, 2]  # of the arena, in the root's own frame
+    along = curve.joints[:, 0] - curve.joints[:, subject.skeleton.tip]
+    along *= shift / np.maximum(np.linalg.norm(along, axis=1), 1e-9)[:, None]
+    along = np.einsum("nji,nj->ni", R, along)
     track.cov_root[:] = covariance_of_root(curve) * (calibration[:, None] * calibration)
-    track.cov_root[:, 3:, 3:] += up[:, :, None] * up[:, None, :]
+    for constant_mm in (up, along):
+        track.cov_root[:, 3:, 3:] += constant_mm[:, :, None] * constant_mm[:, None, :]
     track.sd_angles_rad[:] = (curve.sd_bend * motion.bend_calibration)[
         :, None
     ] * subject.skeleton.axes

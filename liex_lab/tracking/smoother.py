@@ -75,6 +75,7 @@ class Motion:
         unseen_height: standard deviation, over the length, of the height of the joints as a whole:
             a camera sees the back of an animal, and how far below it the midline lies is a matter
             of its build.
+        unseen_shift: the same of their place along the body: where in its outline the joints lie.
         root_calibration: calibration factors of the root's rotation about (3) and position along
             (3) its
             own axes, over what that leaves.
@@ -96,6 +97,7 @@ class Motion:
     stretch: tuple[float, float] = (0.0, 0.0)
     usual_stretch: float = 0.0
     unseen_height: float = 0.0
+    unseen_shift: float = 0.0
     root_calibration: tuple[float, float, float, float, float, float] = (1.0,) * 6
     bend_calibration: tuple[float, float, float] = (1.0,) * 3
 

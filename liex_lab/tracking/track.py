@@ -48,7 +48,10 @@ class Track:
         times_ns: (n,) int64.
         joints_mm: (n, J, 3) arena frame.
         uv_px: (n, J, 2) pixels of the depth image.
-        sd_mm: (n, J) standard deviation of each joint along one axis, mm; speeds are made of it.
+        sd_mm: (n, J) standard deviation of each joint along one axis from one frame to another, mm;
+            speeds are made of it.
+        sd_xy_mm: (n, J) that of its place along x and along y: `sd_mm`, and by how much all joints
+            of a recording may be shifted along the body, whose build nobody knows.
         sd_z_mm: (n, J) that of its height: `sd_mm`, and by how much all heights of a recording may
             be wrong, as a camera sees the back only.
         root_rotation: (n, 3, 3) rotation of T_arena_root.
@@ -75,6 +78,7 @@ class Track:
     joints_mm: Array
     uv_px: Array
     sd_mm: Array
+    sd_xy_mm: Array
     sd_z_mm: Array
     root_rotation: Array
     root_mm: Array
@@ -134,6 +138,7 @@ class Track:
             np.asarray(times_ns, np.int64),
             unknown(j, 3),
             unknown(j, 2),
+            unknown(j),
             unknown(j),
             unknown(j),
             unknown(3, 3),
@@ -200,7 +205,7 @@ class Track:
     @property
     def sd_xyz_mm(self) -> Array:
         """(n, J, 3) standard deviation of each joint along x, y and z, mm."""
-        return np.stack([self.sd_mm, self.sd_mm, self.sd_z_mm], axis=-1)
+        return np.stack([self.sd_xy_mm, self.sd_xy_mm, self.sd_z_mm], axis=-1)
 
     @property
     def spine_mm(self) -> Array:

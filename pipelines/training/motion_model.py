@@ -10,7 +10,8 @@ seeds, frame by frame once. Three fits follow on these observations:
   coefficients, so that nine errors in ten lie within the 90 % interval, in all sequences and in
   each of them.
 - The same factors for the root's six coordinates and for the bend angles about three axes.
-- The spread of heights on animals of builds that no forest was trained on (`unseen_height`).
+- What nobody sees of a build, on animals of builds that no forest was trained on: the spread of
+  heights and of places along the body (`unseen_height`, `unseen_shift`).
 
 Everything starts from fixed seeds, so `tunings.toml` is byte for byte the same on every run.
 """
@@ -67,6 +68,7 @@ _FOUND_OTHERWISE = (
     "stretch",
     "usual_stretch",
     "unseen_height",
+    "unseen_shift",
     "root_calibration",
     "bend_calibration",
 )
@@ -146,7 +148,7 @@ def train_tracking(
         measured, TrackingParameters.of(animal), n_tries, np.random.default_rng(0), progress
     )
     tuning = calibrate_roots(measured, calibrate_joints(measured, tuning))
-    tuning = calibrate_height(other_builds(animal, progress, seeds or BUILD_SEEDS), tuning)
+    tuning = calibrate_builds(other_builds(animal, progress, seeds or BUILD_SEEDS), tuning)
     out.write_text(tunings_with(animal, tuning), encoding="utf-8")
     return out
 
@@ -384,6 +386,7 @@ def calibrate_joints(measured: Sequence[Seen], tuning: TrackingParameters) -> Tr
         stretch=(0.0, 0.0),
         usual_stretch=0.0,
         unseen_height=0.0,
+        unseen_shift=0.0,
     )
     claims = [_claim(each, plain) for each in measured]
     best = (0.0, 0.0)
@@ -421,25 +424,37 @@ def _claim(each: Seen, plain: TrackingParameters) -> _Claim:
     )
 
 
-def calibrate_height(builds: Sequence[Seen], tuning: TrackingParameters) -> TrackingParameters:
-    """The same tuning with the height's spread by which nine in ten of the joints' heights hold.
+def calibrate_builds(builds: Sequence[Seen], tuning: TrackingParameters) -> TrackingParameters:
+    """The same tuning with what nobody sees of a build: how high and how far along its joints lie.
 
-    A height h of a joint that is off by more than 1.645 sd needs a further spread of
-    sqrt((h / 1.645)^2 - sd^2); the 90 % quantile of what all need is that of the animal.
+    A joint that is off by e, upwards or along the body, more than 1.645 sd needs a further spread
+    of sqrt((e / 1.645)^2 - sd^2); the 90 % quantile of what all need is that of the animal.
 
     Args:
         builds: recordings of builds that no forest was trained on; none leaves 0.
-        tuning: what is changed: `unseen_height` of its motion.
+        tuning: what is changed: `unseen_height` and `unseen_shift` of its motion.
     """
-    plain = with_motion(tuning, unseen_height=0.0)
-    needed = [np.zeros(1)]
+    plain = with_motion(tuning, unseen_height=0.0, unseen_shift=0.0)
+    upwards = [np.zeros(1)]
+    lengthways = [np.zeros(1)]
     for each in builds:
         track = _track(each, plain)
         there = track.posed
-        off = (track.joints_mm - each.truth)[there, :, 2] / _Z90
-        needed.append(((off**2 - track.sd_mm[there] ** 2) / each.subject.length_mm**2).ravel())
-    most = max(float(np.quantile(np.concatenate(needed), 0.9)), 0.0)
-    return with_motion(tuning, unseen_height=round(float(np.sqrt(most)), 4))
+        truth = each.truth[there]
+        along = truth[:, 0] - truth[:, each.subject.skeleton.tip]
+        along /= np.linalg.norm(along, axis=1)[:, None]
+        off = track.joints_mm[there] - truth
+        known = track.sd_mm[there] ** 2
+        for needed, one in (
+            (upwards, off[..., 2]),
+            (lengthways, np.einsum("njk,nk->nj", off, along)),
+        ):
+            needed.append((((one / _Z90) ** 2 - known) / each.subject.length_mm**2).ravel())
+    height, shift = (
+        round(float(np.sqrt(max(np.quantile(np.concatenate(needed), 0.9), 0.0))), 4)
+        for needed in (upwards, lengthways)
+    )
+    return with_motion(tuning, unseen_height=height, unseen_shift=shift)
 
 
 def calibration_knots(claims: Sequence[_Claim], stretch: tuple[float, float]) -> Knots:
@@ -489,7 +504,11 @@ def calibrate_roots(measured: Sequence[Seen], tuning: TrackingParameters) -> Tra
         tuning: what is changed: `root_calibration` (6,) and `bend_calibration` (3,) of its motion.
     """
     plain = with_motion(
-        tuning, root_calibration=(1.0,) * 6, bend_calibration=(1.0,) * 3, unseen_height=0.0
+        tuning,
+        root_calibration=(1.0,) * 6,
+        bend_calibration=(1.0,) * 3,
+        unseen_height=0.0,
+        unseen_shift=0.0,
     )
     roots = []
     bends = []

@@ -32,7 +32,7 @@ def straight_track(
         place,
     )
     track.angles_rad[:], track.scale[:], track.sd_mm[:] = 0.0, 1.0, 1.0
-    track.sd_z_mm[:] = 1.0
+    track.sd_xy_mm[:] = track.sd_z_mm[:] = 1.0
     track.predicted_error_mm[:] = 2.0
     return track
 

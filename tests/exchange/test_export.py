@@ -118,7 +118,7 @@ def test_movement_s_data_set_has_the_true_times_and_the_actions(session, out):
     assert data["position"].dims == ("time", "space", "keypoints", "individuals")
     nose = data["position"].sel(keypoints="nose", individuals="mouse_1", space="z")
     np.testing.assert_array_equal(nose, session.poses.query("joint == 'nose'")["z_mm"])
-    for axis, column in (("x", "sd_mm"), ("y", "sd_mm"), ("z", "sd_z_mm")):
+    for axis, column in (("x", "sd_xy_mm"), ("y", "sd_xy_mm"), ("z", "sd_z_mm")):
         spread = data["sd_mm"].sel(keypoints="nose", individuals="mouse_1", space=axis)
         np.testing.assert_array_equal(spread, session.poses.query("joint == 'nose'")[column])
     assert data.attrs["ds_type"] == "poses"

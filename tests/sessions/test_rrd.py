@@ -81,13 +81,16 @@ def test_the_expected_entities_are_there_on_both_timelines(session):
     assert columns_of(session, "log")["TextLog:text"] == [["It was dark."]]
 
 
-def test_spheres_hold_the_joints_with_95_per_cent(session):
+def test_ellipsoids_hold_the_joints_with_95_per_cent(session):
     columns = columns_of(session, replay.UNCERTAINTY)
     assert len(columns["frame"]) == len(MOUSE.times_s)
     sizes, centres = columns["Ellipsoids3D:half_sizes"], columns["Ellipsoids3D:centers"]
     assert len(sizes[0]) == len(centres[0]) == 5
     assert len(sizes[20]) == 0  # the mouse is lost
-    assert sizes[0][0][0] == pytest.approx(2.795 * MOUSE.sd_mm / 1000)
+    table = session.poses.iloc[0]
+    spread = [table["sd_xy_mm"], table["sd_xy_mm"], table["sd_z_mm"]]
+    assert table["sd_z_mm"] > table["sd_xy_mm"] > table["sd_mm"]
+    assert sizes[0][0] == pytest.approx(2.795 * np.array(spread) / 1000)
     draws = np.random.default_rng(0).normal(size=(20_000, 3))
     assert np.mean(np.linalg.norm(draws, axis=1) < 2.795) == pytest.approx(0.95, abs=0.005)
 

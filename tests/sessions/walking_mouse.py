@@ -85,6 +85,7 @@ class WalkingMouse:
             joints_mm=joints,
             uv_px=uv,
             sd_mm=np.full(joints.shape[:2], self.sd_mm),
+            sd_xy_mm=np.full(joints.shape[:2], 1.1 * self.sd_mm),
             sd_z_mm=np.full(joints.shape[:2], 1.25 * self.sd_mm),
             root_rotation=rotation,
             root_mm=pose.root.translation,

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from liex_lab.pipelines.training.motion_model import (
     Seen,
-    calibrate_height,
+    calibrate_builds,
     calibrate_joints,
     calibrate_roots,
     changed,
@@ -128,14 +128,35 @@ def test_heights_that_are_off_throughout_a_recording_are_covered(measured):
         replace(measured[k % 2], truth=np.add(measured[k % 2].truth, [0.0, 0.0, up_mm]))
         for k, up_mm in enumerate((-9.0, -4.0, 5.0, 7.0, 10.0))
     ]
-    height = calibrate_height(builds, tuning).motion.unseen_height
+    higher = calibrate_builds(builds, tuning)
     inside = []
-    higher = with_motion(tuning, unseen_height=height)
     for each in builds:
         track = track_whole(each.subject, each.seen, (), higher).track
         inside.append(np.abs(track.joints_mm - each.truth)[..., 2] <= 1.645 * track.sd_z_mm)
     assert 0.85 < np.mean(inside) < 0.95
-    assert calibrate_height([], tuning).motion.unseen_height == 0.0
+    blind = calibrate_builds([], tuning).motion
+    assert (blind.unseen_height, blind.unseen_shift) == (0.0, 0.0)
+
+
+def test_bodies_that_lie_further_along_throughout_a_recording_are_covered(measured):
+    tuning = TrackingParameters.of("mouse")
+    builds, ways = [], []
+    for k, forward_mm in enumerate((-9.0, -5.0, 4.0, 6.0, 9.0)):
+        truth = measured[k % 2].truth
+        along = truth[:, -1] - truth[:, 0]
+        ways.append(along / np.linalg.norm(along, axis=1)[:, None])
+        builds.append(replace(measured[k % 2], truth=truth + forward_mm * ways[-1][:, None]))
+    further = calibrate_builds(builds, tuning)
+    assert further.motion.unseen_height == tuning.motion.unseen_height
+    inside = []
+    for each, way in zip(builds, ways, strict=True):
+        track = track_whole(each.subject, each.seen, (), further).track
+        off = np.einsum("njk,nk->nj", track.joints_mm - each.truth, way)
+        # half of the variance along the body stands beside x and half beside y
+        spread = np.sqrt(2.0 * track.sd_xy_mm**2 - track.sd_mm**2)
+        inside.append(np.abs(off) <= 1.645 * spread)
+        np.testing.assert_array_equal(track.sd_z_mm, track.sd_mm)
+    assert 0.85 < np.mean(inside) < 0.95
 
 
 def test_a_height_nobody_sees_is_in_the_error_and_upright_in_the_roots_covariance(measured):
@@ -154,6 +175,7 @@ def test_a_height_nobody_sees_is_in_the_error_and_upright_in_the_roots_covarianc
     )
     np.testing.assert_array_equal(after.sd_mm[there], before.sd_mm[there])
     np.testing.assert_array_equal(before.sd_z_mm[there], before.sd_mm[there])
+    np.testing.assert_array_equal(after.sd_xy_mm[there], before.sd_mm[there])
     np.testing.assert_allclose(after.sd_z_mm[there], np.hypot(before.sd_mm[there], sd_mm))
 
 
