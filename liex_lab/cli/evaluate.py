@@ -18,6 +18,7 @@ from liex_lab.cli.options import (
     tell_rows,
 )
 from liex_lab.cli.sections import group_of_verbs
+from liex_lab.errors import LiexError
 from liex_lab.pipelines.evaluation.paper.deviations import DEVIATIONS, HAND
 from liex_lab.runtime.progress import progress_bar
 
@@ -28,7 +29,7 @@ evaluate = group_of_verbs("Measure the method; --json FILE keeps the numbers.")
 def evaluate_pose(
     animal: AnimalName = "mouse",
     split: Annotated[
-        str, typer.Option("--split", help="clean, hard, other-body or other-camera.")
+        str, typer.Option("--split", help="clean, hard, other-body, other-camera or other-build.")
     ] = "clean",
     variant: RowName = "default",
     model: Annotated[
@@ -43,9 +44,31 @@ def evaluate_pose(
             "--spine-mm", min=1.0, help="Render animals of this size instead of the split's."
         ),
     ] = None,
+    sealed: Annotated[
+        bool,
+        typer.Option("--sealed", help="Of other-build what is kept for the end: never develop."),
+    ] = False,
     json_file: JsonFile = None,
 ) -> None:
-    """Joint errors on a fixed split of rendered test frames."""
+    """Joint errors on a fixed split of rendered test frames; of other-build, of whole tracks."""
+    if split == "other-build":
+        from liex_lab.pipelines.evaluation.builds import evaluate_builds
+
+        if variant != "default" or model or spine_mm:
+            raise LiexError("other-build is measured with the bundled model and sizes of its own")
+        with progress_bar() as progress:
+            result = evaluate_builds(animal, n_frames=n_frames, sealed=sealed, progress=progress)
+        if json_file is not None:
+            keep_numbers(result, json_file)
+        tell_rows(
+            {
+                name: {k: v for k, v in result[name].items() if not isinstance(v, dict | list)}
+                for name in ("other", "usual")
+            }
+        )
+        return
+    if sealed:
+        raise LiexError("--sealed is of the split other-build; leave it out")
     from liex_lab.pipelines.evaluation.pose import evaluate_pose as measure
 
     with progress_bar() as progress:
