@@ -16,6 +16,8 @@ from numpy.typing import NDArray
 
 from liex_lab.evaluation.bootstrap import interval95
 from liex_lab.evaluation.pose import rank_correlation
+from liex_lab.evaluation.scenes import FAR
+from liex_lab.evaluation.tracking import Followed
 from liex_lab.tracking.track import Track
 
 Array = NDArray[np.float64]
@@ -39,8 +41,6 @@ BUILDS_PROTOCOL = (
     "height_off_mm: mean over recordings of |mean height error|, and height_bias_mm of the "
     "error itself."
 )
-_Z90 = 1.645
-_FAR = 0.15  # of the length
 _CLASSES = (0.0, 0.01, 0.05, 0.2, 0.5, 0.8, 1.0)  # of p_flip
 
 
@@ -49,67 +49,24 @@ class Built:
     """A recording of one animal as it was tracked, with its truth.
 
     Attributes:
-        track: (n) the track; None where no animal was found.
+        track: (n) the track, without a pose where no animal was found.
         truth: (n, J, 3) true joints, mm, in the track's frame.
         length_mm: true length of the animal.
         found_mm: the length that was found; NaN where no animal was.
         tip: the joint that the base's heading points at.
     """
 
-    track: Track | None
+    track: Track
     truth: Array
     length_mm: float
     found_mm: float
     tip: int
 
     @property
-    def off_mm(self) -> Array:
-        """(n, J, 3) tracked minus true joints, mm; NaN where there is no pose."""
-        return np.full(self.truth.shape, np.nan) if self.track is None else self._off(self.track)
-
-    def _off(self, track: Track) -> Array:
-        return track.joints_mm - self.truth
-
-    @property
-    def error(self) -> Array:
-        """(n,) mean joint error over the length; NaN where there is no pose."""
-        return np.asarray(np.linalg.norm(self.off_mm, axis=-1).mean(axis=1) / self.length_mm)
-
-    @property
-    def predicted(self) -> Array:
-        """(n,) the error that was predicted, over the length."""
-        if self.track is None:
-            return np.full(len(self.truth), np.nan)
-        return self.track.predicted_error_mm / self.length_mm
-
-    @property
-    def trusted(self) -> NDArray[np.bool_]:
-        """(n,) poses that are flagged as trusted."""
-        if self.track is None:
-            return np.zeros(len(self.truth), np.bool_)
-        return np.asarray(self.track.observed & (self.track.flag == ""))
-
-    @property
-    def p_flip(self) -> Array:
-        """(n,) the probability told that head and tail are exchanged."""
-        return np.full(len(self.truth), np.nan) if self.track is None else self.track.p_flip
-
-    @property
-    def flipped(self) -> NDArray[np.bool_]:
-        """(n,) poses whose base-to-tip direction is more than 90 degrees off."""
-        if self.track is None:
-            return np.zeros(len(self.truth), np.bool_)
-        own, true = (j[:, self.tip] - j[:, 0] for j in (self.track.joints_mm, self.truth))
-        return np.asarray(np.einsum("nd,nd->n", own, true) < 0)
-
-    @property
-    def inside(self) -> Array:
-        """(m, J, 3) of the m poses, 1 where a coordinate lies within its 90 % interval, else 0."""
-        if self.track is None:
-            return np.zeros((0, *self.truth.shape[1:]))
-        posed = self.track.posed
-        within = np.abs(self.off_mm[posed]) <= _Z90 * self.track.sd_xyz_mm[posed]
-        return within.astype(np.float64)
+    def followed(self) -> Followed:
+        """Its errors, intervals and exchanged ends; how fast it was tracked is not known."""
+        track = self.track
+        return Followed(track.joints_mm, self.truth, track.sd_xyz_mm, np.nan, self.tip)
 
 
 def build_figures(rows: Sequence[Built], joints: Sequence[str]) -> dict[str, Any]:
@@ -122,7 +79,10 @@ def build_figures(rows: Sequence[Built], joints: Sequence[str]) -> dict[str, Any
     Returns:
         The figures; None for those that have no pose to be of.
     """
-    error = np.concatenate([row.error for row in rows])
+    followed = [row.followed for row in rows]
+    error = np.concatenate(
+        [one.error_mm / row.length_mm for one, row in zip(followed, rows, strict=True)]
+    )
     recording = np.concatenate([np.full(len(row.truth), k) for k, row in enumerate(rows)])
     posed = np.isfinite(error)
     figures: dict[str, Any] = {
@@ -132,13 +92,15 @@ def build_figures(rows: Sequence[Built], joints: Sequence[str]) -> dict[str, Any
     }
     if not posed.any():
         return figures
-    inside = np.concatenate([row.inside for row in rows])
+    inside = np.concatenate([one.inside for one in followed])[posed]
     by_joint = inside.mean(axis=(0, 2))
-    trusted = np.concatenate([row.trusted for row in rows])
-    flipped = np.concatenate([row.flipped for row in rows]) & posed
-    predicted = np.concatenate([row.predicted for row in rows])
+    trusted = np.concatenate([row.track.observed & (row.track.flag == "") for row in rows])
+    flipped = np.concatenate([one.flipped for one in followed])
+    predicted = np.concatenate([row.track.predicted_error_mm / row.length_mm for row in rows])
+    p_flip = np.concatenate([row.track.p_flip for row in rows])
     lengths_mm = np.array([row.length_mm for row in rows])[recording]
-    heights = np.array([np.nanmean(row.off_mm[..., 2]) for row in rows if row.track is not None])
+    off_mm = [(one.joints - one.truth)[..., 2] for one in followed]
+    heights = np.array([np.nanmean(off) for off in off_mm if np.isfinite(off).any()])
     bounds = interval95(100.0 * error, recording.astype(np.int64), np.mean)
     return figures | {
         "mean_joint_error_mm": float((error * lengths_mm)[posed].mean()),
@@ -151,20 +113,14 @@ def build_figures(rows: Sequence[Built], joints: Sequence[str]) -> dict[str, Any
         "interval90_by_joint": dict(zip(joints, by_joint.tolist(), strict=True)),
         "spearman": rank_correlation(predicted[posed], error[posed]),
         "flips": float(flipped[posed].mean()),
-        "longest_flip": max(_longest(row.flipped) for row in rows),
-        "p_flip": _reliability(np.concatenate([row.p_flip for row in rows])[posed], flipped[posed]),
-        "wrong_but_trusted": float((error > _FAR)[trusted].mean()) if trusted.any() else 0.0,
+        "longest_flip": max(one.longest_flip for one in followed),
+        "p_flip": _reliability(p_flip[posed], flipped[posed]),
+        "wrong_but_trusted": float((error > FAR)[trusted].mean()) if trusted.any() else 0.0,
         "trusted": float(trusted.mean()),
         "length_off": float(np.nanmean([abs(row.found_mm / row.length_mm - 1.0) for row in rows])),
         "height_bias_mm": float(heights.mean()),
         "height_off_mm": float(np.abs(heights).mean()),
     }
-
-
-def _longest(flipped: NDArray[np.bool_]) -> int:
-    """Most frames in a row that are (n,) flipped."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], flipped, [False]]).astype(np.int8)))
-    return int((edges[1::2] - edges[::2]).max(initial=0))
 
 
 def _reliability(told: Array, flipped: NDArray[np.bool_]) -> list[dict[str, Any]]:

@@ -71,20 +71,29 @@ class Followed:
         return np.asarray(np.linalg.norm(self.joints - self.truth, axis=-1).mean(axis=1))
 
     @property
+    def flipped(self) -> NDArray[np.bool_]:
+        """(n,) bool, whether the base-to-tip direction is more than 90 degrees off."""
+        along, true = (j[:, self.tip] - j[:, 0] for j in (self.joints, self.truth))
+        return np.asarray(np.einsum("nd,nd->n", along, true) < 0)
+
+    @property
     def longest_flip(self) -> int:
         """Most frames in a row whose base-to-tip direction is more than 90 degrees off."""
-        along, true = (j[:, self.tip] - j[:, 0] for j in (self.joints, self.truth))
         longest = run = 0
-        for off in np.einsum("nd,nd->n", along, true) < 0:
+        for off in self.flipped:
             run = run + 1 if off else 0
             longest = max(longest, run)
         return longest
 
     @property
+    def inside(self) -> NDArray[np.bool_]:
+        """(n, J, 3) bool, whether a joint coordinate lies within its 90 % interval."""
+        return np.asarray(np.abs(self.joints - self.truth) <= _Z90 * self.sd_mm)
+
+    @property
     def covered(self) -> NDArray[np.bool_]:
-        """(m,) bool, whether each known joint coordinate lies within its 90 % interval."""
-        inside = np.abs(self.joints - self.truth) <= _Z90 * self.sd_mm
-        return inside[np.isfinite(self.joints) & np.isfinite(self.sd_mm)]
+        """(m,) bool, the same of the joint coordinates that are known."""
+        return self.inside[np.isfinite(self.joints) & np.isfinite(self.sd_mm)]
 
     def in_view(self, events: Sequence[Event], length_mm: float) -> Array:
         """Errors of the frames in which at least half of the animal is seen.

@@ -14,8 +14,11 @@ import numpy as np
 from liex_lab.errors import EstimationError, LiexError
 from liex_lab.evaluation.builds import BUILDS_PROTOCOL, Built, build_figures
 from liex_lab.runtime.progress import Progress, silent
+from liex_lab.tracking.offline import track_whole
+from liex_lab.tracking.track import Track
 
-from ..build import build_scene, plan_of
+from ..build import plan_of
+from ..training.motion_model import observed
 from .pose import estimator_of
 
 if TYPE_CHECKING:
@@ -29,7 +32,6 @@ SEALED_SEEDS: Final = tuple(range(953_200_417, 953_200_441))
 N_FRAMES: Final = 120  # of a recording
 _N_RECORDINGS: Final = 12
 _NOISES = (0.7, 1.0, 1.5)
-_CHUNK = 32
 
 
 def evaluate_builds(
@@ -122,23 +124,16 @@ def track(estimator: PoseEstimator, recording: TrueRecording, plan: Plan) -> Bui
         recording: with its truth.
         plan: thresholds of the foreground, and expected sizes.
     """
-    from liex_lab.tracking.observations import Observations
-    from liex_lab.tracking.tracker import FrameTracker
-
-    tip = estimator.skeleton.tip
+    skeleton = estimator.skeleton
     try:
-        scene, sample = build_scene(
-            recording, plan, estimator.skeleton, plan.foreground.n_background_frames
-        )
-        tracker = FrameTracker.prepare(estimator, scene, sample, bridge_s=plan.tracking.bridge_s)
+        each = observed(estimator, plan, SPLIT, recording)
     except EstimationError:
-        return Built(None, recording.joints_arena, recording.spine_mm, np.nan, tip)
-    seen = Observations.join([tracker.observe(frames) for frames in recording.chunks(_CHUNK)])
-    T = scene.floor.T_arena_camera @ recording.T_arena_camera.inverse()
+        lost = Track.empty(skeleton, recording.times_ns)
+        return Built(lost, recording.joints_arena, recording.spine_mm, np.nan, skeleton.tip)
     return Built(
-        tracker.track(seen).track,
-        T @ recording.joints_arena,
+        track_whole(each.subject, each.seen).track,
+        each.truth,
         recording.spine_mm,
-        tracker.subject.length_mm,
-        tip,
+        each.subject.length_mm,
+        skeleton.tip,
     )

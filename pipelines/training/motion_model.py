@@ -22,7 +22,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from itertools import product
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numba
 import numpy as np
@@ -45,6 +45,10 @@ from liex_lab.tracking.tracker import FrameTracker
 
 from ..build import build_scene, plan_of
 from ..evaluation.pose import estimator_of
+
+if TYPE_CHECKING:
+    from liex_lab.estimation.estimator import PoseEstimator
+    from liex_lab.plan import Plan
 
 Array = NDArray[np.float64]
 Knots = tuple[tuple[float, float], ...]
@@ -171,7 +175,8 @@ def measure(
     recording = tracking_sequence(
         world_of(Skeleton.load(animal)), kind, seed=seed, n_frames=n_frames
     )
-    return _observed(animal, kind, recording, recording.events, progress)
+    estimator = estimator_of(animal, "default", progress)
+    return observed(estimator, plan_of(animal), kind, recording, recording.events, progress)
 
 
 def other_builds(
@@ -190,19 +195,33 @@ def other_builds(
     world = world_of(Skeleton.load(animal))
     if not isinstance(world, BodySimulator):
         return []
+    estimator = estimator_of(animal, "default", progress)
+    plan = plan_of(animal)
     recordings = [world.motion([seed], _BUILD_FRAMES, family="other") for seed in seeds]
-    return [_observed(animal, "other", recording, (), progress) for recording in recordings]
+    return [observed(estimator, plan, "other", one, (), progress) for one in recordings]
 
 
-def _observed(
-    animal: str,
+def observed(
+    estimator: PoseEstimator,
+    plan: Plan,
     kind: str,
     recording: TrueRecording,
-    events: Sequence[Event],
-    progress: Progress,
+    events: Sequence[Event] = (),
+    progress: Progress = silent,
 ) -> Seen:
-    plan = plan_of(animal)
-    estimator = estimator_of(animal, "default", progress)
+    """A rendered recording, measured frame by frame; background and size are found by the product.
+
+    Args:
+        estimator: the animal's.
+        plan: thresholds of the foreground, and expected sizes.
+        kind: a word for what it is.
+        recording: with its truth.
+        events: what happens in it.
+        progress: told frame by frame.
+
+    Raises:
+        EstimationError: no floor or no animal is found.
+    """
     scene, sample = build_scene(
         recording, plan, estimator.skeleton, plan.foreground.n_background_frames
     )

@@ -54,7 +54,6 @@ def test_errors_are_of_the_length_with_an_interval_over_recordings() -> None:
 
 def test_exchanged_ends_are_counted_in_a_row_and_by_what_was_told() -> None:
     row = made(3)
-    assert row.track is not None
     turned = slice(100, 105)
     row.track.joints_mm[turned] = row.truth[turned][:, ::-1]
     row.track.p_flip[turned] = 0.9
@@ -68,6 +67,7 @@ def test_exchanged_ends_are_counted_in_a_row_and_by_what_was_told() -> None:
 
 
 def test_a_recording_in_which_nothing_was_found_counts_as_not_found() -> None:
-    lost = Built(None, made(1).truth, LENGTH_MM, np.nan, MOUSE.tip)
+    nothing = Track.empty(MOUSE, np.arange(N) * 33_000_000)
+    lost = Built(nothing, made(1).truth, LENGTH_MM, np.nan, MOUSE.tip)
     assert build_figures([made(1), lost], MOUSE.names)["found"] == 0.5
     assert build_figures([lost], MOUSE.names) == {"n_recordings": 1, "n_frames": N, "found": 0.0}
