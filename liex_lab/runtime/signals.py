@@ -1,7 +1,7 @@
 """Ctrl-C, SIGTERM and SIGHUP: what is under way is put down within seconds, and said so.
 
 The signal becomes an exception, so that checkpoints are kept and temporary folders go. What does
-not end by itself, such as a kernel or a library's thread, is ended with the process after 4.5 s; a
+not end by itself, such as a kernel or a library's thread, is ended with the process after 4 s; a
 second signal ends it at once. What is on disk then is as after a kill, which every writer expects.
 """
 
@@ -15,7 +15,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
 
-_PATIENCE_S = 4.5
+_PATIENCE_S = 4.0
 _NAMES = ("SIGINT", "SIGTERM", "SIGHUP")
 _SAID = {"SIGINT": "interrupted (Ctrl-C)", "SIGTERM": "ended (SIGTERM)", "SIGHUP": "ended (SIGHUP)"}
 
@@ -55,7 +55,7 @@ def ending() -> Iterator[None]:
     def end(number: int, frame: FrameType | None) -> None:
         error = Ended(number)
         if asked:
-            os._exit(error.exit_code)
+            _end_now(error, asked)
         asked.append(number)
         late = threading.Timer(_PATIENCE_S, _end_now, [error, asked])
         late.daemon = True

@@ -10,20 +10,22 @@ from __future__ import annotations
 
 import logging
 import os
-import tempfile
+import signal
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, closing, contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from liex_lab.errors import MissingPackageError, StudyError, how_to_install
 from liex_lab.plan.study import PlannedSession
+from liex_lab.runtime.scratch import Scratch
 from liex_lab.sessions.failure import describe_failure
 
 from ..workers import Done, Work, n_cores, worker_environment
 from .one_session import RunSession, measure_one, quarantine
 from .slurm import SlurmTable
+from .slurm_jobs import KeptJobs
 from .status import SessionStatus
 
 if TYPE_CHECKING:
@@ -242,16 +244,36 @@ def _client(
                     "scheduler`, or leave --scheduler out"
                 ) from None
             return
-        scratch = stack.enter_context(tempfile.TemporaryDirectory(prefix="liex-"))
+        scratch = str(stack.enter_context(closing(Scratch())).folder)
+        stack.enter_context(dask.config.set({"temporary-directory": scratch}))
         cluster = (
             slurm_cluster(slurm, scratch)
             if slurm
             else local_cluster(n_tasks, workers, threads, scratch)
         )
         stack.enter_context(cluster)
+        client = stack.enter_context(Client(cluster, set_as_default=False))
         if slurm:
-            cluster.scale(min(slurm.jobs, n_tasks))  # a job is one worker
-        yield stack.enter_context(Client(cluster, set_as_default=False))
+            n_jobs = min(slurm.jobs, n_tasks)  # a job is one worker
+            cluster.scale(n_jobs)
+            stack.enter_context(KeptJobs(client, cluster, n_jobs, slurm.log_folder))
+        try:
+            yield client
+        except BaseException:
+            if not slurm:
+                _end_workers(cluster)
+            raise
+
+
+def _end_workers(cluster: Any) -> None:
+    """Kill the worker processes of this machine: asked to end, they would first finish a kernel,
+    and a session goes on from its checkpoint either way.
+    """
+    for nanny in cluster.workers.values():
+        nanny.auto_restart = False
+        if nanny.pid:
+            with suppress(ProcessLookupError):
+                os.kill(nanny.pid, signal.SIGKILL)
 
 
 def local_cluster(n_tasks: int, workers: int, threads: int, scratch: str) -> Cluster:
