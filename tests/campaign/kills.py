@@ -17,12 +17,13 @@ from liex_lab.pipelines.shards import MEASURING
 from liex_lab.errors import LiexError
 from liex_lab.sessions import Session
 from tests.campaign.runs import begin, refusal, tables_of, undisturbed
+from tests.campaign.tally import Tally
 
 # of the moments are counted from when poses are measured; the others from the very beginning
 _IN_THE_WORK = 0.6
 
 
-def kills(n: int, n_frames: int, seed: int) -> dict[str, Any]:
+def kills(n: int, n_frames: int, seed: int) -> Tally:
     """Kill runs at n random moments; a run that was killed is begun again until it is whole, and
     compared.
     """
@@ -54,9 +55,9 @@ def kills(n: int, n_frames: int, seed: int) -> dict[str, Any]:
             try:
                 Session.open(place)
                 equal += tables_of(place) == expected
+                finished += 1
             except LiexError:
                 half += 1
-            finished += 1
             shutil.rmtree(place)
         figures = {
             "killed": killed,
@@ -69,7 +70,11 @@ def kills(n: int, n_frames: int, seed: int) -> dict[str, Any]:
         }
         print(json.dumps(figures), file=sys.stderr, flush=True)  # so far
     shutil.rmtree(scratch)
-    return figures
+    tally = Tally(tried=killed, wrong=finished - equal + half, more=figures)
+    tally.kinds.update({f"SIGKILL while {stage}": count for stage, count in where.items()})
+    if tally.wrong:
+        tally.broken.append(f"{tally.wrong} of {finished} sessions are not as if undisturbed")
+    return tally
 
 
 def _wait_for_the_work(process: BaseProcess, out: Path) -> None:

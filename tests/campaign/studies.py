@@ -18,23 +18,25 @@ from liex_lab.pipelines.study.status import SessionStatus, standings
 
 from liex_lab.plan.study import Study
 from tests.campaign.runs import SAMPLE, tables_of
+from tests.campaign.tally import Tally
 
 _N_SESSIONS = 4  # of a study whose workers are killed
 
 
-def workers(n: int, seed: int) -> dict[str, Any]:
+def workers(n: int, seed: int) -> Tally:
     """SIGKILL of a worker at n random moments of studies of four sessions; each study ends by
     itself.
     """
     import psutil
 
     rng, killed, done, same, again = random.Random(seed), 0, 0, 0, 0
+    unfinished = 0
     expected: dict[str, dict[str, bytes]] = {}
     given_up: dict[str, int] = {}
     figures: dict[str, Any] = {}
     while killed < n or not expected:
         folder = Path(tempfile.mkdtemp(prefix="liex-workers-"))
-        study = _study(folder, [(f"m{k}", "rawdata/walk.mcap") for k in range(_N_SESSIONS)])
+        study = study_file(folder, [(f"m{k}", "rawdata/walk.mcap") for k in range(_N_SESSIONS)])
         (folder / "rawdata").mkdir()
         shutil.copy(SAMPLE, folder / "rawdata" / "walk.mcap")
         command = [sys.executable, "-m", "liex_lab", "cohort", str(study), "--workers", "2"]
@@ -65,7 +67,9 @@ def workers(n: int, seed: int) -> dict[str, Any]:
             one.state == "failed" for one in standings(Study.load(study))
         ):  # one command tries them again
             subprocess.run([*command, "--retry"], capture_output=True, check=False)
-            again += all(one.state == "done" for one in standings(Study.load(study)))
+            after = standings(Study.load(study))
+            unfinished += sum(one.state != "done" for one in after)
+            again += all(one.state == "done" for one in after)
         shutil.rmtree(folder)
         figures = {
             "workers_killed": killed,
@@ -75,7 +79,11 @@ def workers(n: int, seed: int) -> dict[str, Any]:
             "studies_whole_after_retry": again,
         }
         print(json.dumps(figures), file=sys.stderr, flush=True)  # so far
-    return figures
+    tally = Tally(tried=killed, lost=unfinished, wrong=done - same, more=figures)
+    tally.kinds["SIGKILL of a study's worker"] = killed
+    if tally.wrong or tally.lost:
+        tally.broken.append(f"{tally.wrong} sessions differ, {tally.lost} were never done")
+    return tally
 
 
 # how a recording is broken, and what the reason has to say
@@ -111,7 +119,7 @@ def broken(n: int, n_frames: int, n_workers: int, kept: Path | None = None) -> d
             (f"g{k}", f"synthetic:walk?seed={k}&frames={n_frames}&sensor=primesense-qvga")
             for k in range(n - len(BROKEN))
         ]
-        _study(folder, names)
+        study_file(folder, names)
     if not first.is_file():
         began = time.monotonic()
         found = run_study(study, workers=n_workers)
@@ -143,7 +151,7 @@ def _said(one: SessionStatus) -> dict[str, Any]:
     return {name: failure.get(name) for name in ("stage", "reason", "remedy")}
 
 
-def _study(folder: Path, names: list[tuple[str, str]]) -> Path:
+def study_file(folder: Path, names: list[tuple[str, str]]) -> Path:
     """A study file with one animal for each (name, recording)."""
     text = "".join(
         f'[[animals]]\nid = "{name}"\n[[sessions]]\nanimal = "{name}"\nsession = "01"\n'
