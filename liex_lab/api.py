@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 from liex_lab.errors import MissingPackageError, how_to_install
 from liex_lab.plan import Plan
 from liex_lab.plan.study import Study
+from liex_lab.runtime.limits import check_limits
 from liex_lab.runtime.progress import Board, Progress, progress_board, silent, telling_of_compiling
 from liex_lab.runtime.threads import imported_ahead
 
@@ -77,6 +78,7 @@ def run_session(
     from liex_lab.pipelines.session import measure_session
     from liex_lab.pipelines.workers import Processes
 
+    check_limits()
     if workers > 1 and pool is None:
         pool = Processes(workers)
     with imported_ahead(*_HEAVY), telling_of_compiling(progress) as progress:

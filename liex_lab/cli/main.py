@@ -42,6 +42,7 @@ from liex_lab.cli.sections import MODELS, RECORDINGS, SESSIONS, START, STUDIES, 
 from liex_lab.cli.study import cohort, dashboard, verify
 from liex_lab.errors import LiexError, MisfitError, printable
 from liex_lab.runtime.disk import is_full, why_full
+from liex_lab.runtime.limits import why_short
 from liex_lab.runtime.progress import progress_bar
 from liex_lab.runtime.signals import Ended, ending
 
@@ -457,14 +458,14 @@ def main() -> None:
         if is_full(error):
             _fail(f"{why_full(error)}; make room there and run the same command again")
         if error.errno not in _USERS_TO_MEND:
-            _fault()
+            _fault(error)
         where = f" {error.filename}" if error.filename else ""
         _fail(
             f"the system refused{where}: {error.strerror}; make room, correct the permissions or "
             "name another place"
         )
-    except Exception:
-        _fault()
+    except Exception as error:
+        _fault(error)
 
 
 def _fail(sentence: str, code: int = 1) -> NoReturn:
@@ -472,7 +473,9 @@ def _fail(sentence: str, code: int = 1) -> NoReturn:
     sys.exit(code)
 
 
-def _fault() -> NoReturn:
+def _fault(error: Exception) -> NoReturn:
+    if short := why_short(error):
+        _fail(short)
     traceback.print_exc()
     _fail("this is a fault of liex_lab and not of yours; please report the lines above", FAULT)
 

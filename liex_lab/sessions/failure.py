@@ -12,6 +12,7 @@ from typing import Any
 from liex_lab.errors import LiexError
 from liex_lab.runtime.disk import is_full, why_full
 from liex_lab.runtime.durable import write_whole
+from liex_lab.runtime.limits import why_short
 from liex_lab.runtime.places import unlinked
 from liex_lab.sessions.provenance import versions
 
@@ -33,20 +34,20 @@ def describe_failure(error: BaseException, stage: str, frame: int | None) -> dic
         stage, frame, reason, remedy, kind, at (ISO 8601, UTC), machine, versions, and perhaps
         traceback.
     """
-    ours = not isinstance(error, LiexError | OSError | MemoryError)
+    short = "" if isinstance(error, LiexError) else why_short(error)
+    ours = not short and not isinstance(error, LiexError | OSError)
     if isinstance(error, LiexError):
         reason, _, remedy = str(error).rpartition("; ")
         reason, remedy = (reason, remedy) if reason else (remedy, "see `liex doctor`")
     elif isinstance(error, OSError) and is_full(error):
         reason = why_full(error)
         remedy = "make room there and run it again"
+    elif short:
+        reason, _, remedy = short.partition("; ")
     elif isinstance(error, OSError):
         where = f" {error.filename}" if error.filename else ""
         reason = f"the system refused{where}: {error.strerror or error}"
         remedy = "make room, correct the permissions or mend the drive, and try again"
-    elif isinstance(error, MemoryError):
-        reason = "the memory was not enough"
-        remedy = "give each worker more memory, or use fewer workers"
     else:
         reason = f"{type(error).__name__}: {error}"
         remedy = _REPORT

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import IO, NamedTuple
 
 from liex_lab.errors import RecordingError
+from liex_lab.runtime.limits import why_short
 from liex_lab.runtime.progress import Progress
 
 # A chunk is some megabytes. A damaged one may state any size, and a few bytes unpack to as many
@@ -226,6 +227,8 @@ def unpacked(packed: bytes, chunk: Chunk) -> bytes:
     except DamagedChunk:
         raise
     except Exception as error:  # the codecs are foreign and have exceptions of their own
+        if why_short(error):  # which says nothing about the file
+            raise MemoryError(str(error)) from None
         raise DamagedChunk(str(error)) from None
     if chunk.cut:
         return data
