@@ -51,7 +51,7 @@ TRACKING = "ethogram/tracking"
 _BLOCK = 8192  # frames of small things sent in one go
 # turns in which a flush is waited for, and how long a file may stand still, where the disk has room
 _TURN_S = 2.0
-_PATIENCE_S = 120.0
+_PATIENCE_S = 60.0
 
 PALETTE = tuple(int(colour[1:], 16) for colour in colours.PALETTE)
 _FLAG_COLOURS = {
@@ -215,6 +215,8 @@ class ReplayWriter:
         )
         self.flushed()
         self.abandon()
+        if not self._ended():
+            raise self._why_unwritten()
 
     def flushed(self) -> int:
         """Hand everything to the operating system; returns the file's bytes.
@@ -268,10 +270,25 @@ class ReplayWriter:
         if not self._broken:
             self._broken = True
             _let_go(self._stream)
+        return self._why_unwritten()
+
+    def _why_unwritten(self) -> Exception:
         return probe_full(self._path.parent) or SessionError(
             f"the replay {self._path} was not written whole; make room on the disk or mend it, and "
             "run the same command again"
         )
+
+    def _ended(self) -> bool:
+        """Whether the closed file holds its end, with the index that Rerun writes last of all."""
+        size = self._path.stat().st_size
+        at = self._checked or RRD_HEAD
+        with self._path.open("rb") as file:
+            try:
+                for start, length in rrd_messages(file, size, at):
+                    at = start + length
+            except SessionError:
+                return False
+        return size > at
 
     def abandon(self) -> None:
         """Close the file, whole or not.
@@ -287,9 +304,10 @@ class ReplayWriter:
         self._flush()
         closing = threading.Thread(target=self._stream.disconnect, daemon=True)
         closing.start()
+        until = time.monotonic() + _PATIENCE_S
         closing.join(_TURN_S)
         while closing.is_alive():
-            if probe_full(self._path.parent):
+            if time.monotonic() > until or probe_full(self._path.parent):
                 raise self._unwritten()
             closing.join(_TURN_S)
 
@@ -378,7 +396,7 @@ class ReplayWriter:
             self._send_points(
                 OVERLAY, when, track.uv_px[part][seen] + 0.5, seen, rr.Points2D, rr.LineStrips2D
             )
-            self._stream.flush()  # or hours of it wait in memory
+            self._flush()  # or hours of it wait in memory
 
     def _send_points(
         self,

@@ -29,6 +29,7 @@ import resource, signal, sys
 from liex_lab.errors import LiexError
 from tests.sessions.interrupted import write_session
 import liex_lab.sessions.rrd, liex_lab.sessions.mcap, liex_lab.behaviour, pyarrow.parquet
+liex_lab.sessions.rrd._PATIENCE_S = 3.0  # no probe meets a limit above its own size
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[2]), int(sys.argv[2])))
 try:
@@ -39,7 +40,10 @@ except LiexError as error:
 """
 
 
-@pytest.mark.parametrize("limit", [20_000, 100_000, 300_000])
+# the last four after the last frame: the track is put into the replay, and then its index
+@pytest.mark.parametrize(
+    "limit", [20_000, 100_000, 300_000, 1_125_000, 1_265_000, 1_322_000, 1_380_000]
+)
 def test_a_session_that_meets_a_limit_ends_in_a_sentence_and_goes_on_later(
     tmp_path: Path, limit: int
 ) -> None:
@@ -55,11 +59,12 @@ def test_a_session_that_meets_a_limit_ends_in_a_sentence_and_goes_on_later(
     assert done.returncode == 1, done.stderr
     assert len(done.stderr.splitlines()) == 1, done.stderr
     assert str(tmp_path) in done.stderr
-    assert "full" in done.stderr
+    assert "full" in done.stderr or "was not written whole" in done.stderr
     assert "run the same command again" in done.stderr
     assert not place.exists()
     kept = (tmp_path / "walk.liex.part").is_dir()
-    assert kept == ("goes on after" in done.stderr)
+    if "full" in done.stderr:
+        assert kept == ("goes on after" in done.stderr)
     write_session(str(place))
     assert (place / "session.json").is_file()
 
