@@ -93,7 +93,12 @@ class Checkpoint:
         Raises:
             SessionError: another process is writing the session.
         """
-        unlinked_tree(folder).mkdir(parents=True, exist_ok=True)
+        try:
+            unlinked_tree(folder).mkdir(parents=True, exist_ok=True)
+        except FileNotFoundError as error:  # a parent that the system makes, as below /proc
+            raise SessionError(
+                f"no folder can be made at {error.filename} ({error.strerror}); name another place"
+            ) from None
         check_free(folder)
         held = take_lock(folder / _LOCK)
         if held is None:  # taken in between

@@ -25,6 +25,7 @@ _KINDS = {
 }
 _CODES = {signal.SIGINT: 130, signal.SIGTERM: 143, signal.SIGHUP: 129}
 _ORPHANS_S = 3.0
+_SCRATCH = "liex-scratch-"
 _EARLIEST_S = 0.4  # before, Python itself begins and heeds nothing of ours
 
 
@@ -76,6 +77,10 @@ def signals(n: int, seed: int) -> Tally:
             traceback=ended.traceback,
             said=f"after {at_s:.1f} s: {ended.said}",
         )
+    with started(*commands["run"], environment={"TMPDIR": str(scratch / "tmp")}) as last:
+        last.communicate()
+    if left := [path.name for path in (scratch / "tmp").glob("liex*")]:
+        tally.fault("the command after all others", wrong=f"{left} stay in TMPDIR")
     shutil.rmtree(scratch)
     return tally
 
@@ -116,7 +121,8 @@ def _signalled(
         problems.append("it said nothing")
     if orphans := [pid for pid in family if alive(pid)]:
         problems.append(f"{len(orphans)} processes stay")
-    if left := [path.name for path in tmp.iterdir() if path.name.startswith("liex")]:
+    # what is ended while it tidies up leaves its scratch folder to the next command
+    if left := [path.name for path in tmp.glob("liex*") if not path.name.startswith(_SCRATCH)]:
         problems.append(f"{left} stay in TMPDIR")
         for name in left:
             shutil.rmtree(tmp / name)
