@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import os
 import signal
-import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -83,6 +82,5 @@ def ending() -> Iterator[None]:
 def _end_now(error: Ended, asked: list[int]) -> None:
     """End the process, whatever its threads are doing."""
     if len(asked) == 1:
-        sys.stderr.write(f"liex: {error}\n")
-        sys.stderr.flush()
+        os.write(2, f"liex: {error}\n".encode())  # a handler may stand within a write of ours
     os._exit(error.exit_code)

@@ -229,13 +229,22 @@ class ReplayWriter:
         """
         self._send_depth()
         self._flush()
+        size = self._count()
+        if self._n_found < self._n_sent:
+            raise self._unwritten()
+        return size
+
+    def _count(self) -> int:
+        """Count the messages that are new on disk; returns the file's bytes.
+
+        Raises:
+            SessionError: the last of them is not there as a whole.
+        """
         size = self._path.stat().st_size
         with self._path.open("rb") as file:
             for at, length in rrd_messages(file, size, self._checked or RRD_HEAD):
                 self._checked = at + length
                 self._n_found = self._n_found + 1
-        if self._n_found < self._n_sent:
-            raise self._unwritten()
         return size
 
     def _flush(self) -> None:
@@ -280,15 +289,10 @@ class ReplayWriter:
 
     def _ended(self) -> bool:
         """Whether the closed file holds its end, with the index that Rerun writes last of all."""
-        size = self._path.stat().st_size
-        at = self._checked or RRD_HEAD
-        with self._path.open("rb") as file:
-            try:
-                for start, length in rrd_messages(file, size, at):
-                    at = start + length
-            except SessionError:
-                return False
-        return size > at
+        try:
+            return self._count() > (self._checked or RRD_HEAD)
+        except SessionError:
+            return False
 
     def abandon(self) -> None:
         """Close the file, whole or not.

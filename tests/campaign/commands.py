@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO
 
+from tests.campaign.runs import SAMPLE
 from tests.runtime.test_signals import heeding
 
 _LONGEST_S = 240.0
@@ -42,6 +43,7 @@ def started(
     *arguments: str | Path,
     environment: dict[str, str] | None = None,
     out: IO[str] | int = subprocess.PIPE,
+    before: str = "",
 ) -> subprocess.Popen[str]:
     """`liex` with these arguments, heeding signals, its output and its errors in one.
 
@@ -49,9 +51,11 @@ def started(
         *arguments: of the command line.
         environment: variables besides those of this process.
         out: where its output goes.
+        before: words of the shell that it is started after, such as a limit.
     """
+    shell = ["sh", "-c", f'{before} exec "$@"', "sh"] if before else []
     return subprocess.Popen(
-        [sys.executable, "-m", "liex_lab", *map(str, arguments)],
+        [*shell, sys.executable, "-m", "liex_lab", *map(str, arguments)],
         stdout=out,
         stderr=subprocess.STDOUT,
         text=True,
@@ -61,15 +65,16 @@ def started(
     )
 
 
-def run(*arguments: str | Path, longest_s: float = _LONGEST_S) -> Ended:
+def run(*arguments: str | Path, longest_s: float = _LONGEST_S, before: str = "") -> Ended:
     """A command to its end.
 
     Args:
         *arguments: of the command line.
         longest_s: it is killed after so long.
+        before: see `started`.
     """
     began = time.monotonic()
-    with started(*arguments) as process:
+    with started(*arguments, before=before) as process:
         try:
             said, _ = process.communicate(timeout=longest_s)
         except subprocess.TimeoutExpired:
@@ -77,3 +82,14 @@ def run(*arguments: str | Path, longest_s: float = _LONGEST_S) -> Ended:
             said, _ = process.communicate()
             return Ended(process.returncode, said, time.monotonic() - began, True)
     return Ended(process.returncode, said, time.monotonic() - began)
+
+
+def measured(out: Path) -> tuple[Path, float]:
+    """The bundled sample's session, measured without any disturbance, and how long that took, s.
+
+    Args:
+        out: the folder that the session is made in.
+    """
+    ended = run("run", SAMPLE, "--out", out)
+    assert ended.code in ENDED, ended.said
+    return next(out.glob("*.liex")), ended.seconds

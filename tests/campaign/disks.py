@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import os
 import random
 import shutil
-import subprocess
 import tempfile
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from tests.campaign.commands import ENDED, Ended, run
-from tests.campaign.runs import SAMPLE, tables_of
+from tests.campaign.commands import ENDED, Ended, measured, run
+from tests.campaign.runs import SAMPLE, whole_sessions
+from tests.campaign.small_disks import in_memory, resize, used
 from tests.campaign.studies import study_file
 from tests.campaign.tally import Tally
 
@@ -70,10 +68,9 @@ def _one(*places: str) -> Callable[[Path], Results]:
 
 def _tables(disk: Path) -> Results:
     return {
-        f"{folder.name}/{name}": content
-        for folder in sorted(disk.rglob("session.json"))
-        if not folder.parent.name.endswith(".part")
-        for name, content in tables_of(folder.parent).items()
+        f"{place}/{name}": content
+        for place, tables in whole_sessions(disk).items()
+        for name, content in tables.items()
     }
 
 
@@ -135,13 +132,11 @@ def disks(n: int, seed: int) -> Tally:
     """
     tally, rng = Tally(), random.Random(seed)
     scratch = Path(tempfile.mkdtemp(prefix="liex-disks-"))
-    with _disk(scratch / "probe") as probe:
+    with in_memory(scratch / "probe", _MB) as probe:
         if probe is None:
             tally.more["not_tried"] = "mounting a small disk wants root"
             return tally
-    measured = run("run", SAMPLE, "--out", scratch / "measured")
-    assert measured.code in ENDED, measured.said
-    session = next((scratch / "measured").glob("*.liex"))
+    session, _ = measured(scratch / "measured")
     told = run("describe", session, "session_start_time=2026-08-21T10:00:00+02:00")
     assert told.code == 0, told.said  # NWB wants to know
     total = sum(verb.share for verb in VERBS)
@@ -156,7 +151,7 @@ def _tries(
     tally: Tally, verb: Verb, n: int, session: Path, place: Path, rng: random.Random
 ) -> None:
     """One verb, n times."""
-    with _disk(place) as disk:
+    with in_memory(place, _MB) as disk:
         assert disk is not None
         verb.begin(disk, session)
         began = time.time()
@@ -169,13 +164,13 @@ def _tries(
     for k in range(n):
         level = LEVELS[k % len(LEVELS)]
         room = int(needed * level * rng.uniform(0.8, 1.2))
-        with _disk(place) as disk:
+        with in_memory(place, _MB) as disk:
             assert disk is not None
             verb.begin(disk, session)
-            _resize(disk, _used(disk) + max(room, _PAGE))
+            resize(disk, used(disk) + max(room, _PAGE))
             ended = run(*verb.arguments(disk, session))
             wrong = _wrong(ended, verb.results(disk), expected, usual.seconds)
-            _resize(disk, _MB << 20)
+            resize(disk, _MB << 20)
             again = run(*verb.arguments(disk, session), *_over(verb, ended))
             lost = ""
             if again.code not in ENDED or verb.results(disk) != expected:
@@ -207,27 +202,3 @@ def _over(verb: Verb, ended: Ended) -> list[str]:
 
 
 _ANEW = ("cohort", "report", "figures")  # do what is left, or write anew
-
-
-def _used(disk: Path) -> int:
-    told = os.statvfs(disk)
-    return (told.f_blocks - told.f_bfree) * told.f_frsize
-
-
-def _resize(disk: Path, n_bytes: int) -> None:
-    option = f"remount,size={n_bytes}"
-    subprocess.run(["mount", "-o", option, str(disk)], check=True, capture_output=True)
-
-
-@contextmanager
-def _disk(place: Path) -> Iterator[Path | None]:
-    """A disk of its own in memory; None where the system does not give one."""
-    place.mkdir(parents=True, exist_ok=True)
-    mount = ["mount", "-t", "tmpfs", "-o", f"size={_MB}m", "tmpfs", str(place)]
-    if subprocess.run(mount, capture_output=True, check=False).returncode:
-        yield None
-        return
-    try:
-        yield place
-    finally:
-        subprocess.run(["umount", "-l", str(place)], check=True)

@@ -1,21 +1,14 @@
-"""A disk that is full, a drive that cannot be read, a clock that jumps, two runs on one folder at
-once.
-"""
+"""A drive that cannot be read, a clock that jumps, two runs on one folder at once."""
 
 from __future__ import annotations
 
 import random
 import shutil
-import subprocess
 import tempfile
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from tests.campaign.runs import begin, refusal, tables_of, undisturbed
-
-_DISK_MB = 64
 
 
 def faults(n: int, n_frames: int, seed: int) -> dict[str, Any]:
@@ -24,9 +17,6 @@ def faults(n: int, n_frames: int, seed: int) -> dict[str, Any]:
     """
     rng, scratch = random.Random(seed), Path(tempfile.mkdtemp(prefix="liex-faults-"))
     _, expected = undisturbed(scratch, n_frames)
-    whole_mb = (
-        sum(f.stat().st_size for f in (scratch / "undisturbed").rglob("*") if f.is_file()) / 1e6
-    )
     found: dict[str, Any] = {}
 
     def ended(out: Path) -> bool:
@@ -65,17 +55,6 @@ def faults(n: int, n_frames: int, seed: int) -> dict[str, Any]:
         figures, said = _two_at_once(scratch / f"two{k}", n_frames, expected)
         count("two at once", **figures)
         found["two at once"].setdefault("said", _plain(said, scratch))
-        with _small_disk(scratch / f"disk{k}") as disk:
-            if disk is None:
-                found["disk full"] = "not tried: mounting a small disk wants root"
-                continue
-            sentences = set()
-            ballast = disk / "ballast"
-            ballast.write_bytes(bytes(int(1e6 * (_DISK_MB - rng.uniform(0.05, 0.95) * whole_mb))))
-            broken("disk full", disk / "out")
-            ballast.unlink()
-            count("disk full", equal_afterwards=int(ended(disk / "out")))
-            found["disk full"].setdefault("said", []).extend(sentences)
     shutil.rmtree(scratch)
     return {"times_each": n, **found}
 
@@ -92,20 +71,6 @@ def _two_at_once(
         "one_refused": int(sorted(process.exitcode or 0 for process in both) == [0, 1]),
         "equal_tables": int(len(places) == 1 and tables_of(places[0]) == expected),
     }, refusal(out)
-
-
-@contextmanager
-def _small_disk(place: Path) -> Iterator[Path | None]:
-    """A disk of its own in memory; None where the system does not give one."""
-    place.mkdir()
-    mount = ["mount", "-t", "tmpfs", "-o", f"size={_DISK_MB}m", "tmpfs", str(place)]
-    if subprocess.run(mount, capture_output=True, check=False).returncode:
-        yield None
-        return
-    try:
-        yield place
-    finally:
-        subprocess.run(["umount", str(place)], check=True)
 
 
 def _plain(said: str, scratch: Path) -> str:

@@ -11,15 +11,15 @@ import shutil
 import subprocess
 import tempfile
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from pathlib import Path
 
 from liex_lab.errors import LiexError
 from liex_lab.sessions import Session
 from liex_lab.sessions.corrections import read_log
-from tests.campaign.commands import ENDED, run, started
+from tests.campaign.commands import ENDED, measured, run, started
 from tests.campaign.runs import SAMPLE, tables_of
+from tests.campaign.small_disks import mounted
 from tests.campaign.tally import Tally
 
 _MB = 256
@@ -39,19 +39,17 @@ def power_cuts(n: int, seed: int) -> Tally:
     if not _formatted(scratch / "probe.img"):
         tally.more["not_tried"] = "there is no ext4 to format a disk with"
         return tally
-    with _mounted(scratch / "probe.img", scratch / "probe") as probe:
+    with _image(scratch / "probe.img", scratch / "probe") as probe:
         if probe is None:
             tally.more["not_tried"] = "mounting an image wants root"
             return tally
-    measured = run("run", SAMPLE, "--out", scratch / "measured")
-    assert measured.code in ENDED, measured.said
-    session = next((scratch / "measured").glob("*.liex"))
+    session, usual_s = measured(scratch / "measured")
     expected = tables_of(session)
     again = run("correct", "bout", session, *_BOUT, "--from", "0.5", "--to", "1")
     assert again.code == 0, again.said
     for k in range(n):
         kind = ("correction", "run over a session", "first run")[k % 3]
-        _cut(tally, kind, k, session, expected, measured.seconds, rng)
+        _cut(tally, kind, k, session, expected, usual_s, rng)
     shutil.rmtree(scratch)
     return tally
 
@@ -70,7 +68,7 @@ def _cut(
     image, snapshot = scratch / f"{k}.img", scratch / f"{k}-cut.img"
     _formatted(image)
     correcting = kind == "correction"
-    with _mounted(image, scratch / f"disk{k}") as disk:
+    with _image(image, scratch / f"disk{k}") as disk:
         assert disk is not None
         place = disk / session.name
         if kind != "first run":
@@ -85,7 +83,7 @@ def _cut(
         subprocess.run(["cp", "--sparse=always", str(image), str(snapshot)], check=True)
         process.communicate()
     n_made = 0 if kind == "first run" else 1 + (correcting and over)
-    with _mounted(snapshot, scratch / f"after{k}") as disk:
+    with _image(snapshot, scratch / f"after{k}") as disk:
         assert disk is not None
         lost, wrong, said = _judged(disk / session.name, correcting, over, n_made, expected)
     tally.fault(
@@ -138,15 +136,6 @@ def _formatted(image: Path) -> bool:
     return not subprocess.run(["mkfs.ext4", "-qF", str(image)], check=False).returncode
 
 
-@contextmanager
-def _mounted(image: Path, place: Path) -> Iterator[Path | None]:
-    """The disk of an image; None where the system does not mount one."""
-    place.mkdir()
-    mount = ["mount", "-o", "loop", str(image), str(place)]
-    if subprocess.run(mount, capture_output=True, check=False).returncode:
-        yield None
-        return
-    try:
-        yield place
-    finally:
-        subprocess.run(["umount", "-l", str(place)], check=True)
+def _image(image: Path, place: Path) -> AbstractContextManager[Path | None]:
+    """The disk of an image, see `mounted`."""
+    return mounted(place, "-o", "loop", str(image))

@@ -118,6 +118,15 @@ def tables_of(folder: Path) -> dict[str, bytes]:
     }
 
 
+def whole_sessions(folder: Path) -> dict[str, dict[str, bytes]]:
+    """The tables of every whole session below a folder, by its place in it."""
+    return {
+        str(path.parent.relative_to(folder)): tables_of(path.parent)
+        for path in sorted(folder.rglob("session.json"))
+        if not path.parent.name.endswith(".part")
+    }
+
+
 def undisturbed(scratch: Path, n_frames: int) -> tuple[float, dict[str, bytes]]:
     """Seconds that a run takes that nobody disturbs, and its tables."""
     began = time.monotonic()

@@ -11,7 +11,7 @@ import time
 from pathlib import Path
 
 from tests.campaign.commands import ENDED, Ended, run, started
-from tests.campaign.runs import SAMPLE, tables_of
+from tests.campaign.runs import SAMPLE, whole_sessions
 from tests.campaign.studies import study_file
 from tests.campaign.tally import Tally
 from tests.runtime.test_signals import alive
@@ -47,12 +47,12 @@ def signals(n: int, seed: int) -> Tally:
         "run": ["run", SAMPLE, "--out", scratch / "out"],
         "cohort": ["cohort", scratch / "study.toml", "--workers", "2", "--retry"],
     }
-    expected: dict[str, list[dict[str, bytes]]] = {}
+    expected: dict[str, dict[str, dict[str, bytes]]] = {}
     usual_s: dict[str, float] = {}
     for name, command in commands.items():
         ended = run(*command)
         assert ended.code in ENDED, ended.said
-        expected[name], usual_s[name] = _made(scratch), ended.seconds
+        expected[name], usual_s[name] = whole_sessions(scratch), ended.seconds
         _clear(scratch)
     for k in range(n):
         name = "cohort" if k % 4 == 3 else "run"
@@ -60,13 +60,17 @@ def signals(n: int, seed: int) -> Tally:
         at_s = rng.uniform(_EARLIEST_S, usual_s[name])
         ended, seconds, problem = _signalled(commands[name], kind, at_s, scratch / "tmp")
         lost = ""
-        if not _made(scratch) and (k % 5 == 4 or k == n - 1):  # what is left goes on to the end
+        if not whole_sessions(scratch) and (
+            k % 5 == 4 or k == n - 1
+        ):  # what is left goes on to the end
             whole = run(*commands[name])
-            if whole.code not in ENDED or _made(scratch) != expected[name]:
+            if whole.code not in ENDED or whole_sessions(scratch) != expected[name]:
                 lost = f"the same command then ends with {whole.code}: {whole.said[-600:]}"
             _clear(scratch)
-        elif k % 4 in (2, 3) or _made(scratch):  # another command is next, or nothing is left
-            if any(one not in expected[name] for one in _made(scratch)):
+        elif k % 4 in (2, 3) or whole_sessions(
+            scratch
+        ):  # another command is next, or nothing is left
+            if not whole_sessions(scratch).items() <= expected[name].items():
                 problem += " a session that lies there is another one"
             _clear(scratch)
         tally.fault(
@@ -127,15 +131,6 @@ def _signalled(
         for name in left:
             shutil.rmtree(tmp / name)
     return ended, seconds, ", ".join(problems)
-
-
-def _made(scratch: Path) -> list[dict[str, bytes]]:
-    """The tables of all whole sessions."""
-    return [
-        tables_of(path.parent)
-        for path in sorted(scratch.rglob("session.json"))
-        if not path.parent.name.endswith(".part")
-    ]
 
 
 def _clear(scratch: Path) -> None:

@@ -18,7 +18,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from tests.campaign.commands import started
-from tests.campaign.runs import SAMPLE, tables_of
+from tests.campaign.runs import SAMPLE, whole_sessions
 from tests.campaign.studies import study_file
 from tests.campaign.tally import Tally
 
@@ -132,12 +132,7 @@ def _studied(
         seconds = time.monotonic() - began
         heard.seek(0)
         said = heard.read()
-    tables = {
-        str(path.relative_to(folder)): tables_of(path.parent)
-        for path in sorted(folder.rglob("session.json"))
-        if not path.parent.name.endswith(".part")
-    }
-    return seconds, tables, said
+    return seconds, whole_sessions(folder), said
 
 
 Process = subprocess.Popen[str]

@@ -250,3 +250,9 @@ def test_a_replay_that_is_cut_is_not_taken_for_whole(undisturbed: Path, tmp_path
     cut.write_bytes(data[: len(data) // 2])
     with cut.open("rb") as file, pytest.raises(SessionError, match="not written whole"):
         list(rrd_messages(file, len(data) // 2))
+
+
+@pytest.mark.skipif(not Path("/proc/1").is_dir(), reason="there is no /proc")
+def test_a_folder_that_the_system_does_not_make_is_a_sentence() -> None:
+    with pytest.raises(SessionError, match="name another place"):
+        Checkpoint(Path("/proc/1/none/x.part"), {})

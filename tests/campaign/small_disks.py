@@ -1,0 +1,49 @@
+"""Disks of a campaign's own, mounted for a while."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, contextmanager
+from pathlib import Path
+
+
+@contextmanager
+def mounted(place: Path, *what: str) -> Iterator[Path | None]:
+    """What `mount` finds under these words, at a place; None where the system mounts nothing.
+
+    Args:
+        place: the folder; made if needed.
+        *what: the words of `mount` before the place.
+    """
+    place.mkdir(parents=True, exist_ok=True)
+    if subprocess.run(["mount", *what, str(place)], capture_output=True, check=False).returncode:
+        yield None
+        return
+    try:
+        yield place
+    finally:
+        subprocess.run(["umount", "-l", str(place)], check=True)
+
+
+def in_memory(place: Path, n_mb: int) -> AbstractContextManager[Path | None]:
+    """A disk in memory, see `mounted`.
+
+    Args:
+        place: the folder; made if needed.
+        n_mb: its size, MB.
+    """
+    return mounted(place, "-t", "tmpfs", "-o", f"size={n_mb}m", "tmpfs")
+
+
+def used(disk: Path) -> int:
+    """Bytes that are in use on a disk."""
+    told = os.statvfs(disk)
+    return (told.f_blocks - told.f_bfree) * told.f_frsize
+
+
+def resize(disk: Path, n_bytes: int) -> None:
+    """Give a disk in memory another size."""
+    command = ["mount", "-o", f"remount,size={n_bytes}", str(disk)]
+    subprocess.run(command, check=True, capture_output=True)
