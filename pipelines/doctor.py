@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.errors import LiexError, printable
+from liex_lab.optics.presets import unusual_lens
 from liex_lab.plan import Plan
 from liex_lab.plan.plan import arena_lines
 from liex_lab.recordings.timestamps import DROPPED, Gap, unwritable_times
@@ -164,6 +165,7 @@ def examine(
             "problems": [
                 *seen.problems,
                 *filter(None, [unwritable_times(opened.times_ns)]),
+                *filter(None, [unusual_lens(lens) if water is None and not missing else ""]),
                 *_time_problems(opened),
                 *depth.problems(),
                 *misplaced,

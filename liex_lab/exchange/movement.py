@@ -18,4 +18,5 @@ def write(session: Session, path: Path) -> None:
         session: the session.
         path: the .nc file to write.
     """
-    session.to_xarray().to_netcdf(path, engine="h5netcdf")
+    # in memory, see `hdf5`
+    path.write_bytes(session.to_xarray().to_netcdf(engine="h5netcdf"))

@@ -18,6 +18,8 @@ from liex_lab.errors import SessionError
 from liex_lab.sessions import Session
 from liex_lab.sessions.pose_arrays import Poses
 
+from .hdf5 import hdf5_file
+
 if TYPE_CHECKING:
     from pynwb import NWBFile
 
@@ -44,7 +46,7 @@ def write(session: Session, path: Path) -> None:
     made = build(
         session
     )  # before the file is opened: it takes the types that are known by then, and not ndx-pose's
-    with NWBHDF5IO(path, "w") as file:
+    with hdf5_file(path) as hdf5, NWBHDF5IO(file=hdf5, mode="w") as file:
         file.write(made)
 
 

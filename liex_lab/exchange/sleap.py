@@ -14,6 +14,8 @@ import numpy as np
 
 from liex_lab.sessions import Session
 
+from .hdf5 import hdf5_file
+
 
 def write(session: Session, path: Path) -> None:
     """Write one track with every recorded frame.
@@ -48,7 +50,7 @@ def write(session: Session, path: Path) -> None:
     }
     edges = [(poses.joints[a], poses.joints[b]) for a, b in poses.bones]
     texts = {"node_names": poses.joints, "track_names": (poses.individual,), "edge_names": edges}
-    with h5py.File(path, "w") as file:
+    with hdf5_file(path) as file:
         for name, values in arrays.items():
             file.create_dataset(name, data=values, compression="gzip", compression_opts=4)
             if name in order:

@@ -1,14 +1,17 @@
 """Every table of a session as one Excel workbook, a sheet for each, for those who ask for it.
 
-Written row by row, so that a long session needs no more memory than its longest table. Texts stay
-texts: one that begins with "=" is no formula. CSV and Parquet keep full precision and any length;
-a sheet of Excel ends at 1,048,576 rows.
+Written row by row, so that a long session needs no more memory than its longest table and the
+packed workbook. Texts stay texts: one that begins with "=" is no formula. CSV and Parquet keep full
+precision and any length; a sheet of Excel ends at 1,048,576 rows.
 """
 
 from __future__ import annotations
 
+import io
 import math
 import re
+import shutil
+import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,6 +25,8 @@ if TYPE_CHECKING:
 MAX_ROWS = 1_048_576  # of a sheet, its headings included
 _MOST_CHARACTERS = 32_767  # of a cell
 _UNWRITABLE = re.compile("[\\0-\\x08\\x0b\\x0c\\x0e-\\x1f\\ud800-\\udfff\\ufffe\\uffff]")  # in XML
+_CELL_BYTES = 60  # of a sheet before it is packed, at most: 40 are usual
+_OTHER_BYTES = 1 << 21  # of what does not grow with the recording
 _EXACT = 10**15  # Excel has 15 digits; a longer whole number, a time in ns, is a text
 
 
@@ -33,27 +38,47 @@ def write(session: Session, path: Path) -> None:
         path: the file to write.
 
     Raises:
-        SessionError: a table is longer than a sheet can be.
+        SessionError: a table is longer than a sheet can be, or there is no room for temporary
+            files.
     """
     import pyarrow.parquet as pq
     from openpyxl import Workbook
 
     stored = {file.name for file in session.path.glob("*.parquet")} | set(session.log.files)
     names = sorted(name.removesuffix(".parquet") for name in stored if name.endswith(".parquet"))
-    for name in names:  # before anything is written
-        n_rows = pq.read_metadata(session.file(f"{name}.parquet")).num_rows
-        if n_rows >= MAX_ROWS:
+    told = [pq.read_metadata(session.file(f"{name}.parquet")) for name in names]
+    for name, one in zip(names, told, strict=True):  # before anything is written
+        if one.num_rows >= MAX_ROWS:
             raise SessionError(
                 f"a sheet of Excel has at most {MAX_ROWS:,} rows and the table {name} has "
-                f"{n_rows + 1:,} with its headings; export it as csv"
+                f"{one.num_rows + 1:,} with its headings; export it as csv"
             )
+    _check_room(sum(one.num_rows * one.num_columns for one in told))
     book = Workbook(write_only=True)
     if session.has("summary.csv"):
         _add(book, "summary", session.summary)
     for name in names:
         _add(book, name, session.table(name))
     _add(book, "columns", session.columns)
-    book.save(path)
+    # openpyxl does not survive a disk that gets full under it: in memory it meets none
+    packed = io.BytesIO()
+    book.save(packed)
+    path.write_bytes(packed.getbuffer())
+
+
+def _check_room(n_cells: int) -> None:
+    """Refuse where the folder for temporary files cannot hold the sheets before they are packed.
+
+    openpyxl writes them there, and does not survive that it gets full.
+    """
+    folder = Path(tempfile.gettempdir())
+    needed, free = n_cells * _CELL_BYTES + _OTHER_BYTES, shutil.disk_usage(folder).free
+    if free < needed:
+        raise SessionError(
+            f"the workbook's sheets need {needed / 1e6:,.0f} MB in {folder} while they are "
+            f"written, which has {free / 1e6:,.0f} MB left; make room there, name another "
+            "folder in the variable TMPDIR, or export as csv"
+        )
 
 
 def _add(book: Workbook, name: str, table: pd.DataFrame) -> None:

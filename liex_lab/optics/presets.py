@@ -51,6 +51,10 @@ PRESETS = {
     "raytrix-r5": (RAYTRIX_R5,),
 }
 
+_LIKE = 0.1  # units of a make, and pictures mapped onto another lens, differ by less than this
+# sizes that few kinds of camera have; of others there are too many to call a lens unusual
+_TELLING = ((640, 480), (512, 424), (320, 240), (640, 576))
+
 
 def preset(name: str, width: int, height: int) -> Camera:
     """The camera of a name, for pictures of a size.
@@ -100,3 +104,29 @@ def of_size(width: int, height: int) -> list[str]:
         for name, cameras in PRESETS.items()
         if any((camera.width, camera.height) == (width, height) for camera in cameras)
     ]
+
+
+def unusual_lens(camera: Camera) -> str:
+    """That a focal length is unlike that of every known camera with such pictures; "" if it is not.
+
+    A focal length that is wrong makes every length across the picture wrong by as much, and the
+    animal another one of the same look: nothing else in a recording tells.
+
+    Args:
+        camera: as the recording or the plan states it, of pictures above no water.
+    """
+    size = (camera.width, camera.height)
+    known = {
+        name: one.fx
+        for name, cameras in PRESETS.items()
+        for one in cameras
+        if (one.width, one.height) == size and size in _TELLING
+    }
+    if not known or any(abs(camera.fx / fx - 1.0) <= _LIKE for fx in known.values()):
+        return ""
+    usual = ", ".join(f"{name} {fx:.0f}" for name, fx in known.items())
+    return (
+        f"the focal length of {camera.fx:.0f} px is unlike that of the known cameras with pictures "
+        f"of {camera.width} x {camera.height} px ({usual}); where it is wrong, every length is: "
+        "put something of known length on the floor"
+    )

@@ -79,6 +79,29 @@ def _names(pattern: str) -> Callable[[Path], Results]:
     return lambda disk: {path.name: b"" for path in disk.glob(pattern)}
 
 
+def _export(to: str, share: int, results: Callable[[Path], Results]) -> Verb:
+    """An export of the measured session."""
+    return Verb(
+        f"export {to}",
+        share,
+        _nothing,
+        lambda d, s: ["export", s, "--to", to, "--out", d / "x"],
+        results,
+    )
+
+
+def _groups_of(session: Path) -> Path:
+    """Two groups of two animals each, beside the measured session; made when first asked for."""
+    folder = session.parent / "groups"
+    if not folder.exists():
+        for k in range(4):
+            copy = folder / f"m{k}.liex"
+            shutil.copytree(session, copy)
+            told = run("describe", copy, f"subject_id=m{k}", f"group={'ab'[k // 2]}")
+            assert told.code == 0, told.said
+    return folder
+
+
 VERBS = (
     Verb("run", 20, _nothing, lambda d, s: ["run", SAMPLE, "--out", d / "out"], _tables),
     Verb(
@@ -89,36 +112,41 @@ VERBS = (
         _tables,
     ),
     Verb(
-        "convert", 16, _nothing, lambda d, s: ["convert", SAMPLE, "--to", d / "a"], _one("a/*.png")
+        "convert", 13, _nothing, lambda d, s: ["convert", SAMPLE, "--to", d / "a"], _one("a/*.png")
     ),
     Verb(
         "pack",
-        16,
+        13,
         _nothing,
         lambda d, s: ["pack", SAMPLE, "--to", d / "a.pack.mcap"],
         _one("a.pack.mcap"),
     ),
-    Verb(
-        "export csv",
-        16,
-        _nothing,
-        lambda d, s: ["export", s, "--to", "csv", "--out", d / "x"],
-        _one("x/*/*"),
-    ),
-    Verb(
-        "export nwb",
-        10,
-        _nothing,
-        lambda d, s: ["export", s, "--to", "nwb", "--out", d / "x"],
-        _names("x/*.nwb"),
-    ),
-    Verb("report", 8, _the_session, lambda d, s: ["report", d / s.name], _tables),
+    _export("csv", 10, _one("x/*/*")),
+    _export("nwb", 8, _names("x/*.nwb")),
+    _export("movement", 3, _one("x/*.nc")),
+    _export("sleap", 3, _one("x/*.h5")),
+    _export("xlsx", 3, _names("x/*.xlsx")),
+    Verb("report", 6, _the_session, lambda d, s: ["report", d / s.name], _tables),
     Verb(
         "figures",
-        8,
+        6,
         _nothing,
         lambda d, s: ["figures", s, "--out", d / "f", "--format", "svg"],
         _names("f/*.svg"),
+    ),
+    Verb(
+        "compare",
+        6,
+        _nothing,
+        lambda d, s: ["compare", _groups_of(s), "--out", d / "c"],
+        _one("c/*.csv", "c/*.parquet", "c/methods.txt"),
+    ),
+    Verb(
+        "train",
+        3,
+        _nothing,
+        lambda d, s: ["train", "fish", "--images", "512", "--out", d / "fish.npz"],
+        _one("fish.npz"),
     ),
 )
 
@@ -201,4 +229,4 @@ def _over(verb: Verb, ended: Ended) -> list[str]:
     return ["--overwrite"] if ended.code in ENDED and verb.name not in _ANEW else []
 
 
-_ANEW = ("cohort", "report", "figures")  # do what is left, or write anew
+_ANEW = ("cohort", "report", "figures", "compare", "train")  # do what is left, or write anew

@@ -31,6 +31,7 @@ def kills(n: int, n_frames: int, seed: int) -> Tally:
     usual_s, expected = undisturbed(scratch, n_frames)
     out, lost, where = scratch / "killed", [0.0], dict[str, int]()
     killed = finished = equal = half = 0
+    slowest_s = 0.0
     figures: dict[str, Any] = {}
     while killed < n or not finished:
         began, process = time.monotonic(), begin(out, n_frames)
@@ -41,8 +42,10 @@ def kills(n: int, n_frames: int, seed: int) -> Tally:
         else:
             process.join()
         if process.is_alive():
+            at = time.monotonic()
             process.kill()
             process.join()
+            slowest_s = max(slowest_s, time.monotonic() - at)
             killed += 1
             stage, seconds = _lost(out)
             where[stage] = where.get(stage, 0) + 1
@@ -70,7 +73,7 @@ def kills(n: int, n_frames: int, seed: int) -> Tally:
         }
         print(json.dumps(figures), file=sys.stderr, flush=True)  # so far
     shutil.rmtree(scratch)
-    tally = Tally(tried=killed, wrong=finished - equal + half, more=figures)
+    tally = Tally(tried=killed, wrong=finished - equal + half, slowest_s=slowest_s, more=figures)
     tally.kinds.update({f"SIGKILL while {stage}": count for stage, count in where.items()})
     if tally.wrong:
         tally.broken.append(f"{tally.wrong} of {finished} sessions are not as if undisturbed")

@@ -24,7 +24,8 @@ from tests.campaign.tally import Tally
 
 _PROGRAMS = ("munged", "slurmctld", "slurmd", "sinfo", "scancel", "scontrol", "squeue")
 _KEY = Path("/etc/munge/munge.key")
-_N_SESSIONS = 4
+_N_SESSIONS = 4  # of a study
+_N_LONG = 12  # of one that lasts longer than the shortest time limit of Slurm, a minute
 _LONGEST_S = 900.0  # of a study; one that hangs is killed
 _HELD_S = 8.0  # a node is held up for so long
 _EMPTY_S = 120.0  # after the study the queue is empty within so long
@@ -69,6 +70,7 @@ STUDIES = (
     ("node drained and resumed", "job killed"),
     ("node down and resumed",),
     ("submitter killed", "submitter killed"),
+    ("time limit met",),
 )
 
 
@@ -87,14 +89,17 @@ def slurm(n: int, seed: int) -> Tally:
         return tally
     scratch = Path(tempfile.mkdtemp(prefix="liex-slurm-"))
     with _cluster(scratch):
-        usual_s, expected, said = _studied(scratch / "alone", (), rng, 60.0)
-        assert len(expected) == _N_SESSIONS, said
+        usual_s, expected, said = _studied(scratch / "alone", _N_LONG, (), rng, 60.0)
+        assert len(expected) == _N_LONG, said
+        usual_s *= _N_SESSIONS / _N_LONG
         k = 0
         while tally.tried < n:
             faults = STUDIES[k % len(STUDIES)][: n - tally.tried]
             folder = scratch / f"study{k}"
-            seconds, found, said = _studied(folder, faults, rng, usual_s)
-            wrong = "" if found == expected else f"{len(found)} sessions, some of them others"
+            n_sessions = _N_LONG if "time limit met" in faults else _N_SESSIONS
+            seconds, found, said = _studied(folder, n_sessions, faults, rng, usual_s)
+            whole = len(found) == n_sessions and found.items() <= expected.items()
+            wrong = "" if whole else f"{len(found)} sessions, some of them others"
             if seconds > _LONGEST_S:
                 wrong = f"it hung; {wrong}"
             elif left := _left():
@@ -104,18 +109,20 @@ def slurm(n: int, seed: int) -> Tally:
             tally.fault(faults[-1], wrong=wrong, traceback="Traceback" in said, said=said)
             tally.more.setdefault("study_s", []).append(round(seconds))
             k += 1
+        told = (scratch / "slurmctld.log").read_text(encoding="utf-8", errors="replace")
     tally.more["undisturbed_s"] = round(usual_s)
+    tally.more["jobs_ended_by_their_time"] = told.count("Time limit exhausted")
     shutil.rmtree(scratch)
     return tally
 
 
 def _studied(
-    folder: Path, faults: tuple[str, ...], rng: random.Random, usual_s: float
+    folder: Path, n_sessions: int, faults: tuple[str, ...], rng: random.Random, usual_s: float
 ) -> tuple[float, dict[str, dict[str, bytes]], str]:
     """A study with faults at random moments: how long it took, its tables, and what it said."""
     (folder / "rawdata").mkdir(parents=True)
     shutil.copy(SAMPLE, folder / "rawdata" / "walk.mcap")
-    study = study_file(folder, [(f"m{k}", "rawdata/walk.mcap") for k in range(_N_SESSIONS)])
+    study = study_file(folder, [(f"m{k}", "rawdata/walk.mcap") for k in range(n_sessions)])
     (folder / "slurm.toml").write_text(_JOBS.format(folder=folder))
     command: list[str | Path] = ["cohort", study, "--slurm", folder / "slurm.toml"]
     with (folder / "said").open("w+", encoding="utf-8") as heard:
@@ -151,6 +158,13 @@ def _kill_all_jobs(process: Process, begin: Begin) -> Process:
     return process
 
 
+def _meet_the_time_limit(process: Process, begin: Begin) -> Process:
+    """Slurm ends the jobs that run by then for their time."""
+    for job in _jobs():
+        _do("scontrol", "update", f"JobId={job}", "TimeLimit=1")
+    return process
+
+
 def _hold_up(state: str) -> Callable[[Process, Begin], Process]:
     """The node is out for some seconds."""
 
@@ -175,6 +189,7 @@ _FAULTS: dict[str, Callable[[Process, Begin], Process]] = {
     "node drained and resumed": _hold_up("DRAIN"),
     "node down and resumed": _hold_up("DOWN"),
     "submitter killed": _kill_the_submitter,
+    "time limit met": _meet_the_time_limit,
 }
 
 

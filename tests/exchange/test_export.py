@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import subprocess
 import sys
 from datetime import datetime
 from importlib import import_module
@@ -81,6 +82,46 @@ def test_a_table_longer_than_a_sheet_is_refused_in_a_sentence(session, tmp_path,
     monkeypatch.setattr("liex_lab.exchange.tables_xlsx.MAX_ROWS", 100)
     with pytest.raises(SessionError, match=r"at most 100 rows .* export it as csv"):
         export(session, "xlsx", tmp_path)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_workbook_whose_sheets_have_no_room_is_refused_in_a_sentence(
+    session, tmp_path, monkeypatch
+):
+    room = shutil.disk_usage(tmp_path)._replace(free=100_000)
+    monkeypatch.setattr("liex_lab.exchange.tables_xlsx.shutil.disk_usage", lambda _: room)
+    with pytest.raises(SessionError, match=r"need \d MB in .*, which has 0 MB left; .*TMPDIR"):
+        export(session, "xlsx", tmp_path)
+    assert not list(tmp_path.iterdir())
+
+
+_ON_A_FULL_DISK = """
+import resource, signal, sys
+from liex_lab.exchange import export
+from liex_lab.sessions import Session
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096))
+for to in sys.argv[3:]:
+    try:
+        export(Session.open(sys.argv[1]), to, sys.argv[2])
+    except OSError as error:
+        print(to, error.strerror)
+"""
+
+
+def test_no_library_of_another_format_speaks_of_a_full_disk(session, tmp_path):
+    # HDF5 used to try again at the exit, with its own tracebacks and a crash
+    targets = ("nwb", "movement", "sleap")
+    done = subprocess.run(
+        [sys.executable, "-c", _ON_A_FULL_DISK, session.path, tmp_path, *targets],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    assert done.stdout.splitlines() == [f"{to} File too large" for to in targets]
+    assert done.stderr == ""
+    assert done.returncode == 0
     assert not list(tmp_path.iterdir())
 
 

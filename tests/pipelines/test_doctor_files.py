@@ -17,7 +17,8 @@ from liex_lab.pipelines.doctor import examine
 from liex_lab.pipelines.doctor_files import next_command, open_anyhow
 
 from liex_lab.errors import LiexError, RecordingError
-from liex_lab.optics.presets import PRESETS, of_size, preset
+from liex_lab.optics.camera import Camera
+from liex_lab.optics.presets import PRESETS, of_size, preset, unusual_lens
 from liex_lab.plan import Plan
 from liex_lab.plan.sections import CameraName
 from tests.pipelines.test_choice import FISH, GOOD, RECORDING
@@ -88,6 +89,22 @@ def test_every_camera_that_a_plan_may_name_is_there_and_sees_as_wide_as_it_shoul
 def test_a_camera_that_has_no_preset_is_told() -> None:
     with pytest.raises(LiexError, match=r"camera\.preset is one of kinect-v2"):
         preset("kodak", 640, 480)
+
+
+@pytest.mark.parametrize("factor", [1.3, 1 / 1.3])
+def test_a_focal_length_that_no_known_camera_has_is_told(tmp_path: Path, factor: float) -> None:
+    for name in ("kinect-v2", "primesense", "azure-nfov"):
+        for camera in PRESETS[name]:
+            for scale in (0.92, 1.0, 1.08):
+                usual = replace(camera, fx=scale * camera.fx, fy=scale * camera.fy)
+                assert not unusual_lens(usual)
+            wrong = replace(camera, fx=factor * camera.fx, fy=factor * camera.fy)
+            assert f"{name} {camera.fx:.0f}" in unusual_lens(wrong)
+    assert not unusual_lens(Camera(2000.0, 2000.0, 700.0, 500.0, 1400, 1000)), "not known at all"
+    lens = {"fx": 365.0 * factor, "fy": 365.0 * factor, "cx": 255.5, "cy": 211.5}
+    stated = [*(f"camera.{name}={value!r}" for name, value in lens.items()), "recording.fps=30.0"]
+    found = examine(pictures(tmp_path / "p"), Plan().with_settings(stated))
+    assert any("is unlike that of the known cameras" in one for one in found["problems"])
 
 
 def test_doctor_proposes_the_plan_and_says_what_to_run_next(
