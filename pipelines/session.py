@@ -284,19 +284,26 @@ def make_track(writer: SessionWriter, fitted: Fitted) -> Verdict:
     from liex_lab.optics.presets import unusual_lens
     from liex_lab.sessions.verdict import Verdict
     from liex_lab.tracking.observations import Observations
+    from liex_lab.tracking.pace import why_too_fast
 
     tracker = fitted.tracker
     whole = writer.seen(Observations)
     tracked = tracker.track(whole, allocate=writer.allocate)
     fit = tracker.sample_fit
     files = fitted.recording.files
+    fast = why_too_fast(tracked.track, tracker.subject.length_mm)
     # water makes an ideal camera with a focal length of its own
     lens = unusual_lens(fitted.recording.camera) if fitted.plan.water.height_mm is None else ""
     verdict = Verdict.of(
         tracked.track,
         whole,
         misfits=fitted.misfits,
-        doubts=(*tracker.scene.doubts, *fitted.recording.clock_doubts, *files.rewritten()),
+        doubts=(
+            *tracker.scene.doubts,
+            *fitted.recording.clock_doubts,
+            *filter(None, [fast]),
+            *files.rewritten(),
+        ),
         n_animals=1 if fit is None else fit.n_animals,
         cautions=(*fitted.notes, *tracker.scene.remarks, *files.grown(), *filter(None, [lens])),
         accepted=fitted.plan.estimation.accept_misfit,

@@ -60,7 +60,7 @@ class SceneChange:
             return None
         step = max(1, int(np.sqrt(sample[0].size / _N_PIXELS)))
         depths = sample[:, ::step, ::step].reshape(len(sample), -1)
-        usual = [np.median(part, axis=0) for part in np.array_split(depths, n_parts)]
+        usual = [_usual(part) for part in np.array_split(depths, n_parts)]
         found = None
         for a, b in [*zip(range(n_parts), range(1, n_parts), strict=False), (0, n_parts - 1)]:
             read = (usual[a] > 0) & (usual[b] > 0)
@@ -85,3 +85,12 @@ class SceneChange:
             f"the camera was pushed, or its scene rearranged, at {self.at_s:.1f} s "
             f"({self.share:.0%} of it is elsewhere from then on): cut the recording there"
         )
+
+
+def _usual(depths: NDArray[np.float32]) -> NDArray[np.float32]:
+    """The median (P,) of what was read in frames (n, P), mm; 0 where most of it was not."""
+    n_read = (depths > 0).sum(axis=0)
+    # unread pixels come first
+    row = np.minimum(len(depths) - (n_read + 1) // 2, len(depths) - 1)
+    median = np.take_along_axis(np.sort(depths, axis=0), row[None], axis=0)[0]
+    return np.where(2 * n_read >= len(depths), median, np.float32(0))

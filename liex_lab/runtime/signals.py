@@ -9,12 +9,14 @@ from __future__ import annotations
 
 import os
 import signal
+import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
 
 _PATIENCE_S = 4.0
+_AGAIN_S = 0.05
 _NAMES = ("SIGINT", "SIGTERM", "SIGHUP")
 _SAID = {"SIGINT": "interrupted (Ctrl-C)", "SIGTERM": "ended (SIGTERM)", "SIGHUP": "ended (SIGHUP)"}
 
@@ -50,9 +52,14 @@ def ending() -> Iterator[None]:
     Signals that the process was started to ignore, as by nohup, are ignored.
     """
     asked: list[int] = []
+    unheard = threading.Event()
+    usual = sys.unraisablehook
 
     def end(number: int, frame: FrameType | None) -> None:
         error = Ended(number)
+        if unheard.is_set():
+            unheard.clear()
+            raise error
         if asked:
             _end_now(error, asked)
         asked.append(number)
@@ -61,7 +68,18 @@ def ending() -> Iterator[None]:
         late.start()
         raise error
 
+    def again(what: sys.UnraisableHookArgs) -> None:
+        """It was raised where Python lets no error out, such as in a weak reference's callback."""
+        if not isinstance(what.exc_value, Ended):
+            return usual(what)
+        unheard.set()
+        later = threading.Timer(_AGAIN_S, _send, [what.exc_value.signal])
+        later.daemon = True
+        later.start()
+        return None
+
     before = {}
+    sys.unraisablehook = again
     for name in _NAMES:
         number = getattr(signal, name, None)
         if number is None or threading.current_thread() is not threading.main_thread():
@@ -72,11 +90,20 @@ def ending() -> Iterator[None]:
     try:
         yield
     finally:
+        sys.unraisablehook = usual
         if asked:
             asked.append(0)  # the sentence is said by who catches the error
         else:  # a second signal would still end it at once
             for number, handler in before.items():
                 signal.signal(number, handler)
+
+
+def _send(number: int) -> None:
+    """A signal to the main thread, whatever it waits for."""
+    if hasattr(signal, "pthread_kill"):
+        signal.pthread_kill(threading.main_thread().ident or 0, number)
+    else:
+        signal.raise_signal(number)
 
 
 def _end_now(error: Ended, asked: list[int]) -> None:

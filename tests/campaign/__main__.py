@@ -21,6 +21,7 @@ from tests.campaign.tally import Tally
 SIZES = {
     "names": 0,  # all names against all writers
     "limits": 0,  # each once
+    "odd": 0,
     "damaged": 10_000,
     "signals": 50,
     "disks": 100,
@@ -60,12 +61,24 @@ def main() -> None:
 
 def _counted(part: str, asked: argparse.Namespace) -> Tally:
     """A campaign that counts as all do."""
-    from tests.campaign import damaged, disks, kills, limits, names, power, signals, slurm, studies
+    from tests.campaign import (
+        damaged,
+        disks,
+        kills,
+        limits,
+        names,
+        odd,
+        power,
+        signals,
+        slurm,
+        studies,
+    )
 
     n = asked.n or max(1, round(SIZES[part] * asked.share))
     campaigns: dict[str, Callable[[], Tally]] = {
         "names": names.names,
         "limits": limits.limits,
+        "odd": odd.odd,
         "damaged": lambda: damaged.damaged(n, asked.seed),
         "signals": lambda: signals.signals(n, asked.seed),
         "disks": lambda: disks.disks(n, asked.seed),

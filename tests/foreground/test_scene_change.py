@@ -42,6 +42,12 @@ def test_a_camera_that_is_lifted_is_told_with_the_time() -> None:
     assert "the camera was pushed, or its scene rearranged, at 1.3 s" in scene.doubts[0]
 
 
+def test_a_camera_that_reads_each_pixel_half_of_the_time_was_not_pushed() -> None:
+    rng = np.random.default_rng(5)
+    scene = learned(lambda k, depth: np.where(rng.random(depth.shape) < 0.5, 0, depth))
+    assert scene.changed is None
+
+
 def empty() -> np.ndarray:
     """A tray of 200 x 140 pixels with walls of 80 mm."""
     depth = np.full((240, 320), 700.0, np.float32)

@@ -48,6 +48,19 @@ DEAF = """
             pass
 """
 
+IN_A_CALLBACK = """
+    import os, signal, weakref
+    class Gone: pass
+    def call(_):
+        os.kill(os.getpid(), signal.SIGTERM); time.sleep(0.1)
+    gone = Gone()
+    kept = weakref.ref(gone, call)
+    try:
+        print("begun", flush=True); del gone; time.sleep(60)
+    finally:
+        print("tidied", flush=True)
+"""
+
 
 def heeding() -> None:
     """In a new process: heed the signals, though the tests were started to ignore some (nohup)."""
@@ -99,6 +112,15 @@ def test_what_does_not_end_is_ended(work: str) -> None:
     assert returned == 143
     assert err.count("ended (SIGTERM)") == 1
     assert seconds < 6.0 + SLACK_S
+
+
+def test_a_signal_that_comes_where_python_lets_no_error_out_is_heard_all_the_same() -> None:
+    returned, out, err, seconds = ended(IN_A_CALLBACK)
+    assert returned == 143
+    assert "tidied" in out
+    assert err.count("\n") == 1
+    assert err.startswith("liex: ended (SIGTERM)")
+    assert seconds < 3.0 + SLACK_S
 
 
 def test_a_second_signal_ends_it_at_once() -> None:
