@@ -506,8 +506,8 @@ def describe_session(
 
     Args:
         session: the session folder.
-        facts: any of subject_id, group, cage, sex, batch and session_start_time (ISO 8601 with a
-            time zone); an empty text is unknown.
+        facts: any of subject_id, group, cage, sex, batch, species (Latin), age (12 weeks, or P12W)
+            and session_start_time (ISO 8601 with a time zone); an empty text is unknown.
         author: who says so; "" takes who is logged in.
         progress: told how far the work is.
 

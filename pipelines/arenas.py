@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from liex_lab.sessions import SessionWriter
     from liex_lab.sessions.writer import BlueprintMaker, ReportMaker
 
-_FACTS = ("individual", "subject_id", "group", "cage", "sex", "batch")
+_FACTS = ("individual", "subject_id", "group", "cage", "sex", "batch", "species", "age")
 _REMEMBERED_BYTES = 256 * 2**20  # of frames that several arenas learn their scenes from
 
 

@@ -197,7 +197,8 @@ def describe(
         list[str],
         typer.Argument(
             metavar="KEY=VALUE...",
-            help="subject_id, group, cage, sex, batch or session_start_time; KEY= takes it away.",
+            help="subject_id, group, cage, sex, batch, species, age or session_start_time; KEY= "
+            "takes it away.",
         ),
     ],
     by: Author = "",

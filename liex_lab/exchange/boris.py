@@ -27,8 +27,9 @@ def write(session: Session, path: Path) -> None:
         path: the .boris file to write.
     """
     path.write_text(
-        json.dumps(project(session, path.parent), indent=1, ensure_ascii=False) + "\n",
-        encoding="utf-8",
+        # escapes, for BORIS opens it in the machine's own encoding, which on Windows is not UTF-8
+        json.dumps(project(session, path.parent), indent=1) + "\n",
+        encoding="ascii",
     )
 
 

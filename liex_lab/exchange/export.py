@@ -17,7 +17,7 @@ TARGETS: dict[str, tuple[str, str, str]] = {
     "nwb": (
         "liex_lab.exchange.nwb",
         ".nwb",
-        "Neurodata Without Borders: poses (ndx-pose), rotations, actions",
+        "Neurodata Without Borders: poses (ndx-pose), rotations, actions (ndx-ethogram)",
     ),
     "boris": ("liex_lab.exchange.boris", ".boris", "a BORIS project with the ethogram"),
     "dlc": (

@@ -1,8 +1,14 @@
 """Neurodata Without Borders (NWB) file: poses by the extension ndx-pose, rotations, actions, gaps.
 
 One animal per file. There is no type for rotations in NWB: each joint's is a TimeSeries of rotation
-vectors, rad. Actions and gaps are time intervals. Times are true ones, s since the session's
-beginning, which NWB wants with its time zone.
+vectors, rad. Actions and gaps are time intervals (see `nwb_intervals`). Times are true ones, s
+since the session's beginning, which NWB wants with its time zone.
+
+Species, sex and age are fields of NWB's Subject. Group, cage and batch have none, in NWB or in any
+extension that archives know: the subject's description says them to people (DANDI shows it), and
+`notes`, a field of every NWB file, says to programs all that is known of the animal, a line
+`key: value` for each fact. `scratch` is not meant to be shared, and a type of our own would have to
+be explained to every reader.
 """
 
 from __future__ import annotations
@@ -19,11 +25,13 @@ from liex_lab.sessions import Session
 from liex_lab.sessions.pose_arrays import Poses
 
 from .hdf5 import hdf5_file
+from .nwb_intervals import add_intervals
 
 if TYPE_CHECKING:
     from pynwb import NWBFile
 
 _SPECIES = {"mouse": "Mus musculus", "fish": "Danio rerio", "hand": "Homo sapiens"}
+_SAID = ("group", "cage", "batch")  # what has no field of its own
 _FRAME = (
     "the arena: z up from the floor, origin at the foot of the camera's perpendicular, x along "
     "the picture's rows; joints lie on the body's mid-axis"
@@ -45,7 +53,7 @@ def write(session: Session, path: Path) -> None:
 
     made = build(
         session
-    )  # before the file is opened: it takes the types that are known by then, and not ndx-pose's
+    )  # before the file is opened: it takes the types that are known by then, and no extension's
     with hdf5_file(path) as hdf5, NWBHDF5IO(file=hdf5, mode="w") as file:
         file.write(made)
 
@@ -74,14 +82,15 @@ def build(session: Session) -> NWBFile:
         source_script="liex export --to nwb",
         source_script_file_name=f"liex_lab {version}",
         keywords=["depth camera", "pose", "behavior"],
+        notes=_notes(session),
     )
     module = made.create_processing_module(
         "behavior", "pose estimates, rotations and actions by liex_lab"
     )
     poses = session.pose_arrays()
-    _add_poses(made, module, session, poses, version)
+    estimate = _add_poses(made, module, session, poses, version)
     _add_rotations(module, session, poses)
-    _add_intervals(made, session)
+    add_intervals(made, session, poses, estimate)
     return made
 
 
@@ -101,21 +110,34 @@ def _start(session: Session) -> datetime:
 
 
 def _subject(session: Session) -> Any:
+    """The animal. Its sex is one of NWB's letters, and its id holds no slash: DANDI makes a path of
+    it.
+    """
     from pynwb.file import Subject
 
     about = session.metadata["subject"]
     kind = session.metadata["animal"]["name"]
     sex = str(about.get("sex", ""))[:1].upper()
+    said = [f"{name} {about[name]}" for name in _SAID if about.get(name)]
     return Subject(
-        subject_id=about.get("subject_id") or session.metadata["individual"],
-        species=_SPECIES.get(kind, kind),
+        subject_id=(about.get("subject_id") or session.metadata["individual"]).replace("/", "-"),
+        species=about.get("species") or _SPECIES.get(kind, kind),
         sex=sex if sex in ("M", "F", "O") else "U",
-        description=f"{kind}, group {about.get('group') or 'not stated'}",
+        age=about.get("age"),
+        description=", ".join([kind, *(said or ["group not stated"])]),
     )
 
 
-def _add_poses(made: NWBFile, module: Any, session: Session, poses: Poses, version: str) -> None:
-    """Skeleton and one series per joint; the first one's times are the others' too."""
+def _notes(session: Session) -> str:
+    """What is known of the animal, a line for each fact."""
+    about = {"individual": session.metadata["individual"], **session.metadata["subject"]}
+    return "\n".join(f"{name}: {' '.join(str(value).split())}" for name, value in about.items())
+
+
+def _add_poses(made: NWBFile, module: Any, session: Session, poses: Poses, version: str) -> Any:
+    """Skeleton and one series per joint; the first one's times are the others' too. Returns the
+    PoseEstimation.
+    """
     from ndx_pose import PoseEstimation, PoseEstimationSeries, Skeleton, Skeletons
 
     skeleton = Skeleton(
@@ -143,18 +165,18 @@ def _add_poses(made: NWBFile, module: Any, session: Session, poses: Poses, versi
                 confidence_definition=_CONFIDENCE,
             )
         )
-    module.add(
-        PoseEstimation(
-            name="PoseEstimation",
-            pose_estimation_series=series,
-            description="joints in millimetres, one row per frame",
-            device=device,
-            scorer="liex_lab",
-            source_software="liex_lab",
-            source_software_version=version,
-            skeleton=skeleton,
-        )
+    estimate = PoseEstimation(
+        name="PoseEstimation",
+        pose_estimation_series=series,
+        description="joints in millimetres, one row per frame",
+        device=device,
+        scorer="liex_lab",
+        source_software="liex_lab",
+        source_software_version=version,
+        skeleton=skeleton,
     )
+    module.add(estimate)
+    return estimate
 
 
 def _add_rotations(module: Any, session: Session, poses: Poses) -> None:
@@ -179,29 +201,3 @@ def _add_rotations(module: Any, session: Session, poses: Poses) -> None:
                 description=f"rotation vector {what}",
             )
         )
-
-
-def _add_intervals(made: NWBFile, session: Session) -> None:
-    """Actions and gaps."""
-    from pynwb.epoch import TimeIntervals
-
-    actions = TimeIntervals(name="actions", description="the ethogram: half-open intervals")
-    actions.add_column("label", "the action's name")
-    actions.add_column("score", "how well the bout fits its action, 0 to 1")
-    bouts = session.bouts
-    missing = session.gaps
-    spans = bouts[["start_s", "stop_s"]].to_numpy(float).tolist()
-    scores = bouts["score"].to_numpy(float).tolist()
-    for (start, stop), action, score in zip(spans, bouts["action"], scores, strict=True):
-        actions.add_row(
-            start_time=start, stop_time=stop, label=str(action), score=score, check_ragged=False
-        )
-    gaps = TimeIntervals(name="gaps", description="frames that are missing or without a pose")
-    gaps.add_column("reason", "why")
-    for (start, stop), reason in zip(
-        missing[["start_s", "stop_s"]].to_numpy(float).tolist(), missing["reason"], strict=True
-    ):
-        gaps.add_row(start_time=start, stop_time=stop, reason=str(reason), check_ragged=False)
-    for table in (actions, gaps):
-        if len(table):
-            made.add_time_intervals(table)

@@ -7,6 +7,7 @@ that are written.
 
 from __future__ import annotations
 
+import re
 from datetime import datetime
 from typing import Annotated, Any, Literal
 
@@ -16,6 +17,44 @@ Positive = Annotated[float, Field(gt=0)]
 # names of liex_lab.optics.presets, stated here for a plan is read before any library is there
 CameraName = Literal["kinect-v2", "primesense", "azure-nfov", "femto-bolt", "d435", "raytrix-r5"]
 NotNegative = Annotated[float, Field(ge=0)]
+_SPECIES = "Latin name of its species, as Rattus norvegicus; not set: that of the animal's kind"
+_AGE = "age of the animal on that day, as 12 weeks, or as P12W (ISO 8601)"
+_TAXON = "http://purl.obolibrary.org/obo/NCBITaxon_"
+_LATIN = re.compile(rf"[A-Z][a-z]+ [a-z]+|{re.escape(_TAXON)}\d+")
+_AGED = re.compile(r"(\d+(?:\.\d+)?) *(day|week|month|year)s?", re.IGNORECASE)
+_DURATION = re.compile(r"P(?=\d)(\d+Y)?(\d+M)?(\d+W)?(\d+D)?|P\d+\.\d+[YMWD]")
+
+
+def known_species(species: str | None) -> str | None:
+    """A species as archives know it.
+
+    Args:
+        species: its Latin name or its entry in NCBI's taxonomy; None is that of the animal's kind.
+
+    Raises:
+        ValueError: it is neither.
+    """
+    if species is None or _LATIN.fullmatch(species):
+        return species
+    raise ValueError(f"should be a Latin name such as Rattus norvegicus, or {_TAXON}10116")
+
+
+def whole_age(age: str | None) -> str | None:
+    """An age as ISO 8601 writes durations.
+
+    Args:
+        age: as a person writes it (12 weeks), or as ISO 8601 does (P12W); None is unknown.
+
+    Raises:
+        ValueError: it is neither.
+    """
+    if age is None:
+        return None
+    if said := _AGED.fullmatch(age.strip()):
+        return f"P{said[1]}{said[2][0].upper()}"
+    if _DURATION.fullmatch(age.strip()):
+        return age.strip()
+    raise ValueError("should be an age such as 12 weeks or 84 days, or ISO 8601, as P12W")
 
 
 class Table(BaseModel):
@@ -209,6 +248,11 @@ class SeveralArenas(Table):
     cage: str | None = Field(None, description="home cage or tank of its animal")
     sex: str | None = Field(None, description="sex of its animal")
     batch: str | None = Field(None, description="batch of the experiment")
+    species: str | None = Field(None, description=_SPECIES)
+    age: str | None = Field(None, description=_AGE)
+
+    _aged = field_validator("age")(whole_age)
+    _named = field_validator("species")(known_species)
 
 
 class ArenaFacts(Table):
@@ -336,6 +380,8 @@ class SessionFacts(Table):
     cage: str | None = Field(None, description="home cage or tank of the animal")
     sex: str | None = Field(None, description="sex of the animal")
     batch: str | None = Field(None, description="batch of the experiment")
+    species: str | None = Field(None, description=_SPECIES)
+    age: str | None = Field(None, description=_AGE)
     session_start_time: str | None = Field(
         None,
         description=(
@@ -343,6 +389,9 @@ class SessionFacts(Table):
             "says"
         ),
     )
+
+    _aged = field_validator("age")(whole_age)
+    _named = field_validator("species")(known_species)
 
     @field_validator("session_start_time", mode="before")
     @classmethod

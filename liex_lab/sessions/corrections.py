@@ -22,12 +22,12 @@ from typing import Any, ClassVar
 from liex_lab.catalog import sha256
 from liex_lab.errors import SessionError
 from liex_lab.runtime.places import safe_name
-from liex_lab.sessions.listed import WHO
+from liex_lab.sessions.listed import ALSO, WHO
 
 FOLDER = "corrected"
 LOG = "corrections.json"
 REPLAY = "corrected.rrd"
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2  # since 2 species and age are described, too
 FACTS = {
     "frames",
     "actions",
@@ -38,7 +38,7 @@ FACTS = {
 }  # sections that may change
 EDITS = ("add", "rename", "recut", "delete")
 START = "session_start_time"
-DESCRIBED = (*WHO, START)
+DESCRIBED = (*WHO, *ALSO, START)
 
 
 @dataclass(frozen=True)

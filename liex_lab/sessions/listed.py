@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 WHO = ("subject_id", "group", "cage", "sex", "batch")
+ALSO = ("species", "age")  # what archives ask for as well; nothing is grouped by them
 
 
 @dataclass(frozen=True)

@@ -69,7 +69,7 @@ class Provenance:
         gaps: frames that the camera did not deliver, and timestamps that were moved.
         problems: sentences about the recording.
         truncated: whether the recording ends in the middle of a frame.
-        subject: any of subject_id, group, cage, sex, batch.
+        subject: any of subject_id, group, cage, sex, batch, species and age (ISO 8601).
         session_start_time: ISO 8601 with time zone; empty when unknown.
         model: name and sha256 of the pose model.
         animal_size: spine_mm, its origin, and girth over what is usual for that length.
@@ -130,6 +130,8 @@ class Provenance:
             "cage": stated.cage,
             "sex": stated.sex,
             "batch": stated.batch,
+            "species": stated.species,
+            "age": stated.age,
         }
         known: dict[str, Any] = {
             "name": storable(stated.name or recording.name),

@@ -13,9 +13,16 @@ import pytest
 from liex_lab.sessions import Session
 from tests.sessions.walking_mouse import WalkingMouse, steady, write
 
-# movement alone brings 90 packages and half a gigabyte: `pip install -e '.[test,peers]'` collects
-# these as well
-collect_ignore = [] if find_spec("movement") and find_spec("sleap_io") else ["test_peers.py"]
+# these programs bring 200 packages and more than a gigabyte: `pip install -e '.[test,peers]'`
+# collects their tests as well, and .ci/peers runs them
+_PEERS = {
+    "test_peers.py": ("movement", "sleap_io"),
+    "test_boris_reads.py": ("boris",),
+    "test_dandi.py": ("dandi",),
+}
+collect_ignore = [
+    file for file, packages in _PEERS.items() if not all(find_spec(name) for name in packages)
+]
 
 
 @pytest.fixture(scope="package")
@@ -26,5 +33,12 @@ def session(tmp_path_factory: pytest.TempPathFactory) -> Session:
     )
     mouse = WalkingMouse(times - times[0], rear_s=(1.0, 2.2), lost=(20, 21))
     folder: Path = tmp_path_factory.mktemp("exchange") / "circle.liex"
-    subject = {"subject_id": "m01", "group": "control", "sex": "female"}
+    subject = {
+        "subject_id": "m01",
+        "group": "control",
+        "cage": "c3",
+        "sex": "female",
+        "batch": "b2",
+        "age": "P12W",
+    }
     return write(folder, mouse, subject=subject, session_start_time="2026-08-21T10:00:00+02:00")

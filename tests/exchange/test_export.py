@@ -8,7 +8,6 @@ import json
 import shutil
 import subprocess
 import sys
-from datetime import datetime
 from importlib import import_module
 from pathlib import Path
 
@@ -17,8 +16,6 @@ import numpy as np
 import pandas as pd
 import pytest
 import xarray
-from nwbinspector import Importance, inspect_nwbfile
-from pynwb import NWBHDF5IO
 from typer.testing import CliRunner
 
 from liex_lab import cli
@@ -31,11 +28,6 @@ from tests.sessions.walking_mouse import WalkingMouse, steady, write
 @pytest.fixture(scope="module")
 def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("out")
-
-
-@pytest.fixture(scope="module")
-def nwb(session: Session, out: Path) -> Path:
-    return export(session, "nwb", out)
 
 
 def test_every_table_comes_back_from_csv_as_it_was(session, out):
@@ -204,49 +196,6 @@ def test_boris_gets_two_rows_for_every_bout(session, out):
     media = observation["file"]["1"][0]
     assert set(observation["media_info"]["length"]) == {media}
     assert project["project_format_version"] == "7.0"
-
-
-def test_pynwb_reads_poses_times_rotations_and_actions(session, nwb):
-    poses = session.pose_arrays()
-    with NWBHDF5IO(nwb, "r") as file:
-        read = file.read()
-        module = read.processing["behavior"]
-        estimate = module["PoseEstimation"]
-        assert list(estimate.skeleton.nodes[:]) == list(poses.joints)
-        for k, joint in enumerate(poses.joints):
-            series = estimate.pose_estimation_series[joint]
-            np.testing.assert_array_equal(series.data[:], poses.xyz_mm[:, k].astype(np.float32))
-            np.testing.assert_array_equal(series.timestamps[:], poses.time_s)
-            assert series.unit == "millimeters"
-        assert module["rotation_root"].data.shape == (116, 3)
-        actions = read.intervals["actions"].to_dataframe()
-        np.testing.assert_array_equal(actions["start_time"], session.bouts["start_s"])
-        np.testing.assert_array_equal(actions["stop_time"], session.bouts["stop_s"])
-        assert list(actions["label"]) == list(session.bouts["action"])
-        assert read.session_start_time == datetime.fromisoformat("2026-08-21T10:00:00+02:00")
-        assert (read.subject.subject_id, read.subject.species, read.subject.sex) == (
-            "m01",
-            "Mus musculus",
-            "F",
-        )
-
-
-def test_nwbinspector_finds_nothing_that_would_be_refused(nwb):
-    light = Importance.BEST_PRACTICE_SUGGESTION.value
-    grave = [
-        message for message in inspect_nwbfile(nwbfile_path=nwb) if message.importance.value > light
-    ]
-    # the animal's age is not ours to know; the archive for which it matters asks for it on upload
-    assert [
-        message.check_function_name for message in grave if "age" not in message.check_function_name
-    ] == []
-
-
-def test_nwb_is_refused_without_a_beginning(tmp_path):
-    session = write(tmp_path / "c.liex", WalkingMouse(steady(0.5)))
-    with pytest.raises(SessionError, match="session_start_time=2026"):
-        export(session, "nwb", tmp_path)
-    assert [path.name for path in tmp_path.iterdir()] == ["c.liex"]  # nothing half-written
 
 
 def test_a_wish_that_cannot_be_met_is_told(session, tmp_path):

@@ -370,6 +370,16 @@ def test_who_the_animal_is_can_be_said_afterwards_and_taken_back(session: Sessio
     assert back.metadata["subject"]["group"] == "drug"
 
 
+def test_age_and_species_are_described_as_archives_want_them(session: Session) -> None:
+    told = corrected(
+        session, *correcting.descriptions({"age": "12 weeks", "species": "Rattus norvegicus"})
+    )
+    assert told.metadata["subject"]["age"] == "P12W"
+    assert told.metadata["subject"]["species"] == "Rattus norvegicus"
+    again = corrected(told, *correcting.descriptions({"species": ""}))
+    assert "species" not in again.metadata["subject"]
+
+
 def test_descriptions_stand_beside_corrections(session: Session) -> None:
     moment = "2026-08-21T10:00:00+02:00"
     one = corrected(session, correcting.rename_bout(session, 2.5, "run"))
@@ -387,6 +397,9 @@ def test_descriptions_stand_beside_corrections(session: Session) -> None:
         ({"weight": "20"}, "subject_id, group, cage"),
         ({}, "nothing to describe"),
         ({"session_start_time": "yesterday"}, "time zone"),
+        ({"age": "grown up"}, "12 weeks"),
+        ({"age": "P"}, "12 weeks"),
+        ({"species": "rat"}, "Latin name such as Rattus norvegicus"),
     ],
 )
 def test_a_fact_that_cannot_be_said_is_refused(facts: dict[str, str], said: str) -> None:

@@ -1,0 +1,193 @@
+"""An NWB file holds the session's own poses, actions and animal, and archives would take it."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+from nwbinspector import Importance, inspect_nwbfile, load_config
+from pynwb import NWBHDF5IO, validate
+
+from liex_lab.errors import SessionError
+from liex_lab.exchange import export
+from liex_lab.exchange.nwb_intervals import observed_spans
+from liex_lab.sessions import Session
+from liex_lab.sessions.corrections import BoutEdit, Entry, Log
+from tests.sessions.walking_mouse import WalkingMouse, steady, write
+
+BEGINNING = "2026-08-21T10:00:00+02:00"
+
+
+@pytest.fixture(scope="module")
+def nwb(session: Session, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return export(session, "nwb", tmp_path_factory.mktemp("nwb"))
+
+
+def test_pynwb_reads_poses_times_rotations_and_actions(session, nwb):
+    poses = session.pose_arrays()
+    with NWBHDF5IO(nwb, "r") as file:
+        read = file.read()
+        module = read.processing["behavior"]
+        estimate = module["PoseEstimation"]
+        assert list(estimate.skeleton.nodes[:]) == list(poses.joints)
+        for k, joint in enumerate(poses.joints):
+            series = estimate.pose_estimation_series[joint]
+            np.testing.assert_array_equal(series.data[:], poses.xyz_mm[:, k].astype(np.float32))
+            np.testing.assert_array_equal(series.timestamps[:], poses.time_s)
+            assert series.unit == "millimeters"
+        assert module["rotation_root"].data.shape == (116, 3)
+        actions = read.intervals["actions"].to_dataframe()
+        np.testing.assert_array_equal(actions["start_time"], session.bouts["start_s"])
+        np.testing.assert_array_equal(actions["stop_time"], session.bouts["stop_s"])
+        assert list(actions["label"]) == list(session.bouts["action"])
+        assert read.session_start_time == datetime.fromisoformat(BEGINNING)
+
+
+def test_nwb_is_refused_without_a_beginning(tmp_path):
+    session = write(tmp_path / "c.liex", WalkingMouse(steady(0.5)))
+    with pytest.raises(SessionError, match="session_start_time=2026"):
+        export(session, "nwb", tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["c.liex"]  # nothing half-written
+
+
+def test_actions_are_an_ethogram_of_ndx_ethogram_made_of_these_poses(session, nwb):
+    with NWBHDF5IO(nwb, "r") as file:
+        read = file.read()
+        actions = read.intervals["actions"]
+        assert actions.neurodata_type == "EthogramBouts"
+        assert actions.labeling_method == "automated"
+        assert actions.source_software.startswith("liex_lab ")
+        assert actions.annotator is None
+        assert json.loads(actions.parameters) == {"rules": session.metadata["rules"]}
+        assert actions.source_pose is read.processing["behavior"]["PoseEstimation"]
+        assert list(actions["named_by"][:]) == list(session.bouts["source"])
+        words = actions.ethogram.to_dataframe().set_index("behavior")
+        assert words["definition"].to_dict() == session.metadata["actions"]
+        assert set(words["behavior_type"]) == {"state"}
+        assert actions.ethogram is read.processing["behavior"]["Ethogram"]
+        assert actions.ethogram.exclusive
+
+
+_WITHOUT_THE_EXTENSION = """
+import sys
+from pynwb import NWBHDF5IO
+with NWBHDF5IO(sys.argv[1], "r") as file:
+    print(file.read().intervals["actions"].to_dataframe()["label"].tolist())
+print("ndx_ethogram" in sys.modules)
+"""
+
+
+def test_actions_are_read_where_ndx_ethogram_is_not_known(session, nwb):
+    done = subprocess.run(
+        [sys.executable, "-c", _WITHOUT_THE_EXTENSION, nwb],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=True,
+    )
+    assert done.stdout.splitlines() == [str(session.bouts["action"].tolist()), "False"]
+
+
+def test_bouts_lie_where_actions_could_be_named(session, nwb):
+    with NWBHDF5IO(nwb, "r") as file:
+        actions = file.read().intervals["actions"]
+        seen = actions.observation_intervals.to_dataframe()
+        bouts = actions.to_dataframe()
+    gap = session.gaps.iloc[0]
+    assert ((seen["stop_time"] <= gap["start_s"]) | (seen["start_time"] >= gap["stop_s"])).all()
+    for start, stop in zip(bouts["start_time"], bouts["stop_time"], strict=True):
+        assert ((seen["start_time"] <= start) & (stop <= seen["stop_time"])).any()
+
+
+def test_a_recording_without_gaps_was_observed_throughout(tmp_path):
+    session = write(tmp_path / "c.liex", WalkingMouse(steady(2.0)), session_start_time=BEGINNING)
+    spans = observed_spans(session.pose_arrays())
+    np.testing.assert_allclose(spans, [[0.0, 2.0]])
+    with NWBHDF5IO(export(session, "nwb", tmp_path), "r") as file:
+        read = file.read()
+        assert set(read.intervals) == {"actions"}
+        assert read.intervals["actions"].observation_intervals is None
+
+
+def test_an_ethogram_that_people_corrected_says_so(session, tmp_path):
+    edit = BoutEdit("rename", "run", 1, 2)
+    log = Log("", (Entry(1, "ada", BEGINNING, edit), Entry(2, "bob", BEGINNING, edit)))
+    looked_at = Session(session.path, session.metadata, log)
+    with NWBHDF5IO(export(looked_at, "nwb", tmp_path), "r") as file:
+        actions = file.read().intervals["actions"]
+        assert (actions.labeling_method, actions.annotator) == ("curated", "ada, bob")
+
+
+def test_all_that_is_known_of_the_animal_stands_in_the_file(nwb):
+    with NWBHDF5IO(nwb, "r") as file:
+        read = file.read()
+        animal = read.subject
+        known = (animal.subject_id, animal.species, animal.sex, animal.age)
+        assert known == ("m01", "Mus musculus", "F", "P12W")
+        assert animal.description == "mouse, group control, cage c3, batch b2"
+        assert dict(line.split(": ", 1) for line in read.notes.splitlines()) == {
+            "individual": "mouse_1",
+            "subject_id": "m01",
+            "group": "control",
+            "cage": "c3",
+            "sex": "female",
+            "batch": "b2",
+            "age": "P12W",
+        }
+
+
+def described(session: Session, place: Path, **subject: str) -> Session:
+    """A copy of the session whose animal is another one."""
+    copy = place / "circle.liex"
+    shutil.copytree(session.path, copy)
+    document = json.loads((copy / "session.json").read_text(encoding="utf-8"))
+    (copy / "session.json").write_text(
+        json.dumps({**document, "subject": subject}), encoding="utf-8"
+    )
+    return Session.open(copy)
+
+
+def refused_by(nwb: Path) -> set[str]:
+    """What DANDI's validator would refuse a file for; it is these two that it asks."""
+    assert validate(path=nwb) in ([], ([], 0))
+    found: list[Any] = list(inspect_nwbfile(nwbfile_path=nwb, config=load_config("dandi")))
+    light = Importance.BEST_PRACTICE_SUGGESTION.value
+    return {one.check_function_name for one in found if one.importance.value > light}
+
+
+def test_dandi_would_refuse_nothing_in_a_file_whose_animal_is_described(nwb):
+    assert refused_by(nwb) == set()
+
+
+def test_dandi_takes_an_id_with_a_slash_and_a_species_of_ones_own(session, tmp_path):
+    told = described(
+        session, tmp_path, subject_id="c3/1", sex="male", age="P84D", species="Rattus norvegicus"
+    )
+    path = export(told, "nwb", tmp_path)
+    assert refused_by(path) == set()
+    with NWBHDF5IO(path, "r") as file:
+        read = file.read()
+        assert (read.subject.subject_id, read.subject.species) == ("c3-1", "Rattus norvegicus")
+        assert "subject_id: c3/1" in read.notes.splitlines()
+
+
+def test_dandi_asks_for_nothing_but_the_age_where_nothing_is_described(session, tmp_path):
+    path = export(described(session, tmp_path), "nwb", tmp_path)
+    assert refused_by(path) == {"check_subject_age"}
+
+
+def test_an_export_is_the_same_numbers_each_time(session, nwb, tmp_path):
+    with NWBHDF5IO(nwb, "r") as one, NWBHDF5IO(export(session, "nwb", tmp_path), "r") as other:
+        first, again = one.read(), other.read()
+        assert first.identifier == again.identifier
+        pd.testing.assert_frame_equal(
+            first.intervals["actions"].to_dataframe(), again.intervals["actions"].to_dataframe()
+        )
