@@ -25,6 +25,7 @@ from ..figures.seen import animals, joints_in_picture
 from ..video.film import way_of
 from ..video.relief import Relief
 from ..video.video import scale_mm
+from .crossings import crossings
 from .frames import Frames
 from .tables import records
 
@@ -174,6 +175,10 @@ class Desk:
                 why = f"{word} contradicts its definition: {bout['contradicts']}"
                 found.append(_doubt(bout, "action", why))
         return sorted(found, key=lambda one: one["start_s"])
+
+    def crossings(self) -> list[dict[str, Any]]:
+        """Where ends or animals may have been taken for one another, see `crossings.Crossing`."""
+        return crossings(self.session, self._seen)
 
     def _doubtful_runs(self) -> list[tuple[float, float, float]]:
         """Start, stop (s) and largest predicted error (mm) of the runs of doubtful frames."""

@@ -219,6 +219,11 @@ def add_routes(server: Flask, desks: Desks, clerk: Clerk | None) -> None:
             return told(lambda: desks.suggested(key))
         return told(lambda: desks.of(key).doubts())
 
+    @server.get("/desk/<path:key>/crossings")
+    def desk_crossings(key: str) -> Response:
+        """Where ends or animals of the session `key` may have been taken for one another."""
+        return told(lambda: desks.of(key).crossings())
+
     @server.get("/desk/<path:key>/frame/<int:row>.png")
     def desk_frame(key: str, row: int) -> Response:
         """The part ?box=left,top,width,height of the frame in a `row` of the session `key`."""
