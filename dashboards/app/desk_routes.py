@@ -188,6 +188,12 @@ def add_routes(server: Flask, desks: Desks, clerk: Clerk | None) -> None:
             answer.status_code = 400
             return answer
 
+    @server.before_request
+    def ahead() -> None:
+        """A session's page is asked for: its picture will be as soon as the browser has it."""
+        if request.path.startswith("/session/"):
+            desks.open_ahead(request.path.removeprefix("/session/"))
+
     @server.get("/desk/<path:key>/about")
     def desk_about(key: str) -> Response:
         """What the page is told once of the session `key`."""

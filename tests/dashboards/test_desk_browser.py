@@ -234,9 +234,9 @@ def test_places_in_doubt_are_worked_off_and_stay_so(served: Served, watched: Wat
     expect(page.locator(".desk-clock")).to_contain_text("0.7")
     page.keyboard.press("k")
     expect(page.locator(".desk-said")).to_contain_text("4.00 to 4.50 s")
-    expect(page.locator(".desk-side h3 .muted").first).to_have_text("1 of 2 left")
+    expect(page.locator(".desk-side h3 .muted")).to_have_text("1 of 2 left")
     opened(served, page, 0.0)
-    expect(page.locator(".desk-side h3 .muted").first).to_have_text("1 of 2 left")
+    expect(page.locator(".desk-side h3 .muted")).to_have_text("1 of 2 left")
     page.keyboard.press("n")
     expect(page.locator(".desk-said")).to_contain_text("4.00 to 4.50 s")
     page.keyboard.press("k")
@@ -251,7 +251,7 @@ def test_crossings_are_gone_to_by_a_key_and_by_buttons_and_told_in_words(
     page = watched.page
     opened(served, page, 0.0)
     side, said = page.locator(".desk-side"), page.locator(".desk-said")
-    expect(side.get_by_role("heading", name="Crossings")).to_contain_text("Crossings 4")
+    expect(side.locator(".desk-crossings")).to_have_text("4 in all")
     page.keyboard.press("x")
     expect(said).to_contain_text("crossing 1 of 4, 0.50 to 0.80 s: head and tail were exchanged")
     expect(page.locator(".desk-clock")).to_contain_text("0.500 s")
@@ -294,4 +294,19 @@ def test_the_page_stays_in_place_on_a_phone_and_in_the_dark(
         )
     )
     assert ink > paper + 300
+    watched.nothing_went_wrong()
+
+
+def test_the_first_picture_is_asked_for_before_the_page_around_is_built(
+    served: Served, watched: Watched
+) -> None:
+    page = watched.page
+    asked: list[str] = []
+    page.on("request", lambda request: asked.append(request.url.removeprefix(served.address)))
+    opened(served, page, 1.0)
+    pictures = [address for address in asked if "/frame/30.png" in address]
+    assert pictures == [f"/desk/{KEY}/frame/30.png?box=0,0,65536,65536"]
+    built = next(k for k, address in enumerate(asked) if "_dash-update-component" in address)
+    assert asked.index(f"/desk/{KEY}/times") < built
+    assert asked.count(f"/desk/{KEY}/about") == 1
     watched.nothing_went_wrong()

@@ -1,12 +1,13 @@
 // The page to correct in: picture, bands of time and panel, keys and mouse. Every text is set as text, never as markup.
 
+import { sourceOf } from "./desk_ahead.mjs";
 import { Clerk } from "./desk_clerk.mjs";
 import { Crossings } from "./desk_crossings.mjs";
 import { Doubts } from "./desk_doubts.mjs";
 import { KEYS, actOf, keyOf, typing } from "./desk_keys.mjs";
 import { button, make, set } from "./desk_parts.mjs";
 import { Player, SPEEDS } from "./desk_player.mjs";
-import { Source, json } from "./desk_source.mjs";
+import { json } from "./desk_source.mjs";
 import { Stage } from "./desk_stage.mjs";
 import { Strip } from "./desk_strip.mjs";
 
@@ -45,7 +46,7 @@ class Desk {
   constructor(place, key) {
     this.key = key;
     this.place = place;
-    this.source = new Source(`/desk/${encodeURIComponent(key)}`);
+    this.source = sourceOf(key);
     this.span = [null, null];
     this.bouts = [];
     this.clerk = new Clerk(this);

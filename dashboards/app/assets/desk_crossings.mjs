@@ -9,16 +9,15 @@ export class Crossings {
   constructor(desk) {
     this.desk = desk;
     this.all = null;  // until they have come
-    this.count = make("span", { class: "muted" });
-    this.parts = [make("h3", {}, "Crossings ", this.count),
-      make("div", { class: "desk-bar desk-crossings" },
-        button("◀", "Shift and X", () => this.next(-1), { "aria-label": "previous crossing" }),
-        button("Next crossing", "X", () => this.next(1)))];
+    this.count = make("span", { class: "muted desk-crossings" });
+    this.parts = [make("div", { class: "desk-bar" },
+      button("◀", "Shift and X", () => this.next(-1), { "aria-label": "previous crossing" }),
+      button("Next crossing", "X", () => this.next(1)), this.count)];
   }
 
   async read() {
     this.all = await json(`${this.desk.source.base}/crossings`);
-    this.count.textContent = this.all.length ? String(this.all.length) : "none";
+    this.count.textContent = this.all.length ? `${this.all.length} in all` : "none";
   }
 
   next(way) {
