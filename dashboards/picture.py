@@ -18,7 +18,7 @@ from .report.charts import pictures
 from .report.report import TEMPLATES
 
 WIDTH = 860
-HEIGHT = 960
+HEIGHT = 1064
 _SHOWN = 4  # of the contact sheet
 _STYLE = f"""
 :root {{ color-scheme: light; }}

@@ -25,6 +25,7 @@ from liex_lab.api import run_demo, run_session
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 STATIC = REPOSITORY / "docs" / "_static"
+DEMO = REPOSITORY / "dashboards" / "assets" / "demo.png"
 ANIMALS = (
     ("mouse", "synthetic:walk?seed=3&frames=150&sensor=kinect-v2", 20),
     ("fish", "synthetic:swim?seed=2&frames=60", 40),
@@ -132,9 +133,9 @@ def main() -> None:
         folder = Path(name)
         draw_animals(folder)
         session = run_demo(folder)
-        photograph(session, REPOSITORY / "dashboards" / "assets" / "demo.png")
+        save_small(DEMO, cv2.imread(str(photograph(session, folder / "demo.png")))[..., ::-1])
         shoot_replay(session)
-    for path in (STATIC / "animals.png", STATIC / "replay.png"):
+    for path in (STATIC / "animals.png", STATIC / "replay.png", DEMO):
         print(path, path.stat().st_size)
 
 

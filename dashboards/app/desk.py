@@ -25,6 +25,7 @@ from ..figures.seen import animals, joints_in_picture
 from ..video.film import way_of
 from ..video.relief import Relief
 from ..video.video import scale_mm
+from .crossings import crossings
 from .frames import Frames
 from .tables import records
 
@@ -37,6 +38,12 @@ Suggest = Callable[[Path], "pd.DataFrame"]
 MOST_ROWS = 2000  # that are told of at once
 _LEAST_DOUBT_S = 0.5  # doubtful frames less far apart are one place
 _HELD = 6  # sessions whose desks stay in memory
+_FIRST = (
+    "liex_lab.recordings.formats.messages.mcap_index",
+    "cv2",
+    "matplotlib",
+    "pyarrow.parquet",
+)
 
 
 class Desk:
@@ -53,7 +60,6 @@ class Desk:
         self.session = session
         self._frames = frames
         self._seen = animals(session)
-        self._drawing = threading.Lock()
 
     @cached_property
     def time_s(self) -> Array:
@@ -91,6 +97,13 @@ class Desk:
             at_s: the moment, s since the first frame.
         """
         return int(np.abs(self.time_s - at_s).argmin())
+
+    def open_ahead(self) -> None:
+        """Make what the first picture needs, before it is asked for."""
+        self._frames.depth(self.key, self.session, 0)
+        self.about()
+        self.rows(0, 1)
+        len(self.session.frames)  # the page around tells of them
 
     def about(self) -> dict[str, Any]:
         """What is told once: size, animals, words with their colours, and who corrects."""
@@ -175,6 +188,10 @@ class Desk:
                 found.append(_doubt(bout, "action", why))
         return sorted(found, key=lambda one: one["start_s"])
 
+    def crossings(self) -> list[dict[str, Any]]:
+        """Where ends or animals may have been taken for one another, see `crossings.Crossing`."""
+        return crossings(self.session, self._seen)
+
     def _doubtful_runs(self) -> list[tuple[float, float, float]]:
         """Start, stop (s) and largest predicted error (mm) of the runs of doubtful frames."""
         rows = np.flatnonzero(self._numbers["flag"].astype(str) == "doubtful")
@@ -247,6 +264,7 @@ class Desks:
         self._frames = frames
         self._suggest = suggest
         self._lock = threading.Lock()
+        self._ahead = threading.Semaphore()
         self._known: dict[str, Desk] = {}
         self._suggested: dict[str, tuple[Session, list[dict[str, Any]]]] = {}
         threading.Thread(target=_import, daemon=True).start()
@@ -268,6 +286,24 @@ class Desks:
                 while len(self._known) > _HELD:
                     self._known.pop(next(iter(self._known)))
             return known
+
+    def open_ahead(self, key: str) -> None:
+        """Make what a session's first picture needs in a thread; one at a time, others are left.
+
+        Args:
+            key: the session's name in the study; one that there is not is left, too.
+        """
+
+        def make() -> None:
+            try:
+                self.of(key).open_ahead()
+            except LiexError:  # the page says why
+                pass
+            finally:
+                self._ahead.release()
+
+        if self._ahead.acquire(blocking=False):
+            threading.Thread(target=make).start()  # short, and waited for at the end
 
     def suggested(self, key: str) -> list[dict[str, Any]]:
         """The stretches whose actions are least certain, as `Desk.doubts`; none without a model.
@@ -308,8 +344,8 @@ def _doubt(span: dict[str, Any], kind: str, why: str) -> dict[str, Any]:
 
 def _import() -> None:
     """What the first picture needs, imported while nobody waits for it."""
-    importlib.import_module("cv2")
-    importlib.import_module("matplotlib")
+    for name in _FIRST:
+        importlib.import_module(name)
 
 
 def _size(camera: Any) -> tuple[int, int]:

@@ -188,6 +188,12 @@ def add_routes(server: Flask, desks: Desks, clerk: Clerk | None) -> None:
             answer.status_code = 400
             return answer
 
+    @server.before_request
+    def ahead() -> None:
+        """A session's page is asked for: its picture will be as soon as the browser has it."""
+        if request.path.startswith("/session/"):
+            desks.open_ahead(request.path.removeprefix("/session/"))
+
     @server.get("/desk/<path:key>/about")
     def desk_about(key: str) -> Response:
         """What the page is told once of the session `key`."""
@@ -218,6 +224,11 @@ def add_routes(server: Flask, desks: Desks, clerk: Clerk | None) -> None:
         if request.args.get("of") == "actions":
             return told(lambda: desks.suggested(key))
         return told(lambda: desks.of(key).doubts())
+
+    @server.get("/desk/<path:key>/crossings")
+    def desk_crossings(key: str) -> Response:
+        """Where ends or animals of the session `key` may have been taken for one another."""
+        return told(lambda: desks.of(key).crossings())
 
     @server.get("/desk/<path:key>/frame/<int:row>.png")
     def desk_frame(key: str, row: int) -> Response:

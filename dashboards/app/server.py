@@ -38,7 +38,8 @@ _PAGES = (
 _INDEX = """<!doctype html>
 <html lang="en">
 <head>{%metas%}<meta name="viewport" content="width=device-width, initial-scale=1">
-<title>{%title%}</title>{%css%}</head>
+<title>{%title%}</title>
+<script type="module" async src="/assets/desk_ahead.mjs"></script>{%css%}</head>
 <body>{%app_entry%}<footer hidden>{%config%}{%scripts%}{%renderer%}</footer></body>
 </html>"""
 _SAVER = "liex_saver"

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.errors import SessionError
@@ -137,6 +138,34 @@ def read_evidence(session: Session) -> tuple[Observations, Subject]:
             None if stretch is None else float(stretch),
         )
     return seen, subject
+
+
+def read_things(session: Session) -> NDArray[np.float64] | None:
+    """Where the two likeliest things of every frame are, of the observations no more than that.
+
+    Args:
+        session: the session.
+
+    Returns:
+        (n, 2, 3) centre of the best and of the second thing of about the animal's size, arena
+        frame, mm; NaN where there is none. None for a session that does not hold its observations.
+
+    Raises:
+        SessionError: the file is damaged.
+    """
+    path = session.path / FILE
+    if not path.is_file():
+        return None
+    with (
+        reading_from(path),
+        _opened(path, session) as file,
+        np.load(file, allow_pickle=False) as kept,
+    ):
+        centre = kept["centroid_mm"][:, ::2].astype(np.float64)  # h ^ 1 is the same thing
+        centre[~np.isfinite(kept["score"]).reshape(len(centre), -1, 2).any(axis=2)] = np.nan
+        if centre.shape != (session.metadata["frames"]["n_frames"], 2, 3):
+            raise ValueError(f"centres of things are {centre.shape}, not those of every frame")
+    return centre
 
 
 def _opened(path: Path, session: Session) -> IO[bytes]:

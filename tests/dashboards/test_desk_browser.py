@@ -1,5 +1,5 @@
-"""The page to correct in, in a real browser: joints dragged, actions named by keys, playing, taking
-back, doubtful places one after the other.
+"""The page to correct in, in a real browser: joints dragged, actions named by keys, head and tail
+exchanged, playing, taking back, doubtful places and crossings one after the other.
 """
 
 from __future__ import annotations
@@ -13,14 +13,18 @@ import pandas as pd
 import pytest
 from playwright.sync_api import Locator, Page, expect
 
+from liex_lab.api import run_session
 from liex_lab.arena.outline import Arena
+from liex_lab.plan import Plan
 from liex_lab.sessions import Session
 from liex_lab.sessions.corrections import read_log
 from tests.dashboards.conftest import Watched
 from tests.dashboards.served import Served
+from tests.dashboards.test_crossings import put_flips
 from tests.sessions.walking_mouse import WalkingMouse, steady, write
 
 KEY = "walker"
+TRACKED = "synthetic:walk?seed=3&frames=30&sensor=primesense-qvga&spine_mm=70"
 MOUSE = WalkingMouse(np.delete(steady(6.0), slice(40, 46)), rear_s=(2.0, 3.0), lost=(150, 151))
 
 
@@ -34,6 +38,14 @@ def suggest(folder: Path) -> pd.DataFrame:
 def served(tmp_path: Path) -> Served:
     write(tmp_path / "study" / f"{KEY}.liex", MOUSE, name=KEY, arena=Arena("round", (0, 0), 220.0))
     return Served(tmp_path / "study", suggest=suggest)
+
+
+@pytest.fixture
+def tracked(tmp_path: Path) -> Served:
+    """A session whose track can be made again, for it keeps what its single frames said."""
+    plan = Plan.load("mouse").with_settings(["animal.spine_mm=70", f"session.name={KEY}"])
+    run_session(TRACKED, plan, tmp_path / "study")
+    return Served(tmp_path / "study")
 
 
 def opened(served: Served, page: Page, at_s: float) -> Locator:
@@ -133,6 +145,47 @@ def test_an_action_is_named_by_a_key_and_taken_back_by_another(
     watched.nothing_went_wrong()
 
 
+def to_nose(served: Served) -> np.ndarray:
+    """From rump to nose (n, 3), mm."""
+    poses = session(served).poses.set_index("joint")[["x_mm", "y_mm", "z_mm"]]
+    return np.asarray(poses.loc["nose"].to_numpy() - poses.loc["rump"].to_numpy())
+
+
+def test_f_exchanges_head_and_tail_in_the_marked_span_and_u_takes_it_back(
+    tracked: Served, watched: Watched
+) -> None:
+    page = watched.page
+    stage = opened(tracked, page, 0.3)
+    before, nose = to_nose(tracked), len(MOUSE.skeleton.names) - 1
+    page.keyboard.press("x")
+    expect(page.locator(".desk-said")).to_contain_text("there is no crossing")
+    page.keyboard.press("[")
+    for _ in range(8):
+        page.keyboard.press("ArrowRight")
+    page.keyboard.press("]")
+    for _ in range(4):
+        page.keyboard.press("ArrowLeft")
+    page.wait_for_timeout(500)  # the view comes to rest
+    nose_was = joint_on_screen(page, stage, 13, nose)
+    page.keyboard.press("f")
+    expect(page.locator(".desk-said")).to_contain_text("head and tail exchanged in frames 9 to 17")
+    expect(page.locator(".desk-saved")).to_contain_text("1 correction stands, all saved")
+    agree = np.sum(before * to_nose(tracked), axis=1)
+    assert (agree[11:16] < 0).all()
+    assert (agree[:6] > 0).all()
+    assert (agree[21:] > 0).all()
+    until(page, lambda: joint_on_screen(page, stage, 13, nose) != pytest.approx(nose_was, abs=20.0))
+    page.keyboard.press("x")
+    expect(page.locator(".desk-said")).to_contain_text("head and tail exchanged by a person")
+    page.keyboard.press("u")
+    expect(page.locator(".desk-saved")).to_contain_text("0 corrections stand, all saved")
+    np.testing.assert_array_equal(to_nose(tracked), before)
+    page.keyboard.press("F")  # with Shift, and where nothing is marked: this frame alone
+    expect(page.locator(".desk-said")).to_contain_text("head and tail exchanged in frames")
+    expect(page.locator(".desk-saved")).to_contain_text("1 correction stands, all saved")
+    watched.nothing_went_wrong()
+
+
 def test_it_plays_at_the_pace_that_is_asked_for(served: Served, watched: Watched) -> None:
     page = watched.page
     opened(served, page, 0.0)
@@ -191,6 +244,28 @@ def test_places_in_doubt_are_worked_off_and_stay_so(served: Served, watched: Wat
     watched.nothing_went_wrong()
 
 
+def test_crossings_are_gone_to_by_a_key_and_by_buttons_and_told_in_words(
+    served: Served, watched: Watched
+) -> None:
+    put_flips(served.study / f"{KEY}.liex")
+    page = watched.page
+    opened(served, page, 0.0)
+    side, said = page.locator(".desk-side"), page.locator(".desk-said")
+    expect(side.locator(".desk-crossings")).to_have_text("4 in all")
+    page.keyboard.press("x")
+    expect(said).to_contain_text("crossing 1 of 4, 0.50 to 0.80 s: head and tail were exchanged")
+    expect(page.locator(".desk-clock")).to_contain_text("0.500 s")
+    side.get_by_role("button", name="Next crossing").click()
+    expect(said).to_contain_text("crossing 2 of 4, 1.00 to 1.20 s: head and tail perhaps exchanged")
+    page.keyboard.press("Shift+X")
+    expect(said).to_contain_text("crossing 1 of 4")
+    side.get_by_role("button", name="previous crossing").click()
+    expect(said).to_contain_text("from the end again: crossing 4 of 4")
+    page.keyboard.press("x")
+    expect(said).to_contain_text("from the beginning again: crossing 1 of 4")
+    watched.nothing_went_wrong()
+
+
 def test_keys_belong_to_a_field_while_one_types_into_it(served: Served, watched: Watched) -> None:
     page = watched.page
     opened(served, page, 1.0)
@@ -219,4 +294,19 @@ def test_the_page_stays_in_place_on_a_phone_and_in_the_dark(
         )
     )
     assert ink > paper + 300
+    watched.nothing_went_wrong()
+
+
+def test_the_first_picture_is_asked_for_before_the_page_around_is_built(
+    served: Served, watched: Watched
+) -> None:
+    page = watched.page
+    asked: list[str] = []
+    page.on("request", lambda request: asked.append(request.url.removeprefix(served.address)))
+    opened(served, page, 1.0)
+    pictures = [address for address in asked if "/frame/30.png" in address]
+    assert pictures == [f"/desk/{KEY}/frame/30.png?box=0,0,65536,65536"]
+    built = next(k for k, address in enumerate(asked) if "_dash-update-component" in address)
+    assert asked.index(f"/desk/{KEY}/times") < built
+    assert asked.count(f"/desk/{KEY}/about") == 1
     watched.nothing_went_wrong()

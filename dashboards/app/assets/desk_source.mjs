@@ -27,12 +27,17 @@ export class Source {
     this.changed = () => {};
   }
 
-  async open() {
-    const [about, times] = await Promise.all([
-      json(`${this.base}/about`), fetch(`${this.base}/times`).then((answer) => answer.arrayBuffer())]);
-    this.about = about;
-    this.times = new Float64Array(times);
-    return about;
+  open() {
+    this.opening ||= this.begin();
+    return this.opening;
+  }
+
+  async begin() {
+    this.timed = fetch(`${this.base}/times`).then((answer) => answer.arrayBuffer()).then((times) => {
+      this.times = new Float64Array(times);
+    });
+    [this.about] = await Promise.all([json(`${this.base}/about`), this.timed]);
+    return this.about;
   }
 
   rowAt(time) {  // the frame whose time is nearest
@@ -43,6 +48,8 @@ export class Source {
     }
     return low > 0 && time - this.times[low - 1] <= this.times[low] - time ? low - 1 : low;
   }
+
+  chunkOf(row) { return Math.floor(row / ROWS); }
 
   async load(chunk) {
     const known = this.chunks.get(chunk);
@@ -57,7 +64,7 @@ export class Source {
   }
 
   at(row) {  // what is known of a frame; null until it has come
-    const chunk = Math.floor(row / ROWS), rows = this.chunks.get(chunk);
+    const chunk = this.chunkOf(row), rows = this.chunks.get(chunk);
     if (!rows || rows instanceof Promise) {
       this.load(chunk);
       return null;
@@ -112,11 +119,14 @@ export class Source {
     while (this.loading < AT_ONCE && this.wanted.length) {
       const { row, box } = this.wanted.shift();
       const image = new Image();
-      const kept = { image, box };
+      const kept = { image, box: [...box] };
       this.pictures.set(row, kept);
       this.loading += 1;
       const done = () => { this.loading -= 1; this.changed(); this.pump(); };
-      image.addEventListener("load", done);
+      image.addEventListener("load", () => {  // it was cut to the picture
+        kept.box.splice(2, 2, image.naturalWidth, image.naturalHeight);
+        done();
+      });
       image.addEventListener("error", () => { if (this.pictures.get(row) === kept) this.pictures.delete(row); done(); });
       image.src = `${this.base}/frame/${row}.png?box=${box.join(",")}`;
       while (this.pictures.size > PICTURES) this.pictures.delete(this.pictures.keys().next().value);

@@ -1,9 +1,10 @@
 // Blinded review: clips one after the other, each played again and again until it has a name. Every text is set as text.
 
+import { typing } from "./desk_keys.mjs";
+import { button, make } from "./desk_parts.mjs";
 import { Player } from "./desk_player.mjs";
 import { Source, json } from "./desk_source.mjs";
 import { Stage } from "./desk_stage.mjs";
-import { button, make, typing } from "./desk.mjs";
 
 const LIT_S = 0.12;  // so near to the moment that is to be named the picture has a frame
 let open = null;

@@ -27,6 +27,7 @@ from liex_lab.recordings.formats.messages.depth_images import decode, picture_si
 from liex_lab.recordings.formats.messages.message_file import (
     Channel,
     Envelope,
+    Listed,
     MessageFile,
     Place,
     printable,
@@ -101,6 +102,23 @@ class _Topic:
         self.log_ns.append(message.log_time_ns)
         self.stamp_ns.append(stamp_ns)
         self.places.extend(message.place)
+
+    def add_all(self, listed: Listed) -> None:
+        """Note messages that an index lists; their stamps are the times of logging.
+
+        Args:
+            listed: the messages.
+
+        Raises:
+            DamagedMessage: a time is beyond the year 2116; the others are noted.
+        """
+        good = listed.log_time_ns < _LIMIT_NS
+        times = listed.log_time_ns[good].astype(np.int64).tobytes()
+        self.log_ns.frombytes(times)
+        self.stamp_ns.frombytes(times)
+        self.places.frombytes(np.ascontiguousarray(listed.places[good], np.int64).tobytes())
+        if not good.all():
+            raise DamagedMessage("a message's time cannot be")
 
     def forget(self, chunk: int) -> None:
         """Forget the messages of a chunk and of those after it, for they will be met again.
@@ -316,12 +334,12 @@ def _walk(file: MessageFile, found: _Found, progress: Progress) -> None:
             file.whole = False
 
 
-def _note(found: _Found, envelope: Envelope, parse: Parser) -> bool:
+def _note(found: _Found, envelope: Envelope | Listed, parse: Parser) -> bool:
     """Take note of a message; False where it is the first picture of a topic and not depth."""
     channel = envelope.channel
-    if envelope.data is None:
+    if isinstance(envelope, Listed):
         if channel in found.depths:
-            found.depths[channel].add(envelope, envelope.log_time_ns)
+            found.depths[channel].add_all(envelope)
         return True
     message = parse(envelope.data)
     if isinstance(message, Calibration):

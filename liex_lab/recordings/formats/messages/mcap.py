@@ -31,6 +31,7 @@ from liex_lab.recordings.formats.messages.message_file import (
     Chunk,
     DamagedChunk,
     Envelope,
+    Listed,
     MessageFile,
     Place,
     unpacked,
@@ -148,7 +149,7 @@ class McapFile(MessageFile):
         self._last_chunk = (-1, memoryview(b""))
         return n_chunks
 
-    def walk(self, wanted: Wanted, progress: Progress) -> Iterator[Envelope]:
+    def walk(self, wanted: Wanted, progress: Progress) -> Iterator[Envelope | Listed]:
         """Every whole message of the wanted channels, in file order.
 
         A second walk begins where the first was sure.

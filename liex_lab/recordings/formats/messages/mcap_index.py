@@ -12,9 +12,11 @@ from collections.abc import Iterator
 from io import BytesIO
 from pathlib import Path
 
+import numpy as np
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
-from mcap.records import ChunkIndex, MessageIndex
+from mcap.records import ChunkIndex
+from numpy.typing import NDArray
 
 from liex_lab.errors import RecordingError
 from liex_lab.recordings.formats.messages.depth_topics import open_topic
@@ -30,6 +32,7 @@ from liex_lab.recordings.formats.messages.message_file import (
     Channel,
     DamagedChunk,
     Envelope,
+    Listed,
     Place,
 )
 from liex_lab.recordings.recording import Recording
@@ -37,6 +40,9 @@ from liex_lab.runtime.progress import Progress, silent
 
 _UNTOLD = -1  # the length of a message that only its chunk tells
 _LARGEST_INDEX = 1 << 26  # bytes of one
+_LARGEST_OFFSET = 1 << 40
+_INDEX = struct.Struct("<HI")  # of a message index: channel, bytes of its entries
+_ENTRY = np.dtype([("time_ns", "<u8"), ("offset", "<u8")])
 
 
 def open_replay(path: Path, progress: Progress = silent) -> Recording:
@@ -60,8 +66,8 @@ def open_replay(path: Path, progress: Progress = silent) -> Recording:
 class _Replay(McapFile):
     """An MCAP file whose index is believed; one without an index is walked."""
 
-    def walk(self, wanted: Wanted, progress: Progress) -> Iterator[Envelope]:
-        """The messages of the wanted channels, in file order: the first of each with its data.
+    def walk(self, wanted: Wanted, progress: Progress) -> Iterator[Envelope | Listed]:
+        """The messages of the wanted channels by chunk: the first of each channel with its data.
 
         Args:
             wanted: says of a channel whether its messages are of use.
@@ -81,17 +87,19 @@ class _Replay(McapFile):
         met = set[Channel]()
         for index in sorted(indexes, key=lambda index: index.chunk_start_offset):
             try:
-                envelopes = self._listed_in(index, wanted)
+                parts = self._listed_in(index, wanted)
             except (*DAMAGE, DamagedChunk):
                 self.whole = False
                 continue
-            for one in envelopes:
-                if one.channel in met:
-                    if wanted(one.channel):
-                        yield one
-                    continue
-                met.add(one.channel)
-                yield one._replace(data=self.read(one.place))
+            for part in parts:
+                rest = part
+                if part.channel not in met and len(part.places):
+                    met.add(part.channel)
+                    place = Place(*part.places[0].tolist())
+                    yield Envelope(part.channel, int(part.log_time_ns[0]), place, self.read(place))
+                    rest = Listed(part.channel, part.log_time_ns[1:], part.places[1:])
+                if len(rest.places) and wanted(part.channel):
+                    yield rest
 
     def read(self, place: Place) -> memoryview:
         """The data of one message.
@@ -117,8 +125,8 @@ class _Replay(McapFile):
             ) from None
         return data[begin + MESSAGE.size : begin + length]
 
-    def _listed_in(self, index: ChunkIndex, wanted: Wanted) -> list[Envelope]:
-        """The wanted messages of one chunk, in file order, without their data."""
+    def _listed_in(self, index: ChunkIndex, wanted: Wanted) -> list[Listed]:
+        """The wanted messages of one chunk, by channel and in file order."""
         opcode, start, end = self._record(index.chunk_start_offset)
         if opcode != Opcode.CHUNK:
             raise DamagedChunk("there is no chunk where its index says")
@@ -131,14 +139,35 @@ class _Replay(McapFile):
             kind, begin, stop = self._record(at)
             if kind != Opcode.MESSAGE_INDEX:
                 raise DamagedChunk("there is no index where it should be")
-            for time_ns, offset in MessageIndex.read(self._stream(begin, stop)).records:
-                found.append(Envelope(channel, time_ns, Place(number, offset, _UNTOLD), None))
+            table = self._message_index(begin, stop)
+            places = np.empty((len(table), 3), np.int64)
+            places[:] = number, 0, _UNTOLD
+            places[:, 1] = table["offset"]
+            found.append(Listed(channel, table["time_ns"], places))
         self.chunks.append(self._chunk(start, end - start))
-        return sorted(found, key=lambda one: one.place.offset)
+        return found
+
+    def _message_index(self, begin: int, stop: int) -> NDArray[np.void]:
+        """Times and offsets of one channel's messages in a chunk, in file order.
+
+        An hour's index lists a hundred thousand, so they are read as a table.
+        """
+        content = self._bytes(begin, stop)
+        _, length = _INDEX.unpack_from(content)
+        if length != len(content) - _INDEX.size or length % _ENTRY.itemsize:
+            raise ValueError("an index does not fit into its record")
+        table = np.frombuffer(content, _ENTRY, offset=_INDEX.size)
+        if len(table) and table["offset"].max() > _LARGEST_OFFSET:
+            raise ValueError("an index leads out of its chunk")
+        return table[np.argsort(table["offset"], kind="stable")]
 
     def _stream(self, start: int, end: int) -> ReadDataStream:
+        """The bytes between, of a record of some kilobytes."""
+        return ReadDataStream(BytesIO(self._bytes(start, end)))
+
+    def _bytes(self, start: int, end: int) -> bytes:
         """The bytes between, of a record of some kilobytes."""
         if not 0 <= end - start <= min(_LARGEST_INDEX, self.size):
             raise ValueError("an index is larger than its file")
         self.file.seek(start)
-        return ReadDataStream(BytesIO(self.file.read(end - start)))
+        return self.file.read(end - start)

@@ -14,6 +14,9 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import IO, NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
+
 from liex_lab.errors import RecordingError
 from liex_lab.runtime.limits import why_short
 from liex_lab.runtime.progress import Progress
@@ -58,14 +61,27 @@ class Envelope(NamedTuple):
         channel: topic, schema and encoding.
         log_time_ns: time of logging, ns.
         place: where its data lies, to fetch it again.
-        data: its bytes; None of one that is fetched when it is wanted, whose stamp is the time of
-            logging.
+        data: its bytes.
     """
 
     channel: Channel
     log_time_ns: int
     place: Place
-    data: memoryview | None
+    data: memoryview
+
+
+class Listed(NamedTuple):
+    """Messages that an index lists: fetched when they are wanted, stamped with the time of logging.
+
+    Attributes:
+        channel: topic, schema and encoding.
+        log_time_ns: (n,) uint64 times of logging, ns.
+        places: (n, 3) int64 chunk, offset and length of each, as a `Place`.
+    """
+
+    channel: Channel
+    log_time_ns: NDArray[np.uint64]
+    places: NDArray[np.int64]
 
 
 class Chunk(NamedTuple):
@@ -126,7 +142,9 @@ class MessageFile(ABC):
         self._last_chunk: tuple[int, memoryview] = (-1, memoryview(b""))
 
     @abstractmethod
-    def walk(self, wanted: Callable[[Channel], bool], progress: Progress) -> Iterator[Envelope]:
+    def walk(
+        self, wanted: Callable[[Channel], bool], progress: Progress
+    ) -> Iterator[Envelope | Listed]:
         """Every whole message of the wanted channels, in file order.
 
         Args:

@@ -1,0 +1,42 @@
+// Crossings: places where head and tail, or two animals, were or may have been taken for one another.
+
+import { button, make } from "./desk_parts.mjs";
+import { json } from "./desk_source.mjs";
+
+const NEAR_S = 1e-3;  // so near to its beginning one stands at a crossing
+
+export class Crossings {
+  constructor(desk) {
+    this.desk = desk;
+    this.all = null;  // until they have come
+    this.count = make("span", { class: "muted desk-crossings" });
+    this.parts = [make("div", { class: "desk-bar" },
+      button("◀", "Shift and X", () => this.next(-1), { "aria-label": "previous crossing" }),
+      button("Next crossing", "X", () => this.next(1)), this.count)];
+  }
+
+  async read() {
+    this.all = await json(`${this.desk.source.base}/crossings`);
+    this.count.textContent = this.all.length ? `${this.all.length} in all` : "none";
+  }
+
+  next(way) {
+    if (!this.all) { this.desk.say("crossings are still being looked for"); return; }
+    const n = this.all.length, time = this.desk.time();
+    if (!n) {
+      this.desk.say("there is no crossing: nowhere were head and tail, or the animal and another thing, found to be exchanged or perhaps so");
+      return;
+    }
+    const found = way > 0 ? this.all.findIndex((one) => one.start_s > time + NEAR_S)
+      : this.all.filter((one) => one.start_s < time - NEAR_S).length - 1;
+    const k = found >= 0 ? found : way > 0 ? 0 : n - 1;
+    this.go(k, found >= 0 ? "" : way > 0 ? "from the beginning again: " : "from the end again: ");
+  }
+
+  go(k, first) {
+    const one = this.all[k], several = this.desk.about.animals.length > 1;
+    this.desk.stop(one.start_s);
+    this.desk.say(`${first}crossing ${k + 1} of ${this.all.length}, ${one.start_s.toFixed(2)} to ${one.stop_s.toFixed(2)} s`
+      + `${several ? `, ${one.individual}` : ""}: ${one.why}`);
+  }
+}

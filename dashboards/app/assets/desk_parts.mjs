@@ -1,0 +1,27 @@
+// What the pages to correct in and to review on are built of. Every text is set as text, never as markup.
+
+export function make(name, attributes, ...inside) {
+  const made = document.createElement(name);
+  Object.entries(attributes || {}).forEach(([key, value]) => {
+    if (key.startsWith("on")) made.addEventListener(key.slice(2), value);
+    else if (value !== undefined && value !== false) made.setAttribute(key, value === true ? "" : value);
+  });
+  made.append(...inside);
+  return made;
+}
+
+export function button(text, title, act, more) {
+  return make("button", { type: "button", title, onclick: act, ...more }, text);
+}
+
+export function set(id, values) {  // a property of the page around, where it has such a part
+  if (document.getElementById(id) || id === "corrections-made") window.dash_clientside.set_props(id, values);
+}
+
+export function kept(name, value) {  // a browser that keeps nothing still works
+  try {
+    if (value === undefined) return window.localStorage.getItem(name);
+    window.localStorage.setItem(name, value);
+  } catch { /* private window */ }
+  return null;
+}
