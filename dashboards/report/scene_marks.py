@@ -67,6 +67,8 @@ def scene_marks(session: Session) -> list[Mark]:
         place = _in_picture(session, np.array([[x, y]]), top)
         made.append(Mark(FIXTURE, place, f"{top:.0f} mm"))
     gaps = session.gaps
+    if "x_mm" not in gaps:  # of earlier versions
+        gaps = gaps.assign(x_mm=np.nan, y_mm=np.nan)
     hidden = gaps[(gaps["reason"] == "hidden") & gaps["x_mm"].notna()]
     columns = hidden[["x_mm", "y_mm", "start_s", "stop_s"]].to_numpy(float)
     longest = np.argsort(columns[:, 2] - columns[:, 3], kind="stable")[:_MOST_HIDDEN]
