@@ -559,6 +559,7 @@ def serve_dashboard(
         ) from None
     from liex_lab.dashboards.app.data import StudyData
     from liex_lab.dashboards.report.views import write_views
+    from liex_lab.pipelines.stating import StatedRegions
     from liex_lab.pipelines.training.action_model import suggest
     from liex_lab.sessions.review import FOLDER as REVIEWS
     from liex_lab.sessions.viewer import show_replay
@@ -590,6 +591,7 @@ def serve_dashboard(
         report=write_views,
         suggest=suggest,
         reviews=place / REVIEWS,
+        regions=StatedRegions(study),
     )
     serve(app, host, port, lambda found: told(address(host, found, token)))
 

@@ -28,7 +28,7 @@ from liex_lab.errors import LiexError, SessionError
 from ..report.charts import traces
 from ..report.quality import warnings
 from ..units import counted, shown
-from . import page_corrections, plots
+from . import page_corrections, page_region, plots
 from .data import StudyData, colours_of, shown_words
 from .parts import aria, download, graph
 from .tables import block, number, session_address, session_tables
@@ -119,6 +119,7 @@ def session_page(
         html.Div(id="desk", className="desk", role="region", **aria(label="look and correct")),
         html.Div(html.P("The curves follow ...", className="muted"), id="session-figures"),
         *([page_corrections.panel(session)] if may_correct else []),
+        *page_region.scene_panel(key, session),
         html.H2("Bouts"),
         block(f"bouts/{key}", "Bouts of the session"),
         *_more(data, key, session),

@@ -18,7 +18,15 @@ from dash import ALL, MATCH, ClientsideFunction, Dash, Input, Output, State, dcc
 from liex_lab.errors import LiexError
 from liex_lab.runtime.signals import Ended
 
-from . import page_corrections, page_groups, page_review, page_session, page_study, tables
+from . import (
+    page_corrections,
+    page_groups,
+    page_region,
+    page_review,
+    page_session,
+    page_study,
+    tables,
+)
 from .data import StudyData
 from .desk import Desks, Suggest
 from .desk_routes import Clerk, add_routes
@@ -61,6 +69,7 @@ def make_app(
     report: Report | None = None,
     suggest: Suggest | None = None,
     reviews: Path | None = None,
+    regions: page_region.Regions | None = None,
 ) -> Dash:
     """The dashboard of a study, not yet served.
 
@@ -76,6 +85,7 @@ def make_app(
             where `correct` does.
         suggest: finds the stretches of a session whose actions are least certain; None finds none.
         reviews: folder of blinded reviews, made with the first one; None takes none.
+        regions: states the regions of arenas in plans; None states none.
     """
     app = Dash(
         "liex_lab_dashboard",
@@ -90,12 +100,15 @@ def make_app(
         compress=False,
     )
     app.layout = _shell(data)
-    _register(app, data, may_correct=correct is not None)
+    beyond = regions is not None and regions.of_recordings
+    _register(app, data, may_correct=correct is not None, beyond=beyond)
     page_study.register(app, data)
     page_groups.register(app, data)
     page_session.register(app, data, show_replay)
     saver = Saver(correct, report) if correct is not None else None
-    desks = Desks(data.session, Frames(), suggest)
+    page_region.register(app)
+    frames = Frames()
+    desks = Desks(data.session, frames, suggest)
     if saver is not None:
         page_corrections.register(app, data, saver)
     app.server.extensions[_SAVER] = saver
@@ -109,6 +122,7 @@ def make_app(
     guard(app.server, token, policy, alone=alone)
     add_downloads(app.server, data)
     add_routes(app.server, desks, None if saver is None else Clerk(desks, saver))
+    page_region.add_scenes(app.server, data, frames, regions)
     if reviews is not None:
         page_review.register(app)
         page_review.add_reviews(app.server, page_review.Reviews(data, desks, reviews))
@@ -189,7 +203,9 @@ def _shell(data: StudyData) -> html.Div:
     )
 
 
-def _page(data: StudyData, path: str, search: str, **may: bool) -> list[Any]:
+def _page(
+    data: StudyData, path: str, search: str, *, beyond: bool = False, **may: bool
+) -> list[Any]:
     try:
         if path in ("", "/"):
             return page_study.sessions_page(data)
@@ -202,8 +218,11 @@ def _page(data: StudyData, path: str, search: str, **may: bool) -> list[Any]:
         if path.startswith("/session/"):
             key = unquote(path.removeprefix("/session/"))
             if key not in {entry.key for entry in data.done}:
-                return page_session.failed_page(data, key)
+                more = page_region.not_measured(data, key) if beyond else []
+                return [*page_session.failed_page(data, key), *more]
             return page_session.session_page(data, key, _moment(search), **may)
+        if path.startswith("/arena/"):
+            return page_region.arena_page(data, unquote(path.removeprefix("/arena/")))
     except LiexError as error:
         return [html.H1("This cannot be shown"), html.P(str(error))]
     return [html.H1("No such page"), html.P(dcc.Link("Sessions", href="/"))]
@@ -230,7 +249,7 @@ def _register(app: Dash, data: StudyData, **may: bool) -> None:
     def route(
         path: str | None, search: str | None, tabs: list[dict[str, str]]
     ) -> tuple[Any, list[str]]:
-        here = "/" if (path or "/").startswith("/session") else path or "/"
+        here = "/" if (path or "/").startswith(("/session", "/arena")) else path or "/"
         marks = ["here" if tab["href"] == here else "" for tab in tabs]
         return _page(data, path or "/", search or "", **may), marks
 

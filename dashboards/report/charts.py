@@ -15,6 +15,7 @@ from ..figures.style import RED
 from ..figures.times import drawn_curves
 from ..units import shown
 from . import contact_sheet
+from .scene_marks import scene_marks
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -42,7 +43,7 @@ def traces(session: Session) -> list[tuple[str, Array, Array, str]]:
 
 
 def pictures(session: Session) -> list[tuple[str, str, str, str]]:
-    """The contact sheet: the kept depth pictures with the skeleton over them, in order of time.
+    """The contact sheet: the kept depth pictures with scene and skeleton over them, by time.
 
     Args:
         session: the opened session.
@@ -60,6 +61,7 @@ def pictures(session: Session) -> list[tuple[str, str, str, str]]:
     )
     bones = [(int(a), int(b)) for a, b in session.metadata["animal"]["bones"]]
     words = list(session.metadata.get("actions", {}))
+    marks = scene_marks(session) if kept else []
     for entry in kept:
         depth = cv2.imread(str(session.path / entry["file"]), cv2.IMREAD_UNCHANGED)
         if depth is None:
@@ -70,7 +72,13 @@ def pictures(session: Session) -> list[tuple[str, str, str, str]]:
             frames["spine_mm"].median()
         )  # an animal on its feet is about half its length high
         drawn = contact_sheet.picture(
-            np.asarray(depth, np.uint16), uv, bones, entry["left_px"], entry["top_px"], reach_mm
+            np.asarray(depth, np.uint16),
+            uv,
+            bones,
+            entry["left_px"],
+            entry["top_px"],
+            reach_mm,
+            marks,
         )
         time_s = float(frames.loc[index, "time_s"])
         word = _word_at(session.bouts, time_s)

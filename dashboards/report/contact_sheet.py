@@ -1,4 +1,4 @@
-"""The report's contact sheet: depth pictures with the skeleton over them, as SVG text.
+"""The report's contact sheet: depth pictures with scene and skeleton over them, as SVG.
 
 A picture is a PNG of a few pixels inside an SVG, so that the skeleton stays sharp. Lengths on the
 paper are in units of the SVG's viewBox.
@@ -11,6 +11,8 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
+
+from .scene_marks import Mark, svg_marks
 
 Array = NDArray[np.float64]
 
@@ -37,8 +39,9 @@ def picture(
     left: int,
     top: int,
     reach_mm: float,
+    marks: Sequence[Mark] = (),
 ) -> str:
-    """A depth picture cut out of a frame, with the skeleton over it.
+    """A depth picture cut out of a frame, with the scene and the skeleton over it.
 
     Near is light: from the floor around the animal to `reach_mm` above it, so that walls do not
     take all the colours.
@@ -50,6 +53,7 @@ def picture(
         left: column of the frame at which the picture begins, px.
         top: row of the frame at which the picture begins, px.
         reach_mm: height above the floor from which on everything is light, mm.
+        marks: what stands still, as far as it is in the picture.
     """
     h, w = depth.shape
     points = (
@@ -57,6 +61,7 @@ def picture(
     )  # the paper counts from the corner of the picture, we from a pixel's centre
     r = w / 70.0
     parts = [f'<image href="{png_uri(shade(depth, reach_mm))}" width="{w}" height="{h}"/>']
+    parts.append(svg_marks(marks, left, top, w, h, 0.9 * r, lettered=False))
     for a, b in bones:
         (x0, y0), (x1, y1) = points[a], points[b]
         parts.append(

@@ -14,6 +14,7 @@ import numpy as np
 
 from liex_lab.arena.floor import Floor
 from liex_lab.arena.outline import circle_points
+from liex_lab.arena.polygon import crossing_sides
 from liex_lab.arena.scene import Mask, region_mask
 from liex_lab.errors import PlanError
 from liex_lab.optics.camera import Camera
@@ -37,9 +38,14 @@ def region_corners_px(region: Region, camera: Camera, floor: Floor | None) -> Co
         (u, v) pixels.
 
     Raises:
-        PlanError: a corner in millimetres lies behind the camera.
+        PlanError: sides of its polygon cross, or a corner in millimetres lies behind the camera.
     """
     corners = _drawn(region)
+    if (crossing := crossing_sides(corners)) is not None:
+        raise PlanError(
+            f"arena.region: sides {crossing[0] + 1} and {crossing[1] + 1} of its polygon cross; "
+            "list the corners in the order in which they go round the arena"
+        )
     if region.unit == "px":
         return tuple((float(u), float(v)) for u, v in corners)
     if floor is None:

@@ -21,6 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from liex_lab.arena.floor import Floor
 from liex_lab.arena.outline import Arena, circle_points
+from liex_lab.arena.polygon import crossing_sides
 from liex_lab.errors import PlanError
 from liex_lab.optics.camera import Camera
 
@@ -280,24 +281,12 @@ def _polygon(where: str, polygon: Any) -> Array:
     ends = np.roll(corners, -1, axis=0)
     if abs((corners[:, 0] * ends[:, 1] - corners[:, 1] * ends[:, 0]).sum()) < 1e-6:
         raise PlanError(f"{where}: the corners of the polygon enclose no area; correct them")
-    n = len(corners)
-    for i in range(n):
-        for j in range(i + 2, n - (i == 0)):
-            if _cross(corners[i], ends[i], corners[j], ends[j]):
-                raise PlanError(
-                    f"{where}: sides {i + 1} and {j + 1} of the polygon cross; list its corners in "
-                    "order"
-                )
+    if (crossing := crossing_sides(corners)) is not None:
+        raise PlanError(
+            f"{where}: sides {crossing[0] + 1} and {crossing[1] + 1} of the polygon cross; list "
+            "its corners in order"
+        )
     return corners
-
-
-def _cross(a: Array, b: Array, c: Array, d: Array) -> bool:
-    """Whether the line from a to b and that from c to d cross inside both."""
-
-    def side(p: Array, q: Array, r: Array) -> float:
-        return float((q[0] - p[0]) * (r[1] - p[1]) - (q[1] - p[1]) * (r[0] - p[0]))
-
-    return side(a, b, c) * side(a, b, d) < 0 and side(c, d, a) * side(c, d, b) < 0
 
 
 def _point(where: str, value: Any) -> tuple[float, float]:

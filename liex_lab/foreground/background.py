@@ -60,6 +60,21 @@ def sample_frames(recording: Recording, n_frames: int, stride: int = 1) -> NDArr
     return sample
 
 
+def usual_depth(pictures: NDArray[np.uint16]) -> NDArray[np.uint16]:
+    """Each pixel's median over some pictures, of those in which it was read.
+
+    Args:
+        pictures: (n, H, W) uint16 mm, 0 where unread.
+
+    Returns:
+        (H, W) uint16 mm, 0 where it was read in none.
+    """
+    ordered = np.sort(pictures, axis=0)
+    unread = (ordered == 0).sum(axis=0)
+    middle = np.minimum(unread + (len(ordered) - unread) // 2, len(ordered) - 1)
+    return np.asarray(np.take_along_axis(ordered, middle[None], axis=0)[0])
+
+
 def stride_for(recording: Recording, length_mm: float) -> int:
     """The stride at which an animal is still some pixels long: 64 or more where it is above 1.
 

@@ -10,6 +10,7 @@ from typing import Any
 
 from liex_lab.dashboards.app.data import StudyData
 from liex_lab.dashboards.app.server import make_app, serve
+from liex_lab.pipelines.stating import StatedRegions
 from liex_lab.pipelines.study.listing import list_sessions
 
 from liex_lab.api import correct_session
@@ -33,6 +34,7 @@ class Served:
             show_replay=lambda replay, at_s: self.asked.append((replay, at_s)),
             correct=correct,
             reviews=(study if study.is_dir() else study.parent) / "reviews",
+            regions=StatedRegions(study),
             **more,
         )
         ready = threading.Event()

@@ -94,5 +94,10 @@
     return "review is-open";
   }
 
-  window.dash_clientside = Object.assign({}, window.dash_clientside, { liex: { draw: draw, open: open, moment: moment, again: again, review: review } });
+  async function region(key) {
+    await (await import("/assets/region.mjs")).start(key);
+    return window.dash_clientside.no_update;
+  }
+
+  window.dash_clientside = Object.assign({}, window.dash_clientside, { liex: { draw: draw, open: open, moment: moment, again: again, review: review, region: region } });
 })();

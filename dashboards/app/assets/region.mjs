@@ -1,0 +1,375 @@
+// A region is drawn over a depth picture, by mouse, finger or keys, and saved into the plan. Every text is set as text.
+
+import { json } from "./desk_source.mjs";
+import { button, make } from "./desk.mjs";
+
+const GRAB_PX = 12;  // so near to a corner, or a side, the pointer takes it
+const CORNER_PX = 6;
+const SVG = "http://www.w3.org/2000/svg";
+const KEYS = [
+  ["click", "a corner; on a side of a closed polygon a new one"], ["drag", "moves a corner"],
+  ["first corner", "a click on it closes the polygon"],
+  ["← → ↑ ↓", "move the cross, or the corner that is chosen; with Shift ten pixels"],
+  ["Enter", "a corner at the cross"], ["C", "close the polygon"], ["N P", "choose the next, the previous corner; Esc none"],
+  ["Del", "take the chosen corner out, else the last"], ["U", "undo"],
+];
+let open = null;
+
+export async function start(key) {
+  if (open) open.close();
+  const place = document.getElementById("region");
+  if (!place) return;
+  const page = open = new Region(place, key);
+  try {
+    await page.begin();
+  } catch (error) {
+    place.replaceChildren(make("p", { class: "problems", role: "alert" }, error.message));
+  }
+}
+
+export function drawn() { return open && open.shape.corners; }  // for tests
+
+function shape(name, attributes) {
+  const made = document.createElementNS(SVG, name);
+  Object.entries(attributes).forEach(([at, value]) => made.setAttribute(at, value));
+  return made;
+}
+
+class Region {
+  constructor(place, key) {
+    this.place = place;
+    this.base = `/region/${encodeURIComponent(key)}`;
+    this.shape = { corners: [], closed: false };
+    this.past = [];
+    this.chosen = null;
+    this.held = null;
+    this.cross = null;
+    this.resized = () => this.paint();
+    window.addEventListener("resize", this.resized);
+  }
+
+  close() { window.removeEventListener("resize", this.resized); }
+
+  async begin() {
+    this.place.replaceChildren(make("p", { class: "muted" }, "Reading the picture ..."));
+    this.take(await json(`${this.base}/about`));
+    this.build();
+    this.show(this.about.region);
+  }
+
+  take(about) { this.about = about; }
+
+  show(corners) {  // what the plan states
+    this.shape = { corners: (corners || []).map((one) => [...one]), closed: Boolean(corners && corners.length > 2) };
+    this.paint();
+  }
+
+  build() {
+    const { width, height } = this.about;
+    this.stage = shape("svg", {
+      viewBox: `-0.5 -0.5 ${width} ${height}`, class: "region-stage", tabindex: "0", role: "application",
+      "aria-label": "depth picture; arrow keys move a cross, Enter puts a corner, C closes the polygon",
+    });
+    this.image = shape("image", { x: -0.5, y: -0.5, width, height, preserveAspectRatio: "none" });
+    this.scene = shape("g", {});
+    this.layer = shape("g", {});
+    this.stage.append(this.image, this.scene, this.layer);
+    this.stage.addEventListener("pointerdown", (event) => this.down(event));
+    this.stage.addEventListener("pointermove", (event) => this.move(event));
+    this.stage.addEventListener("pointerup", (event) => this.up(event));
+    this.stage.addEventListener("pointercancel", () => { this.held = null; });
+    this.stage.addEventListener("keydown", (event) => this.key(event));
+    this.at = make("span", { class: "region-at" });
+    this.said = make("p", { class: "region-said", role: "status" });
+    const bar = make("div", { class: "region-bar", role: "toolbar", "aria-label": "the polygon" },
+      this.closer = button("Close", "close the polygon (C)", () => this.closeShape()),
+      button("Undo", "undo (U)", () => this.undo()),
+      button("Clear", "take every corner away", () => this.change({ corners: [], closed: false })),
+      ...this.pictures(), this.at);
+    this.side = make("div", {});
+    this.place.replaceChildren(make("div", {}, this.stage, bar), this.side);
+    this.place.className = "region is-open";
+    this.picture(this.about.measured ? "session" : "recording");
+    this.about.marks.forEach((one) => this.mark(one));
+    this.panel();
+  }
+
+  pictures() {
+    if (!(this.about.measured && this.about.has_recording)) return [];
+    const chooser = make("select", { "aria-label": "picture", onchange: () => this.picture(chooser.value) },
+      make("option", { value: "session" }, "picture of the session"),
+      make("option", { value: "recording" }, "picture of the whole recording"));
+    return [chooser];
+  }
+
+  picture(of) {
+    const address = `${this.base}/picture.png?of=${of}`;
+    this.image.addEventListener("error", async () => {  // why, in words
+      const answer = await fetch(address);
+      if (!answer.ok) this.say(await answer.text(), true);
+    }, { once: true });
+    this.image.setAttribute("href", address);
+  }
+
+  mark({ kind, points, said }) {
+    const text = shape("title", {});
+    text.textContent = `${kind} ${said}`.trim();
+    if (points.length > 1) {
+      const line = shape("polygon", { class: "scene-line", points: points.join(" ") });
+      line.append(text);
+      this.scene.append(line);
+      return;
+    }
+    const [u, v] = points[0], r = this.about.width / 90;
+    const cross = shape("path", { class: `scene-place is-${kind}`, d: `M${u - r} ${v}H${u + r}M${u} ${v - r}V${v + r}` });
+    cross.append(text);
+    this.scene.append(cross);
+  }
+
+  panel() {
+    const places = this.about.places.map((one) => {
+      const input = make("input", { type: "radio", name: "region-place", value: one.name, checked: one.name === this.about.place,
+        onchange: () => { this.about.place = one.name; this.paint(); } });
+      return make("label", {}, input, ` ${one.title} (${one.file}${one.stated === null ? "" : ", states one now"})`);
+    });
+    this.corners = make("textarea", { rows: "4", id: "region-corners", spellcheck: "false", onchange: () => this.typed() });
+    this.lines = make("pre", { id: "region-lines" });
+    this.command = make("pre", { id: "region-command" });
+    this.saver = button("Save into the plan", "write it into the file", () => this.save(this.shape.corners), { class: "main" });
+    this.remover = button("Take it out of the plan", "the arena is found again", () => this.save(null));
+    const list = make("dl", {});
+    KEYS.forEach(([key, does]) => list.append(make("dt", {}, make("kbd", {}, key)), make("dd", {}, does)));
+    const may = this.about.may_save && places.length;
+    this.side.replaceChildren(
+      make("label", { for: "region-corners" }, "Corners x,y in pixels"), this.corners,
+      ...(may ? [make("fieldset", {}, make("legend", {}, "It is the region of"), ...places),
+        make("div", { class: "region-bar" }, this.saver, this.remover)] : []),
+      this.said, make("h3", {}, "Lines for a plan"), this.lines, make("h3", {}, "Try it first"), this.command,
+      make("details", { class: "desk-keys" }, make("summary", {}, "Mouse and keys"), list));
+    if (this.about.said) this.say(this.about.said, true);
+  }
+
+  pixel(event) {
+    const at = new DOMPoint(event.clientX, event.clientY).matrixTransform(this.stage.getScreenCTM().inverse());
+    return this.inside([at.x, at.y]);
+  }
+
+  inside([u, v]) {
+    const fit = (value, most) => Math.round(10 * Math.min(Math.max(value, 0), most - 1)) / 10;
+    return [fit(u, this.about.width), fit(v, this.about.height)];
+  }
+
+  scale() { return 1 / this.stage.getScreenCTM().a; }  // pixels of the picture for one of the screen
+
+  near([u, v]) {  // the corner under the pointer
+    let best = null, least = GRAB_PX * this.scale();
+    this.shape.corners.forEach(([a, b], k) => {
+      const away = Math.hypot(a - u, b - v);
+      if (away < least) { least = away; best = k; }
+    });
+    return best;
+  }
+
+  side_([u, v]) {  // the side of the closed polygon under the pointer
+    const { corners } = this.shape;
+    let best = null, least = GRAB_PX * this.scale();
+    corners.forEach(([a, b], k) => {
+      const [c, d] = corners[(k + 1) % corners.length], long = (c - a) ** 2 + (d - b) ** 2;
+      const share = long ? Math.min(1, Math.max(0, ((u - a) * (c - a) + (v - b) * (d - b)) / long)) : 0;
+      const away = Math.hypot(a + share * (c - a) - u, b + share * (d - b) - v);
+      if (away < least) { least = away; best = k; }
+    });
+    return best;
+  }
+
+  down(event) {
+    if (event.button) return;
+    event.preventDefault();
+    this.stage.focus({ preventScroll: true });
+    const at = this.pixel(event), near = this.near(at);
+    this.cross = null;
+    if (near !== null) {
+      this.hold(near, event, false);
+    } else if (!this.shape.closed) {
+      this.put(at);
+      this.hold(this.shape.corners.length - 1, event, true);
+    } else {
+      const side = this.side_(at);
+      if (side !== null) {
+        this.put(at, side + 1);
+        this.hold(side + 1, event, true);
+      } else this.chosen = null;
+    }
+    this.paint();
+  }
+
+  hold(k, event, isNew) {
+    this.stage.setPointerCapture(event.pointerId);
+    this.held = { k, isNew, before: JSON.stringify(this.shape), moved: false, began: [event.clientX, event.clientY] };
+    this.chosen = k;
+  }
+
+  move(event) {
+    const at = this.pixel(event);
+    this.at.textContent = `${at[0].toFixed(0)}, ${at[1].toFixed(0)}`;
+    if (!this.held) return;
+    const away = Math.hypot(event.clientX - this.held.began[0], event.clientY - this.held.began[1]);
+    if (!this.held.moved && away < 3) return;
+    this.held.moved = true;
+    this.shape.corners[this.held.k] = at;
+    this.paint();
+  }
+
+  up() {
+    const held = this.held;
+    this.held = null;
+    if (!held) return;
+    if (held.moved && !held.isNew) this.past.push(held.before);
+    else if (!held.moved && !held.isNew && held.k === 0 && !this.shape.closed) this.closeShape();
+    if (this.shape.closed || !held.isNew) this.chosen = held.k; else this.chosen = null;
+    this.paint();
+  }
+
+  put(at, where = this.shape.corners.length) {
+    const corners = [...this.shape.corners];
+    corners.splice(where, 0, at);
+    this.change({ ...this.shape, corners });
+  }
+
+  change(next) {
+    this.past.push(JSON.stringify(this.shape));
+    this.nudged = null;
+    this.shape = JSON.parse(JSON.stringify(next));
+    if (this.chosen !== null && this.chosen >= this.shape.corners.length) this.chosen = null;
+    this.paint();
+  }
+
+  closeShape() {
+    if (this.shape.corners.length < 3) { this.say("a polygon has three or more corners", true); return; }
+    if (!this.shape.closed) this.change({ ...this.shape, closed: true });
+  }
+
+  undo() {
+    const before = this.past.pop();
+    if (before === undefined) { this.say("nothing is left to undo"); return; }
+    this.shape = JSON.parse(before);
+    this.chosen = null;
+    this.nudged = null;
+    this.paint();
+  }
+
+  take_() {
+    const k = this.chosen === null ? this.shape.corners.length - 1 : this.chosen;
+    if (k < 0) return;
+    const corners = this.shape.corners.filter((_, j) => j !== k);
+    this.change({ corners, closed: this.shape.closed && corners.length > 2 });
+  }
+
+  step(du, dv) {
+    if (this.chosen === null) {
+      const [u, v] = this.cross || [(this.about.width - 1) / 2, (this.about.height - 1) / 2];
+      this.cross = this.inside([Math.round(u) + du, Math.round(v) + dv]);
+      this.at.textContent = this.cross.join(", ");
+    } else {
+      if (this.nudged !== this.chosen) this.past.push(JSON.stringify(this.shape));
+      this.nudged = this.chosen;
+      const [u, v] = this.shape.corners[this.chosen];
+      this.shape.corners[this.chosen] = this.inside([u + du, v + dv]);
+      this.at.textContent = this.shape.corners[this.chosen].join(", ");
+    }
+    this.paint();
+  }
+
+  choose(by) {
+    const n = this.shape.corners.length;
+    if (!n) return;
+    this.chosen = this.chosen === null ? (by > 0 ? 0 : n - 1) : (this.chosen + by + n) % n;
+    this.at.textContent = this.shape.corners[this.chosen].join(", ");
+    this.paint();
+  }
+
+  key(event) {
+    const undo = event.key.toLowerCase() === "z" && (event.ctrlKey || event.metaKey);
+    if (!undo && (event.ctrlKey || event.metaKey || event.altKey)) return;
+    const by = event.shiftKey ? 10 : 1;
+    const acts = {
+      ArrowLeft: () => this.step(-by, 0), ArrowRight: () => this.step(by, 0), ArrowUp: () => this.step(0, -by), ArrowDown: () => this.step(0, by),
+      Enter: () => { if (this.cross && !this.shape.closed) this.put(this.cross); },
+      " ": () => { if (this.cross && !this.shape.closed) this.put(this.cross); },
+      c: () => this.closeShape(), n: () => this.choose(1), p: () => this.choose(-1), u: () => this.undo(),
+      Escape: () => { this.chosen = null; this.nudged = null; this.paint(); },
+      Delete: () => this.take_(), Backspace: () => this.take_(),
+    };
+    const act = undo ? () => this.undo() : acts[event.key.length === 1 ? event.key.toLowerCase() : event.key];
+    if (!act) return;
+    event.preventDefault();
+    act();
+  }
+
+  typed() {
+    const words = this.corners.value.trim().split(/[\s;]+/).filter((one) => one);
+    const corners = words.map((one) => one.split(",").map((part) => (part ? Number(part) : NaN)));
+    if (corners.some((one) => one.length !== 2 || !one.every(Number.isFinite))) {
+      this.say("corners are written as x,y with blanks between them, as in 60,40 260,40 260,200", true);
+      return;
+    }
+    this.change({ corners, closed: corners.length > 2 });
+  }
+
+  paint() {
+    if (!this.layer || !this.stage.getScreenCTM()) return;
+    const { corners, closed } = this.shape, { width, height } = this.about, r = CORNER_PX * this.scale();
+    const points = corners.map((one) => one.join(",")).join(" "), name = closed ? "polygon" : "polyline";
+    const parts = [];
+    if (closed) {
+      const hole = `M${corners.map((one) => one.join(" ")).join("L")}Z`;
+      parts.push(shape("path", { class: "outside", "fill-rule": "evenodd", d: `M-0.5 -0.5h${width}v${height}h${-width}Z${hole}` }));
+    }
+    if (corners.length > 1) parts.push(shape(name, { class: "under", points }), shape(name, { class: "sides", points }));
+    corners.forEach(([u, v], k) => {
+      const large = k === 0 && !closed ? 1.4 : 1;
+      parts.push(shape("circle", { class: `corner${k === this.chosen ? " is-chosen" : ""}`, cx: u, cy: v, r: large * r }));
+    });
+    if (this.cross && this.chosen === null) {
+      const [u, v] = this.cross;
+      parts.push(shape("path", { class: "cross", d: `M${u - 2 * r} ${v}H${u + 2 * r}M${u} ${v - 2 * r}V${v + 2 * r}` }));
+    }
+    this.layer.replaceChildren(...parts);
+    this.tell();
+  }
+
+  tell() {
+    const { corners, closed } = this.shape, list = corners.map((one) => one.join(",")).join(" ");
+    if (document.activeElement !== this.corners) this.corners.value = list;
+    this.lines.textContent = closed ? `[arena]\nregion = [${corners.map((one) => `[${one.join(", ")}]`).join(", ")}]` : "the polygon is not closed";
+    this.command.textContent = closed ? `liex doctor ${this.about.recording || "RECORDING"} --region '${list}'` : "";
+    const place = this.about.places.find((one) => one.name === this.about.place);
+    this.saver.disabled = !closed;
+    this.remover.disabled = !place || place.stated === null;
+    this.closer.disabled = closed || corners.length < 3;
+  }
+
+  async save(corners) {
+    const place = this.about.places.find((one) => one.name === this.about.place);
+    this.saver.disabled = true;
+    try {
+      const told = await json(`${this.base}/save`, {
+        method: "POST", headers: { "Content-Type": "application/json" },
+        body: JSON.stringify({ place: place.name, corners, was: place.stated }),
+      });
+      this.take({ ...told, place: place.name });
+      this.panel();
+      if (corners === null) this.change({ corners: [], closed: false });
+      this.paint();
+      this.say(told.saved);
+    } catch (error) {
+      this.say(error.message, true);
+      this.saver.disabled = !this.shape.closed;
+    }
+  }
+
+  say(text, wrong = false) {
+    this.said.textContent = text;
+    this.said.classList.toggle("is-wrong", wrong);
+  }
+}

@@ -1,0 +1,285 @@
+"""The dashboard's pictures of a scene, and the page on which a region is drawn into the plan.
+
+The page's script draws; what it asks for is told here as JSON and pictures, and what it saves is
+checked and written by whoever knows the plans (`Regions`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any, Protocol
+from urllib.parse import quote
+
+import numpy as np
+from dash import ClientsideFunction, Dash, Input, Output, dcc, html
+from flask import Flask, Response, jsonify, request
+from numpy.typing import NDArray
+
+from liex_lab.errors import LiexError, PlanError, SessionError
+from liex_lab.foreground.background import usual_depth
+from liex_lab.sessions import Session
+
+from ..report.contact_sheet import png_uri, shade
+from ..report.scene_marks import WORDS, Mark, scene_marks, svg_marks
+from .data import StudyData
+from .frames import Frames
+from .parts import aria
+
+if TYPE_CHECKING:
+    from liex_lab.optics.camera import Camera
+
+_N_PICTURES = 9  # of which each pixel's usual depth is shown
+_LEAST_REACH_MM = 60.0
+
+
+class Regions(Protocol):
+    """Who knows where a region may be stated, and states it."""
+
+    @property
+    def of_recordings(self) -> bool:
+        """Whether recordings are known that were not measured."""
+
+    def about(self, key: str, session: Session | None) -> dict[str, Any]:
+        """What is told of the region of the recording `key`, whose results are `session`."""
+
+    def save(
+        self,
+        key: str,
+        session: Session | None,
+        place: str,
+        corners: Sequence[Any] | None,
+        was: Any,
+    ) -> str:
+        """State a region of `corners` (px) of the recording `key` in a `place` that said `was`."""
+
+    def picture(self, key: str) -> tuple[NDArray[np.uint16], Camera]:
+        """The usual depth (mm) of every pixel of the recording `key`, and its camera."""
+
+
+def arena_address(key: str) -> str:
+    """Address of the page on which the region of a recording is drawn.
+
+    Args:
+        key: its name in the study.
+    """
+    return f"/arena/{quote(key, safe='')}"
+
+
+def scene_panel(key: str, session: Session) -> list[Any]:
+    """The scene over the depth picture, as a session's page shows it.
+
+    Args:
+        key: the session's name in the study.
+        session: the opened session.
+    """
+    kinds = dict.fromkeys(mark.kind for mark in scene_marks(session))
+    words = [html.Li([html.I(className=f"mark is-{kind}"), WORDS[kind]]) for kind in kinds]
+    return [
+        html.H2("The scene"),
+        html.Img(
+            src=f"/region/{quote(key, safe='')}/scene.svg",
+            className="scene",
+            alt="depth picture with " + (", ".join(kinds) or "nothing that stands still"),
+        ),
+        html.Ul(words, className="key"),
+        html.P(dcc.Link("Draw the region of the arena", href=arena_address(key))),
+    ]
+
+
+def not_measured(data: StudyData, key: str) -> list[Any]:
+    """What a recording's page says of its region while it was not measured.
+
+    Args:
+        data: the study.
+        key: the recording's name in the study.
+    """
+    if key not in data.entries:
+        return []
+    return [html.P(dcc.Link("Draw the region of the arena", href=arena_address(key)))]
+
+
+def arena_page(data: StudyData, key: str) -> list[Any]:
+    """Content of the page on which a region is drawn; its script fills it.
+
+    Args:
+        data: the study.
+        key: the recording's name in the study.
+    """
+    back = dcc.Link(key, href=f"/session/{quote(key, safe='')}") if key in data.entries else key
+    return [
+        html.P([dcc.Link("Sessions", href="/"), " / ", back], className="kind"),
+        html.H1("Region of the arena"),
+        html.P(
+            "Draw a polygon around the arena: outside of it nothing is looked at. It is saved as "
+            "arena.region, which liex doctor and liex run take.",
+            className="muted",
+        ),
+        dcc.Store(id="region-key", data=key),
+        html.Div(id="region", className="region", role="region", **aria(label="draw a region")),
+    ]
+
+
+def register(app: Dash) -> None:
+    """Let the page's script begin when the page is opened.
+
+    Args:
+        app: the dashboard.
+    """
+    app.clientside_callback(
+        ClientsideFunction("liex", "region"),
+        Output("region", "className"),
+        Input("region-key", "data"),
+    )
+
+
+class _Scenes:
+    """Pictures and facts of scenes."""
+
+    def __init__(self, data: StudyData, frames: Frames, regions: Regions | None) -> None:
+        self._data = data
+        self._frames = frames
+        self._regions = regions
+
+    def session(self, key: str) -> Session | None:
+        """The results of the recording `key`; None where there are none."""
+        if key not in self._data.entries:
+            raise SessionError(f"there is no recording '{key}'; see the list of sessions")
+        return self._data.session(key) if key in {one.key for one in self._data.done} else None
+
+    def about(self, key: str) -> dict[str, Any]:
+        """What the page is told: the picture's size, marks, and where a region is stated."""
+        session = self.session(key)
+        told: dict[str, Any] = {"may_save": self._regions is not None, "places": [], "region": None}
+        if self._regions is not None:
+            told |= self._regions.about(key, session)
+        if session is None:
+            _, camera = self._whole(key)
+            marks: list[Mark] = []
+        else:
+            camera = session.camera
+            marks = scene_marks(session)
+        found = [{"kind": one.kind, "said": one.said, "points": _rounded(one)} for one in marks]
+        size = {"width": camera.width, "height": camera.height}
+        return {**told, **size, "measured": session is not None, "marks": found}
+
+    def save(self, key: str, asked: dict[str, Any]) -> dict[str, Any]:
+        """Check and save what the page asks for; returns what the page is told from now on."""
+        if self._regions is None:
+            raise PlanError("no region is saved here")
+        corners = asked.get("corners")
+        place = str(asked.get("place"))[:40]
+        session = self.session(key)
+        said = self._regions.save(key, session, place, corners, asked.get("was"))
+        self._data.refresh()
+        return {**self.about(key), "saved": said}
+
+    def picture(self, key: str, of: str) -> NDArray[np.uint16]:
+        """(H, W) uint16 mm: the usual depth of the session, or of its recording."""
+        session = self.session(key)
+        return self._whole(key)[0] if session is None or of == "recording" else self.usual(key)
+
+    def usual(self, key: str) -> NDArray[np.uint16]:
+        """(H, W) uint16 mm: the usual depth of the pictures that the session keeps."""
+        session = self._data.session(key)
+        n = len(session.frames)
+        rows = np.unique(np.linspace(0, n - 1, min(n, _N_PICTURES)).astype(int))
+        found = [self._frames.depth(key, session, int(row)) for row in rows]
+        kept = [one for one in found if one is not None]
+        camera = session.camera
+        return usual_depth(
+            np.stack(kept) if kept else np.zeros((1, camera.height, camera.width), np.uint16)
+        )
+
+    def _whole(self, key: str) -> tuple[NDArray[np.uint16], Any]:
+        if self._regions is None:
+            raise SessionError(f"{key} was not measured yet, so there is no picture of it")
+        return self._regions.picture(key)
+
+
+def add_scenes(server: Flask, data: StudyData, frames: Frames, regions: Regions | None) -> None:
+    """Add the addresses of scenes and regions.
+
+    Args:
+        server: the Flask server of the dashboard; its guard stands before these, too.
+        data: the study.
+        frames: the depth pictures.
+        regions: states regions; None states none.
+    """
+    scenes = _Scenes(data, frames, regions)
+
+    def told(make: Callable[[], Any]) -> Response:
+        """JSON of what `make` returns, or 400 with a sentence."""
+        try:
+            return jsonify(make())
+        except LiexError as error:
+            answer = jsonify({"said": str(error)})
+            answer.status_code = 400
+            return answer
+
+    def drawn(make: Callable[[], str | bytes], kind: str) -> Response:
+        """A picture that `make` returns, or 400 with a sentence."""
+        try:
+            return Response(make(), mimetype=kind)
+        except LiexError as error:
+            return Response(str(error), 400, mimetype="text/plain")
+
+    @server.get("/region/<path:key>/about")
+    def region_about(key: str) -> Response:
+        """What the page is told of the recording `key`."""
+        return told(lambda: scenes.about(key))
+
+    @server.get("/region/<path:key>/picture.png")
+    def region_picture(key: str) -> Response:
+        """The whole depth picture of `key`; with ?of=recording that of its recording."""
+        of = request.args.get("of", "")
+        return drawn(lambda: _png(scenes.picture(key, of)), "image/png")
+
+    @server.get("/region/<path:key>/scene.svg")
+    def region_scene(key: str) -> Response:
+        """The depth picture of the session `key` with its scene."""
+        return drawn(lambda: scene_svg(data.session(key), scenes.usual(key)), "image/svg+xml")
+
+    @server.post("/region/<path:key>/save")
+    def region_save(key: str) -> Response:
+        """State a region of the recording `key`: JSON of place, corners (px) and was."""
+        asked = request.get_json(silent=True)  # another site's form cannot send JSON
+        if regions is None or not isinstance(asked, dict):
+            answer = jsonify({"said": "no region is saved here"})
+            answer.status_code = 403 if regions is None else 400
+            return answer
+        return told(lambda: scenes.save(key, asked))
+
+
+def scene_svg(session: Session, depth: NDArray[np.uint16]) -> str:
+    """The whole depth picture of a session with its scene over it.
+
+    Args:
+        session: the opened session.
+        depth: (H, W) uint16 mm, 0 where unread.
+    """
+    h, w = depth.shape
+    marks = svg_marks(scene_marks(session), 0, 0, w, h, w / 200.0)
+    return (
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {w} {h}" width="{w}" height="{h}">'
+        f'<image href="{png_uri(_shaded(depth))}" width="{w}" height="{h}"/>{marks}</svg>'
+    )
+
+
+def _shaded(depth: NDArray[np.uint16]) -> NDArray[np.uint8]:
+    """Colours over all heights of a picture, walls and rims with them."""
+    read = depth[depth > 0]
+    reach = float(np.ptp(np.percentile(read, [3.0, 95.0]))) if len(read) else 0.0
+    return shade(depth, max(reach, _LEAST_REACH_MM))
+
+
+def _png(depth: NDArray[np.uint16]) -> bytes:
+    import cv2
+
+    done, png = cv2.imencode(".png", np.ascontiguousarray(_shaded(depth)[..., ::-1]))
+    if not done:
+        raise SessionError("the picture cannot be made")
+    return bytes(png)
+
+
+def _rounded(mark: Mark) -> list[list[float]]:
+    return [[round(float(u), 1), round(float(v), 1)] for u, v in mark.points_px]
