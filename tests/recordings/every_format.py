@@ -22,7 +22,7 @@ from mcap.writer import CompressionType
 from numpy.typing import NDArray
 
 from liex_lab.recordings.formats.messages.mcap import McapFile
-from liex_lab.recordings.formats.messages.message_file import MessageFile
+from liex_lab.recordings.formats.messages.message_file import Envelope, MessageFile
 from liex_lab.recordings.formats.messages.rosbag import BagFile
 from liex_lab.recordings.formats.oni.writer import Codec
 from liex_lab.runtime.progress import silent
@@ -193,6 +193,7 @@ def _message_ends(file: MessageFile) -> list[int]:
     """For each depth picture the end of its chunk, or its own where there are no chunks."""
     found = []
     for envelope in file.walk(lambda channel: "Image" in channel.schema, silent):
+        assert isinstance(envelope, Envelope)  # it is walked, not listed by an index
         place = envelope.place
         chunk = file.chunks[place.chunk] if place.chunk >= 0 else None
         found.append(place.offset + place.length if chunk is None else chunk.offset + chunk.length)
