@@ -1,7 +1,7 @@
 // A region is drawn over a depth picture, by mouse, finger or keys, and saved into the plan. Every text is set as text.
 
 import { json } from "./desk_source.mjs";
-import { button, make } from "./desk.mjs";
+import { button, make } from "./desk_parts.mjs";
 
 const GRAB_PX = 12;  // so near to a corner, or a side, the pointer takes it
 const CORNER_PX = 6;
