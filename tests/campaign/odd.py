@@ -39,7 +39,7 @@ _AT_FRAME = 120  # where something happens in the middle
 _LIKE_PLAIN = 2.0  # times the plain recording's error is right, for some have one pose only
 _WRONG_MM = 7.0  # and what is trusted and further off is wrong: 15 % of the spine
 _MOST_WRONG = 0.01  # of the frames
-_LATE_S = 3.0  # of a change made under the run
+_LONGEST_S = 60.0  # until the run measures
 
 
 @dataclass(frozen=True)
@@ -256,7 +256,7 @@ def _measure(shown: Shown, name: str, scratch: Path) -> dict[str, Any]:
         import cv2
 
         assert cv2.imwrite(str(folder / f"frame_{_AT_FRAME}.png"), shown.frames[0][::2, ::2])
-    with _changed(folder, name):
+    with _changed(folder, scratch / "out", name):
         ended = run("run", path, "--out", scratch / "out")
     found: dict[str, Any] = {
         "code": ended.code,
@@ -276,9 +276,14 @@ def _measure(shown: Shown, name: str, scratch: Path) -> dict[str, Any]:
             "median_mm": round(min(float(np.median(sure)), 999.0), 2) if len(sure) else None,
             "wrong_but_trusted": int((sure > _WRONG_MM).sum()),
             "sentence": verdict["sentence"],
-            "notes": [*verdict["reasons"], *verdict["cautions"], *session.metadata["problems"]],
+            "notes": [*verdict["reasons"], *verdict["cautions"], *_odd_problems(session)],
         }
     return found
+
+
+def _odd_problems(session: Session) -> list[str]:
+    """The session's problems, without what is said of names of actions."""
+    return [one for one in session.metadata["problems"] if "recogniser" not in one]
 
 
 def _errors_mm(one: Individual, true: Array) -> Array:
@@ -308,11 +313,13 @@ def _wrong(found: dict[str, Any], plain_mm: float) -> str:
 
 
 @contextmanager
-def _changed(folder: Path, name: str) -> Iterator[None]:
-    """Something becomes of the recording while it is measured."""
+def _changed(folder: Path, out: Path, name: str) -> Iterator[None]:
+    """Something becomes of the recording when its frames begin to be measured."""
 
     def change() -> None:
-        time.sleep(_LATE_S)
+        until = time.monotonic() + _LONGEST_S
+        while not list(out.glob("*.part")) and time.monotonic() < until:
+            time.sleep(0.05)
         pictures = sorted(folder.glob("*.png"))
         if "grows" in name:
             for k in range(10):

@@ -6,11 +6,11 @@ import json
 import os
 import random
 import shutil
-import signal
 import subprocess
 import sys
 import tempfile
 import time
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -23,12 +23,25 @@ from tests.campaign.tally import Tally
 _N_SESSIONS = 4  # of a study whose workers are killed
 
 
+def _workers_of(process: subprocess.Popen[bytes]) -> list[Any]:
+    """The processes of a study that measure; none once it has ended."""
+    import psutil
+
+    found = []
+    try:
+        for one in psutil.Process(process.pid).children(recursive=True):
+            with suppress(psutil.Error):  # it is just ending
+                if "spawn_main" in " ".join(one.cmdline()):
+                    found.append(one)
+    except psutil.Error:
+        return []
+    return found
+
+
 def workers(n: int, seed: int) -> Tally:
     """SIGKILL of a worker at n random moments of studies of four sessions; each study ends by
     itself.
     """
-    import psutil
-
     rng, killed, done, same, again = random.Random(seed), 0, 0, 0, 0
     unfinished = 0
     expected: dict[str, dict[str, bytes]] = {}
@@ -44,17 +57,9 @@ def workers(n: int, seed: int) -> Tally:
         process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         while process.poll() is None:
             time.sleep(rng.uniform(3.0, 20.0))
-            found = (
-                []
-                if process.poll() is not None
-                else [
-                    one
-                    for one in psutil.Process(process.pid).children(recursive=True)
-                    if "spawn_main" in " ".join(one.cmdline())
-                ]
-            )
+            found = _workers_of(process)
             if found and not quiet and killed < n:
-                rng.choice(found).send_signal(signal.SIGKILL)
+                rng.choice(found).kill()
                 killed += 1
         for one in standings(Study.load(study)):
             if one.state != "done":

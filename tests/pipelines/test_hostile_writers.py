@@ -125,7 +125,8 @@ def test_every_format_stays_in_its_folder(
 @pytest.mark.parametrize("name", _SOME)
 def test_sessions_reports_corrections_and_comparisons_stay_in_theirs(name: str, root: Path) -> None:
     out = root / "a" / "b" / "out"
-    text = name.encode(errors="ignore").decode()  # what no file can say is refused elsewhere
+    # what no file can say is refused elsewhere
+    text = name.encode(errors="ignore").decode().replace("\0", "")
     subject = {"subject_id": text, "group": text, "cage": text}
     with nothing_beside(root, out):
         skeleton = MOUSE.skeleton
