@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from playwright.sync_api import Locator, Page, expect
+from playwright.sync_api import Locator, Page, Route, expect
 
 from liex_lab.api import run_session
 from liex_lab.arena.outline import Arena
@@ -263,6 +263,21 @@ def test_crossings_are_gone_to_by_a_key_and_by_buttons_and_told_in_words(
     expect(said).to_contain_text("from the end again: crossing 4 of 4")
     page.keyboard.press("x")
     expect(said).to_contain_text("from the beginning again: crossing 1 of 4")
+    watched.nothing_went_wrong()
+
+
+def test_a_crossing_asked_for_too_early_is_gone_to_once_it_is_found(
+    served: Served, watched: Watched
+) -> None:
+    put_flips(served.study / f"{KEY}.liex")
+    page, held = watched.page, list[Route]()
+    page.route("**/crossings", lambda route: held.append(route))
+    with page.expect_request("**/crossings"):
+        opened(served, page, 0.0)
+    page.keyboard.press("x")
+    expect(page.locator(".desk-said")).to_contain_text("crossings are still being looked for")
+    held.pop().continue_()
+    expect(page.locator(".desk-said")).to_contain_text("crossing 1 of 4, 0.50 to 0.80 s")
     watched.nothing_went_wrong()
 
 

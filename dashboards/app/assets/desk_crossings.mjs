@@ -9,6 +9,7 @@ export class Crossings {
   constructor(desk) {
     this.desk = desk;
     this.all = null;  // until they have come
+    this.asked = 0;  // the way that was asked for before they had come
     this.count = make("span", { class: "muted desk-crossings" });
     this.parts = [make("div", { class: "desk-bar" },
       button("◀", "Shift and X", () => this.next(-1), { "aria-label": "previous crossing" }),
@@ -18,10 +19,13 @@ export class Crossings {
   async read() {
     this.all = await json(`${this.desk.source.base}/crossings`);
     this.count.textContent = this.all.length ? `${this.all.length} in all` : "none";
+    const asked = this.asked;
+    this.asked = 0;
+    if (asked) this.next(asked);
   }
 
   next(way) {
-    if (!this.all) { this.desk.say("crossings are still being looked for"); return; }
+    if (!this.all) { this.asked = way; this.desk.say("crossings are still being looked for"); return; }
     const n = this.all.length, time = this.desk.time();
     if (!n) {
       this.desk.say("there is no crossing: nowhere were head and tail, or the animal and another thing, found to be exchanged or perhaps so");
