@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import subprocess
 import sys
 import time
@@ -13,7 +14,8 @@ from typing import IO
 from tests.campaign.runs import SAMPLE
 from tests.runtime.test_signals import heeding
 
-_LONGEST_S = 240.0
+_LONGEST_S = 120.0
+_DYING_S = 10.0
 ENDED = (0, 4)  # exit codes of a command that did what it was asked to
 
 
@@ -25,7 +27,7 @@ class Ended:
         code: its exit code.
         said: everything that it printed.
         seconds: how long it took.
-        hung: it had to be killed.
+        hung: it had to be killed; `said` then ends with where its threads were.
     """
 
     code: int
@@ -60,7 +62,7 @@ def started(
         stderr=subprocess.STDOUT,
         text=True,
         errors="replace",
-        env={**os.environ, **(environment or {})},
+        env={**os.environ, "PYTHONFAULTHANDLER": "1", **(environment or {})},
         preexec_fn=heeding,
     )
 
@@ -78,8 +80,12 @@ def run(*arguments: str | Path, longest_s: float = _LONGEST_S, before: str = "")
         try:
             said, _ = process.communicate(timeout=longest_s)
         except subprocess.TimeoutExpired:
-            process.kill()
-            said, _ = process.communicate()
+            process.send_signal(signal.SIGABRT)  # where its threads are, by Python's fault handler
+            try:
+                said, _ = process.communicate(timeout=_DYING_S)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                said, _ = process.communicate()
             return Ended(process.returncode, said, time.monotonic() - began, True)
     return Ended(process.returncode, said, time.monotonic() - began)
 
