@@ -385,7 +385,7 @@ class SessionWriter:
 
         Raises:
             SessionError: the recording holds no frame, the track is of other frames, a column is
-                not described, or a log could not be written.
+                not described, a log could not be written, or the disk had no room for the report.
         """
         from liex_lab.sessions.session import Session
 
@@ -439,12 +439,30 @@ class SessionWriter:
         del rows, of_track
         self._rows = None  # the report reads the folder
         rest()
+        self._publish_with_report()
+        return Session.open(self.path)
+
+    def _publish_with_report(self) -> None:
+        """Put the session in its place, with its report or without.
+
+        A report can be made again; hours of tracking should not go with it.
+
+        Raises:
+            SessionError: the disk had no room for the report.
+        """
         try:
             if self._report is not None:
                 self._report(self._folder)
-        finally:  # a report can be made again; hours of tracking should not go with it
+        except BaseException as error:
+            full = full_disk(self._folder, error)
             self._publish()
-        return Session.open(self.path)
+            if full is None:
+                raise
+            raise SessionError(
+                f"{full}; the session {self.path} is whole but for its report: make room there, "
+                f"then make it with liex report {self.path} (in Python report_session)"
+            ) from error
+        self._publish()
 
     @property
     def _elapsed(self) -> float:
