@@ -28,7 +28,7 @@ from liex_lab.errors import LiexError, SessionError
 from liex_lab.runtime.disk import is_full, probe_full, why_full
 from liex_lab.runtime.durable import put_in_place, sync_tree
 from liex_lab.runtime.memory import Allocator, on_disk, peak_memory_mb, rest
-from liex_lab.runtime.places import unlinked_tree
+from liex_lab.runtime.places import storable_document, unlinked_tree
 from liex_lab.sessions.buffer import Columnar, TrackBuffer, columns_of
 from liex_lab.sessions.checkpoint import LOGS, Checkpoint
 from liex_lab.sessions.corrections import FOLDER
@@ -434,7 +434,8 @@ class SessionWriter:
         made = corrections_for(self.path)
         if made is not None and made.parent != self.path:
             self.note(corrections_taken_from=made.parent.name)
-        text = json.dumps(self._document, indent=2, default=str, allow_nan=False)
+        document = storable_document(self._document)
+        text = json.dumps(document, indent=2, default=str, allow_nan=False)
         (self._folder / "session.json").write_text(text + "\n", encoding="utf-8")
         del rows, of_track
         self._rows = None  # the report reads the folder

@@ -286,3 +286,14 @@ def test_a_picture_that_is_written_to_during_the_run_is_a_reason_to_look_at_it(f
     verdict = Session.open(made).metadata["verdict"]
     assert verdict["look_at_it"]
     assert any(".png changed while the recording was measured" in r for r in verdict["reasons"])
+
+
+def test_a_recording_whose_name_is_no_text_is_measured_all_the_same(folder, tmp_path):
+    named = tmp_path / os.fsdecode(b"\xff\xfe day one")
+    shutil.copytree(folder, named)
+    made = run_session(
+        named, Plan.load("mouse").with_settings(["replay.depth=none"]), tmp_path / "out"
+    )
+    session = Session.open(made)
+    assert len(session.poses)
+    assert "day one" in session.metadata["input"]["path"]
