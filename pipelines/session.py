@@ -33,6 +33,7 @@ from .build import (
     build_recording,
     build_rules,
     build_surroundings,
+    build_water,
     why_nameless,
 )
 from .choice import USUAL, Fitted, fit_plan
@@ -292,8 +293,10 @@ def make_track(writer: SessionWriter, fitted: Fitted) -> Verdict:
     fit = tracker.sample_fit
     files = fitted.recording.files
     fast = why_too_fast(tracked.track, tracker.subject.length_mm)
+    water = build_water(fitted.plan)
     # water makes an ideal camera with a focal length of its own
-    lens = unusual_lens(fitted.recording.camera) if fitted.plan.water.height_mm is None else ""
+    lens = unusual_lens(fitted.recording.camera) if water is None else ""
+    place = tracker.scene.floor.unusual(None if water is None else water.lift_mm)
     verdict = Verdict.of(
         tracked.track,
         whole,
@@ -305,7 +308,13 @@ def make_track(writer: SessionWriter, fitted: Fitted) -> Verdict:
             *files.rewritten(),
         ),
         n_animals=1 if fit is None else fit.n_animals,
-        cautions=(*fitted.notes, *tracker.scene.remarks, *files.grown(), *filter(None, [lens])),
+        cautions=(
+            *fitted.notes,
+            *tracker.scene.remarks,
+            *files.grown(),
+            *filter(None, [lens]),
+            *place,
+        ),
         accepted=fitted.plan.estimation.accept_misfit,
     )
     writer.take(tracked, whole, tracker.subject)
