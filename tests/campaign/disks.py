@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+import re
 import shutil
 import tempfile
 import time
@@ -152,7 +153,8 @@ VERBS = (
 
 
 def disks(n: int, seed: int) -> Tally:
-    """Fill the disk under n commands; with room again, the same command does what it should.
+    """Fill the disk under n commands; with room again, the same command, or the one that was told,
+    does what it should.
 
     Args:
         n: commands.
@@ -199,7 +201,7 @@ def _tries(
             ended = run(*verb.arguments(disk, session))
             wrong = _wrong(ended, verb.results(disk), expected, usual.seconds)
             resize(disk, _MB << 20)
-            again = run(*verb.arguments(disk, session), *_over(verb, ended))
+            again = run(*_as_told(ended) or (*verb.arguments(disk, session), *_over(verb, ended)))
             lost = ""
             if again.code not in ENDED or verb.results(disk) != expected:
                 lost = f"with room it ends with {again.code}: {again.said[-600:]}"
@@ -222,6 +224,12 @@ def _wrong(ended: Ended, found: Results, expected: Results, usual_s: float) -> s
     if any(content != expected.get(name) for name, content in found.items()):
         return "half a result lies where whole ones do"
     return "" if "liex:" in ended.said or "failed" in ended.said else "it did not say why"
+
+
+def _as_told(ended: Ended) -> list[str]:
+    """What a command said that should be typed once there is room; nothing: the same again."""
+    told = re.search(r"then make it with liex (report \S+)", ended.said)
+    return told[1].split() if told else []
 
 
 def _over(verb: Verb, ended: Ended) -> list[str]:
