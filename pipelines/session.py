@@ -34,6 +34,7 @@ from .build import (
     build_rules,
     build_surroundings,
     build_water,
+    session_bytes,
     why_nameless,
 )
 from .choice import USUAL, Fitted, fit_plan
@@ -244,13 +245,20 @@ def prepare(fitted: Fitted, folder: Path, started: float, progress: Progress) ->
     Raises:
         ModelError: there is no such recogniser.
         PlanError: it was made for another skeleton.
+        SessionError: the disk has by far no room for it.
     """
     from liex_lab.sessions.checkpoint import hash_once
     from liex_lab.sessions.older import part_folder
+    from liex_lab.sessions.room import check_room, megabytes
 
     build_recogniser(fitted.plan, fitted.tracker.estimator.skeleton)
     hash_once(fitted.recording, part_folder(folder), progress)
     origin = build_provenance(fitted.recording, fitted.plan, fitted.tracker, progress)
+    needed = session_bytes(
+        fitted.recording, fitted.plan, fitted.tracker.spine_mm, origin.floor_distance_mm
+    )
+    progress(0, None, f"the session takes about {megabytes(needed)} on disk")
+    check_room(folder, needed)
     return Prepared(
         fitted, origin, folder, {"prepare": time.perf_counter() - started, "track": 0.0}
     )

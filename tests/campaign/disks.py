@@ -13,7 +13,7 @@ from pathlib import Path
 
 from tests.campaign.commands import ENDED, Ended, measured, run
 from tests.campaign.runs import SAMPLE, whole_sessions
-from tests.campaign.small_disks import in_memory, resize, used
+from tests.campaign.small_disks import filled_after, in_memory, resize, used
 from tests.campaign.studies import study_file
 from tests.campaign.tally import Tally
 
@@ -21,6 +21,7 @@ LEVELS = (0.01, 0.02, 0.05, 0.10, 0.20, 0.50, 0.90)
 LATE_S = 10.0  # after as long as it takes with room, and so much more, it has ended
 _MB = 400
 _PAGE = 4096
+_AT_WORK = 0.6  # of the time that it usually takes
 Results = dict[str, bytes]
 
 
@@ -197,8 +198,14 @@ def _tries(
         with in_memory(place, _MB) as disk:
             assert disk is not None
             verb.begin(disk, session)
-            resize(disk, used(disk) + max(room, _PAGE))
-            ended = run(*verb.arguments(disk, session))
+            full = used(disk) + max(room, _PAGE)
+            arguments = verb.arguments(disk, session)
+            if k // len(LEVELS) % 2:  # another program fills it while the command is at work
+                with filled_after(_AT_WORK * usual.seconds, disk, full):
+                    ended = run(*arguments)
+            else:
+                resize(disk, full)
+                ended = run(*arguments)
             wrong = _wrong(ended, verb.results(disk), expected, usual.seconds)
             resize(disk, _MB << 20)
             again = run(*_as_told(ended) or (*verb.arguments(disk, session), *_over(verb, ended)))
