@@ -31,6 +31,8 @@ from liex_lab.recordings.timestamps import (
     find_gaps,
     median_step,
 )
+from liex_lab.runtime.disk import is_full
+from liex_lab.runtime.limits import why_short
 from liex_lab.runtime.progress import Progress, silent
 
 Times = NDArray[np.int64]
@@ -218,14 +220,23 @@ class Recording:
 
         Raises:
             IndexError: there is no such row.
-            RecordingError: the recording was closed.
+            RecordingError: the recording was closed, or its files are there no more.
         """
         if not -len(self) <= index < len(self):
             raise IndexError(f"frame {index} of a recording of {len(self)} frames")
         if (self._whole or self)._closed:
             raise RecordingError(f"{self.name} was closed; open it again to read from it")
         row = index % len(self)
-        return DepthFrame(row, int(self.times_ns[row]), self._read(int(self._stored[row])))
+        try:
+            depth = self._read(int(self._stored[row]))
+        except OSError as error:
+            if is_full(error) or why_short(error):
+                raise
+            raise RecordingError(
+                f"{error.filename or self.name} can be read no more ({error.strerror or error}); "
+                "put it back, or mend its drive, and run the same command again"
+            ) from error
+        return DepthFrame(row, int(self.times_ns[row]), depth)
 
     def __iter__(self) -> Iterator[DepthFrame]:
         return (self.frame(i) for i in range(len(self)))

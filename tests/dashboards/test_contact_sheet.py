@@ -17,7 +17,8 @@ def embedded(svg: str) -> np.ndarray:
     """The picture (h, w, 3) inside of an SVG."""
     found = re.search(r'base64,([^"]+)"', svg)
     assert found is not None
-    return cv2.imdecode(np.frombuffer(base64.b64decode(found[1]), np.uint8), cv2.IMREAD_COLOR)
+    packed = np.frombuffer(base64.b64decode(found[1]), np.uint8)
+    return np.asarray(cv2.imdecode(packed, cv2.IMREAD_COLOR))
 
 
 @pytest.mark.parametrize(("size", "kept"), [((60, 60), (60, 60)), ((800, 400), (320, 160))])

@@ -7,6 +7,7 @@ from __future__ import annotations
 import gc
 import io
 import os
+import shutil
 import tracemalloc
 from collections.abc import Iterator
 from pathlib import Path
@@ -97,6 +98,21 @@ def test_a_slice_is_a_recording_of_its_frames(
 def test_pictures_may_be_written_on(recording: Recording, form: Format) -> None:
     recording.frame(1).depth[:] = -1
     assert_is(recording.frame(1).depth, 1, form)
+
+
+def test_what_goes_while_it_is_read_gives_its_frames_or_a_sentence(
+    form: Format, tmp_path: Path
+) -> None:
+    path = form.write(tmp_path, STORED)
+    with open_recording(path) as recording:
+        shutil.rmtree(tmp_path)
+        said = set()
+        for index in range(N):
+            try:
+                assert_is(recording.frame(index).depth, index, form)
+            except RecordingError as error:
+                said.add("can be read no more" in str(error))
+        assert said <= {True}
 
 
 def test_equal_files_have_equal_digests_and_others_not(
