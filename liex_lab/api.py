@@ -803,7 +803,8 @@ def run_tables(
             None takes all.
         quick: a few minutes' run whose numbers say only that everything runs.
         fresh: nothing kept is used; every variant is trained again, which takes long.
-        rows: only these rows are trained and measured anew, the others kept; () is all.
+        rows: these rows are trained and measured anew, or `fig7`, the curves of Fig. 7; the others
+            are kept ones. () names none.
         sealed: measure the sealed split, which is done once, when an issue ends.
         without: `tracking` or `actions`, parts of the page that are not measured.
         nyu: folder of the NYU hand data, counted for Table 2; None leaves it out.
@@ -812,6 +813,7 @@ def run_tables(
     from liex_lab.catalog import bundled_models
     from liex_lab.dashboards.paper.confusion import draw_confusions
     from liex_lab.dashboards.paper.key_frames import draw_key_frames
+    from liex_lab.dashboards.paper.nyu_hands import draw_nyu_hands
     from liex_lab.dashboards.paper.page import write_page
     from liex_lab.dashboards.paper.plates import draw_figures
     from liex_lab.dashboards.paper.tracking import draw_tracking
@@ -823,12 +825,19 @@ def run_tables(
         animals or list(bundled_models()),
         n_frames=n_frames,
         quick=quick,
-        fresh=fresh or bool(rows),
+        fresh=fresh,
         rows=rows,
         sealed=sealed,
         without=without,
         nyu=nyu,
-        drawers=Drawers(draw_figures, draw_tracking, draw_confusions, draw_key_frames, write_page),
+        drawers=Drawers(
+            draw_figures,
+            draw_tracking,
+            draw_confusions,
+            draw_key_frames,
+            draw_nyu_hands,
+            write_page,
+        ),
         progress=progress,
     )
 

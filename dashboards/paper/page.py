@@ -11,6 +11,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from markupsafe import Markup, escape
+
 from liex_lab.runtime.durable import write_whole
 
 from ..pages import page
@@ -34,6 +36,10 @@ def write_page(about: Mapping[str, Any], exhibits: Sequence[Mapping[str, Any]], 
     shown = [
         {
             **one,
+            "said": _with_code(one["said"]),
+            "missing": _with_code(one["missing"]),
+            "notes": [_with_code(note) for note in one["notes"]],
+            "tables": [_table(*table) for table in one["tables"]],
             "id": one["label"].lower().replace(".", "").replace(" ", "-"),
             "pictures": [_picture(file) for file in one["pictures"]],
             "empty": not one["tables"] and not one["pictures"],
@@ -42,6 +48,26 @@ def write_page(about: Mapping[str, Any], exhibits: Sequence[Mapping[str, Any]], 
     ]
     write_whole(path, page(TEMPLATES / "page.html.j2", **about, exhibits=shown))
     return path
+
+
+def _table(
+    caption: str, head: Sequence[str], rows: Sequence[Sequence[str]]
+) -> tuple[str, Sequence[str], list[list[Markup]], list[str]]:
+    """A table as it stands in the page; its columns of words are of the class `text`."""
+    kinds = []
+    for column in zip(*rows, strict=True):
+        cells = [cell for cell in column if cell]
+        numbers = sum(cell[0].isdigit() or cell[0] == "-" for cell in cells)
+        kinds.append("number" if cells and 2 * numbers > len(cells) else "text")
+    return caption, head, [[_with_code(cell) for cell in row] for row in rows], kinds
+
+
+def _with_code(text: str) -> Markup:
+    """A text of ours, what stands between backticks as code."""
+    parts = [escape(part) for part in text.split("`")]
+    for k in range(1, len(parts) - 1, 2):
+        parts[k] = Markup("<code>{}</code>").format(parts[k])
+    return Markup("").join(parts)
 
 
 def _picture(path: Path) -> dict[str, Any]:

@@ -161,8 +161,9 @@ def evaluate_tables(
         list[str] | None,
         typer.Option(
             "--row",
-            help="Train and measure only this row anew, beside the default: paper, "
-            "paper-one-pose, paper-no-metric, rf or cnn; repeatable.",
+            help="Train and measure this row anew, beside the default, and take the others from "
+            "kept results: paper, paper-one-pose, paper-no-metric, rf, cnn, or fig7 for the curves "
+            "of Fig. 7; repeatable.",
         ),
     ] = None,
     sealed: Annotated[

@@ -9,7 +9,9 @@ it, and scores two recognisers on individuals that neither learned from:
   matrices as in Fig 20;
 - uncut recordings of novel individuals (`minutes` in all): macro F1 of frames, and F1 of bouts
   that overlap by at least half (intersection over union), at the usual frame rate, at 15 and 30 Hz
-  and at 100 Hz; a decision tree on speed alone as the floor; time for an hour's track.
+  and at 100 Hz; a decision tree on speed alone as the floor; time for an hour's track;
+- of their bouts, how many contradict the printed definition of their word, with the check that
+  `liex run` makes and without it.
 """
 
 from __future__ import annotations
@@ -41,6 +43,8 @@ from ..training.pose_model import cache_folder
 from .pose import estimator_of
 
 if TYPE_CHECKING:
+    import pandas as pd
+
     from liex_lab.actions.labels import LabelledTrack
     from liex_lab.actions.timeline import TimelineModel
 
@@ -65,9 +69,10 @@ PROTOCOL = (
     "times, and the tracker nothing else; at {fast:g} frames per second the first "
     "{fast_minutes:.0f} minutes of the same ones are rendered again, frame by frame. lost_by_fps: "
     "what that is less than at the usual rate over the same time. speed_only_macro_f1: a decision "
-    "tree on speed alone, to show that the task is not told by speed. one_hour: the time that "
-    "features and recognition of an hour's track take; core_seconds: of the machine's cores, "
-    "whatever else they did."
+    "tree on speed alone, to show that the task is not told by speed. contradictions: bouts of the "
+    "same uncut recordings that break a measured limit of their word's printed definition, without "
+    "and with the check that `liex run` makes. one_hour: the time that features and recognition of "
+    "an hour's track take; core_seconds: of the machine's cores, whatever else they did."
 )
 
 
@@ -91,8 +96,9 @@ def evaluate_actions(
         progress: told how far rendering and measuring are.
 
     Returns:
-        Accuracies, confusion matrices, `timeline`, `by_fps`, `lost_by_fps`, `speed_only_macro_f1`,
-        `track_error_mm`, `one_hour`, `unresolved` actions by frame rate, and the protocol.
+        Accuracies, confusion matrices, `timeline`, `by_fps`, `lost_by_fps`, `contradictions`,
+        `speed_only_macro_f1`, `track_error_mm`, `one_hour`, `unresolved` actions by frame rate, and
+        the protocol.
 
     Raises:
         LiexError: no actions are generated for this animal.
@@ -126,6 +132,7 @@ def evaluate_actions(
         "timeline": timeline,
         "by_fps": by_fps,
         "lost_by_fps": lost,
+        "contradictions": contradictions(recogniser, tracks),
         "speed_only_macro_f1": speed_only(learned, tracks, recogniser),
         "track_error_mm": track_error_mm(tracks),
         "one_hour": one_hour(recogniser, tracks[0]),
@@ -278,6 +285,47 @@ def _timelines(
         for rate, row in at.items()
     }
     return usual, by_fps, lost
+
+
+def contradictions(
+    recogniser: TimelineModel, tracks: Sequence[LabelledTrack]
+) -> dict[str, dict[str, Any]]:
+    """How many bouts contradict their printed definition, as the table `bouts` would say.
+
+    Args:
+        recogniser: names the tracks.
+        tracks: of uncut recordings.
+
+    Returns:
+        `unchecked` and `checked`, as `liex run` names: of each the number of `bouts`, those that
+        are `contradicting`, and these `by_word`.
+    """
+    from liex_lab.actions.vocabulary import printed_meanings
+    from liex_lab.behaviour.checking import recognise
+    from liex_lab.behaviour.kinematics import Joints, kinematics
+    from liex_lab.behaviour.measures import measure_bouts
+    from liex_lab.tables.rows import Rows, bout_rows
+
+    meanings = printed_meanings(recogniser.skeleton, recogniser.definitions)
+    tables: dict[str, list[pd.DataFrame]] = {"unchecked": [], "checked": []}
+    for one in tracks:
+        frames = Rows(one.track, np.arange(one.track.n_frames), "", "").frames_table
+        moved = kinematics(frames, Joints.of_track(one.track))
+        for name, found in (
+            ("unchecked", recogniser.recognise(one.track, one.wall_mm)),
+            ("checked", recognise(recogniser, one.track, one.wall_mm, moved)),
+        ):
+            bouts = bout_rows(found.ethogram, frames, "")
+            tables[name].append(measure_bouts(bouts, moved, meanings))
+    counted = {}
+    for name, some in tables.items():
+        wrong = [word for bouts in some for word in bouts["action"][bouts["contradicts"] != ""]]
+        counted[name] = {
+            "bouts": sum(map(len, some)),
+            "contradicting": len(wrong),
+            "by_word": {word: wrong.count(word) for word in sorted(set(wrong))},
+        }
+    return counted
 
 
 def track_error_mm(tracks: Sequence[LabelledTrack]) -> float:

@@ -11,8 +11,9 @@ The published answers are also scored on the very frames that ours were measured
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +22,12 @@ from liex_lab.errors import LiexError
 from liex_lab.plan import Plan
 from liex_lab.runtime.progress import Progress, silent
 
+if TYPE_CHECKING:
+    from liex_lab.recordings.formats.images.nyu_labels import NyuReference
+
 _CHUNK = 32  # frames in memory at a time
+_SHOWN = 10  # hands in Fig 12 of Lie-X
+_OURS = "liex_lab"
 _LABELS = (
     "The bone lengths of our hand, and {share:.0f} % of the postures that our bundled model was "
     "trained on, come from labels of the NYU test frames 1 to {last}. Frames among these that ours "
@@ -36,7 +42,11 @@ _PUBLISHED = {
 
 
 def evaluate_nyu(
-    reference: str | Path, *, model: str | None = None, progress: Progress = silent
+    reference: str | Path,
+    *,
+    model: str | None = None,
+    draw: Callable[[list[dict[str, Any]]], object] | None = None,
+    progress: Progress = silent,
 ) -> dict[str, Any]:
     """Errors on NYU hand data of published answers and of our own, by both root protocols.
 
@@ -44,6 +54,7 @@ def evaluate_nyu(
         reference: folder with `nyu_test_14joints.npz` (labels and answers) or `joint_data.mat`
             (labels), and any of the frames `depth_1_NNNNNNN.png`.
         model: name or path of a hand model; None takes the bundled one.
+        draw: is given `shown_hands`, for a picture.
         progress: told frame by frame.
 
     Returns:
@@ -64,11 +75,14 @@ def evaluate_nyu(
         for name, points in labels.answers.items()
     }
     numbers = _frame_numbers(folder, len(labels.truth))
+    ours, points = _ours(folder, labels.truth, numbers, model, progress)
+    if draw is not None:
+        draw(shown_hands(labels, numbers, points))
     return {
         "reference": str(folder),
         "n_labelled": len(labels.truth),
         "published": rows,
-        "ours": _ours(folder, labels.truth, numbers, model, progress),
+        "ours": ours,
         "same_frames": {
             name: nyu_errors(points[numbers - 1], labels.truth[numbers - 1])
             for name, points in labels.answers.items()
@@ -77,6 +91,32 @@ def evaluate_nyu(
         "labels_used": labels_used(numbers),
         "protocol": NYU_PROTOCOL,
     }
+
+
+def shown_hands(
+    labels: NyuReference, numbers: NDArray[np.int64], ours: NDArray[np.float64]
+) -> list[dict[str, Any]]:
+    """Ten labelled hands, evenly spaced from the first on, with what methods answer, for Fig 12.
+
+    Args:
+        labels: true points and published answers.
+        numbers: (m,) numbers of the frames that ours was measured on, from 1 on.
+        ours: (m, 14, 3) our points in them, mm, camera frame; NaN where nothing was found.
+
+    Returns:
+        Of each `frame`, its number, `truth` (14, 3) mm, and `answers` (14, 3) mm by method; ours is
+        among them where it found the hand.
+    """
+    n = len(labels.truth)
+    own = {int(k): points for k, points in zip(numbers, ours, strict=True)}
+    found = []
+    for row in np.unique(np.arange(_SHOWN) * n // _SHOWN):
+        answers = {name: points[row] for name, points in labels.answers.items()}
+        points = own.get(row + 1)
+        if points is not None and np.isfinite(points).all():
+            answers = {_OURS: points, **answers}
+        found.append({"frame": int(row) + 1, "truth": labels.truth[row], "answers": answers})
+    return found
 
 
 def labels_used(numbers: NDArray[np.int64]) -> str:
@@ -116,7 +156,7 @@ def in_short(result: dict[str, Any]) -> dict[str, str]:
         result: what `evaluate_nyu` returns.
     """
     lines = {}
-    for name, row in [*result["published"].items(), ("liex_lab", result["ours"])]:
+    for name, row in [*result["published"].items(), (_OURS, result["ours"])]:
         if "root_estimated_mm_14" not in row:
             lines[name] = row.get("note", f"lost in all of {row['n_frames']} frames")
             continue
@@ -140,8 +180,10 @@ def _ours(
     numbers: NDArray[np.int64],
     model: str | None,
     progress: Progress,
-) -> dict[str, Any]:
-    """Our errors on the frames in the folder; a note where there are none, or no model."""
+) -> tuple[dict[str, Any], NDArray[np.float64]]:
+    """Our errors on the frames in the folder, a note where there are none, or no model; and our
+    points (m, 14, 3) mm in them, camera frame.
+    """
     from liex_lab.errors import ModelError
     from liex_lab.evaluation.nyu import nyu_errors
     from liex_lab.recordings.formats.images.nyu_labels import points_of_joints
@@ -151,13 +193,13 @@ def _ours(
     plan = Plan.load("hand")
     if model is not None:
         plan = plan.with_settings([f"estimation.model={model}"])
+    points = np.full((len(numbers), *truth.shape[1:]), np.nan)
     if not len(numbers):
-        return {"n_frames": 0, "note": f"no frames depth_1_NNNNNNN.png in {folder}"}
+        return {"n_frames": 0, "note": f"no frames depth_1_NNNNNNN.png in {folder}"}, points
     try:
         estimator = build_estimator(plan)
     except ModelError as error:
-        return {"n_frames": 0, "note": str(error)}
-    points = np.full((len(numbers), *truth.shape[1:]), np.nan)
+        return {"n_frames": 0, "note": str(error)}, points
     with build_recording(folder, plan) as recording:
         scene, sample = build_scene(
             recording, plan, estimator.skeleton, plan.foreground.n_background_frames
@@ -169,8 +211,9 @@ def _ours(
             joints = estimator.estimate(depths, scene, size).chosen.pose.joints(estimator.skeleton)
             points[[frame.index for frame in frames]] = weights @ joints
             progress(frames[-1].index + 1, len(recording), "measuring hands")
-    return {
+    ours = {
         "method": "liex_lab, default",
         "spine_mm": size * estimator.skeleton.length,
         **nyu_errors(points, truth[numbers - 1]),
     }
+    return ours, points

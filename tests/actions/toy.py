@@ -5,6 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from liex_lab.actions.labels import LabelledTrack
+from liex_lab.actions.learning import learn
+from liex_lab.actions.timeline import TimelineModel
+from liex_lab.actions.vocabulary import DEFINITIONS
 from liex_lab.body.pose import Pose
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.geometry import SE3, so3
@@ -53,3 +56,13 @@ def going_and_staying(
     )
     track.joints_mm[:] += rng.normal(0.0, 0.3, track.joints_mm.shape)
     return LabelledTrack(track, np.where(going, GO, STAY), f"{animal}-{seed}")
+
+
+def taught_to_lie() -> TimelineModel:
+    """A recogniser that was taught to call going a pause, and staying a freeze."""
+    taught = []
+    for seed in range(3):
+        one = going_and_staying(seed)
+        words = np.where(one.words == GO, "pause", "freeze")
+        taught.append(LabelledTrack(one.track, words, one.animal))
+    return learn(taught, seed=1, definitions=DEFINITIONS["mouse"])

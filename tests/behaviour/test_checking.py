@@ -8,16 +8,14 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from liex_lab.actions.labels import LabelledTrack
-from liex_lab.actions.learning import learn
 from liex_lab.actions.timeline import TimelineModel
-from liex_lab.actions.vocabulary import DEFINITIONS, MEASURES, WORDS
+from liex_lab.actions.vocabulary import MEASURES, WORDS
 from liex_lab.behaviour import kinematics, measure_bouts
 from liex_lab.behaviour.bout_reader import BoutReader
 from liex_lab.behaviour.checking import _READ, BoutCheck, recognise
 from liex_lab.behaviour.kinematics import Joints
 from liex_lab.tables.rows import Rows, bout_rows
-from tests.actions.toy import GO, going_and_staying
+from tests.actions.toy import going_and_staying, taught_to_lie
 from tests.behaviour.test_kinematics import tables_of
 from tests.behaviour.test_summary import named
 from tests.sessions.walking_mouse import WalkingMouse, steady
@@ -78,12 +76,7 @@ def test_a_bout_that_a_person_named_stays_and_says_what_does_not_hold() -> None:
 @pytest.fixture(scope="module")
 def liar() -> TimelineModel:
     """A recogniser that was taught to call going a pause, and staying a freeze."""
-    taught = []
-    for seed in range(3):
-        one = going_and_staying(seed)
-        words = np.where(one.words == GO, "pause", "freeze")
-        taught.append(LabelledTrack(one.track, words, one.animal))
-    return learn(taught, seed=1, definitions=DEFINITIONS["mouse"])
+    return taught_to_lie()
 
 
 def test_a_recogniser_cannot_name_what_contradicts_its_words(liar: TimelineModel) -> None:

@@ -6,8 +6,10 @@ import json
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
+from liex_lab.dashboards.paper.nyu_hands import draw_nyu_hands
 from liex_lab.pipelines.evaluation import nyu
 
 from liex_lab.evaluation.nyu import nyu_errors
@@ -102,3 +104,21 @@ def test_what_comes_from_test_labels_stands_beside_every_score(folder: Path) -> 
     assert numbers.tolist() == [1]
     same = nyu_errors(truth.answers["liex"][numbers - 1], truth.truth[numbers - 1])
     assert same["root_given_mm_14"] == pytest.approx(7.8645, abs=5e-4)
+
+
+def test_ten_hands_are_shown_with_the_answers_of_all_and_ours_where_it_was_measured(
+    tmp_path: Path,
+) -> None:
+    truth = random_hands(95)
+    answers = {"v2v_posenet": truth + np.array([3.0, 0.0, 4.0]), "somebody": truth + 9.0}
+    ours = np.stack([truth[0] + 1.0, np.full((14, 3), np.nan)])
+    shown = nyu.shown_hands(NyuReference(truth, answers), np.array([1, 10]), ours)
+    assert [one["frame"] for one in shown] == [1, 10, 20, 29, 39, 48, 58, 67, 77, 86]
+    for one in shown:
+        np.testing.assert_array_equal(one["truth"], truth[one["frame"] - 1])
+    assert list(shown[0]["answers"]) == ["liex_lab", "v2v_posenet", "somebody"]
+    assert list(shown[1]["answers"]) == ["v2v_posenet", "somebody"]  # nothing was found there
+    assert nyu.shown_hands(NyuReference(truth[:3], {}), np.zeros(0, int), ours[:0])[2]["frame"] == 3
+    picture = cv2.imread(str(draw_nyu_hands(shown, tmp_path / "hands.png")))
+    assert picture is not None
+    assert picture.std() > 10

@@ -2,7 +2,8 @@
 
 Each row is kept with how it was made (recipe, method, command, version) and with hashes of code,
 training pictures, models, test pictures and foreground; it is used again only where all of them
-agree with what would be measured now, and refused with the reason where one does not.
+agree with what would be measured now, and refused with the reason where one does not. The files are
+part of the repository, so they hold what the page needs and no more, a list a line.
 """
 
 from __future__ import annotations
@@ -15,11 +16,16 @@ from typing import TYPE_CHECKING, Any
 from liex_lab.catalog import kept_results_folder
 from liex_lab.errors import LiexError
 
+from .fingerprints import fingerprint_of
+from .rows import SWEPT
+
 if TYPE_CHECKING:
     from .common_view import CommonView
 
-SCHEMA = 2
+SCHEMA = 3
 _HASHED = {"learning_code": "code", "training_pictures": "training pictures"}
+_DIGITS = 6  # significant ones of a measured number
+_LINE = 100  # characters of a value that stands on one line
 
 
 def kept_results(animal: str, folder: Path | None = None) -> dict[str, Any]:
@@ -58,7 +64,8 @@ def keep_results(
     Args:
         folder: where `ANIMAL.json` is written; it is made where it is missing.
         animal: name of the skeleton.
-        rows: figures by variant.
+        rows: figures by variant. Of `default`, which is measured each time, nothing is kept, and
+            failures only of the variants that Fig. 17 shows.
         sensitivity: curves by variant.
 
     Returns:
@@ -69,13 +76,44 @@ def keep_results(
     content = {
         "schema": SCHEMA,
         "animal": animal,
-        "rows": dict(rows),
+        "rows": {name: _kept(name, row) for name, row in rows.items() if name != "default"},
         "sensitivity": dict(sensitivity),
     }
-    path.write_text(
-        json.dumps(content, indent=1, sort_keys=True, allow_nan=False) + "\n", encoding="utf-8"
-    )
+    path.write_text(_a_list_a_line(content) + "\n", encoding="utf-8")
     return path
+
+
+def _kept(variant: str, row: Mapping[str, Any]) -> dict[str, Any]:
+    """What is kept of a row."""
+    measured = ("splits", "rate")  # what it was made from is compared to the last digit
+    return {
+        key: _rounded(value) if key in measured else value
+        for key, value in row.items()
+        if key != "failures" or variant in SWEPT
+    }
+
+
+def _rounded(value: Any) -> Any:
+    """Plain values with their numbers rounded."""
+    if isinstance(value, Mapping):
+        return {key: _rounded(one) for key, one in value.items()}
+    if isinstance(value, list):
+        return [_rounded(one) for one in value]
+    return float(f"{value:.{_DIGITS}g}") if isinstance(value, float) else value
+
+
+def _a_list_a_line(value: Any, indent: str = "") -> str:
+    """JSON with sorted keys in which a short value or a list of numbers takes one line."""
+    short = json.dumps(value, sort_keys=True, allow_nan=False)
+    inner = indent + " "
+    if isinstance(value, Mapping) and value and len(short) > _LINE and "joints_mm" not in value:
+        items = [f"{json.dumps(k)}: {_a_list_a_line(value[k], inner)}" for k in sorted(value)]
+    elif isinstance(value, list) and value and isinstance(value[0], Mapping):
+        items = [_a_list_a_line(one, inner) for one in value]
+    else:
+        return short
+    opened, closed = "{}" if isinstance(value, Mapping) else "[]"
+    return opened + ",".join(f"\n{inner}{item}" for item in items) + f"\n{indent}{closed}"
 
 
 def why_refused(
@@ -106,7 +144,6 @@ def why_refused(
     ):
         return "the kept row is of another model file"
     for split, ours in views.items():
-        prints = row["splits"].get(split, {}).get("fingerprints")
-        if prints != [one.fingerprint for one in ours]:
+        if row["splits"].get(split, {}).get("fingerprint") != fingerprint_of(ours):
             return f"the kept row is of other test pictures or another foreground on {split}"
     return ""

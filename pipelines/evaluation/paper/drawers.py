@@ -17,6 +17,7 @@ class Drawers:
         tracking: of a test sequence and what was made of it, into a PNG.
         confusions: of what the actions' evaluation found, into a PNG.
         key_frames: of `key_frames.acted_key_frames`, into a PNG.
+        nyu_hands: of `nyu.shown_hands`, into a PNG.
         page: of what stands on top and `exhibits.exhibits`, into a folder with the figures; returns
             the file.
     """
@@ -25,4 +26,5 @@ class Drawers:
     tracking: Callable[[Any, Any, Path], Path]
     confusions: Callable[[Mapping[str, Any], Path], Path]
     key_frames: Callable[[Sequence[Mapping[str, Any]], Path], Path]
+    nyu_hands: Callable[[Sequence[Mapping[str, Any]], Path], Path]
     page: Callable[[Mapping[str, Any], Sequence[Mapping[str, Any]], Path], Path]

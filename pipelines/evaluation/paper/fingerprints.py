@@ -3,7 +3,7 @@
 - `learning_code`: of the sources that decide what is learned and how a pose is estimated, without
   comments, docstrings and spaces; what is rendered and cut out is told by the pictures themselves.
 - `training_pictures`: of the first block of training pictures as the foreground cuts it out.
-- `CommonView.fingerprint`: of each test recording's pictures, components, choice and size.
+- `fingerprint_of`: of the pictures, components, choice and size of all test recordings of a split.
 - `model_digests`: of the model files, where they are at hand.
 """
 
@@ -13,10 +13,15 @@ import ast
 import hashlib
 import io
 import tokenize
+from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from liex_lab.catalog import MODELS
+
+if TYPE_CHECKING:
+    from .common_view import CommonView
 
 _DIGITS = 16
 # modules that matter to every row, under `liex_lab` and `pipelines`
@@ -122,6 +127,16 @@ def _first_pictures(base: str, animal: str) -> str:
     )
     told = hashlib.sha256(data.images.heights.tobytes())
     told.update(data.truth.positions.round(3).tobytes())
+    return told.hexdigest()[:_DIGITS]
+
+
+def fingerprint_of(views: Sequence[CommonView]) -> str:
+    """Hash of what every row is given in the recordings of a split, in their order.
+
+    Args:
+        views: of the recordings.
+    """
+    told = hashlib.sha256("\n".join(one.fingerprint for one in views).encode())
     return told.hexdigest()[:_DIGITS]
 
 

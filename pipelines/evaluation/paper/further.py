@@ -3,7 +3,7 @@
 - tracking (Fig 18): the easy mouse sequence, its first frames, without the paper's own parts;
 - actions (Figs 19 and 20): the 426 cut-out sequences to learn from and the 173 to test on, named by
   the paper's recogniser with either descriptor and by ours; no uncut recordings;
-- nyu (Table 2): the NYU hand data, where its folder is given.
+- nyu (Table 2, Fig 12): the NYU hand data, where its folder is given.
 """
 
 from __future__ import annotations
@@ -28,6 +28,7 @@ _QUICK_STRIDE = 12  # every so many-th cut-out sequence
 _TRACKING = "fig18_tracking.png"
 _KEY_FRAMES = "fig19_key_frames.png"
 _CONFUSIONS = "fig20_confusions.png"
+_NYU_HANDS = "fig12_nyu_hands.png"
 _VERBS = {
     "tracking": f"liex evaluate tracking --animal {TRACKED} --sequence {SEQUENCE} --figure F.png",
     "actions": f"liex evaluate actions --animal {ACTING} --out DIR",
@@ -111,7 +112,12 @@ def measure_further(
     else:
         from ..nyu import evaluate_nyu
 
-        found.nyu = evaluate_nyu(nyu, progress=progress)
+        found.nyu = evaluate_nyu(
+            nyu,
+            draw=lambda hands: drawers.nyu_hands(hands, folder / _NYU_HANDS),
+            progress=progress,
+        )
+        found.figures.append(_NYU_HANDS)
     return found
 
 

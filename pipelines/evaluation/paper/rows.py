@@ -24,6 +24,7 @@ from liex_lab.runtime.progress import Progress, silent
 from ...build import plan_of
 from .common_view import CommonView, common_view, measured
 from .examples import examples_in, failures_in
+from .fingerprints import fingerprint_of
 from .trained_by import baseline_of_today, paper_of_today
 
 if TYPE_CHECKING:
@@ -36,6 +37,7 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 ROWS = ("default", "paper", "paper-one-pose", "paper-no-metric", "rf", "cnn")
+SWEPT = ("paper", "default")  # whose curves (Fig. 7) and failures (Fig. 17) are drawn
 # trainings that a row is pooled over, where there are several
 TRAINING_DRAWS = {"paper": 3, "paper-one-pose": 3, "paper-no-metric": 3}
 START_DRAWS = 5  # of the only initial pose of each of them
@@ -182,7 +184,7 @@ def numbers_of(runs: Sequence[PoseErrors], views: Sequence[CommonView]) -> dict[
     Returns:
         `median_mm`, `mean_mm`, `interval95` (of the median) and `mean_interval95`, `run_median_mm`,
         `wrong_object`, `wrong_object_alone`, `n_frames`, `n_recordings`, the figures of
-        `PoseErrors.summary` over all runs, error of each joint, quantiles, and fingerprints.
+        `PoseErrors.summary` over all runs, error of each joint, quantiles, and the fingerprint.
     """
     errors = PoseErrors.join(list(runs))
     recording = np.concatenate([np.full(len(one.wrong), k) for k, one in enumerate(views)])
@@ -207,7 +209,7 @@ def numbers_of(runs: Sequence[PoseErrors], views: Sequence[CommonView]) -> dict[
         "error_quantiles_mm": [round(float(x), 3) for x in np.quantile(found, spread)]
         if len(found)
         else [],
-        "fingerprints": [one.fingerprint for one in views],
+        "fingerprint": fingerprint_of(views),
     }
 
 

@@ -24,9 +24,9 @@ from liex_lab.errors import MissingPackageError
 from liex_lab.evaluation.pose import plain
 from liex_lab.runtime.progress import Progress, silent
 
-from .budget import Budget
+from .budget import CURVES, Budget
 from .results import Results
-from .rows import ROWS, TRAINING_DRAWS
+from .rows import ROWS, SWEPT, TRAINING_DRAWS
 
 if TYPE_CHECKING:
     from liex_lab.body.skeleton import Skeleton
@@ -38,7 +38,6 @@ if TYPE_CHECKING:
     from .further import Further
     from .rows import Subject
 
-SWEPT = ("paper", "default")  # variants whose sensitivity is drawn
 _N_SESSIONS = 40
 
 
@@ -65,7 +64,8 @@ def make_tables(
         quick: few frames, every row trained on next to nothing; its numbers say only that
             everything runs.
         fresh: rows are trained and measured now, not taken from kept results.
-        rows: only these rows are, beside the default; () takes all.
+        rows: only these rows are, beside the default, or `fig7` for its curves; the others come
+            from kept results. () names none.
         sealed: measure the sealed split instead of the others, as is done once when an issue ends.
         without: parts that belong to other verbs and are left out, `tracking` or `actions`.
         nyu: folder of the NYU hand data, for Table 2; None leaves it out.
@@ -345,8 +345,8 @@ def _sensitivities(
 ) -> dict[str, Any]:
     """Fig. 7 of the paper's variant and of ours, kept or measured now.
 
-    A curve is measured where its row is asked for anew; a kept one that is of another method,
-    training or code is left out.
+    A curve is measured where it is asked for and none is kept that fits; a kept one that is of
+    another method, training or code is left out.
     """
     from liex_lab.estimation.method import method_of
 
@@ -367,12 +367,10 @@ def _sensitivities(
             kept_curve = without_void(known, method_of(variant, skeleton))
             curves[variant] = {**kept_curve, "origin": "kept"}
             continue
-        if not budget.quick and (
-            budget.kept or budget.sealed or variant not in budget.fresh or budget.n_frames
-        ):
+        if not budget.curves:
             results.missing[f"Fig. 7, {variant}"] = (
-                "no curve is kept of today's method and code; "
-                f"`{_command([skeleton.name], None, False, True)} --out DIR` measures it"
+                f"no curve is kept of today's method and code; {_anew(skeleton.name, CURVES)} "
+                "measures it"
             )
             continue
         curve = sensitivity(skeleton, variant, sweep, progress)

@@ -65,6 +65,7 @@ _FLAT = (
     "n_frames",
     "n_recordings",
 )
+_WRONG = "another object measured (alone)"
 QUICK = (
     "**A quick run: few frames, and every row but the default trained on next to nothing. Its "
     "numbers say that everything runs, and nothing about the methods.**"
@@ -75,8 +76,9 @@ HOW = (
     "was trained on, those of the other splits are of the makes that all learned from, at places "
     "of their own. Every row measures the same object in a frame, of the same size: background, "
     "floor, object and size are found by the product, and our default model chooses for all. "
-    "*wrong object* is the share of frames in which that object is another one; *alone*: in which "
-    "it would be for the paper's variant and the baselines, which choose by area and volume. "
+    "*Another object measured* is the share of frames in which that object is not the animal; "
+    "*alone*: in which it would not be for the paper's variant and the baselines, which choose by "
+    "area and volume. *Flips*: head and tail are exchanged; *lost*: without a pose. "
     "Median first, with its 95 % interval by bootstrap over recordings: frames of one recording "
     "are not independent. Rows of the paper's variant are of three trainings, their numbers over "
     "all of them. Published numbers are means on real recordings, other cameras and other "
@@ -127,6 +129,7 @@ def write_tables(folder: Path, results: Sequence[Results], quick: bool) -> list[
             text += [
                 f"## Table {number}: {r.animal}, joint error in mm",
                 _grid(*error_table(r)),
+                _grid(*mean_table(r)),
                 *([HAND] if r.animal == "hand" else []),
                 *words(r, quick),
             ]
@@ -229,7 +232,7 @@ def _number(value: float | None, digits: int = 2) -> str:
 
 
 def error_table(results: Results) -> tuple[list[str], list[list[str]]]:
-    """One animal: a row for each method; for each split median with interval, mean, and objects.
+    """One animal's medians: a row for each method, and one for the objects that all measured.
 
     Args:
         results: of the animal.
@@ -237,40 +240,60 @@ def error_table(results: Results) -> tuple[list[str], list[list[str]]]:
     Returns:
         The head, and the rows.
     """
-    head = ["method"]
-    for split in results.splits:
-        head += [f"{split}: median (95 %)", "mean", "wrong object (alone)", "flips"]
-    rows = []
     published = PUBLISHED_MM.get(results.animal, {})
+    rows = []
     for variant, title in TITLES.items():
         row = results.rows.get(variant)
-        if row is None:
-            empty = [""] * (4 * len(results.splits))
-            rows.append([title, *empty, "", _number(published.get(variant)), "not measured"])
-            continue
-        cells = [title]
-        for split in results.splits:
-            cells += _cells(row["splits"][split])
-        n_frames = "/".join(str(row["splits"][split]["n_frames"]) for split in results.splits)
-        rows.append([*cells, n_frames, _number(published.get(variant)), row["origin"]])
+        cells = [""] * len(results.splits)
+        if row is not None:
+            cells = [_median(row["splits"][split]) for split in results.splits]
+        origin = "not measured" if row is None else row["origin"]
+        rows.append([title, *cells, _number(published.get(variant)), origin])
     if results.animal == "hand":
         for title, value in OTHERS_MM.items():
-            empty = [""] * (4 * len(results.splits))
-            rows.append([title, *empty, "", _number(value), "published"])
-    return [*head, "frames", "published, other data: mean", ""], rows
+            rows.append([title, *[""] * len(results.splits), _number(value), "published"])
+    if results.rows:
+        given = next(iter(results.rows.values()))["splits"]  # what all rows are given alike
+        rows.append([_WRONG, *(_wrong(given[split]) for split in results.splits), "", ""])
+    head = ["method", *(f"{split}: median (95\u00a0%)" for split in results.splits)]
+    return [*head, "published, other data: mean", "row"], rows
 
 
-def _cells(numbers: dict[str, Any]) -> list[str]:
-    """Median with its interval, mean, shares of other objects and of flips on one split."""
+def mean_table(results: Results) -> tuple[list[str], list[list[str]]]:
+    """One animal's means, frames with head and tail exchanged, and lost ones, by method and split.
+
+    Args:
+        results: of the animal.
+
+    Returns:
+        The head, and the rows.
+    """
+    rows = []
+    for variant, row in results.rows.items():
+        numbers = [row["splits"][split] for split in results.splits]
+        cells = [text for one in numbers for text in (_number(one["mean_mm"]), _flips(one))]
+        lost = "/".join(f"{100 * one['lost_rate']:.1f}" for one in numbers)
+        n_frames = "/".join(str(one["n_frames"]) for one in numbers)
+        rows.append([TITLES[variant], *cells, lost, n_frames])
+    head = ["method", *(text for split in results.splits for text in (f"{split}: mean", "flips"))]
+    return [*head, "lost, %", "frames"], rows
+
+
+def _median(numbers: dict[str, Any]) -> str:
+    """Median with its interval."""
     bounds = numbers.get("interval95")
     interval = f" ({_number(bounds[0])} to {_number(bounds[1])})" if bounds else ""
+    return _number(numbers["median_mm"]) + interval
+
+
+def _wrong(numbers: dict[str, Any]) -> str:
+    """Share of frames in which another object was measured, and would be by area and volume."""
+    return f"{100 * numbers['wrong_object']:.2f} % ({100 * numbers['wrong_object_alone']:.2f} %)"
+
+
+def _flips(numbers: dict[str, Any]) -> str:
     flips = numbers["flip_rate"]
-    return [
-        _number(numbers["median_mm"]) + interval,
-        _number(numbers["mean_mm"]),
-        f"{100 * numbers['wrong_object']:.1f} % ({100 * numbers['wrong_object_alone']:.1f} %)",
-        "" if flips is None else f"{100 * flips:.1f} %",
-    ]
+    return "" if flips is None else f"{100 * flips:.1f} %"
 
 
 def words(results: Results, quick: bool) -> list[str]:
@@ -357,8 +380,8 @@ def rate_table(results: Sequence[Results]) -> tuple[list[str], list[list[str]]]:
             )
     for title, value in OTHERS_FPS.items() if any(r.animal == "hand" for r in results) else ():
         rows.append(["hand", title, "", "", "", "", f"{_number(value, 0)} (GPU)", "published"])
-    head = ["animal", "method", "frames/s", "ratio to default", "picture", "cores", "published", ""]
-    return head, rows
+    head = ["animal", "method", "frames/s", "ratio to default", "picture", "cores", "published"]
+    return [*head, "row"], rows
 
 
 def origin_table(results: Sequence[Results]) -> tuple[list[str], list[list[str]]]:
@@ -387,5 +410,5 @@ def origin_table(results: Sequence[Results]) -> tuple[list[str], list[list[str]]
                     f"`{made['command']}`",
                 ]
             )
-    head = ["animal", "method", "", "training images", "seed (trainings)", "version (code)"]
+    head = ["animal", "method", "row", "training images", "seed (trainings)", "version (code)"]
     return [*head, "machine", "command"], rows

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from liex_lab.dashboards.paper.confusion import draw_confusions
 from liex_lab.dashboards.paper.key_frames import draw_key_frames
+from liex_lab.dashboards.paper.nyu_hands import draw_nyu_hands
 from liex_lab.dashboards.paper.page import write_page
 from liex_lab.dashboards.paper.plates import draw_figures
 from liex_lab.dashboards.paper.tracking import draw_tracking
@@ -70,7 +71,9 @@ FIGURES = [
     "fig16_convergence_mouse.png",
     "fig17_failures_mouse.png",
 ]
-DRAWERS = Drawers(draw_figures, draw_tracking, draw_confusions, draw_key_frames, write_page)
+DRAWERS = Drawers(
+    draw_figures, draw_tracking, draw_confusions, draw_key_frames, draw_nyu_hands, write_page
+)
 
 
 class SmallWorld(simulator.MouseSimulator):
@@ -188,13 +191,19 @@ def test_the_page_holds_every_table_and_figure_with_a_sentence_and_asks_no_other
     assert "Lie-X without the learned metric" in told["Table 1"]
     assert "Not made: the hand was not asked for" in told["Fig. 10"]
     for label, verb in (("Fig. 18", "tracking"), ("Fig. 19", "actions"), ("Fig. 20", "actions")):
-        assert f"it was left out; `liex evaluate {verb}" in told[label]
+        assert f"it was left out; <code>liex evaluate {verb}" in told[label]
     assert "liex evaluate nyu" in told["Table 2"]
+    assert "--nyu" in told["Fig. 12"]
+    (objects,) = re.findall(r"<tr>(<td[^>]*>another object measured.+?)</tr>", told["Table 1"])
+    assert objects.count("0.00 % (0.00 %)") == 2  # on clean and hard, which no row can change
+    assert '<td class="text">RF</td>' in told["Table 1"]
+    assert re.search(r'<td class="number">\d+\.\d\d \(', told["Table 1"])
 
 
 @pytest.mark.slow
 def test_kept_rows_keep_their_poses_in_the_examples(made):
     kept = json.loads((made / "kept" / "mouse.json").read_text())["rows"]
+    assert kept
     recordings = {split: SmallWorld().test_split(split) for split in ("clean", "hard")}
     places = [
         {"split": split, "recording": k, "frame": i}
@@ -212,8 +221,8 @@ def test_kept_rows_keep_their_poses_in_the_examples(made):
             np.testing.assert_array_equal(one["truth"], recording.joints_camera[one["frame"]])
             uv = one["camera"].project(one["truth"]).round().astype(int)
             assert (one["depth"][uv[:, 1], uv[:, 0]] > 0).mean() > 0.5
-        worst = row["failures"][0]
-        assert worst["error_mm"] >= max(0.0, row["splits"]["clean"]["median_mm"])
+    worst = kept["paper"]["failures"][0]
+    assert worst["error_mm"] >= max(0.0, kept["paper"]["splits"]["clean"]["median_mm"])
 
 
 def test_a_kept_row_without_poses_gets_them_only_from_the_very_model_it_was_measured_with(
@@ -246,7 +255,7 @@ def test_every_figure_of_the_paper_is_made_or_said_to_be_a_drawing():
         drawing = one["title"] == "Drawing"
         assert drawing == (one["label"].removeprefix("Fig. ") in exhibits.DRAWINGS)
         assert one["said"].endswith(".")
-        assert drawing or "Same" in one["said"] or one["label"] in ("Fig. 12", "Fig. 14", "Fig. 15")
+        assert drawing or "Same" in one["said"] or one["label"] in ("Fig. 14", "Fig. 15")
 
 
 def test_a_part_that_is_none_is_refused_before_anything_is_measured(tmp_path):
@@ -354,11 +363,11 @@ def view_of_one(fingerprint: str) -> common_view.CommonView:
 def test_a_kept_row_is_refused_for_every_reason_by_its_name():
     made = {"recipe": {"n_images": 3}}
     hashes = {"learning_code": "a", "training_pictures": "b", "models": ["c", None]}
+    views = {"clean": [view_of_one("x"), view_of_one("y")]}
     row = {
         "made": {"from": made, **hashes, "models": ["c", "d"]},
-        "splits": {"clean": {"fingerprints": ["x", "y"]}},
+        "splits": {"clean": {"fingerprint": fingerprints.fingerprint_of(views["clean"])}},
     }
-    views = {"clean": [view_of_one("x"), view_of_one("y")]}
     why = cached_results.why_refused
     assert why(row, made, hashes, views) == ""
     assert "another training" in why(row, {"recipe": {"n_images": 4}}, hashes, views)
@@ -383,11 +392,25 @@ def test_with_fewer_frames_or_the_sealed_split_nothing_kept_is_used():
     ):
         assert not budget.kept
         assert budget.fresh == run.ROWS
-    one = run.Budget.of(None, False, True, ("rf",), False)
-    assert one.kept
-    assert one.fresh == ("default", "rf")
+    for fresh in (False, True):  # to name a row is to ask for it anew
+        one = run.Budget.of(None, False, fresh, ("rf",), False)
+        assert one.kept
+        assert one.fresh == ("default", "rf")
+        assert not one.curves
     with pytest.raises(PlanError, match="no row 'knn'"):
         run.Budget.of(None, False, True, ("knn",), False)
+
+
+def test_the_curves_of_fig_7_are_measured_where_they_are_asked_for():
+    curves = run.Budget.of(None, False, False, ("fig7",), False)
+    assert (curves.curves, curves.kept, curves.fresh) == (True, True, ("default",))
+    assert run.Budget.of(None, False, True, (), False).curves
+    for other in (
+        run.Budget.of(None, False, False, (), False),
+        run.Budget.of(100, False, True, (), False),  # `--frames` says nothing of them
+        run.Budget.of(None, False, True, (), True),
+    ):
+        assert not other.curves
 
 
 def test_the_hash_of_code_is_of_what_it_does_not_of_how_it_is_told():
@@ -507,6 +530,30 @@ def test_a_sweep_changes_one_number_of_a_method_and_nothing_else():
         assert changed == chosen_values(method) | {number: own + 7}
 
 
+def test_a_kept_file_reads_as_what_was_kept_in_it(tmp_path):
+    row = {
+        "made": {"from": {"lever_mm": 17.034481234, "sizes": [[0.0, 272]]}},
+        "splits": {"clean": {"median_mm": 1.23456789, "flip_rate": None, "n_frames": 2000}},
+        "rate": {"frames_per_s": 123456.789, "cores": 2},
+        "examples": [{"frame": k, "joints_mm": [[0.1, -2.25, 300.0]] * 9} for k in range(3)],
+        "failures": [{"frame": 7, "joints_mm": None, "error_mm": 9.5}],
+    }
+    curves = {"paper": {"curves": {"rounds": [{"value": 1, "mean_mm": 14.7}]}}}
+    rows = {"default": row, "paper": row, "rf": row}
+    path = cached_results.keep_results(tmp_path, "mouse", rows, curves)
+    told = cached_results.kept_results("mouse", tmp_path)
+    assert set(told["rows"]) == {"paper", "rf"}  # the default is measured each time
+    rounded = {
+        "splits": {"clean": {"median_mm": 1.23457, "flip_rate": None, "n_frames": 2000}},
+        "rate": {"frames_per_s": 123457.0, "cores": 2},
+    }
+    assert told["rows"]["paper"] == {**row, **rounded}
+    assert "failures" not in told["rows"]["rf"]  # which Fig. 17 does not show
+    assert told["sensitivity"] == curves
+    lines = path.read_text().splitlines()
+    assert sum("joints_mm" in line for line in lines) == 3 + 1 + 3  # a pose a line
+
+
 def test_what_is_kept_says_how_it_was_made_and_by_which_it_is_known_again():
     for path in sorted(kept_results_folder().glob("*.json")):
         check_kept(path)
@@ -516,7 +563,8 @@ def check_kept(path: Path) -> None:
     skeleton = Skeleton.load(path.stem)
     kept = cached_results.kept_results(path.stem)
     splits = simulator.world_of(skeleton).splits
-    assert path.stat().st_size < 300_000
+    assert path.stat().st_size < 100_000
+    assert len(path.read_text().splitlines()) < 1_000
     assert set(kept["rows"]) <= set(run.ROWS)
     for row in kept["rows"].values():
         made = row["made"]
@@ -529,7 +577,8 @@ def check_kept(path: Path) -> None:
         assert set(row["splits"]) == set(splits)
         for numbers in row["splits"].values():
             assert numbers["n_frames"] >= 2000
-            assert len(numbers["fingerprints"]) == numbers["n_recordings"] == 40
+            assert len(numbers["fingerprint"]) == 16
+            assert numbers["n_recordings"] == 40
             assert len(numbers["joint_mm"]) == skeleton.n_joints
 
 
