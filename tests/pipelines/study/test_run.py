@@ -288,6 +288,16 @@ def test_a_session_that_someone_has_to_look_at_is_done_and_says_why(
     assert (entry.state, entry.reason) == why(file)
 
 
+def test_figures_in_another_format_are_no_reason_to_measure_again():
+    plan = Plan.load("mouse")
+    asked = plan.with_settings(['report.figures=["svg", "pdf"]'])
+    stored = plan.model_dump(exclude_none=True)
+    assert plan_changed(asked, stored) == ""
+    del stored["report"]  # a session of before
+    assert plan_changed(asked, stored) == ""
+    assert "pause" in plan_changed(plan.with_settings(["behaviour.pause_below_mm_s=40"]), stored)
+
+
 @pytest.mark.parametrize("found", [True, False])
 def test_which_hand_was_found_changes_no_plan(found: bool) -> None:
     """A plan that leaves open which hand it is stays the plan of a session that found it."""
