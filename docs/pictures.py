@@ -37,18 +37,17 @@ ANIMALS = (
 )
 
 
-def save_small(path: Path, rgb: Any, n_colours: int = 96, dither: bool = False) -> None:
+def save_small(path: Path, rgb: Any, n_colours: int = 96) -> None:
     """Write a picture with few colours, so that a clone stays small.
 
     Args:
         path: the PNG.
         rgb: (H, W, 3) uint8.
         n_colours: of its palette.
-        dither: whether colours between those are made of dots, for a picture with slopes.
     """
     from PIL import Image
 
-    Image.fromarray(np.ascontiguousarray(rgb)).quantize(n_colours, dither=3 * dither).save(
+    Image.fromarray(np.ascontiguousarray(rgb)).quantize(n_colours, dither=0).save(
         path, optimize=True
     )
 
@@ -154,22 +153,17 @@ def shoot_pages(session: Path, at_s: float = 3.9) -> None:
             page = browser.new_page(viewport={"width": 1180, "height": 860})
             page.set_default_timeout(120_000)
             page.goto((session / "report.html").as_uri())
-            _save_shot(page.screenshot(), "report.png")
+            page.screenshot(path=STATIC / "report.png")  # all colours: every action has its own
             page.goto(told[0])  # with the token, which is a cookie from then on
             page.goto(f"{told[1]}/session/{session.stem}?t={at_s}")
             page.wait_for_selector("#desk.is-open")
             page.wait_for_load_state("networkidle")
             page.wait_for_timeout(2000)  # the view glides to the animal
-            _save_shot(page.locator("#desk").screenshot(), "desk.png")
+            page.locator("#desk").screenshot(path=STATIC / "desk.png")
             browser.close()
     finally:
         served.terminate()
         served.wait()
-
-
-def _save_shot(png: bytes, name: str) -> None:
-    shot = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)
-    save_small(STATIC / name, shot[..., ::-1], n_colours=256, dither=True)
 
 
 def main() -> None:

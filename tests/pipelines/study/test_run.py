@@ -283,7 +283,7 @@ def test_a_session_that_someone_has_to_look_at_is_done_and_says_why(
         session.id,
         *["look", "at", "it:", "only", "3", "of", "the", "40", "frames", "are", "trusted"],
     ]
-    assert counted == "1 sessions: 1 done, look at it"
+    assert counted == "1 session: 1 done, look at it"
     (entry,) = list_sessions(file)[1]()
     assert (entry.state, entry.reason) == why(file)
 
