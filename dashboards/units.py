@@ -1,7 +1,11 @@
-"""Units that people read on pages: cm/s and degrees; files keep mm/s and radians."""
+"""Units, numbers and dates as people read them on pages: cm/s and degrees; files keep mm/s and
+radians.
+"""
 
 from __future__ import annotations
 
+import math
+from datetime import datetime
 from typing import Any
 
 import numpy as np
@@ -12,6 +16,7 @@ _SHOWN = {
     "rad": ("°", 180.0 / np.pi),
     "rad/s": ("°/s", 180.0 / np.pi),
 }
+_DECIMALS = {"s": 2, "m": 2, "mm": 1, "cm/s": 1, "°": 1, "°/s": 1, "Hz": 1, "1/min": 1}
 
 
 def shown(value: Any, unit: str) -> tuple[Any, str]:
@@ -45,3 +50,38 @@ def counted(n: int, one: str, more: str = "") -> str:
         more: for several; "" adds an s.
     """
     return f"{n:,} {one if n == 1 else more or one + 's'}"
+
+
+def reading(value: Any, unit: str) -> str:
+    """A number as a person would write it, as text: counts whole, all numbers of a unit with as
+    many decimals, more where one would not have two digits left; NaN is a dash.
+
+    Args:
+        value: in the unit that people read.
+        unit: that unit, as `shown` gives it; "" for counts and ratios.
+    """
+    if isinstance(value, int | np.integer):
+        return f"{value:,}"
+    if not np.isfinite(value):
+        return "–"
+    if float(value).is_integer() and not unit:
+        return f"{value:,.0f}"
+    decimals = _DECIMALS.get(unit, 2)
+    if value:
+        decimals = max(decimals, min(1 - math.floor(math.log10(abs(value))), 4))
+    return f"{value:,.{decimals}f}"
+
+
+def day(iso: str) -> str:
+    """A date and time of day as people write it; a text that is none as it is.
+
+    Args:
+        iso: such as 2026-08-21T10:00:00+02:00.
+    """
+    try:
+        when = datetime.fromisoformat(iso)
+    except ValueError:
+        return iso
+    zone = when.strftime("%z")
+    told = f" (UTC{zone[:3]}:{zone[3:5]})" if zone else ""
+    return f"{when.day} {when:%B %Y, %H:%M:%S}{told}"

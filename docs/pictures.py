@@ -1,4 +1,4 @@
-"""The pictures of README.md, made again: `python docs/pictures.py`.
+"""The pictures of README.md and of the manual's pages, made again: `python docs/pictures.py`.
 
 It measures the bundled sample and three virtual animals, and wants a Chromium and, for the replay,
 Vulkan (.ci/run says which packages).
@@ -8,7 +8,11 @@ from __future__ import annotations
 
 import importlib.util
 import os
+import re
+import shutil
 import socket
+import subprocess
+import sys
 import tempfile
 import time
 from pathlib import Path
@@ -127,15 +131,51 @@ def shoot_replay(session: Path, moment: int = 120) -> None:
     save_small(STATIC / "replay.png", small[..., ::-1])
 
 
+def shoot_pages(session: Path, at_s: float = 3.9) -> None:
+    """The beginning of a report, and the page to correct in, as a browser shows them.
+
+    Args:
+        session: the session folder.
+        at_s: the moment that the page is opened at, s.
+    """
+    from playwright.sync_api import sync_playwright
+
+    command = [sys.executable, "-m", "liex_lab", "dashboard", str(session.parent), "--port", "0"]
+    served = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    try:
+        assert served.stdout is not None
+        told = re.search(r"(http://[^/]+)/\S*", served.stdout.readline())
+        assert told is not None
+        with sync_playwright() as driver:
+            browser = driver.chromium.launch(
+                executable_path=shutil.which("chromium"), args=["--no-sandbox"]
+            )
+            page = browser.new_page(viewport={"width": 1180, "height": 860})
+            page.set_default_timeout(120_000)
+            page.goto((session / "report.html").as_uri())
+            page.screenshot(path=STATIC / "report.png")  # all colours: every action has its own
+            page.goto(told[0])  # with the token, which is a cookie from then on
+            page.goto(f"{told[1]}/session/{session.stem}?t={at_s}")
+            page.wait_for_selector("#desk.is-open")
+            page.wait_for_load_state("networkidle")
+            page.wait_for_timeout(2000)  # the view glides to the animal
+            page.locator("#desk").screenshot(path=STATIC / "desk.png")
+            browser.close()
+    finally:
+        served.terminate()
+        served.wait()
+
+
 def main() -> None:
-    """Make all three."""
+    """Make all of them."""
     with tempfile.TemporaryDirectory(prefix="liex-") as name:
         folder = Path(name)
         draw_animals(folder)
         session = run_demo(folder)
         save_small(DEMO, cv2.imread(str(photograph(session, folder / "demo.png")))[..., ::-1])
+        shoot_pages(session)
         shoot_replay(session)
-    for path in (STATIC / "animals.png", STATIC / "replay.png", DEMO):
+    for path in (*sorted(STATIC.glob("*.png")), DEMO):
         print(path, path.stat().st_size)
 
 

@@ -429,7 +429,8 @@ def export_video(
     path = video_path(folder, alone.name if len(chosen) == 1 else "sessions", what)
     if path.exists() and not overwrite:
         raise SessionError(
-            f"{path} exists already; name another place with --out, or say --overwrite"
+            f"{path} exists already; name another place with --out, or say --overwrite (in Python "
+            "out= and overwrite=True)"
         )
     if len(chosen) == 1 and not actions:
         return write_session(

@@ -130,7 +130,8 @@ def _writer(
 
         if step_mm is not None:
             raise RecordingError(
-                "an .mcap file keeps depth as it is, so that --step-mm says nothing; leave it out"
+                "an .mcap file keeps depth as it is, so that --step-mm (in Python step_mm=) says "
+                "nothing; leave it out"
             )
         metadata = {
             "source": recording.name,
@@ -191,7 +192,7 @@ def _step(recording: Recording, kind: str, target: Path) -> float:
     raise RecordingError(
         f"the depths of {recording.name} are no whole steps of {_STEPS_MM[kind][-1]:g} mm, and "
         f"{target.name} would hold 16-bit pictures, which do not keep them; write an .mcap file, "
-        "which does, or let them be rounded with --step-mm 0.1"
+        "which does, or let them be rounded with --step-mm 0.1 (in Python step_mm=0.1)"
     )
 
 

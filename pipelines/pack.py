@@ -156,7 +156,9 @@ def _target(
     beside = Path(recording).parent if opened.sources else Path()
     target = Path(to) if to is not None else inside(beside, opened.name, f"{SUFFIX}.mcap")
     if target.suffix.lower() != ".mcap":
-        raise RecordingError(f"an archive is an MCAP file; give --to NAME.mcap, not {target.name}")
+        raise RecordingError(
+            f"an archive is an MCAP file; give --to NAME.mcap (in Python to=), not {target.name}"
+        )
     if not target.parent.is_dir():
         raise RecordingError(
             f"there is no folder {target.parent} to write {target.name} into; make it first"

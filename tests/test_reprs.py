@@ -51,5 +51,5 @@ def test_a_study_says_its_animals_and_groups(tmp_path: Path) -> None:
     }
     study = Study.from_table(table, tmp_path / "study.toml")
     assert repr(study) == (
-        f"<Study pilot: 2 animals in the groups drug, vehicle, 1 sessions, {study.path}>"
+        f"<Study pilot: 2 animals in the groups drug, vehicle, 1 session, {study.path}>"
     )

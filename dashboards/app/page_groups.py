@@ -13,6 +13,7 @@ from dash import Dash, Input, Output, dcc, html, no_update
 from liex_lab.behaviour import cohort
 from liex_lab.errors import LiexError
 
+from ..units import titled
 from . import plots
 from .data import StudyData
 from .parts import graph
@@ -56,7 +57,8 @@ def groups_page(data: StudyData) -> list[Any]:
                         dcc.Dropdown(
                             id="measure",
                             options=[
-                                {"label": name.replace("_", " "), "value": name} for name in ordered
+                                {"label": titled(name, data.described(name)[0]), "value": name}
+                                for name in ordered
                             ],
                             value=ordered[0],
                             clearable=False,

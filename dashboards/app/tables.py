@@ -17,6 +17,7 @@ from dash import dcc, html
 from liex_lab.errors import SessionError
 from liex_lab.runtime.spreadsheets import harmless_table
 
+from ..units import counted
 from .data import DONE, StudyData
 from .parts import aria, download
 
@@ -249,7 +250,7 @@ def fill(name: str, table: Table, words: str, order: dict[str, Any]) -> dict[str
     ]
     n = len(rows)
     total = len(table.rows)
-    said = f"{n:,} rows" if n == total else f"{n:,} of {total:,} rows"
+    said = counted(n, "row") if n == total else f"{n:,} of {total:,} rows"
     said += f"; the first {MOST_ROWS} are shown, the CSV has all" if n > MOST_ROWS else ""
     return {
         "name": name,

@@ -152,7 +152,8 @@ def transitions(seen: Seen) -> Figure | None:
     wide = 68.0
     figure = sheet(TWO_COLUMNS_MM, wide + 14.0 + (18.0 if side == wide else 0.0))
     _matrix(panel(figure, LEFT_MM - 1.0, 4.0 + 0.4 * (wide - side), side, side), words, found)
-    graph = panel(figure, LEFT_MM + wide + 16.0, 4.0, wide - 6.0, wide - 6.0)
+    left = LEFT_MM + wide + 2.0  # as wide as there is room for, since names stand beside the circle
+    graph = panel(figure, left, 4.0, TWO_COLUMNS_MM - 1.0 - left, wide - 6.0)
     _graph(graph, words, found, action_colours(seen.words))
     n = int(np.nansum(found["n"]))
     heading(
@@ -196,9 +197,7 @@ def _matrix(axes: Axes, words: list[str], found: dict[str, Array]) -> None:
                 continue
             colour = _against_chance(found, i, j)
             axes.add_patch(
-                Rectangle(
-                    corner, 0.94, 0.94, facecolor=colour, alpha=0.05 + 0.75 * p, linewidth=0.0
-                )
+                Rectangle(corner, 0.94, 0.94, facecolor=colour, alpha=0.05 + 0.5 * p, linewidth=0.0)
             )
             text = f"{100 * p:.0f}\n({100 * found['by_chance'][i, j]:.0f})"
             axes.text(j, i, text, ha="center", va="center", size=small, linespacing=1.25)
@@ -256,8 +255,8 @@ def _graph(axes: Axes, words: list[str], found: dict[str, Array], colours: dict[
         across = "left" if x > 0.1 else "right" if x < -0.1 else "center"
         up = "bottom" if y > 0.1 else "top" if y < -0.1 else "center"
         axes.text(1.14 * x, 1.14 * y, text, ha=across, va=up, size=6.0)
-    axes.set_xlim(-1.3, 1.3)
-    axes.set_ylim(-1.3, 1.3)
+    axes.set_xlim(-1.96, 1.96)
+    axes.set_ylim(-1.41, 1.41)
     axes.set_aspect("equal")
     axes.set_axis_off()
 

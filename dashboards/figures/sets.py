@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -270,8 +271,8 @@ def check_kinds(kinds: Sequence[str]) -> None:
 def for_the_page(session: Session, folder: Path | None) -> dict[str, str]:
     """Every figure of a session as an element of a page, by name; written as SVG on the way.
 
-    Files of other formats that lie there already, of the session as it was before a correction,
-    are drawn anew, too. No others are made: they cost as much again as the whole report.
+    Of other formats those are made that the plan asks for (`[report] figures`), and those that lie
+    there already are drawn anew, which show the session as it was before a correction.
 
     Args:
         session: the opened session.
@@ -279,7 +280,9 @@ def for_the_page(session: Session, folder: Path | None) -> dict[str, str]:
     """
     made: dict[str, str] = {}
     there = set() if folder is None else {path.name for path in _files(folder)}
-    with drawing(), _one_pdf(folder if _PAGES_FILE in there else None) as pages:
+    asked = _asked(session)
+    paged = PAGES in asked or _PAGES_FILE in there
+    with drawing(), _one_pdf(folder if paged else None) as pages:
         for one in session_figures(session):
             if one.figure is None:
                 continue
@@ -289,7 +292,8 @@ def for_the_page(session: Session, folder: Path | None) -> dict[str, str]:
                 continue
             put_figure(folder, f"{one.name}.svg", svg)
             for kind in FORMATS:
-                if kind != "svg" and (name := f"{one.name}.{kind}") in there:
+                name = f"{one.name}.{kind}"
+                if kind != "svg" and (kind in asked or name in there):
                     put_figure(folder, name, image_bytes(one.figure, kind))
             if pages is not None:
                 pages.savefig(one.figure)
@@ -298,6 +302,12 @@ def for_the_page(session: Session, folder: Path | None) -> dict[str, str]:
             if old.stem.split("-")[0] in OF_SESSION and old.stem not in made:
                 old.unlink()
     return made
+
+
+def _asked(session: Session) -> set[str]:
+    """The formats that a session's plan asks for; plans of earlier versions ask for none."""
+    report = session.metadata.get("plan", {}).get("report", {})
+    return {str(kind) for kind in report.get("figures", ())}
 
 
 def _files(folder: Path) -> list[Path]:
@@ -317,16 +327,22 @@ def _arena(session: Session) -> Figure | None:
 
 def _grouped(sessions: Sequence[Session], table: pd.DataFrame) -> list[Seen]:
     """The animals with the groups that a comparison puts them in; those in none are left out."""
-    group = {
-        (str(row["session_id"]), str(row["individual"])): row["group"]
-        for row in table.to_dict("records")
-    }
+    stated: dict[tuple[str, str], list[Any]] = {}
+    for row in table.to_dict("records"):
+        stated.setdefault((str(row["session_id"]), str(row["individual"])), []).append(row["group"])
+    every = [seen for session in sessions for seen in animals(session)]
+    there = Counter((seen.session.name, seen.individual) for seen in every)
     found = []
-    for session in sessions:
-        for seen in animals(session):
-            own: Any = group.get((session.name, seen.individual), "")
-            if isinstance(own, str) and own:
-                found.append(replace(seen, group=own))
+    for seen in every:
+        key = seen.session.name, seen.individual
+        own = stated.get(key, [])
+        # of sessions of one name, in several folders, the rows are in the sessions' order; once one
+        # of them has gone, nobody can say whose row is whose
+        if len(own) == there[key] or len(set(map(str, own))) == 1:
+            group = own[0] if len(own) == 1 else own.pop(0)
+            there[key] -= 1
+            if isinstance(group, str) and group:
+                found.append(replace(seen, group=group))
     return found
 
 

@@ -129,14 +129,16 @@ def curves(seen: Seen) -> Figure | None:
     time_s = seen.frames["time_s"].to_numpy(float)
     _, size = time_unit(seen.duration_s)
     rearing = seen.bouts["action"].astype(str).str.startswith("rear")
-    rears = seen.bouts.loc[rearing, ["start_s", "stop_s"]].to_numpy(float)
+    rears = seen.bouts.loc[rearing, ["start_s", "stop_s", "action"]].to_numpy()
+    colours = action_colours(seen.words)
     for k, (title, unit, values, colour, from_zero) in enumerate(rows):
         axes = panel(figure, LEFT_MM, 8.0 + (len(rows) - 1 - k) * step, width, _CURVE_MM)
         n = int(np.isfinite(values).sum())
         if title.startswith("Nose height") and len(rears):
             title += "; rearing shaded"
-            for a, b in rears:
-                axes.axvspan(a / size, b / size, color=RED, alpha=0.2, linewidth=0.0)
+            for a, b, word in rears:
+                shade = colours.get(str(word), RED)
+                axes.axvspan(a / size, b / size, color=shade, alpha=0.3, linewidth=0.0)
         axes.set_title(
             f"{title}, {seen.who}, n = {counted(n, 'frame')}" if k == 0 else title, size=6.5
         )

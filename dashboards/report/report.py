@@ -21,7 +21,7 @@ from liex_lab.sessions.videos import found_video
 from ..figures.seen import FRAMES, KINEMATICS
 from ..figures.sets import FOLDER, for_the_page
 from ..pages import page
-from ..units import counted, shown, titled
+from ..units import counted, day, reading, shown, titled
 from .charts import pictures
 from .methods import methods, optics, spine_mm
 from .quality import flip_rows, frame_account, refusal_rows, warnings
@@ -146,7 +146,7 @@ def headline(session: Session) -> str:
     if frames["fps_median"]:
         parts.append(f"{frames['fps_median']:.1f} frames/s")
     if session.metadata["session_start_time"]:
-        parts.append(str(session.metadata["session_start_time"]))
+        parts.append(day(str(session.metadata["session_start_time"])))
     return " · ".join(parts)
 
 
@@ -170,7 +170,7 @@ def cards(session: Session) -> list[tuple[str, str, str]]:
     speed, unit = shown(row["mean_speed_mm_s"], "mm/s")
     first = [
         (f"{row['distance_m']:.2f}", "m", "distance"),
-        (_number(speed), unit, "mean speed"),
+        (reading(speed, unit), unit, "mean speed"),
     ]
     if "rear_count" in row and "tail_beat_hz" not in row:
         rears = int(row["rear_count"])
@@ -208,7 +208,7 @@ def summary_rows(session: Session, words: list[str]) -> list[tuple[str, str, str
         found.append(
             (
                 titled(name, kept),
-                f"{value:.1%}" if share else _number(value),
+                f"{value:.1%}" if share else reading(value, unit),
                 "" if share else unit,
                 str(described.loc[name, "meaning"]),
             )
@@ -216,13 +216,13 @@ def summary_rows(session: Session, words: list[str]) -> list[tuple[str, str, str
     return found
 
 
-_BUDGET = (
-    ("count", "bouts"),
-    ("s", "time, s"),
-    ("share", "share"),
-    ("mean_s", "mean, s"),
-    ("per_min", "per minute"),
-    ("latency_s", "first after, s"),
+_BUDGET = (  # what of an action, and its unit
+    ("count", ""),
+    ("s", "s"),
+    ("share", ""),
+    ("mean_s", "s"),
+    ("per_min", "1/min"),
+    ("latency_s", "s"),
 )
 
 
@@ -241,8 +241,8 @@ def budget_rows(session: Session, words: list[str]) -> list[tuple[str, str, list
         if f"{word}_s" in row:  # sessions of an older version lack some of the others
             values = [row.get(f"{word}_{what}", np.nan) for what, _ in _BUDGET]
             texts = [
-                f"{value:.1%}" if what == "share" and np.isfinite(value) else _number(value)
-                for value, (what, _) in zip(values, _BUDGET, strict=True)
+                f"{value:.1%}" if what == "share" and np.isfinite(value) else reading(value, unit)
+                for value, (what, unit) in zip(values, _BUDGET, strict=True)
             ]
             rows.append((word, colour, texts))
     return rows
@@ -264,10 +264,11 @@ def zone_rows(session: Session) -> list[tuple[str, list[str]]]:
         (
             str(name),
             [
-                _number(row[0]),
+                reading(row[0], "s"),
                 f"{share:.1%}",
                 f"{row[1]:.0f}",
-                *(_number(value) for value in row[2:]),
+                *(reading(value, "s") for value in row[2:4]),
+                reading(row[4], "mm"),
             ],
         )
         for name, share, row in zip(table["zone"], table["share"], numbers, strict=True)
@@ -365,15 +366,6 @@ def glossary(session: Session) -> list[tuple[str, list[dict[Hashable, Any]]]]:
         for table, file in _TABLES.items()
         if session.has(file)
     ]
-
-
-def _number(value: Any) -> str:
-    """A number as a person would write it: counts whole, the rest of four digits, NaN a dash."""
-    if isinstance(value, int | np.integer):
-        return f"{value:,}"
-    if not np.isfinite(value):
-        return "–"
-    return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.4g}"
 
 
 def _clock(seconds: float) -> str:

@@ -8,6 +8,7 @@ One session as CSV, Excel, DeepLabCut's tables, movement's netCDF and a BORIS pr
 import tempfile
 from pathlib import Path
 
+import matplotlib.pyplot as plt
 import pandas as pd
 
 import liex_lab
@@ -37,3 +38,13 @@ import xarray  # noqa: E402
 
 with xarray.open_dataset(place / "mouse_walk.nc") as data:
     print(data)
+    nose = data.position.sel(keypoints="nose").squeeze()
+    figure, axis = plt.subplots(figsize=(4, 4), layout="constrained")
+    axis.plot(nose.sel(space="x"), nose.sel(space="y"))
+    axis.set(
+        xlabel="x (mm)",
+        ylabel="y (mm)",
+        aspect="equal",
+        title="The nose's way, from movement's file",
+    )
+    plt.show()

@@ -4,6 +4,7 @@ programs.
 
 from __future__ import annotations
 
+from math import isnan
 from pathlib import Path
 from typing import Annotated
 
@@ -47,18 +48,19 @@ def compare(
             engine=engine,
             progress=progress,
         )
+    refused: dict[str, list[str]] = {}
     for row in found["stats"].to_dict("records"):
-        numbers = (
-            f"{row['estimate']:.4g} [{row['ci_low']:.3g}, {row['ci_high']:.3g}], g "
-            f"{row['effect_size']:.2g}"
-        )
-        p = (
-            f"p {row['p']:.2g}, corrected {row['p_fdr']:.2g}: {row['test']}"
-            if row["test"]
-            else row["refused"]
-        )
+        numbers = f"{row['estimate']:.4g} [{row['ci_low']:.3g}, {row['ci_high']:.3g}]"
+        if not isnan(row["effect_size"]):  # of values that are all the same there is none
+            numbers += f", g {row['effect_size']:.2g}"
         n = f"{row['n_units_first']} and {row['n_units_second']} units ({row['unit'] or 'none'})"
-        say(f"{row['measure']}, {row['contrast']}: {numbers}; {n}\n    {p}")
+        say(f"{row['measure']}, {row['contrast']}: {numbers}; {n}")
+        if row["test"]:
+            say(f"    p {row['p']:.2g}, corrected {row['p_fdr']:.2g}: {row['test']}")
+        else:
+            refused.setdefault(row["refused"], []).append(row["measure"])
+    for why, names in refused.items():  # said once, not once for each measure
+        say(f"not tested: {', '.join(dict.fromkeys(names))}\n    {why}")
     say(f"tables: {found['folder']}")
     say(f"figures: {len(found['figures'])} files in {found['folder'] / 'figures'}")
 

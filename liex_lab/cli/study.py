@@ -175,7 +175,7 @@ def _tell_study(standings: list[SessionStatus], all_of_them: bool) -> int:
             remedy = f"; {one.failure['remedy']}" if one.failure and one.state == "failed" else ""
             say(f"{one.state:9}{one.session.id}  {one.reason}{remedy}".rstrip())
     say(
-        f"{len(standings)} sessions: "
+        f"{len(standings)} session{'' if len(standings) == 1 else 's'}: "
         + ", ".join(f"{n} {state}" for state, n in sorted(counts.items()))
     )
     return counts.get("failed", 0)

@@ -29,6 +29,7 @@ from liex_lab.plan.sections import (
     Foreground,
     RecordingOptions,
     Replay,
+    Report,
     SessionFacts,
     SeveralArenas,
     Table,
@@ -69,6 +70,7 @@ class Plan(Table):
         actions: who names what the animal does.
         behaviour: where one behaviour ends and the next begins.
         replay: what the replays hold.
+        report: what is written beside the report.
     """
 
     seed: int = Field(0, ge=0, description="all randomness of a run comes from this number")
@@ -92,6 +94,7 @@ class Plan(Table):
     actions: Actions = Actions()
     behaviour: Behaviour = Behaviour()
     replay: Replay = Replay()
+    report: Report = Report()
 
     @model_validator(mode="after")
     def _apart(self) -> Plan:

@@ -478,6 +478,25 @@ class Replay(Table):
         return {True: "all", False: "none"}[value] if isinstance(value, bool) else value
 
 
+class Report(Table):
+    """[report]: what is written beside report.html."""
+
+    figures: list[Literal["svg", "pdf", "png", "pages"]] = Field(
+        ["svg"],
+        description=(
+            "formats of figures/: svg, which the report holds; also pdf, png or pages (one PDF of "
+            "all). PDF takes a second or two of every run"
+        ),
+    )
+
+    @field_validator("figures")
+    @classmethod
+    def _with_svg(cls, value: list[str]) -> list[str]:
+        if "svg" not in value:
+            raise ValueError(f"{value} should hold svg, too, which the report is made of")
+        return value
+
+
 class Actions(Table):
     """[actions]: who names what the animal does."""
 

@@ -216,10 +216,11 @@ class Study:
 
     def __repr__(self) -> str:
         groups = ", ".join(sorted({animal.group for animal in self.table.animals if animal.group}))
+        n = len(self.table.sessions)
         return (
             f"<Study {self.name}: {len(self.table.animals)} animals"
             f"{f' in the groups {groups}' if groups else ''}, "
-            f"{len(self.table.sessions)} sessions, {self.path}>"
+            f"{n} session{'' if n == 1 else 's'}, {self.path}>"
         )
 
     @staticmethod

@@ -146,7 +146,8 @@ def open_recording(
         n_whole = f"{recording.n_whole} whole frame{'' if recording.n_whole == 1 else 's'}"
         raise RecordingError(
             f"{path} is cut short or damaged, {n_whole} can be read from it; copy it again, or go "
-            "on with what is whole by adding --set recording.accept_truncated=true"
+            "on with what is whole by adding --set recording.accept_truncated=true (in Python "
+            "plan.with_settings(['recording.accept_truncated=true']))"
         )
     return recording
 

@@ -124,7 +124,8 @@ def joint_move_at_pixel(
         raise SessionError(
             f"pixel ({u_px:g}, {v_px:g}) of frame {frame} is outside of the cut-out that the "
             "session keeps of it, and shows the still scene; give the joint's place in mm, or run "
-            "`liex run` on the recording again with --set replay.depth=all"
+            "`liex run` on the recording again with --set replay.depth=all (in Python "
+            "plan.with_settings(['replay.depth=all']))"
         )
     with open_pictures(session) as recording:
         skin_mm = depth_under(recording.frame(row).depth, u_px, v_px)

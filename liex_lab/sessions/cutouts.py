@@ -229,7 +229,8 @@ def open_pictures(session: Session) -> Recording:
             raise
     raise SessionError(
         f'{session.path} keeps no depth pictures, for its plan says replay.depth = "none"; run '
-        "`liex run` on the recording again with --set replay.depth=animal"
+        "`liex run` on the recording again with --set replay.depth=animal (in Python "
+        "plan.with_settings(['replay.depth=animal']))"
     )
 
 

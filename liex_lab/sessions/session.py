@@ -137,7 +137,8 @@ class Session:
                 )
         log = Log("") if raw else read_log(folder)
         fitting = log if applies(log, folder, metadata) else None
-        session = Session(folder, metadata, fitting, log.described)
+        # absolute, so that a table is found after the process went to another folder, too
+        session = Session(folder.absolute(), metadata, fitting, log.described)
         session._check_tables()
         return session
 

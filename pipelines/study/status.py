@@ -195,6 +195,7 @@ def plan_changed(plan: Plan, stored: dict[str, Any]) -> str:
         for key in (now[section] if isinstance(now[section], dict) else [""])
         if (now[section][key] != then[section][key] if key else now[section] != then[section])
         and not (section == "session" and key in DESCRIBED)
+        and section != "report"  # nothing that is measured
     ]
     more = f" and {len(differing) - 3} more" if len(differing) > 3 else ""
     return f"plan changed: {', '.join(differing[:3])}{more}" if differing else ""

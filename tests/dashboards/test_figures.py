@@ -15,6 +15,9 @@ from liex_lab.dashboards.figures.pictures import DepthReader
 from liex_lab.dashboards.figures.seen import Seen, animals
 from liex_lab.dashboards.figures.style import drawing, image_bytes, on_page, scale_bar, sheet
 from liex_lab.dashboards.report.contact_sheet import picture, shade
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import to_hex
+from matplotlib.text import Text
 
 from liex_lab.actions.colours import action_colours
 from liex_lab.api import compare_groups, draw_figures
@@ -22,6 +25,7 @@ from liex_lab.arena.outline import Arena
 from liex_lab.arena.zones import Zone
 from liex_lab.behaviour.cohort import compare
 from liex_lab.errors import PlaceError, SessionError
+from liex_lab.plan import Plan
 from liex_lab.sessions import Session
 from tests.sessions.walking_mouse import FLOOR_MM, WalkingMouse, steady, write
 
@@ -113,6 +117,19 @@ def test_an_action_has_its_colour_in_every_figure(session, seen):
         for draw in (times.ethogram, actions.time_budget, actions.activity, actions.transitions):
             svg = image_bytes(draw(seen), "svg").decode().lower()
             assert all(colours[str(word)].lower() in svg for word in seen_words), draw
+
+
+def test_a_rear_is_shaded_in_the_colour_of_its_name_and_the_curve_keeps_its_own(session, seen):
+    with drawing():
+        figure = times.curves(seen)
+    assert figure is not None
+    (axes,) = [one for one in figure.axes if "Nose height" in one.get_title(loc="left")]
+    rears = session.bouts[session.bouts["action"].str.startswith("rear")]
+    colours = action_colours(seen.words)
+    shades = [to_hex(patch.get_facecolor()) for patch in axes.patches]
+    assert shades == [colours[word].lower() for word in rears["action"]]
+    assert len(shades) == 1
+    assert to_hex(axes.get_lines()[0].get_color()) not in shades
 
 
 def test_a_bar_of_the_ethogram_stands_at_its_time(session, seen):
@@ -241,6 +258,37 @@ def test_a_report_made_again_draws_anew_what_lies_beside_it(session, tmp_path):
     assert (tmp_path / "mine.pdf").read_bytes() == b"mine"
 
 
+def test_a_plan_asks_for_the_formats_beside_every_report(tmp_path):
+    plan = Plan.load("mouse").with_settings(['report.figures=["svg", "pdf", "pages"]'])
+    asked = write(tmp_path / "asked.liex", MOUSE, plan_toml=plan.to_toml())
+    made = sets.for_the_page(asked, tmp_path / "asked")
+    drawn = {path.name for path in (tmp_path / "asked").iterdir()}
+    assert drawn == {"figures.pdf"} | {f"{one}.{kind}" for one in made for kind in ("svg", "pdf")}
+    usual = write(tmp_path / "usual.liex", MOUSE, plan_toml=Plan.load("mouse").to_toml())
+    sets.for_the_page(usual, tmp_path / "usual")
+    assert {path.suffix for path in (tmp_path / "usual").iterdir()} == {".svg"}
+
+
+def test_every_name_of_the_transitions_is_on_the_paper():
+    words = ["rear_unsupported", "stretch_attend", "turn_right", "rear_supported", "walk", "run"]
+    n = len(words)
+    pairs = [(one, other) for one in words for other in words if one != other]
+    table = pd.DataFrame(pairs, columns=["from_action", "to_action"]).assign(
+        n=2, n_from=2 * (n - 1), probability=1 / (n - 1), by_chance=1 / (n - 1), p_fdr=1.0
+    )
+    for first in range(n):  # each of them stands once at each place of the circle
+        own = words[first:] + words[:first]
+        one: Any = SimpleNamespace(who="m01", words=own, table=lambda name: table)
+        with drawing():
+            figure = actions.transitions(one)
+            assert figure is not None
+            FigureCanvasAgg(figure).draw()
+        for text in figure.findobj(Text):
+            box = text.get_window_extent()
+            assert box.x0 >= 0, text.get_text()
+            assert box.x1 <= figure.bbox.width, text.get_text()
+
+
 def test_every_figure_has_something_to_show_of_a_usual_session(session, tmp_path):
     found = draw_figures(session.path, formats=["svg"], out=tmp_path)
     assert found["empty"] == ["onsets"]  # it takes five bouts
@@ -350,6 +398,19 @@ def test_a_comparison_draws_every_animal_and_the_interval_of_the_table(study, tm
     assert "n = 6 animals, 6 sessions" in said
     assert "n = 3 and 3 animals" in said
     assert f"g {row['effect_size']:.2f}" in said
+
+
+def test_sessions_of_one_name_stay_in_their_own_groups(tmp_path):
+    """Two folders hold a session called m each, one of either group."""
+    mouse = WalkingMouse(steady(1.0))
+    both = [
+        write(tmp_path / group / "m.liex", mouse, name="m", subject={"group": group})
+        for group in ("drug", "control")
+    ]
+    table = pd.DataFrame({"session_id": "m", "individual": "mouse", "group": ["drug", "control"]})
+    table["individual"] = [str(one.metadata["individual"]) for one in both]
+    assert [one.group for one in sets._grouped(both, table)] == ["drug", "control"]
+    assert sets._grouped(both[1:], table) == []  # the other has gone: whose row is whose?
 
 
 def test_the_mean_of_a_group_counts_every_subject_alike(study):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from liex_lab.dashboards.units import counted, shown, titled
+from liex_lab.dashboards.units import counted, day, reading, shown, titled
 
 
 def test_speeds_and_angles_are_shown_in_cm_s_and_degrees() -> None:
@@ -29,3 +29,25 @@ def test_one_thing_is_not_several() -> None:
     assert counted(2, "stretch", "stretches") == "2 stretches"
     assert counted(1200, "frame") == "1,200 frames"
     assert counted(0, "gap") == "0 gaps"
+
+
+def test_numbers_of_a_unit_have_as_many_decimals_but_never_fewer_than_two_digits() -> None:
+    assert [reading(value, "s") for value in (0.7505, 1.6, 12.0)] == ["0.75", "1.60", "12.00"]
+    assert reading(9.076, "cm/s") == "9.1"
+    assert reading(0.02134, "m") == "0.021"
+    assert reading(1234.56, "mm") == "1,234.6"
+    assert reading(0.0, "mm") == "0.0"
+    assert reading(np.nan, "s") == "–"
+
+
+def test_counts_are_whole_whatever_they_were_read_as() -> None:
+    assert reading(np.int64(1200), "") == "1,200"
+    assert reading(3.0, "") == "3"
+    assert reading(-0.4462, "") == "-0.45"
+
+
+def test_a_day_is_written_as_people_write_it() -> None:
+    told = "25 January 2017, 10:42:07 (UTC-05:00)"
+    assert day("2017-01-25T10:42:07.173469-05:00") == told
+    assert day("2026-08-01T09:00:00") == "1 August 2026, 09:00:00"
+    assert day("some day") == "some day"

@@ -41,6 +41,15 @@ def test_the_groups_of_a_folder_of_sessions_are_compared(study, tmp_path):
     assert (tmp_path / "columns.json").is_file()
 
 
+def test_why_nothing_is_tested_is_said_once_for_all_measures(study, tmp_path):
+    asked = [f"--measure={name}" for name in ("rear_share", "pause_share", "distance_m")]
+    ran = CliRunner().invoke(cli.app, ["compare", str(study), "--out", str(tmp_path), *asked])
+    assert ran.exit_code == 0, ran.output
+    assert ran.output.count("every unit has the same value") == 1
+    assert "not tested: rear_share, pause_share\n" in ran.output
+    assert "nan" not in ran.output
+
+
 def test_the_usual_measures_are_those_with_values(study, tmp_path):
     stats = compare_sessions([study], tmp_path)["stats"]
     assert {"distance_m", "mean_speed_mm_s", "walk_share"} <= set(stats["measure"])

@@ -283,9 +283,19 @@ def test_a_session_that_someone_has_to_look_at_is_done_and_says_why(
         session.id,
         *["look", "at", "it:", "only", "3", "of", "the", "40", "frames", "are", "trusted"],
     ]
-    assert counted == "1 sessions: 1 done, look at it"
+    assert counted == "1 session: 1 done, look at it"
     (entry,) = list_sessions(file)[1]()
     assert (entry.state, entry.reason) == why(file)
+
+
+def test_figures_in_another_format_are_no_reason_to_measure_again():
+    plan = Plan.load("mouse")
+    asked = plan.with_settings(['report.figures=["svg", "pdf"]'])
+    stored = plan.model_dump(exclude_none=True)
+    assert plan_changed(asked, stored) == ""
+    del stored["report"]  # a session of before
+    assert plan_changed(asked, stored) == ""
+    assert "pause" in plan_changed(plan.with_settings(["behaviour.pause_below_mm_s=40"]), stored)
 
 
 @pytest.mark.parametrize("found", [True, False])
