@@ -108,7 +108,14 @@ def order_blobs(blobs, n_blobs, area, mm2_per_px):
             distances[slot] = np.inf
         else:
             n_near += 1
-    return np.argsort(distances), n_near
+    order = np.empty(n_blobs, np.int64)
+    for slot in range(n_blobs):  # by insertion, in the order of equals: they are few
+        place = slot
+        while place > 0 and distances[order[place - 1]] > distances[slot]:
+            order[place] = order[place - 1]
+            place -= 1
+        order[place] = slot
+    return order, n_near
 
 
 @njit(cache=True)
