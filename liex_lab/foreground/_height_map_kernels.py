@@ -287,7 +287,9 @@ def extract_all(depths, limit, on_floor, area, n_things, parts, sight, crops):
         crops: `CropRows`, out.
     """
     for k in prange(depths.shape[0]):
-        extract_one(depths[k], limit, on_floor, area, n_things, parts, sight, crops, k)
+        # a number of one type: the loop's own has two on the way, and all would be compiled twice
+        row = np.int64(k)
+        extract_one(depths[k], limit, on_floor, area, n_things, parts, sight, crops, row)
 
 
 @njit(cache=True, parallel=True, nogil=True)
@@ -325,4 +327,5 @@ def extract_windows(depths, background, margin, area, n_things, sights, crops):
             sights.behind_mm[k],
             sights.smooth_mm[k],
         )
-        extract_one(depths[k], limit, everywhere, area[k], n_things, False, sight, crops, k)
+        row = np.int64(k)
+        extract_one(depths[k], limit, everywhere, area[k], n_things, False, sight, crops, row)

@@ -179,3 +179,16 @@ def test_an_index_that_leaves_out_messages_is_not_believed(path: Path) -> None:
     assert n_walked < 20
     with open_recording(path, strict=True) as strict:
         assert len(strict) == n_walked
+
+
+@pytest.mark.parametrize("kind", ["zstd", "lz4", "none"])
+def test_a_chunk_that_states_any_size_costs_no_memory(path: Path, kind: str) -> None:
+    KINDS[kind](path)
+    content = bytearray(path.read_bytes())
+    with path.open("rb") as file:
+        indexed = McapFile(path, file)
+        indexed._learn_ending()
+        size_at = indexed.starts[7] + 9 + 16  # behind opcode, length and two times
+    content[size_at : size_at + 8] = (1 << 50).to_bytes(8, "little")
+    path.write_bytes(content)
+    assert "cut short or damaged" in refusal(path, strict=True)

@@ -265,7 +265,7 @@ class _Skimmed(_Indexed):
         """The first bytes of the records at these offsets of a chunk."""
         if not offsets:
             return []
-        chunk = self.chunks[number]
+        chunk = self.believable(number)
         if chunk.packing in ("", "none"):
             if chunk.length != chunk.size:
                 raise DamagedChunk("its parts do not fit into it")

@@ -216,13 +216,25 @@ class MessageFile(ABC):
             DamagedChunk: it states a size that cannot be, or does not unpack to what was packed.
         """
         if self._last_chunk[0] != number:
-            chunk = self.chunks[number]
-            if chunk.size > max(_LARGEST_CHUNK, 2 * self.size):
-                raise DamagedChunk(f"it states that it unpacks to {chunk.size} bytes")
+            chunk = self.believable(number)
             self.file.seek(chunk.offset)
             self._last_chunk = (-1, memoryview(b""))  # never two at once
             self._last_chunk = (number, memoryview(unpacked(self.file.read(chunk.length), chunk)))
         return self._last_chunk[1]
+
+    def believable(self, number: int) -> Chunk:
+        """A chunk whose stated size is one that it may have.
+
+        Args:
+            number: index into `chunks`.
+
+        Raises:
+            DamagedChunk: it states a size that cannot be.
+        """
+        chunk = self.chunks[number]
+        if chunk.size > max(_LARGEST_CHUNK, 2 * self.size):
+            raise DamagedChunk(f"it states that it unpacks to {chunk.size} bytes")
+        return chunk
 
     def close(self) -> None:
         """Close the file and let go of the last chunk."""
