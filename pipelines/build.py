@@ -328,6 +328,29 @@ def build_provenance(
     )
 
 
+def session_bytes(recording: Recording, plan: Plan, length_mm: float, distance_mm: float) -> int:
+    """What a session of a recording takes on disk, bytes, within a factor of two.
+
+    Args:
+        recording: an open recording.
+        plan: the animal's skeleton, and how much of the depth is kept.
+        length_mm: of the animal.
+        distance_mm: of the animal from the camera.
+    """
+    from liex_lab.body.skeleton import Skeleton
+    from liex_lab.recordings.rvl import to_millimetres
+    from liex_lab.sessions.room import Shown, needed_bytes
+
+    rows = sorted({0, len(recording) // 2})
+    shown = Shown(
+        len(recording),
+        Skeleton.load(plan.animal.skeleton).n_joints,
+        recording.camera.fx * length_mm / distance_mm,
+        [to_millimetres(recording.frame(row).depth) for row in rows],
+    )
+    return needed_bytes(shown, plan.replay.depth)
+
+
 def build_background(recording: Recording, plan: Plan) -> NDArray[np.uint16] | None:
     """The still scene (H, W) mm before which the replay shows cut-outs; None where it shows none.
 

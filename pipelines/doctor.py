@@ -22,7 +22,7 @@ from liex_lab.plan.plan import arena_lines
 from liex_lab.recordings.timestamps import DROPPED, Gap, unwritable_times
 from liex_lab.runtime.progress import Progress, silent
 
-from .build import build_water
+from .build import build_water, session_bytes
 from .choice import Proposal, propose_plan
 from .doctor_files import next_command, open_anyhow
 from .doctor_scene import SceneLook
@@ -66,6 +66,7 @@ FINDINGS: Final = {  # key of the JSON: what it says; numbers that cannot be tol
     "animal_area_mm2": "seen from above",
     "animal_share": "of the frames looked at, in which it was found",
     "animal_sits_still": "whether it had become a part of the background",
+    "session_mb": "what a session of it takes on disk, MB, within a factor of two",
     "arenas": "lines of a plan for several arenas in the picture; empty where one is seen",
     "plan": "the bundled plan that fits, or the one that was named; None where none does",
     "plan_says": "how it fits, or what contradicts each plan",
@@ -157,6 +158,7 @@ def examine(
             "water": None if water is None else water.to_dict(),
             **depth.facts(),
             **scene.facts,
+            "session_mb": _session_mb(seen, plan, scene.facts["animal_length_mm"], depth.median_mm),
             "arenas": [line for one in arenas for line in arena_lines(one)],
             "plan": proposal.plan,
             "plan_says": proposal.says,
@@ -175,6 +177,15 @@ def examine(
             "next": next_command(path, proposal, missing, len(arenas) if asked is None else 0),
         }
     return {key: found[key] for key in FINDINGS}
+
+
+def _session_mb(
+    seen: Recording, plan: Plan, length_mm: float | None, distance_mm: float | None
+) -> float | None:
+    """What a session takes on disk, MB; None where no animal is found."""
+    if length_mm is None or distance_mm is None:
+        return None
+    return round(session_bytes(seen, plan, length_mm, distance_mm) / 1e6, 1)
 
 
 def _several(seen: Recording, plan: Plan, misplaced: list[str]) -> list[SeveralArenas]:
@@ -343,6 +354,8 @@ def lines(findings: dict[str, Any]) -> list[tuple[str, str]]:
         findings: what `examine` returns.
     """
     f = findings
+    from liex_lab.sessions.room import megabytes
+
     arena = f["arena"]
     water = f["water"]
     bent = f["distortion"]
@@ -420,6 +433,11 @@ def lines(findings: dict[str, Any]) -> list[tuple[str, str]]:
             ),
         ),
         *([("plan", f["plan_says"])] if f["plan_says"] else []),
+        *(
+            [("a session takes", f"about {megabytes(1e6 * f['session_mb'])} on disk")]
+            if f["session_mb"] is not None
+            else []
+        ),
     ]
 
 

@@ -26,8 +26,6 @@ if TYPE_CHECKING:
     from liex_lab.optics.refraction import Water
     from liex_lab.recordings.recording import Recording
 
-_PLAUSIBLE_FLOOR_MM = (150.0, 3000.0)
-_MUCH_TILT_RAD = math.radians(15.0)
 _LEVEL_RAD = math.radians(3.0)  # a tank's floor is as level as the water over it, to this
 _MUCH_UNREAD = 0.2  # share of the pixels on the floor
 _MUCH_NOISE = 0.5  # of the height from which a pixel counts as the animal
@@ -152,21 +150,10 @@ class SceneLook:
         self._at_animal(background)
 
     def _at_floor(self, floor: Floor) -> None:
-        up = np.zeros(3) if self.water is None else self.water.lift_mm
-        distance = float(floor.distance_mm - up @ floor.normal)  # from the real lens
-        tilt = math.acos(min(1.0, float(floor.normal[2])))
-        self.facts |= {"floor_mm": distance, "floor_tilt_rad": tilt}
-        low, high = _PLAUSIBLE_FLOOR_MM
-        if not low <= distance <= high:
-            self.problems.append(
-                f"the floor lies {distance:.0f} mm from the camera, outside the usual {low:.0f} to "
-                f"{high:.0f} mm; check the unit and the camera's height"
-            )
-        if tilt > _MUCH_TILT_RAD:
-            self.problems.append(
-                f"the camera looks down at {math.degrees(tilt):.0f} degrees from straight, and "
-                "poses are learned up to 10; turn it to look straight down"
-            )
+        lift = None if self.water is None else self.water.lift_mm
+        distance = floor.lens_distance_mm(lift)
+        self.facts |= {"floor_mm": distance, "floor_tilt_rad": floor.tilt_rad}
+        self.problems += floor.unusual(lift)
         if self.water is not None:
             self._at_water(self.water, floor, distance)
 

@@ -33,6 +33,8 @@ from .build import (
     build_recording,
     build_rules,
     build_surroundings,
+    build_water,
+    session_bytes,
     why_nameless,
 )
 from .choice import USUAL, Fitted, fit_plan
@@ -247,13 +249,20 @@ def prepare(fitted: Fitted, folder: Path, started: float, progress: Progress) ->
     Raises:
         ModelError: there is no such recogniser.
         PlanError: it was made for another skeleton.
+        SessionError: the disk has by far no room for it.
     """
     from liex_lab.sessions.checkpoint import hash_once
     from liex_lab.sessions.older import part_folder
+    from liex_lab.sessions.room import check_room, megabytes
 
     build_recogniser(fitted.plan, fitted.tracker.estimator.skeleton)
     hash_once(fitted.recording, part_folder(folder), progress)
     origin = build_provenance(fitted.recording, fitted.plan, fitted.tracker, progress)
+    needed = session_bytes(
+        fitted.recording, fitted.plan, fitted.tracker.spine_mm, origin.floor_distance_mm
+    )
+    progress(0, None, f"the session takes about {megabytes(needed)} on disk")
+    check_room(folder, needed)
     return Prepared(
         fitted, origin, folder, {"prepare": time.perf_counter() - started, "track": 0.0}
     )
@@ -296,8 +305,10 @@ def make_track(writer: SessionWriter, fitted: Fitted) -> Verdict:
     fit = tracker.sample_fit
     files = fitted.recording.files
     fast = why_too_fast(tracked.track, tracker.subject.length_mm)
+    water = build_water(fitted.plan)
     # water makes an ideal camera with a focal length of its own
-    lens = unusual_lens(fitted.recording.camera) if fitted.plan.water.height_mm is None else ""
+    lens = unusual_lens(fitted.recording.camera) if water is None else ""
+    place = tracker.scene.floor.unusual(None if water is None else water.lift_mm)
     verdict = Verdict.of(
         tracked.track,
         whole,
@@ -309,7 +320,13 @@ def make_track(writer: SessionWriter, fitted: Fitted) -> Verdict:
             *files.rewritten(),
         ),
         n_animals=1 if fit is None else fit.n_animals,
-        cautions=(*fitted.notes, *tracker.scene.remarks, *files.grown(), *filter(None, [lens])),
+        cautions=(
+            *fitted.notes,
+            *tracker.scene.remarks,
+            *files.grown(),
+            *filter(None, [lens]),
+            *place,
+        ),
         accepted=fitted.plan.estimation.accept_misfit,
     )
     writer.take(tracked, whole, tracker.subject)

@@ -1,5 +1,5 @@
-"""ruff and mypy hold for the whole repository, and every function but a numba kernel states its
-types.
+"""ruff, mypy and bandit hold for the whole repository, and every function but a numba kernel
+states its types.
 """
 
 from __future__ import annotations
@@ -28,6 +28,13 @@ def test_ruff_finds_nothing() -> None:
 @pytest.mark.slow
 def test_mypy_finds_nothing() -> None:
     ran = run_module("mypy")
+    assert ran.returncode == 0, ran.stdout
+
+
+@pytest.mark.slow
+def test_bandit_finds_nothing_that_has_no_reason_beside_it() -> None:
+    rooms = ("liex_lab", "pipelines", "dashboards")
+    ran = run_module("bandit", "-q", "-c", "pyproject.toml", "-r", *rooms)
     assert ran.returncode == 0, ran.stdout
 
 

@@ -51,7 +51,8 @@ _INDEX = """<!doctype html>
 <body>{%app_entry%}<footer hidden>{%config%}{%scripts%}{%renderer%}</footer></body>
 </html>"""
 _SAVER = "liex_saver"
-_EVERYWHERE = ("", "0.0.0.0", "::")  # addresses to listen on that nobody can open
+# addresses to listen on that nobody can open
+_EVERYWHERE = ("", "0.0.0.0", "::")  # nosec B104: told apart, not listened on
 _POLICY = (
     "default-src 'none'; script-src 'self' {hashes}; style-src 'self' 'unsafe-inline'; img-src "
     "'self' data: blob:; connect-src 'self'; font-src 'self' data:; base-uri 'none'; form-action "

@@ -16,6 +16,7 @@ from .scene_marks import Mark, svg_marks
 
 Array = NDArray[np.float64]
 
+_MOST_PX = 320  # to a side: twice what the widest page shows
 _VIRIDIS = np.array(
     [
         [68, 1, 84],
@@ -60,7 +61,7 @@ def picture(
         uv - [left, top] + 0.5
     )  # the paper counts from the corner of the picture, we from a pixel's centre
     r = w / 70.0
-    parts = [f'<image href="{png_uri(shade(depth, reach_mm))}" width="{w}" height="{h}"/>']
+    parts = [f'<image href="{png_uri(_small(shade(depth, reach_mm)))}" width="{w}" height="{h}"/>']
     parts.append(svg_marks(marks, left, top, w, h, 0.9 * r, lettered=False))
     for a, b in bones:
         (x0, y0), (x1, y1) = points[a], points[b]
@@ -94,6 +95,18 @@ def shade(depth: NDArray[np.uint16], reach_mm: float) -> NDArray[np.uint8]:
     rgb = _VIRIDIS[low] + (at - low)[..., None] * (_VIRIDIS[low + 1] - _VIRIDIS[low])
     rgb[~read] = 90.0
     return rgb.astype(np.uint8)
+
+
+def _small(rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """A picture (h, w, 3) with at most so many pixels to a side as a page shows of it, averaged."""
+    import cv2
+
+    height, width, _ = rgb.shape
+    share = _MOST_PX / max(height, width)
+    if share >= 1.0:
+        return rgb
+    size = (round(share * width), round(share * height))
+    return np.asarray(cv2.resize(rgb, size, interpolation=cv2.INTER_AREA), np.uint8)
 
 
 def png_uri(rgb: NDArray[np.uint8]) -> str:

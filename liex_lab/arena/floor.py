@@ -11,6 +11,7 @@ camera's x.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -32,6 +33,9 @@ _MIN_SHARE = 0.2  # of the readable pixels must lie on the floor
 _MAX_TILT_DEG = 60.0
 # background this near to the plane is floor: flatness, noise and lens errors together
 _FLAT_MM = 15.0
+# what is said of a camera's place: beyond these no model has learned
+_PLAUSIBLE_MM = (150.0, 3000.0)
+_MUCH_TILT_RAD = math.radians(15.0)
 
 
 @dataclass(frozen=True)
@@ -96,6 +100,42 @@ class Floor:
         x = np.array([1.0, 0.0, 0.0]) - up[0] * up
         x = x / np.linalg.norm(x)
         return SE3(np.stack([x, np.cross(up, x), up]), np.array([0.0, 0.0, self.distance_mm]))
+
+    @property
+    def tilt_rad(self) -> float:
+        """Angle between the optical axis and the floor's perpendicular, rad."""
+        return math.acos(min(1.0, float(self.normal[2])))
+
+    def lens_distance_mm(self, lift_mm: Array | None = None) -> float:
+        """Distance of the plane from the real lens, mm.
+
+        Args:
+            lift_mm: see `unusual`.
+        """
+        up = 0.0 if lift_mm is None else float(lift_mm @ self.normal)
+        return self.distance_mm - up
+
+    def unusual(self, lift_mm: Array | None = None) -> list[str]:
+        """What is unlike the places of cameras that models learn from, a sentence each.
+
+        Args:
+            lift_mm: (3,) from the real lens to the camera's origin, mm, where water makes an ideal
+                camera of it; None without water.
+        """
+        found = []
+        distance = self.lens_distance_mm(lift_mm)
+        low, high = _PLAUSIBLE_MM
+        if not low <= distance <= high:
+            found.append(
+                f"the floor lies {distance:.0f} mm from the camera, outside the usual {low:.0f} to "
+                f"{high:.0f} mm; check the unit and the camera's height"
+            )
+        if self.tilt_rad > _MUCH_TILT_RAD:
+            found.append(
+                f"the camera looks down at {math.degrees(self.tilt_rad):.0f} degrees from "
+                "straight, and poses are learned up to 10; turn it to look straight down"
+            )
+        return found
 
     def depth(self, width: int, height: int) -> NDArray[np.float32]:
         """Depth of the bare floor under every pixel.

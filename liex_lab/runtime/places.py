@@ -11,7 +11,9 @@ from __future__ import annotations
 import hashlib
 import os
 import unicodedata
-from pathlib import Path, PurePosixPath
+from collections.abc import Mapping
+from pathlib import Path, PurePath, PurePosixPath
+from typing import Any
 
 from liex_lab.errors import PlaceError
 
@@ -141,6 +143,24 @@ def storable(text: str) -> str:
     """
     raw = text.replace("\0", "\ufffd").encode("utf-16", "surrogatepass")
     return raw.decode("utf-16", "replace")
+
+
+def storable_document(content: Any) -> Any:
+    """A document as files can hold it.
+
+    Args:
+        content: what becomes JSON: tables, lists and values in each other.
+
+    Returns:
+        The same with `storable` texts, keys and paths; numbers and the like are untouched.
+    """
+    if isinstance(content, str | PurePath):
+        return storable(str(content))
+    if isinstance(content, Mapping):
+        return {storable_document(key): storable_document(one) for key, one in content.items()}
+    if isinstance(content, list | tuple):
+        return [storable_document(one) for one in content]
+    return content
 
 
 def named_beside(text: str) -> bool:

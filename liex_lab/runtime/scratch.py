@@ -32,7 +32,8 @@ class Scratch:
         held: IO[bytes] | None = None
         while held is None:  # somebody who removes stale ones may be faster
             self.folder = Path(tempfile.mkdtemp(prefix=_PREFIX))
-            held = take_lock(self.folder / _LOCK)
+            with suppress(FileNotFoundError):
+                held = take_lock(self.folder / _LOCK)
         self._held = held
 
     def close(self) -> None:
@@ -42,10 +43,13 @@ class Scratch:
 
 
 def remove_stale() -> None:
-    """Remove this account's temporary folders whose processes are no more."""
+    """Remove this account's temporary folders whose processes are no more.
+
+    A process may be killed before it has locked its folder, or while it removes it.
+    """
     for folder in Path(tempfile.gettempdir()).glob(f"{_PREFIX}*"):
         with suppress(OSError, LiexError):
-            if folder.is_symlink() or not (folder / _LOCK).is_file() or not _own(folder):
+            if folder.is_symlink() or not _own(folder):
                 continue
             held = take_lock(folder / _LOCK)
             if held is not None:

@@ -13,7 +13,7 @@ from liex_lab.errors import LiexError
 from liex_lab.runtime.disk import is_full, why_full
 from liex_lab.runtime.durable import write_whole
 from liex_lab.runtime.limits import why_short
-from liex_lab.runtime.places import unlinked
+from liex_lab.runtime.places import storable_document, unlinked
 from liex_lab.sessions.provenance import versions
 
 FAILED_FILE = "failed.json"
@@ -72,7 +72,8 @@ def write_failure(folder: Path, failure: dict[str, Any]) -> None:
         failure: what `describe_failure` returned.
     """
     unlinked(folder).mkdir(parents=True, exist_ok=True)
-    write_whole(folder / FAILED_FILE, json.dumps(failure, indent=2, default=str) + "\n")
+    told = storable_document(failure)
+    write_whole(folder / FAILED_FILE, json.dumps(told, indent=2, default=str) + "\n")
 
 
 def read_failure(folder: Path) -> dict[str, Any] | None:

@@ -28,7 +28,7 @@ from liex_lab.errors import LiexError, SessionError
 from liex_lab.runtime.disk import is_full, probe_full, why_full
 from liex_lab.runtime.durable import put_in_place, sync_tree
 from liex_lab.runtime.memory import Allocator, on_disk, peak_memory_mb, rest
-from liex_lab.runtime.places import unlinked_tree
+from liex_lab.runtime.places import storable_document, unlinked_tree
 from liex_lab.sessions.buffer import Columnar, TrackBuffer, columns_of
 from liex_lab.sessions.checkpoint import LOGS, Checkpoint
 from liex_lab.sessions.corrections import FOLDER
@@ -385,7 +385,7 @@ class SessionWriter:
 
         Raises:
             SessionError: the recording holds no frame, the track is of other frames, a column is
-                not described, or a log could not be written.
+                not described, a log could not be written, or the disk had no room for the report.
         """
         from liex_lab.sessions.session import Session
 
@@ -434,17 +434,36 @@ class SessionWriter:
         made = corrections_for(self.path)
         if made is not None and made.parent != self.path:
             self.note(corrections_taken_from=made.parent.name)
-        text = json.dumps(self._document, indent=2, default=str, allow_nan=False)
+        document = storable_document(self._document)
+        text = json.dumps(document, indent=2, default=str, allow_nan=False)
         (self._folder / "session.json").write_text(text + "\n", encoding="utf-8")
         del rows, of_track
         self._rows = None  # the report reads the folder
         rest()
+        self._publish_with_report()
+        return Session.open(self.path)
+
+    def _publish_with_report(self) -> None:
+        """Put the session in its place, with its report or without.
+
+        A report can be made again; hours of tracking should not go with it.
+
+        Raises:
+            SessionError: the disk had no room for the report.
+        """
         try:
             if self._report is not None:
                 self._report(self._folder)
-        finally:  # a report can be made again; hours of tracking should not go with it
+        except BaseException as error:
+            full = full_disk(self._folder, error)
             self._publish()
-        return Session.open(self.path)
+            if full is None:
+                raise
+            raise SessionError(
+                f"{full}; the session {self.path} is whole but for its report: make room there, "
+                f"then make it with liex report {self.path} (in Python report_session)"
+            ) from error
+        self._publish()
 
     @property
     def _elapsed(self) -> float:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+import re
 import shutil
 import tempfile
 import time
@@ -12,7 +13,7 @@ from pathlib import Path
 
 from tests.campaign.commands import ENDED, Ended, measured, run
 from tests.campaign.runs import SAMPLE, whole_sessions
-from tests.campaign.small_disks import in_memory, resize, used
+from tests.campaign.small_disks import filled_after, in_memory, resize, used
 from tests.campaign.studies import study_file
 from tests.campaign.tally import Tally
 
@@ -20,6 +21,7 @@ LEVELS = (0.01, 0.02, 0.05, 0.10, 0.20, 0.50, 0.90)
 LATE_S = 10.0  # after as long as it takes with room, and so much more, it has ended
 _MB = 400
 _PAGE = 4096
+_AT_WORK = 0.6  # of the time that it usually takes
 Results = dict[str, bytes]
 
 
@@ -152,7 +154,8 @@ VERBS = (
 
 
 def disks(n: int, seed: int) -> Tally:
-    """Fill the disk under n commands; with room again, the same command does what it should.
+    """Fill the disk under n commands; with room again, the same command, or the one that was told,
+    does what it should.
 
     Args:
         n: commands.
@@ -195,11 +198,17 @@ def _tries(
         with in_memory(place, _MB) as disk:
             assert disk is not None
             verb.begin(disk, session)
-            resize(disk, used(disk) + max(room, _PAGE))
-            ended = run(*verb.arguments(disk, session))
+            full = used(disk) + max(room, _PAGE)
+            arguments = verb.arguments(disk, session)
+            if k // len(LEVELS) % 2:  # another program fills it while the command is at work
+                with filled_after(_AT_WORK * usual.seconds, disk, full):
+                    ended = run(*arguments)
+            else:
+                resize(disk, full)
+                ended = run(*arguments)
             wrong = _wrong(ended, verb.results(disk), expected, usual.seconds)
             resize(disk, _MB << 20)
-            again = run(*verb.arguments(disk, session), *_over(verb, ended))
+            again = run(*_as_told(ended) or (*verb.arguments(disk, session), *_over(verb, ended)))
             lost = ""
             if again.code not in ENDED or verb.results(disk) != expected:
                 lost = f"with room it ends with {again.code}: {again.said[-600:]}"
@@ -222,6 +231,12 @@ def _wrong(ended: Ended, found: Results, expected: Results, usual_s: float) -> s
     if any(content != expected.get(name) for name, content in found.items()):
         return "half a result lies where whole ones do"
     return "" if "liex:" in ended.said or "failed" in ended.said else "it did not say why"
+
+
+def _as_told(ended: Ended) -> list[str]:
+    """What a command said that should be typed once there is room; nothing: the same again."""
+    told = re.search(r"then make it with liex (report \S+)", ended.said)
+    return told[1].split() if told else []
 
 
 def _over(verb: Verb, ended: Ended) -> list[str]:

@@ -5,8 +5,9 @@ from __future__ import annotations
 import os
 import subprocess
 from collections.abc import Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
+from threading import Timer
 
 
 @contextmanager
@@ -47,3 +48,27 @@ def resize(disk: Path, n_bytes: int) -> None:
     """Give a disk in memory another size."""
     command = ["mount", "-o", f"remount,size={n_bytes}", str(disk)]
     subprocess.run(command, check=True, capture_output=True)
+
+
+@contextmanager
+def filled_after(seconds: float, disk: Path, n_bytes: int) -> Iterator[None]:
+    """A disk in memory that gets smaller within the block: as small as asked, or full.
+
+    Args:
+        seconds: after the block has begun.
+        disk: the disk.
+        n_bytes: its new size, if no more is in use by then.
+    """
+
+    def fill() -> None:
+        for _ in range(20):  # it grows meanwhile
+            with suppress(subprocess.CalledProcessError):
+                return resize(disk, max(n_bytes, used(disk)))
+
+    timer = Timer(seconds, fill)
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
+        timer.join()

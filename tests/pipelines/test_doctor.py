@@ -64,6 +64,7 @@ KEYS = [
     "animal_area_mm2",
     "animal_share",
     "animal_sits_still",
+    "session_mb",
     "arenas",
     "plan",
     "plan_says",

@@ -12,10 +12,12 @@ import numpy as np
 import pandas as pd
 import pytest
 from liex_lab.pipelines import session as job
+from liex_lab.pipelines.build import session_bytes
 
 from liex_lab.api import run_session
 from liex_lab.errors import EstimationError, PlanError, SessionError
 from liex_lab.plan import Plan
+from liex_lab.recordings import open_recording
 from liex_lab.recordings.frame import DepthFrame
 from liex_lab.recordings.recording import Recording
 from liex_lab.sessions import Session
@@ -286,3 +288,26 @@ def test_a_picture_that_is_written_to_during_the_run_is_a_reason_to_look_at_it(f
     verdict = Session.open(made).metadata["verdict"]
     assert verdict["look_at_it"]
     assert any(".png changed while the recording was measured" in r for r in verdict["reasons"])
+
+
+def test_a_recording_whose_name_is_no_text_is_measured_all_the_same(folder, tmp_path):
+    named = tmp_path / os.fsdecode(b"\xff\xfe day one")
+    shutil.copytree(folder, named)
+    made = run_session(
+        named, Plan.load("mouse").with_settings(["replay.depth=none"]), tmp_path / "out"
+    )
+    session = Session.open(made)
+    assert len(session.poses)
+    assert "day one" in session.metadata["input"]["path"]
+
+
+def test_the_room_that_a_session_takes_is_known_to_a_factor_of_two(folder, session):
+    size = sum(path.stat().st_size for path in session.path.rglob("*") if path.is_file())
+    with open_recording(folder) as recording:
+        told = session_bytes(
+            recording,
+            Plan.load("mouse"),
+            session.metadata["animal"]["spine_mm"],
+            session.metadata["camera"]["floor_distance_mm"],
+        )
+    assert 0.5 < told / size < 2.0

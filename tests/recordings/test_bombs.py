@@ -22,6 +22,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import tifffile
+from mcap.writer import Writer
 
 from liex_lab.catalog import MODELS
 from liex_lab.errors import LiexError, ModelError, RecordingError, StudyError
@@ -191,6 +192,18 @@ def test_a_view_that_never_ends_is_no_table_of_messages(name: str, tmp_path: Pat
                 base.execute(f"CREATE TABLE {table} ({columns})")
     base.close()
     bounded(lambda: open_recording(path), "not stored but worked out")
+
+
+def test_as_many_topics_as_a_file_can_number_are_told_as_fast_as_one(tmp_path: Path) -> None:
+    path = tmp_path / "many.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        schema = writer.register_schema("x", "jsonschema", b"{}")
+        for k in range((1 << 16) - 1):
+            writer.register_channel(f"/topic{k}", "json", schema)
+        writer.finish()
+    bounded(lambda: open_recording(path), "holds no depth pictures: its topics are /topic0 ")
 
 
 @pytest.mark.parametrize(

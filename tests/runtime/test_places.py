@@ -11,7 +11,13 @@ from hypothesis import strategies as st
 
 from liex_lab.errors import PlaceError
 from liex_lab.runtime.durable import replacing, write_whole
-from liex_lab.runtime.places import inside, safe_name, unlinked_below, unlinked_tree
+from liex_lab.runtime.places import (
+    inside,
+    safe_name,
+    storable_document,
+    unlinked_below,
+    unlinked_tree,
+)
 from tests.hostile_names import NAMES
 
 
@@ -40,6 +46,15 @@ def test_any_text_makes_a_name_that_stays_the_same_when_it_is_made_safe_again(
 def test_names_that_can_be_names_stay_as_they_are() -> None:
     for text in ("mouse_walk", "2026-08-21 cage 4", "sub-m01_ses-1", "Mäuse 🐁", "a.b", "CONTROL"):
         assert safe_name(text, ".liex") == f"{text}.liex"
+
+
+def test_a_document_holds_no_half_characters_wherever_they_stood() -> None:
+    path = Path(os.fsdecode(b"/data/\xff\xfe.mcap"))
+    told = storable_document({"a\udcff": [path, {"b": ("\0", 1.5, None, True)}], "c": "Mäuse 🐁"})
+    assert told == {
+        "a\ufffd": ["/data/\ufffd\ufffd.mcap", {"b": ["\ufffd", 1.5, None, True]}],
+        "c": "Mäuse 🐁",
+    }
 
 
 def test_two_texts_never_share_a_name() -> None:

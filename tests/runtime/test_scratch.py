@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 
 import pytest
@@ -41,7 +42,7 @@ def test_it_goes_when_it_is_closed(temporary: Path) -> None:
 def test_what_a_killed_process_left_goes_with_the_next_and_what_is_in_use_stays(
     temporary: Path,
 ) -> None:
-    (temporary / "liex-scratch-mine").mkdir()  # of somebody who has not locked it yet
+    (temporary / "liex-scratch-unlocked").mkdir()  # of somebody who was killed before
     (temporary / "other").write_text("kept")
     with subprocess.Popen([sys.executable, "-c", KEEPS], stdout=subprocess.PIPE, text=True) as one:
         assert one.stdout is not None
@@ -52,7 +53,26 @@ def test_what_a_killed_process_left_goes_with_the_next_and_what_is_in_use_stays(
         one.wait()
     assert (left / "big").is_file()
     Scratch().close()
-    assert {path.name for path in temporary.iterdir()} == {"liex-scratch-mine", "other"}
+    assert {path.name for path in temporary.iterdir()} == {"other"}
+
+
+def test_who_has_not_locked_its_folder_when_others_tidy_up_makes_another_one(
+    temporary: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    make = tempfile.mkdtemp
+    made: list[str] = []
+
+    def overtaken(prefix: str) -> str:
+        made.append(make(prefix=prefix))
+        if len(made) == 1:
+            remove_stale()
+        return made[-1]
+
+    monkeypatch.setattr(tempfile, "mkdtemp", overtaken)
+    scratch = Scratch()
+    assert len(made) == 2
+    assert [scratch.folder] == list(temporary.iterdir())
+    scratch.close()
 
 
 def test_a_link_with_such_a_name_is_left_alone(temporary: Path) -> None:

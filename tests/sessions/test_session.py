@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import os
 import resource
 import subprocess
 import sys
@@ -231,6 +233,19 @@ def test_a_broken_report_does_not_take_the_session_with_it(tmp_path):
     with pytest.raises(ValueError, match="no ink"):
         write(tmp_path / "circle.liex", MOUSE, report=broken)
     assert len(Session.open(tmp_path / "circle.liex").frames) == 30
+    assert [path.name for path in tmp_path.iterdir()] == ["circle.liex"]
+
+
+def test_a_disk_without_room_for_the_report_keeps_the_session_and_says_how_to_make_one(tmp_path):
+    def no_room(folder: Path) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(folder / "report.html"))
+
+    place = tmp_path / "circle.liex"
+    with pytest.raises(SessionError) as told:
+        write(place, MOUSE, report=no_room)
+    assert f"the disk that holds {tmp_path} is full" in str(told.value)
+    assert f"liex report {place}" in str(told.value)
+    assert len(Session.open(place).frames) == 30
     assert [path.name for path in tmp_path.iterdir()] == ["circle.liex"]
 
 

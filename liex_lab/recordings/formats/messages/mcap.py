@@ -330,8 +330,8 @@ class McapFile(MessageFile):
                 self._schemas.get(record.schema_id, "no schema"),
                 record.message_encoding,
             )
-            if self._by_id.setdefault(record.id, known) == known and known not in self.channels:
-                self.channels.append(known)
+            if self._by_id.setdefault(record.id, known) == known:
+                self.channels.setdefault(known)
         elif opcode == Opcode.METADATA:
             note = MetadataRecord.read(stream)
             if note.name == NOTES:

@@ -120,7 +120,8 @@ class MessageFile(ABC):
         size: its size, bytes.
         whole: True while it ends as it should and nothing in it was found damaged.
         parsed: False where messages were listed by an index, and only some of them looked at.
-        channels: all channels that were met.
+        channels: all channels that were met, each once, in order; as keys, for a file may name
+            thousands of them.
         notes: facts that the file states about itself.
         chunks: all chunks that were met, in file order.
         starts: where the records of chunks begin, as the file's own index says, in order.
@@ -138,12 +139,10 @@ class MessageFile(ABC):
         self.size = path.stat().st_size
         self.whole = True
         self.parsed = True
-        self.channels: list[Channel] = []
+        self.channels: dict[Channel, None] = {}
         self.notes: dict[str, str] = {}
         self.chunks: list[Chunk] = []
-        self.starts: list[
-            int
-        ] = []  # where the records of chunks begin, as the file's own index says, in order
+        self.starts: list[int] = []
         self._last_chunk: tuple[int, memoryview] = (-1, memoryview(b""))
 
     @abstractmethod

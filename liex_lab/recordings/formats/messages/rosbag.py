@@ -222,8 +222,8 @@ class BagFile(MessageFile):
         (number,) = _U32.unpack(header["conn"])
         topic = "/" + "/".join(part for part in header["topic"].decode().split("/") if part)
         channel = Channel(topic, _fields(data)["type"].decode(), "ros1")
-        if self._by_id.setdefault(number, channel) == channel and channel not in self.channels:
-            self.channels.append(channel)
+        if self._by_id.setdefault(number, channel) == channel:
+            self.channels.setdefault(channel)
 
 
 def _fields(header: memoryview) -> dict[str, bytes]:
@@ -277,7 +277,7 @@ class Db3File(MessageFile):
                 "SELECT id, name, type, serialization_format FROM topics"
             ).fetchall()
             by_id = {int(row[0]): Channel(*map(str, row[1:])) for row in rows}
-            self.channels = list(by_id.values())
+            self.channels = dict.fromkeys(by_id.values())
             (last,) = self._base.execute("SELECT max(id) FROM messages").fetchone()
             messages = self._base.execute(
                 "SELECT id, topic_id, timestamp FROM messages ORDER BY id"

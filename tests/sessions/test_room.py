@@ -1,0 +1,75 @@
+"""A session that the disk has by far no room for is refused before its first frame."""
+
+from __future__ import annotations
+
+import shutil
+from collections import namedtuple
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from liex_lab.errors import SessionError
+from liex_lab.sessions.older import part_folder
+from liex_lab.sessions.room import Shown, check_room, megabytes, needed_bytes
+
+Usage = namedtuple("Usage", "total used free")
+RNG = np.random.default_rng(3)
+NOISY = [RNG.normal(700.0, 3.0, (120, 160)).astype(np.uint16) for _ in range(2)]
+FLAT = [np.full((120, 160), 700, np.uint16)] * 2
+
+
+def free(monkeypatch: pytest.MonkeyPatch, size: int) -> None:
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: Usage(10**12, 10**12 - size, size))
+
+
+def test_more_of_the_depth_takes_more_room_and_noise_packs_badly() -> None:
+    noisy, flat = (Shown(1000, 5, 30.0, pictures) for pictures in (NOISY, FLAT))
+    sizes = [needed_bytes(noisy, kept) for kept in ("none", "animal", "arena", "all")]
+    assert sizes[0] < sizes[1] < sizes[3] < sizes[2]
+    assert needed_bytes(flat, "all") < 0.2 * needed_bytes(noisy, "all")
+
+
+def test_every_frame_takes_as_much_as_every_other_one() -> None:
+    ten, thousand, both = (
+        needed_bytes(Shown(n, 5, 30.0, NOISY)) for n in (10, 1000, 1010)
+    )  # and what is there once
+    once = needed_bytes(Shown(0, 5, 30.0, NOISY))
+    assert both - once == (ten - once) + (thousand - once)
+
+
+def test_a_full_disk_is_told_before_the_work_with_what_to_do(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    free(monkeypatch, 40_000_000)
+    with pytest.raises(SessionError) as told:
+        check_room(tmp_path / "new" / "walk.liex", 100_000_000)
+    assert "takes about 100.0 MB" in str(told.value)
+    assert f"the disk that holds {tmp_path} has 40.0 MB free" in str(told.value)
+    assert "--set replay.depth=" in str(told.value)
+    assert not (tmp_path / "new").exists()
+
+
+def test_an_estimate_that_may_be_too_large_refuses_nobody(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    free(monkeypatch, 60_000_000)
+    check_room(tmp_path / "walk.liex", 100_000_000)
+
+
+def test_what_was_written_before_an_interruption_is_not_asked_for_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    free(monkeypatch, 100_000)
+    place = tmp_path / "walk.liex"
+    part_folder(place).mkdir()
+    (part_folder(place) / "session.mcap").write_bytes(bytes(900_000))
+    check_room(place, 1_000_000)
+    (part_folder(place) / "session.mcap").write_bytes(bytes(100_000))
+    with pytest.raises(SessionError, match=r"takes about 0\.9 MB"):
+        check_room(place, 1_000_000)
+
+
+@pytest.mark.parametrize(("size", "said"), [(2_100_000, "2.1 MB"), (3.25e9, "3.2 GB")])
+def test_sizes_are_said_as_people_read_them(size: float, said: str) -> None:
+    assert megabytes(size) == said
