@@ -39,6 +39,7 @@ from .build import (
 )
 from .choice import USUAL, Fitted, fit_plan
 from .compiling import compile_ahead
+from .hashing import hashed_ahead
 from .regions import pinned
 from .shards import CHUNK, LENGTH, MEASURING, Shard, measure_shards
 from .workers import WorkerPool
@@ -115,6 +116,7 @@ def measure_session(
     ):
         from liex_lab.recordings.timestamps import unwritable_times
         from liex_lab.sessions import SessionWriter
+        from liex_lab.sessions.older import part_folder
 
         folder = folder or inside(Path(out), first.session.name or opened.name, ".liex")
         if told := unwritable_times(opened.times_ns):
@@ -123,7 +125,9 @@ def measure_session(
         compile_ahead(first.animal.skeleton, progress)
         progress(0, None, "learning the background, the floor and the animal's size")
         unnamed = None if plan else settings
-        fitted = fit_plan(opened, first, estimator, settings=unnamed, progress=progress)
+        with hashed_ahead(opened, part_folder(folder), progress) as hashed:
+            fitted = fit_plan(opened, first, estimator, settings=unnamed, progress=progress)
+            hashed()
         prepared = prepare(fitted, folder, started, progress)
         if pool is not None and isinstance(recording, str | Path):
             prepared.measure_by(pool, str(recording), progress)

@@ -67,7 +67,8 @@ def go_on(start, stop, scores, first, stay, leave, switch, value, came_from, sta
                 stayed[t, k] = True
             for s in range(first[k], last + 1):
                 fresh[s] += scores[t, k]
-        value[:] = fresh
+        for s in range(fresh.size):
+            value[s] = fresh[s]
 
 
 @njit(cache=True)
@@ -132,12 +133,15 @@ def probabilities(scores, first, stay, leave, switch, out):
                     fresh[s] = now[s - 1]
                 fresh[first[k]] = enter
                 fresh[last] += held
-            now[:] = fresh
+            for s in range(total):
+                now[s] = fresh[s]
         for k in range(n):
             for s in range(first[k], first[k + 1]):
                 now[s] *= like[k]
-        now /= now.sum()
-        ahead[t] = now
+        every = now.sum()
+        for s in range(total):
+            now[s] /= every
+            ahead[t, s] = now[s]
     back = np.ones(total)
     for t in range(m - 1, -1, -1):
         norm = 0.0
@@ -159,7 +163,9 @@ def probabilities(scores, first, stay, leave, switch, out):
             for s in range(first[k], last):
                 fresh[s] = back[s + 1] * like[k]
             fresh[last] = back[last] * like[k] * go[k] + end[k] * onward
-        back[:] = fresh / fresh.sum()
+        every = fresh.sum()
+        for s in range(total):
+            back[s] = fresh[s] / every
 
 
 @njit(cache=True)

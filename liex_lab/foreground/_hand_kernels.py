@@ -553,7 +553,8 @@ def extract_all(depths, n_things, sights, crops):
             sights.intrinsics[k],
             sights.along_axis,
         )
-        extract_one(depths[k], n_things, sight, crops, k)
+        # of one type: the loop's own number has two on the way, and all would be compiled twice
+        extract_one(depths[k], n_things, sight, crops, np.int64(k))
 
 
 @njit(cache=True)

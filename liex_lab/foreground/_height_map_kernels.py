@@ -108,7 +108,14 @@ def order_blobs(blobs, n_blobs, area, mm2_per_px):
             distances[slot] = np.inf
         else:
             n_near += 1
-    return np.argsort(distances), n_near
+    order = np.empty(n_blobs, np.int64)
+    for slot in range(n_blobs):  # by insertion, in the order of equals: they are few
+        place = slot
+        while place > 0 and distances[order[place - 1]] > distances[slot]:
+            order[place] = order[place - 1]
+            place -= 1
+        order[place] = slot
+    return order, n_near
 
 
 @njit(cache=True)
@@ -280,7 +287,9 @@ def extract_all(depths, limit, on_floor, area, n_things, parts, sight, crops):
         crops: `CropRows`, out.
     """
     for k in prange(depths.shape[0]):
-        extract_one(depths[k], limit, on_floor, area, n_things, parts, sight, crops, k)
+        # a number of one type: the loop's own has two on the way, and all would be compiled twice
+        row = np.int64(k)
+        extract_one(depths[k], limit, on_floor, area, n_things, parts, sight, crops, row)
 
 
 @njit(cache=True, parallel=True, nogil=True)
@@ -318,4 +327,5 @@ def extract_windows(depths, background, margin, area, n_things, sights, crops):
             sights.behind_mm[k],
             sights.smooth_mm[k],
         )
-        extract_one(depths[k], limit, everywhere, area[k], n_things, False, sight, crops, k)
+        row = np.int64(k)
+        extract_one(depths[k], limit, everywhere, area[k], n_things, False, sight, crops, row)

@@ -45,7 +45,13 @@ _RENDERED = "synthetic:"
 _RENDERER = "liex_lab.simulation.address"
 _MCAP = b"\x89MCAP0\r\n"
 _WITH_PATTERN = "images.folder.open_images"
-_WITH_TOPICS = ("messages.mcap.open_mcap", "messages.rosbag.open_bag")
+_WITH_TOPICS = (
+    "messages.mcap.open_mcap",
+    "messages.mcap_index.open_indexed",
+    "messages.rosbag.open_bag",
+)
+# what is damaged is refused when it is met, so nothing needs to be unpacked before
+_STRICTLY = {"messages.mcap.open_mcap": "messages.mcap_index.open_indexed"}
 _RAYTRIX = (
     "is in Raytrix's own format, which only the maker's licensed software reads; compute metric "
     "depth in RxLive, save "
@@ -82,11 +88,13 @@ class _How:
     topic: str | None
     progress: Progress
     pattern: str | None = None
+    strict: bool = False
 
     def open(self, where: str, path: Path) -> Recording:
         """By the function `where` of `formats`, as in "oni.reader.open_oni"; it brings its
         libraries when asked for.
         """
+        where = _STRICTLY.get(where, where) if self.strict else where
         module, name = where.rsplit(".", 1)
         opener = getattr(import_module(f"liex_lab.recordings.formats.{module}"), name)
         topic = (self.topic,) if where in _WITH_TOPICS else ()
@@ -120,7 +128,7 @@ def open_recording(
         topic: the depth topic to read of an MCAP file or a ROS bag with several of them.
         pattern: which pictures of a folder to take, as in `*.tif`, before a camera.toml.
         strict: refuse a recording that is cut short, instead of only saying so in `problems` and
-            `truncated`.
+            `truncated`. A part of an MCAP file that is damaged is refused when it is read.
         progress: told while an archive is unpacked or an index made.
 
     Returns:
@@ -132,7 +140,7 @@ def open_recording(
     """
     path = Path(path)
     try:
-        recording = _open(path, _How(camera, fps, topic, progress, pattern))
+        recording = _open(path, _How(camera, fps, topic, progress, pattern, strict))
     except OSError as error:
         raise RecordingError(
             f"{error.filename or path} cannot be read ({error.strerror or error}); check it"

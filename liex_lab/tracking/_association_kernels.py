@@ -179,10 +179,17 @@ def _keep_best(t, chains, n_beam, missed_cost):
             all_of[n, 1] = h
             costs[n] = cost[a, h] + missed_cost[t + 1] - missed_cost[a + 1]
             n += 1
-    order = np.argsort(costs[:n], kind="mergesort")
+    order = np.empty(n, np.int64)
+    for k in range(n):  # by insertion, in the order of equals: they are few, and most are sorted
+        place = k
+        while place > 0 and costs[order[place - 1]] > costs[k]:
+            order[place] = order[place - 1]
+            place -= 1
+        order[place] = k
     kept = min(n, size)
     for k in range(kept):
-        beam[k] = all_of[order[k]]
+        for i in range(2):
+            beam[k, i] = all_of[order[k], i]
     return kept
 
 

@@ -41,6 +41,23 @@ class Gains(NamedTuple):
     kalman_gain: Any
     rts_gain: Any
 
+    @classmethod
+    def blank(cls, n: int) -> Gains:
+        """Gains of three axes over n frames, not filled yet.
+
+        Args:
+            n: number of frames.
+        """
+        return cls(np.zeros((3, n)), np.zeros((3, n)), np.zeros((3, n, 2)), np.zeros((3, n, 2, 2)))
+
+    def axis(self, a: int) -> Gains:
+        """The gains of one of three axes; views.
+
+        Args:
+            a: number of the axis.
+        """
+        return Gains(*(values[a] for values in self))
+
 
 class Covariances(NamedTuple):
     """Covariances of a group's value and velocity over n frames.
@@ -55,23 +72,22 @@ class Covariances(NamedTuple):
     predicted: Any
     smoothed: Any
 
+    @classmethod
+    def blank(cls, n: int) -> Covariances:
+        """Covariances over n frames, not filled yet.
 
-@njit(cache=True)
-def blank_gains(n):
-    """The `Gains` (3, ...) of three axes over n frames, not filled yet."""
-    return Gains(np.zeros((3, n)), np.zeros((3, n)), np.zeros((3, n, 2)), np.zeros((3, n, 2, 2)))
-
-
-@njit(cache=True)
-def axis_gains(gain, a):
-    """The `Gains` of one of three axes; views."""
-    return Gains(gain.decay[a], gain.gain_dt[a], gain.kalman_gain[a], gain.rts_gain[a])
+        Args:
+            n: number of frames.
+        """
+        return cls(np.zeros((n, 2, 2)), np.zeros((n, 2, 2)), np.zeros((n, 2, 2)))
 
 
 @njit(cache=True)
-def blank_covariances(n):
-    """The `Covariances` over n frames, not filled yet."""
-    return Covariances(np.zeros((n, 2, 2)), np.zeros((n, 2, 2)), np.zeros((n, 2, 2)))
+def _copy(a, out):
+    """Out = a, both (k, l): an assignment of rows compiles to ten times as much."""
+    for i in range(out.shape[0]):
+        for k in range(out.shape[1]):
+            out[i, k] = a[i, k]
 
 
 @njit(cache=True)
@@ -122,7 +138,7 @@ def gains(times, r, q, tau, start, gain, covariances):
             p[0, 1] = 0.0
             p[1, 0] = 0.0
             p[1, 1] = 0.5 * q * tau
-            predicted[t] = p
+            _copy(p, predicted[t])
             kalman_gain[t, 0] = 1.0
             kalman_gain[t, 1] = 0.0
         else:
@@ -135,7 +151,7 @@ def gains(times, r, q, tau, start, gain, covariances):
             p[0, 1] = k * (b + g * c) + q * 0.5 * g * g
             p[1, 1] = k * k * c + q * 0.5 * tau * (1 - k * k)
             p[1, 0] = p[0, 1]
-            predicted[t] = p
+            _copy(p, predicted[t])
             s = p[0, 0] + r[t]
             kalman_gain[t, 0] = p[0, 0] / s
             kalman_gain[t, 1] = p[0, 1] / s
@@ -146,8 +162,8 @@ def gains(times, r, q, tau, start, gain, covariances):
                 p[0, 1] = (1 - k0) * p[0, 1]
                 p[0, 0] = (1 - k0) * p[0, 0]
                 p[1, 0] = p[0, 1]
-        filtered[t] = p
-    smoothed[n - 1] = filtered[n - 1]
+        _copy(p, filtered[t])
+    _copy(filtered[n - 1], smoothed[n - 1])
     for t in range(n - 2, start - 1, -1):
         k = decay[t + 1]
         g = gain_dt[t + 1]
@@ -163,7 +179,13 @@ def gains(times, r, q, tau, start, gain, covariances):
         rts_gain[t, 0, 1] = (u01 * m[0, 0] - u00 * m[0, 1]) / det
         rts_gain[t, 1, 0] = (u10 * m[1, 1] - u11 * m[1, 0]) / det
         rts_gain[t, 1, 1] = (u11 * m[0, 0] - u10 * m[0, 1]) / det
-        smoothed[t] = f + rts_gain[t] @ (smoothed[t + 1] - m) @ rts_gain[t].T
+        for i in range(2):
+            for j in range(2):
+                p[i, j] = smoothed[t + 1, i, j] - m[i, j]
+        back = rts_gain[t] @ p @ rts_gain[t].T
+        for i in range(2):
+            for j in range(2):
+                smoothed[t, i, j] = f[i, j] + back[i, j]
 
 
 @njit(cache=True)
@@ -254,8 +276,9 @@ def smooth_positions(times, y, r, known, start, process_variance, tau, out, spre
                 ahead[t],
                 m[t],
             )
-        state[t] = ahead[t]
-        p[t] = m[t]
+        for k in range(6):
+            state[t, k] = ahead[t, k]
+        _copy(m[t], p[t])
         if not known[t]:
             continue
         for i in range(3):
@@ -279,8 +302,9 @@ def smooth_positions(times, y, r, known, start, process_variance, tau, out, spre
                 p[t, j, i] = p[t, i, j]
     _rts_pass(times, tau, start, state, p, ahead, m)
     for t in range(n):
-        out[t] = state[max(t, start), :3]
-        spread[t] = p[max(t, start), :3, :3]
+        for k in range(3):
+            out[t, k] = state[max(t, start), k]
+        _copy(p[max(t, start)], spread[t])
 
 
 @njit(cache=True)
@@ -404,14 +428,15 @@ def smooth_rotations(y, known, start, gain, out, rate):
     w = np.empty(3)
     off = np.empty(3)
     ahead = np.empty((3, 3))
-    out[start] = y[start]
-    rate[start] = 0.0
+    _copy(y[start], out[start])
+    for k in range(3):
+        rate[start, k] = 0.0
     for t in range(start + 1, n):
         for k in range(3):
             w[k] = gain_dt[k, t] * rate[t - 1, k]
             rate[t, k] = decay[k, t] * rate[t - 1, k]
         _moved(out[t - 1], w, ahead)
-        out[t] = ahead
+        _copy(ahead, out[t])
         if known[t]:
             _between(ahead, y[t], off)
             for k in range(3):
@@ -423,7 +448,7 @@ def smooth_rotations(y, known, start, gain, out, rate):
     for t in range(n - 2, start - 1, -1):
         for k in range(3):
             w[k] = gain_dt[k, t + 1] * rate[t, k]
-        here[:] = out[t]
+        _copy(out[t], here)
         _moved(here, w, expected)
         _between(expected, out[t + 1], off)
         for k in range(3):
@@ -432,4 +457,4 @@ def smooth_rotations(y, known, start, gain, out, rate):
             rate[t, k] += rts_gain[k, t, 1, 0] * off[k] + rts_gain[k, t, 1, 1] * faster
         _moved(here, w, out[t])
     for t in range(start):
-        out[t] = out[start]
+        _copy(out[start], out[t])

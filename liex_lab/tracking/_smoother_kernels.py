@@ -1,12 +1,14 @@
 """Robust Kalman filter and RTS smoother of whole poses: Student-t errors by iterated reweighting.
 
-Four passes of the smoother of `_kalman_kernels` over all coordinates at once. After each, a frame t
-at the mean joint distance δ_t from the curve, in predicted errors, gets the weight w_t = (ν + 1) /
-(ν + δ_t^2), by which its measurement variance is divided (EM for the t distribution, Lange et al.
-1989), and is left out where δ_t is beyond the gate. Positions are those of the joints' middle, with
-an error ellipsoid aligned with the animal; the root is put where the middle requires it. In the
-code `degrees_of_freedom` is ν, `gate` the gate and `correlated_share` the correlated share, whose
-square is left out of the variance.
+`smoother` makes four passes of the smoother of `_kalman_kernels` over all coordinates at once, and
+these kernels do what lies between. After each pass a frame t at the mean joint distance δ_t from
+the curve, in predicted errors, gets the weight w_t = (ν + 1) / (ν + δ_t^2), by which its
+measurement variance is divided (EM for the t distribution, Lange et al. 1989), and is left out
+where δ_t is beyond the gate. Positions are those of the joints' middle, with an error ellipsoid
+aligned with the animal; the root is put where the middle requires it. In the code
+`degrees_of_freedom` is ν, `gate` the gate and `correlated_share` the correlated share, whose square
+is left out of the variance. A kernel that called all others would be compiled with each of them
+once more, for half a minute.
 """
 
 from __future__ import annotations
@@ -18,17 +20,6 @@ from numba import njit
 from numpy.typing import NDArray
 
 from liex_lab.body._kernels import place_joints
-from liex_lab.tracking._kalman_kernels import (
-    axis_gains,
-    blank_covariances,
-    blank_gains,
-    gains,
-    smooth_positions,
-    smooth_rotations,
-    smooth_values,
-)
-
-_PASSES = 4
 
 
 class Moves(NamedTuple):
@@ -90,123 +81,92 @@ class Spread(NamedTuple):
 
 
 @njit(cache=True)
-def smooth_poses(times, seen, error, known, body, length, moves, made, spread, used):
-    """Fill `made` and `spread` with the smoothed curve, and `used` with the frames that it goes by.
-
-    Where the gate leaves no frame at all, every measured one is used again. At least one frame must
-    be measured.
+def middles(joints, known, tip, middle, frame):
+    """Fill the joints' middle of each frame, and the animal's own frame where it was measured.
 
     Args:
-        times: (n,) s.
-        seen: measured poses of n frames, arena frame.
-        error: (n,) predicted mean joint error, mm.
+        joints: (n, J, 3) measured joints, mm.
         known: (n,) bool, measured.
-        body: `KinematicTree` of the skeleton.
-        length: spine length of the animal, mm.
-        moves: motion and error parameters.
-        made: output, smoothed poses.
-        spread: output, their posterior spread; without the correlated share.
-        used: (n,) bool output, frames within the gate.
+        tip: the joint at the other end than the base.
+        middle: (n, 3) output, mm.
+        frame: (n, 3, 3) output, columns along the animal, to its side, and up.
     """
-    n = error.size
-    n_joints = body.parents.size
-    weight = np.ones(n)
-    middle = np.empty((n, 3))
-    frame = np.empty((n, 3, 3))
-    for t in range(n):
-        used[t] = known[t]
+    n_joints = joints.shape[1]
+    for t in range(known.size):
         for k in range(3):
             total = 0.0
             for j in range(n_joints):
-                total += seen.joints[t, j, k]
+                total += joints[t, j, k]
             middle[t, k] = total / n_joints
         if known[t]:
-            _own_frame(seen.joints[t, body.tip] - seen.joints[t, 0], frame[t])
-    for again in range(_PASSES):
-        if again:
-            n_used = 0
-            for t in range(n):
-                if known[t]:
-                    off = 0.0
-                    for j in range(n_joints):
-                        apart = 0.0
-                        for k in range(3):
-                            apart += (seen.joints[t, j, k] - made.joints[t, j, k]) ** 2
-                        off += np.sqrt(apart) / n_joints
-                    off /= error[t]
-                    weight[t] = (moves.degrees_of_freedom + 1.0) / (
-                        moves.degrees_of_freedom + off * off
-                    )
-                    used[t] = off <= moves.gate
-                    n_used += used[t]
-            if n_used == 0:
-                used[:] = known
-        _pass(times, seen, middle, frame, error, weight, body, length, moves, made, spread, used)
+            _own_frame(joints[t, tip], joints[t, 0], frame[t])
 
 
 @njit(cache=True)
-def _pass(times, seen, middle, frame, error, weight, body, length, moves, made, spread, used):
-    """One filter and smoother pass, each measurement's variance divided by its weight."""
-    n = error.size
-    m = body.free.shape[0]
-    start = 0
-    while not used[start]:
-        start += 1
-    variance = np.full(n, np.inf)
-    r = np.zeros((n, 3, 3))
-    for t in range(n):
+def weigh(seen, made, error, known, degrees_of_freedom, gate, weight, used):
+    """Fill the weights of measurements by their distances from the curve; returns how many count.
+
+    Args:
+        seen: (n, J, 3) measured joints, mm.
+        made: (n, J, 3) joints of the curve, mm.
+        error: (n,) predicted mean joint error, mm.
+        known: (n,) bool, measured.
+        degrees_of_freedom: of the errors' t distribution.
+        gate: predicted errors beyond which a measurement does not count.
+        weight: (n,) output where known.
+        used: (n,) bool output where known, frames within the gate.
+    """
+    n_joints = seen.shape[1]
+    n_used = 0
+    for t in range(known.size):
+        if known[t]:
+            off = 0.0
+            for j in range(n_joints):
+                apart = 0.0
+                for k in range(3):
+                    apart += (seen[t, j, k] - made[t, j, k]) ** 2
+                off += np.sqrt(apart) / n_joints
+            off /= error[t]
+            weight[t] = (degrees_of_freedom + 1.0) / (degrees_of_freedom + off * off)
+            used[t] = off <= gate
+            n_used += used[t]
+    return n_used
+
+
+@njit(cache=True)
+def measured_spread(frame, error, weight, used, position_error, correlated_share, variance, r):
+    """Fill the variance of each measurement, and the covariance of its joints' middle.
+
+    Args:
+        frame: (n, 3, 3) the animal's own frames.
+        error: (n,) predicted mean joint error, mm.
+        weight: (n,) by which the variance is divided.
+        used: (n,) bool, frames within the gate.
+        position_error: (3,) over the predicted error, along the animal, to its side, up.
+        correlated_share: share of an error whose square is left out.
+        variance: (n,) output where used, mm^2.
+        r: (n, 3, 3) output, added to where used, mm^2.
+    """
+    for t in range(error.size):
         if used[t]:
-            variance[t] = (1.0 - moves.correlated_share**2) * error[t] ** 2 / weight[t]
+            variance[t] = (1.0 - correlated_share**2) * error[t] ** 2 / weight[t]
             for i in range(3):
                 for k in range(3):
                     for a in range(3):
                         r[t, i, k] += (
-                            frame[t, i, a]
-                            * frame[t, k, a]
-                            * variance[t]
-                            * moves.position_error[a] ** 2
+                            frame[t, i, a] * frame[t, k, a] * variance[t] * position_error[a] ** 2
                         )
-    out = np.empty((n, 3))
-    process_variance = moves.position_variance * length**2
-    smooth_positions(
-        times, middle, r, used, start, process_variance, moves.position_decay_s, out, spread.middle
-    )
-    gain = blank_gains(n)
-    first = axis_gains(gain, 0)
-    covariances = blank_covariances(n)
-    rate = np.zeros(n)
-    value = np.zeros(n)
-    for a in range(3):
-        of_axis = axis_gains(gain, a)
-        left = spread.turn[:, a]
-        _gains_of(times, variance, moves.turn[a], length, start, of_axis, covariances, left)
-    smooth_rotations(seen.rotation, used, start, gain, made.rotation, np.zeros((n, 3)))
-    for a in range(3):
-        of_axis = axis_gains(gain, a)
-        left = spread.bend[:, a]
-        _gains_of(times, variance, moves.bend[a], length, start, of_axis, covariances, left)
-    for i in range(m):
-        j, a = body.free[i]
-        measured = seen.angles[:, j, a].copy()
-        smooth_values(measured, used, start, axis_gains(gain, a), value, rate)
-        made.angles[:, j, a] = value
-    _gains_of(times, variance, moves.size, length, start, first, covariances, rate)
-    smooth_values(seen.log_scale, used, start, first, made.log_scale, rate)
-    _place(body, out, made)
 
 
 @njit(cache=True)
-def _gains_of(times, variance, moves, length, start, gain, covariances, left):
-    """The gains of a group with these `moves`, and its posterior variance (n,) into `left`."""
-    measured = (moves[0] / length) ** 2 * variance
-    gains(times, measured, moves[1], moves[2], start, gain, covariances)
-    for t in range(times.size):
-        left[t] = covariances.smoothed[max(t, start), 0, 0]
+def place_middles(body, middle, made):
+    """Put the poses where their joints' middles are.
 
-
-@njit(cache=True)
-def _place(body, middle, made):
-    """Put the poses where their joints' middles (n, 3) are."""
+    Args:
+        body: `KinematicTree` of the skeleton.
+        middle: (n, 3) mm.
+        made: `Poses` whose place and joints are filled.
+    """
     n_joints = body.parents.size
     made.place[:] = 0.0
     place_joints(
@@ -228,20 +188,34 @@ def _place(body, middle, made):
 
 
 @njit(cache=True)
-def _own_frame(along, out):
-    """A frame (3, 3), as columns: along the animal, to its side, and as far up as that leaves."""
-    length = np.sqrt(along[0] ** 2 + along[1] ** 2 + along[2] ** 2)
-    a = along / max(length, 1e-9)
-    side = np.array([-a[1], a[0], 0.0])
-    level = np.sqrt(side[0] ** 2 + side[1] ** 2)
+def _own_frame(tip, base, out):
+    """A frame (3, 3), as columns: from base to tip (3,), to its side, and as far up as that
+    leaves.
+    """
+    x = tip[0] - base[0]
+    y = tip[1] - base[1]
+    z = tip[2] - base[2]
+    length = max(np.sqrt(x**2 + y**2 + z**2), 1e-9)
+    x /= length
+    y /= length
+    z /= length
+    side_x = -y
+    side_y = x
+    level = np.sqrt(side_x**2 + side_y**2)
     if level < 1e-6:
-        side[0] = 0.0
-        side[1] = 1.0
+        side_x = 0.0
+        side_y = 1.0
         level = 1.0
-        a[0], a[1], a[2] = 0.0, 0.0, 1.0 if a[2] >= 0 else -1.0
-    side /= level
-    out[:, 0] = a
-    out[:, 1] = side
-    out[0, 2] = a[1] * side[2] - a[2] * side[1]
-    out[1, 2] = a[2] * side[0] - a[0] * side[2]
-    out[2, 2] = a[0] * side[1] - a[1] * side[0]
+        x, y, z = 0.0, 0.0, 1.0 if z >= 0 else -1.0
+    side_x /= level
+    side_y /= level
+    side_z = 0.0
+    out[0, 0] = x
+    out[1, 0] = y
+    out[2, 0] = z
+    out[0, 1] = side_x
+    out[1, 1] = side_y
+    out[2, 1] = side_z
+    out[0, 2] = y * side_z - z * side_y
+    out[1, 2] = z * side_x - x * side_z
+    out[2, 2] = x * side_y - y * side_x

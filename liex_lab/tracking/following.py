@@ -118,8 +118,8 @@ def _smoothed(seconds: Array, off: Array, error: Array, length: float, motion: M
         columns = [group] if group < 6 else range(group, n_coordinates, 3)
         if not off[:, columns].any():
             continue
-        gain = kernels.axis_gains(kernels.blank_gains(n), 0)
-        covariances = kernels.blank_covariances(n)
+        gain = kernels.Gains.blank(n).axis(0)
+        covariances = kernels.Covariances.blank(n)
         kernels.gains(seconds, share * variance, drive, decay_s, start, gain, covariances)
         for column in columns:
             value = np.zeros(n)

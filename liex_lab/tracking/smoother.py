@@ -22,10 +22,12 @@ from liex_lab.body.pose import Pose
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.geometry import SE3
 from liex_lab.runtime.shapes import check_shapes
+from liex_lab.tracking import _kalman_kernels as kalman
 from liex_lab.tracking import _smoother_kernels as kernels
 from liex_lab.tracking.observations import joints_of
 
 Array = NDArray[np.float64]
+_PASSES = 4
 
 
 @dataclass(frozen=True)
@@ -215,12 +217,124 @@ def smooth(
     )
     made = kernels.Poses(*(np.zeros(values.shape) for values in seen))
     spread = kernels.Spread(np.zeros((n, 3, 3)), np.zeros((n, 3)), np.zeros((n, 3)))
-    used = np.zeros(n, np.bool_)
-    tree = KinematicTree.of(skeleton)
-    length = float(length_mm)
-    moves = motion.packed
-    kernels.smooth_poses(seconds, seen, error_mm, known, tree, length, moves, made, spread, used)
+    smoother = _Smoother(seconds, seen, error_mm, known, KinematicTree.of(skeleton), motion.packed)
+    used = smoother.smooth(float(length_mm), made, spread)
     return _curve(seconds, error_mm, length_mm, motion, made, spread, used)
+
+
+@dataclass(frozen=True)
+class _Smoother:
+    """Measured poses of n frames, at least one of them measured, and what is known of their errors.
+
+    Attributes:
+        seconds: (n,) s.
+        seen: the measured poses, arena frame.
+        error: (n,) predicted mean joint error, mm.
+        known: (n,) measured.
+        body: kinematic tree of the skeleton.
+        moves: motion and error parameters.
+    """
+
+    seconds: Array
+    seen: kernels.Poses
+    error: Array
+    known: NDArray[np.bool_]
+    body: KinematicTree
+    moves: kernels.Moves
+
+    def smooth(
+        self, length: float, made: kernels.Poses, spread: kernels.Spread
+    ) -> NDArray[np.bool_]:
+        """Fill `made` with the smoothed curve, and `spread` with its spread less what is shared.
+
+        Where the gate leaves no frame at all, every measured one is used again.
+
+        Args:
+            length: spine length of the animal, mm.
+            made: output.
+            spread: output.
+
+        Returns:
+            (n,) the frames that the curve goes by.
+        """
+        n = len(self.error)
+        middle, frame, weight = np.empty((n, 3)), np.empty((n, 3, 3)), np.ones(n)
+        used = self.known.copy()
+        kernels.middles(self.seen.joints, self.known, self.body.tip, middle, frame)
+        for again in range(_PASSES):
+            if again and not kernels.weigh(
+                self.seen.joints,
+                made.joints,
+                self.error,
+                self.known,
+                self.moves.degrees_of_freedom,
+                self.moves.gate,
+                weight,
+                used,
+            ):
+                used[:] = self.known
+            self._pass(middle, frame, weight, length, made, spread, used)
+        return used
+
+    def _pass(
+        self,
+        middle: Array,
+        frame: Array,
+        weight: Array,
+        length: float,
+        made: kernels.Poses,
+        spread: kernels.Spread,
+        used: NDArray[np.bool_],
+    ) -> None:
+        """One filter and smoother pass, each measurement's variance divided by its weight."""
+        moves, seen, n = self.moves, self.seen, len(used)
+        start = int(used.argmax())
+        variance, r = np.full(n, np.inf), np.zeros((n, 3, 3))
+        kernels.measured_spread(
+            frame,
+            self.error,
+            weight,
+            used,
+            moves.position_error,
+            moves.correlated_share,
+            variance,
+            r,
+        )
+        out = np.empty((n, 3))
+        kalman.smooth_positions(
+            self.seconds,
+            middle,
+            r,
+            used,
+            start,
+            moves.position_variance * (length * length),
+            moves.position_decay_s,
+            out,
+            spread.middle,
+        )
+        gain, covariances = kalman.Gains.blank(n), kalman.Covariances.blank(n)
+        later = np.maximum(np.arange(n), start)
+
+        def fill(a: int, group: Array, left: Array | None = None) -> kalman.Gains:
+            """The gains of an axis whose moves these are, and its posterior variance."""
+            relative, axis = group[0] / length, gain.axis(a)
+            measured = relative * relative * variance
+            kalman.gains(self.seconds, measured, group[1], group[2], start, axis, covariances)
+            if left is not None:
+                left[:] = covariances.smoothed[later, 0, 0]
+            return axis
+
+        for a in range(3):
+            fill(a, moves.turn[a], spread.turn[:, a])
+        kalman.smooth_rotations(seen.rotation, used, start, gain, made.rotation, np.zeros((n, 3)))
+        bend = [fill(a, moves.bend[a], spread.bend[:, a]) for a in range(3)]
+        value, rate = np.zeros(n), np.zeros(n)
+        for j, a in self.body.free:
+            kalman.smooth_values(seen.angles[:, j, a].copy(), used, start, bend[a], value, rate)
+            made.angles[:, j, a] = value
+        size = fill(0, moves.size)
+        kalman.smooth_values(seen.log_scale, used, start, size, made.log_scale, rate)
+        kernels.place_middles(self.body, out, made)
 
 
 def _curve(

@@ -104,6 +104,7 @@ class FrameTracker:
         pose = estimates.chosen.pose.moved(scene.floor.T_arena_camera)
         crops = estimates.crops
         used = estimates.found
+        shown = sample if used.all() else sample[used]  # a copy of a hundred pictures
         camera_view = estimator.model.method.camera_view
         body = BodyResidual.fit(
             Surface.of(estimator.skeleton), pose[used], crops[used], scene, camera_view
@@ -118,14 +119,14 @@ class FrameTracker:
             camera_view and estimator.skeleton.is_chain
         ):  # one that stands on the floor is seen from above: it may rear
             ends = OcclusionCorrection.fit(
-                estimator.skeleton, scene, estimates.chosen.pose[used], crops[used], sample[used]
+                estimator.skeleton, scene, estimates.chosen.pose[used], crops[used], shown
             )
         fit = SampleFit.of(
-            int((sample > 0).any(axis=(1, 2)).sum()),
+            sum(bool(image.any()) for image in sample),
             size * home,
             estimates.chosen.error_mm[used],
             agreement,
-            _count(estimator, scene, sample[used], size, body, agreement, crops.n_blobs[used]),
+            _count(estimator, scene, shown, size, body, agreement, crops.n_blobs[used]),
         )
         origin = "plan" if spine_mm else "recording"
         return FrameTracker(

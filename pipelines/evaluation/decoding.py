@@ -52,10 +52,16 @@ _PROTOCOL = (
 )
 
 
-class _MoseqWriter(RecordingWriter):
+class MoseqWriter(RecordingWriter):
     """A MoSeq session: depth.dat, depth_ts.txt in milliseconds and metadata.json."""
 
     def __init__(self, path: Path, camera: Camera) -> None:
+        """Make the folder.
+
+        Args:
+            path: the folder, which must not exist.
+            camera: the camera of the frames, for camera.toml.
+        """
         super().__init__(path, camera)
         path.mkdir()
         size = [camera.width, camera.height]
@@ -66,7 +72,11 @@ class _MoseqWriter(RecordingWriter):
         self._stamps = (path / "depth_ts.txt").open("w", encoding="utf-8")
 
     def add(self, frame: DepthFrame) -> None:
-        """Append a frame: depth as little-endian uint16 mm, its time in ms."""
+        """Append a frame: depth as little-endian uint16 mm, its time in ms.
+
+        Args:
+            frame: the frame, depth (H, W) float32 mm.
+        """
         self._depth.write(frame.depth.astype("<u2").tobytes())
         self._stamps.write(f"{frame.time_ns / 1e6:.6f} 0\n")
 
@@ -74,7 +84,7 @@ class _MoseqWriter(RecordingWriter):
         """Nothing belongs at the end."""
 
     def release(self) -> None:
-        """Close both files."""
+        """Close both files; closing twice does no harm."""
         self._depth.close()
         self._stamps.close()
 
@@ -89,7 +99,7 @@ _FORMATS: dict[str, tuple[str, Callable[[Path, Camera], RecordingWriter], int]] 
         1,
     ),
     "png_folder": ("r", PictureFolderWriter, 6),
-    "moseq_dat": ("r", _MoseqWriter, 1),
+    "moseq_dat": ("r", MoseqWriter, 1),
     "oni_16zt": ("r.oni", OniRecordingWriter, 1),
 }
 
@@ -174,16 +184,32 @@ def _measure(
         with writer(path, camera) as out:
             for frame in _repeated(pictures, n_frames):
                 out.add(frame)
-        environment = os.environ | dict.fromkeys(_ONE_CORE, "1")
-        command = [sys.executable, "-c", _READ, str(path), str(n_repeats)]
-        ran = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
-        if ran.returncode:
-            raise LiexError(
-                f"reading {file} in a process of its own failed ({ran.stderr.strip()[-300:]}); "
-                "report this"
-            )
-        numbers: dict[str, float] = json.loads(ran.stdout)
-        return numbers
+        return read_alone(path, n_repeats)
+
+
+def read_alone(path: Path, n_repeats: int) -> dict[str, float]:
+    """Read a recording in a process of its own on one thread.
+
+    Args:
+        path: the recording.
+        n_repeats: how often it is read, the best counts.
+
+    Returns:
+        `frames_per_s`, `open_ms_per_frame` and `peak_mb`.
+
+    Raises:
+        LiexError: the process failed.
+    """
+    environment = os.environ | dict.fromkeys(_ONE_CORE, "1")
+    command = [sys.executable, "-c", _READ, str(path), str(n_repeats)]
+    ran = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    if ran.returncode:
+        raise LiexError(
+            f"reading {path.name} in a process of its own failed ({ran.stderr.strip()[-300:]}); "
+            "report this"
+        )
+    numbers: dict[str, float] = json.loads(ran.stdout)
+    return numbers
 
 
 def _repeated(pictures: NDArray[np.float32], n_frames: int) -> Iterator[DepthFrame]:

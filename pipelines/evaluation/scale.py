@@ -3,9 +3,10 @@
 `liex evaluate scale` writes virtual mice as 640 x 480 MCAP files and measures `liex run` on them:
 frames/s and ms a frame by stage, held against the bound of opening, decoding and writing alone; one
 recording's shards by one process and by two; a study by one Dask worker and by two (processes held
-on as many cores); and peak memory, MB, by length. Sessions per hour with up to 1,000 workers are
-simulated: measured times are drawn with replacement (a bootstrap), and sessions handed out one by
-one by a scheduler that spends its measured time on each (`ASSUMPTIONS`, `DEFINITIONS`).
+on as many cores); peak memory, MB, by length; and whole runs by kind of recording (`kinds`).
+Sessions per hour with up to 1,000 workers are simulated: measured times are drawn with replacement
+(a bootstrap), and sessions handed out one by one by a scheduler that spends its measured time on
+each (`ASSUMPTIONS`, `DEFINITIONS`).
 """
 
 from __future__ import annotations
@@ -32,6 +33,7 @@ from liex_lab.runtime.progress import Progress, silent
 from ..build import build_provenance, build_recording, build_tracker, kept_estimator
 from ..shards import CHUNK, Shard, measure_shards
 from ..workers import Done, Processes, Work, WorkerPool
+from . import kinds
 from .long_sessions import looped
 
 RunSession = Callable[..., Path]
@@ -88,23 +90,26 @@ def evaluate_scale(
         run: measures a recording, `liex_lab.api.run_session`.
         n_frames: frames of each virtual recording, 640 x 480; some shards long.
         minutes: lengths of recording whose memory is measured, minutes.
-        progress: told the stage, of five.
+        progress: told the stage, of six.
 
     Returns:
-        The measured numbers, `memory_mb_by_length`, `simulated_sessions_per_hour` by workers,
-        `assumptions`, `definitions` and `n_frames`.
+        The measured numbers, `kinds` (whole runs by kind of recording), `memory_mb_by_length`,
+        `simulated_sessions_per_hour` by workers, `assumptions`, `definitions` and `n_frames`.
     """
     with tempfile.TemporaryDirectory(prefix="liex-scale-") as scratch:
         folder = Path(scratch)
-        progress(0, 5, "making recordings")
+        (folder / "kinds").mkdir()
+        progress(0, 6, "running kinds of recordings")
+        by_kind = kinds.evaluate_kinds(n_frames, folder / "kinds")
+        progress(1, 6, "making recordings")
         recordings = [_recording(folder, k, n_frames) for k in range(2)]
-        progress(1, 5, "measuring the stages of a session")
+        progress(2, 6, "measuring the stages of a session")
         stages = _stages(run, recordings[0], folder)
-        progress(2, 5, "looking at one recording by one process and by two")
+        progress(3, 6, "looking at one recording by one process and by two")
         looking = _side_by_side(recordings[0], folder)
-        progress(3, 5, "measuring a study by one worker and by two")
+        progress(4, 6, "measuring a study by one worker and by two")
         workers = _workers(run, recordings, folder)
-        progress(4, 5, "measuring memory by length")
+        progress(5, 6, "measuring memory by length")
         memory = {f"{length:g} min": _memory(length, folder) for length in minutes}
     hour = [seconds * 3600 * _FPS / n_frames for seconds in workers["seconds_each"]]
     simulated = simulate(hour, workers["scheduler_s_per_session"])
@@ -112,10 +117,11 @@ def evaluate_scale(
         **stages,
         **looking,
         **workers["study"],
+        "kinds": by_kind,
         "memory_mb_by_length": memory,
         "simulated_sessions_per_hour": simulated,
         "assumptions": ASSUMPTIONS,
-        "definitions": DEFINITIONS,
+        "definitions": {**DEFINITIONS, "kinds": kinds.DEFINITIONS},
         "n_frames": n_frames,
     }
 

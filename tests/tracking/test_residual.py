@@ -15,7 +15,7 @@ from liex_lab.body.surface import Surface
 from liex_lab.foreground.background_segmenter import BackgroundSubtraction
 from liex_lab.geometry import SE3
 from liex_lab.optics.camera import Camera
-from liex_lab.tracking.residual import BodyResidual, render_crops
+from liex_lab.tracking.residual import BodyResidual, median_of, render_crops
 from tests.estimation.toy import CAMERA, FLOOR, SCENE, Toy, rendered, toy_mice
 
 LARGE = Camera(
@@ -138,3 +138,10 @@ def test_a_head_that_lies_too_low_is_told_though_the_trunk_fits(clean, surface):
     assert (right.part_mm >= right.residual_mm).all()
     assert np.median(wrong.part_mm) > 3.0
     assert np.median(wrong.residual_mm) < 0.4 * np.median(wrong.part_mm)
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 4, 9, 10, 1000, 1001])
+def test_the_median_by_selection_is_that_of_sorted_numbers(n):
+    rng = np.random.default_rng(n)
+    for values in (rng.normal(0.0, 1.0, n), rng.integers(0, 4, n).astype(float), np.zeros(n)):
+        assert median_of(values.copy()) == np.median(values)

@@ -9,6 +9,7 @@ from scipy.linalg import expm
 from liex_lab.geometry import so3
 from liex_lab.geometry._so3_kernels import exp_so3, log_so3
 from liex_lab.tracking import _kalman_kernels as kernels
+from liex_lab.tracking import _smoother_kernels as poses
 
 TIMES = np.cumsum([0.0, 0.03, 0.03, 0.1, 0.03, 0.03, 0.2, 0.03, 0.03])
 Q, FADE = 40.0, 0.3
@@ -17,7 +18,7 @@ Q, FADE = 40.0, 0.3
 def gains(times, r, q):
     """A group's gains and what is left: the first measured frame, gains; covariances."""
     n = len(times)
-    gain, covariances = kernels.axis_gains(kernels.blank_gains(n), 0), kernels.blank_covariances(n)
+    gain, covariances = kernels.Gains.blank(n).axis(0), kernels.Covariances.blank(n)
     start = int(np.argmax(np.isfinite(r)))
     kernels.gains(times, r, q, FADE, start, gain, covariances)
     return (start, gain), covariances.smoothed
@@ -135,3 +136,41 @@ def test_the_scalar_exponential_and_logarithm_are_those_of_the_geometry(angle):
     log_so3(rotation, back)
     np.testing.assert_allclose(so3.exp(back), rotation, atol=1e-12)
     np.testing.assert_allclose(np.linalg.norm(back), angle, atol=1e-7)
+
+
+def test_weights_are_those_of_a_t_distribution_and_the_gate_leaves_frames_out():
+    rng = np.random.default_rng(4)
+    seen = rng.normal(0.0, 3.0, (30, 5, 3))
+    made = seen + rng.normal(0.0, 1.0, seen.shape) * rng.uniform(0.1, 4.0, (30, 1, 1))
+    error, known = rng.uniform(0.5, 2.0, 30), rng.random(30) < 0.8
+    weight, used = np.ones(30), known.copy()
+    n_used = poses.weigh(seen, made, error, known, 4.0, 3.0, weight, used)
+    off = np.linalg.norm(seen - made, axis=2).mean(axis=1) / error
+    np.testing.assert_array_equal(used, known & (off <= 3.0))
+    np.testing.assert_allclose(weight, np.where(known, 5.0 / (4.0 + off**2), 1.0), rtol=1e-12)
+    assert 0 < n_used == used.sum() < known.sum()
+
+
+def test_what_is_measured_errs_along_the_animals_own_axes():
+    rng = np.random.default_rng(5)
+    joints, known = rng.normal(0.0, 30.0, (12, 4, 3)), rng.random(12) < 0.7
+    joints[:2, 3] = joints[:2, 0] + [[0.0, 0.0, 20.0], [0.0, 0.0, -20.0]]  # upright, either way
+    known[:2] = True
+    middle, frame = np.empty((12, 3)), np.empty((12, 3, 3))
+    poses.middles(joints, known, 3, middle, frame)
+    np.testing.assert_allclose(middle, joints.mean(axis=1), atol=1e-12)
+    along = joints[known, 3] - joints[known, 0]
+    along /= np.linalg.norm(along, axis=1, keepdims=True)
+    axes = frame[known]
+    np.testing.assert_allclose(axes[:, :, 0], along, atol=1e-12)
+    np.testing.assert_allclose(axes.mT @ axes, np.tile(np.eye(3), (len(axes), 1, 1)), atol=1e-12)
+    np.testing.assert_allclose(axes[:, 2, 1], 0.0, atol=1e-15)  # its side is level
+    error, weight, own = rng.uniform(1.0, 2.0, 12), rng.uniform(0.5, 2.0, 12), np.array([3, 2, 1.0])
+    variance, r = np.full(12, np.inf), np.zeros((12, 3, 3))
+    poses.measured_spread(frame, error, weight, known, own, 0.6, variance, r)
+    expected = 0.64 * error[known] ** 2 / weight[known]
+    np.testing.assert_allclose(variance[known], expected, rtol=1e-12)
+    by_hand = expected[:, None, None] * (axes @ np.diag(own**2) @ axes.mT)
+    np.testing.assert_allclose(r[known], by_hand, rtol=1e-9, atol=1e-12)
+    assert np.isinf(variance[~known]).all()
+    assert not r[~known].any()

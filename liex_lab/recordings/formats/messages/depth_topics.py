@@ -104,7 +104,7 @@ class _Topic:
         self.places.extend(message.place)
 
     def add_all(self, listed: Listed) -> None:
-        """Note messages that an index lists; their stamps are the times of logging.
+        """Note messages that an index lists.
 
         Args:
             listed: the messages.
@@ -113,9 +113,10 @@ class _Topic:
             DamagedMessage: a time is beyond the year 2116; the others are noted.
         """
         good = listed.log_time_ns < _LIMIT_NS
-        times = listed.log_time_ns[good].astype(np.int64).tobytes()
-        self.log_ns.frombytes(times)
-        self.stamp_ns.frombytes(times)
+        stamps = listed.log_time_ns if listed.stamp_ns is None else listed.stamp_ns
+        good &= (stamps < _LIMIT_NS) & (stamps > -_LIMIT_NS)
+        self.log_ns.frombytes(listed.log_time_ns[good].astype(np.int64).tobytes())
+        self.stamp_ns.frombytes(stamps[good].astype(np.int64).tobytes())
         self.places.frombytes(np.ascontiguousarray(listed.places[good], np.int64).tobytes())
         if not good.all():
             raise DamagedMessage("a message's time cannot be")
@@ -197,7 +198,15 @@ class _Frames:
     def _decode(self, data: memoryview) -> Depth | None:
         try:
             message = self._topic.parse(data)
-            assert isinstance(message, DepthMessage)
+        except _DAMAGE as error:
+            if self._file.parsed:
+                return None
+            raise RecordingError(
+                f"{self._file.path} is damaged ({error}); copy it again, or go on with what is "
+                "whole by adding --set recording.accept_truncated=true"
+            ) from None
+        assert isinstance(message, DepthMessage)
+        try:
             return decode(message, self._camera, self._step_mm, self._scale, self._unread)
         except _DAMAGE:
             return None

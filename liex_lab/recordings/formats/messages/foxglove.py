@@ -17,6 +17,7 @@ from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud as PointCloudMessage
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from google.protobuf.message import DecodeError
+from google.protobuf.timestamp_pb2 import Timestamp
 
 from liex_lab.recordings.formats.messages.messages import (
     Calibration,
@@ -31,6 +32,8 @@ from liex_lab.recordings.formats.messages.messages import (
 # foxglove.PackedElementField's NumericType: NumPy's name of it
 _FIELD_TYPES = {1: "<u1", 2: "<i1", 3: "<u2", 4: "<i2", 5: "<u4", 6: "<i4", 7: "<f4", 8: "<f8"}
 _SECOND = 10**9
+_STAMP = 1 << 3 | 2  # protobuf's key of field 1, the stamp, which has a length
+_ONE_BYTE = 127  # the largest length that is told in one byte
 
 
 def _raw_image(message: Any) -> RawPicture:
@@ -158,3 +161,23 @@ def _from_json(schema: str, data: memoryview) -> Message:
         return _READ[schema](_Json(json.loads(bytes(data))))
     except (ValueError, TypeError, OverflowError, RecursionError, binascii.Error) as error:
         raise DamagedMessage(str(error)) from None
+
+
+def stamp_in(head: memoryview) -> int | None:
+    """The stamp, ns, in the first bytes of a picture or cloud in protobuf.
+
+    It is the message's first field, and writers put it first.
+
+    Args:
+        head: the message's first bytes.
+
+    Returns:
+        The stamp; None where another field comes first, as in a message without a stamp.
+    """
+    if len(head) < 2 or head[0] != _STAMP or head[1] > min(_ONE_BYTE, len(head) - 2):
+        return None
+    try:
+        stamp = Timestamp.FromString(bytes(head[2 : 2 + head[1]]))
+    except DecodeError:
+        return None
+    return int(stamp.seconds) * _SECOND + int(stamp.nanos)

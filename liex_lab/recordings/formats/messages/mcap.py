@@ -53,8 +53,8 @@ _BLOCK = 1 << 20
 # chunks of so many bytes at most are unpacked before it is their turn
 _THREADS = 2
 _SMALL_CHUNK = 1 << 23
-_FACTS = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA)
-_LARGEST_FACT = 1 << 24  # bytes of one of them
+FACTS = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA)
+LARGEST_FACT = 1 << 24  # bytes of one of them
 DAMAGE = (
     McapError,
     KeyError,
@@ -126,6 +126,7 @@ class McapFile(MessageFile):
         self._by_id: dict[int, Channel] = {}
         self._schemas: dict[int, str] = {0: "no schema"}
         self.listed: list[tuple[int, int]] = []  # where the indexes of its chunks begin and end
+        self.n_messages: int | None = None  # in all chunks, as the file's own statistics say
         self._coming: dict[
             int, Future[bytes]
         ] = {}  # chunks that are being unpacked, by where their content begins
@@ -184,7 +185,7 @@ class McapFile(MessageFile):
             elif opcode == Opcode.CHUNK:
                 self._look_ahead(at, unpackers)
                 yield from self._walk_chunk(start, end - start, wanted)
-            elif opcode == Opcode.MESSAGE or (opcode in _FACTS and end - start <= _LARGEST_FACT):
+            elif opcode == Opcode.MESSAGE or (opcode in FACTS and end - start <= LARGEST_FACT):
                 data = memoryview(self.file.read(end - start))
                 yield from self._take(opcode, data, Place(-1, start, end - start), wanted)
             at = end
@@ -232,6 +233,7 @@ class McapFile(MessageFile):
         """
         self.starts = []
         self.listed = []
+        self.n_messages = None
         try:
             ending = self.size - _FOOTER.size - len(MAGIC)
             self.file.seek(max(0, ending))
@@ -247,7 +249,9 @@ class McapFile(MessageFile):
                 if kind == Opcode.CHUNK_INDEX:
                     self.listed.append((start, end))
                     self.starts.append(struct.unpack("<QQQ", self.file.read(24))[2])
-                elif kind in _FACTS and end - start <= _LARGEST_FACT:
+                elif kind == Opcode.STATISTICS:
+                    (self.n_messages,) = struct.unpack("<Q", self.file.read(8))
+                elif kind in FACTS and end - start <= LARGEST_FACT:
                     self._learn(kind, ReadDataStream(BytesIO(self.file.read(end - start))))
                 at = end
         except DAMAGE:
@@ -309,7 +313,7 @@ class McapFile(MessageFile):
                     head = MESSAGE.size
                     inner = Place(place.chunk, place.offset + head, place.length - head)
                     yield Envelope(channel, log_time_ns, inner, payload[head:])
-            elif opcode in _FACTS:
+            elif opcode in FACTS:
                 self._learn(opcode, ReadDataStream(BytesIO(payload)))
         except DAMAGE:
             self.whole = False

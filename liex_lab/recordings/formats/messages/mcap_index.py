@@ -1,14 +1,20 @@
-"""The pictures of a session's replay by the index of its MCAP file, without unpacking its chunks.
+"""MCAP files opened by their index, without unpacking their chunks.
 
-A recording from elsewhere is walked as a whole (`mcap`): it may be cut, and its messages bear the
-sensor's own stamps. A replay was written by this program, under the times of its frames, and holds
-almost as many bytes of still scene as frames; of an hour's, some pictures are wanted at once.
+`open_indexed` opens a recording. Record by record it is looked whether the file is whole and its
+index tells of every chunk and every message; of each picture only the beginning is unpacked, where
+the sensor's stamp is. Where anything is odd the file is walked as ever (`mcap`). A chunk is checked
+against its CRC-32 when a picture in it is read, and not before: that is for whoever refuses what is
+damaged (`open_recording(..., strict=True)`).
+
+`open_replay` opens the pictures of a session's replay. It was written by this program, under the
+times of its frames, and holds almost as many bytes of still scene as frames; of an hour's, some
+pictures are wanted at once. So its index is believed, and of a damaged one the rest is read.
 """
 
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from io import BytesIO
 from pathlib import Path
 
@@ -19,9 +25,13 @@ from mcap.records import ChunkIndex
 from numpy.typing import NDArray
 
 from liex_lab.errors import RecordingError
+from liex_lab.optics.camera import Lens
 from liex_lab.recordings.formats.messages.depth_topics import open_topic
 from liex_lab.recordings.formats.messages.mcap import (
     DAMAGE,
+    FACTS,
+    LARGEST_FACT,
+    MAGIC,
     MESSAGE,
     RECORD,
     McapFile,
@@ -34,7 +44,9 @@ from liex_lab.recordings.formats.messages.message_file import (
     Envelope,
     Listed,
     Place,
+    first_bytes,
 )
+from liex_lab.recordings.formats.messages.parsers import stamp_reader
 from liex_lab.recordings.recording import Recording
 from liex_lab.runtime.progress import Progress, silent
 
@@ -43,6 +55,34 @@ _LARGEST_INDEX = 1 << 26  # bytes of one
 _LARGEST_OFFSET = 1 << 40
 _INDEX = struct.Struct("<HI")  # of a message index: channel, bytes of its entries
 _ENTRY = np.dtype([("time_ns", "<u8"), ("offset", "<u8")])
+_HEAD = 512  # bytes of a message's record in which its stamp is
+# of the unpacked bytes; where so much has to be unpacked for the stamps, threads unpack all of it
+_WORTH_IT = 0.6
+
+
+def open_indexed(
+    path: Path,
+    camera: Lens | None = None,
+    fps: float | None = None,
+    progress: Progress = silent,
+    topic: str | None = None,
+) -> Recording:
+    """Open one depth topic of an MCAP file by its index, or as `open_mcap` does where it has none.
+
+    Args:
+        path: the .mcap file.
+        camera: comes before whatever the files state.
+        fps: not needed, for every message has its time.
+        progress: told how far the file was looked through.
+        topic: name of the depth topic; None for the only one.
+
+    Returns:
+        The recording. Reading a frame of it raises a `RecordingError` where its chunk is damaged.
+
+    Raises:
+        RecordingError: the file is no MCAP file, or holds no depth that can be chosen.
+    """
+    return open_topic(_Skimmed(path, open_file(path)), "mcap", camera, topic, progress)
 
 
 def open_replay(path: Path, progress: Progress = silent) -> Recording:
@@ -63,43 +103,14 @@ def open_replay(path: Path, progress: Progress = silent) -> Recording:
         ) from None
 
 
-class _Replay(McapFile):
-    """An MCAP file whose index is believed; one without an index is walked."""
+class _Indexed(McapFile):
+    """An MCAP file whose messages are found by its index.
 
-    def walk(self, wanted: Wanted, progress: Progress) -> Iterator[Envelope | Listed]:
-        """The messages of the wanted channels by chunk: the first of each channel with its data.
+    Attributes:
+        advice: what to do where a chunk of it is damaged.
+    """
 
-        Args:
-            wanted: says of a channel whether its messages are of use.
-            progress: told how many MB were walked over, where there is no index.
-
-        Yields:
-            The messages.
-        """
-        self._learn_ending()
-        try:
-            indexes = [ChunkIndex.read(self._stream(*place)) for place in self.listed]
-        except DAMAGE:
-            indexes = []
-        if not indexes or not all(index.message_index_length for index in indexes):
-            yield from super().walk(wanted, progress)
-            return
-        met = set[Channel]()
-        for index in sorted(indexes, key=lambda index: index.chunk_start_offset):
-            try:
-                parts = self._listed_in(index, wanted)
-            except (*DAMAGE, DamagedChunk):
-                self.whole = False
-                continue
-            for part in parts:
-                rest = part
-                if part.channel not in met and len(part.places):
-                    met.add(part.channel)
-                    place = Place(*part.places[0].tolist())
-                    yield Envelope(part.channel, int(part.log_time_ns[0]), place, self.read(place))
-                    rest = Listed(part.channel, part.log_time_ns[1:], part.places[1:])
-                if len(rest.places) and wanted(part.channel):
-                    yield rest
+    advice = ""
 
     def read(self, place: Place) -> memoryview:
         """The data of one message.
@@ -113,39 +124,45 @@ class _Replay(McapFile):
         if place.length != _UNTOLD:
             return super().read(place)
         try:
-            data = self.unpack(place.chunk)
+            return self._message(place)
+        except DamagedChunk as error:
+            raise RecordingError(f"{self.path} is damaged ({error}); {self.advice}") from None
+
+    def _message(self, place: Place) -> memoryview:
+        """The data of a message whose length only its chunk tells."""
+        data = self.unpack(place.chunk)
+        try:
             opcode, length = RECORD.unpack_from(data, place.offset)
-            begin = place.offset + RECORD.size
-            if opcode != Opcode.MESSAGE or not MESSAGE.size <= length <= len(data) - begin:
-                raise DamagedChunk("there is no message where its index says")
-        except (DamagedChunk, struct.error) as error:
-            raise RecordingError(
-                f"{self.path} is damaged ({error}); copy it again, or run `liex run` on its "
-                "recording"
-            ) from None
+        except struct.error:
+            opcode, length = 0, 0
+        begin = place.offset + RECORD.size
+        if opcode != Opcode.MESSAGE or not MESSAGE.size <= length <= len(data) - begin:
+            raise DamagedChunk("there is no message where its index says")
         return data[begin + MESSAGE.size : begin + length]
 
-    def _listed_in(self, index: ChunkIndex, wanted: Wanted) -> list[Listed]:
-        """The wanted messages of one chunk, by channel and in file order."""
+    def _take_chunk(self, index: ChunkIndex) -> int:
+        """Note a chunk; its number."""
         opcode, start, end = self._record(index.chunk_start_offset)
         if opcode != Opcode.CHUNK:
             raise DamagedChunk("there is no chunk where its index says")
-        number = len(self.chunks)
-        found = []
-        for channel_id, at in index.message_index_offsets.items():
-            channel = self._by_id[channel_id]
-            if not wanted(channel):
-                continue
-            kind, begin, stop = self._record(at)
-            if kind != Opcode.MESSAGE_INDEX:
-                raise DamagedChunk("there is no index where it should be")
-            table = self._message_index(begin, stop)
-            places = np.empty((len(table), 3), np.int64)
-            places[:] = number, 0, _UNTOLD
-            places[:, 1] = table["offset"]
-            found.append(Listed(channel, table["time_ns"], places))
         self.chunks.append(self._chunk(start, end - start))
-        return found
+        return len(self.chunks) - 1
+
+    def _listed(self, channel: Channel, at: int, number: int) -> Listed:
+        """The messages of a channel in a chunk, of the index at `at`, in file order."""
+        kind, begin, stop = self._record(at)
+        if kind != Opcode.MESSAGE_INDEX:
+            raise DamagedChunk("there is no index where it should be")
+        table = self._message_index(begin, stop)
+        places = np.empty((len(table), 3), np.int64)
+        places[:] = number, 0, _UNTOLD
+        places[:, 1] = table["offset"]
+        return Listed(channel, table["time_ns"], places)
+
+    def _indexes(self) -> list[ChunkIndex]:
+        """The indexes of its chunks, in file order."""
+        found = [ChunkIndex.read(self._stream(*place)) for place in self.listed]
+        return sorted(found, key=lambda index: index.chunk_start_offset)
 
     def _message_index(self, begin: int, stop: int) -> NDArray[np.void]:
         """Times and offsets of one channel's messages in a chunk, in file order.
@@ -171,3 +188,205 @@ class _Replay(McapFile):
             raise ValueError("an index is larger than its file")
         self.file.seek(start)
         return self.file.read(end - start)
+
+
+class _Skimmed(_Indexed):
+    """An MCAP file that is whole as its index says; one about which that is not sure is walked."""
+
+    advice = (
+        "copy it again, or go on with what is whole by adding --set recording.accept_truncated=true"
+    )
+
+    def walk(self, wanted: Wanted, progress: Progress) -> Iterator[Envelope | Listed]:
+        """The messages of the wanted channels by chunk: the first of each channel with its data.
+
+        Args:
+            wanted: says of a channel whether its messages are of use.
+            progress: told how many MB were looked through.
+
+        Yields:
+            The messages.
+        """
+        self._learn_ending()
+        indexes = self._whole_by_index(progress)
+        if not indexes:
+            yield from super().walk(wanted, progress)
+            return
+        self.parsed = False
+        met = set[Channel]()
+        for index in indexes:
+            try:
+                yield from self._skim(index, wanted, met)
+            except (*DAMAGE, DamagedChunk):
+                self.whole = False
+
+    def _skim(
+        self, index: ChunkIndex, wanted: Wanted, met: set[Channel]
+    ) -> Iterator[Envelope | Listed]:
+        """The wanted messages of one chunk; of channels met before with nothing but the stamps."""
+        number = self._take_chunk(index)
+        for channel_id, at in index.message_index_offsets.items():
+            channel = self._by_id[channel_id]
+            if not wanted(channel):
+                continue
+            listed = self._listed(channel, at, number)
+            stamps = self._stamps(listed, channel_id) if channel in met else None
+            if stamps is not None:
+                yield Listed(channel, listed.log_time_ns, listed.places, stamps)
+                continue
+            for time_ns, numbers in zip(
+                listed.log_time_ns.tolist(), listed.places.tolist(), strict=True
+            ):
+                if wanted(channel):
+                    met.add(channel)
+                    place = Place(*numbers)
+                    yield Envelope(channel, time_ns, place, self._message(place))
+
+    def _stamps(self, listed: Listed, channel_id: int) -> NDArray[np.int64] | None:
+        """Stamps (n,) of messages of one chunk, ns; None where their beginnings do not tell."""
+        read = stamp_reader(listed.channel)
+        if read is None:
+            return None
+        found = []
+        number = int(listed.places[0, 0]) if len(listed.places) else 0
+        heads = self._heads(number, listed.places[:, 1].tolist())
+        for time_ns, head in zip(listed.log_time_ns.tolist(), heads, strict=True):
+            opcode, length = RECORD.unpack_from(head)
+            whose, _, logged_ns, _ = MESSAGE.unpack_from(head, RECORD.size)
+            if opcode != Opcode.MESSAGE or (whose, logged_ns) != (channel_id, time_ns):
+                raise DamagedChunk("there is another message than its index says")
+            stamp_ns = read(head[RECORD.size + MESSAGE.size : RECORD.size + length])
+            if stamp_ns is None:
+                return None
+            found.append(stamp_ns)
+        return np.array(found, np.int64)
+
+    def _heads(self, number: int, offsets: Sequence[int]) -> list[memoryview]:
+        """The first bytes of the records at these offsets of a chunk."""
+        if not offsets:
+            return []
+        chunk = self.believable(number)
+        if chunk.packing in ("", "none"):
+            if chunk.length != chunk.size:
+                raise DamagedChunk("its parts do not fit into it")
+            places = [(chunk.offset + at, chunk.offset + chunk.length) for at in offsets]
+            return [memoryview(self._bytes(at, min(at + _HEAD, end))) for at, end in places]
+        need = min(offsets[-1] + _HEAD, chunk.size)
+        data = memoryview(first_bytes(self.file, chunk, need))
+        return [data[at : at + _HEAD] for at in offsets]
+
+    def _whole_by_index(self, progress: Progress) -> list[ChunkIndex]:
+        """The indexes of all chunks of a file that is whole as they say; none where that is not
+        sure, or where unpacking all is no more work.
+        """
+        try:
+            indexes = self._indexes()
+            by_start = {index.chunk_start_offset: index for index in indexes}
+            if len(by_start) == len(indexes) and self._agrees(by_start, progress):
+                return indexes if self._is_worth_it(indexes) else []
+        except (*DAMAGE, DamagedChunk):
+            pass  # the walk says what it finds
+        return []
+
+    def _agrees(self, by_start: dict[int, ChunkIndex], progress: Progress) -> bool:
+        """Whether the file's records are those that its index tells of, from its beginning to its
+        end.
+        """
+        at, n_messages = len(MAGIC), 0
+        unseen = dict(by_start)
+        expected = set[int]()  # where the indexes of the messages in the last chunk are
+        while at + RECORD.size <= self.size:
+            opcode, start, end = self._record(at)
+            if opcode in (0, Opcode.MESSAGE) or end > self.size:
+                return False
+            if opcode == Opcode.MESSAGE_INDEX:
+                if at not in expected:
+                    return False
+                expected.remove(at)
+                n_messages += (end - start - _INDEX.size) // _ENTRY.itemsize
+            elif expected:
+                return False
+            elif opcode == Opcode.CHUNK:
+                index = unseen.pop(at, None)
+                if index is None or index.chunk_length != end - at:
+                    return False
+                expected = set(index.message_index_offsets.values())
+            elif opcode in FACTS and end - start <= LARGEST_FACT:
+                self._learn(opcode, self._stream(start, end))
+            elif opcode == Opcode.FOOTER:
+                whole = end + len(MAGIC) <= self.size
+                known = {i for index in by_start.values() for i in index.message_index_offsets}
+                told = n_messages == self.n_messages and known <= set(self._by_id)
+                return whole and told and not unseen
+            at = end
+            progress(at >> 20, (self.size >> 20) + 1, "looking through the recording (MB)")
+        return False
+
+    def _is_worth_it(self, indexes: Sequence[ChunkIndex]) -> bool:
+        """Whether the stamps are in so few of the bytes that the rest need not be unpacked."""
+        size, needed = 1, 0
+        for index in indexes:
+            if index.compression in ("", "none"):
+                continue
+            size += index.uncompressed_size
+            last = 0
+            for at in index.message_index_offsets.values():
+                _, begin, stop = self._record(at)
+                offsets = self._message_index(begin, stop)["offset"]
+                last = max(last, int(offsets[-1]) + _HEAD if len(offsets) else 0)
+            needed += min(last, index.uncompressed_size)
+        return needed <= _WORTH_IT * size
+
+
+class _Replay(_Indexed):
+    """An MCAP file whose index is believed; one without an index is walked."""
+
+    advice = "copy it again, or run `liex run` on its recording"
+
+    def walk(self, wanted: Wanted, progress: Progress) -> Iterator[Envelope | Listed]:
+        """The messages of the wanted channels by chunk: the first of each channel with its data.
+
+        Args:
+            wanted: says of a channel whether its messages are of use.
+            progress: told how many MB were walked over, where there is no index.
+
+        Yields:
+            The messages.
+        """
+        self._learn_ending()
+        try:
+            indexes = self._indexes()
+        except DAMAGE:
+            indexes = []
+        if not indexes or not all(index.message_index_length for index in indexes):
+            yield from super().walk(wanted, progress)
+            return
+        met = set[Channel]()
+        for index in indexes:
+            try:
+                parts = self._listed_in(index, wanted)
+            except (*DAMAGE, DamagedChunk):
+                self.whole = False
+                continue
+            for part in parts:
+                rest = part
+                if part.channel not in met and len(part.places):
+                    met.add(part.channel)
+                    place = Place(*part.places[0].tolist())
+                    yield Envelope(part.channel, int(part.log_time_ns[0]), place, self.read(place))
+                    rest = Listed(part.channel, part.log_time_ns[1:], part.places[1:])
+                if len(rest.places) and wanted(part.channel):
+                    yield rest
+
+    def _listed_in(self, index: ChunkIndex, wanted: Wanted) -> list[Listed]:
+        """The wanted messages of one chunk, by channel and in file order."""
+        if self._record(index.chunk_start_offset)[0] != Opcode.CHUNK:
+            raise DamagedChunk("there is no chunk where its index says")
+        number = len(self.chunks)
+        found = [
+            self._listed(self._by_id[channel_id], at, number)
+            for channel_id, at in index.message_index_offsets.items()
+            if wanted(self._by_id[channel_id])
+        ]
+        self._take_chunk(index)
+        return found

@@ -24,6 +24,7 @@ from liex_lab.runtime.progress import Progress
 # A chunk is some megabytes. A damaged one may state any size, and a few bytes unpack to as many
 # zeros as one likes.
 _LARGEST_CHUNK = 1 << 27
+_PIECE = 1 << 15  # bytes of a packed chunk that are read at once where its beginning is wanted
 
 
 class Place(NamedTuple):
@@ -71,17 +72,19 @@ class Envelope(NamedTuple):
 
 
 class Listed(NamedTuple):
-    """Messages that an index lists: fetched when they are wanted, stamped with the time of logging.
+    """Messages that an index lists: fetched when they are wanted.
 
     Attributes:
         channel: topic, schema and encoding.
         log_time_ns: (n,) uint64 times of logging, ns.
         places: (n, 3) int64 chunk, offset and length of each, as a `Place`.
+        stamp_ns: (n,) int64 stamps of the sensor, ns; None takes the times of logging.
     """
 
     channel: Channel
     log_time_ns: NDArray[np.uint64]
     places: NDArray[np.int64]
+    stamp_ns: NDArray[np.int64] | None = None
 
 
 class Chunk(NamedTuple):
@@ -116,6 +119,7 @@ class MessageFile(ABC):
         file: the open file.
         size: its size, bytes.
         whole: True while it ends as it should and nothing in it was found damaged.
+        parsed: False where messages were listed by an index, and only some of them looked at.
         channels: all channels that were met, each once, in order; as keys, for a file may name
             thousands of them.
         notes: facts that the file states about itself.
@@ -134,6 +138,7 @@ class MessageFile(ABC):
         self.file = file
         self.size = path.stat().st_size
         self.whole = True
+        self.parsed = True
         self.channels: dict[Channel, None] = {}
         self.notes: dict[str, str] = {}
         self.chunks: list[Chunk] = []
@@ -210,13 +215,25 @@ class MessageFile(ABC):
             DamagedChunk: it states a size that cannot be, or does not unpack to what was packed.
         """
         if self._last_chunk[0] != number:
-            chunk = self.chunks[number]
-            if chunk.size > max(_LARGEST_CHUNK, 2 * self.size):
-                raise DamagedChunk(f"it states that it unpacks to {chunk.size} bytes")
+            chunk = self.believable(number)
             self.file.seek(chunk.offset)
             self._last_chunk = (-1, memoryview(b""))  # never two at once
             self._last_chunk = (number, memoryview(unpacked(self.file.read(chunk.length), chunk)))
         return self._last_chunk[1]
+
+    def believable(self, number: int) -> Chunk:
+        """A chunk whose stated size is one that it may have.
+
+        Args:
+            number: index into `chunks`.
+
+        Raises:
+            DamagedChunk: it states a size that cannot be.
+        """
+        chunk = self.chunks[number]
+        if chunk.size > max(_LARGEST_CHUNK, 2 * self.size):
+            raise DamagedChunk(f"it states that it unpacks to {chunk.size} bytes")
+        return chunk
 
     def close(self) -> None:
         """Close the file and let go of the last chunk."""
@@ -253,6 +270,41 @@ def unpacked(packed: bytes, chunk: Chunk) -> bytes:
         raise DamagedChunk(f"{len(data)} bytes came out of it and {chunk.size} went in")
     if chunk.crc and zlib.crc32(data) != chunk.crc:
         raise DamagedChunk("its checksum is wrong")
+    return data
+
+
+def first_bytes(file: IO[bytes], chunk: Chunk, size: int) -> bytes:
+    """The first bytes of a packed chunk; no more of it is unpacked than that takes, nor checked.
+
+    Args:
+        file: the open file.
+        chunk: what the file says of the chunk, packed by zstd or lz4.
+        size: how many unpacked bytes are wanted.
+
+    Returns:
+        The bytes.
+
+    Raises:
+        DamagedChunk: there are fewer, or it does not unpack.
+    """
+    file.seek(chunk.offset)
+    try:
+        if chunk.packing == "zstd":
+            import zstandard
+
+            unpacker = zstandard.ZstdDecompressor()
+            with unpacker.stream_reader(file, read_size=_PIECE, closefd=False) as reader:
+                data = reader.read(size)
+        else:
+            data = _inflate(file.read(chunk.length), chunk.packing, size)
+    except DamagedChunk:
+        raise
+    except Exception as error:
+        if why_short(error):
+            raise MemoryError(str(error)) from None
+        raise DamagedChunk(str(error)) from None
+    if len(data) < size:
+        raise DamagedChunk(f"{len(data)} bytes came out of it and {size} were expected")
     return data
 
 

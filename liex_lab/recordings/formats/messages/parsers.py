@@ -5,6 +5,8 @@ Foxglove's schemas go to `foxglove` (protobuf, JSON), ROS's to `ros` (ROS 1, CDR
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from liex_lab.recordings.formats.messages.message_file import Channel
 from liex_lab.recordings.formats.messages.messages import (
     CALIBRATION_SCHEMAS,
@@ -49,3 +51,27 @@ def parser_of(channel: Channel) -> Parser | None:
     from liex_lab.recordings.formats.messages import ros
 
     return ros.parser(schema, channel.encoding)
+
+
+def stamp_reader(channel: Channel) -> Callable[[memoryview], int | None] | None:
+    """The function that reads the sensor's stamp, ns, from the first bytes of a channel's messages.
+
+    It says what the channel's parser does of the whole message, or None where these bytes do not
+    tell.
+
+    Args:
+        channel: topic, schema and encoding.
+
+    Returns:
+        The function; None for messages that hold no depth, or whose beginning tells nothing.
+    """
+    schema = plain_schema(channel)
+    if schema not in (*PICTURE_SCHEMAS, *CLOUD_SCHEMAS):
+        return None
+    if schema.startswith("foxglove."):
+        from liex_lab.recordings.formats.messages import foxglove
+
+        return foxglove.stamp_in if channel.encoding == "protobuf" else None
+    from liex_lab.recordings.formats.messages import ros
+
+    return ros.stamp_reader(channel.encoding)

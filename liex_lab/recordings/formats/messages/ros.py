@@ -180,3 +180,26 @@ def parser(schema: str, encoding: str) -> Parser | None:
         return None
     read = _PARSERS[schema]
     return lambda data: read(layout(data))
+
+
+def stamp_reader(encoding: str) -> Callable[[memoryview], int | None] | None:
+    """The function that reads the stamp, ns, of a message that begins with a header.
+
+    Args:
+        encoding: "ros1" or "cdr".
+
+    Returns:
+        The function, which returns None where the header is longer than the bytes that it is given;
+        None for another encoding.
+    """
+    layout = _LAYOUTS.get(encoding)
+    if layout is None:
+        return None
+
+    def read(head: memoryview) -> int | None:
+        try:
+            return layout(head).header()[0]
+        except DamagedMessage:
+            return None
+
+    return read
