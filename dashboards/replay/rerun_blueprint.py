@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -82,6 +83,49 @@ def _followed(body_m: float, skeleton: str) -> Any:
     )
 
 
+def _zoomed(skeleton: str) -> Any:
+    """The cut-out around the animal with its skeleton's entity: it has a camera of its own, which
+    goes with the animal.
+    """
+    import rerun.blueprint as rrb
+
+    from liex_lab.sessions.rrd_depth import CUTOUTS
+
+    return rrb.Spatial2DView(
+        origin=f"{CUTOUTS}/1",
+        contents=["$origin/**", f"+ /{skeleton}/**"],
+        name="the animal, zoomed",
+    )
+
+
+def _over_time(at: Callable[[str], str], swims: bool) -> tuple[Any, Any]:
+    """The lanes of actions, and the curves below them with the list of moments.
+
+    Args:
+        at: the entity that is shown for one that was measured.
+        swims: whether it is a fish, whose tail is of interest and not its nose's height.
+    """
+    import rerun.blueprint as rrb
+
+    lanes = rrb.StateTimelineView(
+        origin=at("ethogram"), name="actions (predicted) and frames to distrust (tracking)"
+    )
+    shown = (
+        ["speed_mm_s", "bend_rad", "tail_beat_hz"] if swims else ["speed_mm_s", "nose_height_mm"]
+    )
+    curves = rrb.Horizontal(
+        *(rrb.TimeSeriesView(origin=at(f"kinematics/{name}"), name=_NAMES[name]) for name in shown),
+        rrb.TimeSeriesView(origin=at("error/predicted"), name="predicted error"),
+        rrb.TextLogView(
+            origin="log",
+            name="what to look at: click to jump there",
+            columns=rrb.TextLogColumns(timeline_columns=["time"], text_log_columns=["body"]),
+        ),
+        column_shares=[*(2.0 for _ in shown), 2.0, 2.4],
+    )
+    return lanes, curves
+
+
 def replay_blueprint(session: dict[str, Any]) -> Any:
     """A Rerun blueprint; handed to `SessionWriter` as `blueprint`.
 
@@ -94,7 +138,7 @@ def replay_blueprint(session: dict[str, Any]) -> Any:
     import rerun as rr
     import rerun.blueprint as rrb
 
-    from liex_lab.sessions.cutouts import N_BOXES
+    from liex_lab.sessions.cutouts import ANIMAL, N_BOXES
     from liex_lab.sessions.rrd import OVERLAY, SKELETON, corrected_entity
     from liex_lab.sessions.rrd_depth import CUTOUTS, cutout_frame
 
@@ -131,21 +175,11 @@ def replay_blueprint(session: dict[str, Any]) -> Any:
         overrides=in_picture,
         name="depth with the corrected skeleton" if corrected else "depth with the fitted skeleton",
     )
-    lanes = rrb.StateTimelineView(
-        origin=at("ethogram"), name="actions (predicted) and frames to distrust (tracking)"
-    )
-    swims = session["animal"]["joints"][0] == "head"
-    shown = (
-        ["speed_mm_s", "bend_rad", "tail_beat_hz"] if swims else ["speed_mm_s", "nose_height_mm"]
-    )
-    curves = rrb.Horizontal(
-        *(rrb.TimeSeriesView(origin=at(f"kinematics/{name}"), name=_NAMES[name]) for name in shown),
-        rrb.TimeSeriesView(origin=at("error/predicted"), name="predicted error"),
-        rrb.TextLogView(origin="log", name="what to look at: click to jump there"),
-        column_shares=[*(2.0 for _ in shown), 2.0, 1.6],
-    )
+    cut_out = session.get("plan", {}).get("replay", {}).get("depth") == ANIMAL
+    beside = rrb.Vertical(_zoomed(at(SKELETON)), picture) if cut_out else picture
+    lanes, curves = _over_time(at, swims=session["animal"]["joints"][0] == "head")
     return rrb.Blueprint(
-        rrb.Vertical(rrb.Horizontal(scene, picture), lanes, curves, row_shares=[5, 1.6, 2]),
+        rrb.Vertical(rrb.Horizontal(scene, beside), lanes, curves, row_shares=[5, 1.6, 2]),
         rrb.TimePanel(timeline="time", state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
         rrb.BlueprintPanel(state="collapsed"),

@@ -17,11 +17,13 @@ from liex_lab.dashboards.replay.rerun_blueprint import replay_blueprint
 from liex_lab.api import correct_session
 from liex_lab.sessions import Session
 from liex_lab.sessions.correcting import joint_move
+from tests.sessions.test_cutouts import written
 from tests.sessions.walking_mouse import WalkingMouse, steady, write
 
 MOUSE = WalkingMouse(steady(2.0), speed_mm_s=220.0)
 MOMENTS = (5, 50)
 Picture = np.ndarray
+NEAR_VIEW = np.s_[70:325, 965:1915]  # where the depth is that of cut-outs; whole pictures below
 DEPTH_VIEW = np.s_[
     70:620, 965:1915
 ]  # of a picture of 1920 x 1080 in our layout; Rerun's own crop of a view panics
@@ -49,7 +51,12 @@ def session(tmp_path_factory: pytest.TempPathFactory) -> Session:
 
 @pytest.fixture(scope="module")
 def pictures(session: Session) -> dict[int, Picture]:
-    """The picture of the depth view, RGB, at each moment; no view complains of anything."""
+    """The picture of the depth view, RGB, at each moment."""
+    return {moment: whole[DEPTH_VIEW] for moment, whole in looked_at(session).items()}
+
+
+def looked_at(session: Session) -> dict[int, Picture]:
+    """What the viewer shows at each moment, RGB; no view complains of anything."""
     from rerun.experimental import ViewerClient
 
     found = importlib.util.find_spec("rerun_cli")
@@ -74,7 +81,7 @@ def pictures(session: Session) -> dict[int, Picture]:
                     png = viewer.take_screenshot()
                     time.sleep(0.5)
                 whole = np.asarray(cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR))
-                taken[moment] = whole[DEPTH_VIEW][..., ::-1]
+                taken[moment] = whole[..., ::-1]
             complaints = [report for view in viewer.get_state().views for report in view.reports]
     assert not complaints
     return taken
@@ -84,6 +91,16 @@ def joints_in(picture: Picture) -> np.ndarray:
     """(H, W) where the joints' colour is."""
     red, green, blue = (picture[..., k].astype(int) for k in range(3))
     return (red > 200) & (green > 40) & (green < 130) & (blue < 110)
+
+
+def test_where_depth_is_cut_out_around_the_animal_it_is_zoomed_and_followed(tmp_path: Path) -> None:
+    session = written(tmp_path / "cut.liex", "animal", blueprint=replay_blueprint)
+    shown = looked_at(session)
+    for moment in MOMENTS:
+        near = joints_in(shown[moment][NEAR_VIEW])
+        assert near.sum() > 100
+        middle = np.argwhere(near).mean(axis=0) / near.shape
+        assert np.abs(middle - 0.5).max() < 0.2, "wherever it goes, it is in the middle"
 
 
 def test_the_two_moments_differ_where_the_animal_moved_and_the_skeleton_lies_on_it(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import struct
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -48,15 +49,15 @@ def observed(mouse: WalkingMouse) -> Observations:
 SEEN = observed(MOUSE)
 
 
-def written(folder: Path, depth: str) -> Session:
-    """A session that keeps so much of the depth."""
+def written(folder: Path, depth: str, **own: Any) -> Session:
+    """A session that keeps so much of the depth; `own` goes to its writer."""
     background = BACKGROUND if depth in ("animal", "arena") else None
     origin = MOUSE.provenance(
         replay_depth=depth,
         background=background,
         plan_toml=f'[replay]\ndepth = "{depth}"\n',
     )
-    with SessionWriter(folder, origin) as writer:
+    with SessionWriter(folder, origin, **own) as writer:
         done = 0
         for frames, track in MOUSE.chunks(20):
             writer.add(frames, track, SEEN[done : done + len(frames)])
