@@ -227,6 +227,18 @@ class StudyData:
                     return str(own["unit"].iloc[0] or ""), str(own["meaning"].iloc[0])
         return "", ""
 
+    def units(self) -> dict[str, str]:
+        """The unit of every measure, from the columns of one session; its others lack one."""
+        for entry in self.done:
+            columns = self._of_one("columns", lambda session: session.columns, entry)
+            if not isinstance(columns, dict):
+                own = columns[columns["table"] == "summary"]
+                return {
+                    str(name): unit if isinstance(unit, str) else ""
+                    for name, unit in zip(own["name"], own["unit"], strict=True)
+                }
+        return {}
+
     def _of_all(
         self, what: str, read: Callable[[Session], Any], entries: Sequence[Entry] | None = None
     ) -> list[Any]:

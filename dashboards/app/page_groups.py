@@ -34,6 +34,7 @@ def groups_page(data: StudyData) -> list[Any]:
     measures = list(columns_of(data))
     usual = [name for name in cohort.usual_measures(table) if name in measures]
     ordered = [*usual, *(name for name in measures if name not in usual)]
+    units = data.units()
     names = sorted({str(name) for name in table["group"].fillna("")} - {""})
     if not ordered or len(names) < 2:
         said = f"{len(table)} measured sessions have {', '.join(names) or 'no group'}"
@@ -57,7 +58,7 @@ def groups_page(data: StudyData) -> list[Any]:
                         dcc.Dropdown(
                             id="measure",
                             options=[
-                                {"label": titled(name, data.described(name)[0]), "value": name}
+                                {"label": titled(name, units.get(name, "")), "value": name}
                                 for name in ordered
                             ],
                             value=ordered[0],

@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 import os
+import socket
 import subprocess
 import sys
 import tempfile
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Annotated, Literal
+from urllib.parse import quote
 
 import typer
 
 from liex_lab.cli.options import SessionPath, say
 from liex_lab.errors import LiexError
 from liex_lab.runtime.progress import progress_bar
+
+_HERE = "127.0.0.1"
 
 
 def show(
@@ -74,11 +79,16 @@ def _show(replay: Path, more: list[Path], at_s: float | None, web: bool) -> None
         return
     # RERUN_ANALYTICS: what a laboratory looks at is nobody else's business; the viewer in a browser
     # does not heed it
+    hosted: list[str] = []
     if web:
         say(
             "Rerun's viewer in the browser calls tel.rerun.io, its makers' count of uses; the "
             "window does not"
         )
+        page, data = _free_ports(2)
+        source = quote(f"rerun+http://{_HERE}:{data}/proxy", safe="")
+        say(f"replay: http://{_HERE}:{page}?url={source}   (Ctrl+C ends it)")
+        hosted = ["--web-viewer", "--web-viewer-port", str(page), "--port", str(data)]
     shown = [str(file) for file in replays_with(replay, more)]
     command = [
         sys.executable,
@@ -86,9 +96,18 @@ def _show(replay: Path, more: list[Path], at_s: float | None, web: bool) -> None
         "rerun",
         *shown,
         "--bind",
-        "127.0.0.1",
-        *(["--web-viewer"] if web else []),
+        _HERE,
+        *hosted,
     ]
-    raise typer.Exit(
-        subprocess.run(command, env={**os.environ, "RERUN_ANALYTICS": "0"}, check=False).returncode
-    )
+    quiet = {"RUST_LOG": "warn"} if web else {}  # its own lines would hide the address
+    around = {**quiet, **os.environ, "RERUN_ANALYTICS": "0"}
+    raise typer.Exit(subprocess.run(command, env=around, check=False).returncode)
+
+
+def _free_ports(n: int) -> list[int]:
+    """Ports of this machine that nobody listens at."""
+    with ExitStack() as held:
+        sockets = [held.enter_context(socket.socket()) for _ in range(n)]
+        for one in sockets:
+            one.bind((_HERE, 0))
+        return [int(one.getsockname()[1]) for one in sockets]
