@@ -60,8 +60,8 @@ class ProcessNoise:
         """The parameters of an animal.
 
         A fish goes and turns three times as far, by its length, between two frames as a mouse.
-        Those of the paper's variant were searched on sequences to develop on (`liex train tracking
-        --particles`).
+        Those of the paper's variant are what `liex train tracking --particles` found on sequences
+        to develop on, where it was run, see `searched`.
 
         Args:
             name: name of the skeleton; 'fish' has its own, all others the default.
@@ -73,6 +73,17 @@ class ProcessNoise:
         """
         own = ProcessNoise(turn_rad=0.45, shift_mm=12.0) if name == "fish" else ProcessNoise()
         return _SEARCHED.get((name, variant, base_rounds), own)
+
+    @staticmethod
+    def searched(name: str, variant: str, base_rounds: int) -> bool:
+        """Whether the parameters of an animal and a variant were searched, and not set by hand.
+
+        Args:
+            name: name of the skeleton.
+            variant: whose regressors and metric are used.
+            base_rounds: rounds of the base joint.
+        """
+        return (name, variant, base_rounds) in _SEARCHED
 
 
 # by animal, variant and rounds of the base joint

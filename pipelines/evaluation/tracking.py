@@ -147,7 +147,7 @@ def evaluate_tracking(
         "protocol": TRACKING_PROTOCOL,
     }
     if paper:
-        result["notes"] = [comparison(table)]
+        result["notes"] = [comparison(table, estimator.skeleton.name)]
     if draw is not None:
         draw(measured[0].sequence, measured[0].rows)
     return result

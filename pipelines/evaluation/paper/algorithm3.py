@@ -10,7 +10,7 @@ whether the base's regressors run after its Brownian step, so there are two rows
 
 The paper leaves the process noise open. `search_noise` finds it on sequences to develop on, which
 are those of the tracker's own search (seeds 101 to 108) and none that is reported;
-`ProcessNoise.of` holds what it found.
+`ProcessNoise.of` holds what it found, where it was run.
 """
 
 from __future__ import annotations
@@ -148,11 +148,12 @@ def _followed(
     )
 
 
-def comparison(rows: Mapping[str, Mapping[str, Any]]) -> str:
-    """A sentence on whether the paper's gain by tracking is seen in measured rows.
+def comparison(rows: Mapping[str, Mapping[str, Any]], animal: str) -> str:
+    """Sentences on whether the paper's gain by tracking is seen in measured rows.
 
     Args:
         rows: figures by row, `PAPER_ROWS` among them.
+        animal: name of the skeleton.
     """
     published = " to ".join(f"{value:.2f}" for value in PUBLISHED_MM.values())
     alone = rows[SINGLE].get("mean_joint_error_mm", np.nan)
@@ -164,10 +165,17 @@ def comparison(rows: Mapping[str, Mapping[str, Any]]) -> str:
         for name, value in tracked.items()
     )
     gain = "is reproduced" if min(ratio.values()) < 1.0 else "is not reproduced"
+    if all(ProcessNoise.searched(animal, "paper", n) for n in BASE_ROUNDS.values()):
+        noise = "Its process noise was searched on other sequences."
+    else:
+        noise = (
+            "Its process noise is set by hand and was not searched for these parts; "
+            f"`liex train tracking --particles --animal {animal}` does."
+        )
     return (
         f"In the paper tracking lowers the error of real mice from {published} mm. With the parts "
         f"of the paper's variant, on this rendered sequence, single frames have {alone:.2f} mm and "
-        f"Algorithm 3 {said}: the paper's gain {gain} here."
+        f"Algorithm 3 {said}: the paper's gain {gain} here. {noise}"
     )
 
 

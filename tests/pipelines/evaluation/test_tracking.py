@@ -20,6 +20,7 @@ from liex_lab.pipelines.evaluation.tracking import evaluate_tracking
 
 from liex_lab.estimation.estimator import PoseEstimator
 from liex_lab.runtime.progress import silent
+from liex_lab.tracking import particles
 from liex_lab.tracking.particles import ProcessNoise
 from tests.estimation.toy import trained
 
@@ -73,7 +74,8 @@ def test_whether_the_paper_s_gain_is_seen_follows_from_the_numbers():
             {
                 row: {"mean_joint_error_mm": error, "ratio_to_single": error / errors[0]}
                 for row, error in zip(PAPER_ROWS, errors, strict=True)
-            }
+            },
+            "mouse",
         )
 
     assert "is not reproduced here" in told(4.0, 9.0, 4.4)
@@ -81,7 +83,20 @@ def test_whether_the_paper_s_gain_is_seen_follows_from_the_numbers():
     assert "9.00 mm with no base rounds (ratio 2.25)" in told(4.0, 9.0, 3.6)
     assert "3.60 mm with 1 base round (ratio 0.90)" in told(4.0, 9.0, 3.6)
     lost = {row: {"lost_rate": 1.0} for row in PAPER_ROWS}
-    assert "is not reproduced" in comparison({**lost, PAPER_ROWS[0]: {"mean_joint_error_mm": 4.0}})
+    lost[PAPER_ROWS[0]] = {"mean_joint_error_mm": 4.0}
+    assert "is not reproduced" in comparison(lost, "mouse")
+
+
+def test_noise_that_nobody_searched_is_not_said_to_be_searched(monkeypatch):
+    rows = {row: {"mean_joint_error_mm": 4.0, "ratio_to_single": 1.0} for row in PAPER_ROWS}
+    found = {("mouse", "paper", n): ProcessNoise(sigma_mm=3.0) for n in (0, 1)}
+    for known in ({}, dict(list(found.items())[:1])):
+        monkeypatch.setattr(particles, "_SEARCHED", known)
+        assert "set by hand and was not searched" in comparison(rows, "mouse")
+    monkeypatch.setattr(particles, "_SEARCHED", found)
+    assert "was searched on other sequences" in comparison(rows, "mouse")
+    assert ProcessNoise.of("mouse", "paper", 1) == ProcessNoise(sigma_mm=3.0)
+    assert "set by hand" in comparison(rows, "fish")
 
 
 def test_the_noise_is_searched_downhill_and_no_setting_is_tried_twice():
