@@ -143,7 +143,7 @@ def _as_moseq(recording: Recording, place: Path) -> Path:
             writer.add(frame)
     (folder / "camera.toml").rename(place / "camera.toml")
     packed = place / "session_walk.tar.gz"
-    with tarfile.open(packed, "w:gz") as archive:
+    with tarfile.open(packed, "w:gz", compresslevel=6) as archive:  # as tar does
         for file in sorted(folder.iterdir()):
             archive.add(file, file.name)
     shutil.rmtree(folder)
