@@ -23,6 +23,7 @@ from liex_lab.runtime.scratch import Scratch
 from liex_lab.sessions.failure import describe_failure
 
 from ..workers import Done, Work, n_cores, worker_environment
+from .cluster_watch import KeptWorkers
 from .one_session import RunSession, measure_one, quarantine
 from .slurm import SlurmTable
 from .slurm_jobs import KeptJobs
@@ -253,7 +254,9 @@ def _client(
         )
         stack.enter_context(cluster)
         client = stack.enter_context(Client(cluster, set_as_default=False))
-        if slurm:
+        if not slurm:
+            stack.enter_context(KeptWorkers(client, cluster))
+        else:
             n_jobs = min(slurm.jobs, n_tasks)  # a job is one worker
             cluster.scale(n_jobs)
             stack.enter_context(KeptJobs(client, cluster, n_jobs, slurm.log_folder))
@@ -270,7 +273,7 @@ def _end_workers(cluster: Any) -> None:
     and a session goes on from its checkpoint either way.
     """
     for nanny in cluster.workers.values():
-        nanny.auto_restart = False
+        nanny.close_gracefully()  # or it would start another one
         if nanny.pid:
             with suppress(ProcessLookupError):
                 os.kill(nanny.pid, signal.SIGKILL)

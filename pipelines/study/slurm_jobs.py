@@ -8,12 +8,10 @@ queue is looked at while sessions are left.
 from __future__ import annotations
 
 import subprocess
-import threading
 from collections.abc import Callable
-from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
-from liex_lab.errors import StudyError
+from .cluster_watch import Watch
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -40,12 +38,8 @@ def queued() -> set[str] | None:
     return set(told.stdout.split())
 
 
-class KeptJobs:
-    """Within the block, as many jobs as sessions are left, but not more than were asked for.
-
-    Attributes:
-        gave_up: why no further job is asked for; empty while there is no reason.
-    """
+class KeptJobs(Watch):
+    """Within the block, as many jobs as sessions are left, but not more than were asked for."""
 
     def __init__(
         self,
@@ -64,44 +58,12 @@ class KeptJobs:
             log_folder: where the jobs' logs are, if a folder was named.
             ask: what tells the jobs that wait or run.
         """
-        self.gave_up = ""
-        self._client, self._cluster, self._n_jobs = client, cluster, n_jobs
+        super().__init__(client, EVERY_S)
+        self._cluster, self._n_jobs = cluster, n_jobs
         self._logs = log_folder or "the folder where the command was started"
         self._ask = ask
         self._missing: set[str] = set()  # jobs that were in no queue at the last look
         self._in_vain = 0
-        self._over = threading.Event()
-        self._thread = threading.Thread(target=self._watch, name="slurm jobs", daemon=True)
-
-    def __enter__(self) -> KeptJobs:
-        """Begin to look."""
-        self._thread.start()
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        tb: TracebackType | None,
-    ) -> None:
-        """No more looking.
-
-        Raises:
-            StudyError: the study was ended because all jobs end at once.
-        """
-        self._over.set()
-        self._thread.join()
-        if self.gave_up and isinstance(error, StudyError):
-            raise StudyError(self.gave_up) from None
-
-    def _watch(self) -> None:
-        from distributed import Future
-
-        while not self._over.wait(EVERY_S):
-            self.look()
-            if self.gave_up:
-                self._client.cancel([Future(key, self._client) for key in self._client.futures])
-                return
 
     def look(self) -> None:
         """Forget jobs that have ended without a word, and ask for others where some are wanted."""
