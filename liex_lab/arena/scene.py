@@ -31,7 +31,7 @@ _LEAST_PX = 64  # of a region
 _HIGH_MM = 20.0  # a fixture stands out from the floor by so much
 _LEAST_MM2 = 300.0  # and is no speck
 _MOST = 32  # fixtures told
-_MOST_ROUND = 2.5  # times its own area: what goes round more is walls
+_MOST_ROUND = 1.6  # times its own area: what goes round more is walls
 
 
 @dataclass(frozen=True)
