@@ -119,18 +119,17 @@ class HeadStage:
         rows, columns = np.nonzero(height)
         if not len(rows):
             return
-        whole = height
         margin = self._side
         cut = (
             slice(max(0, int(rows.min()) - margin), int(rows.max()) + margin + 1),
             slice(max(0, int(columns.min()) - margin), int(columns.max()) + margin + 1),
         )
         # single readings are noise, and a hole of one pixel parts no body
-        height = cv2.medianBlur(np.ascontiguousarray(whole[cut]), 3)
-        closed = cv2.morphologyEx(height, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
+        smooth = np.asarray(cv2.medianBlur(np.ascontiguousarray(height[cut]), 3))
+        closed = cv2.morphologyEx(smooth, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
         wide = cv2.morphologyEx(closed, cv2.MORPH_OPEN, np.ones((self._side,) * 2, np.uint8))
         n, labels, stats, _ = cv2.connectedComponentsWithStats(
-            ((height - wide > _NARROW_MM) & (height > 0)).astype(np.uint8)
+            ((smooth - wide > _NARROW_MM) & (smooth > 0)).astype(np.uint8)
         )
         least, most = (value / self._px_mm**2 for value in _AREA_MM2)
         most = min(most, _TIMES_AREA * self.area_mm2 / self._px_mm**2)
@@ -140,14 +139,14 @@ class HeadStage:
                 continue
             part = labels == k
             ring = (cv2.dilate(part.astype(np.uint8), beside) > 0) & ~part
-            body = height[ring & (height > 0)]
+            body = smooth[ring & (smooth > 0)]
             if len(body) < _ON_BODY * ring.sum():
                 continue
             around = float(np.median(body))
-            step = float(np.percentile(height[part], 80)) - around
-            block = part & (height > around + _FOOT * step)
+            step = float(np.percentile(smooth[part], 80)) - around
+            block = part & (smooth > around + _FOOT * step)
             if step > _STEP_MM and least <= block.sum() <= most:
-                out = np.zeros(whole.shape, np.bool_)
+                out = np.zeros(height.shape, np.bool_)
                 out[cut] = block
                 yield out, around
 
