@@ -31,6 +31,7 @@ _LEAST_PX = 64  # of a region
 _HIGH_MM = 20.0  # a fixture stands out from the floor by so much
 _LEAST_MM2 = 300.0  # and is no speck
 _MOST = 32  # fixtures told
+_MOST_ROUND = 1.6  # times its own area: what goes round more is walls
 
 
 @dataclass(frozen=True)
@@ -241,15 +242,30 @@ def find_fixtures(
     n, labels = cv2.connectedComponents(high.astype(np.uint8))
     found = []
     for k in range(1, n):
-        rows, columns = np.nonzero(labels == k)
-        depth = background[rows, columns].astype(float)
-        area = float((depth**2).sum()) / (camera.fx * camera.fy)
-        if area < _LEAST_MM2:
-            continue
-        place = floor.T_arena_camera @ camera.unproject(
-            np.stack([columns, rows], axis=1).astype(float), depth
-        )
-        middle = place[:, :2].mean(axis=0)
-        top = float(np.percentile(place[:, 2], 95))
-        found.append(Fixture((float(middle[0]), float(middle[1])), top, area))
+        place = labels == k
+        hull = cv2.convexHull(cv2.findNonZero(place.astype(np.uint8)))
+        if cv2.contourArea(hull) > _MOST_ROUND * place.sum():
+            continue  # the walls go round the floor, and do not stand on it
+        fixture = fixture_at(place, background, floor, camera)
+        if fixture.area_mm2 >= _LEAST_MM2:
+            found.append(fixture)
     return tuple(sorted(found, key=lambda fixture: -fixture.area_mm2)[:_MOST])
+
+
+def fixture_at(place: Mask, depth: NDArray[np.float32], floor: Floor, camera: Camera) -> Fixture:
+    """The thing that some pixels show.
+
+    Args:
+        place: (H, W) bool, its pixels, at least one.
+        depth: (H, W) float32 mm, of its surface there.
+        floor: its plane, in the pixels of the camera.
+        camera: whose pixels these are.
+    """
+    rows, columns = np.nonzero(place)
+    z = depth[rows, columns].astype(float)
+    area = float((z**2).sum()) / (camera.fx * camera.fy)
+    pixels = np.stack([columns, rows], axis=1).astype(float)
+    points = floor.T_arena_camera @ camera.unproject(pixels, z)
+    middle = points[:, :2].mean(axis=0)
+    top = float(np.percentile(points[:, 2], 95))
+    return Fixture((float(middle[0]), float(middle[1])), top, area)

@@ -31,6 +31,7 @@ from liex_lab.foreground.bare_ground import SPREADS as SPREADS  # models are tra
 from liex_lab.foreground.bare_ground import BareGround, Wanted
 from liex_lab.foreground.cable import Cable
 from liex_lab.foreground.floor_level import FloorLevel
+from liex_lab.foreground.head_stage import HeadStage
 from liex_lab.foreground.scene_change import SceneChange
 from liex_lab.foreground.still_scene import StillScene
 from liex_lab.optics.camera import Camera
@@ -118,15 +119,35 @@ class BackgroundSubtraction(StillScene):
         ground, sample, level = BareGround.steady(
             sample, recording.camera.every(stride), wanted, floor, cut
         )
-        scene = BackgroundSubtraction._empty(recording.camera, stride, ground, sample, level)
-        if wanted.stands:
-            scene, sample = scene._without_cable(sample, wanted)
-        scene = scene._with_its_animal(sample, wanted)
-        times_s = recording.times_ns[sampled(len(recording), n_frames)]
-        changed = SceneChange.find(
-            sample, (times_s - recording.times_ns[0]) * 1e-9, scene.grid, scene.area_mm2
-        )
-        return replace(scene, volume_mm3=scene.usual_volume(sample), changed=changed), sample
+        camera = recording.camera
+        times_ns = recording.times_ns[sampled(len(recording), n_frames)]
+        times_s = (times_ns - recording.times_ns[0]) * 1e-9
+        whole = sample
+        scene, sample = BackgroundSubtraction._of(camera, stride, ground, whole, level)
+        if wanted.stands and floor is None and not ground.standing.moves:
+            # nothing that moves has told which of two levels is the floor: what lies there does
+            under = ground.under(whole, scene._places(sample))
+            if under.standing is not ground.standing:
+                scene, sample = BackgroundSubtraction._of(camera, stride, under, whole, level)
+        changed = SceneChange.find(sample, times_s, scene.grid, scene.area_mm2)
+        volume = scene.usual_volume(sample)
+        return replace(scene, volume_mm3=volume, changed=changed), sample
+
+    @staticmethod
+    def _of(
+        camera: Camera,
+        stride: int,
+        ground: BareGround,
+        sample: NDArray[np.float32],
+        level: FloorLevel | None,
+    ) -> tuple[BackgroundSubtraction, NDArray[np.float32]]:
+        """The scene of a ground with its animal, and the sample without what that wears; see
+        `_empty`.
+        """
+        scene = BackgroundSubtraction._empty(camera, stride, ground, sample, level)
+        if ground.wanted.stands:
+            scene, sample = scene._without_worn(sample, ground.wanted)
+        return scene._with_its_animal(sample, ground.wanted), sample
 
     @staticmethod
     def _empty(
@@ -160,17 +181,24 @@ class BackgroundSubtraction(StillScene):
             level=level,
         )
 
-    def _without_cable(
+    def _without_worn(
         self, sample: NDArray[np.float32], wanted: Wanted
     ) -> tuple[BackgroundSubtraction, NDArray[np.float32]]:
-        """The scene and the sample (n, H, W) mm with cables cut out, themselves where are none."""
+        """The scene and the sample (n, H, W) mm with cables and head stages cut out, themselves
+        where there are none.
+        """
+        scene = self
         floor = self.grid_floor if self.standing is None else self.standing.floor
-        cable = Cable.find(
-            sample, self.limit, self.grid, floor, wanted.spine_mm[1], wanted.smallest_mm2
-        )
-        if cable is None:
-            return self, sample
-        return replace(self, cable=cable), cable.cut(sample, self.limit)
+        grid = self.grid
+        cable = Cable.find(sample, self.limit, grid, floor, wanted.spine_mm[1], wanted.smallest_mm2)
+        if cable is not None:
+            scene = replace(scene, cable=cable)
+            sample = cable.cut(sample, self.limit)
+        stage = HeadStage.find(sample, self.limit, grid, floor, wanted.smallest_mm2)
+        if stage is not None:
+            scene = replace(scene, stage=stage)
+            sample = stage.cut(sample, self.limit)
+        return scene, sample
 
     def _with_its_animal(
         self, sample: NDArray[np.float32], wanted: Wanted
@@ -385,12 +413,7 @@ class BackgroundSubtraction(StillScene):
         bare = self.grid_floor.depth(self.grid.width, self.grid.height)
         lump = self.on_floor & (self.background > 0) & (bare - self.background > min_height_mm)
         n, labels, stats, _ = cv2.connectedComponentsWithStats(lump.astype(np.uint8))
-        crops = replace(self, area_mm2=area).extract(sample, 1.0)
-        moving = np.zeros((int(crops.found.sum()), *lump.shape), np.bool_)
-        for k, i in enumerate(np.flatnonzero(crops.found)):
-            rows, columns = np.nonzero(crops.heights[i])
-            step, (u, v) = crops.step[i] // self.stride, crops.origin[i] // self.stride
-            moving[k, v + step * rows, u + step * columns] = True
+        moving = np.array(replace(self, area_mm2=area)._places(sample)).reshape(-1, *lump.shape)
         best = self
         best_area = area
         for k in range(1, n):
@@ -410,6 +433,18 @@ class BackgroundSubtraction(StillScene):
                 best = whole
                 best_area = whole_area
         return best, best_area
+
+    def _places(self, sample: NDArray[np.float32]) -> list[NDArray[np.bool_]]:
+        """The animal's pixels (H, W) bool in each frame of a sample (n, H, W) mm that shows it."""
+        crops = self.extract(sample, 1.0)
+        places = []
+        for i in np.flatnonzero(crops.found):
+            rows, columns = np.nonzero(crops.heights[i])
+            step, (u, v) = crops.step[i] // self.stride, crops.origin[i] // self.stride
+            own = np.zeros(self.limit.shape, np.bool_)
+            own[v + step * rows, u + step * columns] = True
+            places.append(own)
+        return places
 
     def usual_area(
         self,

@@ -22,7 +22,13 @@ from liex_lab.body.skeleton import VIEWS, View
 from liex_lab.errors import EstimationError
 from liex_lab.foreground.background import learn_background
 from liex_lab.foreground.floor_level import FloorLevel, wandering
-from liex_lab.foreground.standing import SampledScene, Standing, find_standing
+from liex_lab.foreground.standing import (
+    SampledScene,
+    Standing,
+    find_standing,
+    levelled,
+    thing_at,
+)
 from liex_lab.foreground.unread_floor import unread_floor
 from liex_lab.optics.camera import Camera
 
@@ -152,6 +158,29 @@ class BareGround:
         sample = level.brought_back(sample, levels - first)
         ground = BareGround.learn(sample, camera, wanted, stated, region)
         return ground, sample, replace(ground.level, wander_mm=range_mm)
+
+    def _sampled(self, sample: Depths) -> SampledScene:
+        """A sample (n, H, W) mm, and what is known of the empty scene."""
+        wanted = self.wanted
+        return SampledScene(
+            sample,
+            self.background,
+            self.spread,
+            self.camera,
+            wanted.spine_mm,
+            wanted.min_height_mm,
+            wanted.view,
+        )
+
+    def under(self, sample: Depths, places: list[NDArray[np.bool_]]) -> BareGround:
+        """The same with the plane of the ground on which an animal keeps still, see `levelled`.
+
+        Args:
+            sample: (n, H, W) float32 mm, the frames that it was learned from.
+            places: (H, W) bool each, the animal's pixels in some frames.
+        """
+        things = [thing_at(own, self.background, self.camera, k) for k, own in enumerate(places)]
+        return replace(self, standing=levelled(self.standing, self._sampled(sample), things))
 
     @property
     def level(self) -> FloorLevel:

@@ -186,7 +186,7 @@ def find_standing(scene: SampledScene, stated: Floor | None = None) -> Standing:
     """
     things = things_moving(scene)
     standing = (
-        _levelled(_choose(scene, things), scene, things)
+        levelled(_choose(scene, things), scene, things)
         if stated is None
         else _as_stated(stated, scene.background, scene.camera, things)
     )
@@ -198,6 +198,28 @@ def find_standing(scene: SampledScene, stated: Floor | None = None) -> Standing:
         thing_mm2=float(np.median([thing.area_mm2 for thing in things])),
         n_together=int(np.percentile(n_together, 80, method="lower")),
     )
+
+
+def thing_at(
+    place: NDArray[np.bool_], background: NDArray[np.float32], camera: Camera, frame: int
+) -> Thing:
+    """A thing that keeps still, whose own depth is in the background.
+
+    Args:
+        place: (H, W) bool, its pixels; the ground around them is what it stands on.
+        background: (H, W) float32 mm, 0 where unknown.
+        camera: whose pixels these are.
+        frame: of the sample, in which it is seen.
+    """
+    import cv2
+
+    own = place.astype(np.uint8)
+    outer = np.ones((4 * _AROUND_PX + 1,) * 2, np.uint8)
+    inner = np.ones((2 * _AROUND_PX + 1,) * 2, np.uint8)  # its blurred edge is not ground
+    near = (cv2.dilate(own, outer) > cv2.dilate(own, inner)) & (background > 0)
+    rows, columns = np.nonzero(near)
+    mm2 = float((background[place].astype(float) ** 2).sum()) / (camera.fx * camera.fy)
+    return Thing(rows, columns, background[near].astype(float), mm2, 0.0, frame)
 
 
 def things_moving(scene: SampledScene) -> list[Thing]:
@@ -249,11 +271,16 @@ def _choose(scene: SampledScene, things: list[Thing]) -> Standing:
     return replace(largest, doubt=doubt)
 
 
-def _levelled(standing: Standing, scene: SampledScene, things: list[Thing]) -> Standing:
+def levelled(standing: Standing, scene: SampledScene, things: list[Thing]) -> Standing:
     """The same with the plane of the ground that things stand on, where a step parts it from more.
 
     An arena's floor is often a few millimetres higher than the bench that it lies on, and a plane
     that is fitted to both runs between them.
+
+    Args:
+        standing: the floor as it was found.
+        scene: sampled frames and their background.
+        things: what moves, or keeps still, on it.
     """
     floor = standing.floor
     on = [thing for thing in things if thing.is_on(floor, standing.on_floor)]

@@ -16,12 +16,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.arena.floor import Floor
-from liex_lab.arena.scene import Scene, find_fixtures, region_corners, roughness
+from liex_lab.arena.scene import (
+    Scene,
+    find_fixtures,
+    region_corners,
+    roughness,
+)
 from liex_lab.body.skeleton import MOUSE_VIEW, VIEWS, View
 from liex_lab.foreground import _height_map_kernels as kernels
 from liex_lab.foreground.cable import Cable
 from liex_lab.foreground.crop_camera import pack_crop_cameras
 from liex_lab.foreground.floor_level import FloorLevel
+from liex_lab.foreground.head_stage import HeadStage
 from liex_lab.foreground.height_maps import HeightMaps
 from liex_lab.foreground.scene_change import SceneChange
 from liex_lab.foreground.segmenter import Segmenter
@@ -55,6 +61,7 @@ class StillScene(Segmenter):
             those.
         standing: how the floor was found, None where it was given.
         cable: how cables are told from the animal; None where it wears none.
+        stage: how a head stage is told from it; None where it wears none.
         level: brings frames to one level of the floor; None where it is still.
         changed: what is elsewhere from some time on; None where the scene keeps still.
     """
@@ -71,6 +78,7 @@ class StillScene(Segmenter):
     standing: Standing | None = None
     level: FloorLevel | None = None
     cable: Cable | None = None
+    stage: HeadStage | None = None
     changed: SceneChange | None = None
 
     @cached_property
@@ -127,6 +135,7 @@ class StillScene(Segmenter):
             on_floor=np.ascontiguousarray(self.on_floor[cut]),
             level=None if self.level is None else self.level.every(step),
             cable=None if self.cable is None else self.cable.every(step),
+            stage=None if self.stage is None else self.stage.every(step),
         )
 
     def misfit(self, crops: HeightMaps) -> Array:
@@ -209,12 +218,14 @@ class StillScene(Segmenter):
 
     @property
     def remarks(self) -> tuple[str, ...]:
-        """That a cable or bars were cut out, and that the floor's depth wandered."""
+        """What was cut out of the pictures, and by how much depth wandered."""
         said = []
         if self.cable is not None:
             said.append(
                 "something thin above the animal, a cable or bars, was cut out of the pictures"
             )
+        if self.stage is not None:
+            said.append("a head stage on the animal was cut out of the pictures")
         if self.level is not None:
             said.append(
                 f"the depth of the floor wandered by {self.level.wander_mm:.1f} mm, as of a sensor "
@@ -277,6 +288,8 @@ class StillScene(Segmenter):
             depths = self.level.brought_back(depths)
         if self.cable is not None:
             depths = self.cable.cut(depths, self.limit)
+        if self.stage is not None:
+            depths = self.stage.cut(depths, self.limit)
         crops = HeightMaps.blank(n_things * len(depths), self.floor.distance_mm)
         grid = self.grid
         with threads(parallel):

@@ -10,7 +10,7 @@ import pytest
 from liex_lab.pipelines.build import build_scene
 from typer.testing import CliRunner
 
-from liex_lab.arena.scene import plane_of, region_mask
+from liex_lab.arena.scene import find_fixtures, plane_of, region_mask
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.errors import EstimationError, PlanError
 from liex_lab.foreground.background_segmenter import BackgroundSubtraction
@@ -170,3 +170,15 @@ def test_rough_ground_is_told_by_its_spread():
     bedding = (bare - rng.normal(9.0, 6.0, bare.shape)).astype(np.float32)
     assert roughness(bedding, bare, np.ones(bare.shape, bool)) == pytest.approx(6.0, rel=0.1)
     assert roughness(np.zeros_like(bare), bare, np.ones(bare.shape, bool)) is None
+
+
+def test_the_walls_of_an_arena_are_no_fixture_and_a_thing_in_it_is_one():
+    floor = plane_of([0, 0, 700], [0, 0, 1], CAMERA)
+    depth = floor.depth(CAMERA.width, CAMERA.height)
+    wall = np.zeros(depth.shape, bool)
+    wall[30:210, 60:260] = True
+    wall[40:200, 70:250] = False
+    depth[wall] -= 80.0
+    depth[80:100, 120:150] -= 55.0
+    (thing,) = find_fixtures(depth, floor, CAMERA, np.ones(depth.shape, bool))
+    assert thing.height_mm == pytest.approx(55.0, abs=0.5)

@@ -29,3 +29,17 @@ def test_an_animal_that_only_turns_its_head_is_found_whole(n_frames):
     whole = BackgroundSubtraction.from_floor(scene.camera, scene.floor).extract(sample, 1.0).moments
     np.testing.assert_allclose(crops.moments[:, 1], whole[:, 1], rtol=0.3)
     assert np.linalg.norm(crops.moments[:, 3:5] - whole[:, 3:5], axis=1).max() < 8.0
+
+
+@pytest.mark.parametrize("step_mm", [0.0, 6.0])
+def test_where_nothing_moves_the_floor_is_what_the_animal_lies_on(step_mm):
+    """An arena's floor lies 6 mm above the bench around it, and both are as large."""
+    floor = tilted(2.0)
+    frame = with_box(floor, (60, 56))
+    bench = floor.depth(160, 120) + np.float32(step_mm)
+    around = np.ones(frame.shape, bool)
+    around[18:104, 20:118] = False
+    frame[around] = bench[around]
+    scene, sample = BackgroundSubtraction.learn(recording_of([frame] * 20), SPINES)
+    assert scene.floor.distance_mm == pytest.approx(floor.distance_mm, abs=0.6)
+    assert scene.extract(sample, 1.0).found.all()

@@ -35,6 +35,7 @@ _EPOCHS = 64  # most still pictures of one recording
 _EPOCH_FRAMES = 12
 _COMMUTATOR_MM = np.array([80.0, 110.0, 300.0])  # from the middle of the arena
 _HAND_FRAMES = 16  # that a hand takes to put something in
+_OBJECTS = {"object": 0.4, "object out": 0.6}  # when it is put in or taken out, of the recording
 _WARM_UP = 0.35  # of the recording, in which a sensor's drift falls by a factor e
 
 
@@ -115,7 +116,7 @@ class Making:
         whole = places.arena_at(
             camera, T_arena_camera, (0.0, 0.0), recipe.half_mm, yaw, recipe.wall_mm, clutter
         )
-        if recipe.fixture in ("house", "object"):
+        if recipe.fixture in ("house", *_OBJECTS):
             clutter = self._clutter(whole)
         made = []
         for cell in cells[recipe.n_arenas]:
@@ -141,7 +142,7 @@ class Making:
 
     def _clutter(self, arena: SimulatedScene) -> Array:
         """Outlines (n, 2) mm of what animals walk around."""
-        if self.recipe.fixture == "object":
+        if self.recipe.fixture in _OBJECTS:
             return np.asarray(self._object(arena).vertices[:, :2])
         place, yaw = self._house(arena)
         edge = np.linspace(-1.0, 1.0, 13)[:, None]
@@ -188,11 +189,12 @@ class Making:
                     path,
                 )
             )
-        if recipe.fixture == "object":
-            shown = np.arange(self.n_frames) >= int(0.4 * self.n_frames)
+        if recipe.fixture in _OBJECTS:
+            change = int(_OBJECTS[recipe.fixture] * self.n_frames)
+            later = np.arange(self.n_frames) >= change
             thing = self._object(arenas[0])
-            moving.append(Moving.fixed(thing, shown))
-            moving.append(self._hand(thing.vertices[:, :2].mean(axis=0), int(0.4 * self.n_frames)))
+            moving.append(Moving.fixed(thing, later if recipe.fixture == "object" else ~later))
+            moving.append(self._hand(thing.vertices[:, :2].mean(axis=0), change))
         if recipe.presence in ("late", "leaves") and animals:
             there = animals[0].present
             change = int(np.argmax(there)) if recipe.presence == "late" else int(there.sum())

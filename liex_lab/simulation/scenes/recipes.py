@@ -32,7 +32,7 @@ class SceneRecipe:
         n_animals: in one arena.
         presence: of the animals, one of `cast.PRESENCES`.
         worn: '', 'head stage' or 'tether'.
-        fixture: '', 'house', 'object' or 'lid'.
+        fixture: '', 'house', 'object', which is put in, 'object out', which is taken out, or 'lid'.
         bedding: whether there is bedding on the floor.
         glossy: whether the floor reflects, so that it is unread in places.
         drift_mm: what the sensor's depth changes by while it warms up, mm.
@@ -114,6 +114,10 @@ def _recipes() -> dict[str, SceneRecipe]:
         "object": {
             "says": "a novel object, put in during the recording, that stays",
             "fixture": "object",
+        },
+        "object-out": {
+            "says": "an object that is taken out during the recording",
+            "fixture": "object out",
         },
         "asleep": {"says": "motionless for 78 % of the recording", "presence": "asleep"},
         "still": {"says": "the animal never moves", "presence": "still"},
