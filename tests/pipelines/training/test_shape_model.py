@@ -7,7 +7,6 @@ import pytest
 from liex_lab.pipelines.training.shape_model import PER_SESSION, MiniSession, mini_sessions
 
 from liex_lab.body.shape import BodyShape
-from liex_lab.body.surface import Surface
 from liex_lab.errors import LiexError
 from liex_lab.estimation.estimator import PoseEstimator
 from liex_lab.estimation.session_shape import PLACES, ShapePrior
@@ -40,28 +39,22 @@ def test_bodies_are_drawn_again_as_the_block_shows_them():
     assert isinstance(bodies, BodyShape)
     assert len(bodies) == N
     assert np.bincount(block.session).tolist() == [PER_SESSION] * N
-    # the readings over the head's and the middle joints are the skin of these very bodies
-    rows = np.arange(0, BLOCK, PER_SESSION)
-    top = Surface.of(species.skeleton)
-    assert top.shape is not None
-    middle = block.joints_mm[rows, 6]
+    # what is read over a joint of the trunk is the skin of these very bodies, in the median
+    j, skeleton = 6, species.skeleton
+    joint = block.joints_mm[:, j]
     u, v = (
-        np.rint(
-            block.intrinsics[rows, k] * middle[:, k] / middle[:, 2] + block.intrinsics[rows, 2 + k]
-        )
-        - block.origin[rows, k]
+        np.rint(block.intrinsics[:, k] * joint[:, k] / joint[:, 2] + block.intrinsics[:, 2 + k])
+        - block.origin[:, k]
         for k in range(2)
     )
-    depth = block.depth[rows, v.astype(int), u.astype(int)] * block.unit_mm
-    height = np.array(
-        [np.interp(6 / 20, species.skeleton.surface["stations"], one) for one in bodies.half_height]
-    )
-    height *= block.spine_mm[rows] / species.skeleton.length
-    seen = (depth > 0) & (np.abs(middle[:, 2] - depth) < 12.0)
-    assert seen.sum() > 0.6 * N
-    off = (middle[:, 2] - depth - height)[seen]
-    assert np.corrcoef((middle[:, 2] - depth)[seen], height[seen])[0, 1] > 0.8
-    assert abs(np.median(off)) < 0.6
+    depth = block.depth[np.arange(BLOCK), v.astype(int), u.astype(int)] * block.unit_mm
+    over = np.where((depth > 0) & (joint[:, 2] - depth < 12.0), joint[:, 2] - depth, np.nan)
+    over = np.nanmedian(over.reshape(N, PER_SESSION), axis=1)
+    stations = skeleton.surface["stations"]
+    height = np.array([np.interp(j / 20, stations, one) for one in bodies.half_height])
+    height *= block.spine_mm[::PER_SESSION] / skeleton.length
+    assert np.corrcoef(over, height)[0, 1] > 0.9
+    assert abs(np.median(over - height)) < 0.2
 
 
 def test_the_bundled_shapes_make_the_error_of_unseen_builds_smaller(others):
