@@ -244,7 +244,15 @@ def build_tracker(
     )
     limit = plan.estimation.doubtful_above_mm
     bridge_s = plan.tracking.bridge_s
-    return FrameTracker.prepare(estimator, scene, sample, plan.animal.spine_mm, limit, bridge_s)
+    return FrameTracker.prepare(
+        estimator,
+        scene,
+        sample,
+        plan.animal.spine_mm,
+        limit,
+        bridge_s,
+        adapt=plan.estimation.adapt == "auto",
+    )
 
 
 def build_scene(
@@ -320,6 +328,7 @@ def build_provenance(
             "spine_mm": round(tracker.spine_mm, 3),
             "origin": origin,
             "girth": round(tracker.body.girth, 3),
+            **({} if tracker.shape is None else {"shape": tracker.shape.to_dict()}),
         },
         arena=arena,
         zones=zones,

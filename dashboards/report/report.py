@@ -6,7 +6,7 @@ session.json.
 
 from __future__ import annotations
 
-from collections.abc import Hashable
+from collections.abc import Hashable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -275,6 +275,32 @@ def zone_rows(session: Session) -> list[tuple[str, list[str]]]:
     ]
 
 
+def beside_average(shape: Mapping[str, Any]) -> str:
+    """This animal beside the average one of its length, in words.
+
+    Args:
+        shape: section `animal.shape` of session.json.
+    """
+    if not shape.get("kept"):
+        return f"the average animal's: {shape.get('why', 'none was fitted')}"
+    places = ", ".join(f"{100 * place:.0f}" for place in shape["places"])
+    wide, high = (
+        ", ".join(
+            f"{factor:.2f} ± {factor * sd:.2f}"
+            for factor, sd in zip(shape[name], shape[f"{name}_sd"], strict=True)
+        )
+        for name in ("width", "height")
+    )
+    most = max(float(np.linalg.norm(moved)) for moved in shape["joints_moved"])
+    return (
+        f"its own, fitted to {shape['n_frames']} frames; at {places} % of its length it is {wide} "
+        f"times as wide and {high} times as high as the average animal. Joints were moved by up to "
+        f"{100 * most:.1f} % of its length for it. On frames that were held out this body lies "
+        f"{shape['residual_mm']:.2f} mm from the depth, the average one "
+        f"{shape['average_residual_mm']:.2f} mm"
+    )
+
+
 def facts(session: Session) -> list[tuple[str, str]]:
     """Where the numbers come from: recording, camera, animal, software, cost, as (what, value).
 
@@ -304,6 +330,7 @@ def facts(session: Session) -> list[tuple[str, str]]:
             "Animal",
             f"{about['individual']}, {animal['name']}, {size}",
         ),
+        *([("Shape", beside_average(animal["shape"]))] if animal.get("shape") else []),
         (
             "Frames",
             f"{frames['n_frames']:,} recorded ({flags}); {frames['n_missing']} not delivered, in "

@@ -95,7 +95,7 @@ def draw_hands(rng: np.random.Generator, skeleton: Skeleton, family: str, n: int
     """
     if family not in FAMILIES:
         raise LiexError(f"there is no shape family '{family}'; known are {', '.join(FAMILIES)}")
-    wide = {"train": 1.0, "augmented": 1.5, "other": 1.0}[family]
+    wide = {"train": 1.0, "augmented": 1.5, "wide": 2.0, "other": 1.0}[family]
 
     def draw(sd: float, *shape: int) -> Array:
         """Log-normal factors (n, *shape), clipped at two standard deviations.

@@ -19,7 +19,7 @@ from liex_lab.errors import LiexError
 
 Array = NDArray[np.float64]
 
-FAMILIES = ("train", "augmented", "other")
+FAMILIES = ("train", "augmented", "wide", "other")
 _WILD_SHARE = 0.6
 _HULL_SHARE = 0.5  # of the wild ones
 
@@ -121,8 +121,8 @@ def draw_shapes(rng: np.random.Generator, skeleton: Skeleton, family: str, n: in
         rng: where chance comes from.
         skeleton: one chain of joints, with stations in its [surface].
         family: 'train' varies the default animal as mice vary; most of 'augmented' varies more than
-            mice do, so that no forest relies on one exact profile; 'other' holds bodies of another
-            build, which no model is trained on.
+            mice do, so that no forest relies on one exact profile; all of 'wide' do; 'other' holds
+            bodies of another build, which no forest is trained on.
         n: animals.
 
     Returns:
@@ -135,12 +135,12 @@ def draw_shapes(rng: np.random.Generator, skeleton: Skeleton, family: str, n: in
         raise LiexError(f"there is no shape family '{family}'; known are {', '.join(FAMILIES)}")
     default = BodyShape.default(skeleton)
     stations = np.array(skeleton.surface["stations"], float)
-    wild = (rng.random(n) < _WILD_SHARE) & (family == "augmented")
+    wild = (rng.random(n) < _WILD_SHARE) & (family == "augmented") | (family == "wide")
     if family == "other":
         width, height = _foreign(rng, default, stations, n)
     else:
         width, height = _varied(rng, default, stations, wild[:, None])
-    if family == "augmented":
+    if family in ("augmented", "wide"):
         free = wild & (rng.random(n) < _HULL_SHARE)
         hull_width, hull_height = _hulls(rng, default, stations, n)
         width = np.where(free[:, None], hull_width, width)

@@ -223,7 +223,8 @@ def train(
     animal: Annotated[
         str,
         typer.Argument(
-            metavar="ANIMAL", help="fish, mouse, hand, a skeleton's .toml; or: actions, tracking."
+            metavar="ANIMAL",
+            help="fish, mouse, hand, a skeleton's .toml; or: actions, tracking, shape.",
         ),
     ],
     variant: VariantName = "default",
@@ -239,7 +240,8 @@ def train(
         typer.Option("--images", min=512, help="Pictures to train on, for a quick look."),
     ] = None,
     of: Annotated[
-        str, typer.Option("--animal", help="Of `train actions` and `tracking`: which animal.")
+        str,
+        typer.Option("--animal", help="Of `train actions`, `tracking` and `shape`: which animal."),
     ] = "mouse",
     sessions: Annotated[
         list[Path] | None,
@@ -273,7 +275,8 @@ def train(
 
     `liex train actions` makes the model that names actions: from sessions that people labelled, or,
     without any, from virtual animals that act. `liex train tracking` measures how far off an
-    animal's tracks may be (tunings.toml).
+    animal's tracks may be (tunings.toml), `liex train shape` how the build of an animal shows, and
+    how its poses err with it.
     """
     if animal == "actions":
         from liex_lab.pipelines.training.action_model import train_actions
@@ -307,6 +310,15 @@ def train(
                 of, out or Path("tunings.toml"), workers=workers, progress=progress
             )
         say(f"tunings: {table}")
+        return
+    if animal == "shape":
+        from liex_lab.pipelines.training.shape_model import train_shape
+
+        with progress_bar() as progress:
+            shapes = train_shape(
+                of, out or Path(f"{of}-shapes.npz"), workers=workers, progress=progress
+            )
+        say(f"shapes: {shapes}")
         return
     from liex_lab.pipelines.training.pose_model import train_model
 

@@ -14,6 +14,7 @@ import json
 import lzma
 import zipfile
 from dataclasses import dataclass, field, fields
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -131,6 +132,11 @@ class Model:
     def proposals(self) -> Forest | None:
         """The forest that proposes initial poses; None where they are drawn."""
         return self.cascade.proposals
+
+    @cached_property
+    def fingerprint(self) -> str:
+        """What tells this model from others of the same animal: a hash of its learned metric."""
+        return hashlib.sha256(self.metric.nodes.tobytes()).hexdigest()[:16]
 
     def to_bytes(self) -> bytes:
         """The content of the model file; equal models give equal bytes."""

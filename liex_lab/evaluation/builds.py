@@ -24,7 +24,9 @@ Array = NDArray[np.float64]
 
 BUILDS_PROTOCOL = (
     "Rendered recordings of one moving animal each, of a build that no forest was trained on "
-    "(the tracker's calibration knows other animals of the same family of builds), seen by "
+    "(the tracker's calibration knows other animals of the same family of builds, and so does what "
+    "is said to be left by a fish's own shape; that shape is learned of a wider family, which "
+    "reaches about as far), seen by "
     "makes of camera of the training's and of focal lengths that it had not, in turn, with "
     "0.7, 1 and 1.5 times their noise; background, floor, animal and size are found by the "
     "product. Beside them the same of builds like the training's. found: share of frames with"

@@ -349,6 +349,13 @@ class Estimation(Table):
             "liex run --accept does"
         ),
     )
+    adapt: Literal["auto", "off"] = Field(
+        "auto",
+        description=(
+            "auto: a shape of the animal's own is fitted to sampled frames, and kept where frames "
+            "that it was not fitted to bear it out; off: it has the average animal's"
+        ),
+    )
 
 
 class Tracking(Table):

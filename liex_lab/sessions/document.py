@@ -73,6 +73,30 @@ class _Camera(_Section):
     optics: dict[Text, Any] | None = None
 
 
+class _Shape(_Section):
+    kept: bool
+    n_frames: Count
+    average_residual_mm: Finite | None = None
+    residual_mm: Finite | None = None
+    why: Text = ""
+    places: list[Finite] = []
+    width: list[Finite] = []
+    width_sd: list[Finite] = []
+    height: list[Finite] = []
+    height_sd: list[Finite] = []
+    joints_moved: list[Annotated[list[Finite], Field(min_length=3, max_length=3)]] = []
+
+    @model_validator(mode="after")
+    def _fit(self) -> _Shape:
+        columns = (self.width, self.width_sd, self.height, self.height_sd)
+        if any(len(column) != len(self.places) for column in columns):
+            raise ValueError(f"has not as many widths and heights as its {len(self.places)} places")
+        known = self.residual_mm is not None and self.average_residual_mm is not None
+        if self.kept and not (known and self.places and self.joints_moved):
+            raise ValueError("is kept, but does not say what speaks for it")
+        return self
+
+
 class _Animal(_Section):
     name: Name
     joints: Annotated[list[Name], Field(min_length=1, max_length=_MOST_JOINTS)]
@@ -80,6 +104,7 @@ class _Animal(_Section):
     home_length_mm: Finite
     spine_mm: Finite | None = None
     origin: Text | None = None
+    shape: _Shape | None = None
 
     @model_validator(mode="after")
     def _fit(self) -> _Animal:

@@ -56,6 +56,7 @@ def write_evidence(folder: Path, seen: Observations, subject: Subject) -> None:
         "bridge_s": subject.bridge_s,
         "joint_share": list(subject.joint_share),
         "stretch_sd": subject.stretch_sd,
+        "unseen": None if subject.unseen is None else list(subject.unseen),
     }
     told = np.frombuffer(json.dumps(facts).encode(), np.uint8)
     columns = {"subject": told, **{name: getattr(seen, name) for name in COLUMNS}}
@@ -126,7 +127,9 @@ def read_evidence(session: Session) -> tuple[Observations, Subject]:
             ),
         )
         _check_shapes(seen, len(session.frames))
-        stretch = facts.get("stretch_sd")  # sessions of earlier versions do not tell
+        # sessions of earlier versions do not tell
+        stretch = facts.get("stretch_sd")
+        unseen = facts.get("unseen")
         subject = Subject(
             skeleton,
             session.camera,
@@ -136,6 +139,7 @@ def read_evidence(session: Session) -> tuple[Observations, Subject]:
             float(facts["bridge_s"]),
             tuple(float(share) for share in facts["joint_share"]),
             None if stretch is None else float(stretch),
+            None if unseen is None else (float(unseen[0]), float(unseen[1])),
         )
     return seen, subject
 

@@ -214,6 +214,7 @@ def training_blocks(
     window_px: int = 144,
     parallel: bool = True,
     worn_share: float = 0.0,
+    per_session: int = PER_SESSION,
 ) -> Iterator[TrainingPatches]:
     """Blocks of `BLOCK` training patches from block `first` on.
 
@@ -235,6 +236,7 @@ def training_blocks(
         parallel: render on all threads.
         worn_share: of the mini-sessions whose mouse wears a head stage or a cable, see
             `scenes.worn.draw_worn`; 0 makes the patches that there were before it could.
+        per_session: images of one animal before one camera, a divisor of `BLOCK`.
 
     Yields:
         One set of `BLOCK` patches a block.
@@ -243,10 +245,39 @@ def training_blocks(
     surface = Surface.of(species.skeleton)
     for number in range(first, first + n_blocks):
         rng = np.random.default_rng([seed, number])
-        views = _draw_looks(rng, species, family, noise, erosion_px, degraded_share, spine_mm)
+        views = _draw_looks(
+            rng, species, family, noise, erosion_px, degraded_share, spine_mm, per_session
+        )
         wearing = (np.random.default_rng([seed, number, 1]), worn_share)
-        first_session = number * (BLOCK // PER_SESSION)
-        yield _draw_block(rng, species, surface, views, window_px, first_session, parallel, wearing)
+        first_session = number * (BLOCK // per_session)
+        sessions = first_session + np.arange(BLOCK) // per_session
+        yield _draw_block(rng, species, surface, views, window_px, sessions, parallel, wearing)
+
+
+def drawn_bodies(
+    seed: int,
+    number: int,
+    species: Species,
+    *,
+    family: str,
+    degraded_share: float = 0.0,
+    spine_mm: float | None = None,
+    per_session: int = PER_SESSION,
+) -> Body:
+    """The bodies of a block of `training_blocks`, a batch with one for each mini-session.
+
+    Args:
+        seed: of the whole set.
+        number: of the block.
+        species: the species.
+        family: of body shapes, one of `body.shape.FAMILIES`.
+        degraded_share: as the block was drawn with.
+        spine_mm: as the block was drawn with.
+        per_session: images of one animal before one camera.
+    """
+    rng = np.random.default_rng([seed, number])
+    looks = _draw_looks(rng, species, family, 1.0, 0, degraded_share, spine_mm, per_session)
+    return looks.shape[np.arange(0, BLOCK, per_session)]
 
 
 def _draw_looks(
@@ -257,11 +288,12 @@ def _draw_looks(
     erosion_px: int,
     degraded_share: float,
     spine_mm: float | None,
+    per_session: int = PER_SESSION,
 ) -> _Views:
     """Cameras, floors and animals of one block's mini-sessions, repeated for each of their
     images.
     """
-    m = BLOCK // PER_SESSION
+    m = BLOCK // per_session
     skeleton = species.skeleton
     sensor = np.arange(m) % len(species.sensors)
     shape = species.shapes(rng, family, m)
@@ -281,7 +313,7 @@ def _draw_looks(
         parameters = drawn if not parameters.size else np.where(rows[:, None], drawn, parameters)
     _degrade(rng, parameters, degraded_share)
     nominal = skeleton.length if spine_mm is None else spine_mm
-    each = np.repeat(np.arange(m), PER_SESSION)
+    each = np.repeat(np.arange(m), per_session)
     T_arena_camera = draw_views(rng, m, species.setting)
     scale = species.setting.scale
     return _Views(
@@ -359,7 +391,7 @@ def _draw_block(
     surface: Surface,
     views: _Views,
     window_px: int,
-    first_session: int,
+    sessions: NDArray[np.int64],
     parallel: bool,
     wearing: tuple[np.random.Generator, float],
 ) -> TrainingPatches:
@@ -385,7 +417,8 @@ def _draw_block(
                 f"head stages and cables stand on a tubular body, which a {skeleton.name} has not; "
                 "leave out worn_share"
             )
-        worn = draw_worn(wearing[0], skeleton, pose, views.shape, girth, wearing[1], PER_SESSION)
+        per_session = int(np.sum(sessions == sessions[0]))
+        worn = draw_worn(wearing[0], skeleton, pose, views.shape, girth, wearing[1], per_session)
         thing, thing_faces, has_thing = _with_worn(thing, has_thing, *worn)
     walls = _draw_walls(rng, trunk, species.setting)
     seeds = rng.integers(1, 2**63, n).astype(np.uint64)
@@ -419,7 +452,7 @@ def _draw_block(
         seen.scale,
         seen.joints(skeleton),
         views.size * skeleton.length,
-        first_session + np.arange(n) // PER_SESSION,
+        sessions,
         views.sensor,
         kinds,
         species.sensors[0].unit_mm,

@@ -80,6 +80,9 @@ class Subject:
         stretch_sd: standard deviation of the share by which all distances from the base may be off
             throughout, for an animal whose ends a sensor eats is taken for a smaller one; None
             where nothing is known of it, which takes the usual share of `Motion`.
+        unseen: standard deviations over the length of the joints' height and of their place along
+            the body that a session's own shape leaves; None without one, which takes those of
+            `Motion`.
     """
 
     skeleton: Skeleton
@@ -90,6 +93,7 @@ class Subject:
     bridge_s: float
     joint_share: tuple[float, ...]
     stretch_sd: float | None = None
+    unseen: tuple[float, float] | None = None
 
 
 def track_whole(
@@ -355,8 +359,8 @@ def _write(subject: Subject, track: Track, curve: Curve, tuning: TrackingParamet
     stretch = motion.usual_stretch if subject.stretch_sd is None else subject.stretch_sd
     away = stretch_of(stretch, curve.joints)
     # two of three axes: up, and along the body, whose direction on the floor is any
-    height = motion.unseen_height * subject.length_mm
-    shift = motion.unseen_shift * subject.length_mm
+    unseen = subject.unseen or (motion.unseen_height, motion.unseen_shift)
+    height, shift = (share * subject.length_mm for share in unseen)
     track.sd_mm[:] = np.hypot(
         (curve.error_mm / ERROR_PER_SD)[:, None] * np.array(subject.joint_share), away
     )

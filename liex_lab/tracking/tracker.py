@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from liex_lab.body.surface import Surface
 from liex_lab.errors import EstimationError
 from liex_lab.estimation.estimator import Estimates, PoseEstimator
+from liex_lab.estimation.session_shape import ShapePrior
 from liex_lab.foreground.background_segmenter import BackgroundSubtraction
 from liex_lab.foreground.segmenter import Segmenter
 from liex_lab.recordings.frame import DepthFrame, stacked
@@ -27,6 +28,7 @@ from liex_lab.tracking.observations import Observations
 from liex_lab.tracking.occluders import behind_something
 from liex_lab.tracking.occlusion import OcclusionCorrection
 from liex_lab.tracking.offline import Subject, single_frames, track_whole
+from liex_lab.tracking.own_shape import OwnShape, fit_shape
 from liex_lab.tracking.residual import Agreement, BodyResidual
 from liex_lab.tracking.sample_fit import SampleFit, count_animals
 from liex_lab.tracking.track import Flip, Track, Tracked
@@ -44,7 +46,7 @@ class FrameTracker:
         scene: the segmenter of the recording's camera.
         size: the animal's spine over the skeleton's home length, a fact of the session.
         size_origin: where the size comes from, 'plan' or 'recording'.
-        body: the default body at the recording's girth.
+        body: the default body at the recording's girth, or that of `shape`.
         doubtful_mm: frames with a larger predicted mean joint error, mm, are flagged.
         bridge_s: so long a gap without a measurement is bridged, s.
         blur: how far the body lies from the depth seen, over its length, in the sampled frames.
@@ -54,6 +56,7 @@ class FrameTracker:
             seen says; None without.
         sample_fit: how well the model explains the sampled frames; None of a tracker that was made
             without any.
+        shape: the session's own shape; None where none was asked for.
     """
 
     estimator: PoseEstimator
@@ -67,6 +70,7 @@ class FrameTracker:
     size_spread: float = 0.0
     free_ends: OcclusionCorrection | None = None
     sample_fit: SampleFit | None = None
+    shape: OwnShape | None = None
 
     @staticmethod
     def prepare(
@@ -76,8 +80,9 @@ class FrameTracker:
         spine_mm: float | None = None,
         doubtful_mm: float | None = None,
         bridge_s: float = BRIDGE_S,
+        adapt: bool = True,
     ) -> FrameTracker:
-        """A tracker for a recording: a sample of its frames gives the animal's size and girth.
+        """A tracker for a recording: a sample of its frames gives the animal's size and shape.
 
         Args:
             estimator: the pose estimator.
@@ -87,6 +92,7 @@ class FrameTracker:
             doubtful_mm: flagging limit, mm; None takes the model's calibration at the animal's
                 size.
             bridge_s: the longest gap that is bridged whole, s.
+            adapt: fit a shape to the sample; else the body is the average one at its best girth.
 
         Returns:
             The tracker.
@@ -109,6 +115,14 @@ class FrameTracker:
         body = BodyResidual.fit(
             Surface.of(estimator.skeleton), pose[used], crops[used], scene, camera_view
         )
+        shape = None
+        if adapt:
+            prior = ShapePrior.of(estimator.skeleton.name)
+            shape, body = fit_shape(prior, estimator, scene, estimates, size, body)
+        if shape is not None:
+            pose = shape.corrected(estimator, estimates.chosen.pose, size).moved(
+                scene.floor.T_arena_camera
+            )
         limit = doubtful_mm or estimator.model.calibration.doubtful_mm * size
         agreement = body.agreement(pose[used], crops[used], scene)
         misfit = agreement.residual_mm[np.isfinite(agreement.residual_mm)]
@@ -130,7 +144,7 @@ class FrameTracker:
         )
         origin = "plan" if spine_mm else "recording"
         return FrameTracker(
-            estimator, scene, size, origin, body, limit, bridge_s, blur, spread, ends, fit
+            estimator, scene, size, origin, body, limit, bridge_s, blur, spread, ends, fit, shape
         )
 
     @property
@@ -152,6 +166,7 @@ class FrameTracker:
             self.bridge_s,
             share,
             self.stretch_sd,
+            self.shape.build.unseen if self.shape and self.shape.build else None,
         )
 
     @property
@@ -238,6 +253,8 @@ class FrameTracker:
             if self.free_ends is None
             else self.free_ends.slid(chosen.pose, crops, depths)
         )
+        if self.shape is not None:
+            in_camera = self.shape.corrected(self.estimator, in_camera, self.size)
         pose = in_camera.moved(self.scene.floor.T_arena_camera)
         seen.put_pose(h, pose)
         seen.error_mm[:, h] = chosen.error_mm

@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from liex_lab.dashboards.report.quality import flip_rows, frame_account, warnings
-from liex_lab.dashboards.report.report import methods, render, write_report
+from liex_lab.dashboards.report.report import beside_average, methods, render, write_report
 
 from liex_lab.actions import colours
 from liex_lab.arena.outline import Arena
@@ -278,3 +278,30 @@ def test_no_name_on_the_page_is_given_twice(page):
     assert len(names) == len(set(names))
     pointed = set(re.findall(r"url\(#([^)]+)\)", page)) | set(re.findall(r'href="#([^"]+)"', page))
     assert pointed <= set(names)
+
+
+def test_the_animals_own_shape_stands_beside_the_average_one():
+    shape = {
+        "kept": True,
+        "n_frames": 92,
+        "average_residual_mm": 0.412,
+        "residual_mm": 0.353,
+        "places": [0.1, 0.25],
+        "width": [0.8, 1.1],
+        "width_sd": [0.05, 0.1],
+        "height": [1.2, 0.9],
+        "height_sd": [0.1, 0.2],
+        "joints_moved": [[0.0, 0.0, 0.0], [0.003, 0.0, -0.004]],
+    }
+    told = beside_average(shape)
+    for part in (
+        "fitted to 92 frames",
+        "at 10, 25 % of its length",
+        "0.80 ± 0.04, 1.10 ± 0.11 times as wide",
+        "1.20 ± 0.12, 0.90 ± 0.18 times as high",
+        "by up to 0.5 %",
+        "0.35 mm from the depth, the average one 0.41 mm",
+    ):
+        assert part in told
+    left = beside_average({"kept": False, "n_frames": 12, "why": "12 frames are too few"})
+    assert left == "the average animal's: 12 frames are too few"

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from liex_lab.arena.floor import Floor
 from liex_lab.body.pose import Pose
+from liex_lab.body.shape import BodyShape
 from liex_lab.body.skeleton import PRESETS, Skeleton
 from liex_lab.body.surface import Surface, render_meshes
 from liex_lab.estimation.cascade import Candidates, ImageSet, Truth
@@ -75,15 +76,16 @@ def rendered(
     girth: float = 1.0,
     camera: Camera = CAMERA,
     floor: Floor = FLOOR,
+    shape: BodyShape | None = None,
 ) -> NDArray[np.float32]:
-    """Depth (n, H, W) mm of the default body in poses (n), arena frame, on the floor."""
+    """Depth (n, H, W) mm of a body, the default one, in poses (n), arena frame, on the floor."""
     n, surface = len(pose.scale), Surface.of(skeleton)
     T_camera_arena = floor.T_arena_camera.inverse()
     T = SE3(
         np.repeat(T_camera_arena.rotation[None], n, 0),
         np.repeat(T_camera_arena.translation[None], n, 0),
     )
-    vertices = surface.vertices(pose, girth=girth * pose.scale)
+    vertices = surface.vertices(pose, shape, girth=girth * pose.scale)
     lens = np.tile([camera.fx, camera.fy, camera.cx, camera.cy], (n, 1))
     body = render_meshes(
         vertices, surface.faces, T, lens, np.zeros((n, 2)), (camera.width, camera.height)

@@ -51,6 +51,20 @@ def test_the_curve_is_nearer_to_the_truth_than_its_frames_and_says_how_near(trut
     assert np.mean(off < 1.645) > 0.85
 
 
+def test_what_a_shape_leaves_of_height_and_place_is_in_the_intervals_and_in_no_curve(measured):
+    """Up from the floor, and of the two level axes half each; speeds are made without it."""
+    seen = told(SECONDS, measured)
+    usual = track_whole(SUBJECT, seen).track
+    shaped = track_whole(replace(SUBJECT, unseen=(0.03, 0.02)), seen).track
+    np.testing.assert_array_equal(shaped.joints_mm, usual.joints_mm)
+    np.testing.assert_array_equal(shaped.sd_mm, usual.sd_mm)
+    away = {"sd_z_mm": 0.03, "sd_xy_mm": 0.02 / np.sqrt(2.0)}
+    for name, share in away.items():
+        expected = np.hypot(usual.sd_mm, share * SUBJECT.length_mm)
+        np.testing.assert_allclose(getattr(shaped, name), expected)
+    assert (shaped.predicted_error_mm > usual.predicted_error_mm).all()
+
+
 def test_the_roots_covariance_is_that_of_a_middle_that_is_off_and_a_turn_about_it(measured):
     rng, n = np.random.default_rng(8), 40_000
     pose = measured[:1]

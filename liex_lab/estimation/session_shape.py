@@ -1,0 +1,267 @@
+"""The session's own build: how wide and high this animal is, and how far poses of such a body err.
+
+Forests learn from bodies of one family; on another build their poses are off in the same way in
+every frame, since nobody sees the mid-axis: a body that is flatter than usual lies higher in its
+skin, a blunt one begins elsewhere in its outline. What all frames of a session show together (the
+mean cross-sections, `cross_sections`) tells the build, and with it that error. A linear map fitted
+by ridge regression (Hoerl and Kennard 1970) on rendered mini-sessions of a wide family of builds,
+
+    y = W^T x + b,    x the clues of a session, y its build and its poses' mean error,
+
+takes the clues to the mean of true minus estimated joints in the base's frame, over the length, and
+to the logarithms of half width and half height over the average animal's at five places.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from liex_lab.body.pose import Pose
+from liex_lab.body.skeleton import Skeleton
+from liex_lab.body.surface import Surface
+from liex_lab.estimation.cross_sections import CrossSections
+from liex_lab.foreground.crop_camera import mm_per_px
+from liex_lab.geometry import SE3
+
+Array = NDArray[np.float64]
+
+PLACES = (0.1, 0.25, 0.4, 0.6, 0.8)  # of the body's length
+_FOLDER = Path(__file__).with_name("shapes")
+_RIDGE = 0.03  # of the clues' variance
+_FOLDS = 5
+_TAIL = 0.005  # of what a clue was seen to be: beyond it is taken for the last that was seen
+_DECIMALS = 9  # a product's last bits depend on the machine
+
+
+def session_clues(
+    skeleton: Skeleton, pose: Pose, heights: NDArray[np.int16], crop_cameras: Array, size: float
+) -> Array:
+    """What the frames of a session tell together about the animal's build.
+
+    Args:
+        skeleton: of the animal, one chain with a tube as its surface.
+        pose: (n) estimated poses, view frame, at least one.
+        heights: (n, H, W) int16 height maps, 1/16 mm.
+        crop_cameras: (n, 17) packed crop cameras of the height maps.
+        size: the animal's size over home size, as the poses were estimated with.
+
+    Returns:
+        (F,) numbers, see `CrossSections.clues`, then the size of a pixel and that of the bones over
+        the animal's.
+    """
+    across = CrossSections.of(skeleton, pose, heights, crop_cameras, size)
+    pixel = float(np.median(mm_per_px(crop_cameras))) / (skeleton.length * size)
+    bones = float(np.log(np.median(pose.scale) / size))
+    return np.concatenate([across.clues(skeleton), [pixel, bones]])
+
+
+@dataclass(frozen=True)
+class ShapePrior:
+    """The regression from a session's clues to the animal's build and its poses' mean error.
+
+    Labels are the mean error of the joints (3 J, over the length, in the base's frame), and the
+    logarithms of half width and of half height over the average animal's at `PLACES`.
+
+    Attributes:
+        bounds: (2, F) the least and the most of each clue, beyond which it is clipped.
+        table: (F + 1, K) weights of the clues, and the constant.
+        spread: (K,) standard deviation of what is left of each label, by cross-fitting.
+        unseen: standard deviations over the length of what is left of the joints' height, and of
+            their place along the body, on builds that the regression has not seen either.
+        model: fingerprint of the pose model whose errors these are.
+    """
+
+    bounds: Array
+    table: Array
+    spread: Array
+    unseen: tuple[float, float] = (0.0, 0.0)
+    model: str = ""
+
+    @staticmethod
+    @cache
+    def of(name: str) -> ShapePrior | None:
+        """The prior of an animal; None where there is none.
+
+        Args:
+            name: name of the skeleton.
+        """
+        path = _FOLDER / f"{name}.npz"
+        return ShapePrior.load(path) if path.is_file() else None
+
+    @staticmethod
+    def load(path: Path) -> ShapePrior:
+        """Read a prior.
+
+        Args:
+            path: the file that `save` wrote.
+        """
+        with np.load(path) as held:
+            height, along = held["unseen"].tolist()
+            return ShapePrior(
+                held["bounds"].astype(float),
+                held["table"].astype(float),
+                held["spread"].astype(float),
+                (height, along),
+                str(held["model"]),
+            )
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """The arrays of the file, in single precision but for `unseen`."""
+        return {
+            "bounds": self.bounds.astype(np.float32),
+            "table": self.table.astype(np.float32),
+            "spread": self.spread.astype(np.float32),
+            "unseen": np.array(self.unseen),
+            "model": np.array(self.model),
+        }
+
+    @staticmethod
+    def fit(clues: Array, labels: Array) -> ShapePrior:
+        """Fit the regression to sessions of known animals.
+
+        Args:
+            clues: (n, F) of n sessions.
+            labels: (n, K) of them.
+
+        Returns:
+            The prior; `unseen` is nought until builds that it has not seen have been measured.
+        """
+        bounds = np.quantile(clues, [_TAIL, 1.0 - _TAIL], axis=0)
+        x = np.clip(clues, *bounds)
+        fold = np.arange(len(x)) % _FOLDS
+        left = np.empty_like(labels)
+        for k in range(_FOLDS):
+            table = _ridge(x[fold != k], labels[fold != k])
+            left[fold == k] = labels[fold == k] - (x[fold == k] @ table[:-1] + table[-1])
+        return ShapePrior(bounds, _ridge(x, labels), left.std(axis=0))
+
+    def predict(self, clues: Array) -> Array:
+        """The labels of sessions.
+
+        Args:
+            clues: (..., F).
+
+        Returns:
+            (..., K).
+        """
+        x = np.clip(clues, *self.bounds)
+        return np.asarray((x @ self.table[:-1] + self.table[-1]).round(_DECIMALS))
+
+
+def _ridge(x: Array, y: Array) -> Array:
+    """Weights (F + 1, K) of a ridge regression on standardised clues, the constant last."""
+    middle = x.mean(axis=0)
+    spread = x.std(axis=0)
+    per = np.where(spread > 1e-9, 1.0 / np.maximum(spread, 1e-9), 0.0)
+    z = (x - middle) * per
+    weights = np.linalg.solve(
+        z.T @ z + _RIDGE * len(z) * np.eye(z.shape[1]), z.T @ (y - y.mean(axis=0))
+    )
+    weights *= per[:, None]
+    return np.vstack([weights, y.mean(axis=0) - middle @ weights])
+
+
+def labels_of(offset: Array, width: Array, height: Array) -> Array:
+    """Labels of a session as `ShapePrior` wants them.
+
+    Args:
+        offset: (J, 3) mean of true minus estimated joints, base frame, over the length.
+        width: (P,) half widths over the average animal's at `PLACES`.
+        height: (P,) half heights likewise.
+    """
+    return np.concatenate([offset.ravel(), np.log(width), np.log(height)])
+
+
+@dataclass(frozen=True)
+class Build:
+    """An animal's build beside the average one's, and how far its estimated poses lie off.
+
+    Attributes:
+        offset: (J, 3) what is added to the joints, base frame, over the animal's length.
+        width: (P,) half widths over the average animal's of that length, at `PLACES`.
+        height: (P,) half heights likewise.
+        width_sd: (P,) standard deviations of the logarithms of `width`.
+        height_sd: (P,) of `height`.
+        unseen: standard deviations over the length of what is left of the joints' height and of
+            their place along the body.
+    """
+
+    offset: Array
+    width: Array
+    height: Array
+    width_sd: Array
+    height_sd: Array
+    unseen: tuple[float, float]
+
+    @staticmethod
+    def told(prior: ShapePrior, clues: Array) -> Build:
+        """The build that a session's clues tell.
+
+        Args:
+            prior: of the animal.
+            clues: (F,) of the session, see `session_clues`.
+        """
+        labels = prior.predict(clues)
+        p = len(PLACES)
+        return Build(
+            labels[: -2 * p].reshape(-1, 3),
+            np.exp(labels[-2 * p : -p]),
+            np.exp(labels[-p:]),
+            prior.spread[-2 * p : -p],
+            prior.spread[-p:],
+            prior.unseen,
+        )
+
+    def corrected(self, skeleton: Skeleton, pose: Pose, size: float) -> Pose:
+        """The poses with the mean error of such a body taken off.
+
+        Args:
+            skeleton: of the animal, one chain.
+            pose: (n) estimated poses in any frame; rows that are not finite stay as they are.
+            size: the animal's size over home size.
+        """
+        rows = np.isfinite(pose.scale)
+        if not rows.any():
+            return pose
+        some = pose[rows]
+        rotation = some.root.rotation
+        moved = some.joints(skeleton) + skeleton.length * size * np.einsum(
+            "nij,kj->nki", rotation, self.offset
+        )
+        right = Pose.from_joints(skeleton, moved, rotation[..., 2])
+        whole = Pose(
+            SE3(pose.root.rotation.copy(), pose.root.translation.copy()),
+            pose.angles.copy(),
+            pose.scale.copy(),
+        )
+        whole.root.rotation[rows] = right.root.rotation
+        whole.root.translation[rows] = right.root.translation
+        whole.angles[rows] = right.angles
+        whole.scale[rows] = right.scale
+        return whole
+
+    def surface(self, skeleton: Skeleton) -> Surface:
+        """The body of this build.
+
+        Args:
+            skeleton: of the animal, with a tube as its surface.
+        """
+        average = Surface.of(skeleton)
+        assert average.shape is not None
+        wide, high = (
+            np.exp(np.interp(average.stations, PLACES, np.log(factor)))
+            for factor in (self.width, self.height)
+        )
+        shape = average.shape
+        return replace(
+            average,
+            shape=replace(
+                shape, half_width=shape.half_width * wide, half_height=shape.half_height * high
+            ),
+        )

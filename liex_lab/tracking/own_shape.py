@@ -1,0 +1,156 @@
+"""The session's own shape: fitted over many frames, and kept only where other frames bear it out.
+
+The regression of `estimation.session_shape` tells the animal's build from two thirds of the
+sampled frames that are seen well. The body of that build, in the poses that are corrected for it,
+is then held against the depth of the other third, beside the average body at its best girth in the
+poses as they were (hold-out validation): whichever leaves the smaller median residual is the
+session's. With fewer than 50 such frames it is the average one.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from liex_lab.body.pose import Pose
+from liex_lab.estimation.estimator import Estimates, PoseEstimator
+from liex_lab.estimation.session_shape import PLACES, Build, ShapePrior, session_clues
+from liex_lab.foreground.crop_camera import view_of
+from liex_lab.foreground.segmenter import Segmenter
+from liex_lab.tracking.residual import BodyResidual
+
+Array = NDArray[np.float64]
+
+FEWEST_FRAMES = 50
+_HELD_OUT = 3  # every so many-th frame is not fitted to
+
+
+@dataclass(frozen=True)
+class OwnShape:
+    """A session's shape: the animal's build, and what speaks for it.
+
+    Attributes:
+        build: the build; None where the average body was kept.
+        n_frames: well-seen frames of the sample.
+        average_residual_mm: median distance of the average body, at its best girth, from the depth
+            of the frames that were held out, mm; NaN where none were.
+        residual_mm: the same of the fitted body in the corrected poses.
+        why: why the average body was kept; empty where it was not.
+    """
+
+    build: Build | None
+    n_frames: int
+    average_residual_mm: float = float("nan")
+    residual_mm: float = float("nan")
+    why: str = ""
+
+    def corrected(self, estimator: PoseEstimator, pose: Pose, size: float) -> Pose:
+        """Poses with the mean error of such a body taken off; as they are where none is known.
+
+        Args:
+            estimator: the animal's.
+            pose: (n) poses in any frame, NaN where there is none.
+            size: the animal's size over home size.
+        """
+        return pose if self.build is None else self.build.corrected(estimator.skeleton, pose, size)
+
+    def to_dict(self) -> dict[str, Any]:
+        """The shape for session.json."""
+        told: dict[str, Any] = {
+            "kept": self.build is not None,
+            "n_frames": self.n_frames,
+            "average_residual_mm": _rounded(self.average_residual_mm),
+            "residual_mm": _rounded(self.residual_mm),
+        }
+        if self.build is None:
+            return {**told, "why": self.why}
+        build = self.build
+        return {
+            **told,
+            "places": list(PLACES),
+            "width": build.width.round(3).tolist(),
+            "width_sd": build.width_sd.round(3).tolist(),
+            "height": build.height.round(3).tolist(),
+            "height_sd": build.height_sd.round(3).tolist(),
+            "joints_moved": build.offset.round(4).tolist(),
+        }
+
+
+def _rounded(value: float) -> float | None:
+    return round(value, 4) if np.isfinite(value) else None
+
+
+def fit_shape(
+    prior: ShapePrior | None,
+    estimator: PoseEstimator,
+    scene: Segmenter,
+    estimates: Estimates,
+    size: float,
+    average: BodyResidual,
+) -> tuple[OwnShape | None, BodyResidual]:
+    """The session's shape from a sample of its frames, and the body that its frames are held to.
+
+    Args:
+        prior: of the animal, None where no shapes were learned of it.
+        estimator: the animal's.
+        scene: the segmenter of the recording's camera.
+        estimates: of the sampled frames, camera frame.
+        size: the animal's size over home size.
+        average: the average body at its best girth.
+
+    Returns:
+        The shape, None of an animal of which no shapes were learned; and `average` or the fitted
+        body.
+    """
+    skeleton = estimator.skeleton
+    if prior is None:
+        return None, average
+    limit = estimator.model.calibration.doubtful_mm * size
+    good = np.flatnonzero(estimates.found & ~(estimates.chosen.error_mm > limit))
+    if prior.model != estimator.model.fingerprint:
+        why = f"shapes were learned for the bundled model of the {skeleton.name} alone"
+        return OwnShape(None, len(good), why=why), average
+    if len(good) < FEWEST_FRAMES:
+        why = (
+            f"{len(good)} frames of the sample show the animal well, and a shape of its own is "
+            f"fitted to {FEWEST_FRAMES} or more"
+        )
+        return OwnShape(None, len(good), why=why), average
+    held_out = good[::_HELD_OUT]
+    fitted = np.setdiff1d(good, held_out)
+    crops = estimates.crops
+    cameras = scene.crop_cameras(crops, estimator.model.method.camera_view)
+    pose = estimates.chosen.pose
+    clues = session_clues(
+        skeleton,
+        pose[fitted].moved(view_of(cameras[fitted])),
+        crops.heights[fitted],
+        cameras[fitted],
+        size,
+    )
+    build = Build.told(prior, clues)
+    own = BodyResidual(build.surface(skeleton), camera_view=average.camera_view)
+    before, after = (
+        _median_residual(body, shown.moved(scene.floor.T_arena_camera), crops[held_out], scene)
+        for body, shown in (
+            (average, pose[held_out]),
+            (own, build.corrected(skeleton, pose[held_out], size)),
+        )
+    )
+    if not after < before:
+        why = (
+            "on frames that were held out a body of its own leaves "
+            f"{after:.2f} mm to the depth and the average one {before:.2f} mm"
+        )
+        return OwnShape(None, len(good), before, after, why), average
+    return OwnShape(build, len(good), before, after), own
+
+
+def _median_residual(body: BodyResidual, pose: Pose, crops: Any, scene: Segmenter) -> float:
+    """Median over the frames of a body's residual, mm; NaN where nothing is covered."""
+    residual = body.of(pose, crops, scene)
+    known = residual[np.isfinite(residual)]
+    return float(np.median(known)) if len(known) else float("nan")

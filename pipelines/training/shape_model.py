@@ -1,0 +1,269 @@
+"""Fit of an animal's shape prior on rendered mini-sessions, `liex train shape`.
+
+A mini-session is some frames of one animal before one camera; of a wide family of builds many are
+rendered, measured by the animal's pose model as a session is (its size is found, too), and each
+gives the clues of its mean cross-sections, the poses' mean error, and the animal's build. What the
+fitted regression leaves on builds of a family that neither it nor the forests have seen says how
+far off the joints may still be. Everything is drawn from seeds, so the same command writes the same
+bytes whenever it is run.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from liex_lab.errors import LiexError
+from liex_lab.runtime.progress import Progress, silent
+from liex_lab.runtime.threads import serial_products
+
+from ..evaluation.pose import estimator_of
+from .pose_model import home_area_mm2, recipe_of
+
+if TYPE_CHECKING:
+    from liex_lab.body.shape import BodyShape
+    from liex_lab.body.skeleton import Skeleton
+    from liex_lab.estimation.estimator import PoseEstimator
+    from liex_lab.estimation.session_shape import ShapePrior
+    from liex_lab.foreground.height_maps import HeightMaps
+    from liex_lab.simulation.training_patches import TrainingPatches
+
+Array = NDArray[np.float64]
+
+N_SESSIONS = 512
+PER_SESSION = 16
+SEEDS = {"wide": 41, "other": 42}  # of a family's pictures
+_SIZE_SD = 0.06  # how far off (log) the size is where its search begins
+_SIZE_PASSES = 2
+_PER_PASS = 2.0  # a pass of the search goes a third of the way; so much farther goes this one
+_LEAST_GOOD = 8  # of a mini-session's frames
+_FAR = 0.12  # of the length: a pose that is farther off is lost, and no error of the build's
+
+
+@dataclass(frozen=True)
+class MiniSession:
+    """What a rendered mini-session tells, and its truth.
+
+    Attributes:
+        clues: (F,) see `session_clues`.
+        labels: (K,) see `ShapePrior`.
+    """
+
+    clues: Array
+    labels: Array
+
+
+@serial_products()
+def train_shape(
+    animal: str,
+    out: Path,
+    *,
+    n_sessions: int | None = None,
+    workers: int = 0,
+    progress: Progress = silent,
+) -> Path:
+    """Write an animal's shape prior; the same bytes on every run.
+
+    Args:
+        animal: a bundled animal's name, or the path of a skeleton's TOML.
+        out: path of the file that is written.
+        n_sessions: mini-sessions of the wide family; None takes the usual number.
+        workers: threads of the kernels; 0 takes all.
+        progress: told block by block.
+
+    Returns:
+        `out`.
+
+    Raises:
+        LiexError: the animal is no chain with a tube as its body.
+    """
+    import numba
+
+    from liex_lab.estimation.session_shape import ShapePrior
+
+    if workers:
+        numba.set_num_threads(min(workers, numba.config.NUMBA_NUM_THREADS))
+    estimator = estimator_of(animal, "default", progress)
+    known = n_sessions or N_SESSIONS
+    rows = list(mini_sessions(estimator, "wide", known, progress))
+    prior = ShapePrior.fit(
+        np.stack([row.clues for row in rows]), np.stack([row.labels for row in rows])
+    )
+    others = list(mini_sessions(estimator, "other", known // 4, progress))
+    prior = replace(prior, unseen=left_over(prior, others), model=estimator.model.fingerprint)
+    unfinished = out.with_name(f"{out.name}.part-{os.getpid()}.npz")
+    np.savez(unfinished, **prior.arrays())  # type: ignore[arg-type]
+    unfinished.replace(out)
+    return out
+
+
+def left_over(prior: ShapePrior, others: Sequence[MiniSession]) -> tuple[float, float]:
+    """What a prior leaves of the joints' height and place along the body on other builds.
+
+    Args:
+        prior: fitted to other families.
+        others: mini-sessions of builds that it has not seen, at least one.
+
+    Returns:
+        Standard deviations over the length, of all joints together.
+    """
+    from liex_lab.estimation.session_shape import PLACES
+
+    n = len(others[0].labels) - 2 * len(PLACES)
+    left = np.stack([one.labels - prior.predict(one.clues) for one in others])[:, :n]
+    left = left.reshape(len(others), -1, 3)
+    return (
+        round(float(np.sqrt(np.mean(left[..., 2] ** 2))), 4),
+        round(float(np.sqrt(np.mean(left[..., 0] ** 2))), 4),
+    )
+
+
+def mini_sessions(
+    estimator: PoseEstimator, family: str, n: int, progress: Progress = silent
+) -> Iterator[MiniSession]:
+    """Rendered mini-sessions of a family of builds, measured; those that are lost are left out.
+
+    Args:
+        estimator: the animal's.
+        family: of body shapes.
+        n: how many are rendered; it is rounded up to whole blocks.
+        progress: told block by block.
+
+    Raises:
+        LiexError: the animal is no chain with a tube as its body.
+    """
+    from liex_lab.body.shape import BodyShape
+    from liex_lab.simulation.simulator import BodySimulator, world_of
+    from liex_lab.simulation.training_patches import BLOCK, drawn_bodies
+
+    skeleton = estimator.skeleton
+    world = world_of(skeleton)
+    if not isinstance(world, BodySimulator) or "stations" not in skeleton.surface:
+        raise LiexError(
+            f"a shape is learned of animals that are one chain with a tube around it, not of "
+            f"'{skeleton.name}'"
+        )
+    recipe = recipe_of("default", skeleton)
+    seed = SEEDS[family]
+    n_blocks = -(-n * PER_SESSION // BLOCK)
+    for number in range(n_blocks):
+        progress(number, n_blocks, f"rendering animals of the family '{family}'")
+        spine_mm, window_px = recipe.sizes[number % len(recipe.sizes)]
+        drawn = {
+            "family": family,
+            "degraded_share": recipe.degraded_share,
+            "spine_mm": spine_mm or None,
+            "per_session": PER_SESSION,
+        }
+        (windows,) = world.training_blocks(seed, 1, first=number, window_px=window_px, **drawn)
+        bodies = drawn_bodies(seed, number, world.species, **drawn)
+        assert isinstance(bodies, BodyShape)
+        yield from _measured(estimator, windows, bodies, np.random.default_rng([seed, number, 2]))
+
+
+def _measured(
+    estimator: PoseEstimator, windows: TrainingPatches, bodies: BodyShape, rng: np.random.Generator
+) -> Iterator[MiniSession]:
+    """The mini-sessions of one block."""
+    from liex_lab.body.pose import Pose
+    from liex_lab.foreground.crop_camera import view_of
+
+    skeleton = estimator.skeleton
+    crops, crop_cameras = _cut(estimator, windows)
+    truth = Pose(view_of(crop_cameras) @ windows.root, windows.angles, windows.scale)
+    joints = truth.joints(skeleton)
+    for k in range(len(bodies)):
+        rows = np.arange(k * PER_SESSION, (k + 1) * PER_SESSION)
+        size = windows.spine_mm[rows[0]] / skeleton.length
+        begin = float(size * np.exp(_SIZE_SD * rng.standard_normal()))
+        found = _mini_session(
+            estimator, crops[rows], crop_cameras[rows], joints[rows], bodies[k], size, begin
+        )
+        if found is not None:
+            yield found
+
+
+def _cut(estimator: PoseEstimator, windows: TrainingPatches) -> tuple[HeightMaps, Array]:
+    """Height maps of the animals in patches, cut out by the product's own segmentation."""
+    from liex_lab.foreground.background_segmenter import SPREADS
+    from liex_lab.foreground.height_maps import Patches
+
+    skeleton = estimator.skeleton
+    size = windows.spine_mm / skeleton.length
+    depth, background = (
+        picture if windows.unit_mm == 1.0 else picture * np.float32(windows.unit_mm)
+        for picture in (windows.depth, windows.background)
+    )
+    cut = Patches(
+        depth,
+        background,
+        windows.intrinsics,
+        windows.origin.astype(float),
+        windows.floor,
+        skeleton.view,
+    )
+    least = np.maximum(skeleton.view.min_height_mm, SPREADS * windows.spread_mm)
+    return cut.extract(
+        size, home_area_mm2(skeleton) * size**2, least, estimator.model.method.camera_view
+    )
+
+
+def _mini_session(
+    estimator: PoseEstimator,
+    crops: HeightMaps,
+    crop_cameras: Array,
+    truth: Array,
+    body: BodyShape,
+    true_size: float,
+    begin: float,
+) -> MiniSession | None:
+    """One mini-session, its size found from `begin` on; None where too few frames are measured.
+
+    truth (n, J, 3) mm are its true joints in the view frames.
+    """
+    from liex_lab.estimation.session_shape import session_clues
+    from liex_lab.foreground.crop_camera import view_of
+
+    skeleton = estimator.skeleton
+    plain = replace(estimator, model=replace(estimator.model, corrector=None))
+    size = begin
+    for _ in range(_SIZE_PASSES):
+        estimates = plain.best_of(crops, crop_cameras, size)
+        if estimates.found.sum() < _LEAST_GOOD:
+            return None
+        told = float(np.median(plain.sizes_told(estimates)))
+        size *= (told / size) ** _PER_PASS
+    estimates = estimator.best_of(crops, crop_cameras, size)
+    pose = estimates.chosen.pose.moved(view_of(crop_cameras))
+    off = truth - pose.joints(skeleton)
+    length = skeleton.length * size
+    good = np.linalg.norm(off, axis=-1).mean(axis=1) < _FAR * length  # not where it is not finite
+    if good.sum() < _LEAST_GOOD:
+        return None
+    use = estimates.found
+    clues = session_clues(skeleton, pose[use], crops.heights[use], crop_cameras[use], size)
+    offset = np.einsum("nji,nkj->nki", pose.root.rotation[good], off[good]).mean(axis=0) / length
+    return MiniSession(clues, _labels(skeleton, offset, body, true_size / size))
+
+
+def _labels(skeleton: Skeleton, offset: Array, body: BodyShape, grown: float) -> Array:
+    """Labels of a mini-session, whose animal is larger than it was taken for by `grown`."""
+    from liex_lab.body.shape import BodyShape
+    from liex_lab.estimation.session_shape import PLACES, labels_of
+
+    stations = np.array(skeleton.surface["stations"], float)
+    average = BodyShape.default(skeleton)
+    width, height = (
+        grown * np.interp(PLACES, stations, own) / np.interp(PLACES, stations, usual)
+        for own, usual in (
+            (body.half_width, average.half_width),
+            (body.half_height, average.half_height),
+        )
+    )
+    return labels_of(offset, width, height)

@@ -1,0 +1,187 @@
+"""The build of an animal from many frames: cross-sections as wide as the body, a map found again,
+poses moved by what is known.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from liex_lab.body.pose import Pose
+from liex_lab.body.shape import BodyShape
+from liex_lab.catalog import find_model
+from liex_lab.estimation import _cross_section_kernels as kernels
+from liex_lab.estimation.cross_sections import N_STATIONS, CrossSections
+from liex_lab.estimation.model import Model
+from liex_lab.estimation.session_shape import PLACES, Build, ShapePrior, labels_of, session_clues
+from liex_lab.foreground._crop_camera_kernels import CropCamera, to_pixel
+from liex_lab.foreground.crop_camera import view_of
+from liex_lab.geometry import SE3
+from tests.estimation.toy import SCENE, Toy, rendered, toy_mice
+
+AT = np.linspace(-0.10, 1.10, N_STATIONS)
+TRUNK = (AT > 0.1) & (AT < 0.9)
+
+
+@pytest.fixture(scope="module")
+def toy() -> Toy:
+    return toy_mice(60, 11, noise_mm=0.0, size=(1.0, 1.0))
+
+
+def across(toy: Toy, shape: BodyShape | None = None) -> CrossSections:
+    """The cross-sections of the toy's mice with a body, in their true poses."""
+    crops = SCENE.extract(rendered(toy.skeleton, toy.pose, shape=shape), 1.0)
+    cameras = SCENE.crop_cameras(crops, False)
+    T_view_arena = view_of(cameras) @ SCENE.floor.T_arena_camera.inverse()
+    pose = toy.pose.moved(T_view_arena)
+    return CrossSections.of(toy.skeleton, pose, crops.heights, cameras, 1.0)
+
+
+def tall(toy: Toy, factor: float) -> BodyShape:
+    """The default mouse, so many times as high, without ears, feet and tail."""
+    usual = BodyShape.default(toy.skeleton).bare()
+    return replace(usual, half_height=factor * usual.half_height)
+
+
+def test_the_half_width_of_the_cross_sections_is_that_of_the_body(toy):
+    stations = np.array(toy.skeleton.surface["stations"])
+    true = np.interp(AT, stations, BodyShape.default(toy.skeleton).half_width)
+    seen = across(toy).half_width * toy.skeleton.length
+    np.testing.assert_allclose(seen[TRUNK], true[TRUNK], atol=1.2)  # a pixel is 2 mm
+
+
+def test_the_back_of_a_higher_body_lies_higher_and_falls_farther(toy):
+    flat, high = across(toy, tall(toy, 0.8)), across(toy, tall(toy, 1.2))
+    middle = slice(8, 14)
+    lies = (high.height - flat.height)[middle, 0] * toy.skeleton.length
+    usual = np.interp(
+        AT[middle], toy.skeleton.surface["stations"], BodyShape.default(toy.skeleton).half_height
+    )
+    np.testing.assert_allclose(lies, 0.4 * usual, rtol=0.12)
+    falls = [one.height[middle, 0] - one.height[middle, 10] for one in (flat, high)]
+    assert (falls[1] > 1.2 * falls[0]).all()
+
+
+def test_the_kernel_agrees_with_the_loop_a_reader_would_write():
+    rng = np.random.default_rng(3)
+    heights = (rng.integers(0, 40, (2, 30, 30)) * 16 * (rng.random((2, 30, 30)) < 0.6)).astype(
+        np.int16
+    )
+    camera = CropCamera(20.0, 20.0, 15.0, 15.0, *np.eye(3).ravel(), 50.0, 0.0, 0.0, 1.0)
+    # the camera looks along the axis that heights are measured against
+    camera = camera._replace(r11=-1.0, r22=-1.0)
+    cameras = np.tile(np.array(camera), (2, 1))
+    points = rng.uniform(-20, 20, (2, 3, 3))
+    sideways = rng.normal(size=(2, 3, 2))
+    lateral = np.array([1.0, 4.0, 30.0])
+    seen, height = np.empty((2, 3, 3)), np.empty((2, 3, 3))
+    kernels.read_across(heights, cameras, points, sideways, lateral, seen, height)
+    for i, s, t in np.ndindex(2, 3, 3):
+        readings = []
+        for side in (-1.0, 1.0):
+            x, y = points[i, s, :2] + side * lateral[t] * sideways[i, s]
+            u, v = to_pixel(camera, x, y, points[i, s, 2])
+            column, row = int(np.floor(u + 0.5)), int(np.floor(v + 0.5))
+            if 0 <= row < 30 and 0 <= column < 30 and heights[i, row, column] > 0:
+                readings.append(heights[i, row, column] / 16.0 - points[i, s, 2])
+        assert seen[i, s, t] == len(readings) / 2
+        assert height[i, s, t] == pytest.approx(np.mean(readings) if readings else 0.0)
+    assert 0 < seen.sum() < seen.size
+
+
+def test_a_linear_map_is_found_again_and_its_noise_is_told(tmp_path: Path):
+    rng = np.random.default_rng(5)
+    clues = rng.uniform(-1.0, 1.0, (800, 6))
+    weights = rng.normal(size=(6, 4))
+    labels = clues @ weights + [1.0, 2.0, 3.0, 4.0] + rng.normal(0, 0.2, (800, 4))
+    prior = replace(ShapePrior.fit(clues, labels), unseen=(0.01, 0.02), model="m")
+    new = rng.uniform(-0.9, 0.9, (50, 6))
+    true = new @ weights + [1.0, 2.0, 3.0, 4.0]
+    # ridge regression pulls by three per cent of the clues' variance
+    assert np.abs(prior.predict(new) - true).mean() < 0.05 * np.abs(true).mean()
+    pulled = 0.03 / 1.03 * np.linalg.norm(weights, axis=0) / np.sqrt(3.0)
+    np.testing.assert_allclose(prior.spread, np.hypot(0.2, pulled), rtol=0.15)
+    np.savez(tmp_path / "kept.npz", **prior.arrays())
+    again = ShapePrior.load(tmp_path / "kept.npz")
+    np.testing.assert_allclose(again.predict(new), prior.predict(new), atol=1e-5)
+    assert (again.unseen, again.model) == ((0.01, 0.02), "m")
+
+
+def test_a_clue_beyond_all_that_was_seen_is_taken_for_the_last():
+    clues = np.random.default_rng(6).uniform(-1, 1, (400, 2))
+    prior = ShapePrior.fit(clues, clues @ [[1.0], [0.0]])
+    far, edge = prior.predict(np.array([[50.0, 0.0], [1.0, 0.0]]))
+    assert far == pytest.approx(edge, abs=0.02)
+
+
+def build(offset: np.ndarray) -> Build:
+    ones = np.ones(len(PLACES))
+    return Build(offset, ones, 1.2 * ones, 0.05 * ones, 0.1 * ones, (0.01, 0.01))
+
+
+def test_poses_are_moved_in_their_own_frame_and_bones_keep_their_proportions(toy):
+    """An offset that is the same for all joints moves the whole body by it."""
+    offset = np.tile([0.02, 0.0, -0.03], (toy.skeleton.n_joints, 1))
+    moved = build(offset).corrected(toy.skeleton, toy.pose, 1.1)
+    step = 1.1 * toy.skeleton.length * toy.pose.root.rotation @ offset[0]
+    np.testing.assert_allclose(moved.joints(toy.skeleton), toy.joints + step[:, None], atol=1e-6)
+    np.testing.assert_allclose(moved.scale, toy.pose.scale)
+
+
+def test_frames_without_a_pose_stay_without_one(toy):
+    scale = toy.pose.scale.copy()
+    scale[3] = np.nan
+    pose = Pose(
+        SE3(toy.pose.root.rotation.copy(), toy.pose.root.translation.copy()),
+        toy.pose.angles.copy(),
+        scale,
+    )
+    pose.root.translation[3] = np.nan
+    moved = build(np.full((toy.skeleton.n_joints, 3), 0.01)).corrected(toy.skeleton, pose, 1.0)
+    assert np.isnan(moved.joints(toy.skeleton)[3]).all()
+    assert np.isfinite(moved.joints(toy.skeleton)[[2, 4]]).all()
+
+
+def test_the_body_of_a_build_is_as_much_wider_and_higher(toy):
+    body = build(np.zeros((toy.skeleton.n_joints, 3))).surface(toy.skeleton).shape
+    usual = BodyShape.default(toy.skeleton)
+    np.testing.assert_allclose(body.half_width, usual.half_width)
+    np.testing.assert_allclose(body.half_height, 1.2 * usual.half_height)
+
+
+def test_the_bundled_shapes_were_learned_for_the_bundled_model():
+    prior = ShapePrior.of("fish")
+    model = Model.load(find_model("fish"))
+    assert prior is not None
+    assert prior.model == model.fingerprint
+    assert prior.table.shape == (prior.bounds.shape[1] + 1, 3 * 21 + 2 * len(PLACES))
+    assert ShapePrior.of("snake") is None
+
+
+def test_labels_come_back_as_a_build(toy):
+    """Through a regression that knows one answer alone."""
+    rng = np.random.default_rng(8)
+    offset = rng.normal(0, 0.01, (5, 3))
+    wide, high = rng.uniform(0.7, 1.4, (2, len(PLACES)))
+    labels = labels_of(offset, wide, high)
+    clues = session_clues_of(toy)
+    n = len(clues)
+    prior = ShapePrior(
+        np.tile([[-9.0], [9.0]], n),
+        np.vstack([np.zeros((n, len(labels))), labels]),
+        np.full(len(labels), 0.1),
+    )
+    told = Build.told(prior, clues)
+    np.testing.assert_allclose(told.offset, offset, atol=1e-8)
+    np.testing.assert_allclose(told.width, wide, rtol=1e-8)
+    np.testing.assert_allclose(told.height, high, rtol=1e-8)
+
+
+def session_clues_of(toy: Toy) -> np.ndarray:
+    crops = SCENE.extract(toy.depths, 1.0)
+    cameras = SCENE.crop_cameras(crops, False)
+    pose = toy.pose.moved(view_of(cameras) @ SCENE.floor.T_arena_camera.inverse())
+    return session_clues(toy.skeleton, pose, crops.heights, cameras, 1.0)

@@ -1,0 +1,114 @@
+"""A session's own shape: kept where frames that it was not fitted to bear it out, not elsewhere."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from liex_lab.body.shape import BodyShape
+from liex_lab.body.surface import Surface
+from liex_lab.estimation.estimator import Estimates, PoseEstimator
+from liex_lab.estimation.session_shape import PLACES, ShapePrior, labels_of
+from liex_lab.tracking.own_shape import FEWEST_FRAMES, OwnShape, fit_shape
+from liex_lab.tracking.residual import BodyResidual
+from tests.estimation.test_session_shape import session_clues_of
+from tests.estimation.toy import SCENE, Toy, rendered, toy_mice, trained
+
+N = 60
+HIGHER = 1.25  # than the average mouse's is the back of this one
+LIFTED = 0.03  # of its length the estimated poses lie above the true ones
+
+
+@pytest.fixture(scope="module")
+def toy() -> Toy:
+    return toy_mice(N, 21, noise_mm=0.0, size=(1.0, 1.0))
+
+
+@pytest.fixture(scope="module")
+def estimator() -> PoseEstimator:
+    return PoseEstimator(trained("default").model)
+
+
+@pytest.fixture(scope="module")
+def estimates(toy: Toy, estimator: PoseEstimator) -> Estimates:
+    """Of high mice, as if all poses were right but too high by as much everywhere."""
+    usual = BodyShape.default(toy.skeleton).bare()
+    depths = rendered(
+        toy.skeleton, toy.pose, shape=replace(usual, half_height=HIGHER * usual.half_height)
+    )
+    found = estimator.estimate(depths, SCENE, 1.0)
+    up = toy.pose.root.rotation[..., 2] * LIFTED * toy.skeleton.length
+    pose = replace(
+        toy.pose, root=replace(toy.pose.root, translation=toy.pose.root.translation + up)
+    ).moved(SCENE.floor.T_arena_camera.inverse())
+    chosen = replace(found.chosen, pose=pose, error_mm=np.full(N, 0.1))
+    return Estimates(chosen, np.ones(N, bool), found.crops)
+
+
+def certain(toy: Toy, estimator: PoseEstimator, lowered: float, higher: float) -> ShapePrior:
+    """A regression that tells one build whatever it is shown."""
+    n = len(session_clues_of(toy))
+    offset = np.tile([0.0, 0.0, -lowered], (toy.skeleton.n_joints, 1))
+    labels = labels_of(offset, np.ones(len(PLACES)), np.full(len(PLACES), higher))
+    table = np.vstack([np.zeros((n, len(labels))), labels])
+    spread = np.full(len(labels), 0.05)
+    bounds = np.tile([[-9.0], [9.0]], n)
+    return ShapePrior(bounds, table, spread, (0.01, 0.02), estimator.model.fingerprint)
+
+
+def average(toy: Toy, estimates: Estimates) -> BodyResidual:
+    pose = estimates.chosen.pose.moved(SCENE.floor.T_arena_camera)
+    return BodyResidual.fit(Surface.of(toy.skeleton), pose, estimates.crops, SCENE)
+
+
+def fitted(toy, estimator, estimates, prior) -> tuple[OwnShape | None, BodyResidual]:
+    return fit_shape(prior, estimator, SCENE, estimates, 1.0, average(toy, estimates))
+
+
+def test_the_true_build_is_kept_and_takes_the_poses_to_the_truth(toy, estimator, estimates):
+    prior = certain(toy, estimator, LIFTED, HIGHER)
+    shape, body = fitted(toy, estimator, estimates, prior)
+    assert shape is not None
+    assert shape.build is not None
+    assert shape.residual_mm < 0.7 * shape.average_residual_mm
+    pose = shape.corrected(estimator, estimates.chosen.pose, 1.0)
+    joints = pose.moved(SCENE.floor.T_arena_camera).joints(toy.skeleton)
+    np.testing.assert_allclose(joints, toy.joints, atol=1e-6)
+    pose = pose.moved(SCENE.floor.T_arena_camera)
+    assert np.median(body.of(pose, estimates.crops, SCENE)) < 0.5
+    told = shape.to_dict()
+    assert told["kept"]
+    assert told["height"] == [HIGHER] * len(PLACES)
+    assert told["n_frames"] == N
+
+
+@pytest.mark.parametrize(("lowered", "higher"), [(-0.05, 0.8), (0.15, 1.0)])
+def test_a_build_that_other_frames_contradict_is_not(toy, estimator, estimates, lowered, higher):
+    prior = certain(toy, estimator, lowered, higher)
+    shape, body = fitted(toy, estimator, estimates, prior)
+    assert shape is not None
+    assert shape.build is None
+    assert "held out" in shape.why
+    assert body.girth == average(toy, estimates).girth
+    assert shape.corrected(estimator, estimates.chosen.pose, 1.0) is estimates.chosen.pose
+    assert shape.to_dict()["why"] == shape.why
+
+
+def test_too_few_good_frames_leave_the_average_body_and_say_so(toy, estimator, estimates):
+    prior = certain(toy, estimator, LIFTED, HIGHER)
+    seen = np.arange(N) < FEWEST_FRAMES - 1
+    shape, _ = fitted(toy, estimator, replace(estimates, found=seen), prior)
+    assert shape is not None
+    assert shape.build is None
+    assert shape.why.startswith("49 frames")
+
+
+def test_shapes_learned_for_another_model_are_not_used(toy, estimator, estimates):
+    prior = replace(certain(toy, estimator, LIFTED, HIGHER), model="another")
+    shape, _ = fitted(toy, estimator, estimates, prior)
+    assert shape is not None
+    assert shape.build is None
+    assert "model" in shape.why
+    assert fitted(toy, estimator, estimates, None)[0] is None
