@@ -14,7 +14,7 @@ import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -155,7 +155,7 @@ def mini_sessions(
     for number in range(n_blocks):
         progress(number, n_blocks, f"rendering animals of the family '{family}'")
         spine_mm, window_px = recipe.sizes[number % len(recipe.sizes)]
-        drawn = {
+        drawn: dict[str, Any] = {
             "family": family,
             "degraded_share": recipe.degraded_share,
             "spine_mm": spine_mm or None,

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -70,7 +71,8 @@ def test_the_kernel_agrees_with_the_loop_a_reader_would_write():
     heights = (rng.integers(0, 40, (2, 30, 30)) * 16 * (rng.random((2, 30, 30)) < 0.6)).astype(
         np.int16
     )
-    camera = CropCamera(20.0, 20.0, 15.0, 15.0, *np.eye(3).ravel(), 50.0, 0.0, 0.0, 1.0)
+    numbers = [20.0, 20.0, 15.0, 15.0, *np.eye(3).ravel(), 50.0, 0.0, 0.0, 1.0]
+    camera = CropCamera._make(numbers)
     # the camera looks along the axis that heights are measured against
     camera = camera._replace(r11=-1.0, r22=-1.0)
     cameras = np.tile(np.array(camera), (2, 1))
@@ -104,7 +106,8 @@ def test_a_linear_map_is_found_again_and_its_noise_is_told(tmp_path: Path):
     assert np.abs(prior.predict(new) - true).mean() < 0.05 * np.abs(true).mean()
     pulled = 0.03 / 1.03 * np.linalg.norm(weights, axis=0) / np.sqrt(3.0)
     np.testing.assert_allclose(prior.spread, np.hypot(0.2, pulled), rtol=0.15)
-    np.savez(tmp_path / "kept.npz", **prior.arrays())
+    arrays: dict[str, Any] = prior.arrays()
+    np.savez(tmp_path / "kept.npz", **arrays)
     again = ShapePrior.load(tmp_path / "kept.npz")
     np.testing.assert_allclose(again.predict(new), prior.predict(new), atol=1e-5)
     assert (again.unseen, again.model) == ((0.01, 0.02), "m")
@@ -148,6 +151,7 @@ def test_frames_without_a_pose_stay_without_one(toy):
 def test_the_body_of_a_build_is_as_much_wider_and_higher(toy):
     body = build(np.zeros((toy.skeleton.n_joints, 3))).surface(toy.skeleton).shape
     usual = BodyShape.default(toy.skeleton)
+    assert body is not None
     np.testing.assert_allclose(body.half_width, usual.half_width)
     np.testing.assert_allclose(body.half_height, 1.2 * usual.half_height)
 
