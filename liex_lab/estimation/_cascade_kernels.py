@@ -265,7 +265,7 @@ def _see(lanes, n, joint, seen, reach, candidates):
             size,
             scalars,
         )
-        _write_scalars(lanes, s, np.int64(0), scalars)
+        _write_scalars(lanes, s, 0, scalars)
 
 
 @njit(cache=True)
@@ -296,7 +296,7 @@ def _see_all(lanes, n, seen, reach, body, candidates):
         fill_scalars(
             rotations[i, k, 0], positions[i, k, 0], scales[i, k], seen.moments[i], size, scalars
         )
-        _write_scalars(lanes, s, np.int64(0), scalars)
+        _write_scalars(lanes, s, 0, scalars)
         if body.radius.size > 0:
             explain_pose(
                 seen.heights[i],
@@ -309,7 +309,7 @@ def _see_all(lanes, n, seen, reach, body, candidates):
                 body,
                 fit,
             )
-            _write_scalars(lanes, s, np.int64(N_SCALARS), fit)
+            _write_scalars(lanes, s, N_SCALARS, fit)
 
 
 @njit(cache=True)
@@ -428,15 +428,15 @@ def _estimate_block(
     side = heights.shape[1]
     n_joints = poses.positions.shape[2]
     n_starts = starts.scales.shape[1]
+    lanes = _lanes_for(heights, frames, n_starts, 1, seen.size)
+    n = frames.size * n_starts
+    values = np.empty((lanes.base.size, 7))
     # typed as numbers: a kernel is compiled anew for every literal
     first = np.int64(0)
     no_view = np.int64(0)
-    lanes = _lanes_for(heights, frames, n_starts, np.int64(1), seen.size)
-    n = frames.size * n_starts
-    values = np.empty((lanes.base.size, 7))
     _solve_joint(tuning.solved[0], first, tree, regressors, tuning, lanes, n, seen, starts, values)
     if tuning.keep < n_starts:
-        _see(lanes, n, first, seen, tuning.reach, starts)
+        _see(lanes, n, 0, seen, tuning.reach, starts)
         _predict(pruner, first, lanes, n, no_view, side, 0.0, values)
     chosen = np.arange(tuning.keep)
     early = np.empty(n_starts)
