@@ -50,6 +50,11 @@ def resize(disk: Path, n_bytes: int) -> None:
     subprocess.run(command, check=True, capture_output=True)
 
 
+def read_only(disk: Path) -> None:
+    """Let nobody write to a disk any more."""
+    subprocess.run(["mount", "-o", "remount,ro", str(disk)], check=True, capture_output=True)
+
+
 @contextmanager
 def filled_after(seconds: float, disk: Path, n_bytes: int) -> Iterator[None]:
     """A disk in memory that gets smaller within the block: as small as asked, or full.
