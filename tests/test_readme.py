@@ -102,7 +102,7 @@ def test_every_verb_option_setting_and_format_that_is_named_exists() -> None:
     )
     tables = "|".join(plan)
     for table, key in re.findall(rf"`(?:--set )?({tables})\.([a-z]\w+)(?:=[^`]*)?`", EVERYTHING):
-        if key not in ("parquet", "csv", "json", "toml", "rrd", "mcap", "rbl"):
+        if key not in ("parquet", "csv", "json", "toml", "rrd", "mcap", "rbl", "html"):
             assert key in plan[table], f"{table}.{key}"
     formats = set(re.findall(r"--to ([a-z]+)\b", EVERYTHING)) - {"study", "live"}
     assert {"csv", "xlsx", "nwb"} <= formats <= {*TARGETS, "video"}
