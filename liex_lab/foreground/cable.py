@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.arena.floor import Floor
+from liex_lab.foreground.worn import Worn
 from liex_lab.optics.camera import Camera
 from liex_lab.runtime.shapes import check_shapes
 
@@ -35,17 +36,15 @@ _NEARLY = 1.00001  # what rounding may change
 
 
 @dataclass(frozen=True)
-class Cable:
+class Cable(Worn):
     """How cables are told from the animal before one camera.
 
     Attributes:
-        camera: whose pixels are looked at.
-        floor: the floor as that camera sees it.
+        camera: see `Worn`.
+        floor: likewise.
         tall_mm: no animal reaches higher above the floor.
     """
 
-    camera: Camera
-    floor: Floor
     tall_mm: float
 
     @staticmethod
@@ -94,21 +93,6 @@ class Cable:
         for depth in out:
             self._cut_one(depth, limit)
         return out
-
-    def every(self, step: int) -> Cable:
-        """The same in pictures of every `step`-th row and column.
-
-        Args:
-            step: pixels from one to the next, at least 1.
-        """
-        camera = self.camera.every(step)
-        floor = Floor.from_plane(self.floor.normal, self.floor.distance_mm, camera)
-        return Cable(camera, floor, self.tall_mm)
-
-    @property
-    def _px_mm(self) -> float:
-        """Width of a pixel on the floor, mm."""
-        return self.floor.distance_mm / float(np.sqrt(self.camera.fx * self.camera.fy))
 
     @cached_property
     def _inverse(self) -> NDArray[np.float64]:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from liex_lab.arena.floor import Floor
 from liex_lab.foreground.heights import heights_before
+from liex_lab.foreground.worn import Worn
 from liex_lab.optics.camera import Camera
 from liex_lab.runtime.shapes import check_shapes
 
@@ -34,17 +35,15 @@ _FOOT = 0.4  # of the step: what is higher is the block, not the head
 
 
 @dataclass(frozen=True)
-class HeadStage:
+class HeadStage(Worn):
     """How a head stage is told from the animal before one camera.
 
     Attributes:
-        camera: whose pixels are looked at.
-        floor: the floor as that camera sees it.
+        camera: see `Worn`.
+        floor: likewise.
         area_mm2: its usual area seen from above, mm^2.
     """
 
-    camera: Camera
-    floor: Floor
     area_mm2: float
 
     @staticmethod
@@ -89,21 +88,6 @@ class HeadStage:
             for block, around in self._blocks(height):
                 self._cut_one(depth, height, block, around)
         return out
-
-    def every(self, step: int) -> HeadStage:
-        """The same in pictures of every `step`-th row and column.
-
-        Args:
-            step: pixels from one to the next, at least 1.
-        """
-        camera = self.camera.every(step)
-        floor = Floor.from_plane(self.floor.normal, self.floor.distance_mm, camera)
-        return replace(self, camera=camera, floor=floor)
-
-    @property
-    def _px_mm(self) -> float:
-        """Width of a pixel on the floor, mm."""
-        return self.floor.distance_mm / float(np.sqrt(self.camera.fx * self.camera.fy))
 
     @property
     def _side(self) -> int:

@@ -25,7 +25,7 @@ from tests.campaign.tally import Tally
 _PROGRAMS = ("munged", "slurmctld", "slurmd", "sinfo", "scancel", "scontrol", "squeue")
 _KEY = Path("/etc/munge/munge.key")
 _N_SESSIONS = 4  # of a study
-_N_LONG = 12  # of one that lasts longer than the shortest time limit of Slurm, a minute
+_N_LONG = 30  # of one that lasts well longer than the shortest time limit of Slurm, a minute
 _LONGEST_S = 900.0  # of a study; one that hangs is killed
 _HELD_S = 8.0  # a node is held up for so long
 _EMPTY_S = 120.0  # after the study the queue is empty within so long
