@@ -16,12 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.arena.floor import Floor
-from liex_lab.arena.scene import (
-    Scene,
-    find_fixtures,
-    region_corners,
-    roughness,
-)
+from liex_lab.arena.scene import Scene, find_fixtures, region_corners, roughness
 from liex_lab.body.skeleton import MOUSE_VIEW, VIEWS, View
 from liex_lab.foreground import _height_map_kernels as kernels
 from liex_lab.foreground.cable import Cable
