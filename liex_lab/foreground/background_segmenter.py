@@ -8,9 +8,8 @@ where `background` is the farthest mode of the pixel's readings over time and `s
 deviation of that mode (see `background`); where no mode is known on the floor, the plane fitted to
 the floor takes over. Segmenter pixels are joined to 8-connected components of 4 x 4 blocks; the
 animal is the component whose area comes nearest to the one that recurs in the most frames, and its
-height map and image moments are cut by the kernels (see `height_maps`). A part of the animal that
-kept still and so was absorbed into the background (the "sleeping person" problem) is found as a
-lump on the floor that the moving animal touches in nearly every frame.
+height map and image moments are cut by the kernels (see `height_maps`). An animal that keeps still,
+wholly or in part, and so is absorbed into the background is found by `resting`.
 """
 
 from __future__ import annotations
@@ -32,6 +31,7 @@ from liex_lab.foreground.bare_ground import BareGround, Wanted
 from liex_lab.foreground.cable import Cable
 from liex_lab.foreground.floor_level import FloorLevel
 from liex_lab.foreground.head_stage import HeadStage
+from liex_lab.foreground.resting import at_rest, is_like_an_animal, with_its_still_part
 from liex_lab.foreground.scene_change import SceneChange
 from liex_lab.foreground.still_scene import StillScene
 from liex_lab.optics.camera import Camera
@@ -39,17 +39,8 @@ from liex_lab.recordings.recording import Recording
 
 Array = NDArray[np.float64]
 
-# of the frames: a lump that the animal touches that often is a part of it that keeps still
-_TOUCH_SHARE = 0.9
 _OTHER = 3.0  # times larger or smaller is another thing
-# what was never seen moving is an animal only if it is no longer than so many largest spines,
-# higher than so many times what stands out at all, and larger than so many of the least areas
-_LONGEST = 2.0
-_HIGHER = 1.4
-_LARGER = 1.5
-_KINDS = 4  # areas of things that are held against an animal
 _ALIKE = np.log(1.5)
-_IN_PLACE = 0.8  # of the frames must show it where it usually is
 
 
 @dataclass(frozen=True)
@@ -126,7 +117,7 @@ class BackgroundSubtraction(StillScene):
         scene, sample = BackgroundSubtraction._of(camera, stride, ground, whole, level)
         if wanted.stands and floor is None and not ground.standing.moves:
             # nothing that moves has told which of two levels is the floor: what lies there does
-            under = ground.under(whole, scene._places(sample))
+            under = ground.under(whole, scene.places(sample))
             if under.standing is not ground.standing:
                 scene, sample = BackgroundSubtraction._of(camera, stride, under, whole, level)
         changed = SceneChange.find(sample, times_s, scene.grid, scene.area_mm2)
@@ -212,21 +203,19 @@ class BackgroundSubtraction(StillScene):
         Raises:
             EstimationError: nothing of an animal's size stands on the floor.
         """
-        spine_mm = wanted.spine_mm
-        min_height_mm = wanted.min_height_mm
         scene = self
-        area, share = scene._moving_area(sample, spine_mm, min_height_mm)
+        area, share = scene._moving_area(sample, wanted)
         moves = share >= 0.5 or (share > 0.0 and self.standing is not None and self.standing.moves)
-        rests = scene._at_rest(sample, spine_mm, min_height_mm, area, share)
+        rests = at_rest(scene, sample, wanted, area, share)
         if rests is not None:
-            scene, area, share = rests
+            scene, area, share = rests.scene, rests.area_mm2, rests.share
             moves = False
         elif wanted.stands and share >= 0.5:
-            scene, area = scene.with_its_still_part(sample, spine_mm, min_height_mm, area)
+            scene, area = with_its_still_part(scene, sample, wanted, area)
         # what was not seen moving is an animal only where it is as large and as high as one
         if wanted.stands and share > 0.0 and not moves:
             seen_as = replace(scene, area_mm2=area)
-            share = share if seen_as._is_like_an_animal(sample, spine_mm, min_height_mm) else 0.0
+            share = share if is_like_an_animal(seen_as, sample, wanted) else 0.0
         if share == 0.0:
             raise EstimationError(
                 f"no animal was found in {len(sample)} frames spread over the recording: nothing "
@@ -236,206 +225,30 @@ class BackgroundSubtraction(StillScene):
             )
         return replace(scene, area_mm2=area)
 
-    def _at_rest(
-        self,
-        sample: NDArray[np.float32],
-        spine_mm: tuple[float, float],
-        min_height_mm: float,
-        area: float,
-        share: float,
-    ) -> tuple[BackgroundSubtraction, float, float] | None:
-        """The scene with the bare floor as background, where an animal sits in its own background.
-
-        So it is where fewer than half of the frames show something that moves, or what most of them
-        show is no animal, as the specks of an edge that flickers.
-
-        Args:
-            sample: (n, H, W) float32 mm, frames at this scene's stride.
-            spine_mm: lengths of the smallest and the largest animal to expect, mm.
-            min_height_mm: what stands out by less is not the animal.
-            area: usual area of what was found, mm^2.
-            share: of the frames that show it.
-
-        Returns:
-            The scene, the animal's area and the share of frames that show it; None where the scene
-            as it is is the better one.
-        """
-        stands = self.view.frame == VIEWS[0]
-        found = replace(self, area_mm2=area)
-        if share >= 0.5 and (
-            not stands or found._is_like_an_animal(sample, spine_mm, min_height_mm)
-        ):
-            return None
-        on_floor = self.on_floor if self.standing is None else self.standing.on_floor
-        floor = self.grid_floor if self.standing is None else self.standing.floor
-        bare = floor.depth(self.grid.width, self.grid.height)
-        limit = np.where(
-            on_floor, np.maximum(bare - np.float32(min_height_mm), 0), self.limit
-        ).astype(np.float32)
-        still = replace(self, limit=limit, background=np.where(on_floor, bare, self.background))
-        kinds = _KINDS if share == 0.0 else 1  # what moves is the better evidence
-        rests, still_share = still._most_like_an_animal(sample, spine_mm, min_height_mm, kinds)
-        still_area = rests.area_mm2
-        if still_share <= (share if share < 0.5 else 0.0):
-            return None
-        moves = stands and self.standing is not None and self.standing.moves and area > 0.0
-        if (share >= 0.5 or moves) and not rests._is_like_an_animal(
-            sample, spine_mm, min_height_mm
-        ):
-            return None
-        if share < 0.5 and moves and rests._stays_beside(found, sample):
-            return None
-        return still, still_area, still_share
-
-    def _moving_area(
-        self, sample: NDArray[np.float32], spine_mm: tuple[float, float], min_height_mm: float
-    ) -> tuple[float, float]:
+    def _moving_area(self, sample: NDArray[np.float32], wanted: Wanted) -> tuple[float, float]:
         """The usual area mm^2, and the share of the frames that show it, see `usual_area`.
 
         Where that is not the area of what was seen moving clearly, but of specks that come back in
         more frames, as before an animal came, the area of what moves counts. What is like an animal
         is no speck, though a larger thing comes and goes beside it.
         """
-        area, share = self.usual_area(sample, spine_mm)
+        area, share = self.usual_area(sample, wanted.spine_mm)
         standing = self.standing
         if standing is None or not standing.moves or self.view.frame != VIEWS[0]:
             return area, share
         if area > 0.0 and abs(np.log(area / standing.thing_mm2)) < np.log(_OTHER):
             return area, share
-        if share >= 0.5 and replace(self, area_mm2=area)._is_like_an_animal(
-            sample, spine_mm, min_height_mm
-        ):
+        if share >= 0.5 and is_like_an_animal(replace(self, area_mm2=area), sample, wanted):
             return area, share
         crops = replace(self, area_mm2=standing.thing_mm2).extract(sample, 1.0)
         return standing.thing_mm2, float(crops.found.mean())
 
-    def _most_like_an_animal(
-        self,
-        sample: NDArray[np.float32],
-        spine_mm: tuple[float, float],
-        min_height_mm: float,
-        kinds: int,
-    ) -> tuple[BackgroundSubtraction, float]:
-        """The scene with the area of what stands on its floor in most frames and is like an animal.
-
-        A wall's foot or a step along the floor's edge is in every frame, too, and longer than any
-        animal; what is tried after it must also keep its place, as specks of an edge do not. Where
-        nothing is like one, the area that most frames show.
+    def places(self, sample: NDArray[np.float32]) -> list[NDArray[np.bool_]]:
+        """The animal's pixels (H, W) bool in each frame that shows it.
 
         Args:
             sample: (n, H, W) float32 mm, frames at this scene's stride.
-            spine_mm: lengths of the smallest and the largest animal to expect, mm.
-            min_height_mm: what stands out by less is not the animal.
-            kinds: how many areas are tried.
-
-        Returns:
-            The scene with that area, and the share of the frames that show it.
         """
-        tried: list[float] = []
-        first: tuple[BackgroundSubtraction, float] | None = None
-        while len(tried) < kinds:
-            area, share = self.usual_area(sample, spine_mm, tried)
-            if share == 0.0:
-                break
-            found = replace(self, area_mm2=area)
-            if found._is_like_an_animal(sample, spine_mm, min_height_mm) and (
-                not tried or found._keeps_its_place(sample)
-            ):
-                return found, share
-            first = first or (found, share)
-            tried.append(area)
-        return first or (self, 0.0)
-
-    def _keeps_its_place(self, sample: NDArray[np.float32]) -> bool:
-        """Whether what is found in a sample (n, H, W) mm lies in one place in most frames."""
-        crops = self.extract(sample, 1.0)
-        place = crops[crops.found].centroid[:, :2]
-        off = np.linalg.norm(place - np.median(place, axis=0), axis=1)
-        return bool((off < 0.5 * np.sqrt(self.area_mm2)).mean() > _IN_PLACE)
-
-    def _stays_beside(self, moving: BackgroundSubtraction, sample: NDArray[np.float32]) -> bool:
-        """Whether what stands on the bare floor is there beside what moves: another thing.
-
-        Args:
-            moving: the scene in which only what moves is seen, with its area.
-            sample: (n, H, W) float32 mm, frames at this scene's stride.
-        """
-        mover = moving.extract(sample, 1.0)
-        both = self.extract(sample, 1.0)
-        seen = mover.found & both.found
-        if not seen.any():
-            return True
-        apart = np.linalg.norm(mover[seen].centroid[:, :2] - both[seen].centroid[:, :2], axis=1)
-        beside = (apart > np.sqrt(self.area_mm2)) | (both.n_blobs[seen] > 1)
-        return bool(beside.mean() > 0.5)
-
-    def _is_like_an_animal(
-        self, sample: NDArray[np.float32], spine_mm: tuple[float, float], min_height_mm: float
-    ) -> bool:
-        """Whether what is found in a sample (n, H, W) mm is neither longer than the largest animal,
-        nor as low as an uneven floor.
-        """
-        crops = self.extract(sample, 1.0)
-        if not crops.found.any():
-            return False
-        blobs = crops[crops.found].blobs
-        length = 4.0 * float(np.median(blobs.sd_along))
-        height = float(np.median(blobs.volume_mm3 / np.maximum(blobs.area_mm2, 1e-9)))
-        return (
-            length < _LONGEST * spine_mm[1]
-            and height > _HIGHER * min_height_mm
-            and self.area_mm2 > _LARGER * self.view.area[0] * spine_mm[0] ** 2
-        )
-
-    def with_its_still_part(
-        self,
-        sample: NDArray[np.float32],
-        spine_mm: tuple[float, float],
-        min_height_mm: float,
-        area: float,
-    ) -> tuple[BackgroundSubtraction, float]:
-        """The scene with the floor put under an animal that was partly taken for background.
-
-        Such a part is a lump on the floor that the moving animal touches in (nearly, nine tenths
-        of) every frame, and together with which it is still no larger than an animal.
-
-        Args:
-            sample: (n, H, W) float32 mm, frames at this scene's stride.
-            spine_mm: lengths of the smallest and the largest animal to expect, mm.
-            min_height_mm: what stands out from the floor by less is not the animal.
-            area: area of the moving animal, mm^2.
-
-        Returns:
-            The scene, this one where there is no such lump, and the area mm^2 of the whole animal.
-        """
-        import cv2
-
-        bare = self.grid_floor.depth(self.grid.width, self.grid.height)
-        lump = self.on_floor & (self.background > 0) & (bare - self.background > min_height_mm)
-        n, labels, stats, _ = cv2.connectedComponentsWithStats(lump.astype(np.uint8))
-        moving = np.array(replace(self, area_mm2=area)._places(sample)).reshape(-1, *lump.shape)
-        best = self
-        best_area = area
-        for k in range(1, n):
-            part = labels == k
-            if stats[k, cv2.CC_STAT_AREA] < 16:
-                continue
-            near = cv2.dilate(part.astype(np.uint8), np.ones((9, 9), np.uint8)).astype(bool)
-            if moving[:, near].any(axis=1).mean() < _TOUCH_SHARE:
-                continue
-            floor = np.where(near & self.on_floor, bare, self.background)
-            limit = np.where(
-                near & self.on_floor, np.maximum(bare - np.float32(min_height_mm), 0), self.limit
-            )
-            whole = replace(self, background=floor, limit=limit.astype(np.float32))
-            whole_area, share = whole.usual_area(sample, spine_mm)
-            if share >= 0.5 and whole_area > best_area:
-                best = whole
-                best_area = whole_area
-        return best, best_area
-
-    def _places(self, sample: NDArray[np.float32]) -> list[NDArray[np.bool_]]:
-        """The animal's pixels (H, W) bool in each frame of a sample (n, H, W) mm that shows it."""
         crops = self.extract(sample, 1.0)
         places = []
         for i in np.flatnonzero(crops.found):

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from liex_lab.foreground.background_segmenter import BackgroundSubtraction
+from liex_lab.recordings import open_recording
 from tests.foreground.test_background_segmenter import SPINES, recording_of, tilted, with_box
 
 BODY = ((80, 60), (12, 8))  # centre and half sides, pixels
@@ -43,3 +44,16 @@ def test_where_nothing_moves_the_floor_is_what_the_animal_lies_on(step_mm):
     scene, sample = BackgroundSubtraction.learn(recording_of([frame] * 20), SPINES)
     assert scene.floor.distance_mm == pytest.approx(floor.distance_mm, abs=0.6)
     assert scene.extract(sample, 1.0).found.all()
+
+
+@pytest.mark.parametrize(("seed", "n_frames"), [(36, 30), (37, 30), (35, 90)])
+def test_of_what_stands_still_in_a_noisy_picture_the_animal_is_what_changes(seed, n_frames):
+    """Things stand on the floor beside it, the foot of a wall flickers, and it stays in place."""
+    recording = open_recording(
+        f"synthetic:walk?seed={seed}&frames={n_frames}&sensor=primesense-qvga"
+    )
+    scene, sample = BackgroundSubtraction.learn(recording, SPINES)
+    crops = scene.extract(sample, 1.0)
+    assert crops.found.all()
+    off = scene.middles(crops)[:, :2] - recording.joints_arena.mean(axis=1)[:, :2]
+    assert np.linalg.norm(off, axis=1).max() < 20.0

@@ -1,0 +1,286 @@
+"""Animals that keep still, wholly or in part, and so are taken for the scene's background.
+
+The farthest mode of a pixel's readings is the animal where it never leaves (the "sleeping person"
+problem). What is missed then stands on the floor's plane as a lump of the background:
+
+- one that a moving animal touches in nearly every frame is a part of it (`with_its_still_part`);
+- where nothing moves that is like an animal, the lump that is like one and changes most is it, as
+  of a mouse that stays where it is and moves only its head (`at_rest`);
+- where no lump is like one, the bare plane is the background of the whole floor (`at_rest`).
+
+Of the background a lump is told better than of frames: it is free of their noise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from liex_lab.foreground.background_segmenter import BackgroundSubtraction
+    from liex_lab.foreground.bare_ground import Wanted
+
+Depths = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+
+# of the frames: a lump that the animal touches that often is a part of it that keeps still
+_TOUCH_SHARE = 0.9
+# what was never seen moving is an animal only if it is no longer than so many largest spines,
+# higher than so many times what stands out at all, and larger than so many of the least areas
+_LONGEST = 2.0
+_HIGHER = 1.4
+_LARGER = 1.5
+_KINDS = 4  # areas of things that are held against an animal
+_IN_PLACE = 0.8  # of the frames must show it where it usually is
+_LEAST_PX = 16  # of a lump
+_FREE = 0.75  # of a lump's edge is bare floor; of the foot of a wall half is
+_AROUND_PX = 4  # a lump's edge, whose readings flicker between it and the floor
+
+
+@dataclass(frozen=True)
+class Resting:
+    """An animal that was found at rest.
+
+    Attributes:
+        scene: the scene with the floor under it, so that it stands out.
+        area_mm2: its usual area, mm^2.
+        share: of the frames that show it, 0 to 1.
+    """
+
+    scene: BackgroundSubtraction
+    area_mm2: float
+    share: float
+
+    @property
+    def sized(self) -> BackgroundSubtraction:
+        """The scene that looks for things of that area."""
+        return replace(self.scene, area_mm2=self.area_mm2)
+
+
+def at_rest(
+    scene: BackgroundSubtraction, sample: Depths, wanted: Wanted, area: float, share: float
+) -> Resting | None:
+    """The animal that sits in its own background.
+
+    So it is where fewer than half of the frames show something that moves, or what most of them
+    show is no animal, as the specks of an edge that flickers.
+
+    Args:
+        scene: the scene as it was learned.
+        sample: (n, H, W) float32 mm, frames at its stride.
+        wanted: what animal is expected.
+        area: usual area of what was seen moving, mm^2.
+        share: of the frames that show that.
+
+    Returns:
+        What was found; None where the scene as it is is the better one.
+    """
+    found = Resting(scene, area, share)
+    if share >= 0.5 and (not wanted.stands or is_like_an_animal(found.sized, sample, wanted)):
+        return None
+    rests = _changing_lump(scene, sample, wanted) if wanted.stands else None
+    rests = rests or _on_bare_floor(scene, sample, wanted, 1 if share > 0.0 else _KINDS)
+    if rests.share <= (share if share < 0.5 else 0.0):
+        return None
+    moves = wanted.stands and area > 0.0 and scene.standing is not None and scene.standing.moves
+    if (share >= 0.5 or moves) and not is_like_an_animal(rests.sized, sample, wanted):
+        return None
+    if share < 0.5 and moves and _stays_beside(rests.sized, found.sized, sample):
+        return None
+    return rests
+
+
+def with_its_still_part(
+    scene: BackgroundSubtraction, sample: Depths, wanted: Wanted, area: float
+) -> tuple[BackgroundSubtraction, float]:
+    """The scene with the floor put under an animal that was partly taken for background.
+
+    Such a part is a lump on the floor that the moving animal touches in (nearly, nine tenths of)
+    every frame, and together with which it is still no larger than an animal.
+
+    Args:
+        scene: the scene as it was learned.
+        sample: (n, H, W) float32 mm, frames at its stride.
+        wanted: what animal is expected.
+        area: area of the moving animal, mm^2.
+
+    Returns:
+        The scene, the same where there is no such lump, and the area mm^2 of the whole animal.
+    """
+    moving = np.array(replace(scene, area_mm2=area).places(sample))
+    moving = moving.reshape(-1, *scene.limit.shape)
+    best, best_area = scene, area
+    for lump in _lumps(scene, wanted):
+        near = _around(lump)
+        if moving[:, near].any(axis=1).mean() < _TOUCH_SHARE:
+            continue
+        whole = _with_floor_at(scene, near, wanted)
+        whole_area, share = whole.usual_area(sample, wanted.spine_mm)
+        if share >= 0.5 and whole_area > best_area:
+            best, best_area = whole, whole_area
+    return best, best_area
+
+
+def is_like_an_animal(scene: BackgroundSubtraction, sample: Depths, wanted: Wanted) -> bool:
+    """Whether what is found is neither longer than the largest animal, nor as low as uneven floor.
+
+    Args:
+        scene: the scene with the area of what is looked for.
+        sample: (n, H, W) float32 mm, frames at its stride.
+        wanted: what animal is expected.
+    """
+    crops = scene.extract(sample, 1.0)
+    if not crops.found.any():
+        return False
+    blobs = crops[crops.found].blobs
+    length = 4.0 * float(np.median(blobs.sd_along))
+    height = float(np.median(blobs.volume_mm3 / np.maximum(blobs.area_mm2, 1e-9)))
+    return (
+        length < _LONGEST * wanted.spine_mm[1]
+        and height > _HIGHER * wanted.min_height_mm
+        and scene.area_mm2 > _LARGER * wanted.smallest_mm2
+    )
+
+
+def _changing_lump(scene: BackgroundSubtraction, sample: Depths, wanted: Wanted) -> Resting | None:
+    """The free lump that is like an animal, keeps its place and changes most; None without one.
+
+    A thing that lies still only flickers along its edge; an animal moves a part of itself. The foot
+    of a wall flickers as much as an animal moves, but has floor on one side only.
+    """
+    found: list[tuple[float, Resting]] = []
+    for lump in _lumps(scene, wanted):
+        near = _around(lump)
+        if _free(scene, near & ~lump, wanted) < _FREE:
+            continue
+        whole = _with_floor_at(scene, near, wanted)
+        areas = _areas_at(whole, sample, lump, wanted)
+        own = (areas > wanted.smallest_mm2) & (areas < wanted.largest_mm2)
+        if own.mean() < 0.5:
+            continue
+        rests = Resting(whole, float(np.median(areas[own])), float(own.mean()))
+        if is_like_an_animal(rests.sized, sample, wanted) and _keeps_its_place(rests.sized, sample):
+            found.append((_change(scene, sample, near, wanted), rests))
+    return max(found, key=lambda one: one[0])[1] if found else None
+
+
+def _on_bare_floor(
+    scene: BackgroundSubtraction, sample: Depths, wanted: Wanted, kinds: int
+) -> Resting:
+    """What stands on the floor's bare plane in most frames and is like an animal.
+
+    A wall's foot or a step along the floor's edge is in every frame, too, and longer than any
+    animal; what is tried after it must also keep its place, as specks of an edge do not. Where
+    nothing is like an animal, it is what most frames show; at most `kinds` areas are tried.
+    """
+    on_floor = scene.on_floor if scene.standing is None else scene.standing.on_floor
+    bare = _with_floor_at(scene, on_floor, wanted)
+    tried: list[float] = []
+    first: Resting | None = None
+    while len(tried) < kinds:
+        area, share = bare.usual_area(sample, wanted.spine_mm, tried)
+        if share == 0.0:
+            break
+        found = Resting(bare, area, share)
+        if is_like_an_animal(found.sized, sample, wanted) and (
+            not tried or _keeps_its_place(found.sized, sample)
+        ):
+            return found
+        first = first or found
+        tried.append(area)
+    return first or Resting(bare, bare.area_mm2, 0.0)
+
+
+def _lumps(scene: BackgroundSubtraction, wanted: Wanted) -> Iterator[Mask]:
+    """The lumps (H, W) bool of the background that stand on the floor."""
+    above = _bare(scene) - scene.background
+    stands = scene.on_floor & (scene.background > 0) & (above > wanted.min_height_mm)
+    n, labels, stats, _ = cv2.connectedComponentsWithStats(stands.astype(np.uint8))
+    for k in range(1, n):
+        if stats[k, cv2.CC_STAT_AREA] >= _LEAST_PX:
+            yield labels == k
+
+
+def _free(scene: BackgroundSubtraction, edge: Mask, wanted: Wanted) -> float:
+    """The share of a lump's edge (H, W) that is bare floor, 0 to 1."""
+    off = np.abs(_bare(scene) - scene.background)[edge]
+    return float((scene.on_floor[edge] & (off < wanted.min_height_mm)).mean())
+
+
+def _bare(scene: BackgroundSubtraction) -> Depths:
+    """Depth (H, W) mm of the floor's plane."""
+    return scene.grid_floor.depth(scene.grid.width, scene.grid.height)
+
+
+def _around(lump: Mask) -> Mask:
+    """A lump (H, W) with its edge."""
+    square = np.ones((2 * _AROUND_PX + 1, 2 * _AROUND_PX + 1), np.uint8)
+    return cv2.dilate(lump.astype(np.uint8), square).astype(bool)
+
+
+def _with_floor_at(
+    scene: BackgroundSubtraction, where: Mask, wanted: Wanted
+) -> BackgroundSubtraction:
+    """The scene with the floor's bare plane as background in some of its pixels (H, W)."""
+    bare = _bare(scene)
+    there = where & scene.on_floor
+    limit = np.where(there, np.maximum(bare - np.float32(wanted.min_height_mm), 0), scene.limit)
+    background = np.where(there, bare, scene.background)
+    return replace(scene, background=background, limit=limit.astype(np.float32))
+
+
+def _areas_at(
+    scene: BackgroundSubtraction, sample: Depths, lump: Mask, wanted: Wanted
+) -> NDArray[np.float64]:
+    """Area (n,) mm^2 of what stands out and touches a lump (H, W), frame by frame."""
+    rows, columns = np.nonzero(lump)
+    reach = int(wanted.spine_mm[1] * scene.grid.fx / float(np.median(scene.background[lump])))
+    cut = (
+        slice(max(0, rows.min() - reach), rows.max() + reach + 1),
+        slice(max(0, columns.min() - reach), columns.max() + reach + 1),
+    )
+    areas = np.zeros(len(sample))
+    for k, depth in enumerate(sample):
+        near = depth[cut]
+        out = (near > 0) & (near < scene.limit[cut]) & scene.on_floor[cut]
+        _, labels = cv2.connectedComponents(out.astype(np.uint8))
+        own = np.isin(labels, np.unique(labels[lump[cut] & out])) & out
+        areas[k] = (near[own].astype(float) ** 2).sum() / (scene.grid.fx * scene.grid.fy)
+    return areas
+
+
+def _change(scene: BackgroundSubtraction, sample: Depths, near: Mask, wanted: Wanted) -> float:
+    """Share of the readings at some pixels (H, W) that are an animal's height off the background.
+
+    Counted are pixels of which that is so in more than one frame of ten, so that noise adds little.
+    """
+    off = np.abs(sample[:, near] - scene.background[near]) > wanted.min_height_mm
+    often = (off & (sample[:, near] > 0)).mean(axis=0)
+    return float(np.where(often > 0.1, often, 0.0).mean())
+
+
+def _keeps_its_place(scene: BackgroundSubtraction, sample: Depths) -> bool:
+    """Whether what is found in a sample (n, H, W) mm lies in one place in most frames."""
+    crops = scene.extract(sample, 1.0)
+    place = crops[crops.found].centroid[:, :2]
+    off = np.linalg.norm(place - np.median(place, axis=0), axis=1)
+    return bool((off < 0.5 * np.sqrt(scene.area_mm2)).mean() > _IN_PLACE)
+
+
+def _stays_beside(
+    resting: BackgroundSubtraction, moving: BackgroundSubtraction, sample: Depths
+) -> bool:
+    """Whether what rests, in a sample (n, H, W) mm, is there beside what moves: another thing."""
+    mover = moving.extract(sample, 1.0)
+    both = resting.extract(sample, 1.0)
+    seen = mover.found & both.found
+    if not seen.any():
+        return True
+    apart = np.linalg.norm(mover[seen].centroid[:, :2] - both[seen].centroid[:, :2], axis=1)
+    beside = (apart > np.sqrt(resting.area_mm2)) | (both.n_blobs[seen] > 1)
+    return bool(beside.mean() > 0.5)
