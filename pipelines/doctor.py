@@ -423,6 +423,7 @@ def lines(findings: dict[str, Any]) -> list[tuple[str, str]]:
         ),
         ("arena", shape or "unknown"),
         ("scene", _scene_text(f["scene"])),
+        *_sensor_lines(f["scene"]),
         (
             "animal",
             "not found"
@@ -458,6 +459,14 @@ def _scene_text(scene: dict[str, Any] | None) -> str:
             *(["only a region is looked at"] if scene["region_px"] else []),
         ]
     )
+
+
+def _sensor_lines(scene: dict[str, Any] | None) -> list[tuple[str, str]]:
+    """The line on the sensor; none where nothing is known of it."""
+    from liex_lab.optics.sensor_card import SensorCard
+
+    known = None if scene is None else scene.get("sensor")
+    return [] if known is None else [("sensor", str(SensorCard.from_dict(known)))]
 
 
 def _text(value: float | None, unit: str, digits: int = 0) -> str:

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from liex_lab.actions.colours import action_colours
+from liex_lab.optics.sensor_card import SensorCard
 from liex_lab.runtime.durable import write_whole
 from liex_lab.sessions import Session
 from liex_lab.sessions.verdict import verdict_in
@@ -342,6 +343,7 @@ def facts(session: Session) -> list[tuple[str, str]]:
             f"{camera['fy']:.1f}, cx {camera['cx']:.1f}, cy {camera['cy']:.1f} px "
             f"({camera['source']}), {camera['floor_distance_mm']:.0f} mm from the floor",
         ),
+        *sensor_row(about),
         ("Arena", f"{session.arena}{f'; zones: {zones}' if zones else ''}"),
         (
             "Model",
@@ -361,6 +363,16 @@ def facts(session: Session) -> list[tuple[str, str]]:
         known.insert(5, ("Optics", undone))
     subject = ", ".join(f"{name} {value}" for name, value in about["subject"].items())
     return known + ([("Subject", subject)] if subject else [])
+
+
+def sensor_row(about: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """The line on how good the sensor's readings are; none where nothing is known of it.
+
+    Args:
+        about: session.json.
+    """
+    known = about.get("scene", {}).get("sensor")
+    return [] if known is None else [("Sensor", str(SensorCard.from_dict(known)))]
 
 
 def gap_rows(session: Session) -> list[tuple[str, str, str, str]]:

@@ -18,6 +18,7 @@ from liex_lab.arena.floor import Floor
 from liex_lab.arena.outline import UNKNOWN, Arena
 from liex_lab.errors import PlanError
 from liex_lab.optics.camera import Camera
+from liex_lab.optics.sensor_card import SensorCard
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -72,6 +73,7 @@ class Scene:
             None where it is still.
         thin_above: whether something thin above the animal, a cable or bars, is cut out of the
             pictures.
+        sensor: how good the sensor's readings are; None where it is not known.
     """
 
     floor: Floor
@@ -86,6 +88,7 @@ class Scene:
     doubts: tuple[str, ...] = ()
     wander_mm: float | None = None
     thin_above: bool = False
+    sensor: SensorCard | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """Plain numbers for session.json; the outline is there already, as `arena`."""
@@ -112,6 +115,7 @@ class Scene:
                 for fixture in self.fixtures
             ],
             "doubts": list(self.doubts),
+            **({} if self.sensor is None else {"sensor": self.sensor.to_dict()}),
         }
 
 

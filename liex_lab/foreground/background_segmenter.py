@@ -14,7 +14,6 @@ wholly or in part, and so is absorbed into the background is found by `resting`.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -23,8 +22,6 @@ from numpy.typing import NDArray
 from liex_lab.arena.floor import Floor
 from liex_lab.body.skeleton import MOUSE_VIEW, VIEWS, View
 from liex_lab.errors import EstimationError
-from liex_lab.foreground import _height_map_kernels as kernels
-from liex_lab.foreground._blob_kernels import MAX_BLOBS
 from liex_lab.foreground.background import sample_frames, sampled, stride_for
 from liex_lab.foreground.bare_ground import SPREADS as SPREADS  # models are trained with it
 from liex_lab.foreground.bare_ground import BareGround, Wanted
@@ -33,6 +30,7 @@ from liex_lab.foreground.floor_level import FloorLevel
 from liex_lab.foreground.head_stage import HeadStage
 from liex_lab.foreground.resting import at_rest, is_like_an_animal, with_its_still_part
 from liex_lab.foreground.scene_change import SceneChange
+from liex_lab.foreground.sensor_reading import read_sensor
 from liex_lab.foreground.still_scene import StillScene
 from liex_lab.optics.camera import Camera
 from liex_lab.recordings.recording import Recording
@@ -40,7 +38,6 @@ from liex_lab.recordings.recording import Recording
 Array = NDArray[np.float64]
 
 _OTHER = 3.0  # times larger or smaller is another thing
-_ALIKE = np.log(1.5)
 
 
 @dataclass(frozen=True)
@@ -122,7 +119,8 @@ class BackgroundSubtraction(StillScene):
                 scene, sample = BackgroundSubtraction._of(camera, stride, under, whole, level)
         changed = SceneChange.find(sample, times_s, scene.grid, scene.area_mm2)
         volume = scene.usual_volume(sample)
-        return replace(scene, volume_mm3=volume, changed=changed), sample
+        sensor = read_sensor(scene, sample)
+        return replace(scene, volume_mm3=volume, changed=changed, sensor=sensor), sample
 
     @staticmethod
     def _of(
@@ -242,82 +240,3 @@ class BackgroundSubtraction(StillScene):
             return area, share
         crops = replace(self, area_mm2=standing.thing_mm2).extract(sample, 1.0)
         return standing.thing_mm2, float(crops.found.mean())
-
-    def places(self, sample: NDArray[np.float32]) -> list[NDArray[np.bool_]]:
-        """The animal's pixels (H, W) bool in each frame that shows it.
-
-        Args:
-            sample: (n, H, W) float32 mm, frames at this scene's stride.
-        """
-        crops = self.extract(sample, 1.0)
-        places = []
-        for i in np.flatnonzero(crops.found):
-            rows, columns = np.nonzero(crops.heights[i])
-            step, (u, v) = crops.step[i] // self.stride, crops.origin[i] // self.stride
-            own = np.zeros(self.limit.shape, np.bool_)
-            own[v + step * rows, u + step * columns] = True
-            places.append(own)
-        return places
-
-    def usual_area(
-        self,
-        depths: NDArray[np.float32],
-        spine_mm: tuple[float, float],
-        without_mm2: Sequence[float] = (),
-    ) -> tuple[float, float]:
-        """The area that most frames have a component of, and the share of frames that do.
-
-        One object of constant size is in (nearly) every frame, the animal; other things come and go
-        or differ. The mode of a kernel density over the logarithm of area, to which each frame adds
-        its nearest component with a Gaussian kernel of standard deviation 0.35.
-
-        Args:
-            depths: (n, H, W) float32 mm, frames at this scene's stride.
-            spine_mm: lengths of the smallest and the largest animal to expect, mm; they bound the
-                area.
-            without_mm2: areas that are not looked for, nor those that differ from them by less than
-                a half.
-
-        Returns:
-            The area, mm^2, and the share (0 to 1) of frames with a component within a factor of 4
-            of it; both 0 where no component has an animal's size.
-        """
-        self._check(depths)
-        areas = np.zeros((len(depths), MAX_BLOBS))
-        bridge = 0 if self.view.frame == VIEWS[0] else kernels.BRIDGE
-        kernels.blob_areas(
-            depths, self.limit, self.on_floor, bridge, 1.0 / (self.grid.fx * self.grid.fy), areas
-        )
-        low = self.view.area[0] * spine_mm[0] ** 2
-        high = self.view.area[1] * spine_mm[1] ** 2
-        for other in without_mm2:
-            areas[np.abs(np.log(np.maximum(areas, 1e-9) / other)) < _ALIKE] = 0.0
-        candidates = np.sort(areas[(areas > low) & (areas < high)])
-        if not len(candidates):
-            return 0.0, 0.0
-        tried = candidates[
-            np.linspace(0, len(candidates) - 1, min(200, len(candidates))).astype(int)
-        ]
-        distance = np.abs(np.log(np.maximum(areas, 1e-9)[None] / tried[:, None, None])).min(axis=2)
-        support = np.exp(-0.5 * (distance / 0.35) ** 2).sum(axis=1)
-        best = tried[np.argmax(support)]
-        return float(best), float(
-            (distance[np.argmax(support)] < np.log(kernels.AREA_FACTOR)).mean()
-        )
-
-    def usual_volume(self, depths: NDArray[np.float32]) -> float:
-        """The animal's median volume, mm^3, over frames in which nothing else has about its area.
-
-        Where fewer than 5 frames are such, all frames in which it was found count.
-
-        Args:
-            depths: (n, H, W) float32 mm, frames at this scene's stride.
-        """
-        volume = np.zeros(len(depths))
-        n_blobs = np.zeros(len(depths), np.int64)
-        for start in range(0, len(depths), 16):
-            crops = self.extract(depths[start : start + 16], 1.0)
-            volume[start : start + 16] = crops.blobs.volume_mm3
-            n_blobs[start : start + 16] = crops.n_blobs
-        alone = n_blobs == 1 if (n_blobs == 1).sum() >= 5 else n_blobs > 0
-        return float(np.median(volume[alone]))

@@ -15,18 +15,19 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Generic, TypeVar
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
-    from liex_lab.foreground.background_segmenter import BackgroundSubtraction
     from liex_lab.foreground.bare_ground import Wanted
+    from liex_lab.foreground.still_scene import StillScene
 
 Depths = NDArray[np.float32]
 Mask = NDArray[np.bool_]
+AnyScene = TypeVar("AnyScene", bound="StillScene")
 
 # of the frames: a lump that the animal touches that often is a part of it that keeps still
 _TOUCH_SHARE = 0.9
@@ -43,7 +44,7 @@ _AROUND_PX = 4  # a lump's edge, whose readings flicker between it and the floor
 
 
 @dataclass(frozen=True)
-class Resting:
+class Resting(Generic[AnyScene]):
     """An animal that was found at rest.
 
     Attributes:
@@ -52,19 +53,19 @@ class Resting:
         share: of the frames that show it, 0 to 1.
     """
 
-    scene: BackgroundSubtraction
+    scene: AnyScene
     area_mm2: float
     share: float
 
     @property
-    def sized(self) -> BackgroundSubtraction:
+    def sized(self) -> AnyScene:
         """The scene that looks for things of that area."""
         return replace(self.scene, area_mm2=self.area_mm2)
 
 
 def at_rest(
-    scene: BackgroundSubtraction, sample: Depths, wanted: Wanted, area: float, share: float
-) -> Resting | None:
+    scene: AnyScene, sample: Depths, wanted: Wanted, area: float, share: float
+) -> Resting[AnyScene] | None:
     """The animal that sits in its own background.
 
     So it is where fewer than half of the frames show something that moves, or what most of them
@@ -96,8 +97,8 @@ def at_rest(
 
 
 def with_its_still_part(
-    scene: BackgroundSubtraction, sample: Depths, wanted: Wanted, area: float
-) -> tuple[BackgroundSubtraction, float]:
+    scene: AnyScene, sample: Depths, wanted: Wanted, area: float
+) -> tuple[AnyScene, float]:
     """The scene with the floor put under an animal that was partly taken for background.
 
     Such a part is a lump on the floor that the moving animal touches in (nearly, nine tenths of)
@@ -126,7 +127,7 @@ def with_its_still_part(
     return best, best_area
 
 
-def is_like_an_animal(scene: BackgroundSubtraction, sample: Depths, wanted: Wanted) -> bool:
+def is_like_an_animal(scene: StillScene, sample: Depths, wanted: Wanted) -> bool:
     """Whether what is found is neither longer than the largest animal, nor as low as uneven floor.
 
     Args:
@@ -147,13 +148,13 @@ def is_like_an_animal(scene: BackgroundSubtraction, sample: Depths, wanted: Want
     )
 
 
-def _changing_lump(scene: BackgroundSubtraction, sample: Depths, wanted: Wanted) -> Resting | None:
+def _changing_lump(scene: AnyScene, sample: Depths, wanted: Wanted) -> Resting[AnyScene] | None:
     """The free lump that is like an animal, keeps its place and changes most; None without one.
 
     A thing that lies still only flickers along its edge; an animal moves a part of itself. The foot
     of a wall flickers as much as an animal moves, but has floor on one side only.
     """
-    found: list[tuple[float, Resting]] = []
+    found: list[tuple[float, Resting[AnyScene]]] = []
     for lump in _lumps(scene, wanted):
         near = _around(lump)
         if _free(scene, near & ~lump, wanted) < _FREE:
@@ -170,8 +171,8 @@ def _changing_lump(scene: BackgroundSubtraction, sample: Depths, wanted: Wanted)
 
 
 def _on_bare_floor(
-    scene: BackgroundSubtraction, sample: Depths, wanted: Wanted, kinds: int
-) -> Resting:
+    scene: AnyScene, sample: Depths, wanted: Wanted, kinds: int
+) -> Resting[AnyScene]:
     """What stands on the floor's bare plane in most frames and is like an animal.
 
     A wall's foot or a step along the floor's edge is in every frame, too, and longer than any
@@ -181,7 +182,7 @@ def _on_bare_floor(
     on_floor = scene.on_floor if scene.standing is None else scene.standing.on_floor
     bare = _with_floor_at(scene, on_floor, wanted)
     tried: list[float] = []
-    first: Resting | None = None
+    first: Resting[AnyScene] | None = None
     while len(tried) < kinds:
         area, share = bare.usual_area(sample, wanted.spine_mm, tried)
         if share == 0.0:
@@ -196,7 +197,7 @@ def _on_bare_floor(
     return first or Resting(bare, bare.area_mm2, 0.0)
 
 
-def _lumps(scene: BackgroundSubtraction, wanted: Wanted) -> Iterator[Mask]:
+def _lumps(scene: StillScene, wanted: Wanted) -> Iterator[Mask]:
     """The lumps (H, W) bool of the background that stand on the floor."""
     above = _bare(scene) - scene.background
     stands = scene.on_floor & (scene.background > 0) & (above > wanted.min_height_mm)
@@ -206,13 +207,13 @@ def _lumps(scene: BackgroundSubtraction, wanted: Wanted) -> Iterator[Mask]:
             yield labels == k
 
 
-def _free(scene: BackgroundSubtraction, edge: Mask, wanted: Wanted) -> float:
+def _free(scene: StillScene, edge: Mask, wanted: Wanted) -> float:
     """The share of a lump's edge (H, W) that is bare floor, 0 to 1."""
     off = np.abs(_bare(scene) - scene.background)[edge]
     return float((scene.on_floor[edge] & (off < wanted.min_height_mm)).mean())
 
 
-def _bare(scene: BackgroundSubtraction) -> Depths:
+def _bare(scene: StillScene) -> Depths:
     """Depth (H, W) mm of the floor's plane."""
     return scene.grid_floor.depth(scene.grid.width, scene.grid.height)
 
@@ -223,9 +224,7 @@ def _around(lump: Mask) -> Mask:
     return cv2.dilate(lump.astype(np.uint8), square).astype(bool)
 
 
-def _with_floor_at(
-    scene: BackgroundSubtraction, where: Mask, wanted: Wanted
-) -> BackgroundSubtraction:
+def _with_floor_at(scene: AnyScene, where: Mask, wanted: Wanted) -> AnyScene:
     """The scene with the floor's bare plane as background in some of its pixels (H, W)."""
     bare = _bare(scene)
     there = where & scene.on_floor
@@ -234,9 +233,7 @@ def _with_floor_at(
     return replace(scene, background=background, limit=limit.astype(np.float32))
 
 
-def _areas_at(
-    scene: BackgroundSubtraction, sample: Depths, lump: Mask, wanted: Wanted
-) -> NDArray[np.float64]:
+def _areas_at(scene: StillScene, sample: Depths, lump: Mask, wanted: Wanted) -> NDArray[np.float64]:
     """Area (n,) mm^2 of what stands out and touches a lump (H, W), frame by frame."""
     rows, columns = np.nonzero(lump)
     reach = int(wanted.spine_mm[1] * scene.grid.fx / float(np.median(scene.background[lump])))
@@ -254,7 +251,7 @@ def _areas_at(
     return areas
 
 
-def _change(scene: BackgroundSubtraction, sample: Depths, near: Mask, wanted: Wanted) -> float:
+def _change(scene: StillScene, sample: Depths, near: Mask, wanted: Wanted) -> float:
     """Share of the readings at some pixels (H, W) that are an animal's height off the background.
 
     Counted are pixels of which that is so in more than one frame of ten, so that noise adds little.
@@ -264,7 +261,7 @@ def _change(scene: BackgroundSubtraction, sample: Depths, near: Mask, wanted: Wa
     return float(np.where(often > 0.1, often, 0.0).mean())
 
 
-def _keeps_its_place(scene: BackgroundSubtraction, sample: Depths) -> bool:
+def _keeps_its_place(scene: StillScene, sample: Depths) -> bool:
     """Whether what is found in a sample (n, H, W) mm lies in one place in most frames."""
     crops = scene.extract(sample, 1.0)
     place = crops[crops.found].centroid[:, :2]
@@ -272,9 +269,7 @@ def _keeps_its_place(scene: BackgroundSubtraction, sample: Depths) -> bool:
     return bool((off < 0.5 * np.sqrt(scene.area_mm2)).mean() > _IN_PLACE)
 
 
-def _stays_beside(
-    resting: BackgroundSubtraction, moving: BackgroundSubtraction, sample: Depths
-) -> bool:
+def _stays_beside(resting: StillScene, moving: StillScene, sample: Depths) -> bool:
     """Whether what rests, in a sample (n, H, W) mm, is there beside what moves: another thing."""
     mover = moving.extract(sample, 1.0)
     both = resting.extract(sample, 1.0)

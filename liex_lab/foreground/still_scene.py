@@ -8,6 +8,7 @@ nearest to the animal's usual one, and its height map and image moments are cut 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Self
@@ -19,6 +20,7 @@ from liex_lab.arena.floor import Floor
 from liex_lab.arena.scene import Scene, find_fixtures, region_corners, roughness
 from liex_lab.body.skeleton import MOUSE_VIEW, VIEWS, View
 from liex_lab.foreground import _height_map_kernels as kernels
+from liex_lab.foreground._blob_kernels import MAX_BLOBS
 from liex_lab.foreground.cable import Cable
 from liex_lab.foreground.crop_camera import pack_crop_cameras
 from liex_lab.foreground.floor_level import FloorLevel
@@ -28,6 +30,7 @@ from liex_lab.foreground.scene_change import SceneChange
 from liex_lab.foreground.segmenter import Segmenter
 from liex_lab.foreground.standing import Standing
 from liex_lab.optics.camera import Camera
+from liex_lab.optics.sensor_card import SensorCard
 from liex_lab.runtime.shapes import check_shapes
 from liex_lab.runtime.threads import threads
 
@@ -36,6 +39,7 @@ Array = NDArray[np.float64]
 # of the logarithms, from posture to posture of one animal
 _AREA_SD = 0.25
 _VOLUME_SD = 0.2
+_ALIKE = np.log(1.5)  # areas that differ by less are of one thing
 
 
 @dataclass(frozen=True)
@@ -59,6 +63,7 @@ class StillScene(Segmenter):
         stage: how a head stage is told from it; None where it wears none.
         level: brings frames to one level of the floor; None where it is still.
         changed: what is elsewhere from some time on; None where the scene keeps still.
+        sensor: how good its readings are; None where no sample told it.
     """
 
     camera: Camera
@@ -75,6 +80,7 @@ class StillScene(Segmenter):
     cable: Cable | None = None
     stage: HeadStage | None = None
     changed: SceneChange | None = None
+    sensor: SensorCard | None = None
 
     @cached_property
     def grid(self) -> Camera:
@@ -92,24 +98,26 @@ class StillScene(Segmenter):
         """The scene as it is written to session.json, without its outline."""
         floor = self.grid_floor
         bare = floor.depth(self.grid.width, self.grid.height)
-        rough = roughness(self.background, bare, self.on_floor)
-        fixtures = find_fixtures(self.background, floor, self.grid, self.on_floor)
-        standing = self.standing
-        wander_mm = None if self.level is None else self.level.wander_mm
-        if standing is None:
-            return Scene(self.floor, roughness_mm=rough, fixtures=fixtures, doubts=self.doubts)
-        return Scene(
+        known = Scene(
             self.floor,
-            standing.origin,
-            standing.support if standing.moves else None,
-            standing.n_things,
-            standing.n_together,
-            rough,
-            region_corners(standing.region, self.stride),
-            fixtures=fixtures,
-            doubts=((standing.doubt,) if standing.doubt else ()) + self.doubts,
-            wander_mm=wander_mm,
+            roughness_mm=roughness(self.background, bare, self.on_floor),
+            fixtures=find_fixtures(self.background, floor, self.grid, self.on_floor),
+            doubts=self.doubts,
+            wander_mm=None if self.level is None else self.level.wander_mm,
             thin_above=self.cable is not None,
+            sensor=self.sensor,
+        )
+        standing = self.standing
+        if standing is None:
+            return known
+        return replace(
+            known,
+            floor_from=standing.origin,
+            floor_support=standing.support if standing.moves else None,
+            n_moving=standing.n_things,
+            n_animals=standing.n_together,
+            region_px=region_corners(standing.region, self.stride),
+            doubts=((standing.doubt,) if standing.doubt else ()) + self.doubts,
         )
 
     def every(self, step: int) -> Self:
@@ -246,6 +254,85 @@ class StillScene(Segmenter):
         for axis in (1, 2):
             worn = np.repeat(worn, self.stride, axis=axis)
         return np.where(worn[:, : depths.shape[1], : depths.shape[2]], np.float32(0), depths)
+
+    def places(self, sample: NDArray[np.float32]) -> list[NDArray[np.bool_]]:
+        """The animal's pixels (H, W) bool in each frame that shows it.
+
+        Args:
+            sample: (n, H, W) float32 mm, frames at this scene's stride.
+        """
+        crops = self.extract(sample, 1.0)
+        places = []
+        for i in np.flatnonzero(crops.found):
+            rows, columns = np.nonzero(crops.heights[i])
+            step, (u, v) = crops.step[i] // self.stride, crops.origin[i] // self.stride
+            own = np.zeros(self.limit.shape, np.bool_)
+            own[v + step * rows, u + step * columns] = True
+            places.append(own)
+        return places
+
+    def usual_area(
+        self,
+        depths: NDArray[np.float32],
+        spine_mm: tuple[float, float],
+        without_mm2: Sequence[float] = (),
+    ) -> tuple[float, float]:
+        """The area that most frames have a component of, and the share of frames that do.
+
+        One object of constant size is in (nearly) every frame, the animal; other things come and go
+        or differ. The mode of a kernel density over the logarithm of area, to which each frame adds
+        its nearest component with a Gaussian kernel of standard deviation 0.35.
+
+        Args:
+            depths: (n, H, W) float32 mm, frames at this scene's stride.
+            spine_mm: lengths of the smallest and the largest animal to expect, mm; they bound the
+                area.
+            without_mm2: areas that are not looked for, nor those that differ from them by less than
+                a half.
+
+        Returns:
+            The area, mm^2, and the share (0 to 1) of frames with a component within a factor of 4
+            of it; both 0 where no component has an animal's size.
+        """
+        self._check(depths)
+        areas = np.zeros((len(depths), MAX_BLOBS))
+        bridge = 0 if self.view.frame == VIEWS[0] else kernels.BRIDGE
+        kernels.blob_areas(
+            depths, self.limit, self.on_floor, bridge, 1.0 / (self.grid.fx * self.grid.fy), areas
+        )
+        low = self.view.area[0] * spine_mm[0] ** 2
+        high = self.view.area[1] * spine_mm[1] ** 2
+        for other in without_mm2:
+            areas[np.abs(np.log(np.maximum(areas, 1e-9) / other)) < _ALIKE] = 0.0
+        candidates = np.sort(areas[(areas > low) & (areas < high)])
+        if not len(candidates):
+            return 0.0, 0.0
+        tried = candidates[
+            np.linspace(0, len(candidates) - 1, min(200, len(candidates))).astype(int)
+        ]
+        distance = np.abs(np.log(np.maximum(areas, 1e-9)[None] / tried[:, None, None])).min(axis=2)
+        support = np.exp(-0.5 * (distance / 0.35) ** 2).sum(axis=1)
+        best = tried[np.argmax(support)]
+        return float(best), float(
+            (distance[np.argmax(support)] < np.log(kernels.AREA_FACTOR)).mean()
+        )
+
+    def usual_volume(self, depths: NDArray[np.float32]) -> float:
+        """The animal's median volume, mm^3, over frames in which nothing else has about its area.
+
+        Where fewer than 5 frames are such, all frames in which it was found count.
+
+        Args:
+            depths: (n, H, W) float32 mm, frames at this scene's stride.
+        """
+        volume = np.zeros(len(depths))
+        n_blobs = np.zeros(len(depths), np.int64)
+        for start in range(0, len(depths), 16):
+            crops = self.extract(depths[start : start + 16], 1.0)
+            volume[start : start + 16] = crops.blobs.volume_mm3
+            n_blobs[start : start + 16] = crops.n_blobs
+        alone = n_blobs == 1 if (n_blobs == 1).sum() >= 5 else n_blobs > 0
+        return float(np.median(volume[alone]))
 
     def _check(self, depths: NDArray[np.float32]) -> None:
         """Refuse frames of another size than those that the scene was learned from."""

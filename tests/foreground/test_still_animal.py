@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING, cast
+
 import numpy as np
 import pytest
 
 from liex_lab.foreground.background_segmenter import BackgroundSubtraction
 from liex_lab.recordings import open_recording
 from tests.foreground.test_background_segmenter import SPINES, recording_of, tilted, with_box
+
+if TYPE_CHECKING:
+    from liex_lab.simulation.recording import TrueRecording
 
 BODY = ((80, 60), (12, 8))  # centre and half sides, pixels
 
@@ -55,5 +60,6 @@ def test_of_what_stands_still_in_a_noisy_picture_the_animal_is_what_changes(seed
     scene, sample = BackgroundSubtraction.learn(recording, SPINES)
     crops = scene.extract(sample, 1.0)
     assert crops.found.all()
-    off = scene.middles(crops)[:, :2] - recording.joints_arena.mean(axis=1)[:, :2]
+    true = cast("TrueRecording", recording).joints_arena
+    off = scene.middles(crops)[:, :2] - true.mean(axis=1)[:, :2]
     assert np.linalg.norm(off, axis=1).max() < 20.0
