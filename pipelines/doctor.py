@@ -444,17 +444,21 @@ def lines(findings: dict[str, Any]) -> list[tuple[str, str]]:
 
 def _scene_text(scene: dict[str, Any] | None) -> str:
     """How the floor was found, its roughness, what stands on it and how many animals move."""
+    from liex_lab.arena.scene import Fixture
+
     if scene is None:
         return "unknown"
     floor = scene["floor"]
     share = floor["support"]
     support = "nothing moves" if share is None else f"{share:.0%} of what moves stands on it"
-    n_fixtures = len(scene["fixtures"])
+    fixtures = [Fixture.from_dict(one) for one in scene["fixtures"]]
+    passing = [str(one) for one in fixtures if (one.since_s, one.until_s) != (None, None)]
+    times = f" ({'; '.join(passing)})" if passing else ""
     return ", ".join(
         [
             f"floor from {floor['from']} ({support})",
             f"rough to {_text(floor['roughness_mm'], 'mm', 1)}",
-            f"{n_fixtures} thing{'' if n_fixtures == 1 else 's'} on it",
+            f"{len(fixtures)} thing{'' if len(fixtures) == 1 else 's'} on it{times}",
             f"at most {scene['n_animals']} moving together",
             *(["only a region is looked at"] if scene["region_px"] else []),
         ]

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from liex_lab.arena.scene import Fixture
 from liex_lab.behaviour.occupancy import Occupancy, occupancy
 from liex_lab.sessions import Session
 
@@ -297,12 +298,10 @@ def arena_map(session: Session, depth: Sequence[NDArray[np.uint16]]) -> Figure |
     draw_outlines(axes, session)
     draw_region(axes, session)
     draw_hidden(axes, session)
-    for fixture in fixtures:
-        place = fixture["centre_mm"][:2]
+    for fixture in map(Fixture.from_dict, fixtures):
+        place = fixture.centre_mm
         axes.plot(*place, "+", color=PAPER, markersize=4)
-        text = axes.annotate(
-            f"{fixture['height_mm']:.0f} mm", place, (3, 2), textcoords="offset points", size=6.0
-        )
+        text = axes.annotate(str(fixture), place, (3, 2), textcoords="offset points", size=6.0)
         halo(text)
     floor_limits(axes, [x_mm[0], y_mm[0]], [x_mm[-1], y_mm[-1]])
     scale_bar(axes)

@@ -14,6 +14,7 @@ from html import escape
 import numpy as np
 from numpy.typing import NDArray
 
+from liex_lab.arena.scene import Fixture
 from liex_lab.sessions import Session
 
 Array = NDArray[np.float64]
@@ -61,11 +62,9 @@ def scene_marks(session: Session) -> list[Mark]:
     scene = session.metadata.get("scene") or {}
     made = [Mark(REGION, np.array(scene.get("region_px") or np.empty((0, 2)), float))]
     made.append(Mark(OUTLINE, _in_picture(session, session.arena.outline_mm())))
-    for fixture in scene.get("fixtures") or []:
-        x, y = fixture["centre_mm"][:2]
-        top = float(fixture["height_mm"])
-        place = _in_picture(session, np.array([[x, y]]), top)
-        made.append(Mark(FIXTURE, place, f"{top:.0f} mm"))
+    for fixture in map(Fixture.from_dict, scene.get("fixtures") or []):
+        place = _in_picture(session, np.array([fixture.centre_mm]), fixture.height_mm)
+        made.append(Mark(FIXTURE, place, str(fixture)))
     gaps = session.gaps
     if "x_mm" not in gaps:  # of earlier versions
         gaps = gaps.assign(x_mm=np.nan, y_mm=np.nan)

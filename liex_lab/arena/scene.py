@@ -7,7 +7,7 @@ about the floor's plane, its fixtures what stands still on the floor.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -29,8 +29,8 @@ WALLED = "walled ground"
 STATED = "plan"
 
 _LEAST_PX = 64  # of a region
-_HIGH_MM = 20.0  # a fixture stands out from the floor by so much
-_LEAST_MM2 = 300.0  # and is no speck
+HIGH_MM = 20.0  # a fixture stands out from the floor by so much
+LEAST_MM2 = 300.0  # and is no speck
 _MOST = 32  # fixtures told
 _MOST_ROUND = 1.6  # times its own area: what goes round more is walls
 
@@ -43,11 +43,43 @@ class Fixture:
         centre_mm: x and y of its middle, mm, arena frame.
         height_mm: of its top above the floor, mm.
         area_mm2: seen from the camera, mm^2.
+        since_s: when it was put in, s since the first frame; None where it was there before.
+        until_s: when it was taken out; None where it stays.
     """
 
     centre_mm: tuple[float, float]
     height_mm: float
     area_mm2: float
+    since_s: float | None = None
+    until_s: float | None = None
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain numbers for session.json; times only where it does not stay throughout."""
+        times = {"since_s": self.since_s, "until_s": self.until_s}
+        return {
+            "centre_mm": [round(value, 1) for value in self.centre_mm],
+            "height_mm": round(self.height_mm, 1),
+            "area_mm2": round(self.area_mm2, 1),
+            **{name: round(at, 2) for name, at in times.items() if at is not None},
+        }
+
+    @staticmethod
+    def from_dict(known: Mapping[str, Any]) -> Fixture:
+        """The fixture that `to_dict` wrote.
+
+        Args:
+            known: an entry of `scene.fixtures` in session.json.
+        """
+        x, y = known["centre_mm"][:2]
+        times = known.get("since_s"), known.get("until_s")
+        return Fixture((x, y), known["height_mm"], known["area_mm2"], *times)
+
+    def __str__(self) -> str:
+        """Its height, and when it stands there if not always."""
+        since = "" if self.since_s is None else f" from {self.since_s:.1f}"
+        until = "" if self.until_s is None else f" {'to' if since else 'until'} {self.until_s:.1f}"
+        times = since + until
+        return f"{self.height_mm:.0f} mm{f',{times} s' if times else ''}"
 
 
 @dataclass(frozen=True)
@@ -67,7 +99,8 @@ class Scene:
         region_px: (u, v) corners, pixels, of the polygon outside of which nothing is looked at;
             empty where the whole picture is.
         outline: the shape of the arena.
-        fixtures: what stands still on the floor, largest first.
+        fixtures: what stands still on the floor, largest first; then what was put in or taken out,
+            in order of time.
         doubts: sentences about why this may be wrong.
         wander_mm: range of the floor's depth over the recording, mm, as of a sensor that warms up;
             None where it is still.
@@ -106,14 +139,7 @@ class Scene:
             "n_moving": self.n_moving,
             "n_animals": self.n_animals,
             "thin_above": self.thin_above,
-            "fixtures": [
-                {
-                    "centre_mm": [round(value, 1) for value in fixture.centre_mm],
-                    "height_mm": round(fixture.height_mm, 1),
-                    "area_mm2": round(fixture.area_mm2, 1),
-                }
-                for fixture in self.fixtures
-            ],
+            "fixtures": [fixture.to_dict() for fixture in self.fixtures],
             "doubts": list(self.doubts),
             **({} if self.sensor is None else {"sensor": self.sensor.to_dict()}),
         }
@@ -242,7 +268,7 @@ def find_fixtures(
     bare = floor.depth(camera.width, camera.height)
     # the foot of the walls is no thing on the floor
     inner = cv2.erode(np.pad(on_floor, 1).astype(np.uint8), np.ones((9, 9), np.uint8))[1:-1, 1:-1]
-    high = (inner > 0) & (background > 0) & (bare - background > _HIGH_MM)
+    high = (inner > 0) & (background > 0) & (bare - background > HIGH_MM)
     n, labels = cv2.connectedComponents(high.astype(np.uint8))
     found = []
     for k in range(1, n):
@@ -251,7 +277,7 @@ def find_fixtures(
         if cv2.contourArea(hull) > _MOST_ROUND * place.sum():
             continue  # the walls go round the floor, and do not stand on it
         fixture = fixture_at(place, background, floor, camera)
-        if fixture.area_mm2 >= _LEAST_MM2:
+        if fixture.area_mm2 >= LEAST_MM2:
             found.append(fixture)
     return tuple(sorted(found, key=lambda fixture: -fixture.area_mm2)[:_MOST])
 

@@ -28,6 +28,7 @@ from liex_lab.foreground.bare_ground import BareGround, Wanted
 from liex_lab.foreground.cable import Cable
 from liex_lab.foreground.floor_level import FloorLevel
 from liex_lab.foreground.head_stage import HeadStage
+from liex_lab.foreground.put_in import find_put_in
 from liex_lab.foreground.resting import at_rest, is_like_an_animal, with_its_still_part
 from liex_lab.foreground.scene_change import SceneChange
 from liex_lab.foreground.sensor_reading import read_sensor
@@ -118,9 +119,9 @@ class BackgroundSubtraction(StillScene):
             if under.standing is not ground.standing:
                 scene, sample = BackgroundSubtraction._of(camera, stride, under, whole, level)
         changed = SceneChange.find(sample, times_s, scene.grid, scene.area_mm2)
-        volume = scene.usual_volume(sample)
-        sensor = read_sensor(scene, sample)
-        return replace(scene, volume_mm3=volume, changed=changed, sensor=sensor), sample
+        scene = replace(scene, volume_mm3=scene.usual_volume(sample), changed=changed)
+        put_in = find_put_in(scene, sample, times_s) if wanted.stands and changed is None else ()
+        return replace(scene, sensor=read_sensor(scene, sample), put_in=put_in), sample
 
     @staticmethod
     def _of(

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.arena.floor import Floor
-from liex_lab.arena.scene import Scene, find_fixtures, region_corners, roughness
+from liex_lab.arena.scene import Fixture, Scene, find_fixtures, region_corners, roughness
 from liex_lab.body.skeleton import MOUSE_VIEW, VIEWS, View
 from liex_lab.foreground import _height_map_kernels as kernels
 from liex_lab.foreground._blob_kernels import MAX_BLOBS
@@ -64,6 +64,7 @@ class StillScene(Segmenter):
         level: brings frames to one level of the floor; None where it is still.
         changed: what is elsewhere from some time on; None where the scene keeps still.
         sensor: how good its readings are; None where no sample told it.
+        put_in: things that stand on the floor for a part of the recording.
     """
 
     camera: Camera
@@ -81,6 +82,7 @@ class StillScene(Segmenter):
     stage: HeadStage | None = None
     changed: SceneChange | None = None
     sensor: SensorCard | None = None
+    put_in: tuple[Fixture, ...] = ()
 
     @cached_property
     def grid(self) -> Camera:
@@ -101,7 +103,10 @@ class StillScene(Segmenter):
         known = Scene(
             self.floor,
             roughness_mm=roughness(self.background, bare, self.on_floor),
-            fixtures=find_fixtures(self.background, floor, self.grid, self.on_floor),
+            fixtures=(
+                *find_fixtures(self.background, floor, self.grid, self.on_floor),
+                *self.put_in,
+            ),
             doubts=self.doubts,
             wander_mm=None if self.level is None else self.level.wander_mm,
             thin_above=self.cable is not None,
@@ -153,9 +158,7 @@ class StillScene(Segmenter):
         """
         area = np.maximum(crops.blobs.area_mm2, 1.0)
         volume = np.maximum(crops.blobs.volume_mm3, 1.0)
-        if (
-            self.view.frame != VIEWS[0]
-        ):  # what is below an animal that swims or is held up is not its own
+        if self.view.frame != VIEWS[0]:
             return (np.log(area / self.area_mm2) / _AREA_SD) ** 2
         return (np.log(area / self.area_mm2) / _AREA_SD) ** 2 + (
             np.log(volume / self.volume_mm3) / _VOLUME_SD
