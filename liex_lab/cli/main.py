@@ -196,7 +196,8 @@ def doctor(
 
     asked = [*(settings or []), *region_setting(region)]
     chosen = Plan.load(plan or "mouse").with_settings(asked)
-    from liex_lab.pipelines.doctor import examine, print_report
+    from liex_lab.pipelines.doctor import examine
+    from liex_lab.pipelines.doctor_text import print_report
 
     with progress_bar() as progress:
         findings = examine(

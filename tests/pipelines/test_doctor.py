@@ -10,7 +10,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from liex_lab.pipelines.doctor import FINDINGS, examine, lines, print_report
+from liex_lab.pipelines.doctor import FINDINGS, examine
+from liex_lab.pipelines.doctor_text import lines, print_report
 
 from liex_lab.arena.floor import Floor
 from liex_lab.errors import RecordingError
