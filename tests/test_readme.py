@@ -32,7 +32,8 @@ PAGES = {
 }
 EVERYTHING = "\n".join([README, *PAGES.values()])
 
-OTHERS = {"height_ave_mm", "velocity_2d_mm"}  # MoSeq's columns
+# MoSeq's columns, and keys of session.json
+OTHERS = {"height_ave_mm", "velocity_2d_mm", "since_s", "until_s"}
 
 
 def blocks(language: str, text: str) -> list[str]:

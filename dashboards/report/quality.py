@@ -128,7 +128,8 @@ def _of_flips(session: Session) -> list[str]:
     undone = int(flips["applied"].astype(bool).sum())
     return [
         f"Head and tail may have been exchanged in {counted(len(flips), 'stretch', 'stretches')} "
-        f"of {seconds:.1f} s in all; {counted(undone, 'was', 'were')} put right. "
+        f"of {seconds:.{1 if seconds >= 0.1 else 2}f} s in all; "
+        f"{counted(undone, 'was', 'were')} put right. "
         "See the list below, and look at the replay."
     ]
 
