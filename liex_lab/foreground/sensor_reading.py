@@ -90,7 +90,7 @@ def _step(sample: Depths) -> float | None:
 
 
 def _seam(scene: StillScene, sample: Depths) -> float | None:
-    """How many pixels around the animal are unread, beyond those that are unread anyway."""
+    """How many pixels of the picture around the animal are unread, beyond those unread anyway."""
     rows = np.linspace(0, len(sample) - 1, min(_N_FRAMES, len(sample))).astype(int)
     shown = sample[rows]
     crops = scene.extract(shown, 1.0)
@@ -110,7 +110,7 @@ def _seam(scene: StillScene, sample: Depths) -> float | None:
     if seen.min() < _LEAST:
         return None
     anyway = float((shown[:, scene.on_floor] == 0).mean())
-    return round(float(np.clip(unread / seen - anyway, 0.0, 1.0).sum()), 2)
+    return round(scene.stride * float(np.clip(unread / seen - anyway, 0.0, 1.0).sum()), 2)
 
 
 def _mixed(background: Depths, sample: Depths) -> float | None:
