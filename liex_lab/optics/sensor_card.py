@@ -10,6 +10,8 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from typing import Any
 
+_NONE_MM = 0.05  # no sensor is so quiet
+
 
 @dataclass(frozen=True)
 class SensorCard:
@@ -45,6 +47,8 @@ class SensorCard:
     def __str__(self) -> str:
         """A line for a person."""
         noise = ", ".join(f"{sd:.1f} mm at {depth / 1000:.2f} m" for depth, sd in self.noise)
+        if self.noise and max(sd for _, sd in self.noise) < _NONE_MM:
+            noise = "none, as of pictures that were filtered or put together"
         parts = [f"noise {noise or 'unknown'}"]
         if self.step_mm is not None:
             parts.append(f"steps of {self.step_mm:.2g} mm")

@@ -81,3 +81,5 @@ def test_a_card_is_read_back_as_it_was_written_and_says_itself():
         "7% of readings at edges lie between both sides"
     )
     assert str(SensorCard()) == "noise unknown"
+    filtered = "noise none, as of pictures that were filtered or put together"
+    assert str(SensorCard(((650.0, 0.0),))) == filtered
