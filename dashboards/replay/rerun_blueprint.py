@@ -138,9 +138,9 @@ def replay_blueprint(session: dict[str, Any]) -> Any:
     import rerun as rr
     import rerun.blueprint as rrb
 
-    from liex_lab.sessions.cutouts import ANIMAL, N_BOXES
+    from liex_lab.sessions.cutouts import ANIMAL, N_BOXES, N_WINDOWS
     from liex_lab.sessions.rrd import OVERLAY, SKELETON, corrected_entity
-    from liex_lab.sessions.rrd_depth import CUTOUTS, cutout_frame
+    from liex_lab.sessions.rrd_depth import CUTOUTS, cutout_entity, cutout_frame
 
     # with corrections, what they are made of is left out of the views, but is still there to be
     # looked at
@@ -163,7 +163,9 @@ def replay_blueprint(session: dict[str, Any]) -> Any:
         line_grid=rrb.LineGrid3D(visible=False),
     )
     in_picture: Any = {
-        f"{CUTOUTS}/{k + 1}/depth": rr.CoordinateFrame(cutout_frame(k)) for k in range(N_BOXES)
+        cutout_entity(k, which): rr.CoordinateFrame(cutout_frame(k))
+        for k in range(N_BOXES)
+        for which in range(N_WINDOWS)
     }
     picture = rrb.Spatial2DView(
         origin="arena/camera/image",

@@ -10,10 +10,19 @@ with a margin of 15 % of the spine all around:
     box = hull(joints, centroid -+ 0.7 sqrt(n_px)) -+ (0.15 spine f / z + 4 px).
 
 It is made of what the single frame says alone, so it does not matter which process made it.
+
+Rerun's viewer takes pictures that change their size for a broken film and says so. So in its replay
+cut-outs come in few sizes, `windows`: from the length of the animal's box on the floor,
+
+    a = 1.3 spine f / z + 8 px,
+
+sides of 1, 1.15 and 1.4 times that (animals rear and swim above the floor), and whole pictures. A
+cut-out lies in the middle of the smallest window that holds it, before the still scene.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -46,6 +55,8 @@ _FRAMES = 16  # that show the background
 _REACH = 0.7  # of the square root of a thing's pixels, to each side of its centroid
 _MARGIN = 0.15  # of the spine
 _MARGIN_PX = 4.0
+_SIDES = (1.0, 1.15, 1.4)  # of windows, in lengths of the animal's box on the floor
+N_WINDOWS = len(_SIDES) ** 2 + 1  # at most; the last is the whole picture
 
 
 def still_scene(recording: Recording) -> Depth:
@@ -111,23 +122,79 @@ class PictureKeeper:
 
     @cached_property
     def _region(self) -> NDArray[np.bool_] | None:
-        """(H, W) the arena's region; None is the whole picture."""
-        from liex_lab.arena.scene import region_mask
-
-        scene = self._origin.scene
-        camera = self._origin.camera
-        if scene is None or not scene.region_px:
-            return None
-        return region_mask(scene.region_px, camera.width, camera.height)
+        return _region(self._origin)
 
     @cached_property
     def _arena(self) -> tuple[int, int, int, int]:
-        """The box of the region."""
-        if self._region is None:
-            return 0, 0, self._origin.camera.width, self._origin.camera.height
-        rows = np.flatnonzero(self._region.any(axis=1))
-        columns = np.flatnonzero(self._region.any(axis=0))
-        return int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1
+        return _arena(self._origin)
+
+
+def _region(origin: Provenance) -> NDArray[np.bool_] | None:
+    """(H, W) the arena's region; None is the whole picture."""
+    from liex_lab.arena.scene import region_mask
+
+    if origin.scene is None or not origin.scene.region_px:
+        return None
+    return region_mask(origin.scene.region_px, origin.camera.width, origin.camera.height)
+
+
+def _arena(origin: Provenance) -> tuple[int, int, int, int]:
+    """The box of the arena's region."""
+    region = _region(origin)
+    if region is None:
+        return 0, 0, origin.camera.width, origin.camera.height
+    rows = np.flatnonzero(region.any(axis=1))
+    columns = np.flatnonzero(region.any(axis=0))
+    return int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1
+
+
+def windows(origin: Provenance) -> list[tuple[int, int]]:
+    """Sizes in which cut-outs stand in the Rerun replay; they follow from these facts alone.
+
+    Args:
+        origin: camera, its distance from the floor, the animal's length, and what is kept.
+
+    Returns:
+        At most `N_WINDOWS` times (width, height) px, the smallest area first; the last is the whole
+        picture.
+    """
+    camera = origin.camera
+    sizes = {(camera.width, camera.height)}
+    if origin.replay_depth == ARENA:
+        left, top, right, bottom = _arena(origin)
+        sizes.add((right - left, bottom - top))
+    else:
+        length_px = _spine_mm(origin) * camera.fx / max(origin.floor_distance_mm, 1.0)
+        side = (1.0 + 2.0 * _MARGIN) * length_px + 2.0 * _MARGIN_PX
+        sides = [math.ceil(times * side) for times in _SIDES]
+        sizes |= {(min(w, camera.width), min(h, camera.height)) for w in sides for h in sides}
+    return sorted(sizes, key=lambda size: (size[0] * size[1], size))
+
+
+def window_around(
+    box: Sequence[int], sizes: Sequence[tuple[int, int]]
+) -> tuple[int, tuple[int, int, int, int]]:
+    """The smallest window that holds a box, around its middle.
+
+    Args:
+        box: left, top, right, bottom, px, in the picture.
+        sizes: of windows, see `windows`.
+
+    Returns:
+        Which size it is, and left, top, right, bottom, px.
+    """
+    left, top, right, bottom = box
+    width = right - left
+    height = bottom - top
+    which = next(k for k, (w, h) in enumerate(sizes) if w >= width and h >= height)
+    wide, high = sizes[which]
+    x = min(max(left + width // 2 - wide // 2, 0), sizes[-1][0] - wide)
+    y = min(max(top + height // 2 - high // 2, 0), sizes[-1][1] - high)
+    return which, (x, y, x + wide, y + high)
+
+
+def _spine_mm(origin: Provenance) -> float:
+    return float(origin.animal_size.get("spine_mm") or origin.skeleton.length)
 
 
 def boxes_around(seen: Observations, origin: Provenance) -> Boxes:
@@ -142,7 +209,7 @@ def boxes_around(seen: Observations, origin: Provenance) -> Boxes:
     """
     camera = origin.camera
     into = origin.T_arena_camera.inverse()
-    spine_mm = float(origin.animal_size.get("spine_mm") or origin.skeleton.length)
+    spine_mm = _spine_mm(origin)
     found = np.zeros((len(seen), N_BOXES, 4), np.int16)
     for k in range(N_BOXES):
         h = 2 * k  # the other hypothesis of each thing is the same one turned round

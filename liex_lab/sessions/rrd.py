@@ -114,6 +114,7 @@ class ReplayWriter:
             first_ns: time of the first frame of that file, ns.
         """
         self._first_ns = first_ns
+        self._depth.go_on()
 
     def add(
         self,
@@ -127,7 +128,8 @@ class ReplayWriter:
         Args:
             frame_index: the camera's count of the n frames.
             times_ns: their times, ns.
-            depth: n pictures (H, W) uint16 mm, 0 where unread; none where depth is not kept.
+            depth: n pictures (H, W) uint16 mm, 0 where unread, outside of their cut-outs the still
+                scene; none where depth is not kept.
             boxes: (n, K, 4) left, top, right and bottom of the cut-outs, px, all 0 for none; None
                 where whole pictures are kept. It is the same for all frames of a replay.
         """

@@ -2,18 +2,25 @@
 
 Depth is stored without loss: RVL (Wilson 2017, run-length and variable-length coding), or PNG where
 sensor noise makes that smaller. A cut-out is seen by a pinhole camera of its own, whose principal
-point is that of the camera less the cut-out's corner (left, top):
+point is that of the camera less the corner (left, top) of the window that it stands in (see
+`cutouts.windows`):
 
     K' = K - [[0, 0, left], [0, 0, top], [0, 0, 0]].
 
 The still scene is there once. Where cut-outs lie in the picture say the entities below `PLACES`,
 see `cutout_frame`.
+
+Rerun 0.41 takes what an entity shows over time for a film (rerun-io/rerun#12801). It complains of
+nothing where all its pictures have one size and one packing, and the packing stands there once for
+all times. So every size of window and every packing has an entity of its own, and of those that
+belong together one shows a picture at a time. Without a time only PNG is no error.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -21,7 +28,7 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from liex_lab.recordings.rvl import rvl_message
-from liex_lab.sessions.cutouts import N_BOXES, Boxes
+from liex_lab.sessions.cutouts import N_BOXES, N_WINDOWS, Boxes, window_around, windows
 from liex_lab.sessions.provenance import Provenance
 
 Array = NDArray[np.float64]
@@ -29,6 +36,7 @@ Packed = tuple[NDArray[np.uint8], str]  # bytes and media type
 
 IMAGE = "arena/camera/image"
 DEPTH = f"{IMAGE}/depth"
+NOISY = f"{DEPTH}/png"  # whole pictures whose noise makes PNG smaller
 BACKGROUND = f"{IMAGE}/background"
 PLACES = f"{IMAGE}/places"
 CUTOUTS = "arena/camera/cutouts"
@@ -37,7 +45,9 @@ MM_PER_UNIT = 1000.0  # our depth is in mm, the scene in metres
 _BACKMOST = -40.0
 _BEHIND = -30.0
 _WHOLE = -20.0
-_RVL = "application/rvl"  # media type
+# media types
+_RVL = "application/rvl"
+_PNG = "image/png"
 _LARGE = 0.54  # bytes per pixel: 166 kB for 640 x 480
 _PACKED_FURTHER = 0.93  # by Rerun, which packs what it writes: RVL so much, PNG not at all
 _NOISY_PNG = (
@@ -48,7 +58,7 @@ _NOISY_PNG = (
 )  # OpenCV's IMWRITE_PNG_COMPRESSION 1 and IMWRITE_PNG_STRATEGY 2, HUFFMAN_ONLY
 # pictures, and their bytes, in one message: for each message the index that ends the file takes
 # some 5 kB of memory
-_TOGETHER = 64
+_TOGETHER = 128
 _TOGETHER_BYTES = 1 << 23
 
 
@@ -62,7 +72,19 @@ class DepthColumns:
     def __init__(self, origin: Provenance) -> None:
         self._origin = origin
         self._waiting: list[_Picture] = []
+        self._n_bytes = 0
         self._n_messages = 0
+        self._introduced: set[str] = set()
+        self._shown: set[str] = set()  # entities that show a picture of frames before
+
+    @cached_property
+    def _windows(self) -> list[tuple[int, int]]:
+        return windows(self._origin)
+
+    def go_on(self) -> None:
+        """Continue another file, of which it is not known what it shows at its end."""
+        cut_out = self._origin.background is not None
+        self._shown = set(cutout_entities() if cut_out else (DEPTH, NOISY))
 
     def take(
         self,
@@ -76,18 +98,41 @@ class DepthColumns:
         Args:
             frame_index: the camera's count of the frame.
             elapsed_ns: time since the first frame, ns.
-            depth: (H, W) uint16 mm, 0 where unread.
+            depth: (H, W) uint16 mm, 0 where unread; outside of its cut-outs the still scene.
             boxes: (K, 4) left, top, right and bottom of its cut-outs, px, all 0 for none; None for
                 a whole picture.
 
         Returns:
             Whether it is time to `send` what waits.
         """
-        cuts = [] if boxes is None else boxes.tolist()
-        parts = [packed(depth)] if boxes is None else [_cut_out(depth, box) for box in cuts]
+        if boxes is None:
+            blob, media_type = packed(depth)
+            parts = {DEPTH if media_type == _RVL else NOISY: blob}
+            cuts: list[tuple[int, int, int, int]] = []
+        else:
+            parts, cuts = self._cut_out(depth, boxes.tolist())
         self._waiting.append(_Picture(int(frame_index), elapsed_ns, parts, cuts))
-        n_bytes = sum(picture.n_bytes for picture in self._waiting)
-        return len(self._waiting) == _TOGETHER or n_bytes > _TOGETHER_BYTES
+        self._n_bytes += sum(len(blob) for blob in parts.values())
+        return len(self._waiting) == _TOGETHER or self._n_bytes > _TOGETHER_BYTES
+
+    def _cut_out(
+        self, depth: NDArray[np.uint16], boxes: Sequence[Sequence[int]]
+    ) -> tuple[dict[str, NDArray[np.uint8]], list[tuple[int, int, int, int]]]:
+        """Packed windows around boxes by their entities, and where they lie; all 0 for no box.
+
+        Always RVL: it is several times as quick as PNG, and no larger.
+        """
+        parts = {}
+        places = []
+        for k, box in enumerate(boxes):
+            if box[2] <= box[0]:
+                places.append((0, 0, 0, 0))
+                continue
+            which, place = window_around(box, self._windows)
+            left, top, right, bottom = place
+            parts[cutout_entity(k, which)] = rvl_message(depth[top:bottom, left:right])
+            places.append(place)
+        return parts, places
 
     def send(self, stream: Any) -> int:
         """Write what waits.
@@ -100,46 +145,41 @@ class DepthColumns:
         """
         waiting = self._waiting
         self._waiting = []
+        self._n_bytes = 0
         self._n_messages = 0
         if not waiting:
             return 0
-        when = timeline(
-            np.array([picture.index for picture in waiting]),
-            np.array([picture.elapsed_ns for picture in waiting]),
-        )
-        if not waiting[0].boxes:
-            self._send_pictures(stream, DEPTH, when, [picture.parts[0] for picture in waiting])
-        for k in range(len(waiting[0].boxes)):
-            boxes = np.array([picture.boxes[k] for picture in waiting], np.float64)
-            self._send_cutouts(stream, k, when, boxes, [picture.parts[k] for picture in waiting])
+        for k in range(len(waiting[0].windows)):
+            self._send_lens(stream, k, waiting)
+        for entity in sorted(self._shown.union(*(picture.parts for picture in waiting))):
+            self._send_pictures(stream, entity, waiting)
+        self._shown = set(waiting[-1].parts)
         return self._n_messages
 
-    def _send_pictures(
-        self,
-        stream: Any,
-        entity: str,
-        when: list[rr.TimeColumn],
-        parts: Sequence[Packed],
-    ) -> None:
-        """Depth pictures, packed; those of no bytes are none."""
-        there = [part for part in parts if len(part[0])]
-        blobs, kinds = zip(*there, strict=True) if there else ((), ())
-        columns = rr.EncodedDepthImage.columns(blob=blobs, media_type=kinds)
-        counts = [int(len(blob) > 0) for blob, _ in parts]
+    def _send_pictures(self, stream: Any, entity: str, waiting: Sequence[_Picture]) -> None:
+        """Pictures of an entity, and from when on it shows none."""
+        blobs = []
+        rows = []
+        counts = []
+        shown = entity in self._shown
+        for row, picture in enumerate(waiting):
+            blob = picture.parts.get(entity)
+            if blob is not None:
+                blobs.append(blob)
+            if blob is not None or shown:
+                rows.append(row)
+                counts.append(int(blob is not None))
+            shown = blob is not None
+        if blobs and entity.startswith(CUTOUTS) and entity not in self._introduced:
+            self._introduce(stream, entity)
+        columns = rr.EncodedDepthImage.columns(blob=blobs)
+        when = _when([waiting[row] for row in rows])
         stream.send_columns(entity, when, [*columns.partition(counts)])
         self._n_messages += 1
 
-    def _send_cutouts(
-        self,
-        stream: Any,
-        k: int,
-        when: list[rr.TimeColumn],
-        boxes: Array,
-        parts: Sequence[Packed],
-    ) -> None:
-        """The k-th cut-out of frames with its lens, and where in the picture it lies; boxes (n, 4)
-        px.
-        """
+    def _send_lens(self, stream: Any, k: int, waiting: Sequence[_Picture]) -> None:
+        """Lenses of the k-th cut-out of frames, and where in the picture it lies."""
+        boxes = np.array([picture.windows[k] for picture in waiting], np.float64)
         there = boxes[:, 2] > boxes[:, 0]
         if not there.any() and k:
             return
@@ -156,50 +196,91 @@ class DepthColumns:
             child_frame=[cutout_frame(k)] * n,
             parent_frame=[f"tf#/{IMAGE}"] * n,
         )
+        when = _when(waiting)
         stream.send_columns(f"{CUTOUTS}/{k + 1}", when, [*lenses])
         stream.send_columns(f"{PLACES}/{k + 1}", when, [*places])
-        self._send_pictures(stream, f"{CUTOUTS}/{k + 1}/depth", when, parts)
+
+    def _introduce(self, stream: Any, entity: str) -> None:
+        """Log what holds for all cut-outs of an entity; every part of a replay says the same."""
+        assert self._origin.background is not None
+        look = self._look(self._origin.background)
+        kind = rr.EncodedDepthImage.from_fields(**look, media_type=_RVL, draw_order=_BEHIND)
+        stream.log(entity, kind, static=True)
+        self._introduced.add(entity)
 
     def log_kind(self, stream: Any, first: NDArray[np.uint16], *, whole: bool) -> None:
-        """Log what holds for every depth picture: unit, colours, layout; and the still scene.
+        """Log what holds for whole pictures: packing, unit, colours, layout; or the still scene.
 
         Args:
             stream: the Rerun stream.
             first: (H, W) uint16 mm, the first picture.
             whole: whole pictures are kept, no cut-outs.
         """
-        look: dict[str, Any] = {
+        if whole:
+            for entity, media_type in ((DEPTH, _RVL), (NOISY, _PNG)):
+                kind = rr.EncodedDepthImage.from_fields(
+                    **self._look(first), media_type=media_type, draw_order=_WHOLE
+                )
+                stream.log(entity, kind, static=True)
+            return
+        import cv2
+
+        assert self._origin.background is not None
+        blob = cv2.imencode(".png", self._origin.background)[1].ravel()
+        scene = rr.EncodedDepthImage(
+            blob=blob,
+            media_type=_PNG,
+            **self._look(self._origin.background),
+            draw_order=_BACKMOST,
+        )
+        stream.log(BACKGROUND, scene, static=True)
+
+    def _look(self, depth: NDArray[np.uint16]) -> dict[str, Any]:
+        """Unit and colours of pictures that are like this one."""
+        return {
             "meter": MM_PER_UNIT,
             "colormap": "viridis",
             "point_fill_ratio": 0.25,
-            "depth_range": colour_range(first, self._origin.floor_distance_mm),
+            "depth_range": colour_range(depth, self._origin.floor_distance_mm),
         }
-        if whole:
-            kind = rr.EncodedDepthImage.from_fields(**look, draw_order=_WHOLE)
-            stream.log(DEPTH, kind, static=True)
-            return
-        for k in range(N_BOXES):
-            kind = rr.EncodedDepthImage.from_fields(**look, draw_order=_BEHIND)
-            stream.log(f"{CUTOUTS}/{k + 1}/depth", kind, static=True)
-        assert self._origin.background is not None
-        blob, media_type = packed(self._origin.background)
-        scene = rr.EncodedDepthImage(blob=blob, media_type=media_type, **look, draw_order=_BACKMOST)
-        stream.log(BACKGROUND, scene, static=True)
 
 
 @dataclass(frozen=True)
 class _Picture:
-    """What is kept of a frame's depth: its packed parts, and their boxes, none for a whole one."""
+    """What is kept of a frame's depth: its packed parts by entity, and the windows of its cut-outs
+    (left, top, right, bottom, px; all 0 for none), none for a whole one.
+    """
 
     index: int
     elapsed_ns: int
-    parts: Sequence[Packed]
-    boxes: Sequence[Sequence[int]]
+    parts: dict[str, NDArray[np.uint8]]
+    windows: Sequence[tuple[int, int, int, int]]
 
-    @property
-    def n_bytes(self) -> int:
-        """Of all parts."""
-        return sum(len(blob) for blob, _ in self.parts)
+
+def _when(pictures: Sequence[_Picture]) -> list[rr.TimeColumn]:
+    """The timelines of pictures."""
+    return timeline(
+        np.array([picture.index for picture in pictures], np.int64),
+        np.array([picture.elapsed_ns for picture in pictures], np.int64),
+    )
+
+
+def cutout_entity(k: int, which: int) -> str:
+    """Entity of the k-th cut-out in a window.
+
+    The smallest window's is that of every cut-out in replays of earlier versions.
+
+    Args:
+        k: counted from 0.
+        which: of the `windows`, counted from 0.
+    """
+    entity = f"{CUTOUTS}/{k + 1}/depth"
+    return f"{entity}/{which + 1}" if which else entity
+
+
+def cutout_entities() -> list[str]:
+    """All entities that may show a cut-out."""
+    return [cutout_entity(k, which) for k in range(N_BOXES) for which in range(N_WINDOWS)]
 
 
 def cutout_frame(k: int) -> str:
@@ -233,19 +314,8 @@ def packed(depth: NDArray[np.uint16]) -> Packed:
     if len(rvl) > _LARGE * depth.size:
         png = cv2.imencode(".png", depth, _NOISY_PNG)[1].ravel()
         if len(png) < _PACKED_FURTHER * len(rvl):
-            return png, "image/png"
+            return png, _PNG
     return rvl, _RVL
-
-
-def _cut_out(depth: NDArray[np.uint16], box: Sequence[int]) -> Packed:
-    """A box of a picture, encoded without loss; no bytes where there is no box.
-
-    Always RVL: Rerun takes PNGs for a video, whose pictures may not change their size.
-    """
-    left, top, right, bottom = box
-    if right <= left:
-        return np.empty(0, np.uint8), _RVL
-    return rvl_message(depth[top:bottom, left:right]), _RVL
 
 
 def colour_range(depth: NDArray[np.uint16], floor_distance_mm: float) -> tuple[float, float]:

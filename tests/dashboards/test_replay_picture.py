@@ -4,10 +4,16 @@ from __future__ import annotations
 
 import ctypes.util
 import importlib.util
+import os
+import re
 import shutil
 import socket
+import subprocess
 import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -15,13 +21,27 @@ import pytest
 from liex_lab.dashboards.replay.rerun_blueprint import replay_blueprint
 
 from liex_lab.api import correct_session
+from liex_lab.recordings.rvl import rvl_message, to_millimetres
 from liex_lab.sessions import Session
 from liex_lab.sessions.correcting import joint_move
-from tests.sessions.test_cutouts import written
+from liex_lab.sessions.cutouts import Kept
+from liex_lab.sessions.rrd import ReplayWriter
+from liex_lab.sessions.rrd_depth import BACKGROUND as BACKGROUND_ENTITY
+from liex_lab.sessions.rrd_depth import (
+    CUTOUTS,
+    IMAGE,
+    PLACES,
+    colour_range,
+    cutout_frame,
+    packed,
+)
+from tests.sessions.test_cutouts import BACKGROUND, written
+from tests.sessions.test_cutouts import MOUSE as KEPT_MOUSE
 from tests.sessions.walking_mouse import WalkingMouse, steady, write
 
 MOUSE = WalkingMouse(steady(2.0), speed_mm_s=220.0)
 MOMENTS = (5, 50)
+FPS = 30.0
 Picture = np.ndarray
 NEAR_VIEW = np.s_[70:325, 965:1915]  # where the depth is that of cut-outs; whole pictures below
 DEPTH_VIEW = np.s_[
@@ -55,8 +75,9 @@ def pictures(session: Session) -> dict[int, Picture]:
     return {moment: whole[DEPTH_VIEW] for moment, whole in looked_at(session).items()}
 
 
-def looked_at(session: Session) -> dict[int, Picture]:
-    """What the viewer shows at each moment, RGB; no view complains of anything."""
+@contextmanager
+def viewing(files: Sequence[Path], log: Path) -> Iterator[Any]:
+    """Rerun's viewer, without a screen, of one replay's files; what it says goes to a log."""
     from rerun.experimental import ViewerClient
 
     found = importlib.util.find_spec("rerun_cli")
@@ -68,22 +89,70 @@ def looked_at(session: Session) -> dict[int, Picture]:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
+    command = [str(program), "--headless", "--hide-welcome-screen", "--bind", "127.0.0.1"]
+    with log.open("wb") as out:
+        viewer = subprocess.Popen(
+            [*command, "--port", str(port)],
+            env={**os.environ, "RERUN_ANALYTICS": "0", "RUST_LOG": "info"},
+            stdout=out,
+            stderr=out,
+        )
+        try:
+            client = connected(viewer, port, ViewerClient)
+            for file in files:
+                client.open(str(file))
+            yield client
+        finally:
+            viewer.terminate()
+            viewer.wait(10)
+
+
+def connected(viewer: subprocess.Popen[bytes], port: int, client: Any) -> Any:
+    """The client of a viewer, once that is up."""
+    ends = time.monotonic() + 30.0
+    while True:
+        assert viewer.poll() is None
+        try:
+            return client.connect(f"rerun+http://127.0.0.1:{port}/proxy")
+        except Exception:  # not up yet; what it raises then is not documented
+            assert time.monotonic() < ends
+            time.sleep(0.2)
+
+
+def complaints_in(log: Path) -> list[str]:
+    """What a viewer complained of, but for the screen that it has not."""
+    told = re.sub(r"\x1b\[[0-9;]*m", "", log.read_text(encoding="utf-8")).splitlines()
+    assert any("rasterizer" in line or " INFO " in line for line in told), "it logs something"
+    return [
+        line
+        for line in told
+        if (" ERROR " in line or (" WARN " in line and "re_viewer_context" in line))
+    ]
+
+
+def pictures_of(client: Any) -> dict[int, Picture]:
+    """What a viewer shows at each moment, RGB."""
     taken = {}
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("RERUN_ANALYTICS", "0")
-        with ViewerClient.spawn(
-            headless=True, port=port, hide_welcome_screen=True, executable_path=str(program)
-        ) as viewer:
-            viewer.open(str(session.path / "session.rrd"))
-            for moment in MOMENTS:
-                for _ in range(4):  # chunks load on demand: the first pictures may be incomplete
-                    viewer.set_time("frame", sequence=moment, play_state="paused")
-                    png = viewer.take_screenshot()
-                    time.sleep(0.5)
-                whole = np.asarray(cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR))
-                taken[moment] = whole[..., ::-1]
-            complaints = [report for view in viewer.get_state().views for report in view.reports]
-    assert not complaints
+    for moment in MOMENTS:
+        for _ in range(4):  # chunks load on demand: the first pictures may be incomplete
+            client.set_time("time", duration=moment / FPS, play_state="paused")
+            png = client.take_screenshot()
+            time.sleep(0.5)
+        whole = np.asarray(cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR))
+        taken[moment] = whole[..., ::-1]
+    return taken
+
+
+def looked_at(session: Session, *more: Path) -> dict[int, Picture]:
+    """What the viewer shows at each moment, RGB; neither a view nor its log complains."""
+    from liex_lab.sessions.viewer import replays_with
+
+    log = session.path.with_suffix(".log")
+    with viewing(replays_with(session.path / "session.rrd", more), log) as client:
+        taken = pictures_of(client)
+        told = [report for view in client.get_state().views for report in view.reports]
+    assert not told
+    assert not complaints_in(log)
     return taken
 
 
@@ -91,6 +160,103 @@ def joints_in(picture: Picture) -> np.ndarray:
     """(H, W) where the joints' colour is."""
     red, green, blue = (picture[..., k].astype(int) for k in range(3))
     return (red > 200) & (green > 40) & (green < 130) & (blue < 110)
+
+
+@pytest.mark.parametrize("depth", ["arena", "none"])
+def test_the_viewer_complains_of_nothing_however_much_depth_is_kept(
+    tmp_path: Path, depth: str
+) -> None:
+    looked_at(written(tmp_path / "kept.liex", depth, blueprint=replay_blueprint))
+
+
+def test_the_viewer_complains_of_nothing_where_whole_pictures_are_laid_over_cut_outs(
+    tmp_path: Path,
+) -> None:
+    session = written(tmp_path / "cut.liex", "animal", blueprint=replay_blueprint)
+    over = tmp_path / "over.rrd"
+    whole = ReplayWriter(over, KEPT_MOUSE.provenance())
+    rng = np.random.default_rng(5)
+    read = [to_millimetres(KEPT_MOUSE.frame(row).depth) for row in range(len(KEPT_MOUSE.times_s))]
+    for row in (3, 4, 5, 6):  # too noisy for RVL
+        noisy = read[row] + rng.normal(0.0, 6.0, read[row].shape)
+        read[row] = (5.0 * np.rint(noisy / 5.0)).astype(np.uint16)
+    whole.add(list(range(len(read))), KEPT_MOUSE.times_ns.tolist(), read)
+    whole.flushed()
+    whole.abandon()
+    kinds = {packed(depth)[1] for depth in read}
+    assert kinds == {"application/rvl", "image/png"}
+    both = looked_at(session, over)
+    alone = looked_at(session)
+    for moment in MOMENTS:
+        assert (both[moment] != alone[moment]).any()
+
+
+def test_a_replay_of_earlier_versions_is_shown_by_todays_layout_and_its_log_has_the_error(
+    tmp_path: Path,
+) -> None:
+    session = written(tmp_path / "new.liex", "animal", blueprint=replay_blueprint)
+    old = tmp_path / "old.rrd"
+    write_as_before(old, session)
+    log = tmp_path / "log"
+    with viewing([old], log) as client:
+        shown = pictures_of(client)
+    assert any("Failed to detect GOP" in line for line in complaints_in(log))
+    new = looked_at(session)
+    for moment in MOMENTS:
+        before, now = (picture[DEPTH_VIEW][260:] for picture in (shown[moment], new[moment]))
+        changed = np.abs(before.astype(int) - now.astype(int)).max(axis=-1) > 40
+        assert changed.mean() < 0.02, "the skeleton alone is missing"
+
+
+def write_as_before(path: Path, session: Session) -> None:
+    """The depth of a replay as version 0.1.0 logged it: each cut-out as large as its box is."""
+    import rerun as rr
+
+    stream = rr.RecordingStream("liex_lab", recording_id="old", send_properties=False)
+    stream.save(path)
+    stream.send_blueprint(replay_blueprint(session.metadata))
+    camera = KEPT_MOUSE.camera
+    place = KEPT_MOUSE.T_arena_camera
+    stream.log("arena", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+    stream.log(
+        "arena/camera",
+        rr.Transform3D(translation=place.translation / 1000.0, mat3x3=place.rotation),
+        static=True,
+    )
+    lens = rr.Pinhole(image_from_camera=camera.matrix, resolution=[camera.width, camera.height])
+    stream.log(IMAGE, lens, static=True)
+    boxes = Kept(session).boxes
+    assert boxes is not None
+    look: dict[str, Any] = {"meter": 1000.0, "colormap": "viridis"}
+    look["depth_range"] = colour_range(BACKGROUND, 700.0)
+    scene = rr.EncodedDepthImage(
+        blob=rvl_message(BACKGROUND), media_type="application/rvl", draw_order=-40.0, **look
+    )
+    stream.log(BACKGROUND_ENTITY, scene, static=True)
+    for row, (left, top, right, bottom) in enumerate(boxes[:, 0].tolist()):
+        stream.set_time("frame", sequence=row)
+        stream.set_time("time", duration=row / FPS)
+        matrix = camera.matrix.copy()
+        matrix[:2, 2] -= (left, top)
+        stream.log(
+            f"{CUTOUTS}/1",
+            rr.Pinhole(image_from_camera=matrix, resolution=[right - left, bottom - top]),
+        )
+        stream.log(
+            f"{PLACES}/1",
+            rr.Transform3D(
+                translation=[left, top, 0],
+                child_frame=cutout_frame(0),
+                parent_frame=f"tf#/{IMAGE}",
+            ),
+        )
+        blob = rvl_message(to_millimetres(KEPT_MOUSE.frame(row).depth)[top:bottom, left:right])
+        picture = rr.EncodedDepthImage(
+            blob=blob, media_type="application/rvl", draw_order=-30.0, **look
+        )
+        stream.log(f"{CUTOUTS}/1/depth", picture)
+    stream.flush()
+    stream.disconnect()
 
 
 def test_where_depth_is_cut_out_around_the_animal_it_is_zoomed_and_followed(tmp_path: Path) -> None:

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import struct
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
 from mcap.reader import make_reader
 
 import liex_lab.sessions.rrd_depth as depth_of
+from liex_lab.arena.scene import region_mask
 from liex_lab.body.pose import Pose
 from liex_lab.errors import RecordingError, SessionError
 from liex_lab.geometry import SE3
@@ -18,7 +21,20 @@ from liex_lab.recordings import open_recording
 from liex_lab.recordings.formats.messages.mcap import McapFile
 from liex_lab.recordings.rvl import to_millimetres, unpack_rvl
 from liex_lab.sessions import Session, SessionWriter, correcting
-from liex_lab.sessions.cutouts import FILE, Kept, PictureKeeper, boxes_around, open_pictures
+from liex_lab.sessions.cutouts import (
+    FILE,
+    N_BOXES,
+    N_WINDOWS,
+    Kept,
+    PictureKeeper,
+    boxes_around,
+    composed,
+    open_pictures,
+    window_around,
+    windows,
+)
+from liex_lab.sessions.joining import join_rrd
+from liex_lab.sessions.rrd import ReplayWriter
 from liex_lab.sessions.source import link_to, linked_recording
 from liex_lab.tracking.observations import Observations
 from tests.sessions.test_rrd import columns_of
@@ -47,6 +63,7 @@ def observed(mouse: WalkingMouse) -> Observations:
 
 
 SEEN = observed(MOUSE)
+ORIGIN = MOUSE.provenance(background=BACKGROUND)
 
 
 def written(folder: Path, depth: str, **own: Any) -> Session:
@@ -161,19 +178,23 @@ def test_of_a_damaged_replay_no_picture_is_taken_for_another_one(tmp_path: Path)
 def test_in_the_replay_a_cut_out_is_seen_by_a_camera_of_its_own(session: Session) -> None:
     boxes = Kept(session).boxes
     assert boxes is not None
-    pictures = columns_of(session, f"{depth_of.CUTOUTS}/1/depth")
+    sizes = windows(replace(ORIGIN, replay_depth="animal"))
     lenses = columns_of(session, f"{depth_of.CUTOUTS}/1")
     places = columns_of(session, f"{depth_of.PLACES}/1")
-    assert pictures["frame"] == lenses["frame"] == places["frame"] == list(range(len(SEEN)))
+    assert lenses["frame"] == places["frame"] == list(range(len(SEEN)))
     for row in (0, UNSEEN, 40):
-        left, top, right, bottom = (int(x) for x in boxes[row, 0])
-        blob = np.asarray(pictures["EncodedDepthImage:blob"][row][0], np.uint8).tobytes()
+        which, window = window_around(boxes[row, 0].tolist(), sizes)
+        left, top, right, bottom = window
+        pictures = columns_of(session, depth_of.cutout_entity(0, which))
+        at = pictures["frame"].index(row)
+        blob = np.asarray(pictures["EncodedDepthImage:blob"][at][0], np.uint8).tobytes()
         width, height = struct.unpack_from("<II", blob, 12)
-        assert (width, height) == (right - left, bottom - top)
+        assert (width, height) == (right - left, bottom - top) == sizes[which]
         assert lenses["Pinhole:resolution"][row][0] == [right - left, bottom - top]
         cut = unpack_rvl(blob[20:], width, height)
         read = to_millimetres(MOUSE.frame(row).depth)
-        np.testing.assert_array_equal(cut, read[top:bottom, left:right])
+        shown = composed(read, boxes[row], BACKGROUND)
+        np.testing.assert_array_equal(cut, shown[top:bottom, left:right])
         lens = np.array(lenses["Pinhole:image_from_camera"][row][0]).reshape(3, 3).T
         point = np.linalg.inv(lens) @ [3.0, 5.0, 1.0]
         np.testing.assert_allclose(
@@ -183,6 +204,84 @@ def test_in_the_replay_a_cut_out_is_seen_by_a_camera_of_its_own(session: Session
         assert places["Transform3D:child_frame"][row] == [depth_of.cutout_frame(0)]
     scene = columns_of(session, depth_of.BACKGROUND)
     assert len(scene["EncodedDepthImage:blob"]) == 1, "the still scene is there once"
+
+
+@pytest.mark.parametrize("length_mm", [20.0, 70.0, 400.0])
+def test_a_cut_out_stands_in_the_smallest_window_that_holds_it(length_mm: float) -> None:
+    camera = MOUSE.camera
+    sizes = windows(MOUSE.provenance(replay_depth="animal", animal_size={"spine_mm": length_mm}))
+    assert len(set(sizes)) == len(sizes) <= N_WINDOWS
+    assert sizes[-1] == (camera.width, camera.height)
+    rng = np.random.default_rng(3)
+    for _ in range(200):
+        left, right = np.sort(rng.choice(camera.width + 1, 2, replace=False)).tolist()
+        top, bottom = np.sort(rng.choice(camera.height + 1, 2, replace=False)).tolist()
+        which, window = window_around((left, top, right, bottom), sizes)
+        assert 0 <= window[0] <= left < right <= window[2] <= camera.width
+        assert 0 <= window[1] <= top < bottom <= window[3] <= camera.height
+        assert sizes[which] == (window[2] - window[0], window[3] - window[1])
+        held = [w * h for w, h in sizes if w >= right - left and h >= bottom - top]
+        assert sizes[which][0] * sizes[which][1] == min(held)
+
+
+def test_the_windows_of_an_arena_are_its_region_and_the_whole_picture() -> None:
+    corners = ((5.0, 5.0), (60.0, 5.0), (60.0, 40.0), (5.0, 40.0))
+    scene = cast("Any", SimpleNamespace(region_px=corners))
+    sizes = windows(MOUSE.provenance(replay_depth="arena", scene=scene))
+    region = region_mask(corners, MOUSE.camera.width, MOUSE.camera.height)
+    assert sizes == [
+        (int(region.any(axis=0).sum()), int(region.any(axis=1).sum())),
+        (MOUSE.camera.width, MOUSE.camera.height),
+    ]
+
+
+def shown_at(folder: Path, row: int) -> dict[int, tuple[int, int]]:
+    """Sizes of the cut-outs that a viewer shows in a frame, the last that each entity was given."""
+    found: dict[int, tuple[int, int]] = {}
+    replay = cast("Session", SimpleNamespace(path=folder))
+    for k in range(N_BOXES):
+        for which in range(N_WINDOWS):
+            columns = columns_of(replay, depth_of.cutout_entity(k, which))
+            blobs = columns.get("EncodedDepthImage:blob", [])
+            before = [at for at, frame in enumerate(columns.get("frame", [])) if frame <= row]
+            blob = blobs[before[-1]] if before else None
+            if blob:
+                assert k not in found, "one cut-out is shown in one window"
+                found[k] = struct.unpack_from("<II", np.asarray(blob[0], np.uint8).tobytes(), 12)
+    return found
+
+
+@pytest.mark.filterwarnings("ignore:RRD file has no footer")
+def test_of_every_cut_out_one_window_is_shown_at_a_time_also_where_a_run_went_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(depth_of, "_TOGETHER", 64)
+    origin = replace(ORIGIN, replay_depth="animal")
+    sizes = windows(origin)
+    rng = np.random.default_rng(4)
+    boxes = np.zeros((150, N_BOXES, 4), np.int16)
+    for row in range(150):
+        width, height = sizes[rng.integers(len(sizes))]
+        boxes[row, 0] = (0, 0, width, height)
+    boxes[60:64, 1] = (8, 8, 20, 20)  # the second one goes where one message ends
+    parts = []
+    for number, part in enumerate((slice(0, 80), slice(80, 150))):
+        path = tmp_path / f"{number}.rrd"
+        replay = ReplayWriter(path, origin)
+        if number:
+            replay.go_on(0)
+        frames = list(range(150)[part])
+        replay.add(
+            frames, [k * 33_000_000 for k in frames], [BACKGROUND] * len(frames), boxes[part]
+        )
+        parts.append((path, replay.flushed()))
+        replay.abandon()
+    join_rrd(parts, tmp_path / "session.rrd")
+    for row in (0, 1, 40, 60, 63, 64, 79, 80, 81, 149):
+        there = [(k, box) for k, box in enumerate(boxes[row].tolist()) if box[2]]
+        assert shown_at(tmp_path, row) == {
+            k: sizes[window_around(box, sizes)[0]] for k, box in there
+        }
 
 
 def test_a_session_with_cut_outs_is_a_fraction_of_one_with_whole_pictures(
