@@ -98,6 +98,20 @@ def _zoomed(skeleton: str) -> Any:
     )
 
 
+def _in_picture() -> Any:
+    """The frames in which cut-outs lie in the picture, by their entities."""
+    import rerun as rr
+
+    from liex_lab.sessions.cutouts import N_BOXES, N_WINDOWS
+    from liex_lab.sessions.rrd_depth import cutout_entity, cutout_frame
+
+    return {
+        cutout_entity(k, which): rr.CoordinateFrame(cutout_frame(k))
+        for k in range(N_BOXES)
+        for which in range(N_WINDOWS)
+    }
+
+
 def _over_time(at: Callable[[str], str], swims: bool) -> tuple[Any, Any]:
     """The lanes of actions, and the curves below them with the list of moments.
 
@@ -135,12 +149,11 @@ def replay_blueprint(session: dict[str, Any]) -> Any:
     Args:
         session: the content of session.json.
     """
-    import rerun as rr
     import rerun.blueprint as rrb
 
-    from liex_lab.sessions.cutouts import ANIMAL, N_BOXES, N_WINDOWS
+    from liex_lab.sessions.cutouts import ALL, ANIMAL, NONE
     from liex_lab.sessions.rrd import OVERLAY, SKELETON, corrected_entity
-    from liex_lab.sessions.rrd_depth import CUTOUTS, cutout_entity, cutout_frame
+    from liex_lab.sessions.rrd_depth import CUTOUTS
 
     # with corrections, what they are made of is left out of the views, but is still there to be
     # looked at
@@ -162,11 +175,7 @@ def replay_blueprint(session: dict[str, Any]) -> Any:
         eye_controls=_followed(body_m, at(SKELETON)),
         line_grid=rrb.LineGrid3D(visible=False),
     )
-    in_picture: Any = {
-        cutout_entity(k, which): rr.CoordinateFrame(cutout_frame(k))
-        for k in range(N_BOXES)
-        for which in range(N_WINDOWS)
-    }
+    kept = session.get("plan", {}).get("replay", {}).get("depth")
     picture = rrb.Spatial2DView(
         origin="arena/camera/image",
         contents=[
@@ -174,11 +183,10 @@ def replay_blueprint(session: dict[str, Any]) -> Any:
             f"+ /{CUTOUTS}/**",
             *(f"- /{OVERLAY}/{name}" for name in ("joints", "bones") if corrected),
         ],
-        overrides=in_picture,
+        overrides={} if kept in (ALL, NONE) else _in_picture(),
         name="depth with the corrected skeleton" if corrected else "depth with the fitted skeleton",
     )
-    cut_out = session.get("plan", {}).get("replay", {}).get("depth") == ANIMAL
-    beside = rrb.Vertical(_zoomed(at(SKELETON)), picture) if cut_out else picture
+    beside = rrb.Vertical(_zoomed(at(SKELETON)), picture) if kept == ANIMAL else picture
     lanes, curves = _over_time(at, swims=session["animal"]["joints"][0] == "head")
     return rrb.Blueprint(
         rrb.Vertical(rrb.Horizontal(scene, beside), lanes, curves, row_shares=[5, 1.6, 2]),
