@@ -26,13 +26,10 @@ from liex_lab.cli.options import (
     SessionPath,
     Settings,
     TopicName,
-    VariantName,
     WhichPlan,
-    keep_numbers,
     region_setting,
     say,
     tell_numbers,
-    tell_scores,
     to_json,
 )
 from liex_lab.cli.recordings import convert, pack
@@ -40,6 +37,7 @@ from liex_lab.cli.replay import show
 from liex_lab.cli.results import compare, export, figures, report
 from liex_lab.cli.sections import MODELS, RECORDINGS, SESSIONS, START, STUDIES, group_of_verbs
 from liex_lab.cli.study import cohort, dashboard, verify
+from liex_lab.cli.train import train
 from liex_lab.errors import LiexError, MisfitError, printable
 from liex_lab.runtime.disk import is_full, why_full
 from liex_lab.runtime.limits import why_short
@@ -219,116 +217,7 @@ app.command(rich_help_panel=RECORDINGS)(convert)
 app.command(rich_help_panel=RECORDINGS)(pack)
 
 
-@app.command(rich_help_panel=MODELS)
-def train(
-    animal: Annotated[
-        str,
-        typer.Argument(
-            metavar="ANIMAL",
-            help="fish, mouse, hand, a skeleton's .toml; or: actions, tracking, shape.",
-        ),
-    ],
-    variant: VariantName = "default",
-    out: Annotated[
-        Path | None,
-        typer.Option("--out", metavar="FILE", help="The model file, .npz (of actions: .skops)."),
-    ] = None,
-    workers: Annotated[
-        int, typer.Option("--workers", min=0, help="CPU cores to use; 0: all of them.")
-    ] = 0,
-    n_images: Annotated[
-        int | None,
-        typer.Option("--images", min=512, help="Pictures to train on, for a quick look."),
-    ] = None,
-    of: Annotated[
-        str,
-        typer.Option("--animal", help="Of `train actions`, `tracking` and `shape`: which animal."),
-    ] = "mouse",
-    sessions: Annotated[
-        list[Path] | None,
-        typer.Option("--session", help="Of `train actions`: a labelled session; repeatable."),
-    ] = None,
-    labels: Annotated[
-        list[Path] | None,
-        typer.Option(
-            "--labels",
-            metavar="FILE",
-            help="Of `train actions`: .csv, .parquet, or .boris; repeatable.",
-        ),
-    ] = None,
-    pose_model: Annotated[
-        str | None,
-        typer.Option(
-            "--model", metavar="FILE", help="Of `train actions`: the model that measures poses."
-        ),
-    ] = None,
-    particles: Annotated[
-        bool,
-        typer.Option(
-            "--particles",
-            help="Of `train tracking`: search the noise of the paper's Algorithm 3 instead.",
-        ),
-    ] = False,
-    json_file: JsonFile = None,
-) -> None:
-    """Make an animal's model from rendered pictures, the same again, byte for byte, whenever it is
-    run.
-
-    `liex train actions` makes the model that names actions: from sessions that people labelled, or,
-    without any, from virtual animals that act. `liex train tracking` measures how far off an
-    animal's tracks may be (tunings.toml), `liex train shape` how the build of an animal shows, and
-    how its poses err with it.
-    """
-    if animal == "actions":
-        from liex_lab.pipelines.training.action_model import train_actions
-
-        with progress_bar() as progress:
-            model, report = train_actions(
-                out or Path(f"{of}-actions.skops"),
-                animal=of,
-                sessions=sessions or (),
-                labels=labels or (),
-                pose_model=pose_model,
-                progress=progress,
-            )
-        if json_file is not None:
-            keep_numbers(report, json_file)
-        tell_scores(report)
-        say(f"model: {model}")
-        return
-    if animal == "tracking" and particles:
-        from liex_lab.pipelines.evaluation.paper.algorithm3 import search_noise
-
-        with progress_bar() as progress:
-            found = search_noise(of, progress=progress)
-        tell_numbers(found, json_file or out)
-        return
-    if animal == "tracking":
-        from liex_lab.pipelines.training.motion_model import train_tracking
-
-        with progress_bar() as progress:
-            table = train_tracking(
-                of, out or Path("tunings.toml"), workers=workers, progress=progress
-            )
-        say(f"tunings: {table}")
-        return
-    if animal == "shape":
-        from liex_lab.pipelines.training.shape_model import train_shape
-
-        with progress_bar() as progress:
-            shapes = train_shape(
-                of, out or Path(f"{of}-shapes.npz"), workers=workers, progress=progress
-            )
-        say(f"shapes: {shapes}")
-        return
-    from liex_lab.pipelines.training.pose_model import train_model
-
-    with progress_bar() as progress:
-        path = out or Path(f"{Path(animal).stem}.npz")
-        model = train_model(
-            animal, variant, path, workers=workers, n_images=n_images, progress=progress
-        )
-    say(f"model: {model}")
+app.command(rich_help_panel=MODELS)(train)
 
 
 @app.command(rich_help_panel=SESSIONS)

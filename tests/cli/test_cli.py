@@ -238,12 +238,8 @@ def test_doctor_prints_json_that_holds_no_nan(monkeypatch: pytest.MonkeyPatch) -
         "floor_mm": math.nan,
         "problems": ["a"],
     }
-    job(
-        monkeypatch,
-        "doctor",
-        examine=lambda path, **options: findings,
-        print_report=lambda findings: print("fine"),
-    )
+    job(monkeypatch, "doctor", examine=lambda path, **options: findings)
+    job(monkeypatch, "doctor_text", print_report=lambda findings: print("fine"))
     result = CliRunner().invoke(cli.app, ["doctor", "m01.mcap", "--json"])
     expected = {"format": "mcap", "n_frames": 3, "fx": 365.0, "floor_mm": None, "problems": ["a"]}
     assert json.loads(result.output) == expected
@@ -459,13 +455,26 @@ def test_train_names_the_model_after_the_animal(monkeypatch: pytest.MonkeyPatch)
     assert result.output == f"model: {(Path('snake.npz'), 'default', 0, 512)}\n"
 
 
+def test_the_noise_of_particles_is_searched_on_as_many_frames_as_are_asked_for(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    def search(animal: str, *, n_frames: int | None, progress: Any) -> dict[str, Any]:
+        return {"animal": animal, "n_frames": n_frames}
+
+    job(monkeypatch, "evaluation.paper.algorithm3", search_noise=search)
+    words = ["train", "tracking", "--animal", "fish", "--particles", "--frames", "60"]
+    file = tmp_path / "noise.json"
+    assert CliRunner().invoke(cli.app, [*words, "--json", str(file)]).exit_code == 0
+    assert json.loads(file.read_text()) == {"animal": "fish", "n_frames": 60}
+
+
 def test_errors_of_a_job_come_through(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def examine(path: Path, **options: Any) -> dict[str, Any]:
         raise RecordingError(f"{path} holds colour [uint8], not depth")
 
-    job(monkeypatch, "doctor", examine=examine, print_report=print)
+    job(monkeypatch, "doctor", examine=examine)
     monkeypatch.setattr(sys, "argv", ["liex", "doctor", "colour.png"])
     with pytest.raises(SystemExit) as left:
         cli.main()
