@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from liex_lab.body.pose import Pose
 from liex_lab.body.skeleton import Skeleton
@@ -252,16 +252,29 @@ class Build:
         Args:
             skeleton: of the animal, with a tube as its surface.
         """
-        average = Surface.of(skeleton)
-        assert average.shape is not None
-        wide, high = (
-            np.exp(np.interp(average.stations, PLACES, np.log(factor)))
-            for factor in (self.width, self.height)
-        )
-        shape = average.shape
-        return replace(
-            average,
-            shape=replace(
-                shape, half_width=shape.half_width * wide, half_height=shape.half_height * high
-            ),
-        )
+        return built(skeleton, self.width, self.height)
+
+
+def built(
+    skeleton: Skeleton, width: ArrayLike, height: ArrayLike, places: ArrayLike = PLACES
+) -> Surface:
+    """The body of an animal that is not built like the average one.
+
+    Args:
+        skeleton: of the animal, with a tube as its surface.
+        width: (P,) half widths over the average animal's of that length, at `places`.
+        height: (P,) half heights likewise.
+        places: (P,) along the body, shares of its length, ascending.
+    """
+    average = Surface.of(skeleton)
+    assert average.shape is not None
+    wide, high = (
+        np.exp(np.interp(average.stations, places, np.log(factor))) for factor in (width, height)
+    )
+    shape = average.shape
+    return replace(
+        average,
+        shape=replace(
+            shape, half_width=shape.half_width * wide, half_height=shape.half_height * high
+        ),
+    )

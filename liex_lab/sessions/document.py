@@ -43,6 +43,7 @@ def _said(text: str) -> str:
 Text = Annotated[str, AfterValidator(_said)]
 Name = Annotated[Text, Field(max_length=4096)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
+Factor = Annotated[float, Field(gt=1e-3, lt=1e3)]
 Count = Annotated[int, Field(ge=0, le=_MOST_FRAMES)]
 Focal = Annotated[float, Field(gt=1e-3, lt=1e7)]
 Size = Annotated[int, Field(gt=0, le=_MOST_PX)]
@@ -80,9 +81,9 @@ class _Shape(_Section):
     residual_mm: Finite | None = None
     why: Text = ""
     places: list[Finite] = []
-    width: list[Finite] = []
+    width: list[Factor] = []
     width_sd: list[Finite] = []
-    height: list[Finite] = []
+    height: list[Factor] = []
     height_sd: list[Finite] = []
     joints_moved: list[Annotated[list[Finite], Field(min_length=3, max_length=3)]] = []
 
