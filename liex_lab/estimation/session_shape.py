@@ -14,13 +14,14 @@ to the logarithms of half width and half height over the average animal's at fiv
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from liex_lab.body.pose import Pose
 from liex_lab.body.skeleton import Skeleton
@@ -207,7 +208,16 @@ class Build:
             prior: of the animal.
             clues: (F,) of the session, see `session_clues`.
         """
-        labels = prior.predict(clues)
+        return Build.of(prior, prior.predict(clues))
+
+    @staticmethod
+    def of(prior: ShapePrior, labels: Array) -> Build:
+        """The build that labels state, as certain as one that a session's clues tell.
+
+        Args:
+            prior: of the animal.
+            labels: (K,), see `labels_of`.
+        """
         p = len(PLACES)
         return Build(
             labels[: -2 * p].reshape(-1, 3),
@@ -256,7 +266,10 @@ class Build:
 
 
 def built(
-    skeleton: Skeleton, width: ArrayLike, height: ArrayLike, places: ArrayLike = PLACES
+    skeleton: Skeleton,
+    width: Array | Sequence[float],
+    height: Array | Sequence[float],
+    places: Sequence[float] = PLACES,
 ) -> Surface:
     """The body of an animal that is not built like the average one.
 

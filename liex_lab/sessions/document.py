@@ -80,6 +80,7 @@ class _Shape(_Section):
     average_residual_mm: Finite | None = None
     residual_mm: Finite | None = None
     why: Text = ""
+    shared_by: Text = ""
     places: list[Finite] = []
     width: list[Factor] = []
     width_sd: list[Finite] = []
@@ -93,7 +94,7 @@ class _Shape(_Section):
         if any(len(column) != len(self.places) for column in columns):
             raise ValueError(f"has not as many widths and heights as its {len(self.places)} places")
         known = self.residual_mm is not None and self.average_residual_mm is not None
-        if self.kept and not (known and self.places and self.joints_moved):
+        if self.kept and not ((known or self.shared_by) and self.places and self.joints_moved):
             raise ValueError("is kept, but does not say what speaks for it")
         return self
 
