@@ -456,8 +456,9 @@ def run_study(
 ) -> list[SessionStatus]:
     """Measure the sessions of a study that are to be done; returns the status of every session.
 
-    A session that fails leaves failed.json in its folder and stops no other. The study's table is
-    written again at the end.
+    A session that fails leaves failed.json in its folder and stops no other. Where the study says
+    shared = "subject", sessions of one animal are looked at first, and measured with what they
+    agree on. The study's table is written again at the end.
 
     Args:
         study: the study file, or the folder that holds study.toml.

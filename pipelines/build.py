@@ -33,8 +33,10 @@ if TYPE_CHECKING:
     from liex_lab.foreground.segmenter import Segmenter
     from liex_lab.optics.camera import Camera, Distortion, Lens
     from liex_lab.optics.refraction import Water
+    from liex_lab.plan.sections import SharedShape
     from liex_lab.recordings.recording import Recording
     from liex_lab.sessions import Provenance
+    from liex_lab.tracking.own_shape import StatedShape
     from liex_lab.tracking.tracker import FrameTracker
 
 
@@ -242,17 +244,78 @@ def build_tracker(
     scene, sample = build_scene(
         recording, plan, estimator.skeleton, plan.foreground.n_background_frames
     )
-    limit = plan.estimation.doubtful_above_mm
-    bridge_s = plan.tracking.bridge_s
+    shared = plan.animal.shared
     return FrameTracker.prepare(
         estimator,
         scene,
         sample,
-        plan.animal.spine_mm,
-        limit,
-        bridge_s,
+        plan.animal.spine_mm or (shared.spine_mm if shared else None),
+        plan.estimation.doubtful_above_mm,
+        plan.tracking.bridge_s,
         adapt=plan.estimation.adapt == "auto",
+        stated=build_stated_shape(plan, estimator.skeleton),
     )
+
+
+def build_stated_shape(plan: Plan, skeleton: Skeleton) -> StatedShape | None:
+    """The shape that the plan states for its animal; None where it states none.
+
+    Args:
+        plan: its setting `animal.shared`.
+        skeleton: the animal's skeleton.
+
+    Raises:
+        PlanError: it is that of another skeleton.
+    """
+    from liex_lab.tracking.own_shape import StatedShape
+
+    shared = plan.animal.shared
+    if shared is None:
+        return None
+    shape = shared.shape
+    if shape is None:
+        return StatedShape(None, shared.girth, shared.by)
+    if len(shape.joints_moved) != skeleton.n_joints:
+        raise PlanError(
+            f"animal.shared.shape.joints_moved lists {len(shape.joints_moved)} joints, and the "
+            f"{skeleton.name} has {skeleton.n_joints}; take animal.shared of a session of this "
+            "skeleton, or leave it out"
+        )
+    return StatedShape(shape_labels(shape), shared.girth, shared.by)
+
+
+def shape_labels(shape: SharedShape) -> NDArray[np.float64]:
+    """A shape as the library knows it: (K,) labels, see `session_shape.labels_of`.
+
+    Args:
+        shape: as a plan states it.
+    """
+    import numpy as np
+
+    from liex_lab.estimation.session_shape import labels_of
+
+    columns = (np.array(column) for column in (shape.joints_moved, shape.width, shape.height))
+    return labels_of(*columns)
+
+
+def animal_facts(plan: Plan, tracker: FrameTracker) -> dict[str, Any]:
+    """What session.json says of the animal's size, girth and shape.
+
+    Args:
+        plan: its section `animal`.
+        tracker: the prepared tracker.
+    """
+    shared = plan.animal.shared
+    origin = "estimated over the recording"
+    if tracker.size_origin == "plan":
+        is_shared = shared is not None and plan.animal.spine_mm is None
+        origin = f"shared by {shared.by}" if shared and is_shared else "stated in the plan"
+    return {
+        "spine_mm": round(tracker.spine_mm, 3),
+        "origin": origin,
+        "girth": round(tracker.body.girth, 3),
+        **({} if tracker.shape is None else {"shape": tracker.shape.to_dict()}),
+    }
 
 
 def build_scene(
@@ -315,21 +378,13 @@ def build_provenance(
         progress
     )  # kept by the recording; the longest wait here, so it is the one that is shown
     arena, zones = build_arena(tracker.scene, plan)
-    origin = {"plan": "stated in the plan", "recording": "estimated over the recording"}[
-        tracker.size_origin
-    ]
     return Provenance.of(
         recording,
         tracker.scene.floor,
         tracker.estimator.skeleton,
         plan,
         model={"name": plan.estimation.model, "sha256": sha256(find_model(plan.estimation.model))},
-        animal_size={
-            "spine_mm": round(tracker.spine_mm, 3),
-            "origin": origin,
-            "girth": round(tracker.body.girth, 3),
-            **({} if tracker.shape is None else {"shape": tracker.shape.to_dict()}),
-        },
+        animal_size=animal_facts(plan, tracker),
         arena=arena,
         zones=zones,
         scene=build_described_scene(tracker.scene, arena),

@@ -231,9 +231,8 @@ class Prepared:
         self.timings["track"] += time.perf_counter() - began
         if isinstance(source, str | Path):
             writer.note(input=link_to(source, self.folder))
-        writer.note(
-            problems=self.recording.problems, verdict=verdict.to_dict(), **dict(notes or {})
-        )
+        writer.note(problems=self.recording.problems, verdict=verdict.to_dict())
+        writer.note(**dict(notes or {}))
         return conclude(writer, self.fitted.plan, self.timings)
 
 

@@ -293,12 +293,19 @@ def beside_average(shape: Mapping[str, Any]) -> str:
         for name in ("width", "height")
     )
     most = max(float(np.linalg.norm(moved)) for moved in shape["joints_moved"])
+    by = shape.get("shared_by")
+    whose = f"shared by {by}" if by else f"its own, fitted to {shape['n_frames']} frames"
+    told = (
+        f"{whose}; at {places} % of its length it is {wide} times as wide and {high} times as high "
+        f"as the average animal. Joints were moved by up to {100 * most:.1f} % of its length for it"
+    )
+    own, average = shape.get("residual_mm"), shape.get("average_residual_mm")
+    if own is None or average is None:
+        return told
+    held = f"{shape['n_frames']} frames" if by else "frames that were held out"
     return (
-        f"its own, fitted to {shape['n_frames']} frames; at {places} % of its length it is {wide} "
-        f"times as wide and {high} times as high as the average animal. Joints were moved by up to "
-        f"{100 * most:.1f} % of its length for it. On frames that were held out this body lies "
-        f"{shape['residual_mm']:.2f} mm from the depth, the average one "
-        f"{shape['average_residual_mm']:.2f} mm"
+        f"{told}. On {held} this body lies {own:.2f} mm from the depth, the average one "
+        f"{average:.2f} mm"
     )
 
 

@@ -174,6 +174,9 @@ def _tell_study(standings: list[SessionStatus], all_of_them: bool) -> int:
         elif all_of_them or one.state not in ("done", "excluded"):
             remedy = f"; {one.failure['remedy']}" if one.failure and one.state == "failed" else ""
             say(f"{one.state:9}{one.session.id}  {one.reason}{remedy}".rstrip())
+    remarks = [one.session.remark for one in standings if one.state not in ("failed", "excluded")]
+    for remark in dict.fromkeys(filter(None, remarks)):
+        say(remark)
     say(
         f"{len(standings)} session{'' if len(standings) == 1 else 's'}: "
         + ", ".join(f"{n} {state}" for state, n in sorted(counts.items()))

@@ -14,6 +14,7 @@ to the logarithms of half width and half height over the average animal's at fiv
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -207,7 +208,16 @@ class Build:
             prior: of the animal.
             clues: (F,) of the session, see `session_clues`.
         """
-        labels = prior.predict(clues)
+        return Build.of(prior, prior.predict(clues))
+
+    @staticmethod
+    def of(prior: ShapePrior, labels: Array) -> Build:
+        """The build that labels state, as certain as one that a session's clues tell.
+
+        Args:
+            prior: of the animal.
+            labels: (K,), see `labels_of`.
+        """
         p = len(PLACES)
         return Build(
             labels[: -2 * p].reshape(-1, 3),
@@ -252,16 +262,32 @@ class Build:
         Args:
             skeleton: of the animal, with a tube as its surface.
         """
-        average = Surface.of(skeleton)
-        assert average.shape is not None
-        wide, high = (
-            np.exp(np.interp(average.stations, PLACES, np.log(factor)))
-            for factor in (self.width, self.height)
-        )
-        shape = average.shape
-        return replace(
-            average,
-            shape=replace(
-                shape, half_width=shape.half_width * wide, half_height=shape.half_height * high
-            ),
-        )
+        return built(skeleton, self.width, self.height)
+
+
+def built(
+    skeleton: Skeleton,
+    width: Array | Sequence[float],
+    height: Array | Sequence[float],
+    places: Sequence[float] = PLACES,
+) -> Surface:
+    """The body of an animal that is not built like the average one.
+
+    Args:
+        skeleton: of the animal, with a tube as its surface.
+        width: (P,) half widths over the average animal's of that length, at `places`.
+        height: (P,) half heights likewise.
+        places: (P,) along the body, shares of its length, ascending.
+    """
+    average = Surface.of(skeleton)
+    assert average.shape is not None
+    wide, high = (
+        np.exp(np.interp(average.stations, places, np.log(factor))) for factor in (width, height)
+    )
+    shape = average.shape
+    return replace(
+        average,
+        shape=replace(
+            shape, half_width=shape.half_width * wide, half_height=shape.half_height * high
+        ),
+    )

@@ -14,6 +14,8 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 Positive = Annotated[float, Field(gt=0)]
+Factor = Annotated[float, Field(gt=1e-3, lt=1e3)]
+N_PLACES = 5  # along the body, of liex_lab.estimation.session_shape
 # names of liex_lab.optics.presets, stated here for a plan is read before any library is there
 CameraName = Literal["kinect-v2", "primesense", "azure-nfov", "femto-bolt", "d435", "raytrix-r5"]
 NotNegative = Annotated[float, Field(ge=0)]
@@ -67,6 +69,47 @@ class Table(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
 
 
+class SharedShape(Table):
+    """How wide and high an animal is, and where its joints lie, as session.json says it."""
+
+    width: list[Factor] = Field(
+        min_length=N_PLACES,
+        max_length=N_PLACES,
+        description="half widths over the average animal's of that length, at five places",
+    )
+    height: list[Factor] = Field(
+        min_length=N_PLACES, max_length=N_PLACES, description="half heights likewise"
+    )
+    joints_moved: list[Annotated[list[float], Field(min_length=3, max_length=3)]] = Field(
+        description="what is added to each joint in the frame of the body's base, over the length"
+    )
+
+
+class SharedBody(Table):
+    """What the sessions of one animal found of it together."""
+
+    subject: str = Field(min_length=1, max_length=500, description="the animal")
+    n_sessions: int = Field(ge=2, description="how many sessions found it")
+    spine_mm: Positive | None = Field(
+        None, description="its length; not set: every session states or measures its own"
+    )
+    girth: Factor | None = Field(
+        None, description="of the average body of that length; not set: every session finds its own"
+    )
+    shape: SharedShape | None = Field(
+        None, description="its shape; not set: the average animal's is used"
+    )
+
+    def __repr__(self) -> str:
+        length = "" if self.spine_mm is None else f": {self.spine_mm:g} mm long"
+        return f"<SharedBody of {self.by}{length}>"
+
+    @property
+    def by(self) -> str:
+        """Who shares it, in words."""
+        return f"{self.n_sessions} sessions of {self.subject}"
+
+
 class Animal(Table):
     """[animal]: what is in front of the camera."""
 
@@ -89,6 +132,13 @@ class Animal(Table):
     )
     spine_max_mm: Positive = Field(
         115.0, description="an animal is not longer than this, where its size is measured"
+    )
+    shared: SharedBody | None = Field(
+        None,
+        description=(
+            "size and shape that the sessions of this animal agree on; a study with shared = "
+            "'subject' puts them in; not set: the session's own"
+        ),
     )
 
     @model_validator(mode="after")

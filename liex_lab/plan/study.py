@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path, PurePosixPath
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 from urllib.parse import parse_qsl
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
@@ -123,6 +123,8 @@ class StudyTable(_Table):
         name: the study's name.
         plan: a bundled plan or a path below the study's folder.
         results: path below the study's folder that results go to.
+        shared: what the sessions of one animal share: 'subject', its size and shape; 'off',
+            nothing.
         set: settings of the plan for all sessions, nested.
         animals: the animals.
         arenas: several arenas in one picture, each recorded with an animal of its own.
@@ -132,6 +134,7 @@ class StudyTable(_Table):
     name: Text = "study"
     plan: PathText = "mouse"
     results: PathText = DERIVED
+    shared: Literal["off", "subject"] = "off"
     set: Settings = {}
     animals: list[StudyAnimal] = []
     arenas: list[StudyArena] = []
@@ -187,6 +190,7 @@ class PlannedSession:
         folder: where its results lie.
         plan: all settings, resolved.
         exclude: why it is left out; empty where it is not.
+        remark: what session.json is to say of it besides; empty where there is nothing.
     """
 
     id: str
@@ -195,6 +199,7 @@ class PlannedSession:
     folder: Path
     plan: Plan
     exclude: str = ""
+    remark: str = ""
 
     @property
     def recording_exists(self) -> bool:

@@ -43,6 +43,7 @@ def _said(text: str) -> str:
 Text = Annotated[str, AfterValidator(_said)]
 Name = Annotated[Text, Field(max_length=4096)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
+Factor = Annotated[float, Field(gt=1e-3, lt=1e3)]
 Count = Annotated[int, Field(ge=0, le=_MOST_FRAMES)]
 Focal = Annotated[float, Field(gt=1e-3, lt=1e7)]
 Size = Annotated[int, Field(gt=0, le=_MOST_PX)]
@@ -79,10 +80,11 @@ class _Shape(_Section):
     average_residual_mm: Finite | None = None
     residual_mm: Finite | None = None
     why: Text = ""
+    shared_by: Text = ""
     places: list[Finite] = []
-    width: list[Finite] = []
+    width: list[Factor] = []
     width_sd: list[Finite] = []
-    height: list[Finite] = []
+    height: list[Factor] = []
     height_sd: list[Finite] = []
     joints_moved: list[Annotated[list[Finite], Field(min_length=3, max_length=3)]] = []
 
@@ -92,7 +94,7 @@ class _Shape(_Section):
         if any(len(column) != len(self.places) for column in columns):
             raise ValueError(f"has not as many widths and heights as its {len(self.places)} places")
         known = self.residual_mm is not None and self.average_residual_mm is not None
-        if self.kept and not (known and self.places and self.joints_moved):
+        if self.kept and not ((known or self.shared_by) and self.places and self.joints_moved):
             raise ValueError("is kept, but does not say what speaks for it")
         return self
 

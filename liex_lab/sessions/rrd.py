@@ -383,8 +383,8 @@ class ReplayWriter:
             colors=_SPREAD, fill_mode="majorwireframe", line_radii=0.0003
         )
         self._stream.log(UNCERTAINTY, look, static=True)
-        girth = float(self._origin.animal_size.get("girth", 1.0))
-        carriers = log_body(self._stream, skeleton, girth) if skeleton.surface else []
+        animal = self._origin.animal_size
+        carriers = log_body(self._stream, skeleton, animal) if skeleton.surface else []
         for part in blocks(track.n_frames, _BLOCK):
             when = timeline(index[part], elapsed[part])
             seen = track[part].posed

@@ -6,6 +6,7 @@ trunk at home pose is cut at its joints, and each vertex belongs to its nearest 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 from liex_lab.body.pose import Pose
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.body.surface import Surface
+from liex_lab.estimation.session_shape import built
 from liex_lab.geometry import SE3, so3
 from liex_lab.tracking.track import Track
 
@@ -42,19 +44,37 @@ class BodyPart:
     normals: Array
 
 
-def body_parts(skeleton: Skeleton, girth: float = 1.0) -> list[BodyPart]:
-    """Trunk of the default animal at home pose, cut at its joints.
+def body_of(skeleton: Skeleton, animal: Mapping[str, Any]) -> tuple[Surface, float]:
+    """The session's body: that of the shape it kept, or the average one at its best girth.
+
+    Args:
+        skeleton: the skeleton, which has a surface.
+        animal: section `animal` of session.json.
+
+    Returns:
+        The surface, and the girth over what is usual for its length.
+    """
+    shape = animal.get("shape") or {}
+    average = Surface.of(skeleton)
+    girth = float(animal.get("girth", 1.0))
+    if not shape.get("kept") or average.shape is None:
+        return average, girth
+    return built(skeleton, shape["width"], shape["height"], shape["places"]), girth
+
+
+def body_parts(surface: Surface, girth: float = 1.0) -> list[BodyPart]:
+    """Trunk of an animal at home pose, cut at its joints.
 
     Each part reaches one ring of faces farther, so that a bent body shows no gap.
 
     Args:
-        skeleton: the skeleton, which has a surface.
+        surface: of the animal.
         girth: of the animal, over what is usual for its length.
 
     Returns:
         One part per joint that carries any face.
     """
-    surface = Surface.of(skeleton)
+    skeleton = surface.skeleton
     home = Pose.home(skeleton)
     faces = surface.faces[: surface.n_trunk_faces].astype(np.int64)
     vertices = surface.vertices(home, girth=girth, parallel=False)
@@ -100,15 +120,15 @@ def _normals(vertices: Array, faces: NDArray[np.int64]) -> Array:
     return out / np.maximum(np.linalg.norm(out, axis=1, keepdims=True), 1e-12)
 
 
-def log_body(stream: Any, skeleton: Skeleton, girth: float) -> list[int]:
+def log_body(stream: Any, skeleton: Skeleton, animal: Mapping[str, Any]) -> list[int]:
     """Log the body's parts once; returns the joints that carry one.
 
     Args:
         stream: the Rerun stream.
         skeleton: the skeleton, which has a surface.
-        girth: of the animal, over what is usual for its length.
+        animal: section `animal` of session.json, see `body_of`.
     """
-    parts = body_parts(skeleton, girth)
+    parts = body_parts(*body_of(skeleton, animal))
     for part in parts:
         mesh = rr.Mesh3D(
             vertex_positions=part.vertices / 1000.0,

@@ -5,6 +5,9 @@ sampled frames that are seen well. The body of that build, in the poses that are
 is then held against the depth of the other third, beside the average body at its best girth in the
 poses as they were (hold-out validation): whichever leaves the smaller median residual is the
 session's. With fewer than 50 such frames it is the average one.
+
+A shape that is stated, as sessions of one animal share it, is taken as it is and only held against
+the depth of all well-seen frames.
 """
 
 from __future__ import annotations
@@ -29,6 +32,21 @@ _HELD_OUT = 3  # every so many-th frame is not fitted to
 
 
 @dataclass(frozen=True)
+class StatedShape:
+    """A shape that nothing is fitted for.
+
+    Attributes:
+        labels: (K,), see `session_shape.labels_of`; None states the average animal's.
+        girth: of the average body; None finds it.
+        by: who states it, such as '4 sessions of m07'.
+    """
+
+    labels: Array | None
+    girth: float | None
+    by: str
+
+
+@dataclass(frozen=True)
 class OwnShape:
     """A session's shape: the animal's build, and what speaks for it.
 
@@ -39,6 +57,7 @@ class OwnShape:
             of the frames that were held out, mm; NaN where none were.
         residual_mm: the same of the fitted body in the corrected poses.
         why: why the average body was kept; empty where it was not.
+        shared_by: who states the shape; empty where the session's own frames tell it.
     """
 
     build: Build | None
@@ -46,6 +65,7 @@ class OwnShape:
     average_residual_mm: float = float("nan")
     residual_mm: float = float("nan")
     why: str = ""
+    shared_by: str = ""
 
     def corrected(self, estimator: PoseEstimator, pose: Pose, size: float) -> Pose:
         """Poses with the mean error of such a body taken off; as they are where none is known.
@@ -64,6 +84,7 @@ class OwnShape:
             "n_frames": self.n_frames,
             "average_residual_mm": _rounded(self.average_residual_mm),
             "residual_mm": _rounded(self.residual_mm),
+            **({"shared_by": self.shared_by} if self.shared_by else {}),
         }
         if self.build is None:
             return {**told, "why": self.why}
@@ -90,6 +111,7 @@ def fit_shape(
     estimates: Estimates,
     size: float,
     average: BodyResidual,
+    stated: StatedShape | None = None,
 ) -> tuple[OwnShape | None, BodyResidual]:
     """The session's shape from a sample of its frames, and the body that its frames are held to.
 
@@ -100,6 +122,7 @@ def fit_shape(
         estimates: of the sampled frames, camera frame.
         size: the animal's size over home size.
         average: the average body at its best girth.
+        stated: the shape where it is stated; None fits it.
 
     Returns:
         The shape, None of an animal of which no shapes were learned; and `average` or the fitted
@@ -113,6 +136,13 @@ def fit_shape(
     if prior.model != estimator.model.fingerprint:
         why = f"shapes were learned for the bundled model of the {skeleton.name} alone"
         return OwnShape(None, len(good), why=why), average
+    if stated is not None:
+        if stated.labels is None:
+            why = f"of {stated.by} too few bear out another, and they share it"
+            return OwnShape(None, len(good), why=why, shared_by=stated.by), average
+        build = Build.of(prior, stated.labels)
+        own, before, after = _beside(average, build, estimator, scene, estimates, size, good)
+        return OwnShape(build, len(good), before, after, shared_by=stated.by), own
     if len(good) < FEWEST_FRAMES:
         why = (
             f"{len(good)} frames of the sample show the animal well, and a shape of its own is "
@@ -121,25 +151,8 @@ def fit_shape(
         return OwnShape(None, len(good), why=why), average
     held_out = good[::_HELD_OUT]
     fitted = np.setdiff1d(good, held_out)
-    crops = estimates.crops
-    cameras = scene.crop_cameras(crops, estimator.model.method.camera_view)
-    pose = estimates.chosen.pose
-    clues = session_clues(
-        skeleton,
-        pose[fitted].moved(view_of(cameras[fitted])),
-        crops.heights[fitted],
-        cameras[fitted],
-        size,
-    )
-    build = Build.told(prior, clues)
-    own = BodyResidual(build.surface(skeleton), camera_view=average.camera_view)
-    before, after = (
-        _median_residual(body, shown.moved(scene.floor.T_arena_camera), crops[held_out], scene)
-        for body, shown in (
-            (average, pose[held_out]),
-            (own, build.corrected(skeleton, pose[held_out], size)),
-        )
-    )
+    build = Build.told(prior, _clues(estimator, scene, estimates, size, fitted))
+    own, before, after = _beside(average, build, estimator, scene, estimates, size, held_out)
     if not after < before:
         why = (
             "on frames that were held out a body of its own leaves "
@@ -147,6 +160,40 @@ def fit_shape(
         )
         return OwnShape(None, len(good), before, after, why), average
     return OwnShape(build, len(good), before, after), own
+
+
+def _clues(
+    estimator: PoseEstimator,
+    scene: Segmenter,
+    estimates: Estimates,
+    size: float,
+    rows: NDArray[np.int64],
+) -> Array:
+    """(F,) clues of some of the sampled frames."""
+    cameras = scene.crop_cameras(estimates.crops, estimator.model.method.camera_view)[rows]
+    pose = estimates.chosen.pose[rows].moved(view_of(cameras))
+    return session_clues(estimator.skeleton, pose, estimates.crops.heights[rows], cameras, size)
+
+
+def _beside(
+    average: BodyResidual,
+    build: Build,
+    estimator: PoseEstimator,
+    scene: Segmenter,
+    estimates: Estimates,
+    size: float,
+    rows: NDArray[np.int64],
+) -> tuple[BodyResidual, float, float]:
+    """The body of a build, and the median residuals of the average body and of it, mm."""
+    skeleton = estimator.skeleton
+    own = BodyResidual(build.surface(skeleton), camera_view=average.camera_view)
+    pose = estimates.chosen.pose[rows]
+    crops = estimates.crops[rows]
+    before, after = (
+        _median_residual(body, shown.moved(scene.floor.T_arena_camera), crops, scene)
+        for body, shown in ((average, pose), (own, build.corrected(skeleton, pose, size)))
+    )
+    return own, before, after
 
 
 def _median_residual(body: BodyResidual, pose: Pose, crops: Any, scene: Segmenter) -> float:

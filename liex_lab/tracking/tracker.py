@@ -28,7 +28,7 @@ from liex_lab.tracking.observations import Observations
 from liex_lab.tracking.occluders import behind_something
 from liex_lab.tracking.occlusion import OcclusionCorrection
 from liex_lab.tracking.offline import Subject, single_frames, track_whole
-from liex_lab.tracking.own_shape import OwnShape, fit_shape
+from liex_lab.tracking.own_shape import OwnShape, StatedShape, fit_shape
 from liex_lab.tracking.residual import Agreement, BodyResidual
 from liex_lab.tracking.sample_fit import SampleFit, count_animals
 from liex_lab.tracking.track import Flip, Track, Tracked
@@ -81,6 +81,7 @@ class FrameTracker:
         doubtful_mm: float | None = None,
         bridge_s: float = BRIDGE_S,
         adapt: bool = True,
+        stated: StatedShape | None = None,
     ) -> FrameTracker:
         """A tracker for a recording: a sample of its frames gives the animal's size and shape.
 
@@ -93,6 +94,7 @@ class FrameTracker:
                 size.
             bridge_s: the longest gap that is bridged whole, s.
             adapt: fit a shape to the sample; else the body is the average one at its best girth.
+            stated: the animal's shape where it is stated; None fits it.
 
         Returns:
             The tracker.
@@ -112,13 +114,16 @@ class FrameTracker:
         used = estimates.found
         shown = sample if used.all() else sample[used]  # a copy of a hundred pictures
         camera_view = estimator.model.method.camera_view
-        body = BodyResidual.fit(
-            Surface.of(estimator.skeleton), pose[used], crops[used], scene, camera_view
+        average = Surface.of(estimator.skeleton)
+        body = (
+            BodyResidual.fit(average, pose[used], crops[used], scene, camera_view)
+            if stated is None or stated.girth is None
+            else BodyResidual(average, stated.girth, camera_view)
         )
         shape = None
         if adapt:
             prior = ShapePrior.of(estimator.skeleton.name)
-            shape, body = fit_shape(prior, estimator, scene, estimates, size, body)
+            shape, body = fit_shape(prior, estimator, scene, estimates, size, body, stated)
         if shape is not None:
             pose = shape.corrected(estimator, estimates.chosen.pose, size).moved(
                 scene.floor.T_arena_camera

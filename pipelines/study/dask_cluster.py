@@ -14,17 +14,20 @@ import signal
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager, suppress
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from liex_lab.errors import MissingPackageError, StudyError, how_to_install
 from liex_lab.plan.study import PlannedSession
+from liex_lab.runtime.progress import Progress
 from liex_lab.runtime.scratch import Scratch
 from liex_lab.sessions.failure import describe_failure
 
 from ..workers import Done, Work, n_cores, worker_environment
 from .cluster_watch import KeptWorkers
 from .one_session import RunSession, measure_one, quarantine
+from .sharing import LOOKING, LookAtSession, about
 from .slurm import SlurmTable
 from .slurm_jobs import KeptJobs
 from .status import SessionStatus
@@ -71,13 +74,93 @@ def measure_cohort(
         StudyError: no scheduler answers, or it ends before the study does.
         MissingPackageError: Slurm is asked for and dask-jobqueue is not installed.
     """
-    planned = {one.session.id: one.session for one in todo}
-    if not planned:
+    if not todo:
         return []
-    with _client(len(planned), workers, threads, scheduler, slurm) as client:
-        client.subscribe_topic(TOPIC, lambda event: told(*event[1]))
-        count = slurm.jobs if slurm else len(client.nthreads())
-        return list(_results(client, planned, run, finished, n_shared(len(planned), count)))
+    with crew_of(len(todo), workers=workers, threads=threads, scheduler=scheduler, slurm=slurm) as (
+        crew
+    ):
+        return crew.measure(todo, run, told, finished)
+
+
+@contextmanager
+def crew_of(
+    n_tasks: int,
+    *,
+    workers: int = 0,
+    threads: int = 0,
+    scheduler: str | None = None,
+    slurm: SlurmTable | None = None,
+) -> Iterator[Crew]:
+    """Workers for the sessions of a study, within the block.
+
+    Args:
+        n_tasks: the most sessions that there are to do at once.
+        workers: processes on this machine; 0 takes one for every two cores.
+        threads: cores of each; 0 takes an equal share.
+        scheduler: address of a running Dask scheduler.
+        slurm: how to ask a Slurm cluster for workers.
+
+    Raises:
+        StudyError: no scheduler answers, or it ends before the study does.
+        MissingPackageError: Slurm is asked for and dask-jobqueue is not installed.
+    """
+    with _client(n_tasks, workers, threads, scheduler, slurm) as client:
+        yield Crew(client, slurm.jobs if slurm else 0)
+
+
+class Crew:
+    """The workers of a study.
+
+    Args:
+        client: of their cluster.
+        n_jobs: how many of them are to come; 0 where they are there.
+    """
+
+    def __init__(self, client: Client, n_jobs: int = 0) -> None:
+        self._client, self._n_jobs = client, n_jobs
+        self._told: Told = lambda *_: None
+        client.subscribe_topic(TOPIC, lambda event: self._told(*event[1]))
+
+    def measure(
+        self,
+        todo: Sequence[SessionStatus],
+        run: RunSession,
+        told: Told = lambda *_: None,
+        finished: Finished = lambda _: None,
+    ) -> list[dict[str, Any]]:
+        """Measure sessions; returns how each went, as `measure_one` does.
+
+        Args:
+            todo: the sessions.
+            run: measures a recording, `liex_lab.api.run_session`.
+            told: is told id, pieces done, pieces in all, and what is being done.
+            finished: is given each result as soon as it is there.
+        """
+        self._told = told
+        count = self._n_jobs or len(self._client.nthreads())
+        shared = n_shared(len(todo), count)
+        task = partial(_on_worker, run)
+        planned = [one.session for one in todo]
+        return list(_results(self._client, planned, task, _died, finished, shared))
+
+    def look_at(
+        self,
+        sessions: Sequence[PlannedSession],
+        look: LookAtSession,
+        told: Told = lambda *_: None,
+        finished: Finished = lambda _: None,
+    ) -> list[dict[str, Any]]:
+        """Look at sessions; returns what was found of each animal, see `sharing.look_at`.
+
+        Args:
+            sessions: the sessions.
+            look: looks at one, `sharing.look_at`.
+            told: is told id, pieces done, pieces in all, and what is being done.
+            finished: is given each look as soon as it is there.
+        """
+        self._told = told
+        task = partial(_look_on_worker, look)
+        return list(_results(self._client, sessions, task, _died_looking, finished))
 
 
 def n_shared(n: int, n_workers: int) -> int:
@@ -95,36 +178,35 @@ def n_shared(n: int, n_workers: int) -> int:
 
 def _results(
     client: Client,
-    planned: dict[str, PlannedSession],
-    run: RunSession,
+    planned: Sequence[PlannedSession],
+    task: Callable[[PlannedSession, str, bool], dict[str, Any]],
+    died: Callable[[PlannedSession, BaseException], dict[str, Any]],
     finished: Finished,
-    shared: int,
+    shared: int = 0,
 ) -> Iterator[dict[str, Any]]:
+    """What the task makes of every session, or `died` of one whose workers ended without a word."""
     from distributed import CancelledError, as_completed
 
     run_id = f"{os.getpid()}-{time.monotonic_ns()}"
     submitted = [
         client.submit(
-            _on_worker,
+            task,
             session,
-            run,
             run_id,
             k >= len(planned) - shared,
-            key=f"{id}-{run_id}",
+            key=f"{session.id}-{run_id}",
             pure=False,
         )
-        for k, (id, session) in enumerate(planned.items())
+        for k, session in enumerate(planned)
     ]
-    sessions = {
-        future.key: session for future, session in zip(submitted, planned.values(), strict=True)
-    }
+    sessions = {future.key: session for future, session in zip(submitted, planned, strict=True)}
     completed = as_completed(submitted, loop=client.loop)
     del submitted
     for future in completed:
         session = sessions[future.key]
         try:  # a result that a dying worker took with it is waited for until it is made again
             error = future.exception()
-            result = _died(session, error) if error is not None else future.result()
+            result = died(session, error) if error is not None else future.result()
         except CancelledError:  # by the client, as nobody here takes a session back
             raise StudyError(
                 "the Dask scheduler ended before the study did; the sessions that were measured "
@@ -137,7 +219,18 @@ def _results(
 
 def _died(session: PlannedSession, error: BaseException) -> dict[str, Any]:
     """The outcome of a session whose workers ended without a word."""
-    failure = describe_failure(error, "measuring", None)
+    failure = _why_died(error, "measuring")
+    quarantine(session, failure)
+    return {"id": session.id, "state": "failed", "seconds": 0.0, "failure": failure}
+
+
+def _died_looking(session: PlannedSession, error: BaseException) -> dict[str, Any]:
+    """The look at a session whose workers ended without a word."""
+    return about(session) | {"failure": _why_died(error, LOOKING)}
+
+
+def _why_died(error: BaseException, stage: str) -> dict[str, Any]:
+    failure = describe_failure(error, stage, None)
     if type(error).__name__ == "KilledWorker":
         failure |= {
             "reason": f"the worker process died {_DEATHS + 1} times while it measured this session",
@@ -147,16 +240,27 @@ def _died(session: PlannedSession, error: BaseException) -> dict[str, Any]:
             ),
         }
         failure.pop("traceback", None)
-    quarantine(session, failure)
-    return {"id": session.id, "state": "failed", "seconds": 0.0, "failure": failure}
+    return failure
 
 
 def _on_worker(
-    session: PlannedSession, run: RunSession, run_id: str, shared: bool
+    run: RunSession, session: PlannedSession, run_id: str, shared: bool
 ) -> dict[str, Any]:
     """The task: one session, its progress sent to whoever started the study. shared: by all
     workers.
     """
+    return measure_one(session, run, _teller(session), run_id, Workers() if shared else None)
+
+
+def _look_on_worker(
+    look: LookAtSession, session: PlannedSession, run_id: str, shared: bool
+) -> dict[str, Any]:
+    """The task of a look, which is short: no other worker has a share in it."""
+    return look(session, _teller(session))
+
+
+def _teller(session: PlannedSession) -> Progress:
+    """What a task tells its progress; it is sent to whoever started the study."""
     from distributed import get_worker
 
     worker = get_worker()
@@ -170,7 +274,7 @@ def _on_worker(
             last = now
             worker.log_event(TOPIC, [session.id, done, total, what])
 
-    return measure_one(session, run, tell, run_id, Workers() if shared else None)
+    return tell
 
 
 class Workers:

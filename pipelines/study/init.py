@@ -157,6 +157,7 @@ def _text(root: Path, named: list[tuple[str, str, Path]]) -> str:
         'plan = "mouse"                 # a bundled plan (see `liex info`), or a .toml file in '
         "this folder",
         f'results = "{DERIVED}"',
+        'shared = "off"                 # "subject": an animal has one size and shape',
         "",
         "[set]",
         "",

@@ -44,7 +44,8 @@ def _of_study(one: SessionStatus) -> Entry:
     who = {"subject_id": animal.id, **{name: getattr(animal, name) for name in WHO[1:]}}
     there = (one.session.folder / "session.json").is_file()
     folder = one.session.folder if there else None
-    return Entry(one.session.id, one.state, one.reason, str(failure.get("remedy", "")), folder, who)
+    reason = one.reason or one.session.remark
+    return Entry(one.session.id, one.state, reason, str(failure.get("remedy", "")), folder, who)
 
 
 def _of_folder(path: Path) -> list[Entry]:

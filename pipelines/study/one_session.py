@@ -17,7 +17,8 @@ from liex_lab.sessions.verdict import read_verdict
 
 from ..shards import MEASURING
 from ..workers import WorkerPool
-from .status import input_stamp, to_look_at
+from .changes import input_stamp
+from .status import to_look_at
 
 
 class RunSession(Protocol):
@@ -97,7 +98,11 @@ def measure_one(
             session.plan,
             folder=session.folder,
             overwrite=True,
-            notes={"input": {"stamp": stamp}, "run_id": run_id},
+            notes={
+                "input": {"stamp": stamp},
+                "run_id": run_id,
+                **({"problems": [session.remark]} if session.remark else {}),
+            },
             pool=pool,
             progress=watch,
         )

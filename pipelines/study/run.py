@@ -1,17 +1,20 @@
 """Run of a study, `liex cohort`: measure the sessions that are to be done, write its table.
 
+Where sessions of one animal share size and shape, these are looked at first (`sharing`).
+
 A lock in the study's cohort folder keeps a second run out.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager
+from functools import partial
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 from liex_lab.errors import StudyError
-from liex_lab.plan.study import Study
+from liex_lab.plan.study import PlannedSession, Study
 from liex_lab.runtime.lock import locked
 from liex_lab.runtime.places import unlinked_below
 from liex_lab.runtime.progress import Board
@@ -20,9 +23,13 @@ from liex_lab.sessions.corrections import Description
 from ..compiling import compile_ahead
 from ..correct import correct_session
 from .one_session import RunSession
+from .sharing import LookAtSession, look_at, to_be_looked_at, write_look
 from .slurm import SlurmTable
 from .status import SessionStatus, standings
 from .table import write_study_table
+
+if TYPE_CHECKING:
+    from .dask_cluster import Crew
 
 
 class DescribeSession(Protocol):
@@ -51,6 +58,7 @@ def run_study(
     dry_run: bool,
     board: Callable[[int], AbstractContextManager[Board]],
     describe: DescribeSession = correct_session,
+    look: LookAtSession = look_at,
 ) -> list[SessionStatus]:
     """Measure the sessions of a study that are to be done; returns every session's status.
 
@@ -66,6 +74,7 @@ def run_study(
         dry_run: only look.
         board: opens the display of so many sessions' progress.
         describe: writes descriptions into a session, `liex_lab.api.correct_session`.
+        look: looks at a session's animal.
 
     Raises:
         StudyError: both scheduler and slurm are given, or no scheduler answers at that address.
@@ -81,36 +90,89 @@ def run_study(
 
         is_encrypted(scheduler)  # an address that is none ends here
     table = SlurmTable.load(slurm) if slurm else None
-    before = standings(study, retry=retry, only=only, again=again)
+    ask = partial(standings, study, retry=retry, only=only, again=again)
+    before = ask()
     if dry_run:
         return before
-    for place in (study.cohort_folder, *(one.session.folder for one in before)):
+    unseen = to_be_looked_at(study, only, retry, again)
+    written = [*(one.session.folder for one in before), *(session.folder for session in unseen)]
+    for place in (study.cohort_folder, *written):
         unlinked_below(study.results, place)
     study.cohort_folder.mkdir(parents=True, exist_ok=True)
     with locked(
         study.cohort_folder / ".lock",
         f"the study {study.name} is being measured by another process",
     ):
-        for one in before:
-            if one.described:
-                said = [Description(key, value) for key, value in one.described.items()]
-                describe(one.session.folder, said, author=f"study {study.name}")
-        todo = [one for one in before if one.to_do and not one.described]
-        if todo:
-            _measure(todo, run, board, workers=workers, scheduler=scheduler, slurm=table)
+        with _crew(before, unseen, workers=workers, scheduler=scheduler, slurm=table) as crew:
+            if unseen and crew:
+                _look(unseen, look, crew, board)
+                before = ask()
+            for one in before:
+                if one.described:
+                    said = [Description(key, value) for key, value in one.described.items()]
+                    describe(one.session.folder, said, author=f"study {study.name}")
+            if (todo := _to_measure(before)) and crew:
+                _measure(todo, run, crew, board)
         after = standings(study)
         write_study_table(study, after)
     return after
 
 
+def _to_measure(found: Sequence[SessionStatus]) -> list[SessionStatus]:
+    return [one for one in found if one.to_do and not one.described]
+
+
+@contextmanager
+def _crew(
+    found: Sequence[SessionStatus], unseen: Sequence[PlannedSession], **where: Any
+) -> Iterator[Crew | None]:
+    """Workers for what is to be done; None where nothing is."""
+    todo = [one.session for one in _to_measure(found)]
+    if not todo and not unseen:
+        yield None
+        return
+    from .dask_cluster import crew_of
+
+    if not where["scheduler"] and not where["slurm"]:  # once, and not in every worker
+        for animal in sorted({session.plan.animal.skeleton for session in [*todo, *unseen]}):
+            compile_ahead(animal)
+    # what was looked at may have others of its animal measured again
+    most = sum(one.state != "excluded" for one in found) if unseen else len(todo)
+    with crew_of(max(most, len(unseen)), **where) as crew:
+        yield crew
+
+
+def _look(
+    sessions: Sequence[PlannedSession],
+    look: LookAtSession,
+    crew: Crew,
+    board: Callable[[int], AbstractContextManager[Board]],
+) -> None:
+    """Look at sessions, and keep what was found."""
+    known = {session.id: session for session in sessions}
+    with board(len(sessions)) as shown:
+
+        def finished(found: dict[str, Any]) -> None:
+            """Keep what was `found`, and tell the board what was seen."""
+            id = found["session_id"]
+            write_look(known[id], found)
+            failure = found.get("failure")
+            sentence = (
+                f"could not be looked at: {failure['reason']}"
+                if failure
+                else f"shows an animal of {found['animal']['spine_mm']:.1f} mm"
+            )
+            shown.ended(id, sentence, failed=failure is not None)
+
+        crew.look_at(sessions, look, shown.told, finished)
+
+
 def _measure(
     todo: list[SessionStatus],
     run: RunSession,
+    crew: Crew,
     board: Callable[[int], AbstractContextManager[Board]],
-    **where: Any,
 ) -> None:
-    from .dask_cluster import measure_cohort
-
     with board(len(todo)) as shown:
 
         def finished(result: dict[str, Any]) -> None:
@@ -126,7 +188,4 @@ def _measure(
             )
             shown.ended(result["id"], sentence, failed=failure is not None)
 
-        if not where["scheduler"] and not where["slurm"]:  # once, and not in every worker
-            for animal in sorted({one.session.plan.animal.skeleton for one in todo}):
-                compile_ahead(animal)
-        measure_cohort(todo, run, told=shown.told, finished=finished, **where)
+        crew.measure(todo, run, shown.told, finished)

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from liex_lab.plan.study import Study
+from liex_lab.plan.study import PlannedSession, Study
 from liex_lab.runtime.durable import replacing, write_whole
 from liex_lab.runtime.places import unlinked_below
 from liex_lab.runtime.spreadsheets import harmless
@@ -31,6 +31,13 @@ STUDY_SESSIONS = columns(
         "changed: to be done",
     ),
     ("reason", "string", "", "why it failed, is excluded or is to be done"),
+    (
+        "shared",
+        "string",
+        "",
+        "what it shares with other sessions of its animal, or why it does not; empty where the "
+        "study has shared = 'off'",
+    ),
     ("remedy", "string", "", "what to do about it"),
     ("stage", "string", "", "what was being done when it failed"),
     (
@@ -101,6 +108,7 @@ def _row(study: Study, one: SessionStatus) -> dict[str, Any]:
         **{name: getattr(session.animal, name) for name in ("group", "cage", "sex", "batch")},
         "state": one.state,
         "reason": one.reason,
+        "shared": _shared(session),
         "remedy": str(failure.get("remedy", "")),
         "stage": str(failure.get("stage") or ""),
         "frame": _count(failure.get("frame"), -1),
@@ -112,6 +120,15 @@ def _row(study: Study, one: SessionStatus) -> dict[str, Any]:
         "recording": _below(study, session.recording),
         "folder": _below(study, str(session.folder)),
     }
+
+
+def _shared(session: PlannedSession) -> str:
+    shared = session.plan.animal.shared
+    if shared is None:
+        return session.remark
+    length = "" if shared.spine_mm is None else f"{shared.spine_mm:.1f} mm long, "
+    shape = "the average shape" if shared.shape is None else "a shape of its own"
+    return f"{length}{shape}, by {shared.by}"
 
 
 def _document(folder: Path) -> dict[str, Any]:

@@ -1,5 +1,5 @@
-"""A run that takes no time: it writes what the study looks at, or breaks in the way the recording's
-name asks for.
+"""A run and a look that take no time: they give what the study looks at, or break in the way the
+recording's name asks for.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from typing import Any
 
 from liex_lab.errors import EstimationError, RecordingError
 from liex_lab.plan import Plan
+from liex_lab.plan.study import PlannedSession
 from liex_lab.runtime.progress import Progress
 from liex_lab.sessions.provenance import SCHEMA_VERSION, versions
 
@@ -65,6 +66,7 @@ def pretended_run(
         "model": {"sha256": sha256(find_model(plan.estimation.model))},
         "input": {"sha256": file_digest([Path(recording)]), **notes["input"]},
         "run_id": notes["run_id"],
+        "problems": notes.get("problems", []),
         "frames": {"n_frames": N_FRAMES, "n_observed": 39, "observed_s": 1.3},
         "frames_per_s": 100.0,
         "peak_memory_mb": 500.0,
@@ -73,6 +75,34 @@ def pretended_run(
     }
     (folder / "session.json").write_text(json.dumps(document))
     return folder
+
+
+def pretended_look(session: PlannedSession, progress: Progress) -> dict[str, Any]:
+    """Stands in for `sharing.look_at`: the recording holds the animal's length, mm."""
+    from liex_lab.pipelines.study.sharing import about
+
+    from liex_lab.catalog import find_model, sha256
+
+    path = Path(session.recording)
+    with (path.parents[1] / f"{path.stem}.looks").open("a") as file:
+        file.write("x")
+    progress(0, None, "looking at the animal")
+    if path.stem.startswith("deadly"):
+        os.kill(os.getpid(), signal.SIGKILL)
+    if path.stem.startswith("empty"):
+        failure = {"reason": "no animal was found in the sampled frames", "stage": "looking"}
+        return about(session) | {"failure": failure}
+    model = {"sha256": sha256(find_model(session.plan.estimation.model))}
+    animal = {"spine_mm": float(path.read_text()), "girth": 1.1}
+    misfits = ["its body covers 3% of the outline that is seen"] * path.stem.startswith("other")
+    return about(session) | {
+        "model": model,
+        "animal": animal,
+        "log_sd": 0.02,
+        "n_frames": 40,
+        "stated": session.plan.animal.spine_mm is not None,
+        "misfits": misfits,
+    }
 
 
 def shared_task(n: int) -> list[tuple[int, int]]:

@@ -4,17 +4,19 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 from liex_lab.pipelines.build import (
     build_estimator,
     build_recogniser,
     build_recording,
+    build_stated_shape,
     why_nameless,
 )
 
 from liex_lab.body import Skeleton
 from liex_lab.catalog import MODELS
-from liex_lab.errors import LiexError
+from liex_lab.errors import LiexError, PlanError
 from liex_lab.optics.camera import Distortion
 from liex_lab.plan import Plan
 from liex_lab.recordings import open_recording
@@ -148,3 +150,23 @@ def test_no_actions_are_named_of_an_animal_that_no_vocabulary_was_made_for() -> 
     assert "no vocabulary was made for a hand" in why_nameless(plan, hand)
     assert why_nameless(plan.with_settings(["actions.model=rules"]), hand) == ""
     assert why_nameless(Plan.load("mouse"), Skeleton.load("mouse")) == ""
+
+
+def test_a_shape_that_sessions_share_is_that_of_their_skeleton() -> None:
+    skeleton = Skeleton.load("fish")
+    moved = [[0.0, 0.001, -0.01]] * skeleton.n_joints
+    table = Plan.load("fish").model_dump(exclude_none=True)
+
+    def sharing(**more: object) -> Plan:
+        shape = {"width": [1.1] * 5, "height": [0.9] * 5, "joints_moved": moved} | more
+        body = {"subject": "z1", "n_sessions": 3, "shape": shape}
+        return Plan.from_table({**table, "animal": {**table["animal"], "shared": body}})
+
+    stated = build_stated_shape(sharing(), skeleton)
+    assert stated is not None
+    assert stated.labels is not None
+    assert (len(stated.labels), stated.by) == (3 * skeleton.n_joints + 10, "3 sessions of z1")
+    np.testing.assert_allclose(np.exp(stated.labels[-10:]), [1.1] * 5 + [0.9] * 5)
+    with pytest.raises(PlanError, match="lists 5 joints, and the fish has 21"):
+        build_stated_shape(sharing(joints_moved=moved[:5]), skeleton)
+    assert build_stated_shape(Plan.load("fish"), skeleton) is None

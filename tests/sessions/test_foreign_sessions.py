@@ -20,6 +20,14 @@ from liex_lab.sessions.verdict import verdict_in
 from tests.sessions.walking_mouse import WalkingMouse, steady, write
 
 Change = Callable[[dict[str, Any]], Any]
+SHARED = {  # a shape that others found, of a session whose frames show too little of the animal
+    "kept": True,
+    "n_frames": 3,
+    "shared_by": "2 sessions of m07",
+    "places": [0.1],
+    **{name: [1.0] for name in ("width", "width_sd", "height", "height_sd")},
+    "joints_moved": [[0.0, 0.0, 0.0]],
+}
 
 
 @pytest.fixture(scope="module")
@@ -99,6 +107,8 @@ def refused(folder: Path, names: str) -> None:
         put("animal", "shape", 5),
         put("animal", "shape", {"kept": True, "n_frames": 60}),
         put("animal", "shape", {"kept": False, "n_frames": 60, "places": [0.1], "width": []}),
+        put("animal", "shape", SHARED | {"width": [0.0]}),
+        put("animal", "shape", SHARED | {"shared_by": ""}),
         put("model", "name", {"a": 1}),
         put("model", None),
         put("problems", "none"),
@@ -135,6 +145,15 @@ def test_what_session_json_may_not_say_is_told_before_anything_is_read(
         Session.open(foreign)
     assert str(foreign) in str(caught.value)
     assert str(caught.value).isprintable()
+
+
+def test_a_shape_that_is_shared_needs_no_frames_of_its_own(
+    foreign: Path, document: dict[str, Any]
+) -> None:
+    told = copy.deepcopy(document)
+    put("animal", "shape", SHARED)(told)
+    (foreign / "session.json").write_text(json.dumps(told))
+    assert Session.open(foreign).metadata["animal"]["shape"]["shared_by"] == "2 sessions of m07"
 
 
 def test_every_section_that_is_missing_is_told_or_not_needed(

@@ -184,7 +184,7 @@ def test_whatever_the_noise_the_picture_comes_out_as_it_went_in():
 
 
 def test_the_body_moves_with_the_joints_that_carry_it(session):
-    parts = body_parts(MOUSE.skeleton)
+    parts = body_parts(Surface.of(MOUSE.skeleton))
     assert {part.joint for part in parts} == {0, 1, 2, 3}
     surface, track = Surface.of(MOUSE.skeleton), MOUSE.track()
     for row in (0, 75):
@@ -205,6 +205,51 @@ def test_the_body_moves_with_the_joints_that_carry_it(session):
             assert off.max() < 1e-5, "this mouse is straight, so its parts lie on its skin"
     lost = columns_of(session, f"{BODY}/rump")["Transform3D:scale"][20][0]
     assert lost == [0.0, 0.0, 0.0]
+
+
+def trunk_drawn(session):
+    """The vertices of every part of the body that the replay draws, mm, in order of joints."""
+    drawn = [
+        columns_of(session, f"{BODY}/{name}").get("Mesh3D:vertex_positions", [])
+        for name in MOUSE.skeleton.names
+    ]
+    return [1000.0 * np.array(rows[0]) for rows in drawn if rows]
+
+
+def test_the_body_is_that_of_the_shape_the_session_kept_or_of_its_girth(tmp_path, strict):
+    mouse = WalkingMouse(steady(0.3))
+    places = [0.1, 0.25, 0.4, 0.6, 0.8]
+    shape = {
+        "kept": True,
+        "n_frames": 90,
+        "average_residual_mm": 2.0,
+        "residual_mm": 1.0,
+        "places": places,
+        "width": [1.3] * 5,
+        "width_sd": [0.1] * 5,
+        "height": [0.7] * 5,
+        "height_sd": [0.1] * 5,
+        "joints_moved": [[0.0, 0.0, 0.0]] * 5,
+    }
+    left = {"kept": False, "n_frames": 12, "why": "12 frames are too few"}
+    usual = Surface.of(MOUSE.skeleton)
+    assert usual.shape is not None
+    own = replace(
+        usual,
+        shape=replace(
+            usual.shape,
+            half_width=1.3 * usual.shape.half_width,
+            half_height=0.7 * usual.shape.half_height,
+        ),
+    )
+    for name, animal, parts in (
+        ("own", {"girth": 1.0, "shape": shape}, body_parts(own)),
+        ("stout", {"girth": 1.15, "shape": left}, body_parts(usual, 1.15)),
+    ):
+        drawn = trunk_drawn(write(tmp_path / f"{name}.liex", mouse, animal_size=animal))
+        assert len(drawn) == len(parts)
+        for vertices, part in zip(drawn, parts, strict=True):
+            np.testing.assert_allclose(vertices, part.vertices, atol=1e-3)
 
 
 def test_every_candidate_is_there_when_it_is_asked_for(tmp_path, strict):

@@ -11,7 +11,7 @@ from liex_lab.body.shape import BodyShape
 from liex_lab.body.surface import Surface
 from liex_lab.estimation.estimator import Estimates, PoseEstimator
 from liex_lab.estimation.session_shape import PLACES, ShapePrior, labels_of
-from liex_lab.tracking.own_shape import FEWEST_FRAMES, OwnShape, fit_shape
+from liex_lab.tracking.own_shape import FEWEST_FRAMES, OwnShape, StatedShape, fit_shape
 from liex_lab.tracking.residual import BodyResidual
 from tests.estimation.test_session_shape import session_clues_of
 from tests.estimation.toy import SCENE, Toy, rendered, toy_mice, trained
@@ -112,3 +112,40 @@ def test_shapes_learned_for_another_model_are_not_used(toy, estimator, estimates
     assert shape.build is None
     assert "model" in shape.why
     assert fitted(toy, estimator, estimates, None)[0] is None
+
+
+def test_a_shape_that_is_stated_is_used_whatever_the_frames_say(toy, estimator, estimates):
+    prior = certain(toy, estimator, 0.0, 1.0)  # these frames would tell the average animal
+    offset = np.tile([0.0, 0.0, -LIFTED], (toy.skeleton.n_joints, 1))
+    labels = labels_of(offset, np.ones(len(PLACES)), np.full(len(PLACES), HIGHER))
+    few = replace(estimates, found=np.arange(N) < 3)
+    for seen, n in ((estimates, N), (few, 3)):
+        shape, body = fit_shape(
+            prior,
+            estimator,
+            SCENE,
+            seen,
+            1.0,
+            average(toy, estimates),
+            StatedShape(labels, None, "2 sessions of m07"),
+        )
+        assert shape is not None
+        assert shape.build is not None
+        joints = shape.corrected(estimator, estimates.chosen.pose, 1.0)
+        moved = joints.moved(SCENE.floor.T_arena_camera).joints(toy.skeleton)
+        np.testing.assert_allclose(moved, toy.joints, atol=1e-6)
+        pose = joints.moved(SCENE.floor.T_arena_camera)
+        assert np.median(body.of(pose, estimates.crops, SCENE)) < 0.5
+        told = shape.to_dict()
+        assert (told["kept"], told["n_frames"], told["shared_by"]) == (True, n, "2 sessions of m07")
+
+
+def test_sessions_that_share_the_average_shape_fit_none(toy, estimator, estimates):
+    prior = certain(toy, estimator, LIFTED, HIGHER)
+    before = average(toy, estimates)
+    stated = StatedShape(None, 1.1, "3 sessions of m07")
+    shape, body = fit_shape(prior, estimator, SCENE, estimates, 1.0, before, stated)
+    assert shape is not None
+    assert shape.build is None
+    assert body is before
+    assert "3 sessions of m07" in shape.to_dict()["why"]

@@ -12,6 +12,7 @@ from liex_lab.estimation.estimator import PoseEstimator
 from liex_lab.foreground.background_segmenter import BackgroundSubtraction
 from liex_lab.geometry import so3
 from liex_lab.recordings.frame import DepthFrame
+from liex_lab.tracking.own_shape import StatedShape
 from liex_lab.tracking.track import Track
 from liex_lab.tracking.tracker import FrameTracker
 from tests.estimation.toy import CAMERA, FLOOR, SCENE, Toy, rendered, toy_mice, trained
@@ -143,6 +144,9 @@ def test_the_size_is_measured_or_taken_from_the_plan(tracker, toy, scene):
     assert stated.size_origin == "plan"
     assert stated.spine_mm == pytest.approx(55.0)
     assert stated.size == pytest.approx(55.0 / HOME_MM, rel=1e-4)
+    shape = StatedShape(None, 0.8, "2 sessions of m07")
+    shared = FrameTracker.prepare(estimator, scene, toy.depths, 55.0, stated=shape)
+    assert (shared.spine_mm, shared.body.girth) == (stated.spine_mm, 0.8)
 
 
 def test_a_frame_is_doubtful_where_more_error_is_expected_than_allowed(toy, scene, frames, track):

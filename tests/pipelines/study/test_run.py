@@ -12,10 +12,11 @@ from pathlib import Path
 import pandas as pd
 import pytest
 from liex_lab.pipelines.study import dask_cluster
+from liex_lab.pipelines.study.changes import plan_changed
 from liex_lab.pipelines.study.listing import list_sessions
 from liex_lab.pipelines.study.one_session import measure_one
 from liex_lab.pipelines.study.slurm import SlurmTable
-from liex_lab.pipelines.study.status import plan_changed, standing, standings
+from liex_lab.pipelines.study.status import standing, standings
 from liex_lab.pipelines.study.table import write_study_table
 from typer.testing import CliRunner
 
@@ -180,7 +181,7 @@ def test_a_session_is_done_again_only_when_input_plan_or_version_changed(
     file.write_text(text + "set = { behaviour.rear_height_mm = 41.0 }\n")
     assert why(file) == ("changed", "plan changed: behaviour.rear_height_mm = 41.0")
     file.write_text(text)
-    monkeypatch.setattr("liex_lab.pipelines.study.status.package_version", lambda name: "9.9")
+    monkeypatch.setattr("liex_lab.pipelines.study.changes.package_version", lambda name: "9.9")
     assert why(file)[1].startswith("version changed: ")
     monkeypatch.undo()
     assert why(file) == ("done", "")

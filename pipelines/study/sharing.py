@@ -1,0 +1,374 @@
+"""What sessions of one animal share: size and shape, where the study says shared = "subject".
+
+First every session of the animal is looked at: its sampled frames tell size and shape, and
+look.json beside its results keeps them. What these agree on then stands in the plan of each
+(`animal.shared`), so that plan and recording alone say what comes out, whoever measures it and in
+whatever order. A session that cannot be looked at, or does not show the animal, keeps to itself,
+and where the lengths lie too far apart all do.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+
+from liex_lab.body.skeleton import Skeleton
+from liex_lab.errors import LiexError, RecordingError
+from liex_lab.plan import Plan
+from liex_lab.plan.sections import N_PLACES, Factor, Positive, SharedBody, SharedShape
+from liex_lab.plan.study import PlannedSession, Study
+from liex_lab.runtime.durable import write_whole
+from liex_lab.runtime.places import storable_document, unlinked
+from liex_lab.runtime.progress import Progress, silent
+from liex_lab.runtime.threads import in_background
+from liex_lab.sessions.failure import describe_failure
+from liex_lab.sessions.provenance import SCHEMA_VERSION, versions
+
+from .changes import input_stamp, what_changed
+
+if TYPE_CHECKING:
+    from liex_lab.tracking.shared_body import Found
+
+LOOK_FILE = "look.json"
+LOOKING = "looking at the animal"
+_MM_DECIMALS = 3
+_DECIMALS = 4  # of a shape, relative to the length or to the average animal's
+
+
+class LookAtSession(Protocol):
+    """What looks at a session's animal: `look_at`."""
+
+    def __call__(self, session: PlannedSession, progress: Progress) -> dict[str, Any]:
+        """The content of look.json.
+
+        Args:
+            session: the planned session.
+            progress: told what is being done.
+        """
+
+
+class _Part(BaseModel):
+    model_config = ConfigDict(extra="ignore", strict=True, allow_inf_nan=False)
+
+
+class _ShapeFound(_Part):
+    kept: bool = False
+    n_frames: int = Field(0, ge=0)
+    residual_mm: float | None = None
+    width: list[float] = []
+    height: list[float] = []
+    joints_moved: list[list[float]] = []
+
+    @property
+    def stated(self) -> dict[str, Any]:
+        """As a plan states it."""
+        return self.model_dump(include={"width", "height", "joints_moved"})
+
+
+class _AnimalFound(_Part):
+    spine_mm: Positive
+    girth: Factor
+    shape: _ShapeFound | None = None
+
+
+class _Look(_Part):
+    """What is read of look.json where the animal was seen."""
+
+    animal: _AnimalFound
+    log_sd: float = Field(ge=0.0)
+    n_frames: int = Field(ge=1)
+    stated: bool
+
+
+@dataclass(frozen=True)
+class Shared:
+    """A session with what it shares.
+
+    Attributes:
+        session: the planned session; its plan holds what it shares, its remark why it shares
+            nothing.
+        waits_for: id of a session of its animal that is to be looked at first; empty where all
+            were.
+    """
+
+    session: PlannedSession
+    waits_for: str = ""
+
+
+def shared_sessions(study: Study) -> list[Shared]:
+    """The sessions of a study, in its order, with what they share by the looks that were kept.
+
+    Args:
+        study: the study.
+    """
+    known = {session.id: Shared(session) for session in study.sessions}
+    for group in _groups(study):
+        looks = {session.id: read_look(session) for session in group}
+        missing = [id for id, look in looks.items() if look is None]
+        if missing:
+            for session in group:
+                known[session.id] = Shared(session, missing[0])
+            continue
+        seen = {id: look for id, look in looks.items() if look is not None}
+        known |= {session.id: Shared(session) for session in together(group, seen)}
+    return list(known.values())
+
+
+def to_be_looked_at(
+    study: Study, only: Sequence[str] = (), retry: bool = False, again: bool = False
+) -> list[PlannedSession]:
+    """Sessions that are to be looked at before others of their animal are measured.
+
+    Args:
+        study: the study.
+        only: ids of the sessions that are measured; () takes all.
+        retry: those that could not be looked at are tried again.
+        again: all are looked at again.
+    """
+    found = []
+    for group in _groups(study):
+        if only and not any(session.id in only for session in group):
+            continue
+        for session in group:
+            look = None if again else read_look(session)
+            if look is None or (retry and "failure" in look):
+                found.append(session)
+    return found
+
+
+def _groups(study: Study) -> list[list[PlannedSession]]:
+    """The sessions of each animal that may share, two or more of one skeleton and model."""
+    if study.table.shared == "off":
+        return []
+    groups: dict[tuple[str, str, str], list[PlannedSession]] = {}
+    for session in study.sessions:
+        plan = session.plan
+        if not session.exclude and plan.animal.shared is None:
+            key = session.animal.id, plan.animal.skeleton, plan.estimation.model
+            groups.setdefault(key, []).append(session)
+    return [group for group in groups.values() if len(group) > 1]
+
+
+def together(
+    group: Sequence[PlannedSession], looks: Mapping[str, dict[str, Any]]
+) -> list[PlannedSession]:
+    """The sessions of one animal with what they agree on in their plans, or why they do not.
+
+    Args:
+        group: sessions of one animal.
+        looks: of each of them, by id, as `look_at` gives it.
+    """
+    from liex_lab.tracking.shared_body import MOST_APART, agree, spread_of
+
+    subject = group[0].animal.id
+    taking_part = {s.id: found_in(looks[s.id]) for s in group if not _why_not(looks[s.id])}
+    alone = f"The sessions of {subject} do not share size and shape"
+    if len(taking_part) < 2:
+        n = len(taking_part)
+        seen = "none of them" if n == 0 else "one of them alone"
+        return [replace(s, remark=f"{alone}: {seen} shows the animal.") for s in group]
+    found = list(taking_part.values())
+    if (spread := spread_of(found)) > MOST_APART:
+        lengths = sorted(one.spine_mm for one in found)
+        why = (
+            f"{alone}: their lengths, {lengths[0]:.1f} to {lengths[-1]:.1f} mm, lie {spread:.1%} "
+            f"apart, more than {MOST_APART:.0%}; each keeps its own."
+        )
+        return [replace(s, remark=why) for s in group]
+    agreed = agree(found)
+    body = SharedBody(
+        subject=subject,
+        n_sessions=len(found),
+        spine_mm=None if agreed.spine_mm is None else round(agreed.spine_mm, _MM_DECIMALS),
+        girth=None if agreed.girth is None else round(agreed.girth, _DECIMALS),
+        shape=None if agreed.shape is None else _stated(agreed.shape),
+    )
+    return [
+        replace(s, plan=_with(s.plan, body))
+        if s.id in taking_part
+        else replace(s, remark=_left_out(s, looks[s.id]))
+        for s in group
+    ]
+
+
+def _with(plan: Plan, body: SharedBody) -> Plan:
+    animal = plan.animal.model_copy(update={"shared": body})
+    return plan.model_copy(update={"animal": animal})
+
+
+def _why_not(look: Mapping[str, Any]) -> str:
+    """Why a session takes no part in what its animal's share; '' where it does."""
+    if "failure" in look:
+        return str(look["failure"].get("reason", ""))
+    return ", and ".join(map(str, look["misfits"]))
+
+
+def _left_out(session: PlannedSession, look: Mapping[str, Any]) -> str:
+    return (
+        f"{session.id} does not share size and shape with the other sessions of "
+        f"{session.animal.id}: {_why_not(look)}."
+    )
+
+
+def found_in(look: Mapping[str, Any]) -> Found:
+    """What a look says of the animal.
+
+    Args:
+        look: as `look_at` gives it, of a session that shows the animal.
+
+    Raises:
+        ValueError: it is damaged.
+    """
+    from liex_lab.tracking.shared_body import Found
+
+    from ..build import shape_labels
+
+    told = _Look.model_validate(look)
+    shape = told.animal.shape or _ShapeFound()
+    stated = SharedShape.model_validate(shape.stated) if shape.kept else None
+    return Found(
+        told.animal.spine_mm,
+        told.stated,
+        told.log_sd,
+        told.n_frames,
+        told.animal.girth,
+        None if stated is None else shape_labels(stated),
+        # a shape was tried, and the frames that were held out spoke against it
+        not shape.kept and shape.residual_mm is not None,
+        shape.n_frames,
+    )
+
+
+def _stated(labels: Any) -> SharedShape:
+    from liex_lab.estimation.session_shape import PLACES
+
+    p = len(PLACES)
+    return SharedShape(
+        width=np.exp(labels[-2 * p : -p]).round(_DECIMALS).tolist(),
+        height=np.exp(labels[-p:]).round(_DECIMALS).tolist(),
+        joints_moved=labels[: -2 * p].reshape(-1, 3).round(_DECIMALS).tolist(),
+    )
+
+
+def look_at(session: PlannedSession, progress: Progress = silent) -> dict[str, Any]:
+    """What a session's sampled frames tell of its animal, or why they tell nothing.
+
+    Nothing is written.
+
+    Args:
+        session: the planned session.
+        progress: told what is being done.
+
+    Returns:
+        The content of look.json: plan, model and input it goes by, and `animal`, `log_sd`,
+        `n_frames`, `stated` and `misfits`, or `failure`.
+    """
+    stage = "opening the recording"
+
+    def watch(done: int, total: int | None, what: str) -> None:
+        """Note the stage for a failure's report, and pass `done`, `total` and `what` on."""
+        nonlocal stage
+        stage = what
+        progress(done, total, what)
+
+    try:
+        return about(session) | _found(session, watch)
+    except Exception as error:
+        return about(session) | {"failure": describe_failure(error, stage, None)}
+
+
+def about(session: PlannedSession) -> dict[str, Any]:
+    """What a look at a session goes by: version, plan and input.
+
+    Args:
+        session: the planned session.
+    """
+    return {
+        "session_id": session.id,
+        "schema_version": SCHEMA_VERSION,
+        "versions": versions(),
+        "plan": session.plan.model_dump(exclude_none=True),
+        "input": {"stamp": input_stamp(session.recording)},
+    }
+
+
+def _found(session: PlannedSession, progress: Progress) -> dict[str, Any]:
+    from liex_lab.catalog import find_model, sha256
+
+    from ..build import animal_facts, build_estimator, build_recording
+    from ..choice import fit_plan
+
+    if not session.recording_exists:
+        raise RecordingError(
+            f"there is no recording {session.recording}; correct its path, or copy it there"
+        )
+    plan = session.plan
+    with (
+        in_background(partial(build_estimator, plan)) as estimator,
+        build_recording(session.recording, plan, progress) as opened,
+    ):
+        progress(0, None, LOOKING)
+        fitted = fit_plan(opened, plan, estimator, progress=progress)
+    tracker = fitted.tracker
+    fit = tracker.sample_fit
+    return {
+        "model": {"sha256": sha256(find_model(plan.estimation.model))},
+        "animal": animal_facts(fitted.plan, tracker),
+        "log_sd": round(tracker.size_spread, 6),
+        "n_frames": 0 if fit is None else fit.n_found,
+        "stated": plan.animal.spine_mm is not None,
+        "misfits": list(fitted.misfits),
+    }
+
+
+def look_file(session: PlannedSession) -> Path:
+    """Where the look at a session is kept: beside its results.
+
+    Args:
+        session: the planned session.
+    """
+    return session.folder.with_name(LOOK_FILE)
+
+
+def write_look(session: PlannedSession, look: dict[str, Any]) -> None:
+    """Keep the look at a session, whole or not at all.
+
+    Args:
+        session: the planned session.
+        look: as `look_at` gives it.
+    """
+    file = look_file(session)
+    unlinked(file.parent).mkdir(parents=True, exist_ok=True)
+    write_whole(file, json.dumps(storable_document(look), indent=1, default=str) + "\n")
+
+
+def read_look(session: PlannedSession) -> dict[str, Any] | None:
+    """The look at a session that was kept; None where there is none that still holds.
+
+    One at a recording that is gone holds on: its results are all there is left of it.
+
+    Args:
+        session: the planned session.
+    """
+    try:
+        look = json.loads(look_file(session).read_text(encoding="utf-8"))
+        failed = "failure" in look
+        if not failed and not session.recording_exists:
+            look = look | {"input": {"stamp": input_stamp(session.recording)}}
+        if what_changed(session, look):
+            return None
+        if not _why_not(look) and not failed:
+            found = found_in(look)
+            n_joints = Skeleton.load(session.plan.animal.skeleton).n_joints
+            if found.shape is not None and len(found.shape) != 3 * n_joints + 2 * N_PLACES:
+                return None
+    except (OSError, LiexError, ValueError, TypeError, KeyError, AttributeError, RecursionError):
+        return None
+    return dict(look)
