@@ -28,18 +28,16 @@ from liex_lab.runtime.threads import in_background, prefetch
 
 from .build import (
     build_estimator,
-    build_provenance,
     build_recogniser,
     build_recording,
     build_rules,
-    build_surroundings,
     build_water,
-    session_bytes,
     why_nameless,
 )
 from .choice import USUAL, Fitted, fit_plan
 from .compiling import compile_ahead
 from .hashing import hashed_ahead
+from .origin import build_provenance, build_surroundings, session_bytes
 from .regions import pinned
 from .shards import CHUNK, LENGTH, MEASURING, Shard, measure_shards
 from .workers import WorkerPool

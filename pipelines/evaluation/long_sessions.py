@@ -18,7 +18,8 @@ import numpy as np
 from liex_lab.plan import Plan
 from liex_lab.runtime.memory import peak_memory_mb, rest
 
-from ..build import build_provenance, build_tracker
+from ..build import build_tracker
+from ..origin import build_provenance
 from ..session import conclude
 
 if TYPE_CHECKING:

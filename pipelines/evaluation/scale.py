@@ -30,7 +30,8 @@ from liex_lab.plan import Plan
 from liex_lab.plan.study import Study
 from liex_lab.runtime.progress import Progress, silent
 
-from ..build import build_provenance, build_recording, build_tracker, kept_estimator
+from ..build import build_recording, build_tracker, kept_estimator
+from ..origin import build_provenance
 from ..shards import CHUNK, Shard, measure_shards
 from ..workers import Done, Processes, Work, WorkerPool
 from . import kinds

@@ -302,8 +302,9 @@ def about(session: PlannedSession) -> dict[str, Any]:
 def _found(session: PlannedSession, progress: Progress) -> dict[str, Any]:
     from liex_lab.catalog import find_model, sha256
 
-    from ..build import animal_facts, build_estimator, build_recording
+    from ..build import build_estimator, build_recording
     from ..choice import fit_plan
+    from ..origin import animal_facts
 
     if not session.recording_exists:
         raise RecordingError(

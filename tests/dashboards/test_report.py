@@ -11,8 +11,9 @@ from xml.etree import ElementTree
 import numpy as np
 import pandas as pd
 import pytest
+from liex_lab.dashboards.report.facts import beside_average
 from liex_lab.dashboards.report.quality import flip_rows, frame_account, warnings
-from liex_lab.dashboards.report.report import beside_average, methods, render, write_report
+from liex_lab.dashboards.report.report import methods, render, write_report
 
 from liex_lab.actions import colours
 from liex_lab.arena.outline import Arena

@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from liex_lab.pipelines import session as job
-from liex_lab.pipelines.build import session_bytes
+from liex_lab.pipelines.origin import session_bytes
 
 from liex_lab.api import run_session
 from liex_lab.errors import EstimationError, PlanError, SessionError

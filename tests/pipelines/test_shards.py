@@ -12,7 +12,8 @@ from typing import Any
 import pytest
 from liex_lab.pipelines import session as job
 from liex_lab.pipelines import shards
-from liex_lab.pipelines.build import build_provenance, build_recording, build_tracker
+from liex_lab.pipelines.build import build_recording, build_tracker
+from liex_lab.pipelines.origin import build_provenance
 from liex_lab.pipelines.verify import verify_session
 from liex_lab.pipelines.workers import Processes
 

@@ -1,0 +1,167 @@
+"""What a session says of where it comes from: recording, animal, arena and scene, zones, room."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+from liex_lab.runtime.progress import Progress, silent
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from liex_lab.arena.outline import Arena
+    from liex_lab.arena.scene import Scene
+    from liex_lab.arena.zones import DrawnZone, Zone
+    from liex_lab.behaviour.places import Surroundings
+    from liex_lab.foreground.segmenter import Segmenter
+    from liex_lab.plan import Plan
+    from liex_lab.recordings.recording import Recording
+    from liex_lab.sessions import Provenance
+    from liex_lab.tracking.tracker import FrameTracker
+
+
+def build_provenance(
+    recording: Recording, plan: Plan, tracker: FrameTracker, progress: Progress = silent
+) -> Provenance:
+    """What the session says about its origin: recording, camera, plan, model, animal, arena, zones.
+
+    Args:
+        recording: an open recording; hashing its content is the longest wait here.
+        plan: names the model and the zones.
+        tracker: the prepared tracker: background, animal's size, girth.
+        progress: told while the content is hashed.
+    """
+    from liex_lab.catalog import find_model, sha256
+    from liex_lab.sessions import Provenance
+
+    recording.digest(
+        progress
+    )  # kept by the recording; the longest wait here, so it is the one that is shown
+    arena, zones = build_arena(tracker.scene, plan)
+    return Provenance.of(
+        recording,
+        tracker.scene.floor,
+        tracker.estimator.skeleton,
+        plan,
+        model={"name": plan.estimation.model, "sha256": sha256(find_model(plan.estimation.model))},
+        animal_size=animal_facts(plan, tracker),
+        arena=arena,
+        zones=zones,
+        scene=build_described_scene(tracker.scene, arena),
+        background=build_background(recording, plan),
+    )
+
+
+def animal_facts(plan: Plan, tracker: FrameTracker) -> dict[str, Any]:
+    """What session.json says of the animal's size, girth and shape.
+
+    Args:
+        plan: its section `animal`.
+        tracker: the prepared tracker.
+    """
+    shared = plan.animal.shared
+    origin = "estimated over the recording"
+    if tracker.size_origin == "plan":
+        is_shared = shared is not None and plan.animal.spine_mm is None
+        origin = f"shared by {shared.by}" if shared and is_shared else "stated in the plan"
+    return {
+        "spine_mm": round(tracker.spine_mm, 3),
+        "origin": origin,
+        "girth": round(tracker.body.girth, 3),
+        **({} if tracker.shape is None else {"shape": tracker.shape.to_dict()}),
+    }
+
+
+def build_background(recording: Recording, plan: Plan) -> NDArray[np.uint16] | None:
+    """The still scene (H, W) mm before which the replay shows cut-outs; None where it shows none.
+
+    Args:
+        recording: an open recording.
+        plan: its section `replay`.
+    """
+    from liex_lab.sessions.cutouts import ANIMAL, ARENA, still_scene
+
+    return still_scene(recording) if plan.replay.depth in (ANIMAL, ARENA) else None
+
+
+def build_described_scene(segmenter: Segmenter, arena: Arena) -> Scene | None:
+    """What stands still before the camera, for session.json; None for a hand, which has no floor.
+
+    Args:
+        segmenter: the learned segmentation.
+        arena: the outline of its floor.
+    """
+    from liex_lab.foreground.background_segmenter import BackgroundSubtraction
+
+    if not isinstance(segmenter, BackgroundSubtraction):
+        return None
+    return replace(segmenter.described(), outline=arena)
+
+
+def build_arena(scene: Segmenter, plan: Plan) -> tuple[Arena, tuple[Zone, ...]]:
+    """The outline of the arena's floor, and the plan's zones placed in it, arena frame, mm.
+
+    Args:
+        scene: the learned segmentation; a hand has no arena, so its outline is unknown.
+        plan: names the file of zones.
+    """
+    from liex_lab.arena.floor import Floor
+    from liex_lab.arena.outline import UNKNOWN, find_arena
+    from liex_lab.foreground.background_segmenter import BackgroundSubtraction
+
+    arena = UNKNOWN
+    if isinstance(scene, BackgroundSubtraction):
+        floor = Floor.from_plane(scene.floor.normal, scene.floor.distance_mm, scene.grid)
+        arena = find_arena(scene.background, floor, scene.grid)
+    return arena, tuple(zone.placed(scene.camera, scene.floor, arena) for zone in build_zones(plan))
+
+
+def build_zones(plan: Plan) -> tuple[DrawnZone, ...]:
+    """The zones of the plan as they were drawn, () where it names none.
+
+    Args:
+        plan: its setting `arena.zones`.
+
+    Raises:
+        PlanError: the file of zones cannot be used.
+    """
+    from liex_lab.arena.zones import read_zones
+
+    return read_zones(plan.arena.zones) if plan.arena.zones else ()
+
+
+def build_surroundings(provenance: Provenance) -> Surroundings:
+    """What measures of behaviour have to know of arena, zones and water.
+
+    Args:
+        provenance: the session's origin.
+    """
+    from liex_lab.behaviour.places import Surroundings, surface_height_mm
+
+    surface = surface_height_mm(provenance.floor_distance_mm, provenance.optics)
+    return Surroundings(provenance.arena, [zone.name for zone in provenance.zones], surface)
+
+
+def session_bytes(recording: Recording, plan: Plan, length_mm: float, distance_mm: float) -> int:
+    """What a session of a recording takes on disk, bytes, within a factor of two.
+
+    Args:
+        recording: an open recording.
+        plan: the animal's skeleton, and how much of the depth is kept.
+        length_mm: of the animal.
+        distance_mm: of the animal from the camera.
+    """
+    from liex_lab.body.skeleton import Skeleton
+    from liex_lab.recordings.rvl import to_millimetres
+    from liex_lab.sessions.room import Shown, needed_bytes
+
+    rows = sorted({0, len(recording) // 2})
+    shown = Shown(
+        len(recording),
+        Skeleton.load(plan.animal.skeleton).n_joints,
+        recording.camera.fx * length_mm / distance_mm,
+        [to_millimetres(recording.frame(row).depth) for row in rows],
+    )
+    return needed_bytes(shown, plan.replay.depth)
