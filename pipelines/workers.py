@@ -1,7 +1,7 @@
 """Worker pool of processes of this machine, for the shards of one recording.
 
 Processes are spawned, as numba's threads do not survive a fork, and share the cores. The workers of
-a study are Dask's, see `study.dask_cluster`.
+a study are Dask's, see `study.crew`.
 """
 
 from __future__ import annotations

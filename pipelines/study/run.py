@@ -29,7 +29,7 @@ from .status import SessionStatus, standings
 from .table import write_study_table
 
 if TYPE_CHECKING:
-    from .dask_cluster import Crew
+    from .crew import Crew
 
 
 class DescribeSession(Protocol):

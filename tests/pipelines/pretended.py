@@ -109,7 +109,7 @@ def shared_task(n: int) -> list[tuple[int, int]]:
     """A session's task that shares its stretches: each one's number, and the process that
     did it.
     """
-    from liex_lab.pipelines.study.dask_cluster import Workers
+    from liex_lab.pipelines.study.crew import Workers
 
     return list(Workers().each(stretch, range(n)))
 

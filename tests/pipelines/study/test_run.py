@@ -13,6 +13,7 @@ import pandas as pd
 import pytest
 from liex_lab.pipelines.study import dask_cluster
 from liex_lab.pipelines.study.changes import plan_changed
+from liex_lab.pipelines.study.crew import n_shared
 from liex_lab.pipelines.study.listing import list_sessions
 from liex_lab.pipelines.study.one_session import measure_one
 from liex_lab.pipelines.study.slurm import SlurmTable
@@ -142,9 +143,9 @@ def test_workers_share_the_cores(finished: tuple[Path, str, int]) -> None:
 def test_sessions_are_shared_by_all_workers_where_there_are_fewer_than_these(
     finished: tuple[Path, str, int],
 ) -> None:
-    assert [dask_cluster.n_shared(n, 2) for n in range(6)] == [0, 1, 0, 1, 0, 1]
-    assert [dask_cluster.n_shared(n, 4) for n in (3, 4, 11)] == [3, 0, 3]
-    assert dask_cluster.n_shared(3, 0) == 0, "workers that are still to come cannot be counted"
+    assert [n_shared(n, 2) for n in range(6)] == [0, 1, 0, 1, 0, 1]
+    assert [n_shared(n, 4) for n in (3, 4, 11)] == [3, 0, 3]
+    assert n_shared(3, 0) == 0, "workers that are still to come cannot be counted"
     done = [one.session for one in standings(Study.load(finished[0])) if one.state == "done"]
     shared = {
         one.animal.id: json.loads((one.folder / "session.json").read_text())["shared"]

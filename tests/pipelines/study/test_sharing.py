@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 from liex_lab.pipelines.study import dask_cluster, sharing
 from liex_lab.pipelines.study.listing import list_sessions
+from liex_lab.pipelines.study.one_session import measure_one
 from liex_lab.pipelines.study.run import run_study
 from liex_lab.pipelines.study.sharing import shared_sessions, to_be_looked_at
 from liex_lab.pipelines.study.status import SessionStatus, standings
@@ -34,7 +35,7 @@ class Here:
 
     def measure(self, todo: Any, run: Any, told: Any, finished: Any) -> None:
         for one in todo:
-            finished(dask_cluster.measure_one(one.session, run))
+            finished(measure_one(one.session, run))
 
 
 @pytest.fixture(autouse=True)
