@@ -12,6 +12,7 @@ from liex_lab.body.skeleton import Skeleton
 from liex_lab.geometry import SE3
 from liex_lab.optics.camera import Camera
 from liex_lab.recordings.frame import DepthFrame
+from liex_lab.sessions.drawn import dot_mm
 from liex_lab.sessions.rrd import BONE_COLOUR, JOINT_COLOUR, SKELETON
 from liex_lab.sessions.rrd_depth import DEPTH, IMAGE, MM_PER_UNIT, colour_range
 from liex_lab.sessions.viewer import begin_viewer
@@ -69,9 +70,10 @@ class LiveView:
             camera_xyz=rr.ViewCoordinates.RDF,
         )
         self._stream.log(IMAGE, lens, static=True)
-        dots = rr.Points3D.from_fields(radii=0.003, colors=JOINT_COLOUR)
+        dot_m = dot_mm(skeleton) / MM_PER_UNIT
+        dots = rr.Points3D.from_fields(radii=dot_m, colors=JOINT_COLOUR)
         self._stream.log(f"{SKELETON}/joints", dots, static=True)
-        lines = rr.LineStrips3D.from_fields(radii=0.0015, colors=BONE_COLOUR)
+        lines = rr.LineStrips3D.from_fields(radii=dot_m / 2.0, colors=BONE_COLOUR)
         self._stream.log(f"{SKELETON}/bones", lines, static=True)
         self._first_ns: int | None = None
         self._range: Any = None

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from liex_lab.geometry import SE3, so3
 from liex_lab.runtime.memory import blocks
+from liex_lab.sessions.drawn import dot_mm
 from liex_lab.sessions.provenance import Provenance
 from liex_lab.tables.rows import Rows
 from liex_lab.tracking.track import Track
@@ -86,6 +87,7 @@ class McapWriter:
         """
         usual = _WHOLE if origin.background is None else _ALIKE
         self._origin = origin
+        self._dot_m = dot_mm(origin.skeleton) / 1000.0
         self._context = (
             foxglove.Context()
         )  # the global one would also receive every other writer's messages
@@ -232,11 +234,12 @@ class McapWriter:
         lines = messages.LinePrimitive(
             type=messages.LinePrimitiveLineType.LineList,
             pose=_place(0.0, 0.0, 0.0),
-            thickness=0.002,
+            thickness=0.7 * self._dot_m,
             points=ends,
             color=_BONE,
         )
-        size = messages.Vector3(x=0.006, y=0.006, z=0.006)
+        across = 2.0 * self._dot_m
+        size = messages.Vector3(x=across, y=across, z=across)
         spheres = [
             messages.SpherePrimitive(pose=_place(*xyz), size=size, color=_JOINT)
             for xyz in joints_m.tolist()

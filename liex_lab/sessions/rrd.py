@@ -24,6 +24,7 @@ from liex_lab.errors import SessionError
 from liex_lab.geometry import so3
 from liex_lab.runtime.disk import probe_full
 from liex_lab.runtime.memory import blocks
+from liex_lab.sessions.drawn import dot_mm, dot_pt
 from liex_lab.sessions.joining import RRD_HEAD, rrd_messages
 from liex_lab.sessions.provenance import Provenance
 from liex_lab.sessions.rrd_body import log_body, send_body
@@ -361,9 +362,11 @@ class ReplayWriter:
             info=rr.AnnotationInfo(id=1, label=skeleton.name, color=BONE_COLOUR),
             keypoint_annotations=names,
         )
+        dot_m = dot_mm(skeleton) / MM_PER_UNIT
+        pt = dot_pt(skeleton)
         radii = {
-            SKELETON: (0.003, 0.0015),
-            OVERLAY: (rr.Radius.ui_points(3.5), rr.Radius.ui_points(1.2)),
+            SKELETON: (dot_m, dot_m / 2.0),
+            OVERLAY: (rr.Radius.ui_points(pt), rr.Radius.ui_points(pt / 3.0)),
         }
         for entity, dot, line in (
             (SKELETON, rr.Points3D, rr.LineStrips3D),

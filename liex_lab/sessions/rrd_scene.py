@@ -37,7 +37,7 @@ def log_surroundings(stream: Any, scene: Scene) -> None:
         stream.log(f"{OVERLAY}/region", outline, static=True)
     if scene.fixtures:
         tops = np.array([[*one.centre_mm, one.height_mm] for one in scene.fixtures])
-        labels = [f"{one.height_mm:.0f} mm high" for one in scene.fixtures]
+        labels = [f"fixture, {one}" for one in scene.fixtures]
         things = rr.Points3D(tops / MM_PER_UNIT, radii=0.003, colors=[_GREY], labels=labels)
         stream.log(f"{FLOOR}/fixtures", things, static=True)
 

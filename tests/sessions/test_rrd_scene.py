@@ -39,7 +39,7 @@ def test_the_region_and_what_stands_in_it_are_drawn() -> None:
     things = heard.said[f"{FLOOR}/fixtures"]
     places = things.positions.as_arrow_array().to_pylist()
     np.testing.assert_allclose(places, [[0.12, -0.04, 0.062]], atol=1e-6)
-    assert things.labels.as_arrow_array().to_pylist() == ["62 mm high"]
+    assert things.labels.as_arrow_array().to_pylist() == ["fixture, 62 mm"]
 
 
 def test_of_a_whole_picture_with_nothing_in_it_nothing_is_drawn() -> None:
