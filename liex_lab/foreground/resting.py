@@ -39,6 +39,7 @@ _LARGER = 1.5
 _KINDS = 4  # areas of things that are held against an animal
 _IN_PLACE = 0.8  # of the frames must show it where it usually is
 _LEAST_PX = 16  # of a lump
+_MOST_LUMPS = 16  # that are held against an animal
 _FREE = 0.75  # of a lump's edge is bare floor; of the foot of a wall half is
 _AROUND_PX = 4  # a lump's edge, whose readings flicker between it and the floor
 
@@ -154,11 +155,12 @@ def _changing_lump(scene: AnyScene, sample: Depths, wanted: Wanted) -> Resting[A
     A thing that lies still only flickers along its edge; an animal moves a part of itself. The foot
     of a wall flickers as much as an animal moves, but has floor on one side only.
     """
-    found: list[tuple[float, Resting[AnyScene]]] = []
+    free = []
     for lump in _lumps(scene, wanted):
         near = _around(lump)
-        if _free(scene, near & ~lump, wanted) < _FREE:
-            continue
+        if _free(scene, near & ~lump, wanted) >= _FREE:
+            free.append((_change(scene, sample, near, wanted), lump, near))
+    for _, lump, near in sorted(free, key=lambda one: -one[0])[:_MOST_LUMPS]:
         whole = _with_floor_at(scene, near, wanted)
         areas = _areas_at(whole, sample, lump, wanted)
         own = (areas > wanted.smallest_mm2) & (areas < wanted.largest_mm2)
@@ -166,8 +168,8 @@ def _changing_lump(scene: AnyScene, sample: Depths, wanted: Wanted) -> Resting[A
             continue
         rests = Resting(whole, float(np.median(areas[own])), float(own.mean()))
         if is_like_an_animal(rests.sized, sample, wanted) and _keeps_its_place(rests.sized, sample):
-            found.append((_change(scene, sample, near, wanted), rests))
-    return max(found, key=lambda one: one[0])[1] if found else None
+            return rests
+    return None
 
 
 def _on_bare_floor(
