@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 SCHEMA = 3
 _HASHED = {"learning_code": "code", "training_pictures": "training pictures"}
 _DIGITS = 6  # significant ones of a measured number
-_LINE = 100  # characters of a value that stands on one line
+_LINE = 160  # characters of a value that stands on one line
 
 
 def kept_results(animal: str, folder: Path | None = None) -> dict[str, Any]:
