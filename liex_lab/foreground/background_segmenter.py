@@ -115,7 +115,7 @@ class BackgroundSubtraction(StillScene):
         scene, sample = BackgroundSubtraction._of(camera, stride, ground, whole, level)
         if wanted.stands and floor is None and not ground.standing.moves:
             # nothing that moves has told which of two levels is the floor: what lies there does
-            under = ground.under(whole, scene.places(sample))
+            under = ground.under(whole, scene.places(scene.extract(sample, 1.0)))
             if under.standing is not ground.standing:
                 scene, sample = BackgroundSubtraction._of(camera, stride, under, whole, level)
         changed = SceneChange.find(sample, times_s, scene.grid, scene.area_mm2)

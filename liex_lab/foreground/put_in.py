@@ -117,7 +117,7 @@ def _is_an_animal(scene: StillScene, sample: Depths, thing: _Thing) -> bool:
     """
     rows = np.arange(len(sample))
     inside = (rows >= thing.first) & (rows < thing.last)
-    own = scene.places(sample[_some(rows[inside])])
+    own = scene.places(scene.extract(sample[_some(rows[inside])], 1.0))
     if own and float(np.mean([one[thing.place].mean() > _OWN for one in own])) > _OFTEN:
         return True
     others = scene.extract(sample[_some(rows[~inside])], 1.0)

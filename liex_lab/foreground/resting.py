@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 if TYPE_CHECKING:
     from liex_lab.foreground.bare_ground import Wanted
+    from liex_lab.foreground.height_maps import HeightMaps
     from liex_lab.foreground.still_scene import StillScene
 
 Depths = NDArray[np.float32]
@@ -52,16 +53,13 @@ class Resting(Generic[AnyScene]):
         scene: the scene with the floor under it, so that it stands out.
         area_mm2: its usual area, mm^2.
         share: of the frames that show it, 0 to 1.
+        is_like: whether it is like an animal, see `is_like_an_animal`.
     """
 
     scene: AnyScene
     area_mm2: float
     share: float
-
-    @property
-    def sized(self) -> AnyScene:
-        """The scene that looks for things of that area."""
-        return replace(self.scene, area_mm2=self.area_mm2)
+    is_like: bool = False
 
 
 def at_rest(
@@ -82,17 +80,18 @@ def at_rest(
     Returns:
         What was found; None where the scene as it is is the better one.
     """
-    found = Resting(scene, area, share)
-    if share >= 0.5 and (not wanted.stands or is_like_an_animal(found.sized, sample, wanted)):
+    moving = replace(scene, area_mm2=area)
+    if share >= 0.5 and (not wanted.stands or is_like_an_animal(moving, sample, wanted)):
         return None
     rests = _changing_lump(scene, sample, wanted) if wanted.stands else None
     rests = rests or _on_bare_floor(scene, sample, wanted, 1 if share > 0.0 else _KINDS)
     if rests.share <= (share if share < 0.5 else 0.0):
         return None
     moves = wanted.stands and area > 0.0 and scene.standing is not None and scene.standing.moves
-    if (share >= 0.5 or moves) and not is_like_an_animal(rests.sized, sample, wanted):
+    if (share >= 0.5 or moves) and not rests.is_like:
         return None
-    if share < 0.5 and moves and _stays_beside(rests.sized, found.sized, sample):
+    resting = replace(rests.scene, area_mm2=rests.area_mm2)
+    if share < 0.5 and moves and _stays_beside(resting, moving, sample):
         return None
     return rests
 
@@ -114,8 +113,8 @@ def with_its_still_part(
     Returns:
         The scene, the same where there is no such lump, and the area mm^2 of the whole animal.
     """
-    moving = np.array(replace(scene, area_mm2=area).places(sample))
-    moving = moving.reshape(-1, *scene.limit.shape)
+    crops = replace(scene, area_mm2=area).extract(sample, 1.0)
+    moving = np.array(scene.places(crops)).reshape(-1, *scene.limit.shape)
     best, best_area = scene, area
     for lump in _lumps(scene, wanted):
         near = _around(lump)
@@ -136,16 +135,26 @@ def is_like_an_animal(scene: StillScene, sample: Depths, wanted: Wanted) -> bool
         sample: (n, H, W) float32 mm, frames at its stride.
         wanted: what animal is expected.
     """
+    return _is_like(_shown(scene, sample), scene.area_mm2, wanted)
+
+
+def _shown(scene: StillScene, sample: Depths) -> HeightMaps:
+    """The height maps of the frames of a sample (n, H, W) mm in which something is found."""
     crops = scene.extract(sample, 1.0)
-    if not crops.found.any():
+    return crops[crops.found]
+
+
+def _is_like(shown: HeightMaps, area_mm2: float, wanted: Wanted) -> bool:
+    """`is_like_an_animal` of what was found with such an area."""
+    if not len(shown.n_px):
         return False
-    blobs = crops[crops.found].blobs
+    blobs = shown.blobs
     length = 4.0 * float(np.median(blobs.sd_along))
     height = float(np.median(blobs.volume_mm3 / np.maximum(blobs.area_mm2, 1e-9)))
     return (
         length < _LONGEST * wanted.spine_mm[1]
         and height > _HIGHER * wanted.min_height_mm
-        and scene.area_mm2 > _LARGER * wanted.smallest_mm2
+        and area_mm2 > _LARGER * wanted.smallest_mm2
     )
 
 
@@ -166,9 +175,10 @@ def _changing_lump(scene: AnyScene, sample: Depths, wanted: Wanted) -> Resting[A
         own = (areas > wanted.smallest_mm2) & (areas < wanted.largest_mm2)
         if own.mean() < 0.5:
             continue
-        rests = Resting(whole, float(np.median(areas[own])), float(own.mean()))
-        if is_like_an_animal(rests.sized, sample, wanted) and _keeps_its_place(rests.sized, sample):
-            return rests
+        area = float(np.median(areas[own]))
+        shown = _shown(replace(whole, area_mm2=area), sample)
+        if _is_like(shown, area, wanted) and _keeps_its_place(shown, area):
+            return Resting(whole, area, float(own.mean()), is_like=True)
     return None
 
 
@@ -189,10 +199,9 @@ def _on_bare_floor(
         area, share = bare.usual_area(sample, wanted.spine_mm, tried)
         if share == 0.0:
             break
-        found = Resting(bare, area, share)
-        if is_like_an_animal(found.sized, sample, wanted) and (
-            not tried or _keeps_its_place(found.sized, sample)
-        ):
+        shown = _shown(replace(bare, area_mm2=area), sample)
+        found = Resting(bare, area, share, _is_like(shown, area, wanted))
+        if found.is_like and (not tried or _keeps_its_place(shown, area)):
             return found
         first = first or found
         tried.append(area)
@@ -263,12 +272,11 @@ def _change(scene: StillScene, sample: Depths, near: Mask, wanted: Wanted) -> fl
     return float(np.where(often > 0.1, often, 0.0).mean())
 
 
-def _keeps_its_place(scene: StillScene, sample: Depths) -> bool:
-    """Whether what is found in a sample (n, H, W) mm lies in one place in most frames."""
-    crops = scene.extract(sample, 1.0)
-    place = crops[crops.found].centroid[:, :2]
+def _keeps_its_place(shown: HeightMaps, area_mm2: float) -> bool:
+    """Whether what is found with such an area lies in one place in most frames that show it."""
+    place = shown.centroid[:, :2]
     off = np.linalg.norm(place - np.median(place, axis=0), axis=1)
-    return bool((off < 0.5 * np.sqrt(scene.area_mm2)).mean() > _IN_PLACE)
+    return bool((off < 0.5 * np.sqrt(area_mm2)).mean() > _IN_PLACE)
 
 
 def _stays_beside(resting: StillScene, moving: StillScene, sample: Depths) -> bool:

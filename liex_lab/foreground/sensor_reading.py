@@ -96,7 +96,7 @@ def _seam(scene: StillScene, sample: Depths) -> float | None:
     crops = scene.extract(shown, 1.0)
     unread = np.zeros(_REACH_PX)
     seen = np.zeros(_REACH_PX)
-    for i, own in zip(np.flatnonzero(crops.found), scene.places(shown), strict=True):
+    for i, own in zip(np.flatnonzero(crops.found), scene.places(crops), strict=True):
         v, u, height, width = cv2.boundingRect(own.T.astype(np.uint8))
         cut = (
             slice(max(0, v - _REACH_PX), v + height + _REACH_PX),

@@ -258,13 +258,12 @@ class StillScene(Segmenter):
             worn = np.repeat(worn, self.stride, axis=axis)
         return np.where(worn[:, : depths.shape[1], : depths.shape[2]], np.float32(0), depths)
 
-    def places(self, sample: NDArray[np.float32]) -> list[NDArray[np.bool_]]:
+    def places(self, crops: HeightMaps) -> list[NDArray[np.bool_]]:
         """The animal's pixels (H, W) bool in each frame that shows it.
 
         Args:
-            sample: (n, H, W) float32 mm, frames at this scene's stride.
+            crops: of frames at this scene's stride, see `extract`.
         """
-        crops = self.extract(sample, 1.0)
         places = []
         for i in np.flatnonzero(crops.found):
             rows, columns = np.nonzero(crops.heights[i])

@@ -19,6 +19,7 @@ from liex_lab.arena.zones import Zone
 from liex_lab.errors import SessionError
 from liex_lab.geometry import SE3
 from liex_lab.optics.camera import Camera
+from liex_lab.plan.sections import Factor
 from liex_lab.sessions.provenance import SCHEMA_VERSION
 from liex_lab.sessions.thumbnails import FOLDER
 
@@ -43,7 +44,6 @@ def _said(text: str) -> str:
 Text = Annotated[str, AfterValidator(_said)]
 Name = Annotated[Text, Field(max_length=4096)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
-Factor = Annotated[float, Field(gt=1e-3, lt=1e3)]
 Count = Annotated[int, Field(ge=0, le=_MOST_FRAMES)]
 Focal = Annotated[float, Field(gt=1e-3, lt=1e7)]
 Size = Annotated[int, Field(gt=0, le=_MOST_PX)]

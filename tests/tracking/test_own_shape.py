@@ -67,17 +67,19 @@ def fitted(toy, estimator, estimates, prior) -> tuple[OwnShape | None, BodyResid
     return fit_shape(prior, estimator, SCENE, estimates, 1.0, average(toy, estimates))
 
 
+def lies_on_the_truth(toy, estimator, estimates, shape: OwnShape, body: BodyResidual) -> None:
+    pose = shape.corrected(estimator, estimates.chosen.pose, 1.0).moved(SCENE.floor.T_arena_camera)
+    np.testing.assert_allclose(pose.joints(toy.skeleton), toy.joints, atol=1e-6)
+    assert np.median(body.of(pose, estimates.crops, SCENE)) < 0.5
+
+
 def test_the_true_build_is_kept_and_takes_the_poses_to_the_truth(toy, estimator, estimates):
     prior = certain(toy, estimator, LIFTED, HIGHER)
     shape, body = fitted(toy, estimator, estimates, prior)
     assert shape is not None
     assert shape.build is not None
     assert shape.residual_mm < 0.7 * shape.average_residual_mm
-    pose = shape.corrected(estimator, estimates.chosen.pose, 1.0)
-    joints = pose.moved(SCENE.floor.T_arena_camera).joints(toy.skeleton)
-    np.testing.assert_allclose(joints, toy.joints, atol=1e-6)
-    pose = pose.moved(SCENE.floor.T_arena_camera)
-    assert np.median(body.of(pose, estimates.crops, SCENE)) < 0.5
+    lies_on_the_truth(toy, estimator, estimates, shape, body)
     told = shape.to_dict()
     assert told["kept"]
     assert told["height"] == [HIGHER] * len(PLACES)
@@ -131,11 +133,7 @@ def test_a_shape_that_is_stated_is_used_whatever_the_frames_say(toy, estimator, 
         )
         assert shape is not None
         assert shape.build is not None
-        joints = shape.corrected(estimator, estimates.chosen.pose, 1.0)
-        moved = joints.moved(SCENE.floor.T_arena_camera).joints(toy.skeleton)
-        np.testing.assert_allclose(moved, toy.joints, atol=1e-6)
-        pose = joints.moved(SCENE.floor.T_arena_camera)
-        assert np.median(body.of(pose, estimates.crops, SCENE)) < 0.5
+        lies_on_the_truth(toy, estimator, estimates, shape, body)
         told = shape.to_dict()
         assert (told["kept"], told["n_frames"], told["shared_by"]) == (True, n, "2 sessions of m07")
 
