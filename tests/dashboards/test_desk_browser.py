@@ -281,6 +281,22 @@ def test_a_crossing_asked_for_too_early_is_gone_to_once_it_is_found(
     watched.nothing_went_wrong()
 
 
+def test_a_crossing_asked_for_right_after_a_correction_is_one_of_the_new_ones(
+    tracked: Served, watched: Watched
+) -> None:
+    page, held = watched.page, list[Route]()
+    with page.expect_response("**/crossings"):
+        opened(tracked, page, 0.3)
+    page.route("**/crossings", lambda route: held.append(route))
+    page.keyboard.press("F")
+    until(page, lambda: bool(held))
+    page.keyboard.press("x")
+    expect(page.locator(".desk-said")).to_contain_text("crossings are still being looked for")
+    held.pop().continue_()
+    expect(page.locator(".desk-said")).to_contain_text("head and tail exchanged by a person")
+    watched.nothing_went_wrong()
+
+
 def test_keys_belong_to_a_field_while_one_types_into_it(served: Served, watched: Watched) -> None:
     page = watched.page
     opened(served, page, 1.0)

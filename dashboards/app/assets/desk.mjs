@@ -234,6 +234,7 @@ class Desk {
   }
 
   async refresh() {
+    this.crossings.forget();
     await Promise.all([this.source.forgetRows(), this.readBouts()]);
     this.player.wake();
     this.doubts.read().then(() => this.crossings.read()).catch((error) => this.say(error.message, true));

@@ -10,14 +10,22 @@ export class Crossings {
     this.desk = desk;
     this.all = null;  // until they have come
     this.asked = 0;  // the way that was asked for before they had come
+    this.turn = 0;  // how often they were forgotten
     this.count = make("span", { class: "muted desk-crossings" });
     this.parts = [make("div", { class: "desk-bar" },
       button("◀", "Shift and X", () => this.next(-1), { "aria-label": "previous crossing" }),
       button("Next crossing", "X", () => this.next(1)), this.count)];
   }
 
+  forget() {  // what was corrected may be another list
+    this.all = null;
+    this.turn += 1;
+  }
+
   async read() {
-    this.all = await json(`${this.desk.source.base}/crossings`);
+    const turn = this.turn, all = await json(`${this.desk.source.base}/crossings`);
+    if (turn !== this.turn) return;  // corrected meanwhile, and read again
+    this.all = all;
     this.count.textContent = this.all.length ? `${this.all.length} in all` : "none";
     const asked = this.asked;
     this.asked = 0;
