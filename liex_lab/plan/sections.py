@@ -539,10 +539,10 @@ class Report(Table):
     """[report]: what is written beside report.html."""
 
     figures: list[Literal["svg", "pdf", "png", "pages"]] = Field(
-        ["svg"],
+        ["svg", "pages"],
         description=(
-            "formats of figures/: svg, which the report holds; also pdf, png or pages (one PDF of "
-            "all). PDF takes a second or two of every run"
+            "formats of figures/: svg, which the report holds, and pages, one PDF of all; also pdf "
+            "or png, one of each, which takes a second or two of every run"
         ),
     )
 

@@ -266,7 +266,8 @@ def test_a_plan_asks_for_the_formats_beside_every_report(tmp_path):
     assert drawn == {"figures.pdf"} | {f"{one}.{kind}" for one in made for kind in ("svg", "pdf")}
     usual = write(tmp_path / "usual.liex", MOUSE, plan_toml=Plan.load("mouse").to_toml())
     sets.for_the_page(usual, tmp_path / "usual")
-    assert {path.suffix for path in (tmp_path / "usual").iterdir()} == {".svg"}
+    usually = {path.name for path in (tmp_path / "usual").iterdir()}
+    assert usually == {"figures.pdf"} | {f"{one}.svg" for one in made}
 
 
 def test_every_name_of_the_transitions_is_on_the_paper():
