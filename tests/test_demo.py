@@ -53,7 +53,8 @@ def test_the_folder_is_whole(session: Session) -> None:
     }
     drawn = {path.name for path in (session.path / "figures").iterdir()}
     assert {"occupancy.svg", "ethogram.svg", "arena.svg"} <= drawn
-    assert all(name.endswith(".svg") for name in drawn)  # other formats are asked for
+    others = {name for name in drawn if not name.endswith(".svg")}
+    assert others == {"figures.pdf"}  # other formats are asked for
     # nothing is wrong with it; bouts that contradicted their definition are said to be refused
     refused = session.metadata.get("refused_bouts", {}).get("bouts", [])
     assert len(session.metadata["problems"]) == bool(refused)
