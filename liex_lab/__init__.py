@@ -11,6 +11,7 @@ name brings its own module along when it is asked for.
 
 from __future__ import annotations
 
+import os
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
@@ -20,6 +21,9 @@ from liex_lab.runtime.kernel_cache import keep_kernels
 __version__ = "0.1.0"
 
 keep_old_paths()
+# kernels' threads that have nothing to do sleep; OpenMP's usual ones spin, on cores on which
+# recordings are read and logs are written meanwhile (libgomp reads this when it is loaded)
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 _KERNELS_TOLD = keep_kernels()  # a sentence for the command line, where there is something to say
 
 _HOMES = {

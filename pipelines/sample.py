@@ -97,7 +97,7 @@ def _card(path: Path, mouse: SyntheticSession) -> str:
         ),
         "licence": "BSD-3-Clause, as the rest of liex_lab",
         "made_by": "liex_lab.pipelines.sample.write_sample",
-        "made_with": f"foxglove-sdk {package_version('foxglove-sdk')}",
+        "made_with": f"zstandard {package_version('zstandard')}",
         "sha256": hashlib.sha256(path.read_bytes()).hexdigest(),
         "bytes": path.stat().st_size,
         "n_frames": N_FRAMES - len(LEFT_OUT),

@@ -16,16 +16,15 @@ from itertools import zip_longest
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import foxglove
 import numpy as np
-from foxglove import channels, messages
-from foxglove.mcap import MCAPCompression, MCAPWriteOptions
+from foxglove import messages
 from numpy.typing import NDArray
 
 from liex_lab.geometry import SE3, so3
 from liex_lab.runtime.memory import blocks
 from liex_lab.sessions.drawn import dot_mm
-from liex_lab.sessions.provenance import Provenance
+from liex_lab.sessions.mcap_file import McapFile, SchemaOf
+from liex_lab.sessions.provenance import Provenance, package_version
 from liex_lab.tables.rows import Rows
 from liex_lab.tracking.track import Track
 
@@ -36,11 +35,11 @@ Array = NDArray[np.float64]
 
 _SECOND = 10**9
 _BLOCK = 8192  # frames of a track that are in memory
-# level (0 is the usual one) and bytes of the chunks: whole pictures, one to a chunk; and those that
-# are alike but for a cut-out
-_WHOLE = (0, 128 * 1024)
-_ALIKE = (9, 32 * 1024 * 1024)
-_ACTION_SCHEMA = {
+# level and bytes of the chunks: whole pictures, one to a chunk; and those that are alike but for a
+# cut-out
+_WHOLE = (3, 128 * 1024)
+_ALIKE = (1, 32 * 1024 * 1024)
+_ACTION_SCHEMA: dict[str, Any] = {
     "title": "liex_lab.ActionState",
     "description": "The action that begins now; an empty word ends the last one.",
     "type": "object",
@@ -58,6 +57,9 @@ _ACTION_SCHEMA = {
         "frame_index": {"type": "integer"},
     },
 }
+_ACTIONS = SchemaOf(
+    _ACTION_SCHEMA["title"], "jsonschema", json.dumps(_ACTION_SCHEMA).encode(), "json"
+)
 _BONE = messages.Color(r=1.0, g=1.0, b=1.0, a=1.0)
 _JOINT = messages.Color(r=1.0, g=0.31, b=0.24, a=1.0)
 
@@ -88,31 +90,25 @@ class McapWriter:
         usual = _WHOLE if origin.background is None else _ALIKE
         self._origin = origin
         self._dot_m = dot_mm(origin.skeleton) / 1000.0
-        self._context = (
-            foxglove.Context()
-        )  # the global one would also receive every other writer's messages
-        options = MCAPWriteOptions(
-            compression=MCAPCompression.Zstd,
-            compression_level=usual[0] if level is None else level,
-            chunk_size=usual[1] if chunk_size is None else chunk_size,
-            compression_threads=0,
-            profile="liex_lab",
-        )
         self._file = _WatchedFile(path)
-        self._writer = foxglove.open_mcap(self._file, context=self._context, writer_options=options)
-        self._depth = channels.RawImageChannel("/camera/depth", context=self._context)
-        self._calibration = channels.CameraCalibrationChannel(
-            "/camera/calibration", context=self._context
+        self._writer = McapFile(
+            self._file,
+            profile="liex_lab",
+            library=f"liex_lab {package_version('liex_lab')}",
+            level=usual[0] if level is None else level,
+            chunk_size=usual[1] if chunk_size is None else chunk_size,
         )
-        self._transforms = channels.FrameTransformsChannel("/tf", context=self._context)
-        self._scene = channels.SceneUpdateChannel("/skeleton/scene", context=self._context)
-        self._poses = channels.PosesInFrameChannel("/skeleton/joints", context=self._context)
-        self._overlay = channels.ImageAnnotationsChannel("/camera/skeleton", context=self._context)
-        self._log = channels.LogChannel("/log", context=self._context)
-        self._actions = foxglove.Channel(
-            "/actions", schema=_ACTION_SCHEMA, message_encoding="json", context=self._context
-        )
+        self._depth = self._topic("/camera/depth", messages.RawImage)
+        self._calibration = self._topic("/camera/calibration", messages.CameraCalibration)
+        self._transforms = self._topic("/tf", messages.FrameTransforms)
+        self._scene = self._topic("/skeleton/scene", messages.SceneUpdate)
+        self._poses = self._topic("/skeleton/joints", messages.PosesInFrame)
+        self._overlay = self._topic("/camera/skeleton", messages.ImageAnnotations)
+        self._log = self._topic("/log", messages.Log)
         self._calibrated_ns: int | None = None
+
+    def _topic(self, name: str, kind: Any) -> _Topic:
+        return _Topic(self._writer, name, kind)
 
     def add(self, times_ns: Sequence[int], depth: Sequence[NDArray[np.uint16]]) -> None:
         """Write the depth of consecutive frames, and the calibration about once a second.
@@ -288,7 +284,7 @@ class McapWriter:
                 "index": list(words).index(action) if action else -1,
                 "frame_index": int(rows.frame_index[row]),
             }
-            self._actions.log(json.dumps(state).encode(), log_time=first + at)
+            self._writer.log("/actions", _ACTIONS, json.dumps(state).encode(), first + at)
 
     def _log_notes(self, time_ns: int, problems: Sequence[str]) -> None:
         for problem in problems:
@@ -301,10 +297,24 @@ class McapWriter:
             self._log.log(note, log_time=time_ns)
 
 
-class _WatchedFile:
-    """A file for Foxglove's writer, which prints a line for every message when the disk is full.
+class _Topic:
+    """A topic of messages of one of Foxglove's kinds."""
 
-    This one remembers the first error for `check`, and only counts what comes after it.
+    def __init__(self, file: McapFile, name: str, kind: Any) -> None:
+        schema = kind.get_schema()
+        self._file = file
+        self._name = name
+        self._schema = SchemaOf(schema.name, schema.encoding, schema.data, "protobuf")
+
+    def log(self, message: Any, log_time: int) -> None:
+        """Write a message at a time in ns."""
+        self._file.log(self._name, self._schema, message.encode(), log_time)
+
+
+class _WatchedFile:
+    """A file that remembers its first error for `check`, and only counts what comes after it.
+
+    So a full disk is told once, where the writer can act on it.
     """
 
     def __init__(self, path: Path) -> None:

@@ -1,0 +1,118 @@
+"""Our MCAP files are what the format's own library reads, whole or cut after any flush."""
+
+from __future__ import annotations
+
+import io
+from contextlib import suppress
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mcap.exceptions import McapError
+from mcap.reader import make_reader
+from mcap.stream_reader import StreamReader
+
+from liex_lab.sessions.mcap_file import McapFile, SchemaOf
+
+ONE = SchemaOf("one", "jsonschema", b"{}", "json")
+OTHER = SchemaOf("other", "jsonschema", b'{"type": "object"}', "json")
+Said = list[tuple[str, int, bytes]]
+
+
+def said(n: int = 60) -> Said:
+    """Messages of two topics, out of turn, of 0 to 3,000 bytes that compress and that do not."""
+    rng = np.random.default_rng(5)
+    told = []
+    for k in range(n):
+        data = rng.bytes(k * 50) if k % 3 else bytes(k * 50)
+        told.append((f"/{'ab'[k % 2]}", int(rng.integers(1, 10**12)), data))
+    return told
+
+
+def written(told: Said, chunk_size: int = 4_000, level: int = 1, flush_at: int = -1) -> io.BytesIO:
+    sink = io.BytesIO()
+    file = McapFile(sink, profile="p", library="l", level=level, chunk_size=chunk_size)
+    for k, (topic, time_ns, data) in enumerate(told):
+        if k == flush_at:
+            file.flush()
+            file.flush()  # what does not wait is not written
+        file.log(topic, ONE if topic == "/a" else OTHER, data, time_ns)
+    file.close()
+    sink.seek(0)
+    return sink
+
+
+@pytest.mark.parametrize("chunk_size", [1, 4_000, 10**9])
+@pytest.mark.parametrize("level", [1, 3, 19])
+def test_every_message_comes_back_by_the_index_in_the_order_of_time(
+    chunk_size: int, level: int
+) -> None:
+    told = said()
+    reader = make_reader(written(told, chunk_size, level), validate_crcs=True)
+    found = [
+        (channel.topic, message.log_time, message.data)
+        for _, channel, message in reader.iter_messages()
+    ]
+    assert found == sorted(told, key=lambda one: one[1])
+    summary = reader.get_summary()
+    assert summary is not None
+    assert summary.statistics is not None
+    assert summary.statistics.message_count == len(told)
+    assert summary.statistics.message_start_time == min(one[1] for one in told)
+    assert summary.statistics.message_end_time == max(one[1] for one in told)
+    assert len(summary.chunk_indexes) == summary.statistics.chunk_count
+    assert {s.name: s.data for s in summary.schemas.values()} == {
+        one.name: one.data for one in (ONE, OTHER)
+    }
+
+
+def test_records_follow_each_other_as_the_format_says_and_checksums_hold() -> None:
+    sink = written(said())
+    names = [type(one).__name__ for one in StreamReader(sink, validate_crcs=True).records]
+    assert names[0] == "Header"
+    assert names[-1] == "Footer"
+    assert names.count("Message") == 60
+    assert names.index("DataEnd") > max(k for k, name in enumerate(names) if name == "Message")
+
+
+def test_a_file_that_ends_after_a_flush_holds_what_was_written_before() -> None:
+    told = said()
+    whole = io.BytesIO()
+    file = McapFile(whole, profile="p", library="l", level=1, chunk_size=10**9)
+    for topic, time_ns, data in told[:25]:
+        file.log(topic, ONE if topic == "/a" else OTHER, data, time_ns)
+    file.flush()
+    for topic, time_ns, data in told[25:]:
+        file.log(topic, ONE if topic == "/a" else OTHER, data, time_ns)
+    cut = io.BytesIO(whole.getvalue())
+    found = []
+    with suppress(McapError, EOFError):  # it has no end
+        for record in StreamReader(cut, validate_crcs=True).records:
+            if type(record).__name__ == "Message":
+                found.append(record.data)  # type: ignore[attr-defined]
+    assert found == [data for _, _, data in told[:25]]
+
+
+def test_the_same_messages_and_flushes_are_the_same_bytes() -> None:
+    told = said()
+    assert written(told, flush_at=7).getvalue() == written(told, flush_at=7).getvalue()
+
+
+def test_a_file_without_a_message_is_whole(tmp_path: Path) -> None:
+    place = tmp_path / "empty.mcap"
+    place.write_bytes(written([]).getvalue())
+    with place.open("rb") as file:
+        reader = make_reader(file, validate_crcs=True)
+        assert list(reader.iter_messages()) == []
+
+
+def test_pictures_that_are_alike_are_stored_once() -> None:
+    rng = np.random.default_rng(6)
+    still = rng.integers(0, 2**16, (240, 320)).astype("<u2")
+    pictures = []
+    for k in range(10):
+        picture = still.copy()
+        picture[20 + k : 40 + k, 30:60] = k
+        pictures.append(picture.tobytes())
+    size = len(written([("/a", k, data) for k, data in enumerate(pictures)], 10**9).getvalue())
+    assert size < 1.2 * len(pictures[0])
