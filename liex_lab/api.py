@@ -1,4 +1,4 @@
-"""Public Python interface: one function for each job of the command line.
+"""Public Python interface: the jobs of the command line that scripts ask for.
 
 `run_session` is `liex run`, `run_demo` is `liex demo`, and so on. The folders `pipelines` (jobs)
 and `dashboards` (views) do not import each other; this module hands the views, which are the layout

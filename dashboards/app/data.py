@@ -23,6 +23,8 @@ from liex_lab.sessions import Session
 from liex_lab.sessions.corrections import LOG, corrected_folder
 from liex_lab.sessions.listed import WHO, Entry
 
+from ..report.quality import warnings
+
 if TYPE_CHECKING:
     import pandas as pd
 
@@ -382,7 +384,7 @@ def _quality(session: Session) -> dict[str, Any]:
         "predicted_error_mm": float(error.median()),
         "n_flips": len(flips),
         "flips_s": float((flips["stop_s"] - flips["start_s"]).sum()),
-        "warnings": len(session.metadata["problems"]),
+        "warnings": len(warnings(session)),
         "damage": "",
     }
 

@@ -106,7 +106,9 @@ class _Chunk:
 class McapFile:
     """Writer of one MCAP file with an index; call `log`, `flush` at will, and `close` once."""
 
-    def __init__(self, sink: Sink, *, profile: str, library: str, level: int, chunk_size: int):
+    def __init__(
+        self, sink: Sink, *, profile: str, library: str, level: int, chunk_size: int
+    ) -> None:
         """Write the file's beginning.
 
         Args:

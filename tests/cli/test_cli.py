@@ -208,6 +208,8 @@ def test_run_ends_with_how_it_went_and_exit_code_4_where_someone_has_to_look(
     words = ["run", "m01.mcap", "--out", str(tmp_path), *["--accept"] * accepted]
     result = CliRunner().invoke(cli.app, words)
     assert result.exit_code == code, result.output
+    size = (tmp_path / "session.json").stat().st_size
+    assert f"on disk: {size / 1e6:.1f} MB" in result.output
     last = result.output.strip().splitlines()[-1]
     assert last.startswith("result:  9 frames, 8 with a pose (89%), 7 of them trusted")
     assert ("look at it" in last) == bool(reasons)

@@ -26,6 +26,7 @@ from liex_lab.optics.refraction import Water
 from liex_lab.recordings.timestamps import find_gaps, median_step
 from liex_lab.sessions import Session, SessionWriter
 from liex_lab.sessions.rrd import PALETTE
+from liex_lab.sessions.verdict import Verdict
 from liex_lab.tables import schema
 from tests.conftest import REPOSITORY
 from tests.sessions.walking_mouse import WalkingMouse, steady, write
@@ -115,6 +116,18 @@ def test_warnings_come_before_everything_else_and_say_what_is_wrong(session, pag
     assert page.index("Read this first") < page.index('class="cards"')
     shares = [share for _, share, _, _ in frame_account(session)]
     assert sum(shares) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("caution", ["", "2 animals are in view and one of them is followed"])
+def test_a_report_with_something_to_say_does_not_say_that_there_is_nothing(
+    session, monkeypatch, caution
+):
+    monkeypatch.setattr("liex_lab.dashboards.report.report.warnings", lambda _: [])
+    verdict = Verdict(9, 9, 9, 9, 2.0, 1, (), (caution,) if caution else ())
+    monkeypatch.setitem(session.metadata, "verdict", verdict.to_dict())
+    page = render(session)
+    assert ("Nothing to warn of" in page) == (not caution)
+    assert caution in page
 
 
 def test_exchanges_of_head_and_tail_are_warned_of_and_listed(session, monkeypatch):
