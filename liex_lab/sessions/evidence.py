@@ -57,6 +57,7 @@ def write_evidence(folder: Path, seen: Observations, subject: Subject) -> None:
         "joint_share": list(subject.joint_share),
         "stretch_sd": subject.stretch_sd,
         "unseen": None if subject.unseen is None else list(subject.unseen),
+        "n_animals": subject.n_animals,
     }
     told = np.frombuffer(json.dumps(facts).encode(), np.uint8)
     columns = {"subject": told, **{name: getattr(seen, name) for name in COLUMNS}}
@@ -140,6 +141,7 @@ def read_evidence(session: Session) -> tuple[Observations, Subject]:
             tuple(float(share) for share in facts["joint_share"]),
             None if stretch is None else float(stretch),
             None if unseen is None else (float(unseen[0]), float(unseen[1])),
+            int(facts.get("n_animals", 1)),
         )
     return seen, subject
 

@@ -29,6 +29,7 @@ class TransitionCosts(NamedTuple):
         bend: standard deviation of the posture about it, lengths a second.
         tail: costs above this grow as logarithms, nats.
         ceiling: the most that a transition costs, nats.
+        elsewhere: the most that it costs for how far the middle moves, where that is more.
         length: spine length of the animal, mm.
     """
 
@@ -37,6 +38,7 @@ class TransitionCosts(NamedTuple):
     bend: float
     tail: float
     ceiling: float
+    elsewhere: float
     length: float
 
 
@@ -105,8 +107,9 @@ def transition_cost(joints_a, joints_b, error_a, error_b, dt, costs):
         bend += np.sqrt(off) / n
     seen = costs.error_factor**2 * (error_a * error_a + error_b * error_b)
     cost = 0.5 * shift / (seen + (costs.shift * costs.length * dt) ** 2)
+    most = max(costs.ceiling, min(cost, costs.elsewhere))
     cost += 0.5 * bend * bend / (seen + (costs.bend * costs.length * dt) ** 2)
-    return min(costs.tail * np.log1p(cost / costs.tail), costs.ceiling)
+    return min(costs.tail * np.log1p(cost / costs.tail), most)
 
 
 @njit(cache=True)

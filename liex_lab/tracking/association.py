@@ -44,6 +44,9 @@ _AROUND_S = 0.2
 _BACKS_UP = 0.6
 _BACKWARD = 60.0
 _JUMPS = 25.0
+# of several animals one is told from another by nothing but its place: to be elsewhere costs up to
+# so many times a transition's ceiling
+_OTHER = 20.0
 NONE = kernels.NONE
 
 
@@ -83,10 +86,18 @@ class HypothesisAssociation:
             moved.
         length_mm: spine length of the animal, mm.
         tuning: costs.
+        n_animals: how many animals are in view at once.
     """
 
-    def __init__(self, skeleton: Skeleton, length_mm: float, tuning: AssociationCosts) -> None:
+    def __init__(
+        self,
+        skeleton: Skeleton,
+        length_mm: float,
+        tuning: AssociationCosts,
+        n_animals: int = 1,
+    ) -> None:
         self._tuning = tuning
+        self._alone = n_animals < 2
         self._skeleton = skeleton
         self._length_mm = length_mm
         self._score_mm = tuning.score_mm * skeleton.relative_size
@@ -98,6 +109,7 @@ class HypothesisAssociation:
             float(tuning.bend),
             float(tuning.tail),
             float(tuning.ceiling),
+            float(tuning.ceiling) * (1.0 if self._alone else _OTHER),
             float(length_mm),
         )
 
@@ -181,7 +193,21 @@ class HypothesisAssociation:
                 ahead = joints[around, :, -1] - joints[around, :, 0]
                 backward = backward_cost(seen[around], ahead, self._length_mm)
                 cost[rows] += backward[rows.start - first :][: rows.stop - rows.start]
+            if not self._alone:
+                cost[rows] -= self._likeness(cost[rows])
         return cost
+
+    def _likeness(self, cost: Array) -> Array:
+        """What (n, H) of a thing's cost says nothing where several animals are in view.
+
+        Of two animals the one whose build the metric knows better scores better in every frame,
+        which is no reason to change over to it. So what the likelier way round of a thing costs, up
+        to the price of passing a frame by, counts for nothing; the difference between its ways
+        stays.
+        """
+        other = np.arange(cost.shape[1]) ^ 1
+        likelier = np.fmin(cost, cost[:, other])
+        return np.asarray(np.minimum(likelier, self._tuning.none))
 
     def _strangeness(self, seen: Observations) -> float:
         """How many times worse than ordinary the metric scores the poses of this animal, 1 or more.

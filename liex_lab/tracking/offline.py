@@ -43,6 +43,7 @@ from liex_lab.tracking.trust import (
     elsewhere,
     gone_behind,
     share_in_view,
+    together,
     usual_pixels,
 )
 
@@ -83,6 +84,7 @@ class Subject:
         unseen: standard deviations over the length of the joints' height and of their place along
             the body that a session's own shape leaves; None without one, which takes those of
             `Motion`.
+        n_animals: how many animals are in view at once, one of which is followed.
     """
 
     skeleton: Skeleton
@@ -94,6 +96,7 @@ class Subject:
     joint_share: tuple[float, ...]
     stretch_sd: float | None = None
     unseen: tuple[float, float] | None = None
+    n_animals: int = 1
 
 
 def track_whole(
@@ -120,7 +123,9 @@ def track_whole(
         The track (n rows) and the flips, those found and those of `corrections`, in order of time.
     """
     tuning = tuning or TrackingParameters.of(subject.skeleton.name)
-    chain = HypothesisAssociation(subject.skeleton, subject.length_mm, tuning.chain)
+    chain = HypothesisAssociation(
+        subject.skeleton, subject.length_mm, tuning.chain, subject.n_animals
+    )
     joints = chain.joints(seen, allocate)
     emission = chain.emission(seen, joints, allocate)
     path = chain.path(seen, joints=joints, allocate=allocate, emission=emission)
@@ -180,6 +185,8 @@ def track_whole(
     bridged &= ~strayed & ~hidden  # what is in view is measured, or it has no pose
     hidden |= (in_view < MOSTLY) & ~bridged
     strayed |= contradicted(seen, path, subject.length_mm) | (in_view < WHOLE)
+    if subject.n_animals > 1:
+        strayed |= together(seen, path, usual_px)
     for rows in blocks(len(seen), _BLOCK):
         _mask_and_flag(
             subject,

@@ -172,6 +172,7 @@ class FrameTracker:
             share,
             self.stretch_sd,
             self.shape.build.unseen if self.shape and self.shape.build else None,
+            1 if self.sample_fit is None else self.sample_fit.n_animals,
         )
 
     @property

@@ -89,6 +89,19 @@ def usual_pixels(seen: Observations, path: NDArray[np.int64]) -> float:
     return float(np.median(shown[taken])) if taken.any() else 0.0
 
 
+def together(
+    seen: Observations, path: NDArray[np.int64], usual_px: float
+) -> NDArray[np.bool_]:
+    """Whether (n,) an animal touches another, so that both are one thing in the picture.
+
+    Args:
+        seen: hypotheses (n, H) of the frames.
+        path: (n,) which of them is meant, negative for none.
+        usual_px: pixels that the animal usually shows.
+    """
+    return np.asarray((path >= 0) & (seen.along(seen.n_px, path) > _MOST_SHOWN * usual_px))
+
+
 def share_in_view(seen: Observations, path: NDArray[np.int64], usual_px: float) -> Array:
     """The share (n,) of an animal that is in view where something stands before the rest of it.
 
