@@ -45,8 +45,8 @@ class OnlineTracker:
         self._lag = lag
         self._motion = tuning.motion
         self._chain = HypothesisAssociation(
-        subject.skeleton, subject.length_mm, tuning.chain, subject.n_animals
-    )
+            subject.skeleton, subject.length_mm, tuning.chain, subject.n_animals
+        )
         self._seen: Observations | None = None
         self._told = 0  # of the window's frames
         self._path: NDArray[np.int64] = np.zeros(0, np.int64)

@@ -89,9 +89,7 @@ def usual_pixels(seen: Observations, path: NDArray[np.int64]) -> float:
     return float(np.median(shown[taken])) if taken.any() else 0.0
 
 
-def together(
-    seen: Observations, path: NDArray[np.int64], usual_px: float
-) -> NDArray[np.bool_]:
+def together(seen: Observations, path: NDArray[np.int64], usual_px: float) -> NDArray[np.bool_]:
     """Whether (n,) an animal touches another, so that both are one thing in the picture.
 
     Args:

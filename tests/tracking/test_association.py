@@ -102,3 +102,45 @@ def test_joints_of_another_number_are_refused():
         CHAIN.path(seen, joints=CHAIN.joints(seen)[:, :, :3])
     with pytest.raises(ValueError, match="path of hypotheses"):
         CHAIN.doubt(seen, np.zeros(3, np.int64))
+
+
+def two_animals(n: int = 90) -> tuple[Observations, np.ndarray]:
+    """Two mice 200 mm apart, the likelier one first in each frame; and where the second of them is.
+
+    For the first ten frames the second one is the likelier by 2 nats, then the first one is.
+    """
+    clock = np.arange(n) / 30.0
+    here = walk(clock)
+    there = walk(clock)
+    there.root.translation[:, 0] += 200.0
+    seen = told(clock, here)
+    other = told(clock, there)
+    first = np.arange(n) < 10
+    for name in ("turn", "place", "angles", "scale", "error_mm", "score", "n_px"):
+        ours, theirs = (getattr(one, name)[:, :2].copy() for one in (seen, other))
+        mask = first.reshape(-1, *[1] * (ours.ndim - 1))
+        getattr(seen, name)[:, :2] = np.where(mask, theirs, ours)
+        getattr(seen, name)[:, 2:] = np.where(mask, ours, theirs)
+    seen.score[:, 2:] = seen.score[:, :2] + 2.0 * COSTS.score_mm
+    return seen, np.where(first, 0, 2)
+
+
+def test_of_two_animals_the_one_that_is_followed_stays_the_one_that_was_followed():
+    seen, second = two_animals()
+    path = HypothesisAssociation(MOUSE, MOUSE.length, COSTS, 2).path(seen)
+    assert len(set((path // 2 * 2 == second).tolist())) == 1
+    alone = CHAIN.path(seen)  # of which one is no animal: the likelier one is taken in the end
+    assert (alone[30:] == 0).all()
+
+
+def test_head_and_tail_of_one_of_two_animals_are_told_as_those_of_a_lone_one():
+    seen, second = two_animals()
+    seen.score[:, [0, 2]], seen.score[:, [1, 3]] = seen.score[:, [1, 3]], seen.score[:, [0, 2]]
+    path = HypothesisAssociation(MOUSE, MOUSE.length, COSTS, 2).path(seen)
+    assert (path % 2 == 1).all()
+
+
+def test_one_animal_is_associated_as_ever_whatever_is_said_of_their_number():
+    seen = told(CLOCK, walk(CLOCK), flipped=np.arange(20) == 12)
+    several = HypothesisAssociation(MOUSE, MOUSE.length, COSTS, 3)
+    np.testing.assert_array_equal(several.path(seen), CHAIN.path(seen))
