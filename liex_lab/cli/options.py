@@ -40,7 +40,10 @@ AnimalName = Annotated[
     str, typer.Option("--animal", help="fish, mouse, hand, or a skeleton's .toml file.")
 ]
 VariantName = Annotated[
-    str, typer.Option("--variant", help="default, or paper: as the paper describes it, on fewer pictures.")
+    str,
+    typer.Option(
+        "--variant", help="default, or paper: as the paper describes it, on fewer pictures."
+    ),
 ]
 RowName = Annotated[
     str,

@@ -134,7 +134,7 @@ def test_of_two_animals_the_one_that_is_followed_stays_the_one_that_was_followed
 
 
 def test_head_and_tail_of_one_of_two_animals_are_told_as_those_of_a_lone_one():
-    seen, second = two_animals()
+    seen, _ = two_animals()
     seen.score[:, [0, 2]], seen.score[:, [1, 3]] = seen.score[:, [1, 3]], seen.score[:, [0, 2]]
     path = HypothesisAssociation(MOUSE, MOUSE.length, COSTS, 2).path(seen)
     assert (path % 2 == 1).all()
