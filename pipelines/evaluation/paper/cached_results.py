@@ -1,9 +1,12 @@
 """Cache of evaluation results whose models take long to train: JSON in `datasets/kept_results`.
 
 Each row is kept with how it was made (recipe, method, command, version) and with hashes of code,
-training pictures, models, test pictures and foreground; it is used again only where all of them
-agree with what would be measured now, and refused with the reason where one does not. The files are
-part of the repository, so they hold what the page needs and no more, a list a line.
+training pictures, models, test pictures and foreground; it is used again where all of them agree
+with what would be measured now. Code, recipe and method must. The hashes of pictures and models
+change with the last digit of a float, and so with the kind of processor: a row that was kept on
+another one is used where what it was given agrees in numbers (`given`), and the tables say so.
+Anything else is refused with the reason. The files are part of the repository, so they hold what
+the page needs and no more, a list a line.
 """
 
 from __future__ import annotations
@@ -17,13 +20,14 @@ from liex_lab.catalog import kept_results_folder
 from liex_lab.errors import LiexError
 
 from .fingerprints import fingerprint_of
+from .given import Given, processor, training_differs
+from .results import ELSEWHERE
 from .rows import SWEPT
 
 if TYPE_CHECKING:
     from .common_view import CommonView
 
 SCHEMA = 3
-_HASHED = {"learning_code": "code", "training_pictures": "training pictures"}
 _DIGITS = 6  # significant ones of a measured number
 _LINE = 160  # characters of a value that stands on one line
 
@@ -51,6 +55,11 @@ def kept_results(animal: str, folder: Path | None = None) -> dict[str, Any]:
         raise LiexError(
             f"the kept results {path} are of schema {kept.get('schema')}, not {SCHEMA}; use --fresh"
         )
+    described = kept.pop("given", {})
+    for row in kept["rows"].values():
+        for numbers in row["splits"].values():
+            if numbers["fingerprint"] in described:
+                numbers["given"] = described[numbers["fingerprint"]]
     return dict(kept)
 
 
@@ -78,6 +87,7 @@ def keep_results(
         "animal": animal,
         "rows": {name: _kept(name, row) for name, row in rows.items() if name != "default"},
         "sensitivity": dict(sensitivity),
+        "given": _given(rows),
     }
     path.write_text(_a_list_a_line(content) + "\n", encoding="utf-8")
     return path
@@ -85,11 +95,26 @@ def keep_results(
 
 def _kept(variant: str, row: Mapping[str, Any]) -> dict[str, Any]:
     """What is kept of a row."""
-    measured = ("splits", "rate")  # what it was made from is compared to the last digit
+    # what it was made from is compared to the last digit, and is not rounded
+    splits = {
+        split: {key: _rounded(value) for key, value in numbers.items() if key != "given"}
+        for split, numbers in row["splits"].items()
+    }
     return {
-        key: _rounded(value) if key in measured else value
-        for key, value in row.items()
-        if key != "failures" or variant in SWEPT
+        **{key: value for key, value in row.items() if key != "failures" or variant in SWEPT},
+        "splits": splits,
+        "rate": _rounded(row["rate"]),
+    }
+
+
+def _given(rows: Mapping[str, Any]) -> dict[str, Any]:
+    """What the kept rows were given, by the fingerprint of a split: mostly all were given alike."""
+    return {
+        numbers["fingerprint"]: numbers["given"]
+        for name, row in rows.items()
+        if name != "default"
+        for numbers in row["splits"].values()
+        if "given" in numbers
     }
 
 
@@ -121,6 +146,7 @@ def why_refused(
     made_from: Mapping[str, Any],
     hashes: Mapping[str, Any],
     views: Mapping[str, Sequence[CommonView]],
+    given: Mapping[str, Given],
 ) -> str:
     """Why a kept row must not stand for what would be measured now; empty where it may.
 
@@ -131,19 +157,84 @@ def why_refused(
             `run.hashes_of`.
         views: what every row is given now, by split and recording; a kept row of more recordings
             does not fit.
+        given: the same in numbers, by split.
     """
     made = row["made"]
     if made["from"] != json.loads(json.dumps(made_from)):
         return "the kept row is of another training or method"
-    for name, what in _HASHED.items():
-        if made.get(name) != hashes[name]:
-            return f"the kept row is of other {what}"
-    known = made.get("models", [])
-    if len(known) != len(hashes["models"]) or any(
-        now is not None and now != then for now, then in zip(hashes["models"], known, strict=True)
+    if made.get("learning_code") != hashes["learning_code"]:
+        return "the kept row is of other code"
+    if len(made.get("models", [])) != len(hashes["models"]):
+        return "the kept row is of another number of models"
+    other = _other_hash(row, hashes, views)
+    if not other:
+        return ""
+    why = f"the kept row is of {other}"
+    if made.get("processor", processor()) == processor():  # or nobody knows of which
+        return why
+    if apart := _apart(row, hashes, given):
+        return f"{why}, and its processor ({made['processor']}) does not explain that: {apart}"
+    return ""
+
+
+def _other_hash(
+    row: Mapping[str, Any], hashes: Mapping[str, Any], views: Mapping[str, Sequence[CommonView]]
+) -> str:
+    """What was made with other floats than today's, by its hash; '' where nothing was."""
+    made = row["made"]
+    if made.get("training_pictures") != hashes["training_pictures"]:
+        return "other training pictures"
+    if any(
+        now is not None and now != then
+        for now, then in zip(hashes["models"], made.get("models", []), strict=True)
     ):
-        return "the kept row is of another model file"
+        return "another model file"
     for split, ours in views.items():
         if row["splits"].get(split, {}).get("fingerprint") != fingerprint_of(ours):
-            return f"the kept row is of other test pictures or another foreground on {split}"
+            return f"other test pictures or another foreground on {split}"
     return ""
+
+
+def _apart(row: Mapping[str, Any], hashes: Mapping[str, Any], given: Mapping[str, Given]) -> str:
+    """In what a row was given something else than it would be today, in numbers; '' in nothing."""
+    trained = row["made"].get("training_given")
+    if trained is None:
+        return "nothing tells its training pictures in numbers"
+    if told := training_differs(trained, hashes["training_given"]):
+        return told
+    for split, today in given.items():
+        then = row["splits"].get(split, {}).get("given")
+        if then is None:
+            return f"nothing tells in numbers what it was given on {split}"
+        if told := Given.from_dict(then).differs(today):
+            return f"on {split}, {told}"
+    return ""
+
+
+def taken(
+    row: Mapping[str, Any],
+    hashes: Mapping[str, Any],
+    views: Mapping[str, Sequence[CommonView]],
+    given: Mapping[str, Given],
+) -> dict[str, Any]:
+    """A kept row that is not refused, as it stands in the results.
+
+    Where every hash is today's, the row was given what is given today: it gets the numbers that say
+    so, and today's processor as the one on which its pictures come out, unless it has its own.
+    Where one is not, the row names the processor that it is of (`other_processor`).
+
+    Args:
+        row: the kept row.
+        hashes: of today's training pictures and models, and the pictures in numbers.
+        views: what every row is given now, by split and recording.
+        given: the same in numbers, by split.
+    """
+    made = row["made"]
+    if _other_hash(row, hashes, views):
+        return {**row, ELSEWHERE: made["processor"]}
+    known = {"training_given": hashes["training_given"], "processor": processor()}
+    splits = {
+        split: {"given": given[split].to_dict(), **numbers} if split in given else numbers
+        for split, numbers in row["splits"].items()
+    }
+    return {**row, "made": {**known, **made}, "splits": splits}

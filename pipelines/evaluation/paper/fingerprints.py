@@ -110,16 +110,31 @@ def training_pictures(variant: str, animal: str) -> str:
         variant: a row of the tables.
         animal: a bundled animal's name.
     """
-    return _first_pictures("default" if variant == "default" else "paper", animal)
+    return _first_pictures(_base_of(variant), animal)[0]
+
+
+def training_given(variant: str, animal: str) -> dict[str, float]:
+    """What is in these pictures, see `given.of_training`.
+
+    Args:
+        variant: a row of the tables.
+        animal: a bundled animal's name.
+    """
+    return _first_pictures(_base_of(variant), animal)[1]
+
+
+def _base_of(variant: str) -> str:
+    return "default" if variant == "default" else "paper"
 
 
 @cache
-def _first_pictures(base: str, animal: str) -> str:
+def _first_pictures(base: str, animal: str) -> tuple[str, dict[str, float]]:
     from liex_lab.body.skeleton import Skeleton
     from liex_lab.estimation.method import method_of
     from liex_lab.runtime.progress import silent
 
     from ...training.pose_model import recipe_of, rendered_set
+    from .given import of_training
 
     skeleton = Skeleton.load(animal)
     data = rendered_set(
@@ -127,7 +142,7 @@ def _first_pictures(base: str, animal: str) -> str:
     )
     told = hashlib.sha256(data.images.heights.tobytes())
     told.update(data.truth.positions.round(3).tobytes())
-    return told.hexdigest()[:_DIGITS]
+    return told.hexdigest()[:_DIGITS], of_training(data)
 
 
 def fingerprint_of(views: Sequence[CommonView]) -> str:
@@ -160,8 +175,7 @@ def model_digests(animal: str, variant: str, draws: int) -> list[str | None]:
         skeleton = Skeleton.load(animal)
         paths = [cached_baseline(variant, skeleton, training_of(variant, skeleton))]
     else:
-        base = "default" if variant == "default" else "paper"
-        paths = [cache_path(animal, base, draw) for draw in range(draws)]
+        paths = [cache_path(animal, _base_of(variant), draw) for draw in range(draws)]
     return [
         hashlib.sha256(path.read_bytes()).hexdigest()[:_DIGITS] if path.is_file() else None
         for path in paths

@@ -5,6 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
+ELSEWHERE = (
+    "other_processor"  # of a kept row: the processor, where the row is of another's pictures
+)
+
 
 @dataclass
 class Results:

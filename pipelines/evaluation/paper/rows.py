@@ -25,6 +25,7 @@ from ...build import plan_of
 from .common_view import CommonView, common_view, measured
 from .examples import examples_in, failures_in
 from .fingerprints import fingerprint_of
+from .given import Given
 from .trained_by import baseline_of_today, paper_of_today
 
 if TYPE_CHECKING:
@@ -102,7 +103,7 @@ def measured_rows(
     chooser: PoseEstimator,
     tests: Mapping[str, Sequence[TrueRecording]],
     progress: Progress,
-) -> tuple[dict[str, dict[str, Any]], dict[str, list[CommonView]]]:
+) -> tuple[dict[str, dict[str, Any]], dict[str, list[CommonView]], dict[str, Given]]:
     """What is measured of each row, and what each was given.
 
     Every recording is rendered and its scene learned once.
@@ -116,40 +117,44 @@ def measured_rows(
 
     Returns:
         By row `splits` and `rate`, `examples` and `failures`; and by split the view of each of its
-        recordings.
+        recordings, and what was given in them in numbers.
     """
     rows: dict[str, dict[str, Any]] = {
         name: {"splits": {}, "examples": [], "failures": []} for name in runs
     }
     views: dict[str, list[CommonView]] = {}
+    given: dict[str, Given] = {}
     for split, sessions in tests.items():
         measured_ones = []
         for k, recording in enumerate(sessions):
             progress(k, len(sessions), f"measuring {recording.name}")
             measured_ones.append(_measure(recording, animal, runs, chooser))
         views[split] = [one.view for one in measured_ones]
+        given[split] = Given.join([one.given for one in measured_ones])
         for name in runs:
             errors = [
                 PoseErrors.join(list(of_run))
                 for of_run in zip(*(one.errors[name] for one in measured_ones), strict=True)
             ]
             first = [one.first[name] for one in measured_ones]
-            rows[name]["splits"][split] = numbers_of(errors, views[split])
+            numbers = numbers_of(errors, views[split])
+            rows[name]["splits"][split] = {**numbers, "given": given[split].to_dict()}
             rows[name]["examples"] += examples_in(split, first, sessions)
             rows[name]["failures"] += failures_in(split, first, sessions)
     progress(0, None, "timing")
     timed = {name: some[0] for name, some in runs.items()}
     for name, rate in rates_of(animal, timed, next(iter(tests.values()))).items():
         rows[name]["rate"] = rate
-    return rows, views
+    return rows, views, given
 
 
 class _Measured(NamedTuple):
-    """One recording: what every row is given; by row the errors of its runs, and the joints (n, J,
-    3) mm that the first of them finds.
+    """One recording: what every row is given, as it is and in numbers; by row the errors of its
+    runs, and the joints (n, J, 3) mm that the first of them finds.
     """
 
     view: CommonView
+    given: Given
     errors: dict[str, list[PoseErrors]]
     first: dict[str, Array]
 
@@ -161,7 +166,7 @@ def _measure(
     chooser: PoseEstimator,
 ) -> _Measured:
     scene, frames, view = common_view(recording, plan_of(animal), chooser)
-    out = _Measured(view, {name: [] for name in runs}, {})
+    out = _Measured(view, Given.of(frames, view), {name: [] for name in runs}, {})
     cut: dict[Any, Any] = {}
     tip = chooser.skeleton.tip
     for name, subjects in runs.items():

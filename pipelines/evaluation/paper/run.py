@@ -6,8 +6,9 @@ learned metric, and the baselines RF and CNN. All see the same frames and, in ea
 with the same size (`common_view`). Numbers: those of `rows`, 101 quantiles of the error (Fig 8),
 frames/s on at most two cores, sensitivity to five parameters (Fig 7), candidates and convergence of
 one image (Fig 13 to 16). Rows whose models take long to train come from kept results where these
-are of today's code, training and test pictures; a row of which they are not is left out, and the
-command that measures it anew stands in its place.
+are of today's code, training and test pictures, to the last digit or, of another processor's, in
+numbers (`given`); a row of which they are not is left out, and the command that measures it anew
+stands in its place.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from liex_lab.evaluation.pose import plain
 from liex_lab.runtime.progress import Progress, silent
 
 from .budget import CURVES, Budget
-from .results import Results
+from .results import ELSEWHERE, Results
 from .rows import ROWS, SWEPT, TRAINING_DRAWS
 
 if TYPE_CHECKING:
@@ -36,6 +37,7 @@ if TYPE_CHECKING:
     from .common_view import CommonView
     from .drawers import Drawers
     from .further import Further
+    from .given import Given
     from .rows import Subject
 
 _N_SESSIONS = 40
@@ -146,7 +148,7 @@ def _command(
 
 def _unmarked(rows: Mapping[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
     return {
-        name: {key: value for key, value in row.items() if key != "origin"}
+        name: {key: value for key, value in row.items() if key not in ("origin", ELSEWHERE)}
         for name, row in rows.items()
     }
 
@@ -172,8 +174,8 @@ def results_of(animal: str, budget: Budget, command: str, progress: Progress) ->
     chooser = cast("PoseEstimator", default["default"][0])
     wanted = [name for name in budget.fresh if name != "default"]
     runs = default | _subjects(animal, wanted, budget, results, progress)
-    rows, views = measured_rows(animal, runs, chooser, tests, progress)
-    kept = _kept(skeleton, budget, tests, views, results)
+    rows, views, given = measured_rows(animal, runs, chooser, tests, progress)
+    kept = _kept(skeleton, budget, tests, views, given, results)
     for name, row in rows.items():
         made = {"quick": True} if budget.quick else made_from(name, skeleton)
         known = {} if budget.quick else hashes_of(animal, name)
@@ -230,10 +232,11 @@ def _kept(
     budget: Budget,
     tests: Mapping[str, Sequence[TrueRecording]],
     views: Mapping[str, Sequence[CommonView]],
+    given: Mapping[str, Given],
     results: Results,
 ) -> Mapping[str, Any]:
     """Kept rows that fit go into the results, why another does not into `missing`; the curves."""
-    from .cached_results import kept_results, why_refused
+    from .cached_results import kept_results, taken, why_refused
     from .kept_examples import examples_of_kept
 
     if not budget.kept:
@@ -248,12 +251,12 @@ def _kept(
         row = kept["rows"].get(name)
         why = "no row is kept"
         if row is not None:
-            made = made_from(name, skeleton)
-            why = why_refused(row, made, hashes_of(skeleton.name, name), views)
+            made, hashes = made_from(name, skeleton), hashes_of(skeleton.name, name)
+            why = why_refused(row, made, hashes, views, given)
         if row is None or why:
             results.missing[name] = f"{why}; {_anew(skeleton.name, name)} measures it"
         else:
-            results.rows[name] = {**row, "origin": "kept"}
+            results.rows[name] = {**taken(row, hashes, views, given), "origin": "kept"}
             if found := examples_of_kept(skeleton.name, name, row, tests, views):
                 results.rows[name]["examples"] = found
     return cast("Mapping[str, Any]", kept["sensitivity"])
@@ -305,17 +308,18 @@ def made_from(variant: str, skeleton: Skeleton) -> dict[str, Any]:
 
 
 def hashes_of(animal: str, variant: str) -> dict[str, Any]:
-    """Hashes of what a row was made with today, see `fingerprints`.
+    """Hashes of what a row was made with today, see `fingerprints`, and its pictures in numbers.
 
     Args:
         animal: the animal's name.
         variant: a name of `ROWS`.
     """
-    from .fingerprints import learning_code, model_digests, training_pictures
+    from .fingerprints import learning_code, model_digests, training_given, training_pictures
 
     return {
         "learning_code": learning_code(variant),
         "training_pictures": training_pictures(variant, animal),
+        "training_given": training_given(variant, animal),
         "models": model_digests(animal, variant, TRAINING_DRAWS.get(variant, 1)),
     }
 
@@ -323,6 +327,8 @@ def hashes_of(animal: str, variant: str) -> dict[str, Any]:
 def _made_by() -> dict[str, str]:
     """The program and the machine."""
     from liex_lab.sessions.provenance import package_version
+
+    from .given import processor
 
     sources = hashlib.sha256()
     for path in sorted(MODELS.parent.rglob("*.py")):
@@ -332,6 +338,7 @@ def _made_by() -> dict[str, str]:
         "version": package_version("liex_lab"),
         "code": sources.hexdigest()[:12],
         "machine": machine,
+        "processor": processor(),
     }
 
 

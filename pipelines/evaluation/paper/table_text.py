@@ -19,7 +19,9 @@ from typing import TYPE_CHECKING, Any
 from liex_lab.evaluation.pose import POSE_PROTOCOL, plain
 
 from .deviations import DEVIATIONS, HAND
+from .given import elsewhere
 from .published import OTHERS_FPS, OTHERS_MM, PUBLISHED_FPS, PUBLISHED_MM, TITLES
+from .results import ELSEWHERE
 
 if TYPE_CHECKING:
     from .results import Results
@@ -49,6 +51,8 @@ _COLUMNS = (
     "published_mean_joint_error_mm",
     "published_frames_per_s",
     "origin",
+    "processor",
+    ELSEWHERE,
     "seed",
     "version",
     "command",
@@ -85,8 +89,10 @@ HOW = (
     "animals: they show the order of the methods, and are not to be compared with ours in "
     "millimetres. A row is *measured* in this run, or *kept*: measured earlier, with the command, "
     "seeds and version below; kept rows are of the same test pictures, foreground, training and "
-    "code, by their hashes, and are left out where these differ. Frames/s count the foreground "
-    "too, on frames in memory; those of a kept row are of another run, so compare its ratio to "
+    "code, by their hashes, and are left out where these differ. Of a row of *another "
+    "processor*, whose pictures differ in the last digit of a number, code and recipe are the "
+    "same, and what it was given agrees in numbers. Frames/s count the foreground too, on frames "
+    "in memory; those of a kept row are of another run, so compare its ratio to "
     "the default, which was timed beside it."
 )
 SEALED = (
@@ -172,6 +178,8 @@ def _by_split(results: Results) -> dict[str, dict[str, dict[str, Any]]]:
                 "training_images": _training_images(row),
                 "seeds": row["made"].get("seeds"),
                 "origin": row["origin"],
+                "processor": row["made"].get("processor"),
+                ELSEWHERE: row.get(ELSEWHERE),
             }
             for variant, row in results.rows.items()
         }
@@ -194,6 +202,8 @@ def _rows(results: Results, only_rates: bool) -> Iterator[dict[str, Any]]:
             "method": TITLES[variant],
             "variant": variant,
             "origin": row["origin"],
+            "processor": row["made"].get("processor"),
+            ELSEWHERE: row.get(ELSEWHERE),
             **row["rate"],
             "published_mean_joint_error_mm": published.get(variant),
             "published_frames_per_s": PUBLISHED_FPS.get(results.animal)
@@ -247,7 +257,7 @@ def error_table(results: Results) -> tuple[list[str], list[list[str]]]:
         cells = [""] * len(results.splits)
         if row is not None:
             cells = [_median(row["splits"][split]) for split in results.splits]
-        origin = "not measured" if row is None else row["origin"]
+        origin = "not measured" if row is None else _origin(row)
         rows.append([title, *cells, _number(published.get(variant)), origin])
     if results.animal == "hand":
         for title, value in OTHERS_MM.items():
@@ -279,6 +289,11 @@ def mean_table(results: Results) -> tuple[list[str], list[list[str]]]:
     return [*head, "lost, %", "frames"], rows
 
 
+def _origin(row: dict[str, Any]) -> str:
+    """Measured in this run, or kept, and then on what other processor."""
+    return f"{row['origin']}{', another processor' if row.get(ELSEWHERE) else ''}"
+
+
 def _median(numbers: dict[str, Any]) -> str:
     """Median with its interval."""
     bounds = numbers.get("interval95")
@@ -297,7 +312,9 @@ def _flips(numbers: dict[str, Any]) -> str:
 
 
 def words(results: Results, quick: bool) -> list[str]:
-    """Which rows are missing and, unless the run was quick, where the order is not the paper's.
+    """Which rows are missing or of another processor, and where the order is not the paper's.
+
+    Of a quick run nothing is said of the order.
 
     Args:
         results: of one animal.
@@ -309,6 +326,9 @@ def words(results: Results, quick: bool) -> list[str]:
     sentences = [
         f"{TITLES.get(variant, variant)} was not measured: {why}."
         for variant, why in results.missing.items()
+    ]
+    sentences += [
+        told for name, row in results.rows.items() if (told := elsewhere(TITLES[name], row))
     ]
     if quick:
         return sentences
@@ -375,7 +395,7 @@ def rate_table(results: Sequence[Results]) -> tuple[list[str], list[list[str]]]:
                     rate["picture"],
                     str(rate["cores"]),
                     published,
-                    row["origin"],
+                    _origin(row),
                 ]
             )
     for title, value in OTHERS_FPS.items() if any(r.animal == "hand" for r in results) else ():
@@ -402,11 +422,11 @@ def origin_table(results: Sequence[Results]) -> tuple[list[str], list[list[str]]
                 [
                     r.animal,
                     TITLES[variant],
-                    row["origin"],
+                    _origin(row),
                     str(recipe.get("n_images", "")),
                     f"{recipe.get('seed', '')} ({len(made.get('seeds') or [0])})",
                     f"{made['version']} ({made['code']})",
-                    made["machine"],
+                    ", ".join(filter(None, (made["machine"], made.get("processor")))),
                     f"`{made['command']}`",
                 ]
             )

@@ -27,6 +27,7 @@ from liex_lab.pipelines.evaluation.paper import (
     examples,
     exhibits,
     fingerprints,
+    given,
     kept_examples,
     quick,
     rows,
@@ -368,14 +369,17 @@ def test_a_kept_row_is_refused_for_every_reason_by_its_name():
         "made": {"from": made, **hashes, "models": ["c", "d"]},
         "splits": {"clean": {"fingerprint": fingerprints.fingerprint_of(views["clean"])}},
     }
-    why = cached_results.why_refused
+
+    def why(row: Any, made: Any, hashes: Any, views: Any) -> str:
+        return cached_results.why_refused(row, made, hashes, views, {})
+
     assert why(row, made, hashes, views) == ""
     assert "another training" in why(row, {"recipe": {"n_images": 4}}, hashes, views)
     assert "other code" in why(row, made, hashes | {"learning_code": "z"}, views)
     pictures = hashes | {"training_pictures": "z"}
     assert "other training pictures" in why(row, made, pictures, views)
     assert "another model" in why(row, made, hashes | {"models": ["z", None]}, views)
-    assert "another model" in why(row, made, hashes | {"models": ["c"]}, views)
+    assert "another number of models" in why(row, made, hashes | {"models": ["c"]}, views)
     fewer = {"clean": views["clean"][:1]}  # `--frames` never mixes with kept rows
     turned = {"clean": views["clean"][::-1]}
     for other in (fewer, turned, views | {"hard": views["clean"]}):
@@ -533,7 +537,7 @@ def test_a_sweep_changes_one_number_of_a_method_and_nothing_else():
 def test_a_kept_file_reads_as_what_was_kept_in_it(tmp_path):
     row = {
         "made": {"from": {"lever_mm": 17.034481234, "sizes": [[0.0, 272]]}},
-        "splits": {"clean": {"median_mm": 1.23456789, "flip_rate": None, "n_frames": 2000}},
+        "splits": {"clean": {"median_mm": 1.23456789, "flip_rate": None, "fingerprint": "a"}},
         "rate": {"frames_per_s": 123456.789, "cores": 2},
         "examples": [{"frame": k, "joints_mm": [[0.1, -2.25, 300.0]] * 9} for k in range(3)],
         "failures": [{"frame": 7, "joints_mm": None, "error_mm": 9.5}],
@@ -544,7 +548,7 @@ def test_a_kept_file_reads_as_what_was_kept_in_it(tmp_path):
     told = cached_results.kept_results("mouse", tmp_path)
     assert set(told["rows"]) == {"paper", "rf"}  # the default is measured each time
     rounded = {
-        "splits": {"clean": {"median_mm": 1.23457, "flip_rate": None, "n_frames": 2000}},
+        "splits": {"clean": {"median_mm": 1.23457, "flip_rate": None, "fingerprint": "a"}},
         "rate": {"frames_per_s": 123457.0, "cores": 2},
     }
     assert told["rows"]["paper"] == {**row, **rounded}
@@ -573,12 +577,17 @@ def check_kept(path: Path) -> None:
         assert made["code"]
         assert isinstance(made["from"]["recipe"]["seed"], int)
         assert {"learning_code", "training_pictures", "models", "seeds"} <= set(made)
+        assert ("processor" in made) == ("training_given" in made)
         assert row["rate"]["frames_per_s"] > 0
         assert set(row["splits"]) == set(splits)
         for numbers in row["splits"].values():
             assert numbers["n_frames"] >= 2000
             assert len(numbers["fingerprint"]) == 16
             assert numbers["n_recordings"] == 40
+            assert ("given" in numbers) == ("processor" in made)
+            if "given" in numbers:
+                assert given.Given.from_dict(numbers["given"]).n_frames == numbers["n_frames"]
+                assert len(numbers["given"]["size"]) == 40
             assert len(numbers["joint_mm"]) == skeleton.n_joints
 
 
