@@ -46,7 +46,7 @@ HASHES: dict[str, Any] = {
 }
 VIEWS = {"clean": [view_of_one("x")]}
 TODAY = {"clean": recordings_given()}
-OTHERS = {  # each as another processor's last digit would make it
+OTHERS: dict[str, dict[str, Any]] = {  # each as another processor's last digit would make it
     "training pictures": {"hashes": {"training_pictures": "z"}},
     "model file": {"hashes": {"models": ["z", None]}},
     "test pictures": {"views": {"clean": [view_of_one("z")]}},
@@ -106,7 +106,7 @@ def test_other_code_and_another_training_are_refused_whatever_the_processor():
         assert "another training or method" in told
 
 
-FAR = {
+FAR: dict[str, dict[str, Any]] = {
     "the mean depth of recording 2": {"depth_mm": 2 * given.DEPTH_MM},
     "the unread share of recording 2": {"unread": 2 * given.UNREAD},
     "the animal's size of recording 2": {"size": 3 * given.SIZE},
