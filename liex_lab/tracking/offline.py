@@ -184,9 +184,7 @@ def track_whole(
     hidden = gone_behind(seen, measured, usual_px)
     bridged &= ~strayed & ~hidden  # what is in view is measured, or it has no pose
     hidden |= (in_view < MOSTLY) & ~bridged
-    strayed |= contradicted(seen, path, subject.length_mm) | (in_view < WHOLE)
-    if subject.n_animals > 1:
-        strayed |= together(seen, path, usual_px)
+    strayed |= _doubted(subject, seen, path, in_view, usual_px)
     for rows in blocks(len(seen), _BLOCK):
         _mask_and_flag(
             subject,
@@ -203,6 +201,22 @@ def track_whole(
     return Tracked(
         track, tuple(sorted([*flips, *corrections], key=lambda flip: (flip.start, flip.source)))
     )
+
+
+def _doubted(
+    subject: Subject,
+    seen: Observations,
+    path: NDArray[np.int64],
+    in_view: Array,
+    usual_px: float,
+) -> NDArray[np.bool_]:
+    """Whether (n,) a pose is doubtful for what its picture shows: it contradicts the pose, a part
+    of the animal (1 - `in_view`, (n,)) is behind something, or it touches another animal.
+    """
+    doubted = contradicted(seen, path, subject.length_mm) | (in_view < WHOLE)
+    if subject.n_animals > 1:
+        doubted |= together(seen, path, usual_px)
+    return doubted
 
 
 def _turn_round(
@@ -303,9 +317,9 @@ def to_track(
     bridged = short_gaps(seen.seconds, measured, subject.bridge_s, ahead)
     track = Track.empty(subject.skeleton, seen.times_ns[told])
     _write(subject, track, curve[told], tuning)
-    strayed = contradicted(seen, path, subject.length_mm)
-    in_view = share_in_view(seen, path, usual_pixels(seen, path) if usual_px is None else usual_px)
-    strayed |= in_view < WHOLE
+    usual_px = usual_pixels(seen, path) if usual_px is None else usual_px
+    in_view = share_in_view(seen, path, usual_px)
+    strayed = _doubted(subject, seen, path, in_view, usual_px)
     measured &= in_view >= MOSTLY
     _mask_and_flag(
         subject,

@@ -316,3 +316,19 @@ def test_a_body_turned_round_twice_lies_as_before(truth):
     assert joint_error(again.joints(MOUSE), truth).max() < 0.5
     ends = reversed_pose(MOUSE, truth).joints(MOUSE)
     np.testing.assert_allclose(ends[:, 0], truth.joints(MOUSE)[:, -1], atol=0.5)
+
+
+@pytest.mark.parametrize("n_animals", [1, 2])
+def test_while_two_animals_touch_poses_are_doubtful_live_as_over_the_whole(measured, n_animals):
+    subject = replace(SUBJECT, n_animals=n_animals)
+    seen = told(SECONDS, measured)
+    seen.n_px[60:66, :2] = 1500  # both are one thing
+    online = OnlineTracker(subject, 6)
+    parts = [online.add(seen[k : k + 10]) for k in range(0, len(seen), 10)]
+    rows = [part for part in (*parts, online.close()) if part is not None]
+    for flag in (
+        track_whole(subject, seen).track.flag,
+        np.concatenate([part.flag for part in rows]),
+    ):
+        touching = (flag == "doubtful")[60:66]
+        assert touching.all() if n_animals == 2 else not touching.any()
