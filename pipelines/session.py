@@ -299,9 +299,9 @@ def make_track(writer: SessionWriter, fitted: Fitted) -> Verdict:
     tracker = fitted.tracker
     whole = writer.seen(Observations)
     tracked = tracker.track(whole, allocate=writer.allocate)
-    fit = tracker.sample_fit
+    subject = tracker.subject
     files = fitted.recording.files
-    fast = why_too_fast(tracked.track, tracker.subject.length_mm)
+    fast = why_too_fast(tracked.track, subject.length_mm)
     water = build_water(fitted.plan)
     # water makes an ideal camera with a focal length of its own
     lens = unusual_lens(fitted.recording.camera) if water is None else ""
@@ -316,7 +316,7 @@ def make_track(writer: SessionWriter, fitted: Fitted) -> Verdict:
             *filter(None, [fast]),
             *files.rewritten(),
         ),
-        n_animals=1 if fit is None else fit.n_animals,
+        n_animals=subject.n_animals,
         cautions=(
             *fitted.notes,
             *tracker.scene.remarks,
@@ -326,7 +326,7 @@ def make_track(writer: SessionWriter, fitted: Fitted) -> Verdict:
         ),
         accepted=fitted.plan.estimation.accept_misfit,
     )
-    writer.take(tracked, whole, tracker.subject)
+    writer.take(tracked, whole, subject)
     return verdict
 
 

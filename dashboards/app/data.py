@@ -373,7 +373,7 @@ def _quality(session: Session) -> dict[str, Any]:
     frames = session.metadata["frames"]
     n = max(int(frames["n_frames"]), 1)
     error = session.table("frames", ["predicted_error_mm"])["predicted_error_mm"]
-    flips = session.table("flips", ["start_s", "stop_s"])
+    flips = session.flips
     return {
         "duration_min": frames["duration_s"] / 60.0,
         "n_frames": frames["n_frames"],

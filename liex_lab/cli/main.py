@@ -402,15 +402,10 @@ def _tell_session(session: Path, further: str = "") -> None:
         raise typer.Exit(code)
 
 
-def _size_of(folder: Path) -> int:
-    """Bytes of all files of a folder."""
-    return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
-
-
 def _told_session(session: Path, further: str = "") -> int:
     """Say where the session is, and how it went; returns the exit code."""
     from liex_lab.sessions.older import taken_from
-    from liex_lab.sessions.room import megabytes
+    from liex_lab.sessions.room import folder_bytes, megabytes
     from liex_lab.sessions.verdict import read_verdict
 
     say(f"session: {session}")
@@ -421,7 +416,7 @@ def _told_session(session: Path, further: str = "") -> int:
         say(f"report:  {report}")
         say(f"figures: {session / 'figures'}")
     say(f"replay:  liex show {shlex.quote(str(session))}")
-    say(f"on disk: {megabytes(_size_of(session))}")
+    say(f"on disk: {megabytes(folder_bytes(session))}")
     if further:
         say(further)
     verdict = read_verdict(session)

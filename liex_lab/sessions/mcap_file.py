@@ -9,7 +9,6 @@ their messages, end of data, summary with offsets, footer.
 
 from __future__ import annotations
 
-import struct
 import zlib
 from collections import Counter
 from collections.abc import Sequence
@@ -33,9 +32,8 @@ from mcap.records import (
     SummaryOffset,
 )
 
-_MESSAGE = struct.Struct("<BQHIQQ")  # what stands before the data of a message
-_RECORD_BYTES = 9  # of which are its kind and length
-MAGIC = b"\x89MCAP0\r\n"
+from liex_lab.recordings.formats.messages.mcap import MAGIC, MESSAGE, RECORD
+
 _WINDOW = 23  # log2 of the bytes in which a repetition is found: some ten pictures of 640 x 480
 
 
@@ -147,8 +145,8 @@ class McapFile:
         chunk = self._open
         chunk.note(channel.id, time_ns)
         number = self._counts[channel.id]
-        length = _MESSAGE.size - _RECORD_BYTES + len(data)
-        chunk.put(_MESSAGE.pack(Opcode.MESSAGE, length, channel.id, number, time_ns, time_ns))
+        head = RECORD.pack(Opcode.MESSAGE, MESSAGE.size + len(data))
+        chunk.put(head + MESSAGE.pack(channel.id, number, time_ns, time_ns))
         chunk.put(data)
         if chunk.size > self._chunk_size:
             self.flush()

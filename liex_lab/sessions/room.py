@@ -86,7 +86,7 @@ def check_room(folder: Path, needed: int) -> None:
     """
     nearest = next(place for place in folder.absolute().parents if place.is_dir())
     begun = part_folder(folder)
-    written = sum(path.stat().st_size for path in begun.rglob("*") if path.is_file())
+    written = folder_bytes(begun)
     free = shutil.disk_usage(nearest).free
     if free < _SURE * (needed - written):
         raise SessionError(
@@ -94,6 +94,15 @@ def check_room(folder: Path, needed: int) -> None:
             f"{nearest} has {megabytes(free)} free; make room there, choose another place (--out, "
             "in Python out=), or keep less depth (--set replay.depth=animal or none)"
         )
+
+
+def folder_bytes(folder: Path) -> int:
+    """Bytes of all files of a folder; 0 of one that is not there.
+
+    Args:
+        folder: the folder.
+    """
+    return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
 
 
 def megabytes(size: float) -> str:

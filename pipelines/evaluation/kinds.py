@@ -86,6 +86,7 @@ def _written(
 def _measured(recording: Path, place: Path) -> dict[str, float]:
     """The numbers of one recording."""
     from liex_lab.sessions import Session
+    from liex_lab.sessions.room import folder_bytes
 
     before = read_alone(recording, 1)
     seconds = _run(recording, place / "results")
@@ -95,7 +96,7 @@ def _measured(recording: Path, place: Path) -> dict[str, float]:
     n = facts["frames"]["n_frames"]
     whole = facts["timings_s"]["prepare"] + facts["timings_s"]["total"]
     decoding = (before["frames_per_s"] + after["frames_per_s"]) / 2.0
-    size = sum(file.stat().st_size for file in path.rglob("*") if file.is_file())
+    size = folder_bytes(path)
     return {
         "frames_per_s": n / whole,
         "frames_per_s_with_start": n / seconds,
