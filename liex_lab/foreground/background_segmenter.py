@@ -182,8 +182,8 @@ class BackgroundSubtraction(StillScene):
         grid = self.grid
         cable = Cable.find(sample, self.limit, grid, floor, wanted.spine_mm[1], wanted.smallest_mm2)
         if cable is not None:
-            scene = replace(scene, cable=cable)
-            sample = cable.cut(sample, self.limit)
+            whole, sample = sample, cable.cut(sample, self.limit)
+            scene = replace(scene, cable=cable.with_fixed(whole, sample))
         stage = HeadStage.find(sample, self.limit, grid, floor, wanted.smallest_mm2)
         if stage is not None:
             scene = replace(scene, stage=stage)

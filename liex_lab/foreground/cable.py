@@ -5,12 +5,15 @@ Heights above the floor are opened with a square as wide as no cable is (grey-sc
 lead up to more than an animal can reach are a cable. Its pixels are taken for unread, and
 over the body they are filled in from beside it by closing: what lies under a cable is hidden, not
 absent. A tail is thin, too, but leads nowhere up.
+
+What is thin in the same place throughout is no cable but a part of the arena, as the bars of a
+cage's lid: it is cut out of the pictures likewise, but what lies behind it is hidden.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -32,6 +35,8 @@ _LINK_PX = 2  # a cable that is unread for so long is still one
 _JOINED_PX = 3  # a cable this near to a body leads to it
 _LEAST_RUN_MM = 40.0  # it is so long in the picture
 _LEAST_SHARE = 0.3  # of the frames with something wide: an edge that flickers is not there so often
+_FIXED = 0.5  # what is thin in so many frames is a part of the arena
+_FIXED_EDGE_PX = 2  # and so are the readings beside it, which are of both
 _NEARLY = 1.00001  # what rounding may change
 
 
@@ -43,9 +48,12 @@ class Cable(Worn):
         camera: see `Worn`.
         floor: likewise.
         tall_mm: no animal reaches higher above the floor.
+        fixed: (H, W) bool, where the arena itself has thin parts above the floor, as a lid's bars;
+            None where nothing is known of them.
     """
 
     tall_mm: float
+    fixed: Mask | None = None
 
     @staticmethod
     def find(
@@ -93,6 +101,43 @@ class Cable(Worn):
         for depth in out:
             self._cut_one(depth, limit)
         return out
+
+    def with_fixed(self, sample: Depths, cut: Depths) -> Cable:
+        """The same, knowing where the arena itself has thin parts.
+
+        Args:
+            sample: (n, H, W) float32 mm, frames spread over a recording.
+            cut: (n, H, W) what `cut` made of them.
+
+        Returns:
+            A cable whose `fixed` says where most frames were cut.
+        """
+        import cv2
+
+        share = np.mean(
+            [before != after for before, after in zip(sample, cut, strict=True)], axis=0
+        )
+        edge = np.ones((2 * _FIXED_EDGE_PX + 1,) * 2, np.uint8)
+        return replace(self, fixed=cv2.dilate((share > _FIXED).astype(np.uint8), edge) > 0)
+
+    def every(self, step: int) -> Cable:
+        """The same in pictures of every `step`-th row and column.
+
+        Args:
+            step: pixels from one to the next, at least 1.
+        """
+        fixed = None if self.fixed is None else np.ascontiguousarray(self.fixed[::step, ::step])
+        return replace(super().every(step), fixed=fixed)
+
+    def worn(self, depths: Depths, limit: Depths) -> Mask:
+        """Where (n, H, W) something was cut that the animal wears, and no part of the arena.
+
+        Args:
+            depths: (n, H, W) float32 mm, 0 where unread.
+            limit: (H, W) float32 mm; a reading below it is in front of the background.
+        """
+        worn = self.cut(depths, limit) != depths
+        return np.asarray(worn if self.fixed is None else worn & ~self.fixed)
 
     @cached_property
     def _inverse(self) -> NDArray[np.float64]:

@@ -247,15 +247,18 @@ class StillScene(Segmenter):
     def cleared(self, depths: NDArray[np.float32]) -> NDArray[np.float32]:
         """Whole pictures without what the animal wears: 0 where a cable is.
 
+        The bars of a lid stay, for they are no cable, but what an animal is hidden by.
+
         Args:
-            depths: (n, H, W) float32 mm, whole pictures.
+            depths: (n, H, W) float32 mm, whole pictures, or a sample of them with the scene's own
+                stride.
         """
         if self.cable is None:
             return depths
-        thinned = depths[:, :: self.stride, :: self.stride]
-        worn = self.cable.cut(thinned, self.limit) != thinned
+        step = 1 if depths.shape[1:] == self.limit.shape else self.stride
+        worn = self.cable.worn(depths[:, ::step, ::step], self.limit)
         for axis in (1, 2):
-            worn = np.repeat(worn, self.stride, axis=axis)
+            worn = np.repeat(worn, step, axis=axis)
         return np.where(worn[:, : depths.shape[1], : depths.shape[2]], np.float32(0), depths)
 
     def places(self, crops: HeightMaps) -> list[NDArray[np.bool_]]:

@@ -22,6 +22,7 @@ from liex_lab.runtime.memory import Allocator, blocks
 from liex_lab.runtime.shapes import check_shapes
 from liex_lab.tracking import _association_kernels as kernels
 from liex_lab.tracking.observations import Observations
+from liex_lab.tracking.trust import told_ends
 
 Array = NDArray[np.float64]
 
@@ -195,6 +196,12 @@ class HypothesisAssociation:
                 cost[rows] += backward[rows.start - first :][: rows.stop - rows.start]
             if not self._alone:
                 cost[rows] -= self._likeness(cost[rows])
+        if self._skeleton.is_chain:
+            other = np.arange(cost.shape[1]) ^ 1
+            told = told_ends(seen)
+            both = seen.known & seen.known[:, other]
+            least = np.fmin(cost, cost[:, other])
+            cost[:] = np.where(both, least + told * (cost - least), cost)
         return cost
 
     def _likeness(self, cost: Array) -> Array:

@@ -31,17 +31,18 @@ from liex_lab.geometry import SE3, so3
 from liex_lab.optics.camera import Camera
 from liex_lab.runtime.memory import Allocator, blocks
 from liex_lab.tracking.association import NONE, HypothesisAssociation
+from liex_lab.tracking.gaps import short_gaps, spans, whole_gaps
 from liex_lab.tracking.motion_model import TrackingParameters
 from liex_lab.tracking.observations import Observations, joints_of, reversed_pose
 from liex_lab.tracking.smoother import Curve, smooth
 from liex_lab.tracking.track import Flip, Track, Tracked
 from liex_lab.tracking.trust import (
     MOST_ERROR,
-    MOSTLY,
     WHOLE,
     contradicted,
     elsewhere,
     gone_behind,
+    lies_unknown,
     share_in_view,
     together,
     usual_pixels,
@@ -157,14 +158,15 @@ def track_whole(
 
     usual_px = usual_pixels(seen, path)
     in_view = share_in_view(seen, path, usual_px)
-    path[in_view < MOSTLY] = NONE  # of half an animal nobody knows how it lies
+    unknown = lies_unknown(in_view, doubt)
+    path[unknown] = NONE
     for rows in blocks(len(seen), _BLOCK):
         draw(rows)
     for _ in range(_TIMES):
         taken = path == NONE
         for rows in blocks(len(seen), _BLOCK):
             _admit(subject, seen[rows], path[rows], error[rows], track[rows], usual_px)
-        path[in_view < MOSTLY] = NONE
+        path[unknown] = NONE
         taken &= path != NONE
         for rows in blocks(len(seen), _BLOCK):
             if taken[max(0, rows.start - MARGIN) : rows.stop + MARGIN].any():
@@ -183,7 +185,9 @@ def track_whole(
         )
     hidden = gone_behind(seen, measured, usual_px)
     bridged &= ~strayed & ~hidden  # what is in view is measured, or it has no pose
-    hidden |= (in_view < MOSTLY) & ~bridged
+    # nobody knows what an animal does that stays half hidden for long
+    bridged &= ~unknown | whole_gaps(seconds, measured, subject.bridge_s)
+    hidden |= unknown & ~bridged
     strayed |= _doubted(subject, seen, path, in_view, usual_px)
     for rows in blocks(len(seen), _BLOCK):
         _mask_and_flag(
@@ -320,7 +324,8 @@ def to_track(
     usual_px = usual_pixels(seen, path) if usual_px is None else usual_px
     in_view = share_in_view(seen, path, usual_px)
     strayed = _doubted(subject, seen, path, in_view, usual_px)
-    measured &= in_view >= MOSTLY
+    unknown = lies_unknown(in_view, doubt)
+    measured &= ~unknown
     _mask_and_flag(
         subject,
         track,
@@ -331,7 +336,7 @@ def to_track(
         bridged[told],
         strayed[told],
     )
-    hide(track, (in_view < MOSTLY)[told] & ~bridged[told])
+    hide(track, unknown[told] & ~bridged[told])
     return track
 
 
@@ -516,38 +521,6 @@ def single_frames(subject: Subject, seen: Observations) -> Track:
     return to_track(replace(subject, bridge_s=0.0), seen, path, curve, np.zeros(len(seen)))
 
 
-def short_gaps(
-    seconds: Array, measured: NDArray[np.bool_], bridge_s: float, ahead: bool = False
-) -> NDArray[np.bool_]:
-    """Mask (n,) of the unmeasured frames that are bridged.
-
-    A frame between two measured ones is bridged where the nearer of them is no farther than half of
-    bridge_s, so a gap no longer than bridge_s is bridged whole.
-
-    Args:
-        seconds: (n,) s, increasing.
-        measured: (n,) True where the pose was measured.
-        bridge_s: the longest gap that is bridged whole, s.
-        ahead: also bridge the frames within bridge_s after the last measured one.
-
-    Returns:
-        (n,) bool, False at measured frames.
-    """
-    rows = np.flatnonzero(measured)
-    if not len(rows):
-        return np.zeros(len(measured), np.bool_)
-    t = np.arange(len(measured))
-    after = np.searchsorted(rows, t)
-    inside = (after > 0) & (after < len(rows))
-    before = rows[np.maximum(after - 1, 0)]
-    after = rows[np.minimum(after, len(rows) - 1)]
-    away = np.minimum(seconds - seconds[before], seconds[after] - seconds)
-    short = inside & (away <= 0.5 * bridge_s)
-    if ahead:
-        short[rows[-1] + 1 :] = seconds[rows[-1] + 1 :] - seconds[rows[-1]] <= bridge_s
-    return short & ~measured
-
-
 def _flips(seen: Observations, track: Track) -> list[Flip]:
     """The stretches in which the single frames had head and tail exchanged, and those in which the
     track may have.
@@ -561,16 +534,3 @@ def _flips(seen: Observations, track: Track) -> list[Flip]:
     found = [Flip(a, b, float(1.0 - track.p_flip[a:b].mean()), True) for a, b in spans(exchanged)]
     unsure = ~exchanged & (track.p_flip > _TOLD)
     return found + [Flip(a, b, float(track.p_flip[a:b].mean()), False) for a, b in spans(unsure)]
-
-
-def spans(where: NDArray[np.bool_]) -> list[tuple[int, int]]:
-    """The runs of True in a mask, as (start, stop) with stop exclusive.
-
-    Args:
-        where: (n,) bool.
-
-    Returns:
-        One pair of indices for each run, in order.
-    """
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], where, [False]]).astype(np.int8)))
-    return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]

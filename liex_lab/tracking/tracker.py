@@ -8,7 +8,7 @@ of every frame by the estimator of Lie-X Algorithm 1, and `track` smooths them a
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -32,9 +32,11 @@ from liex_lab.tracking.own_shape import OwnShape, StatedShape, fit_shape
 from liex_lab.tracking.residual import Agreement, BodyResidual
 from liex_lab.tracking.sample_fit import SampleFit, count_animals
 from liex_lab.tracking.track import Flip, Track, Tracked
+from liex_lab.tracking.trust import WHOLE, in_view, median_of_whole
 
 BRIDGE_S = 0.5
 _MOST_COUNTED = 24  # frames in which animals are counted
+_FEWEST_WHOLE = 20  # frames that show all of an animal tell its size by themselves
 
 
 @dataclass(frozen=True)
@@ -105,6 +107,12 @@ class FrameTracker:
         home = estimator.skeleton.length
         size = spine_mm / home if spine_mm else estimator.find_size(sample, scene)
         estimates = estimator.estimate(sample, scene, size)
+        whole = _whole(scene, sample, estimates)
+        if whole.sum() < len(whole) and (whole & estimates.found).sum() >= _FEWEST_WHOLE:
+            # of half an animal nobody knows how long it is
+            sample = sample[whole]
+            size = size if spine_mm else estimator.find_size(sample, scene)
+            estimates = estimator.estimate(sample, scene, size)
         if not estimates.found.any():
             raise EstimationError(
                 "no animal was found in the sampled frames; check the depth unit and the plan"
@@ -284,6 +292,23 @@ class FrameTracker:
             columns, (told.residual_mm, told.covered, told.beside, told.part_mm), strict=True
         ):
             column[found, h] = values
+
+
+def _whole(
+    scene: Segmenter, sample: NDArray[np.float32], estimates: Estimates
+) -> NDArray[np.bool_]:
+    """Which frames (n,) of a sample (n, H, W) mm do not show a part of the animal only, beside
+    something nearer.
+    """
+    if not isinstance(scene, BackgroundSubtraction):
+        return np.ones(len(sample), np.bool_)
+    crops = estimates.crops
+    if scene.stride > 1:  # told in pixels of the picture, of which a sample holds some
+        crops = replace(crops, origin=crops.origin // scene.stride, step=crops.step // scene.stride)
+    behind = behind_something(crops, scene.cleared(sample))
+    shown = np.where(estimates.found, crops.n_px, np.nan)
+    usual_px = median_of_whole(shown, behind)
+    return ~estimates.found | (in_view(behind, shown, usual_px, 0) >= WHOLE)
 
 
 def _count(

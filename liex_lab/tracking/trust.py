@@ -36,9 +36,11 @@ _MOST_SHOWN = 1.6
 # an animal is partly behind something where so much of its outline ends there, and it shows less
 # than this share of its usual pixels; what lies before it is there for some frames at least
 _BEHIND = 0.03
+_FEWEST_WHOLE = 12  # frames without anything before it that tell what an animal usually shows
 WHOLE = 0.95
 _FRAMES = 2  # before and after
 MOSTLY = 0.7  # of it must be in view to tell how it lies
+_UNSURE = 0.25  # and all of it where head and tail are exchanged as probably as that
 # it has gone behind something where it showed less than this share shortly before it was gone
 _GOING = 0.8
 _SHORTLY_S = 0.5
@@ -78,14 +80,34 @@ def contradicted(
 
 
 def usual_pixels(seen: Observations, path: NDArray[np.int64]) -> float:
-    """The pixels that the animal usually shows, the median along a path; 0 where it is empty.
+    """The pixels that the animal usually shows where nothing stands before it.
+
+    The median along a path over the frames in which its outline ends at nothing nearer, or over all
+    of them where fewer than 12 are such.
 
     Args:
         seen: hypotheses (n, H) of the frames.
         path: (n,) which of them is meant, negative for none.
+
+    Returns:
+        The pixels; 0 where the path is empty.
     """
-    taken = path >= 0
-    shown = seen.along(seen.n_px, path)
+    return median_of_whole(seen.along(seen.n_px, path), seen.along(seen.behind, path))
+
+
+def median_of_whole(shown: Array, behind: Array) -> float:
+    """The pixels that an animal usually shows where nothing stands before it.
+
+    Args:
+        shown: (n,) its pixels, NaN where they are not known.
+        behind: (n,) share of its outline that ends at something nearer.
+
+    Returns:
+        The median; 0 where none is known.
+    """
+    known = np.isfinite(shown)
+    whole = known & (np.nan_to_num(behind) <= _BEHIND)
+    taken = whole if whole.sum() >= _FEWEST_WHOLE else known
     return float(np.median(shown[taken])) if taken.any() else 0.0
 
 
@@ -112,11 +134,57 @@ def share_in_view(seen: Observations, path: NDArray[np.int64], usual_px: float) 
         1 where nothing is before it, or there is no hypothesis.
     """
     meant = np.where((path < 0) & seen.known[:, 0], 0, path)
-    behind = np.nan_to_num(seen.along(seen.behind, meant))
-    near = np.pad(behind, _FRAMES)
-    most = np.max([near[k : k + len(behind)] for k in range(2 * _FRAMES + 1)], axis=0)
-    shown = seen.along(seen.n_px, meant) / max(usual_px, 1.0)
-    return np.where((most > _BEHIND) & (meant >= 0), np.minimum(shown, 1.0), 1.0)
+    share = in_view(seen.along(seen.behind, meant), seen.along(seen.n_px, meant), usual_px)
+    return np.where(meant >= 0, share, 1.0)
+
+
+def lies_unknown(in_view: Array, doubt: Array) -> NDArray[np.bool_]:
+    """Whether (n,) so much of an animal is hidden that nobody knows how it lies.
+
+    Args:
+        in_view: (n,) share of it that is in view.
+        doubt: (n,) probability that its head and tail are exchanged.
+
+    Returns:
+        True where less than 0.7 is in view, or not all of it and its ends are unknown as well.
+    """
+    return np.asarray((in_view < MOSTLY) | ((in_view < WHOLE) & (doubt > _UNSURE)))
+
+
+def in_view(behind: Array, shown_px: Array, usual_px: float, beside: int = _FRAMES) -> Array:
+    """The share (n,) of an animal that is in view where something stands before the rest of it.
+
+    Args:
+        behind: (n,) share of its outline that ends at something nearer.
+        shown_px: (n,) its pixels.
+        usual_px: those that it usually shows.
+        beside: what stands before it in so many frames before and after does so in this one.
+    """
+    near = np.pad(np.nan_to_num(behind), beside)
+    most = np.max([near[k : k + len(behind)] for k in range(2 * beside + 1)], axis=0)
+    return np.where(most > _BEHIND, np.minimum(shown_px / max(usual_px, 1.0), 1.0), 1.0)
+
+
+def told_ends(seen: Observations) -> Array:
+    """How much (n, H), 0 to 1, each hypothesis tells of which end of the animal is its head.
+
+    Of an animal that something stands before, the metric takes one end for the other in frame after
+    frame, for it never saw such an animal: it tells nothing where no more than 0.7 is in view.
+
+    Args:
+        seen: hypotheses (n, H) of consecutive frames.
+
+    Returns:
+        1 where all of it is in view, or there is no hypothesis.
+    """
+    first = np.where(seen.known[:, 0], 0, -1)
+    usual_px = usual_pixels(seen, first)
+    told = np.ones(seen.score.shape)
+    for h in range(seen.score.shape[1]):
+        behind, shown = (values[:, h].astype(float) for values in (seen.behind, seen.n_px))
+        share = in_view(behind, shown, usual_px)
+        told[:, h] = np.clip((share - MOSTLY) / (WHOLE - MOSTLY), 0.0, 1.0) ** 2
+    return told
 
 
 def gone_behind(
@@ -169,7 +237,8 @@ class Watch:
     """
 
     def __init__(self) -> None:
-        self._shown: deque[int] = deque(maxlen=_REMEMBERED)  # pixels of measured frames
+        # of measured frames: pixels, share of the outline behind something
+        self._shown: deque[tuple[float, float]] = deque(maxlen=_REMEMBERED)
         # of the frames shortly before this one in which something was in view: s, px, share behind
         self._near: deque[tuple[float, int, float]] = deque()
         self._lost = False
@@ -178,7 +247,7 @@ class Watch:
     @property
     def usual_px(self) -> float | None:
         """Pixels that the animal usually shows; None before the first measurement."""
-        return float(np.median(self._shown)) if self._shown else None
+        return median_of_whole(*np.array(self._shown).T) if self._shown else None
 
     def gone(
         self, seen: Observations, path: NDArray[np.int64], measured: NDArray[np.bool_]
@@ -196,7 +265,7 @@ class Watch:
         for k, time_ns in enumerate(seen.times_ns):
             now_s = 1e-9 * float(time_ns)
             if measured[k]:
-                self._shown.append(int(seen.n_px[k, path[k]]))
+                self._shown.append((float(seen.n_px[k, path[k]]), float(behind[k, path[k]])))
                 self._lost = self._gone = False
             if known[k]:
                 self._near.append((now_s, int(seen.n_px[k].max()), float(behind[k].max())))

@@ -104,3 +104,26 @@ def test_every_second_pixel_tells_the_same() -> None:
     picture = drawn(cabled(mouse()))[::2, ::2]
     cut = cable.every(2).cut(picture[None], LIMIT[::2, ::2])[0]
     assert ((cut > 0) & (cut < FLOOR_MM - 100.0)).sum() == 0
+
+
+def test_thin_parts_that_stay_where_they_are_belong_to_the_arena() -> None:
+    """A lid's bar over one end of the arena is no cable, though it is cut out of the pictures: what
+    lies behind it is hidden. A cable that goes with its animal is worn.
+    """
+    bar = np.zeros((240, 320))
+    bar[60:220, 210:213] = 200.0
+    pictures = np.stack([drawn(np.maximum(cabled(mouse(x), x), bar)) for x in range(0, 80, 5)])
+    cable = Cable.find(pictures, LIMIT, CAMERA, FLOOR, LONGEST_MM, AREA_MM2)
+    assert cable is not None
+    cut = cable.cut(pictures, LIMIT)
+    known = cable.with_fixed(pictures, cut)
+    assert known.fixed is not None
+    assert known.fixed[80:200, 209:214].all()
+    assert known.fixed.mean() < 0.03
+    worn = known.worn(pictures, LIMIT)
+    changed = cut != pictures
+    assert not worn[:, 80:200, 210:213].any()
+    assert worn[0].sum() > 0.6 * (changed[0] & ~known.fixed).sum() > 0
+    every = known.every(2)
+    assert every.fixed is not None
+    np.testing.assert_array_equal(every.fixed, known.fixed[::2, ::2])

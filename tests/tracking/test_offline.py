@@ -13,12 +13,11 @@ from liex_lab.body.pose import Pose
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.geometry import SE3, so3
 from liex_lab.runtime.memory import on_disk
+from liex_lab.tracking.gaps import short_gaps, spans, whole_gaps
 from liex_lab.tracking.observations import Observations, joints_of, reversed_pose
 from liex_lab.tracking.offline import (
     covariance_of_root,
-    short_gaps,
     single_frames,
-    spans,
     track_whole,
 )
 from liex_lab.tracking.online import OnlineTracker
@@ -295,6 +294,8 @@ def test_gaps_are_measured_in_seconds_between_measurements():
     assert np.flatnonzero(short_gaps(seconds, measured, 1.01)).tolist() == [2, 3, 5]
     assert np.flatnonzero(short_gaps(seconds, measured, 0.15, ahead=True)).tolist() == [7]
     assert not short_gaps(seconds, np.zeros(8, bool), 1.0).any()
+    assert np.flatnonzero(whole_gaps(seconds, measured, 0.31)).tolist() == [2, 3]
+    assert not whole_gaps(seconds, measured, 0.29).any()
 
 
 def test_quick_joints_are_the_joints(measured):

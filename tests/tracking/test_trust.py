@@ -11,7 +11,15 @@ import pytest
 
 from liex_lab.tracking.observations import Observations
 from liex_lab.tracking.offline import track_whole
-from liex_lab.tracking.trust import contradicted, elsewhere, together
+from liex_lab.tracking.trust import (
+    contradicted,
+    elsewhere,
+    lies_unknown,
+    share_in_view,
+    together,
+    told_ends,
+    usual_pixels,
+)
 from tests.tracking.stories import MOUSE, SUBJECT, joint_error, lose, noisy, told, walk
 
 SECONDS = np.arange(120) / 30.0
@@ -123,3 +131,56 @@ def test_two_animals_that_touch_are_one_thing_of_more_pixels_than_one_usually_sh
     np.testing.assert_array_equal(
         together(seen, path, 800.0), [False, False, True, True, False, False]
     )
+
+
+def test_what_an_animal_usually_shows_is_told_by_frames_with_nothing_before_it(
+    seen: Observations,
+) -> None:
+    """Though most of a recording shows half of it beside a bar."""
+    seen.behind[:] = 0.0
+    seen.n_px[40:, :2] = 400
+    seen.behind[40:, :2] = 0.2
+    assert usual_pixels(seen, FIRST) == 800
+    assert share_in_view(seen, FIRST, usual_pixels(seen, FIRST))[80] == 0.5
+    seen.behind[5:, :2] = 0.2  # too few are left to tell
+    assert usual_pixels(seen, FIRST) == 400
+
+
+def test_the_ends_of_an_animal_beside_a_bar_are_told_by_the_frames_around(
+    seen: Observations,
+) -> None:
+    """The metric takes one end for the other in every frame that shows two thirds of it; it counts
+    for nothing there, so the track goes on as it came, and without the bar it would turn round.
+    """
+    seen.behind[:] = 0.0
+    behind = slice(50, 80)
+    seen.n_px[behind, :2] = 580
+    seen.score[behind, 0], seen.score[behind, 1] = 12.0, 2.0
+    truth = walk(SECONDS)
+    turned = track_whole(SUBJECT, seen).track
+    seen.behind[behind, :2] = 0.2
+    ends = told_ends(seen)
+    assert np.all(ends[behind, :2] < 0.05)
+    assert np.all(ends[:45] == 1.0)
+    track = track_whole(SUBJECT, seen).track
+    assert np.isfinite(track.joints_mm[behind]).all()
+    assert joint_error(track.joints_mm, truth)[behind].max() < 6.0
+    assert np.nanmax(joint_error(turned.joints_mm, truth)[behind]) > 20.0
+    assert not (track.flag[behind] == "").any()
+
+
+def test_half_an_animal_whose_ends_are_unknown_has_no_pose() -> None:
+    share = np.array([1.0, 1.0, 0.8, 0.8, 0.6])
+    doubt = np.array([0.0, 0.5, 0.1, 0.5, 0.0])
+    assert lies_unknown(share, doubt).tolist() == [False, False, False, True, True]
+
+
+def test_a_long_gap_beside_a_bar_is_not_bridged_from_its_ends(seen: Observations) -> None:
+    """A second in which half of it is in view: hidden throughout; a gap of 0.3 s is bridged."""
+    seen.behind[:] = 0.0
+    for rows, hidden in ((slice(40, 70), True), (slice(90, 99), False)):
+        seen.n_px[rows, :2] = 400
+        seen.behind[rows, :2] = 0.2
+        flags = track_whole(SUBJECT, seen).track.flag[rows]
+        assert (flags == "hidden").all() == hidden
+        assert (flags == "hidden").any() == hidden
