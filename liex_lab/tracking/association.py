@@ -22,7 +22,7 @@ from liex_lab.runtime.memory import Allocator, blocks
 from liex_lab.runtime.shapes import check_shapes
 from liex_lab.tracking import _association_kernels as kernels
 from liex_lab.tracking.observations import Observations
-from liex_lab.tracking.trust import told_ends
+from liex_lab.tracking.trust import told_ends, together, usual_pixels
 
 Array = NDArray[np.float64]
 
@@ -48,6 +48,8 @@ _JUMPS = 25.0
 # of several animals one is told from another by nothing but its place: to be elsewhere costs up to
 # so many times a transition's ceiling
 _OTHER = 20.0
+# and of frames in which they touch, to pass one by costs this share of what it does else
+_TOGETHER = 0.1
 NONE = kernels.NONE
 
 
@@ -153,9 +155,7 @@ class HypothesisAssociation:
         if told is not None:
             emission = emission.copy()
             emission[: len(told)][np.arange(h) != told[:, None]] = np.inf
-        missed_cost = np.concatenate(
-            [[0.0], np.cumsum(np.where(seen.known.any(axis=1), self._tuning.none, 0.0))]
-        )
+        missed_cost = np.concatenate([[0.0], np.cumsum(self._missed(seen))])
         cost = allocate((n, h), float)
         parent = allocate((n, h, 2), np.int64)
         chains = kernels.Chains(np.zeros((_BEAM, 2), np.int64), cost, parent)
@@ -202,6 +202,16 @@ class HypothesisAssociation:
             both = seen.known & seen.known[:, other]
             least = np.fmin(cost, cost[:, other])
             cost[:] = np.where(both, least + told * (cost - least), cost)
+        return cost
+
+    def _missed(self, seen: Observations) -> Array:
+        """What it costs (n,) to pass a frame by: little where several animals are one thing in it,
+        whose pose is that of any of them, and nothing where nothing is in view.
+        """
+        cost = np.where(seen.known.any(axis=1), self._tuning.none, 0.0)
+        if not self._alone:
+            first = np.where(seen.known[:, 0], 0, NONE)
+            cost[together(seen, first, usual_pixels(seen, first))] *= _TOGETHER
         return cost
 
     def _likeness(self, cost: Array) -> Array:

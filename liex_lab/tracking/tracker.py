@@ -333,6 +333,11 @@ def _count(
     other = estimator.hypotheses(sample[rows], scene, size)[2]
     there = other.found
     pose = other.chosen.pose.moved(scene.floor.T_arena_camera)[there]
-    second = body.agreement(pose, other.crops[there], scene)
+    own = body
+    if there.any():  # the girth of the first says nothing of another's
+        own = BodyResidual.fit(
+            Surface.of(estimator.skeleton), pose, other.crops[there], scene, body.camera_view
+        )
+    second = own.agreement(pose, other.crops[there], scene)
     n = len(n_things) * len(rows) // len(unsure)  # as many of all frames as were looked at of these
     return count_animals(first, second, rows[there], n)

@@ -19,6 +19,7 @@ from liex_lab.foreground.hand_segmenter import HandSegmenter
 from liex_lab.optics.camera import KINECT_V2
 from liex_lab.plan import Plan
 from liex_lab.recordings.recording import Recording
+from liex_lab.simulation.scenes.catalogue import film
 from liex_lab.tracking.residual import Agreement
 from liex_lab.tracking.sample_fit import SampleFit, count_animals
 
@@ -204,3 +205,11 @@ def test_two_animals_are_two_where_the_second_fits_as_well_as_the_first() -> Non
     assert count_animals(agreement(96, 0.8), agreement(40, 0.3), rows, 96) == 1
     assert count_animals(agreement(96, 0.8), agreement(5, 0.8), rows[:5], 96) == 1
     assert count_animals(agreement(96, 0.8), agreement(0, 0.8), rows[:0], 96) == 1
+
+
+def test_a_slim_mouse_beside_a_stout_one_of_its_length_is_counted() -> None:
+    """The girth of the one that is measured says nothing of the other's."""
+    recording = film("two-animals", 1003, 60, family="other")
+    fit = choice.look(recording, "mouse").fit
+    assert fit is not None
+    assert fit.n_animals == 2

@@ -133,6 +133,31 @@ def test_of_two_animals_the_one_that_is_followed_stays_the_one_that_was_followed
     assert (alone[30:] == 0).all()
 
 
+def test_while_two_animals_touch_no_pose_of_both_is_a_reason_to_change_over():
+    """In three of four frames of a second both are one thing, whose pose is first that of one and
+    then that of the other, 100 mm away; the frames between tell them apart.
+    """
+    n = 60
+    clock = np.arange(n) / 30.0
+    there = walk(clock)
+    there.root.translation[:, 0] += 100.0
+    seen = told(clock, walk(clock))
+    other = told(clock, there)
+    rows = np.arange(n)
+    joined = (rows >= 20) & (rows < 44) & (rows % 4 > 0)
+    of_other = joined & (rows >= 32)
+    for name in ("turn", "place", "angles", "scale", "error_mm", "score", "n_px"):
+        ours, theirs = (getattr(one, name) for one in (seen, other))
+        ours[of_other, :2] = theirs[of_other, :2]
+        ours[~joined, 2:] = theirs[~joined, :2]
+    seen.n_px[joined, :2] = 1600
+    path = HypothesisAssociation(MOUSE, MOUSE.length, COSTS, 2).path(seen)
+    one = path[0]
+    assert one in (0, 2)
+    assert (path[~joined] == one).all()
+    assert (path[of_other if one == 0 else joined & ~of_other] == NONE).all()
+
+
 def test_head_and_tail_of_one_of_two_animals_are_told_as_those_of_a_lone_one():
     seen, _ = two_animals()
     seen.score[:, [0, 2]], seen.score[:, [1, 3]] = seen.score[:, [1, 3]], seen.score[:, [0, 2]]
