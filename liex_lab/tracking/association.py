@@ -22,7 +22,7 @@ from liex_lab.runtime.memory import Allocator, blocks
 from liex_lab.runtime.shapes import check_shapes
 from liex_lab.tracking import _association_kernels as kernels
 from liex_lab.tracking.observations import Observations
-from liex_lab.tracking.trust import told_ends, together, usual_pixels
+from liex_lab.tracking.trust import together, told_ends, usual_pixels
 
 Array = NDArray[np.float64]
 
