@@ -35,9 +35,9 @@ def traces(session: Session) -> list[tuple[str, Array, Array, str]]:
     seen = animals(session)[0]
     time_s = seen.frames["time_s"].to_numpy(float)
     made: list[tuple[str, Array, Array, str]] = []
-    for name, title, _, unit, colour, _ in drawn_curves(seen):
-        values, unit = shown(seen.column(name), unit)
-        made.append((f"{title}, {unit}", time_s, values, colour))
+    for one in drawn_curves(seen):
+        values, unit = shown(seen.column(one.column), one.unit)
+        made.append((f"{one.title}{f', {unit}' if unit else ''}", time_s, values, one.colour))
     error = seen.broken(seen.frames["predicted_error_mm"])
     return [*made, ("Predicted error, mm", time_s, error, RED)]
 

@@ -82,6 +82,7 @@ def render(session: Session, figures: Path | None = None) -> str:
         account=frame_account(session),
         flips=flip_rows(session),
         pictures=pictures(session),
+        last_joint=session.metadata["animal"]["joints"][-1].replace("_", " "),
         figures=for_the_page(session, figures),
         clips=clip_links(session),
         video=None if (video := found_video(session)) is None else video.name,
