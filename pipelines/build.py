@@ -388,6 +388,6 @@ def why_nameless(plan: Plan, skeleton: Skeleton) -> str:
         return ""
     return (
         f"No actions are named: no vocabulary was made for a {skeleton.name}. `liex train actions` "
-        "makes one from what you label; `--set actions.model=rules` names rears, runs, walks and "
-        "pauses as of a mouse."
+        "makes one from what you label; `--set actions.model=rules` names runs, walks and pauses "
+        "as of a mouse, and the rears of an animal that stands."
     )

@@ -23,6 +23,7 @@ from dash import (
     no_update,
 )
 
+from liex_lab.behaviour.curves import logged_of
 from liex_lab.errors import LiexError, SessionError
 
 from ..report.charts import traces
@@ -55,14 +56,7 @@ _FACTS = (
     ("gap_before", "frames missing before", ""),
     ("zone", "zone", ""),
 )
-_MOVED = (
-    ("speed_mm_s", "speed", "mm/s"),
-    ("heading_rad", "heading", "rad"),
-    ("nose_height_mm", "nose height", "mm"),
-    ("bend_rad", "bend", "rad"),
-    ("tail_beat_hz", "tail beat", "Hz"),
-    ("length_mm", "length", "mm"),
-)
+_MOVED = (("heading_rad", "heading", "rad"), ("length_mm", "length", "mm"))
 
 
 def session_page(
@@ -319,8 +313,14 @@ def facts(session: Session, row: int) -> list[Any]:
     known = [(title, frame[name], unit) for name, title, unit in _FACTS if name in frame]
     if session.has("kinematics.parquet"):
         moved = session.kinematics.iloc[row]
+        measured = [
+            (one.column, one.title.lower(), one.unit)
+            for one in logged_of(session.metadata["animal"])
+        ]
         known += [
-            (title, *shown(moved[name], unit)) for name, title, unit in _MOVED if name in moved
+            (title, *shown(moved[name], unit))
+            for name, title, unit in (*measured, *_MOVED)
+            if name in moved
         ]
     bouts = session.bouts
     now = bouts[(bouts["start_s"] <= frame["time_s"]) & (frame["time_s"] < bouts["stop_s"])]

@@ -29,7 +29,7 @@ from .style import (
     sheet,
     time_unit,
 )
-from .times import CURVES
+from .times import drawn_curves
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 CERTAIN = 0.05  # of p, corrected
 _MORE = BLUE
 _LESS = "#d55e00"
-_AROUND = ("speed_mm_s", "nose_height_mm", "tail_beat_hz")
+_AROUND = ("speed_mm_s", "nose_height_mm", "tail_beat_hz", "opening")
 _BESIDE = 4  # panels of a row
 
 
@@ -302,8 +302,9 @@ def _onsets(seen: Seen) -> list[tuple[str, str, str, Around]]:
     """(measure, unit, word, curves) of every action with enough bouts, in the unit people read."""
     moved = seen.kinematics
     found: list[tuple[str, str, str, Around]] = []
-    for name, title, _, unit, _, _ in CURVES if moved is not None else ():
-        if name not in _AROUND or moved is None or name not in moved:
+    for curve in drawn_curves(seen) if moved is not None else ():
+        name, title, unit = curve.column, curve.title, curve.unit
+        if name not in _AROUND or moved is None:
             continue
         for word in seen.words:
             if name == "nose_height_mm" and not word.startswith("rear"):

@@ -29,6 +29,7 @@ KINEMATICS = (
     "nose_height_mm",
     "tail_beat_hz",
     "bend_rad",
+    "opening",
 )
 
 

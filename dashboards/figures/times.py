@@ -10,18 +10,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.actions.colours import action_colours
+from liex_lab.behaviour.curves import Curve, curves_of
 
 from ..units import counted, shown
 from .seen import Array, Seen
 from .style import (
     BLUE,
-    GREEN,
     INK,
     LEFT_MM,
     LINE,
     MUTED,
     ONE_COLUMN_MM,
-    PURPLE,
     RED,
     RIGHT_MM,
     TWO_COLUMNS_MM,
@@ -35,24 +34,14 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-# column of the kinematics, title, what it is, unit, colour, whether the axis begins at zero
-CURVES = (
-    ("speed_mm_s", "Speed", "of the body centre", "mm/s", BLUE, True),
-    ("nose_height_mm", "Nose height", "above the floor", "mm", GREEN, True),
-    ("z_mm", "Height", "of the body centre above the floor", "mm", GREEN, True),
-    ("tail_beat_hz", "Tail beat", "frequency", "Hz", PURPLE, True),
-    ("bend_rad", "Bend", "of the whole body, positive to the left", "rad", PURPLE, False),
-)
-_WALKING = ("speed_mm_s", "nose_height_mm")
-_SWIMMING = ("speed_mm_s", "z_mm", "bend_rad", "tail_beat_hz")
 _MOST_COLUMNS = 1200  # of a curve; more points than that cannot be told apart on a page
 _LANE_MM = 4.0
 _CURVE_MM = 17.0
 _HAIR_MM = 0.05  # bouts nearer than that are one bar on paper
 
 
-def drawn_curves(seen: Seen) -> list[tuple[str, str, str, str, str, bool]]:
-    """The rows of `CURVES` that fit the animal and that its session has.
+def drawn_curves(seen: Seen) -> list[Curve]:
+    """The measures that fit the animal and that its session has.
 
     Args:
         seen: the animal.
@@ -60,8 +49,7 @@ def drawn_curves(seen: Seen) -> list[tuple[str, str, str, str, str, bool]]:
     moved = seen.kinematics
     if moved is None:
         return []
-    wanted = _SWIMMING if "tail_beat_hz" in moved else _WALKING
-    return [curve for curve in CURVES if curve[0] in wanted and curve[0] in moved]
+    return [one for one in curves_of(seen.session.metadata["animal"]) if one.column in moved]
 
 
 def ethogram(seen: Seen) -> Figure | None:
@@ -117,9 +105,9 @@ def curves(seen: Seen) -> Figure | None:
     """
     error = seen.broken(seen.frames["predicted_error_mm"])
     rows: list[tuple[str, str, Array, str, bool]] = []
-    for name, title, what, unit, colour, from_zero in drawn_curves(seen):
-        values, unit = shown(seen.column(name), unit)
-        rows.append((f"{title} {what}", unit, values, colour, from_zero))
+    for one in drawn_curves(seen):
+        values, unit = shown(seen.column(one.column), one.unit)
+        rows.append((f"{one.title} {one.what}", unit, values, one.colour, one.from_zero))
     rows.append(("Predicted error of a joint", "mm", error, RED, True))
     if not any(np.isfinite(values).any() for _, _, values, _, _ in rows):
         return None
@@ -134,7 +122,7 @@ def curves(seen: Seen) -> Figure | None:
     for k, (title, unit, values, colour, from_zero) in enumerate(rows):
         axes = panel(figure, LEFT_MM, 8.0 + (len(rows) - 1 - k) * step, width, _CURVE_MM)
         n = int(np.isfinite(values).sum())
-        if title.startswith("Nose height") and len(rears):
+        if " height above the floor" in title and len(rears):
             title += "; rearing shaded"
             for a, b, word in rears:
                 shade = colours.get(str(word), RED)

@@ -8,18 +8,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from liex_lab.behaviour.curves import Curve, curves_of
 from liex_lab.runtime.durable import replacing
 
 if TYPE_CHECKING:
     from liex_lab.sessions import Session
 
 FILE = "replay.rbl"
-_NAMES = {
-    "speed_mm_s": "speed",
-    "nose_height_mm": "nose above the floor",
-    "bend_rad": "bend of the body",
-    "tail_beat_hz": "tail beat",
-}
 
 
 def write_blueprint(session: Session) -> Path:
@@ -112,23 +107,24 @@ def _in_picture() -> Any:
     }
 
 
-def _over_time(at: Callable[[str], str], swims: bool) -> tuple[Any, Any]:
+def _over_time(at: Callable[[str], str], animal: dict[str, Any]) -> tuple[Any, Any]:
     """The lanes of actions, and the curves below them with the list of moments.
 
     Args:
         at: the entity that is shown for one that was measured.
-        swims: whether it is a fish, whose tail is of interest and not its nose's height.
+        animal: the section of that name of session.json; what is drawn follows from its joints.
     """
     import rerun.blueprint as rrb
 
     lanes = rrb.StateTimelineView(
         origin=at("ethogram"), name="actions (predicted) and frames to distrust (tracking)"
     )
-    shown = (
-        ["speed_mm_s", "bend_rad", "tail_beat_hz"] if swims else ["speed_mm_s", "nose_height_mm"]
-    )
+    shown = curves_of(animal)
     curves = rrb.Horizontal(
-        *(rrb.TimeSeriesView(origin=at(f"kinematics/{name}"), name=_NAMES[name]) for name in shown),
+        *(
+            rrb.TimeSeriesView(origin=at(f"kinematics/{one.column}"), name=_called(one))
+            for one in shown
+        ),
         rrb.TimeSeriesView(origin=at("error/predicted"), name="predicted error"),
         rrb.TextLogView(
             origin="log",
@@ -138,6 +134,11 @@ def _over_time(at: Callable[[str], str], swims: bool) -> tuple[Any, Any]:
         column_shares=[*(2.0 for _ in shown), 2.0, 2.4],
     )
     return lanes, curves
+
+
+def _called(curve: Curve) -> str:
+    """Name of a curve's view."""
+    return f"{curve.title.lower()} {curve.what}".split(";")[0].split(",")[0]
 
 
 def replay_blueprint(session: dict[str, Any]) -> Any:
@@ -187,7 +188,7 @@ def replay_blueprint(session: dict[str, Any]) -> Any:
         name="depth with the corrected skeleton" if corrected else "depth with the fitted skeleton",
     )
     beside = rrb.Vertical(_zoomed(at(SKELETON)), picture) if kept == ANIMAL else picture
-    lanes, curves = _over_time(at, swims=session["animal"]["joints"][0] == "head")
+    lanes, curves = _over_time(at, session["animal"])
     return rrb.Blueprint(
         rrb.Vertical(rrb.Horizontal(scene, beside), lanes, curves, row_shares=[5, 1.6, 2]),
         rrb.TimePanel(timeline="time", state="collapsed"),

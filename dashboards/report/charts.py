@@ -15,7 +15,7 @@ from ..figures.style import RED
 from ..figures.times import drawn_curves
 from ..units import shown
 from . import contact_sheet
-from .scene_marks import scene_marks
+from .scene_marks import BESIDE, Mark, scene_marks
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -35,9 +35,9 @@ def traces(session: Session) -> list[tuple[str, Array, Array, str]]:
     seen = animals(session)[0]
     time_s = seen.frames["time_s"].to_numpy(float)
     made: list[tuple[str, Array, Array, str]] = []
-    for name, title, _, unit, colour, _ in drawn_curves(seen):
-        values, unit = shown(seen.column(name), unit)
-        made.append((f"{title}, {unit}", time_s, values, colour))
+    for one in drawn_curves(seen):
+        values, unit = shown(seen.column(one.column), one.unit)
+        made.append((f"{one.title}{f', {unit}' if unit else ''}", time_s, values, one.colour))
     error = seen.broken(seen.frames["predicted_error_mm"])
     return [*made, ("Predicted error, mm", time_s, error, RED)]
 
@@ -85,6 +85,42 @@ def pictures(session: Session) -> list[tuple[str, str, str, str]]:
         colour = action_colours(words).get(word, "")
         made.append((drawn, f"{time_s:.2f} s", word, colour))
     return made
+
+
+def whole_picture(session: Session) -> tuple[str, str] | None:
+    """The whole picture with an animal that is in view beside the one that is followed.
+
+    Args:
+        session: the opened session.
+
+    Returns:
+        SVG, and when it was taken; None where the session kept none.
+    """
+    import cv2
+
+    entry = session.metadata.get("whole_picture")
+    depth = cv2.imread(str(session.path / entry["file"]), cv2.IMREAD_UNCHANGED) if entry else None
+    if not entry or depth is None:
+        return None
+    index = entry["frame_index"]
+    uv = session.table("poses", ["u_px", "v_px"], [index])[["u_px", "v_px"]].to_numpy(float)
+    frames = session.frames.set_index("frame_index")
+    marks = [
+        *scene_marks(session),
+        Mark(BESIDE, np.array([entry["beside_px"]], float), "not measured"),
+    ]
+    drawn = contact_sheet.picture(
+        np.asarray(depth, np.uint16),
+        uv,
+        [(int(a), int(b)) for a, b in session.metadata["animal"]["bones"]],
+        0,
+        0,
+        0.9 * float(frames["spine_mm"].median()),
+        marks,
+        unit=depth.shape[1] / 250.0,
+        lettered=True,
+    )
+    return drawn, f"{float(frames.loc[index, 'time_s']):.2f} s"
 
 
 def _word_at(bouts: pd.DataFrame, time_s: float) -> str:

@@ -41,6 +41,8 @@ def picture(
     top: int,
     reach_mm: float,
     marks: Sequence[Mark] = (),
+    unit: float | None = None,
+    lettered: bool = False,
 ) -> str:
     """A depth picture cut out of a frame, with the scene and the skeleton over it.
 
@@ -55,14 +57,16 @@ def picture(
         top: row of the frame at which the picture begins, px.
         reach_mm: height above the floor from which on everything is light, mm.
         marks: what stands still, as far as it is in the picture.
+        unit: radius of a joint, px; None takes that of a picture around the animal.
+        lettered: whether is written what a mark says.
     """
     h, w = depth.shape
     points = (
         uv - [left, top] + 0.5
     )  # the paper counts from the corner of the picture, we from a pixel's centre
-    r = w / 70.0
+    r = w / 70.0 if unit is None else unit
     parts = [f'<image href="{png_uri(_small(shade(depth, reach_mm)))}" width="{w}" height="{h}"/>']
-    parts.append(svg_marks(marks, left, top, w, h, 0.9 * r, lettered=False))
+    parts.append(svg_marks(marks, left, top, w, h, 0.9 * r, lettered))
     for a, b in bones:
         (x0, y0), (x1, y1) = points[a], points[b]
         parts.append(

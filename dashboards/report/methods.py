@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
-from liex_lab.behaviour.body import BodyAxis
+from liex_lab.behaviour.body import BRANCHES, SWIMS
+from liex_lab.behaviour.curves import axis_of
 from liex_lab.sessions import Session
 
 from ..units import counted
@@ -44,13 +44,15 @@ def methods(session: Session) -> list[str]:
         if np.isfinite(error)
         else ""
     )
+    branches = axis_of(animal).kind == BRANCHES
+    where = "inside the body" if branches else "on the body's mid-axis"
     first = (
         f"Depth images of one {animal['name']} ({camera['width']} x {camera['height']} pixels, "
         f"{counted(frames['n_frames'], 'frame')}{rate}, camera "
         f"{camera['floor_distance_mm']:.0f} mm from "
         f"the floor) were analysed with liex_lab {about['versions']['liex_lab']}{learned}. A "
-        f"skeleton of {len(animal['joints'])} joints ({', '.join(animal['joints'])}) on the body's "
-        f"mid-axis was fitted to every frame{size}. {frames['n_observed']:,} of "
+        f"skeleton of {len(animal['joints'])} joints ({', '.join(animal['joints'])}) {where} "
+        f"was fitted to every frame{size}. {frames['n_observed']:,} of "
         f"{frames['n_frames']:,} recorded frames have a pose, {frames['flags'].get('doubtful', 0)} "
         f"of them flagged as doubtful; {frames['n_missing']} further frames were not delivered by "
         f"the camera.{known} Positions are millimetres in the arena frame, z up from the floor."
@@ -120,7 +122,7 @@ def _behaviour(session: Session) -> list[str]:
     if not rules:
         return []
     observed_s = session.metadata["frames"]["observed_s"]
-    sentences = [_speed(session.metadata["animal"]["joints"], rules)]
+    sentences = [_speed(session.metadata["animal"], rules)]
     if reason := session.metadata.get("no_actions"):
         sentences.append(reason)
     if "model" in naming(session):
@@ -149,13 +151,16 @@ def naming(session: Session) -> set[str]:
     return found
 
 
-def _speed(joints: Sequence[str], rules: dict[str, Any]) -> str:
+def _speed(animal: dict[str, Any], rules: dict[str, Any]) -> str:
     """Which joints the speed is of, and how it is taken."""
-    axis = BodyAxis.of(joints)
+    axis = axis_of(animal)
+    joints = axis.joints
     trunk = [joints[k] for k in axis.trunk]
     rest = [name for name in joints if name not in trunk]
-    if axis.swims:
+    if axis.kind == SWIMS:
         which = f"the first {len(trunk)} joints of the chain, {trunk[0]} to {trunk[-1]}, in space"
+    elif axis.kind == BRANCHES:
+        which = f"{', '.join(trunk)} in space"
     elif len(trunk) <= 6:
         which = f"{', '.join(trunk)} over the floor"
     else:

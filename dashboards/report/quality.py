@@ -27,10 +27,23 @@ def warnings(session: Session) -> list[str]:
     """
     return [
         *session.metadata["problems"],
+        *_of_company(session),
         *_of_frames(session),
         *_of_flips(session),
         *_of_measures(session),
         *_of_names(session),
+    ]
+
+
+def _of_company(session: Session) -> list[str]:
+    """That there were others beside the animal that was followed."""
+    n = int((session.metadata.get("verdict") or {}).get("n_animals", 1))
+    if n < 2:
+        return []
+    return [
+        f"{n} animals are in view, and only one of them is followed; nothing is measured of the "
+        f"{'other' if n == 2 else 'others'}. Record one animal at a time, or look in the replay "
+        "whether it is the same one throughout."
     ]
 
 

@@ -22,7 +22,7 @@ from ..figures.seen import FRAMES, KINEMATICS
 from ..figures.sets import FOLDER, for_the_page
 from ..pages import page
 from ..units import counted, day, reading, shown, titled
-from .charts import pictures
+from .charts import pictures, whole_picture
 from .facts import facts
 from .methods import methods
 from .quality import flip_rows, frame_account, refusal_rows, warnings
@@ -82,6 +82,9 @@ def render(session: Session, figures: Path | None = None) -> str:
         account=frame_account(session),
         flips=flip_rows(session),
         pictures=pictures(session),
+        whole_picture=whole_picture(session),
+        n_animals=(session.metadata.get("verdict") or {}).get("n_animals", 1),
+        last_joint=session.metadata["animal"]["joints"][-1].replace("_", " "),
         figures=for_the_page(session, figures),
         clips=clip_links(session),
         video=None if (video := found_video(session)) is None else video.name,

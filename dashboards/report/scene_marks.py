@@ -23,11 +23,13 @@ REGION = "region"
 OUTLINE = "outline"
 FIXTURE = "fixture"
 HIDDEN = "hidden"
+BESIDE = "beside"
 WORDS = {
     REGION: "region outside of which nothing is looked at",
     OUTLINE: "walls that were found",
     FIXTURE: "fixture, with its height",
     HIDDEN: "where an animal hid, and when",
+    BESIDE: "another animal in view",
 }
 # colour and dashes (in widths of the line) of each
 _LOOKS = {
@@ -35,7 +37,12 @@ _LOOKS = {
     OUTLINE: ("#fff", ""),
     FIXTURE: ("#ffd24a", ""),
     HIDDEN: ("#ff8ad4", ""),
+    BESIDE: ("#ffd24a", "2 1.5"),
 }
+
+
+# from a place to the words about it, in widths of the line
+_BESIDE_IT = {BESIDE: (16.0, 2.0)}
 
 
 @dataclass(frozen=True)
@@ -43,7 +50,7 @@ class Mark:
     """One thing of the scene, as it is drawn.
 
     Attributes:
-        kind: region, outline, fixture or hidden.
+        kind: region, outline, fixture, hidden or beside.
         points_px: (n, 2) corners of a closed line, or the one place, px of the whole picture.
         said: what is written beside a place.
     """
@@ -125,9 +132,10 @@ def svg_marks(
             f'stroke-width="{0.8 * unit:.2f}"{dashed}><title>{told}</title></{name}>'
         )
         if one.said and lettered:
-            x, y = points[0] + unit * np.array([2.4, -1.2])
+            x, y = points[0] + unit * np.array(_BESIDE_IT.get(one.kind, (2.4, -1.2)))
+            size = (6.0 if one.kind == BESIDE else 4.0) * unit
             parts.append(
-                f'<text x="{x:.1f}" y="{y:.1f}" font-size="{4 * unit:.2f}" fill="{colour}" '
+                f'<text x="{x:.1f}" y="{y:.1f}" font-size="{size:.2f}" fill="{colour}" '
                 f'font-family="sans-serif" stroke="#000" stroke-width="{0.9 * unit:.2f}" '
                 f'paint-order="stroke">{escape(one.said)}</text>'
             )
@@ -139,6 +147,8 @@ def _shape(kind: str, points: Array, reach: float) -> tuple[str, str]:
     if len(points) > 1:
         return "polygon", f'points="{" ".join(f"{x:.1f},{y:.1f}" for x, y in points)}"'
     (x, y), r = points[0], reach
+    if kind == BESIDE:
+        return "circle", f'cx="{x:.1f}" cy="{y:.1f}" r="{7 * r:.1f}"'
     if kind == FIXTURE:
         return "path", f'd="M{x - r:.1f} {y:.1f}H{x + r:.1f}M{x:.1f} {y - r:.1f}V{y + r:.1f}"'
     way = (

@@ -2,8 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
+
+STANDS = "stands"  # on a floor, over which it moves
+SWIMS = "swims"  # in all three directions; its tail beats
+BRANCHES = "branches"  # limbs at a base, as a hand's fingers at the palm, and no front
+KINDS = (STANDS, SWIMS, BRANCHES)
 
 
 @dataclass(frozen=True)
@@ -12,18 +18,19 @@ class BodyAxis:
 
     Attributes:
         joints: names of the J joints.
-        swims: whether the chain begins at the head, as a fish's does, and the animal moves in all
-            three directions.
-        spine: the chain from front to rear.
+        kind: one of `KINDS`: what can be measured of it.
+        spine: the chain from front to rear; of a body that branches, its middle limb from the end.
         axis: (from, to), the line whose direction is the heading.
         trunk: the joints whose mean is the body's centre.
+        limbs: of a body that branches, the chains that can bend, each from the base to its end.
     """
 
     joints: tuple[str, ...]
-    swims: bool
+    kind: str
     spine: tuple[int, ...]
     axis: tuple[int, int]
     trunk: tuple[int, ...]
+    limbs: tuple[tuple[int, ...], ...] = ()
 
     @property
     def front(self) -> int:
@@ -41,10 +48,13 @@ class BodyAxis:
         return self.spine[1:-1] or self.spine[:1]
 
     @staticmethod
-    def of(joints: Sequence[str]) -> BodyAxis:
+    def of(joints: Sequence[str], parents: Sequence[int] | None = None) -> BodyAxis:
         """The parts by name or along the chain, which begins at the head or at the rump.
 
         A chain that begins at a head is that of an animal that swims; any other begins at the rump.
+        A tree of several limbs without a nose, as a hand is, has neither front nor rear: its
+        centre is that of the base joint and those next to it, and its heading that of its middle
+        limb's root from the base.
 
         A swimming body's heading is that of the front quarter of its chain, which is stiff, and its
         centre that of the front half, which the tail's beat hardly moves; a walking body's are rump
@@ -52,12 +62,19 @@ class BodyAxis:
 
         Args:
             joints: names of the joints in the skeleton's order.
+            parents: joint before each of them, -1 at the base; None takes them for one chain.
         """
         names = tuple(joints)
         n = len(joints)
         if names[0] == "head":
             half = tuple(range(n // 2 + 1))
-            return BodyAxis(names, True, tuple(range(n)), (min(max(n // 4, 1), n - 1), 0), half)
+            return BodyAxis(names, SWIMS, tuple(range(n)), (min(max(n // 4, 1), n - 1), 0), half)
+        limbs = _limbs(parents or range(-1, n - 1))
+        if len(limbs) > 1 and "nose" not in names:
+            middle = limbs[len(limbs) // 2]
+            assert parents is not None
+            trunk = (middle[0], *(k for k in range(n) if parents[k] == middle[0]))
+            return BodyAxis(names, BRANCHES, middle[::-1], (middle[0], middle[1]), trunk, limbs)
         at = {name: k for k, name in enumerate(names)}
         rump, neck, nose = (
             at.get(name, place)
@@ -69,4 +86,26 @@ class BodyAxis:
             else (0,)
         )
         trunk = tuple(k for k in range(n) if k != nose) or (nose,)
-        return BodyAxis(names, False, spine, (rump, neck), trunk)
+        return BodyAxis(names, STANDS, spine, (rump, neck), trunk)
+
+
+def parents_of(animal: Mapping[str, Any]) -> tuple[int, ...]:
+    """Joint before each joint, -1 at the base.
+
+    Args:
+        animal: the section of that name of a session.json.
+    """
+    before = {int(child): int(parent) for parent, child in animal["bones"]}
+    return tuple(before.get(joint, -1) for joint in range(len(animal["joints"])))
+
+
+def _limbs(parents: Sequence[int]) -> tuple[tuple[int, ...], ...]:
+    """The chains from the base to an end, of three joints or more: shorter ones cannot bend."""
+    found = []
+    for end in sorted(set(range(len(parents))) - set(parents)):
+        chain = [end]
+        while parents[chain[-1]] >= 0:
+            chain.append(parents[chain[-1]])
+        if len(chain) >= 3:
+            found.append(tuple(chain[::-1]))
+    return tuple(found)

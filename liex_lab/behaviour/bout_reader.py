@@ -14,6 +14,8 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from liex_lab.behaviour.body import STANDS, SWIMS
+from liex_lab.behaviour.columns import kind_of
 from liex_lab.behaviour.kinematics import segments, smallest_turn
 from liex_lab.tables.rows import median_step, stop_times
 
@@ -34,7 +36,7 @@ class BoutReader:
         step = median_step(self.time_s)
         self.fps = 1.0 / step if step > 0 else 0.0
         self.place = kinematics[["x_mm", "y_mm", "z_mm"]].to_numpy(float)
-        self.swims = "tail_angle_rad" in kinematics
+        self.kind = kind_of(kinematics)
         length = self._of("length_mm")
         self.length_mm = float(np.nanmedian(length)) if np.isfinite(length).any() else np.nan
         self._columns: dict[str, Array] = {}
@@ -64,7 +66,9 @@ class BoutReader:
             Column name to value; NaN where nothing is known.
         """
         found = {**self.motion(start, stop), **self.turn(start, stop)}
-        return {**found, **(self._tail(start, stop) if self.swims else self.height(start, stop))}
+        if self.kind == SWIMS:
+            return found | self._tail(start, stop)
+        return found | self.height(start, stop) if self.kind == STANDS else found
 
     def since_last(self, bouts: pd.DataFrame, spans: Sequence[tuple[int, int]]) -> Array:
         """(n,) time from the end of the last bout of the same action, s.
@@ -135,7 +139,7 @@ class BoutReader:
             "path_mm": path,
             "path_bl": path / self.length_mm,
             "displacement_mm": float(
-                np.linalg.norm(displacement if self.swims else displacement[:2])
+                np.linalg.norm(displacement if self.kind != STANDS else displacement[:2])
             ),
             "rise_mm": float(displacement[2]),
             "mean_speed_mm_s": path / timed if timed > 0 else np.nan,

@@ -7,8 +7,10 @@ the report share the list. Rules after Live Mouse Tracker (de Chaumont et al. 20
 
 from __future__ import annotations
 
+from collections.abc import Hashable, Iterable
 from dataclasses import replace
 
+from liex_lab.behaviour.body import BRANCHES, STANDS, SWIMS
 from liex_lab.tables.schema import FRAMES, Column, columns
 
 OWN = "this library's choice"
@@ -25,7 +27,8 @@ KINEMATICS: tuple[Column, ...] = columns(
         "float64",
         "mm",
         "body centre in the arena, along the picture's rows",
-        "mean of all joints but the nose; of a swimming animal, of the front half of its chain",
+        "mean of all joints but the nose; of a swimming animal, of the front half of its chain; of "
+        "a hand, of the palm and the joints next to it",
     ),
     ("y_mm", "float64", "mm", "body centre in the arena, up in the picture", "as x_mm"),
     ("z_mm", "float64", "mm", "height of the body centre above the floor", "as x_mm"),
@@ -88,9 +91,9 @@ KINEMATICS: tuple[Column, ...] = columns(
         "heading_rad",
         "float64",
         "rad",
-        "direction from rump to neck (of a swimming animal, along its front quarter to the head) "
-        "on the floor, 0 along x, counter-clockwise seen from above; empty when the body stands "
-        "steeper than 75 degrees",
+        "direction from rump to neck (of a swimming animal, along its front quarter to the head; "
+        "of a hand, from the palm to the root of the middle finger) on the floor, 0 along x, "
+        "counter-clockwise seen from above; empty when the body stands steeper than 75 degrees",
         "atan2(dy, dx)",
     ),
     (
@@ -131,7 +134,13 @@ KINEMATICS: tuple[Column, ...] = columns(
         "hypot(sd of both joints) / their distance",
         _INDEPENDENT,
     ),
-    ("length_mm", "float64", "mm", "length of the chain of joints", "sum of the bones"),
+    (
+        "length_mm",
+        "float64",
+        "mm",
+        "length of the chain of joints; of a hand, from the palm to the tip of the middle finger",
+        "sum of the bones",
+    ),
     (
         "straightness",
         "float64",
@@ -473,22 +482,52 @@ SWIMMING_BOUTS = tuple(
 )
 
 
-def kinematics_columns(swims: bool) -> tuple[Column, ...]:
+BRANCHING: tuple[Column, ...] = columns(
+    "kinematics",
+    (
+        "opening",
+        "float64",
+        "",
+        "1 when all limbs, a hand's fingers, are stretched out; less the more they are bent",
+        "mean over the limbs of the distance from the base joint to the limb's end / length of the "
+        "bones in between",
+        OWN,
+    ),
+)
+_KINEMATICS = {STANDS: WALKING, SWIMS: SWIMMING, BRANCHES: BRANCHING}
+_BOUTS: dict[str, tuple[Column, ...]] = {
+    STANDS: WALKING_BOUTS,
+    SWIMS: SWIMMING_BOUTS,
+    BRANCHES: (),
+}
+
+
+def kinematics_columns(kind: str) -> tuple[Column, ...]:
     """The columns of the table `kinematics`.
 
     Args:
-        swims: of an animal that swims, else of one that walks.
+        kind: one of `body.KINDS`.
     """
-    return (*KINEMATICS, *(SWIMMING if swims else WALKING))
+    return (*KINEMATICS, *_KINEMATICS[kind])
 
 
-def bout_columns(swims: bool) -> tuple[Column, ...]:
+def kind_of(names: Iterable[Hashable]) -> str:
+    """The kind of body, one of `body.KINDS`, whose table `kinematics` has these columns.
+
+    Args:
+        names: the columns of the table.
+    """
+    known = set(names)
+    return next((kind for kind in (SWIMS, BRANCHES) if _KINEMATICS[kind][0].name in known), STANDS)
+
+
+def bout_columns(kind: str) -> tuple[Column, ...]:
     """The measures that the table `bouts` has beside who, when and what.
 
     Args:
-        swims: of an animal that swims, else of one that walks.
+        kind: one of `body.KINDS`.
     """
-    return (*BOUT_MEASURES, *(SWIMMING_BOUTS if swims else WALKING_BOUTS))
+    return (*BOUT_MEASURES, *_BOUTS[kind])
 
 
 def trusted(columns_of: tuple[Column, ...], fps: float) -> frozenset[str]:

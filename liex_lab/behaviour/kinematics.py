@@ -19,7 +19,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from liex_lab.behaviour.body import BodyAxis
+from liex_lab.behaviour.body import BRANCHES, STANDS, SWIMS, BodyAxis
 from liex_lab.behaviour.columns import kinematics_columns
 from liex_lab.behaviour.posture import Posture, Shape
 from liex_lab.behaviour.tail import tail_beat
@@ -62,6 +62,7 @@ _HEIGHTS = (
     "nose_over_rump_mm",
     "reach_mm",
 )
+_BY_FRAME = {STANDS: _HEIGHTS, SWIMS: (), BRANCHES: ("opening",)}
 STEEP_RAD = np.radians(75.0)  # beyond it the body's axis has no reliable direction on the floor
 
 
@@ -157,8 +158,8 @@ def kinematics(
         known.
     """
     joints = poses if isinstance(poses, Joints) else Joints.of_table(poses, len(frames))
-    body = BodyAxis.of(joints.names)
-    shape, heights = _frame_by_frame(body, joints, allocate)
+    body = BodyAxis.of(joints.names, joints.parents)
+    shape, own = _frame_by_frame(body, joints, allocate)
     time_s = frames["time_s"].to_numpy(float)
     observed = np.isfinite(shape.centre[:, 0])
     spans = Spans.of(time_s, observed, half_window_s)
@@ -167,31 +168,33 @@ def kinematics(
     }
     block |= {name: str(frames[name].iloc[0]) for name in ("session_id", "individual")}
     block |= _moving(
-        shape, body.swims, spans, stop_times(time_s) - time_s, impossible_above_mm_s, allocate
+        shape, body.kind, spans, stop_times(time_s) - time_s, impossible_above_mm_s, allocate
     )
     block |= {
         "length_mm": shape.length_mm,
         "straightness": shape.straightness,
         "bend_rad": shape.bend_rad,
-        **heights,
+        **own,
     }
-    if body.swims:
+    if body.kind == SWIMS:
         block |= _swimming(shape, time_s, segments(time_s, observed), surface_z_mm)
-    return to_pandas(kinematics_columns(body.swims), block, copy=False)
+    return to_pandas(kinematics_columns(body.kind), block, copy=False)
 
 
 def _frame_by_frame(
     body: BodyAxis, joints: Joints, allocate: Allocator
 ) -> tuple[Shape, dict[str, Array]]:
-    """What each frame tells by itself, and of an animal that stands its heights, block by block."""
+    """What each frame tells by itself: of every body, and of one of its kind, block by block."""
     shape = Shape.empty(joints.n_frames, allocate)
-    heights = {} if body.swims else {name: allocate((joints.n_frames,), float) for name in _HEIGHTS}
+    own = {name: allocate((joints.n_frames,), float) for name in _BY_FRAME[body.kind]}
     for rows in blocks(joints.n_frames, _BLOCK):
         xyz, sd = joints.at(rows)
         shape.put(rows, Posture.of(body, xyz, sd))
-        if not body.swims:
-            _put(heights, rows, _walking(body, xyz, sd))
-    return shape, heights
+        if body.kind == STANDS:
+            _put(own, rows, _walking(body, xyz, sd))
+        elif body.kind == BRANCHES:
+            _put(own, rows, {"opening": _opening(body, xyz)})
+    return shape, own
 
 
 def _put_away(column: pd.Series[Any], allocate: Allocator) -> NDArray[Any]:
@@ -209,7 +212,7 @@ def _put(columns: dict[str, Array], rows: slice, values: dict[str, Array]) -> No
 
 def _moving(
     shape: Shape,
-    swims: bool,
+    kind: str,
     spans: Spans,
     hold_s: Array,
     impossible_above_mm_s: float,
@@ -223,7 +226,7 @@ def _moving(
     for rows in blocks(len(hold_s), _BLOCK):
         centre = shape.centre[rows]
         velocity = spans[rows].rate(shape.centre)
-        fast = np.linalg.norm(velocity if swims else velocity[:, :2], axis=1)
+        fast = np.linalg.norm(velocity[:, :2] if kind == STANDS else velocity, axis=1)
         speed[rows] = np.where(fast > impossible_above_mm_s, np.nan, fast)
         speed_sd[rows] = spans[rows].sd(shape.centre_sd)
         flat = np.abs(shape.pitch_rad[rows]) < STEEP_RAD
@@ -271,6 +274,16 @@ def _walking(body: BodyAxis, xyz: Array, sd: Array) -> dict[str, Array]:
     }
 
 
+def _opening(body: BodyAxis, xyz: Array) -> Array:
+    """(n,) how far the limbs are stretched out, 1 at most, of joints (n, J, 3)."""
+    shares = []
+    for limb in body.limbs:
+        at = xyz[:, list(limb)]
+        bones = np.linalg.norm(np.diff(at, axis=1), axis=2).sum(axis=1)
+        shares.append(np.linalg.norm(at[:, -1] - at[:, 0], axis=1) / bones)
+    return np.asarray(np.mean(shares, axis=0))
+
+
 def _swimming(
     shape: Shape, time_s: Array, number: Rows, surface_z_mm: float | None
 ) -> dict[str, Array]:
@@ -300,20 +313,23 @@ class Joints:
         n_frames: number of frames.
         at: from a slice of m frames to positions (m, J, 3) mm in the arena frame and their standard
             deviation (m, J) mm along an axis, NaN where they are not known.
+        parents: joint before each of them, -1 at the base; None takes them for one chain.
     """
 
     names: list[str]
     n_frames: int
     at: Callable[[slice], tuple[Array, Array]]
+    parents: tuple[int, ...] | None = None
 
     @staticmethod
-    def of_table(poses: pd.DataFrame, n: int) -> Joints:
+    def of_table(poses: pd.DataFrame, n: int, parents: tuple[int, ...] | None = None) -> Joints:
         """The joints of the table `poses`.
 
         Args:
             poses: the table `poses`, J rows per frame; without sd_mm all standard deviations are
                 NaN.
             n: number of frames.
+            parents: joint before each joint, -1 at the base; None takes them for one chain.
         """
         column = poses["joint"]
         names = (
@@ -332,6 +348,7 @@ class Joints:
             [str(name) for name in names],
             n,
             lambda rows: (_apart([one[rows] for one in xyz]), sd[rows]),
+            parents,
         )
 
     @staticmethod
@@ -349,7 +366,8 @@ class Joints:
             sd = part.sd_mm.copy()
             return _apart(list(np.moveaxis(xyz, -1, 0))), sd
 
-        return Joints(list(track.skeleton.names), track.n_frames, at)
+        parents = tuple(int(joint) for joint in track.skeleton.parents)
+        return Joints(list(track.skeleton.names), track.n_frames, at, parents)
 
 
 def _apart(xyz: Sequence[Array]) -> Array:

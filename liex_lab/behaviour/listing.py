@@ -7,6 +7,7 @@ the list; a test holds the page to it.
 from __future__ import annotations
 
 from liex_lab.actions.vocabulary import WORDS
+from liex_lab.behaviour.body import BRANCHES, STANDS, SWIMS
 from liex_lab.behaviour.summary_columns import Vocabulary
 from liex_lab.tables.schema import TABLES, Column
 
@@ -64,13 +65,13 @@ FIRST = (
 
 
 def all_columns() -> dict[str, Column]:
-    """Every column that a session can have, of animals that walk and that swim, by `table.name`."""
-    walking, swimming = (
-        Vocabulary(tuple(WORDS[animal]), (), swims).columns
-        for animal, swims in (("mouse", False), ("fish", True))
+    """Every column that a session can have, of every kind of body, by `table.name`."""
+    walking, swimming, branching = (
+        Vocabulary(tuple(WORDS.get(animal, ())), (), kind).columns
+        for animal, kind in (("mouse", STANDS), ("fish", SWIMS), ("hand", BRANCHES))
     )
     stored = [column for rows in TABLES.values() for column in rows]
-    return {f"{c.table}.{c.name}": c for c in (*stored, *swimming, *walking)}
+    return {f"{c.table}.{c.name}": c for c in (*stored, *branching, *swimming, *walking)}
 
 
 def first_columns() -> str:

@@ -14,7 +14,7 @@ import pandas as pd
 
 from liex_lab.behaviour.bout_reader import BoutReader
 from liex_lab.behaviour.checking import BoutCheck
-from liex_lab.behaviour.columns import bout_columns, trusted
+from liex_lab.behaviour.columns import bout_columns, kind_of, trusted
 from liex_lab.tables.schema import BOUTS, to_pandas
 
 
@@ -35,8 +35,7 @@ def measure_bouts(
     Returns:
         The columns `BOUTS` and those of `bout_columns`, one row per bout.
     """
-    swims = "tail_angle_rad" in kinematics
-    described = bout_columns(swims)
+    described = bout_columns(kind_of(kinematics))
     reader = BoutReader(kinematics)
     check = BoutCheck(reader, meanings or {})
     spans = reader.rows_of(bouts)

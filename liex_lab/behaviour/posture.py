@@ -16,7 +16,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from liex_lab.behaviour.body import BodyAxis
+from liex_lab.behaviour.body import SWIMS, BodyAxis
 from liex_lab.runtime.memory import Allocator, blocks
 
 Array = NDArray[np.float64]
@@ -229,7 +229,7 @@ class Shape:
             posture: the posture of these m frames.
         """
         told = [one.name for one in fields(Shape)]
-        for name in told[: None if posture.body.swims else -4]:
+        for name in told[: None if posture.body.kind == SWIMS else -4]:
             if name == "thirds_rad":
                 self.thirds_rad[rows] = np.stack(posture.thirds_rad(), axis=1)
             else:

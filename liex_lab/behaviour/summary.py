@@ -16,7 +16,9 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from liex_lab.behaviour.activity import activity
+from liex_lab.behaviour.body import SWIMS, parents_of
 from liex_lab.behaviour.bouts import ACTIONS, MouseRules, find_bouts
+from liex_lab.behaviour.columns import kind_of
 from liex_lab.behaviour.kinematics import Joints, kinematics
 from liex_lab.behaviour.measures import measure_bouts
 from liex_lab.behaviour.places import (
@@ -145,7 +147,7 @@ def measure(
         find_bouts(frames, moved, rules) if bouts is None else measure_bouts(bouts, moved, actions)
     )
     actions |= dict.fromkeys(sorted(set(named["action"]) - set(actions)), "")
-    words = Vocabulary(tuple(actions), tuple(around.zones), "tail_angle_rad" in moved)
+    words = Vocabulary(tuple(actions), tuple(around.zones), kind_of(moved))
     gaps = empty_table(GAPS) if gaps is None else gaps
     summary = summarise(frames, moved, named, words, around, rules)
     behaviour = Behaviour(
@@ -227,9 +229,11 @@ def measure_session(session: SessionTables, rules: MouseRules | None = None) -> 
     """
     stated, around = stated_by(session)
     poses = session.table("poses", ["frame_index", "joint", "x_mm", "y_mm", "z_mm", "sd_mm"])
+    frames = session.frames
+    parents = parents_of(session.metadata["animal"])
     return measure(
-        session.frames,
-        poses,
+        frames,
+        Joints.of_table(poses, len(frames), parents),
         rules or stated,
         around,
         session.gaps,
@@ -252,7 +256,7 @@ def summarise(
         frames: the table `frames`.
         kinematics: the table `kinematics`.
         bouts: the table `bouts` with its measures.
-        words: actions, zones and whether the animal swims; None takes the rules' actions of a
+        words: actions, zones and the kind of body; None takes the rules' actions of a
             walking animal.
         around: arena, zones and water; None where nothing is known.
         rules: what is slower than their pause does not move for certain; None takes the defaults.
@@ -280,7 +284,7 @@ def summarise(
         **_budget(bouts, words.words, float(hold.sum()), first),
         **_time_in_zones(frames, words.zones, hold),
     }
-    if words.swims:
+    if words.kind == SWIMS:
         block |= depth_measures(kinematics, hold, around.surface_z_mm)
         block |= {name: _median(kinematics[name]) for name in ("tail_beat_hz", "tail_beat_mm")}
     else:
@@ -288,7 +292,7 @@ def summarise(
         block["distance_moving_m"] = _moving_m(
             kinematics, np.fmax(pause_mm_s, block["speed_noise_mm_s"])
         )
-    return to_pandas(summary_columns(words.words, words.zones, words.swims), block)
+    return to_pandas(summary_columns(words.words, words.zones, words.kind), block)
 
 
 def _motion(kinematics: pd.DataFrame, hold: Array) -> dict[str, float]:

@@ -1,7 +1,7 @@
 """Data dictionary of the tables `summary`, `transitions`, `zones` and `activity`.
 
 Unit, meaning, formula and source of each column, listed once. Which columns there are depends on
-the actions' names, the zones' names, and whether the animal swims.
+the actions' names, the zones' names, and the kind of body.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from liex_lab.behaviour.body import STANDS, SWIMS
 from liex_lab.behaviour.columns import OWN, bout_columns, kinematics_columns
 from liex_lab.tables.schema import Column, columns
 
@@ -166,14 +167,14 @@ _SWIMMER = (
 
 
 def summary_columns(
-    words: Sequence[str], zones: Sequence[str] = (), swims: bool = False
+    words: Sequence[str], zones: Sequence[str] = (), kind: str = STANDS
 ) -> tuple[Column, ...]:
     """The columns of the table `summary`: one row per animal.
 
     Args:
         words: the actions' names.
         zones: the zones' names.
-        swims: of an animal that swims, else of one that walks.
+        kind: one of `body.KINDS`.
     """
     named = [row for word in words for row in _of_action(word)]
     if together := rears_of(words):
@@ -195,7 +196,9 @@ def summary_columns(
             "unlabelled_s / observed_s",
         ),
     )
-    return columns("summary", *_GENERAL, *(_SWIMMER if swims else _WALKER), *named, *rest, *placed)
+    return columns(
+        "summary", *_GENERAL, *(_SWIMMER if kind == SWIMS else _WALKER), *named, *rest, *placed
+    )
 
 
 def rears_of(words: Sequence[str]) -> tuple[str, ...]:
@@ -411,20 +414,20 @@ class Vocabulary:
     Attributes:
         words: the actions' names.
         zones: the zones' names.
-        swims: whether the animal swims, else it walks.
+        kind: of body, one of `body.KINDS`.
     """
 
     words: tuple[str, ...]
     zones: tuple[str, ...] = ()
-    swims: bool = False
+    kind: str = STANDS
 
     @property
     def columns(self) -> tuple[Column, ...]:
         """Every column of the behaviour tables."""
         return (
-            *kinematics_columns(self.swims),
-            *bout_columns(self.swims),
-            *summary_columns(self.words, self.zones, self.swims),
+            *kinematics_columns(self.kind),
+            *bout_columns(self.kind),
+            *summary_columns(self.words, self.zones, self.kind),
             *TRANSITIONS,
             *ZONES,
             *activity_columns(self.words),

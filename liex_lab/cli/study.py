@@ -166,10 +166,8 @@ def _tell_study(standings: list[SessionStatus], all_of_them: bool) -> int:
     """
     counts: dict[str, int] = {}
     for one in standings:
-        look = one.state == "done" and one.reason
-        state = "done, look at it" if look else one.state
-        counts[state] = counts.get(state, 0) + 1
-        if look:
+        counts[one.in_words] = counts.get(one.in_words, 0) + 1
+        if one.state == "done" and one.reason:
             say(f"{'done':9}{one.session.id}  {one.reason}")
         elif all_of_them or one.state not in ("done", "excluded"):
             remedy = f"; {one.failure['remedy']}" if one.failure and one.state == "failed" else ""

@@ -137,6 +137,10 @@ class _Thumbnail(_Section):
         return self
 
 
+class _WholePicture(_Thumbnail):
+    beside_px: Annotated[list[Finite], Field(min_length=2, max_length=2)]
+
+
 class _Frames(_Section):
     n_frames: Count
     n_observed: Count
@@ -206,6 +210,7 @@ class Document(_Section):
     rules: dict[Text, Finite] | None = None
     no_actions: Text = ""
     thumbnails: list[_Thumbnail] = []
+    whole_picture: _WholePicture | None = None
     files: dict[Text, _Facts] = {}
     frames: _Frames
     depth_unit_mm: Finite = 1.0

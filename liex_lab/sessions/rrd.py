@@ -20,6 +20,7 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from liex_lab.actions import colours
+from liex_lab.behaviour.curves import logged_of
 from liex_lab.errors import SessionError
 from liex_lab.geometry import so3
 from liex_lab.runtime.disk import probe_full
@@ -184,16 +185,13 @@ class ReplayWriter:
         scalars = [
             ("error/predicted", "predicted error (mm)", 0xEE6677, rows.track.predicted_error_mm)
         ]
-        for name, label, colour in (
-            ("speed_mm_s", "speed (mm/s)", 0x4477AA),
-            ("nose_height_mm", "nose height (mm)", 0x228833),
-            ("bend_rad", "bend (rad)", 0xAA3377),
-            ("tail_beat_hz", "tail beat (Hz)", 0x66CCEE),
-        ):
-            if name in kinematics:
-                scalars.append(
-                    (f"kinematics/{name}", label, colour, kinematics[name].to_numpy(float))
-                )
+        skeleton = self._origin.skeleton
+        animal = {"joints": skeleton.names, "bones": skeleton.edges}
+        for one in logged_of(animal):
+            if one.column in kinematics:
+                label = f"{one.title.lower()}{f' ({one.unit})' if one.unit else ''}"
+                values = kinematics[one.column].to_numpy(float)
+                scalars.append((f"kinematics/{one.column}", label, int(one.colour[1:], 16), values))
         for entity, label, colour, values in scalars:
             self._stream.log(
                 entity, rr.SeriesLines(names=label, colors=_rgba([colour]), widths=1.5), static=True

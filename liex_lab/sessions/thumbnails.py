@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from liex_lab.optics.camera import Camera
 from liex_lab.tables.rows import Rows
+from liex_lab.tracking.observations import Observations
 
 FOLDER = "thumbnails"
 _KEPT = 32  # at most this many whole frames are held while a recording of unknown length goes by
@@ -97,6 +98,53 @@ class Keepsakes:
                 }
             )
         return entries
+
+    def save_whole(self, folder: Path, rows: Rows, seen: Observations) -> dict[str, Any] | None:
+        """Write the whole picture in which another thing of the animal's size is seen best.
+
+        Call it after `save`.
+
+        Args:
+            folder: the session folder.
+            rows: the track as the tables see it.
+            seen: what the single frames said: the animal is one of their two components.
+
+        Returns:
+            Its entry as `save` gives it, and `beside_px`, [u, v] of the middle of the other thing;
+            None where no kept picture shows one.
+        """
+        import cv2
+
+        best: tuple[int, int, NDArray[np.float64]] | None = None
+        for row in sorted(self._kept):
+            if row >= rows.track.n_frames or not rows.track.observed[row]:
+                continue
+            uv = rows.track.uv_px[row]
+            centre = np.nanmean(uv, axis=0)
+            found = np.asarray(seen.centroid_px[row, ::2], float)  # of both components
+            away = np.linalg.norm(found - centre, axis=1)
+            reach = np.nanmax(np.linalg.norm(uv - centre, axis=1))
+            n_px = seen.n_px[row, ::2]
+            if not (np.isfinite(away) & (n_px > 0)).all() or away.max() < reach:
+                continue
+            size = int(n_px.min())  # that both are seen whole
+            if best is None or size > best[1]:
+                best = row, size, found[int(away.argmax())]
+        if best is None:
+            return None
+        row, _, place = best
+        depth = self._kept[row]
+        name = f"{FOLDER}/whole_{int(rows.frame_index[row]):07d}.png"
+        cv2.imwrite(str(folder / name), depth)
+        return {
+            "file": name,
+            "frame_index": int(rows.frame_index[row]),
+            "left_px": 0,
+            "top_px": 0,
+            "width_px": depth.shape[1],
+            "height_px": depth.shape[0],
+            "beside_px": [round(float(at), 1) for at in place],
+        }
 
     def _cut(self, row: int, rows: Rows, camera: Camera) -> tuple[int, int, NDArray[np.uint16]]:
         depth = self._kept[row]

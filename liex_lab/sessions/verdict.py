@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from liex_lab.tracking.track import Track
 
 LOOK_AT_IT = "look at it"
+CAUTION = "note"
 _MEASURED_SHARE = 0.5  # of the frames in which something of the animal's size is in view
 _LEAST_SHARE = 0.2  # of all frames that hold depth
 _DOUBTFUL_SHARE = 0.05
@@ -142,7 +143,7 @@ class Verdict:
             accepted = " (accepted)" if self.accepted else ""
             parts.append(f"{LOOK_AT_IT}{accepted}: {'; '.join(self.reasons)}")
         if self.cautions:
-            parts.append(f"note: {'; '.join(self.cautions)}")
+            parts.append(f"{CAUTION}: {'; '.join(self.cautions)}")
         return ". ".join(parts)
 
     def to_dict(self) -> dict[str, Any]:

@@ -118,6 +118,7 @@ class SessionWriter:
         self._rows: Rows | None = None
         self._flips: Sequence[Flip] = ()
         self._candidates: Observations | None = None
+        self._together: Observations | None = None
         self._keepsakes = Keepsakes()
         self._keeper = PictureKeeper(origin)
         self._done = False
@@ -321,6 +322,7 @@ class SessionWriter:
         self._flips = tracked.flips
         rest()  # hours of recording leave much behind
         self._candidates = seen if self.origin.replay_candidates else None
+        self._together = seen if subject.n_animals > 1 else None
         write_evidence(self._folder, seen, subject)
 
     @property
@@ -427,6 +429,9 @@ class SessionWriter:
             actions={word: (actions or {}).get(word, "") for word in words}, **dict(record or {})
         )
         self._document["thumbnails"] = self._keepsakes.save(self._folder, rows, self.origin.camera)
+        if self._together is not None:
+            whole = self._keepsakes.save_whole(self._folder, rows, self._together)
+            self._document |= {} if whole is None else {"whole_picture": whole}
         (self._folder / "plan.toml").write_text(self.origin.plan_toml, encoding="utf-8")
         self._seconds += time.perf_counter() - began
         self._document["files"] = file_facts(self._folder, self._checkpoint.logs)

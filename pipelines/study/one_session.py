@@ -71,7 +71,7 @@ def measure_one(
     Returns:
         `id`, `state` (`done` or `failed`), `seconds`, `failure` (None where it is done),
         `corrections_taken_from` (the outdated copy that people had corrected; "" for none), and
-        `look_at_it` (why someone has to look at it although it is done; "" where nobody has to).
+        `look_at_it` (what there is to look at or to distrust although it is done; "" for nothing).
     """
     if run_id and (ended := _ended(session, run_id)):
         return ended

@@ -16,7 +16,7 @@ from liex_lab.plan import Plan
 from liex_lab.plan.study import PlannedSession, Study
 from liex_lab.sessions.corrections import DESCRIBED, START, read_log, with_description
 from liex_lab.sessions.failure import read_failure
-from liex_lab.sessions.verdict import LOOK_AT_IT, verdict_in
+from liex_lab.sessions.verdict import CAUTION, LOOK_AT_IT, verdict_in
 
 from .changes import what_changed
 from .sharing import shared_sessions
@@ -31,7 +31,8 @@ class SessionStatus:
     Attributes:
         session: the planned session.
         state: done, failed, new, begun, changed or excluded.
-        reason: why it is to be done, was not, or is to be looked at although it is done.
+        reason: why it is to be done, was not, or what there is to look at or to distrust although
+            it is done.
         failure: of the last attempt, if it failed.
         described: what the study says otherwise of the animal than its results; then nothing else
             changed, and nothing is measured anew.
@@ -42,6 +43,13 @@ class SessionStatus:
     reason: str = ""
     failure: dict[str, Any] | None = None
     described: dict[str, str] = field(default_factory=dict)
+
+    @property
+    def in_words(self) -> str:
+        """The state as a person is told it: of one that is done, whether all is well with it."""
+        if self.state != "done" or not self.reason:
+            return self.state
+        return f"done, {LOOK_AT_IT}" if self.reason.startswith(LOOK_AT_IT) else "done with cautions"
 
     @property
     def to_do(self) -> bool:
@@ -138,15 +146,21 @@ def standing(session: PlannedSession, waits_for: str = "") -> SessionStatus:
 
 
 def to_look_at(verdict: Mapping[str, Any]) -> str:
-    """Why someone has to look at a session that is done, '' where nobody has to.
+    """Why someone has to look at a session that is done, and what to distrust in it.
 
     Args:
         verdict: as `sessions.verdict.read_verdict` gives it.
+
+    Returns:
+        As the session itself says it; '' where there is nothing to say.
     """
-    if not verdict["look_at_it"]:
-        return ""
-    accepted = ", accepted" if verdict["accepted"] else ""
-    return f"{LOOK_AT_IT}{accepted}: {'; '.join(map(str, verdict['reasons']))}"
+    said = []
+    if verdict["look_at_it"]:
+        accepted = ", accepted" if verdict["accepted"] else ""
+        said.append(f"{LOOK_AT_IT}{accepted}: {'; '.join(map(str, verdict['reasons']))}")
+    if verdict["cautions"]:
+        said.append(f"{CAUTION}: {'; '.join(map(str, verdict['cautions']))}")
+    return ". ".join(said)
 
 
 def _described_anew(session: PlannedSession, document: dict[str, Any]) -> dict[str, str]:

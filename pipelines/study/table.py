@@ -30,7 +30,13 @@ STUDY_SESSIONS = columns(
         "done; failed: see reason and remedy; excluded: by the study file; new, begun or "
         "changed: to be done",
     ),
-    ("reason", "string", "", "why it failed, is excluded or is to be done"),
+    (
+        "reason",
+        "string",
+        "",
+        "why it failed, is excluded or is to be done; of one that is done, what to look at or to "
+        "distrust",
+    ),
     (
         "shared",
         "string",

@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from liex_lab.behaviour.body import BodyAxis
+from liex_lab.behaviour.body import STANDS, SWIMS, BodyAxis
 from liex_lab.behaviour.columns import kinematics_columns
 from liex_lab.behaviour.kinematics import Joints, kinematics, neighbours, segments, smallest_turn
 from liex_lab.recordings.timestamps import find_gaps, median_step
@@ -145,7 +145,7 @@ def test_neighbours_agree_with_the_search_a_reader_would_write():
 
 def test_body_points_are_found_by_name_or_along_the_chain():
     named = BodyAxis.of(["neck", "loin", "chest", "rump", "nose"])
-    assert (named.front, named.rear, named.axis, named.swims) == (4, 3, (3, 0), False)
+    assert (named.front, named.rear, named.axis, named.kind) == (4, 3, (3, 0), STANDS)
     chain = BodyAxis.of(["a", "b", "c", "d"])
     assert (chain.spine, chain.axis, chain.back, chain.trunk) == (
         (3, 2, 1, 0),
@@ -154,14 +154,14 @@ def test_body_points_are_found_by_name_or_along_the_chain():
         (0, 1, 2),
     )
     fish = BodyAxis.of(["head", *(f"spine_{k}" for k in range(8)), "tail_tip"])
-    assert (fish.front, fish.rear, fish.axis, fish.swims) == (0, 9, (2, 0), True)
+    assert (fish.front, fish.rear, fish.axis, fish.kind) == (0, 9, (2, 0), SWIMS)
     alone = BodyAxis.of(["a"])
     assert (alone.front, alone.rear, alone.back) == (0, 0, (0,))
 
 
 def test_the_table_has_the_listed_columns_and_one_row_per_frame():
     moved = kinematics(*tables_of(WalkingMouse(steady(1.0))))
-    assert list(moved.columns) == [column.name for column in kinematics_columns(swims=False)]
+    assert list(moved.columns) == [column.name for column in kinematics_columns(STANDS)]
     assert len(moved) == 30
 
 
