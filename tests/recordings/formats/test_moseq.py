@@ -6,6 +6,7 @@ import gzip
 import io
 import json
 import tarfile
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -254,6 +255,30 @@ def test_an_archive_may_be_several_gzips_one_after_the_other(
     (tmp_path / "s.tar.gz").write_bytes(b"".join(map(gzip.compress, parts)) + bytes(700))
     with open_recording(tmp_path / "s.tar.gz", strict=True) as recording:
         np.testing.assert_array_equal([frame.depth for frame in recording], STORED)
+
+
+def test_a_whole_archive_is_not_unpacked_by_zlib_and_one_with_a_wrong_checksum_is(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    archive = write_archive(folder, tmp_path / "s.tar.gz")
+    made: list[int] = []
+    ready_made = zlib.decompressobj
+
+    def counted(wbits: int) -> object:
+        made.append(wbits)
+        return ready_made(wbits)
+
+    monkeypatch.setattr("zlib.decompressobj", counted)
+    with open_recording(archive, strict=True) as recording:
+        np.testing.assert_array_equal([frame.depth for frame in recording], STORED)
+    assert not made
+    content = bytearray(archive.read_bytes())
+    content[-8] ^= 1  # gzip ends in a CRC-32 and a size
+    archive.write_bytes(content)
+    with open_recording(archive) as recording:
+        assert recording.truncated
+        np.testing.assert_array_equal([frame.depth for frame in recording], STORED)
+    assert made
 
 
 def _slow_gunzip(archive: Path) -> bytes:
