@@ -312,7 +312,7 @@ class _Topic:
 
 
 class _WatchedFile:
-    """A file that remembers its first error for `check`, and only counts what comes after it.
+    """A file that remembers its first error for `check`, and drops what comes after it.
 
     So a full disk is told once, where the writer can act on it.
     """
@@ -321,8 +321,6 @@ class _WatchedFile:
         self._path = path
         self._file = path.open("wb")
         self._error: OSError | None = None
-        self._at = 0
-        self._end = 0
 
     @property
     def size(self) -> int:
@@ -336,19 +334,7 @@ class _WatchedFile:
                 self._file.write(data)
             except OSError as error:
                 self._error = error
-        self._at += len(data)
-        self._end = max(self._end, self._at)
         return len(data)
-
-    def seek(self, offset: int, whence: int = 0) -> int:
-        """As a file does."""
-        if self._error is None:
-            try:
-                self._file.seek(offset, whence)
-            except OSError as error:
-                self._error = error
-        self._at = offset + (0, self._at, self._end)[whence]
-        return self._at
 
     def flush(self) -> None:
         """As a file does."""

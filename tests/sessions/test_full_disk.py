@@ -120,7 +120,7 @@ def test_a_replay_that_stands_still_on_a_disk_with_room_is_given_up_as_well(
     writer.abandon()
 
 
-def test_a_watched_file_keeps_the_first_error_to_itself_and_only_counts_after_it(
+def test_a_watched_file_keeps_the_first_error_to_itself_and_drops_what_comes_after_it(
     tmp_path: Path,
 ) -> None:
     file = _WatchedFile(tmp_path / "a.mcap")
@@ -133,9 +133,7 @@ def test_a_watched_file_keeps_the_first_error_to_itself_and_only_counts_after_it
     whole = file._file
     file._file = Full()  # type: ignore[assignment]
     assert file.write(b"1234") == 4
-    assert file.seek(2) == 2
     assert file.write(b"56") == 2
-    assert file.seek(0, os.SEEK_END) == 12
     file.flush()
     with pytest.raises(OSError, match="No space left"):
         file.check()
