@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
 from numba import njit, prange
 
 
@@ -49,30 +48,27 @@ def far_mode(values, window):
 
 
 @njit(cache=True, parallel=True, nogil=True)
-def far_modes(stack, window_share, window_mm, near_share, depth, spread, near):
+def far_modes(ordered, window_share, window_mm, near_share, depth, spread, near):
     """Background depth, its spread and the nearest usual depth of every pixel.
 
-    Runs `far_mode` in every pixel, rows in parallel.
+    Runs `far_mode` in every pixel, pixels in parallel.
 
     Args:
-        stack: (n, H, W) float32 mm, 0 where unread.
+        ordered: (n_pixels, n) float32 mm, each pixel's readings, ascending; 0 where unread.
         window_share: width of a cluster, of the pixel's farthest reading.
         window_mm: width of a cluster at least, mm.
         near_share: share of a pixel's readings that are nearer than `near`.
-        depth: (H, W) float32 mm, out: the farthest mode, 0 without one.
-        spread: (H, W) float32 mm, out: its standard deviation.
-        near: (H, W) float32 mm, out: the depth that only `near_share` of the readings are nearer
-            than, 0 where never read.
+        depth: (n_pixels,) float32 mm, out: the farthest mode, 0 without one.
+        spread: (n_pixels,) float32 mm, out: its standard deviation.
+        near: (n_pixels,) float32 mm, out: the depth that only `near_share` of the readings are
+            nearer than, 0 where never read.
     """
-    for row in prange(stack.shape[1]):
-        values = np.empty(stack.shape[0], np.float32)
-        for column in range(stack.shape[2]):
-            n = 0
-            for k in range(stack.shape[0]):
-                if stack[k, row, column] > 0:
-                    values[n] = stack[k, row, column]
-                    n += 1
-            ordered = np.sort(values[:n])
-            window = window_mm if n == 0 else max(window_mm, window_share * ordered[-1])
-            depth[row, column], spread[row, column] = far_mode(ordered, window)
-            near[row, column] = ordered[int(near_share * n)] if n > 0 else 0.0
+    for pixel in prange(ordered.shape[0]):
+        first = 0
+        while first < ordered.shape[1] and not ordered[pixel, first] > 0:
+            first += 1
+        values = ordered[pixel, first:]
+        n = values.size
+        window = window_mm if n == 0 else max(window_mm, window_share * values[-1])
+        depth[pixel], spread[pixel] = far_mode(values, window)
+        near[pixel] = values[int(near_share * n)] if n > 0 else 0.0

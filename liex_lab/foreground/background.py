@@ -23,6 +23,7 @@ _NEAR_SHARE = 0.05  # of a pixel's readings may be nearer than its nearest usual
 # an animal of this many pixels is looked at finely enough
 _LENGTH_PX = 64.0
 _MAX_STRIDE = 4
+_ROWS = 32  # of pixels whose readings are sorted at once
 
 
 def sampled(n: int, most: int) -> NDArray[np.int64]:
@@ -108,7 +109,13 @@ def learn_background(
     """
     stack = sample if isinstance(sample, np.ndarray) else sample_frames(sample, 96)
     check_shapes("a sample", ("frames", stack, ("n", "H", "W")))
-    depth, spread, near = np.zeros((3, *stack.shape[1:]), np.float32)
+    found = np.zeros((3, *stack.shape[1:]), np.float32)
     numbers = [np.float32(value) for value in (_MODE_SHARE, _MODE_MM, _NEAR_SHARE)]
-    kernels.far_modes(stack, *numbers, depth, spread, near)
-    return depth, spread, near
+    for start in range(0, stack.shape[1], _ROWS):
+        rows = slice(start, start + _ROWS)
+        # numpy sorts many short rows five times as fast as a compiled loop does
+        ordered = np.ascontiguousarray(stack[:, rows].reshape(len(stack), -1).T)
+        ordered.sort(axis=1)
+        depth, spread, near = (np.ravel(one[rows]) for one in found)
+        kernels.far_modes(ordered, *numbers, depth, spread, near)
+    return found[0], found[1], found[2]

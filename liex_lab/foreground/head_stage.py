@@ -19,6 +19,7 @@ from liex_lab.foreground.heights import heights_before
 from liex_lab.foreground.worn import Worn
 from liex_lab.optics.camera import Camera
 from liex_lab.runtime.shapes import check_shapes
+from liex_lab.runtime.threads import side_by_side
 
 Depths = NDArray[np.float32]
 Mask = NDArray[np.bool_]
@@ -60,14 +61,16 @@ class HeadStage(Worn):
             area_mm2: area of the smallest animal, mm^2.
         """
         largest = HeadStage(camera, floor, _AREA_MM2[1] / _TIMES_AREA)
-        found = []
-        n_animals = 0
-        for depth in sample:
+
+        def look(depth: Depths) -> tuple[bool, list[float]]:
+            """Whether a frame shows something as large as an animal, and its blocks' areas, px."""
             height = heights_before(depth, limit, floor)
-            n_animals += int((height > 0).sum() * largest._px_mm**2 > area_mm2)
-            found.append([float(block.sum()) for block, _ in largest._blocks(height)])
-        worn = [max(areas) for areas in found if areas]
-        if not worn or len(worn) < _LEAST_SHARE * n_animals:
+            shows = bool(np.count_nonzero(height) * largest._px_mm**2 > area_mm2)
+            return shows, [float(block.sum()) for block, _ in largest._blocks(height)]
+
+        found = side_by_side(look, list(sample))
+        worn = [max(areas) for _, areas in found if areas]
+        if not worn or len(worn) < _LEAST_SHARE * sum(shows for shows, _ in found):
             return None
         return replace(largest, area_mm2=float(np.median(worn)) * largest._px_mm**2)
 
@@ -100,13 +103,13 @@ class HeadStage(Worn):
         """
         import cv2
 
-        rows, columns = np.nonzero(height)
+        rows, columns = (np.flatnonzero((height != 0).any(axis=axis)) for axis in (1, 0))
         if not len(rows):
             return
         margin = self._side
         cut = (
-            slice(max(0, int(rows.min()) - margin), int(rows.max()) + margin + 1),
-            slice(max(0, int(columns.min()) - margin), int(columns.max()) + margin + 1),
+            slice(max(0, int(rows[0]) - margin), int(rows[-1]) + margin + 1),
+            slice(max(0, int(columns[0]) - margin), int(columns[-1]) + margin + 1),
         )
         # single readings are noise, and a hole of one pixel parts no body
         smooth = np.asarray(cv2.medianBlur(np.ascontiguousarray(height[cut]), 3))

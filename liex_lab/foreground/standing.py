@@ -22,6 +22,7 @@ from liex_lab.arena.scene import LARGEST, STATED, STOOD_ON, WALLED
 from liex_lab.body.skeleton import VIEWS, View
 from liex_lab.errors import EstimationError
 from liex_lab.optics.camera import Camera
+from liex_lab.runtime.threads import side_by_side
 
 Array = NDArray[np.float64]
 
@@ -355,13 +356,15 @@ def _moving(
 
     The largest few of each frame; of them, those that are not much smaller than the usual largest.
     """
+
+    def look(frame: int) -> list[Thing]:
+        """Those of a frame, the largest first."""
+        things = _of_frame(sample, frame, background, limit, camera, areas)
+        return sorted(things, key=lambda thing: -thing.volume_mm3)
+
     found = []
     largest = []
-    for frame in range(len(sample)):
-        things = sorted(
-            _of_frame(sample, frame, background, limit, camera, areas),
-            key=lambda thing: -thing.volume_mm3,
-        )
+    for things in side_by_side(look, range(len(sample))):
         found += things[:_A_FRAME]
         largest += [thing.volume_mm3 for thing in things[:1]]
     least = _SMALLER * float(np.median(largest)) if largest else 0.0

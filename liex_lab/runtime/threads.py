@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from importlib import import_module
 from typing import TypeVar
 
 Item = TypeVar("Item")
+Result = TypeVar("Result")
 
 
 def prefetch(items: Iterable[Item]) -> Generator[Item, None, None]:
@@ -52,6 +53,24 @@ def in_background(make: Callable[[], Item]) -> Iterator[Callable[[], Item]]:
         yield coming.result
     finally:
         maker.shutdown(wait=False)
+
+
+def side_by_side(do: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:
+    """Results of a function for each item, in their order, on as many threads as kernels may use.
+
+    For work on whole pictures by numpy and OpenCV, which let other threads run meanwhile.
+
+    Args:
+        do: the function; it changes nothing that another item needs.
+        items: its arguments.
+    """
+    import numba
+
+    n = min(numba.get_num_threads(), len(items))
+    if n < 2:
+        return [do(item) for item in items]
+    with ThreadPoolExecutor(n) as pool:
+        return list(pool.map(do, items))
 
 
 @contextmanager

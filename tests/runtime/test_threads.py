@@ -5,9 +5,10 @@ from __future__ import annotations
 import threading
 from collections.abc import Iterator
 
+import numba
 import pytest
 
-from liex_lab.runtime.threads import in_background, prefetch
+from liex_lab.runtime.threads import in_background, prefetch, side_by_side
 
 
 def test_items_made_ahead_are_the_same_in_the_same_order() -> None:
@@ -64,3 +65,16 @@ def test_something_is_made_while_a_block_runs_and_its_error_is_raised_where_it_i
         failed()
     with in_background(fail):  # nobody wants it
         pass
+
+
+@pytest.mark.parametrize("n_threads", [1, 2])
+def test_results_side_by_side_are_in_order_and_what_goes_wrong_is_raised(n_threads: int) -> None:
+    before = numba.get_num_threads()
+    numba.set_num_threads(min(n_threads, before))
+    try:
+        assert side_by_side(lambda number: number**2, range(50)) == [n**2 for n in range(50)]
+        assert side_by_side(lambda number: number, []) == []
+        with pytest.raises(ZeroDivisionError):
+            side_by_side(lambda number: 1 // number, [1, 0, 2])
+    finally:
+        numba.set_num_threads(before)
