@@ -1,6 +1,4 @@
-"""Units, numbers and dates as people read them on pages: cm/s and degrees; files keep mm/s and
-radians.
-"""
+"""Units, numbers and dates as people read them on pages; see `tables.units`."""
 
 from __future__ import annotations
 
@@ -10,35 +8,21 @@ from typing import Any
 
 import numpy as np
 
-_SHOWN = {
-    "mm/s": ("cm/s", 0.1),
-    "mm/s²": ("cm/s²", 0.1),
-    "rad": ("°", 180.0 / np.pi),
-    "rad/s": ("°/s", 180.0 / np.pi),
-}
+from liex_lab.tables.units import shown, titled
+
+__all__ = ["counted", "day", "read_as", "reading", "shown", "titled"]
+
 _DECIMALS = {"s": 2, "m": 2, "mm": 1, "cm/s": 1, "°": 1, "°/s": 1, "Hz": 1, "1/min": 1}
 
 
-def shown(value: Any, unit: str) -> tuple[Any, str]:
-    """A number, or an array of them, in the unit that people read, and that unit.
+def read_as(measure: str, unit: str) -> str:
+    """A measure as people read it: its name, and the unit that its values are shown in.
 
     Args:
-        value: in the unit of the files.
-        unit: as columns.json names it; others than speeds and angles stay as they are.
+        measure: a column of the summary.
+        unit: its unit there; "" for none.
     """
-    name, factor = _SHOWN.get(unit, (unit, 1.0))
-    return (value * factor if factor != 1.0 else value), name
-
-
-def titled(column: str, unit: str) -> str:
-    """The name of a column as people read it: without its unit, which stands beside the number.
-
-    Args:
-        column: name of the column, such as `mean_speed_mm_s`.
-        unit: as columns.json names it.
-    """
-    tail = "_" + unit.replace("/", "_").replace("²", "2")
-    return (column.removesuffix(tail) if unit else column).replace("_", " ")
+    return f"{titled(measure, unit)}{f', {shown(1.0, unit)[1]}' if unit else ''}"
 
 
 def counted(n: int, one: str, more: str = "") -> str:

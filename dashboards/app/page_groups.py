@@ -13,7 +13,7 @@ from dash import Dash, Input, Output, dcc, html, no_update
 from liex_lab.behaviour import cohort
 from liex_lab.errors import LiexError
 
-from ..units import titled
+from ..units import shown, titled
 from . import plots
 from .data import StudyData
 from .parts import graph
@@ -130,15 +130,13 @@ def verdict(row: dict[str, Any], unit: str) -> html.Div:
 
     Args:
         row: a row of the table `stats`, see `cohort.compare`.
-        unit: the measure's unit; empty where it has none.
+        unit: the measure's unit in the table; empty where it has none.
     """
-    sized = (
-        f"{number(row['estimate'])}{f' {unit}' if unit else ''}, 95 % interval "
-        f"{number(row['ci_low'])} to "
-    )
+    factor, read = shown(1.0, unit)
+    estimate, low, high = (factor * row[name] for name in ("estimate", "ci_low", "ci_high"))
+    sized = f"{number(estimate)}{f' {read}' if read else ''}, 95 % interval {number(low)} to "
     sized += (
-        f"{number(row['ci_high'])}; Hedges' g {number(row['effect_size'])} "
-        f"({number(row['effect_low'])} to "
+        f"{number(high)}; Hedges' g {number(row['effect_size'])} ({number(row['effect_low'])} to "
     )
     sized += f"{number(row['effect_high'])})"
     if row["test"]:

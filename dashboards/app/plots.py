@@ -19,6 +19,7 @@ from liex_lab.behaviour.design import animal_means
 from ..figures.style import INK, LINE, MUTED
 from ..figures.times import kept_rows
 from ..report.contact_sheet import Array
+from ..units import read_as, shown
 from .data import GREY, NO_POSE, OTHER, Ethogram, raster
 
 # Okabe and Ito's colours; beside them every group has its own mark
@@ -79,8 +80,8 @@ def ethograms(ones: Mapping[str, Ethogram], coloured: Mapping[str, str]) -> dict
     every = [*words, *sorted({word for one in ones.values() for word in one.words} - set(words))]
     rows = np.stack([raster(one, every, 0.0, stop_s, n_columns) for one in ones.values()])
     # as places of the colours: 0 no pose, 1 other actions, then the words
-    shown = np.where(rows == -2, 0.0, np.where(rows >= len(words), 1.0, rows + 2.0))
-    shown[rows == -1] = np.nan
+    painted = np.where(rows == -2, 0.0, np.where(rows >= len(words), 1.0, rows + 2.0))
+    painted[rows == -1] = np.nan
     unit, size = time_unit(stop_s)
     time_s = (np.arange(n_columns) + 0.5) * stop_s / n_columns
     named = np.array(["", NO_POSE, *every])  # of -1, -2 and the words
@@ -88,7 +89,7 @@ def ethograms(ones: Mapping[str, Ethogram], coloured: Mapping[str, str]) -> dict
     colours = [NO_POSE_COLOUR, GREY, *coloured.values()]
     trace = {
         "type": "heatmap",
-        "z": shown.astype(np.float32),
+        "z": painted.astype(np.float32),
         "x": (time_s / size).astype(np.float32),
         "y": [text(key) for key in ones],
         "text": np.array([text(name) for name in named])[place].tolist(),
@@ -160,8 +161,9 @@ def groups(table: pd.DataFrame, measure: str, unit: str) -> dict[str, Any]:
         table: one row per session: key, subject_id, group and the measure, see
             `StudyData.collected`.
         measure: the column to draw.
-        unit: its unit; empty where it has none.
+        unit: its unit in the table; empty where it has none.
     """
+    factor = shown(1.0, unit)[0]
     known = table[np.isfinite(table[measure].astype(float))] if measure in table else table.iloc[:0]
     if known.empty:
         return empty("No session has a value of this measure.")
@@ -171,7 +173,7 @@ def groups(table: pd.DataFrame, measure: str, unit: str) -> dict[str, Any]:
     lines = []
     for k, name in enumerate(names):
         own = known[known["group"].fillna("") == name]
-        values = own[measure].to_numpy(float)
+        values = factor * own[measure].to_numpy(float)
         animal, animals = pd.factorize(own["subject_id"].where(own["subject_id"] != "", own["key"]))
         means = animal_means(values, animal)
         beside = rng.uniform(-0.16, 0.16, len(animals)) if len(animals) > 1 else np.zeros(1)
@@ -241,9 +243,7 @@ def groups(table: pd.DataFrame, measure: str, unit: str) -> dict[str, Any]:
         "showgrid": False,
         "zeroline": False,
     }
-    title = (
-        text(measure) if not unit or measure.endswith(unit) else f"{text(measure)}, {escape(unit)}"
-    )
+    title = escape(read_as(measure, unit))
     return {
         "data": data,
         "layout": _layout(380, xaxis=x, yaxis={"title": {"text": title}}, shapes=lines),
@@ -255,26 +255,28 @@ def differences(stats: pd.DataFrame, unit: str) -> dict[str, Any]:
 
     Args:
         stats: rows of the table `stats` of one measure, see `cohort.compare`.
-        unit: the measure's unit; empty where it has none.
+        unit: the measure's unit in the table; empty where it has none.
     """
+    factor, unit = shown(1.0, unit)
     known = stats[np.isfinite(stats["estimate"].astype(float))]
     if known.empty:
         return empty("No difference can be given; the table below says why.", 220)
     places = list(range(len(known)))
+    estimate = factor * known["estimate"].astype(float)
     low, high = (
-        known[name].astype(float).fillna(known["estimate"]) for name in ("ci_low", "ci_high")
+        (factor * known[name].astype(float)).fillna(estimate) for name in ("ci_low", "ci_high")
     )
     tested = (known["test"] != "").to_numpy()
     trace = {
         "type": "scatter",
         "mode": "markers",
-        "x": known["estimate"].to_numpy(float),
+        "x": estimate.to_numpy(float),
         "y": places,
         "error_x": {
             "type": "data",
             "symmetric": False,
-            "array": (high - known["estimate"]).to_numpy(float),
-            "arrayminus": (known["estimate"] - low).to_numpy(float),
+            "array": (high - estimate).to_numpy(float),
+            "arrayminus": (estimate - low).to_numpy(float),
             "color": INK,
             "thickness": 1.6,
         },

@@ -6,8 +6,8 @@ Cells of a CSV that a spreadsheet would take for a formula are made harmless.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
@@ -17,7 +17,8 @@ from dash import dcc, html
 from liex_lab.errors import SessionError
 from liex_lab.runtime.spreadsheets import harmless_table
 
-from ..units import counted
+from ..units import counted, read_as
+from ..units import shown as as_read
 from .data import DONE, StudyData
 from .parts import aria, download
 
@@ -37,11 +38,14 @@ class Table:
         shown: the columns to show -> their headings.
         link: the column whose cells link onwards: to a session, or with start_s to a moment; may be
             empty.
+        units: column, or measure that a row is about -> its unit in the table; cells are shown in
+            the unit that people read.
     """
 
     rows: pd.DataFrame
     shown: dict[str, str]
     link: str = ""
+    units: Mapping[str, str] = field(default_factory=dict)
 
 
 SESSIONS = {
@@ -89,7 +93,7 @@ BOUTS = {
     "duration_s": "lasts, s",
     "score": "score",
     "source": "by",
-    "peak_speed_mm_s": "peak, mm/s",
+    "peak_speed_mm_s": "peak, cm/s",
     "contradicts": "contradicts its definition",
     "path_mm": "way, mm",
 }
@@ -101,6 +105,8 @@ FLIPS = {
     "applied": "put right",
     "source": "by",
 }
+BOUT_UNITS = {"peak_speed_mm_s": "mm/s"}
+_ESTIMATES = ("estimate", "ci_low", "ci_high")  # in the unit of the measure
 _LONG = ("test", "refused")
 STATES = {
     "done": "done",
@@ -132,11 +138,11 @@ def find(data: StudyData, name: str) -> Table:
         return Table(rows, {str(column): str(column) for column in rows}, "key")
     if what == "stats":
         measure, _, reference = rest.partition("/")
-        return Table(data.stats(measure, reference or None), STATS)
+        return Table(data.stats(measure, reference or None), STATS, units=data.units())
     if what in _OF_SESSION and rest:
         rows = data.session(rest).table(what)
         shown = {column: title for column, title in _OF_SESSION[what].items() if column in rows}
-        return Table(rows, shown, "start_s")
+        return Table(rows, shown, "start_s", BOUT_UNITS)
     raise SessionError(f"there is no table '{name}'")
 
 
@@ -367,6 +373,11 @@ def records(rows: pd.DataFrame) -> list[dict[str, Any]]:
 def _cell(table: Table, row: dict[str, Any], column: str) -> dict[str, Any]:
     """A cell: its text and, where it is more than that, its kind and where it leads."""
     value = row.get(column, "")
+    about = str(row.get("measure", ""))
+    if column == "measure":
+        return {"text": read_as(about, table.units.get(about, ""))}
+    if unit := table.units.get(about if column in _ESTIMATES else column, ""):
+        value = as_read(value, unit)[0]
     if column == "state":
         return {"kind": "state", "text": STATES.get(str(value), str(value)), "to": str(value)}
     if column == "reason" and "remedy" in row:

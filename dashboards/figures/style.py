@@ -32,7 +32,6 @@ SOFT = "#f2f2ee"
 PAPER = "#fdfdfb"
 BLUE = "#4477aa"
 GREEN = "#228833"
-RED = "#ee6677"
 PURPLE = "#aa3377"
 # Okabe and Ito's colours, which colour-blind people tell apart; every group has its own mark, too
 GROUP_COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#7f7f7f")

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from liex_lab.actions.colours import action_colours
+from liex_lab.actions.colours import PREDICTED_ERROR, action_colours
 from liex_lab.behaviour.curves import Curve, curves_of
 
 from ..units import counted, shown
@@ -21,7 +21,6 @@ from .style import (
     LINE,
     MUTED,
     ONE_COLUMN_MM,
-    RED,
     RIGHT_MM,
     TWO_COLUMNS_MM,
     halo,
@@ -108,7 +107,7 @@ def curves(seen: Seen) -> Figure | None:
     for one in drawn_curves(seen):
         values, unit = shown(seen.column(one.column), one.unit)
         rows.append((f"{one.title} {one.what}", unit, values, one.colour, one.from_zero))
-    rows.append(("Predicted error of a joint", "mm", error, RED, True))
+    rows.append(("Predicted error of a joint", "mm", error, PREDICTED_ERROR, True))
     if not any(np.isfinite(values).any() for _, _, values, _, _ in rows):
         return None
     step = _CURVE_MM + 6.0
@@ -125,7 +124,7 @@ def curves(seen: Seen) -> Figure | None:
         if " height above the floor" in title and len(rears):
             title += "; rearing shaded"
             for a, b, word in rears:
-                shade = colours.get(str(word), RED)
+                shade = colours.get(str(word), MUTED)
                 axes.axvspan(a / size, b / size, color=shade, alpha=0.3, linewidth=0.0)
         axes.set_title(
             f"{title}, {seen.who}, n = {counted(n, 'frame')}" if k == 0 else title, size=6.5
@@ -197,7 +196,7 @@ def error_distribution(seen: Seen) -> Figure | None:
 
     values = seen.frames["predicted_error_mm"].to_numpy(float)
     hold = hold_times(seen.frames["time_s"].to_numpy(float))
-    return distribution("Predicted error of a joint", seen, values, hold, "mm", RED)
+    return distribution("Predicted error of a joint", seen, values, hold, "mm", PREDICTED_ERROR)
 
 
 def distribution(

@@ -122,7 +122,11 @@ def _over_time(at: Callable[[str], str], animal: dict[str, Any]) -> tuple[Any, A
     shown = curves_of(animal)
     curves = rrb.Horizontal(
         *(
-            rrb.TimeSeriesView(origin=at(f"kinematics/{one.column}"), name=_called(one))
+            rrb.TimeSeriesView(
+                origin=at(one.entity),
+                contents=["$origin/**", f"+ /{at(one.entity_before)}"],
+                name=_called(one),
+            )
             for one in shown
         ),
         rrb.TimeSeriesView(origin=at("error/predicted"), name="predicted error"),

@@ -7,11 +7,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from liex_lab.actions.colours import action_colours
+from liex_lab.actions.colours import PREDICTED_ERROR, action_colours
 from liex_lab.sessions import Session
 
 from ..figures.seen import animals
-from ..figures.style import RED
 from ..figures.times import drawn_curves
 from ..units import shown
 from . import contact_sheet
@@ -39,7 +38,7 @@ def traces(session: Session) -> list[tuple[str, Array, Array, str]]:
         values, unit = shown(seen.column(one.column), one.unit)
         made.append((f"{one.title}{f', {unit}' if unit else ''}", time_s, values, one.colour))
     error = seen.broken(seen.frames["predicted_error_mm"])
-    return [*made, ("Predicted error, mm", time_s, error, RED)]
+    return [*made, ("Predicted error, mm", time_s, error, PREDICTED_ERROR)]
 
 
 def pictures(session: Session) -> list[tuple[str, str, str, str]]:

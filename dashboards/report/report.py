@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from liex_lab.actions.colours import action_colours
+from liex_lab.actions.colours import NO_POSE, action_colours
 from liex_lab.runtime.durable import write_whole
 from liex_lab.sessions import Session
 from liex_lab.sessions.verdict import verdict_in
@@ -84,6 +84,7 @@ def render(session: Session, figures: Path | None = None) -> str:
         pictures=pictures(session),
         whole_picture=whole_picture(session),
         n_animals=(session.metadata.get("verdict") or {}).get("n_animals", 1),
+        no_pose=NO_POSE,
         last_joint=session.metadata["animal"]["joints"][-1].replace("_", " "),
         figures=for_the_page(session, figures),
         clips=clip_links(session),

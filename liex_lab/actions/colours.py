@@ -1,7 +1,9 @@
 """Colours of actions: a word has the same in the report, the replay and the dashboard.
 
 Words of the bundled vocabularies have a colour of their own; others take those that are left, in
-their order. Based on Paul Tol's qualitative schemes; red is kept for errors and lost frames.
+their order. Based on Paul Tol's qualitative schemes; red is kept for frames without a pose. The
+predicted error has the dark yellow of his high-contrast scheme, which colour-blind people tell from
+that red.
 """
 
 from __future__ import annotations
@@ -9,6 +11,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from itertools import cycle
 
+NO_POSE = "#EE6677"
+PREDICTED_ERROR = "#997700"
 PALETTE = (
     "#FFAABB",
     "#CCBB44",

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from liex_lab.behaviour.body import BRANCHES, STANDS, SWIMS, BodyAxis, parents_of
+from liex_lab.tables.units import shown, titled
 
 _BLUE = "#4477aa"
 _GREEN = "#228833"
@@ -37,6 +38,18 @@ class Curve:
     unit: str
     colour: str
     from_zero: bool = True
+
+    @property
+    def entity(self) -> str:
+        """Where a replay keeps it: named by the unit that people read, in which it is kept."""
+        unit = shown(1.0, self.unit)[1].replace("/", "_").replace("°", "deg")
+        name = titled(self.column, self.unit).replace(" ", "_")
+        return f"kinematics/{name}_{unit}" if unit else f"kinematics/{name}"
+
+    @property
+    def entity_before(self) -> str:
+        """Where replays of earlier versions keep it, in the unit of the table."""
+        return f"kinematics/{self.column}"
 
 
 def axis_of(animal: Mapping[str, Any]) -> BodyAxis:

@@ -34,6 +34,7 @@ from liex_lab.sessions.rrd_scene import FLOOR as FLOOR
 from liex_lab.sessions.rrd_scene import OVERLAY as OVERLAY
 from liex_lab.sessions.rrd_scene import log_hidden_places, log_surroundings
 from liex_lab.tables.rows import Rows, constant_runs, frame_count, stop_times
+from liex_lab.tables.units import shown
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -58,7 +59,7 @@ _PATIENCE_S = 60.0
 PALETTE = tuple(int(colour[1:], 16) for colour in colours.PALETTE)
 _FLAG_COLOURS = {
     "doubtful": 0xCCBB44,
-    "not_found": 0xEE6677,
+    "not_found": int(colours.NO_POSE[1:], 16),
     "hidden": 0xAA3377,
     "no_depth": 0xBBBBBB,
     "corrected": 0x4477AA,
@@ -183,15 +184,20 @@ class ReplayWriter:
         if candidates is not None:
             self._log_candidates(candidates, index, elapsed)
         scalars = [
-            ("error/predicted", "predicted error (mm)", 0xEE6677, rows.track.predicted_error_mm)
+            (
+                "error/predicted",
+                "predicted error (mm)",
+                int(colours.PREDICTED_ERROR[1:], 16),
+                rows.track.predicted_error_mm,
+            )
         ]
         skeleton = self._origin.skeleton
         animal = {"joints": skeleton.names, "bones": skeleton.edges}
         for one in logged_of(animal):
             if one.column in kinematics:
-                label = f"{one.title.lower()}{f' ({one.unit})' if one.unit else ''}"
-                values = kinematics[one.column].to_numpy(float)
-                scalars.append((f"kinematics/{one.column}", label, int(one.colour[1:], 16), values))
+                values, unit = shown(kinematics[one.column].to_numpy(float), one.unit)
+                label = f"{one.title.lower()}{f' ({unit})' if unit else ''}"
+                scalars.append((one.entity, label, int(one.colour[1:], 16), values))
         for entity, label, colour, values in scalars:
             self._stream.log(
                 entity, rr.SeriesLines(names=label, colors=_rgba([colour]), widths=1.5), static=True

@@ -22,6 +22,14 @@ _EMPTY = (
 _BROKEN = "[...document.images].filter(image => !image.naturalWidth).length"
 # on paper: what runs over its right edge, and figures that two pages would share
 _A4_PX = 718  # the width of A4 between margins of 10 mm at 96 dpi
+_A4_HIGH_PX = 1017  # its height between margins of 14 mm
+# a box that may not be broken and is not higher than a page is on one page as a whole
+_CUT = """high => [...document.querySelectorAll('svg, .cards, .problems')]
+    .filter(box => box.getClientRects().length)
+    .map(box => box.closest('figure') || box)
+    .filter(box => getComputedStyle(box).breakInside !== 'avoid'
+        || box.getBoundingClientRect().height > high)
+    .map(box => box.outerHTML.slice(0, 80))"""
 
 
 @pytest.fixture(scope="module")
@@ -59,6 +67,8 @@ def test_the_report_can_be_printed(report: Path, watched: Watched) -> None:
         box => box.scrollWidth > box.clientWidth + 1
             && getComputedStyle(box).overflowX !== 'visible').length"""
     assert page.evaluate(clipped) == 0  # on paper nobody scrolls
+    assert page.evaluate("document.querySelectorAll('svg').length") > 8
+    assert page.evaluate(_CUT, _A4_HIGH_PX) == []
     shown = page.pdf(format="A4", print_background=True)
     assert shown.startswith(b"%PDF")
     watched.nothing_went_wrong()

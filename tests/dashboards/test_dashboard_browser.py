@@ -161,7 +161,7 @@ def test_a_measure_is_chosen_and_its_groups_compared_with_names_as_text(
     page.locator("#measure").click()
     page.get_by_role("option", name="mean speed", exact=True).click()
     expect(page.locator("#measure-meaning")).to_contain_text("mean speed")
-    expect(page.locator(".verdict")).to_contain_text("mm/s")
+    expect(page.locator(".verdict")).to_contain_text("cm/s")
     verdict = page.locator(".verdict").inner_text()
     assert "Hedges' g" in verdict
     assert "100 animals" in verdict

@@ -308,11 +308,11 @@ def test_what_was_corrected_is_shown_in_place_of_what_was_measured(
     shown = show_replay(folder / "session.rrd", MOMENTS[0] / 30, headless=True)
     try:
         ends, origins = time.monotonic() + 20.0, set[str]()
-        while time.monotonic() < ends and "/corrected/kinematics/speed_mm_s" not in origins:
+        while time.monotonic() < ends and "/corrected/kinematics/speed_cm_s" not in origins:
             time.sleep(0.5)
             views = shown.client.get_state().views
             origins = {view.origin for view in views}
-        assert {"/corrected/ethogram", "/corrected/kinematics/speed_mm_s"} <= origins
+        assert {"/corrected/ethogram", "/corrected/kinematics/speed_cm_s"} <= origins
         assert not [report for view in views for report in view.reports]
         (recording,) = shown.client.get_state().recordings
         assert recording.timelines, "both files are one recording"

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
+import pandas as pd
 import pytest
+from liex_lab.dashboards.app import plots, tables
+from liex_lab.dashboards.app.page_groups import verdict
 from liex_lab.dashboards.units import counted, day, reading, shown, titled
 
 
@@ -51,3 +54,58 @@ def test_a_day_is_written_as_people_write_it() -> None:
     assert day("2017-01-25T10:42:07.173469-05:00") == told
     assert day("2026-08-01T09:00:00") == "1 August 2026, 09:00:00"
     assert day("some day") == "some day"
+
+
+def test_one_page_of_groups_has_one_unit_for_a_speed() -> None:
+    """Marks, differences, sentence and table say the same number in the same unit."""
+    rows = pd.DataFrame(
+        {
+            "key": ["a", "b"],
+            "subject_id": ["a", "b"],
+            "group": ["x", "y"],
+            "mean_speed_mm_s": [120.0, 80.0],
+        }
+    )
+    drawn = plots.groups(rows, "mean_speed_mm_s", "mm/s")
+    assert [float(trace["y"][0]) for trace in drawn["data"]] == [12.0, 12.0, 8.0, 8.0]
+    assert drawn["layout"]["yaxis"]["title"]["text"] == "mean speed, cm/s"
+    stats = pd.DataFrame(
+        [
+            {
+                **dict.fromkeys(tables.STATS, 1),
+                "measure": "mean_speed_mm_s",
+                "contrast": "y - x",
+                "estimate": -40.0,
+                "ci_low": -60.0,
+                "ci_high": -20.0,
+                "test": "",
+                "refused": "two animals",
+            }
+        ]
+    )
+    figure = plots.differences(stats, "mm/s")
+    (trace,) = figure["data"]
+    assert (trace["x"][0], trace["error_x"]["array"][0]) == (-4.0, 2.0)
+    assert "cm/s" in figure["layout"]["xaxis"]["title"]["text"]
+    said = str(verdict(stats.iloc[0].to_dict(), "mm/s"))
+    assert "-4 cm/s, 95 % interval -6 to -2" in said
+    shown_table = tables.Table(stats, tables.STATS, units={"mean_speed_mm_s": "mm/s"})
+    heads = list(tables.STATS)
+    cells = tables.fill("stats", shown_table, "", {"column": "", "down": False})["rows"][0]
+    assert cells[heads.index("measure")]["text"] == "mean speed, cm/s"
+    assert [cells[heads.index(name)]["text"] for name in ("estimate", "ci_low", "ci_high")] == [
+        "-4",
+        "-6",
+        "-2",
+    ]
+    assert cells[heads.index("effect_size")]["text"] == "1"
+
+
+def test_a_bouts_peak_speed_is_in_the_unit_of_the_curve_above_it() -> None:
+    bouts = pd.DataFrame({"action": ["walk"], "start_s": [1.0], "peak_speed_mm_s": [250.0]})
+    table = tables.Table(
+        bouts, {"action": "action", "peak_speed_mm_s": "peak"}, units=tables.BOUT_UNITS
+    )
+    cells = tables.fill("bouts", table, "", {"column": "", "down": False})["rows"][0]
+    assert cells[1]["text"] == "25"
+    assert tables.BOUTS["peak_speed_mm_s"].endswith("cm/s")

@@ -69,7 +69,7 @@ def test_the_expected_entities_are_there_on_both_timelines(session):
         f"{replay.OVERLAY}/joints",
         replay.ROOT,
         f"{replay.OVERLAY}/bones",
-        "kinematics/speed_mm_s",
+        "kinematics/speed_cm_s",
         "kinematics/nose_height_mm",
         "error/predicted",
         replay.ACTIONS,
