@@ -23,8 +23,7 @@ from liex_lab.sessions.corrections import author_name, read_log
 
 from ..figures.seen import animals, joints_in_picture
 from ..video.film import way_of
-from ..video.relief import Relief
-from ..video.video import scale_mm
+from ..video.relief import Relief, scale_mm
 from .crossings import crossings
 from .frames import Frames
 from .tables import records

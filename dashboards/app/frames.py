@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 from liex_lab.errors import LiexError
 from liex_lab.sessions import cutouts
 
+from ..video.relief import put_back
+
 if TYPE_CHECKING:
     from liex_lab.recordings.recording import Recording
     from liex_lab.sessions import Session
@@ -75,13 +77,7 @@ def _kept(session: Session, row: int) -> NDArray[np.uint16] | None:
             continue
         cut = cv2.imread(str(session.path / entry["file"]), cv2.IMREAD_UNCHANGED)
         if cut is not None:
-            depth = np.zeros((session.camera.height, session.camera.width), np.uint16)
-            left = int(entry["left_px"])
-            top = int(entry["top_px"])
-            x0 = max(left, 0)
-            y0 = max(top, 0)
-            x1 = min(left + cut.shape[1], depth.shape[1])
-            y1 = min(top + cut.shape[0], depth.shape[0])
-            depth[y0:y1, x0:x1] = cut[y0 - top : y1 - top, x0 - left : x1 - left]
-            return depth
+            shape = (session.camera.height, session.camera.width)
+            picture = np.asarray(cut, np.uint16)
+            return put_back(picture, int(entry["left_px"]), int(entry["top_px"]), shape)
     return None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +13,7 @@ from liex_lab.sessions import Session
 from ..figures.seen import animals
 from ..figures.times import drawn_curves
 from ..units import shown
+from ..video.relief import Relief, put_back, scale_mm
 from . import contact_sheet
 from .scene_marks import BESIDE, Mark, scene_marks
 
@@ -61,24 +62,15 @@ def pictures(session: Session) -> list[tuple[str, str, str, str]]:
     bones = [(int(a), int(b)) for a, b in session.metadata["animal"]["bones"]]
     words = list(session.metadata.get("actions", {}))
     marks = scene_marks(session) if kept else []
+    relief = _relief(session)
     for entry in kept:
         depth = cv2.imread(str(session.path / entry["file"]), cv2.IMREAD_UNCHANGED)
         if depth is None:
             continue
         index = entry["frame_index"]
         uv = poses.loc[poses["frame_index"] == index, ["u_px", "v_px"]].to_numpy(float)
-        reach_mm = 0.9 * float(
-            frames["spine_mm"].median()
-        )  # an animal on its feet is about half its length high
-        drawn = contact_sheet.picture(
-            np.asarray(depth, np.uint16),
-            uv,
-            bones,
-            entry["left_px"],
-            entry["top_px"],
-            reach_mm,
-            marks,
-        )
+        rgb = _in_colours(relief, depth, entry)
+        drawn = contact_sheet.picture(rgb, uv, bones, entry["left_px"], entry["top_px"], marks)
         time_s = float(frames.loc[index, "time_s"])
         word = _word_at(session.bouts, time_s)
         colour = action_colours(words).get(word, "")
@@ -109,17 +101,29 @@ def whole_picture(session: Session) -> tuple[str, str] | None:
         Mark(BESIDE, np.array([entry["beside_px"]], float), "not measured"),
     ]
     drawn = contact_sheet.picture(
-        np.asarray(depth, np.uint16),
+        _in_colours(_relief(session), depth, entry),
         uv,
         [(int(a), int(b)) for a, b in session.metadata["animal"]["bones"]],
         0,
         0,
-        0.9 * float(frames["spine_mm"].median()),
         marks,
         unit=depth.shape[1] / 250.0,
         lettered=True,
     )
     return drawn, f"{float(frames.loc[index, 'time_s']):.2f} s"
+
+
+def _relief(session: Session) -> Relief:
+    """Heights above the floor in colours, on the scale of the session's video."""
+    return Relief(session, scale_mm([session]))
+
+
+def _in_colours(relief: Relief, depth: Any, entry: dict[str, Any]) -> NDArray[np.uint8]:
+    """What was cut out of a depth picture, as relief: (h, w, 3) uint8 RGB."""
+    cut = np.asarray(depth, np.uint16)
+    left, top = int(entry["left_px"]), int(entry["top_px"])
+    side = (cut.shape[1], cut.shape[0])
+    return relief.picture(put_back(cut, left, top, relief.shape), left, top, side, side)
 
 
 def _word_at(bouts: pd.DataFrame, time_s: float) -> str:

@@ -34,38 +34,33 @@ _VIRIDIS = np.array(
 
 
 def picture(
-    depth: NDArray[np.uint16],
+    rgb: NDArray[np.uint8],
     uv: Array,
     bones: Sequence[tuple[int, int]],
     left: int,
     top: int,
-    reach_mm: float,
     marks: Sequence[Mark] = (),
     unit: float | None = None,
     lettered: bool = False,
 ) -> str:
     """A depth picture cut out of a frame, with the scene and the skeleton over it.
 
-    Near is light: from the floor around the animal to `reach_mm` above it, so that walls do not
-    take all the colours.
-
     Args:
-        depth: (h, w) uint16 mm, 0 where unread.
+        rgb: (h, w, 3) uint8 RGB, the depth in colours, see `Relief.picture`.
         uv: (J, 2) joints, px of the whole frame, counted from the centre of its first pixel.
         bones: pairs of joints.
         left: column of the frame at which the picture begins, px.
         top: row of the frame at which the picture begins, px.
-        reach_mm: height above the floor from which on everything is light, mm.
         marks: what stands still, as far as it is in the picture.
         unit: radius of a joint, px; None takes that of a picture around the animal.
         lettered: whether is written what a mark says.
     """
-    h, w = depth.shape
+    h, w = rgb.shape[:2]
     points = (
         uv - [left, top] + 0.5
     )  # the paper counts from the corner of the picture, we from a pixel's centre
     r = w / 70.0 if unit is None else unit
-    parts = [f'<image href="{png_uri(_small(shade(depth, reach_mm)))}" width="{w}" height="{h}"/>']
+    parts = [f'<image href="{png_uri(_small(rgb))}" width="{w}" height="{h}"/>']
     parts.append(svg_marks(marks, left, top, w, h, 0.9 * r, lettered))
     for a, b in bones:
         (x0, y0), (x1, y1) = points[a], points[b]

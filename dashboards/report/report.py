@@ -22,6 +22,7 @@ from ..figures.seen import FRAMES, KINEMATICS
 from ..figures.sets import FOLDER, for_the_page
 from ..pages import page
 from ..units import counted, day, reading, shown, titled
+from ..video.relief import scale_mm
 from .charts import pictures, whole_picture
 from .facts import facts
 from .methods import methods
@@ -85,6 +86,7 @@ def render(session: Session, figures: Path | None = None) -> str:
         whole_picture=whole_picture(session),
         n_animals=(session.metadata.get("verdict") or {}).get("n_animals", 1),
         no_pose=NO_POSE,
+        top_mm=scale_mm([session]),
         last_joint=session.metadata["animal"]["joints"][-1].replace("_", " "),
         figures=for_the_page(session, figures),
         clips=clip_links(session),

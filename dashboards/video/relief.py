@@ -8,6 +8,8 @@ is as even as an upright one's. Shading is Lambert's, of a light from the upper 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -42,6 +44,7 @@ class Relief:
         self._above_mm = np.float32(np.asarray(session.T_arena_camera.translation, float)[2])
         self._pixel_mm = float(self._above_mm) / camera.fx
         self.top_mm = top_mm
+        self.shape = (camera.height, camera.width)
         shades = colormaps["viridis"](np.linspace(0.08, 1.0, 256))
         self._colours = (255.0 * np.asarray(shades)[:, :3]).astype(np.uint8)
         self._outside = _beyond_walls(session, np.stack([*rays, np.ones_like(rays[0])], axis=-1))
@@ -112,6 +115,38 @@ class Relief:
         """
         at = np.linspace(255.0, 0.0, height).astype(np.uint8)
         return np.repeat(self._colours[at][:, None], 6, axis=1)
+
+
+def scale_mm(sessions: Sequence[Session]) -> float:
+    """The one scale of heights of some sessions: what an animal on its hind legs reaches, mm.
+
+    Args:
+        sessions: the opened sessions.
+    """
+    lengths = [float(session.metadata["animal"].get("spine_mm") or np.nan) for session in sessions]
+    known = [length for length in lengths if np.isfinite(length) and length > 0]
+    return max(10.0 * float(np.ceil(max(known) / 10.0)), 20.0) if known else 80.0
+
+
+def put_back(
+    cut: NDArray[np.uint16], left: int, top: int, shape: tuple[int, int]
+) -> NDArray[np.uint16]:
+    """A depth picture (H, W) with nothing in it but what was cut out of it, 0 elsewhere.
+
+    Args:
+        cut: (h, w) uint16 mm; what of it lies outside of the picture is left out.
+        left: column of the picture at which it begins, px; it may be negative.
+        top: row at which it begins, px.
+        shape: (H, W) of the picture.
+    """
+    depth = np.zeros(shape, np.uint16)
+    x0 = max(left, 0)
+    y0 = max(top, 0)
+    x1 = min(left + cut.shape[1], depth.shape[1])
+    y1 = min(top + cut.shape[0], depth.shape[0])
+    if x1 > x0 and y1 > y0:
+        depth[y0:y1, x0:x1] = cut[y0 - top : y1 - top, x0 - left : x1 - left]
+    return depth
 
 
 def _part(

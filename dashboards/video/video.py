@@ -24,6 +24,7 @@ from ..units import counted
 from .encoder import Video, h264
 from .film import Film
 from .lettering import write
+from .relief import scale_mm
 
 _BEFORE_S = 0.5  # of a bout
 _AFTER_S = 0.5
@@ -76,17 +77,6 @@ class Cell:
         x = (size[0] - shown.shape[1]) // 2
         placed[y : y + shown.shape[0], x : x + shown.shape[1]] = shown
         return (placed * _DIMMED).astype(np.uint8) if over else placed
-
-
-def scale_mm(sessions: Sequence[Session]) -> float:
-    """The one scale of heights of some sessions: what an animal on its hind legs reaches, mm.
-
-    Args:
-        sessions: the opened sessions.
-    """
-    lengths = [float(session.metadata["animal"].get("spine_mm") or np.nan) for session in sessions]
-    known = [length for length in lengths if np.isfinite(length) and length > 0]
-    return max(10.0 * float(np.ceil(max(known) / 10.0)), 20.0) if known else 80.0
 
 
 def write_session(

@@ -11,7 +11,9 @@ them do in half the time. The loss is the mean distance of the joints,
 
     L = 1/J sum_j |y_j - y_j*|,        in half sides of the patch.
 
-torch is an optional dependency: `pip install 'liex_lab[cnn]'`.
+torch is an optional dependency: `pip install '.[cnn]'` in the folder of liex_lab. The error below
+says it in another way: its text is part of the code that kept rows of the paper's tables were made
+with.
 """
 
 from __future__ import annotations

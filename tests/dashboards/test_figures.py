@@ -463,8 +463,6 @@ def test_near_is_light_and_unread_is_grey():
 
 
 def test_a_skeleton_is_drawn_on_its_pixels():
-    depth = np.full((20, 20), 700, np.uint16)
-    svg = picture(
-        depth, np.array([[104.0, 55.0], [110.0, 60.0]]), [(0, 1)], left=100, top=50, reach_mm=60.0
-    )
+    rgb = np.full((20, 20, 3), 70, np.uint8)
+    svg = picture(rgb, np.array([[104.0, 55.0], [110.0, 60.0]]), [(0, 1)], left=100, top=50)
     assert 'x1="4.5" y1="5.5" x2="10.5" y2="10.5"' in svg

@@ -59,12 +59,12 @@ def test_the_contact_sheet_and_the_scene_show_the_marks(session: Session) -> Non
 
 
 def test_a_mark_outside_of_a_cut_out_is_not_in_it_and_one_within_is_in_its_place() -> None:
-    depth, uv = np.full((20, 20), 700, np.uint16), np.full((2, 2), 105.0)
+    depth, uv = np.full((20, 20, 3), 70, np.uint8), np.full((2, 2), 105.0)
     marks = [
         Mark("fixture", np.array([[104.0, 55.0]]), "<b>"),
         Mark("hidden", np.array([[90.0, 55.0]])),
     ]
-    svg = picture(depth, uv, [(0, 1)], left=100, top=50, reach_mm=60.0, marks=marks)
+    svg = picture(depth, uv, [(0, 1)], left=100, top=50, marks=marks)
     assert 'class="hidden"' not in svg
     assert "M4.0 5.5H5.0M4.5 5.0V6.0" in svg
     assert "<b>" not in svg

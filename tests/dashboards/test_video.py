@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from liex_lab.dashboards.video import encoder
 from liex_lab.dashboards.video.film import Film
-from liex_lab.dashboards.video.relief import Relief
-from liex_lab.dashboards.video.video import matches, scale_mm
+from liex_lab.dashboards.video.relief import Relief, scale_mm
+from liex_lab.dashboards.video.video import matches
 
 from liex_lab.api import export_video
 from liex_lab.errors import PlaceError, SessionError
