@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.arena.floor import Floor
+from liex_lab.foreground.components import components
 from liex_lab.foreground.heights import heights_before
 from liex_lab.foreground.worn import Worn
 from liex_lab.optics.camera import Camera
@@ -115,13 +116,11 @@ class HeadStage(Worn):
         smooth = np.asarray(cv2.medianBlur(np.ascontiguousarray(height[cut]), 3))
         closed = cv2.morphologyEx(smooth, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
         wide = cv2.morphologyEx(closed, cv2.MORPH_OPEN, np.ones((self._side,) * 2, np.uint8))
-        n, labels, stats, _ = cv2.connectedComponentsWithStats(
-            ((smooth - wide > _NARROW_MM) & (smooth > 0)).astype(np.uint8)
-        )
+        labels, stats = components(((smooth - wide > _NARROW_MM) & (smooth > 0)).astype(np.uint8))
         least, most = (value / self._px_mm**2 for value in _AREA_MM2)
         most = min(most, _TIMES_AREA * self.area_mm2 / self._px_mm**2)
         beside = np.ones((2 * _BESIDE_PX + 1,) * 2, np.uint8)
-        for k in range(1, n):
+        for k in range(1, len(stats)):
             if stats[k, cv2.CC_STAT_AREA] < least:
                 continue
             part = labels == k

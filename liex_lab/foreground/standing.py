@@ -21,6 +21,7 @@ from liex_lab.arena.grounds import Ground, flat_grounds
 from liex_lab.arena.scene import LARGEST, STATED, STOOD_ON, WALLED
 from liex_lab.body.skeleton import VIEWS, View
 from liex_lab.errors import EstimationError
+from liex_lab.foreground.components import components
 from liex_lab.optics.camera import Camera
 from liex_lab.runtime.threads import side_by_side
 
@@ -387,10 +388,10 @@ def _of_frame(
     square = np.ones((3, 3), np.uint8)
     nearer = ((depth > 0) & (depth < limit)).astype(np.uint8)
     nearer |= cv2.dilate(nearer, square) & (depth == 0)  # holes in it are bridged
-    n, labels, stats, _ = cv2.connectedComponentsWithStats(
-        cv2.morphologyEx(nearer, cv2.MORPH_OPEN, square)
+    labels, stats = components(
+        np.asarray(cv2.morphologyEx(nearer, cv2.MORPH_OPEN, square), np.uint8)
     )
-    for k in range(1, n):
+    for k in range(1, len(stats)):
         u, v, width, height, n_px = stats[k]
         if n_px < _LEAST_PX:
             continue
