@@ -45,6 +45,8 @@ _AROUND_S = 0.2
 _BACKS_UP = 0.6
 _BACKWARD = 60.0
 _JUMPS = 25.0
+# what the metric says of head against tail is as good as new after so long
+_ALIKE_S = 0.1
 # of several animals one is told from another by nothing but its place: to be elsewhere costs up to
 # so many times a transition's ceiling
 _OTHER = 20.0
@@ -198,11 +200,19 @@ class HypothesisAssociation:
                 cost[rows] -= self._likeness(cost[rows])
         if self._skeleton.is_chain:
             other = np.arange(cost.shape[1]) ^ 1
-            told = told_ends(seen)
+            told = told_ends(seen) * self._independent(seen)
             both = seen.known & seen.known[:, other]
             least = np.fmin(cost, cost[:, other])
             cost[:] = np.where(both, least + told * (cost - least), cost)
         return cost
+
+    def _independent(self, seen: Observations) -> float:
+        """How much of an independent measurement a frame is: pictures shortly after each other show
+        the same posture, and the metric errs in the one as in the other.
+        """
+        if len(seen) < 2:
+            return 1.0
+        return float(min(1.0, np.median(np.diff(seen.seconds)) / _ALIKE_S))
 
     def _missed(self, seen: Observations) -> Array:
         """What it costs (n,) to pass a frame by: little where several animals are one thing in it,

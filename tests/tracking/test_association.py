@@ -96,6 +96,18 @@ def test_going_tail_first_costs_by_the_second_and_backing_up_slowly_costs_nothin
             assert total[1 - wrong] == 0.0
 
 
+def test_a_second_in_which_the_metric_errs_alike_in_every_frame_does_not_turn_an_animal_round():
+    """It takes head for tail by 1 nat in thirty frames that show the same; of three seconds more it
+    is right. At 10 frames a second each of them counts for itself.
+    """
+    for rate in (30.0, 10.0):
+        clock = np.arange(120) / rate
+        seen = told(clock, walk(clock))
+        seen.score[:30] = seen.score[:30, [1, 0, 3, 2]]
+        seen.score[:30, :2] = [2.0 + COSTS.score_mm, 2.0]
+        assert ((CHAIN.path(seen)[:30] == 0).all()) == (rate == 30.0)
+
+
 def test_joints_of_another_number_are_refused():
     seen = story(1.0)
     with pytest.raises(ValueError, match="joints of hypotheses"):
