@@ -7,11 +7,12 @@ groups are those of `liex_lab.behaviour.cohort`.
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
@@ -55,6 +56,11 @@ class Ethogram:
     lost_s: np.ndarray
     duration_s: float
     vocabulary: tuple[str, ...] = ()
+
+
+Made = TypeVar("Made")
+# after which what a correction replaced meanwhile is read again
+_PAUSES_S = (0.05, 0.2, 0.5)
 
 
 class StudyData:
@@ -131,6 +137,24 @@ class StudyData:
             while len(self._open) > _HELD:
                 self._open.pop(next(iter(self._open)))
             return known[1]
+
+    def read(self, key: str, make: Callable[[Session], Made]) -> Made:
+        """What is made of a session, which a correction may replace while its tables are read.
+
+        Args:
+            key: its name in the study.
+            make: reads the opened session.
+
+        Raises:
+            SessionError: the study has no such session, or its tables cannot be read.
+        """
+        for pause_s in _PAUSES_S:
+            session = self.session(key)
+            try:
+                return make(session)
+            except SessionError:
+                time.sleep(pause_s)
+        return make(self.session(key))
 
     def overview(self) -> pd.DataFrame:
         """One row per session: who, state, and how good it is (the columns `QUALITY`)."""

@@ -394,18 +394,20 @@ def register(app: Dash, data: StudyData, show_replay: ShowReplay | None) -> None
             key: the session's name in the study.
             unit_s: seconds per unit of the whole session's axis.
         """
-        session = data.session(key)
         moment = float(at_s or 0.0)
-        row = nearest_row(session, moment)
         marked = Patch()
         marked["layout"]["shapes"] = [plots.cursor(moment / unit_s)]
-        command = f"liex show {shlex.quote(str(session.path))} --at {moment:.3f}"
-        return (
-            plots.around(traces(session), moment, _HALF_S),
-            facts(session, row),
-            marked,
-            command,
-        )
+
+        def shown_of(session: Session) -> tuple[Any, ...]:
+            """Curves, facts, cursor and command of the opened `session`."""
+            return (
+                plots.around(traces(session), moment, _HALF_S),
+                facts(session, nearest_row(session, moment)),
+                marked,
+                f"liex show {shlex.quote(str(session.path))} --at {moment:.3f}",
+            )
+
+        return data.read(key, shown_of)
 
     @app.callback(
         Output("moment-link", "children"),
@@ -447,10 +449,11 @@ def register(app: Dash, data: StudyData, show_replay: ShowReplay | None) -> None
             at_s: the present moment, s.
             unit_s: seconds per unit of the whole session's axis.
         """
-        session = data.session(key)
-        figure = _whole(data, key, session)
+        figure, made = data.read(
+            key, lambda session: (_whole(data, key, session), page_corrections.made(session))
+        )
         figure["layout"]["shapes"] = [plots.cursor(float(at_s or 0.0) / unit_s)]
-        return figure, page_corrections.made(session)
+        return figure, made
 
     @app.callback(
         Output({"part": "order", "table": ALL}, "data", allow_duplicate=True),

@@ -140,7 +140,7 @@ def find(data: StudyData, name: str) -> Table:
         measure, _, reference = rest.partition("/")
         return Table(data.stats(measure, reference or None), STATS, units=data.units())
     if what in _OF_SESSION and rest:
-        rows = data.session(rest).table(what)
+        rows = data.read(rest, lambda session: session.table(what))
         shown = {column: title for column, title in _OF_SESSION[what].items() if column in rows}
         return Table(rows, shown, "start_s", BOUT_UNITS)
     raise SessionError(f"there is no table '{name}'")

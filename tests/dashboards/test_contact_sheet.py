@@ -48,8 +48,7 @@ def test_the_pictures_of_a_report_are_the_relief_of_the_video(tmp_path: Path) ->
     session = write(tmp_path / "m.liex", WalkingMouse(steady(2.0)))
     entry = session.metadata["thumbnails"][0]
     relief = Relief(session, scale_mm([session]))
-    kept = cv2.imread(str(session.path / entry["file"]), cv2.IMREAD_UNCHANGED)
-    assert kept is not None
+    kept = np.asarray(cv2.imread(str(session.path / entry["file"]), cv2.IMREAD_UNCHANGED))
     left, top = entry["left_px"], entry["top_px"]
     whole = put_back(np.asarray(kept, np.uint16), left, top, relief.shape)
     side = (kept.shape[1], kept.shape[0])

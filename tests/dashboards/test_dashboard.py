@@ -399,3 +399,25 @@ def test_a_report_that_is_a_link_elsewhere_is_not_shown(tmp_path: Path) -> None:
         (folder / "report.html").unlink()
         (folder / "report.html").symlink_to(tmp_path / "secret")
         assert server.test_client().get("/report/b").status_code == 404
+
+
+def test_a_session_that_is_corrected_while_it_is_read_is_read_again(
+    data: StudyData, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("liex_lab.dashboards.app.data._PAUSES_S", (0.0, 0.0, 0.0))
+    asked: list[Session] = []
+
+    def replaced_once(session: Session) -> int:
+        asked.append(session)
+        if len(asked) == 1:
+            raise SessionError("its table is gone")
+        return len(session.frames)
+
+    assert data.read(KEY, replaced_once) == 174
+    assert len(asked) == 2
+
+    def damaged(session: Session) -> int:
+        raise SessionError("it is damaged")
+
+    with pytest.raises(SessionError, match="it is damaged"):
+        data.read(KEY, damaged)
