@@ -5,7 +5,6 @@ stays quick.
 from __future__ import annotations
 
 import errno
-import gc
 import os
 import shlex
 import sys
@@ -59,10 +58,6 @@ _USERS_TO_MEND = {
 }
 # what Rerun's writer says of a full disk is said by our own sentence
 _RUST_LOG = "warn,re_log_encoding=off,re_sdk=off"
-
-# a run imports and draws some hundred thousand objects that stay or go together: looking among them
-# for cycles after every 700 takes a twentieth of its processor time
-_GARBAGE = (50_000, 20, 50)
 
 app = group_of_verbs(
     "Depth recordings of animals in; 3D skeletons, a replay and behaviour tables out.", name="liex"
@@ -352,7 +347,6 @@ def main() -> None:
     ours shows itself.
     """
     os.environ.setdefault("RUST_LOG", _RUST_LOG)
-    gc.set_threshold(*_GARBAGE)
     if told := liex_lab._KERNELS_TOLD:
         typer.echo(f"note: {printable(told)}", err=True)
     try:
