@@ -3,7 +3,8 @@
 The farthest mode of a pixel's readings is the animal where it never leaves (the "sleeping person"
 problem). What is missed then stands on the floor's plane as a lump of the background:
 
-- one that a moving animal touches in nearly every frame is a part of it (`with_its_still_part`);
+- one that a moving animal touches in nearly every frame that shows it is a part of it
+  (`with_its_still_part`);
 - where nothing moves that is like an animal, the lump that is like one and changes most is it, as
   of a mouse that stays where it is and moves only its head (`at_rest`);
 - where no lump is like one, the bare plane is the background of the whole floor (`at_rest`).
@@ -32,6 +33,7 @@ AnyScene = TypeVar("AnyScene", bound="StillScene")
 
 # of the frames: a lump that the animal touches that often is a part of it that keeps still
 _TOUCH_SHARE = 0.9
+_READ = 0.5  # of a lump: it is there, and not gone with what was under it unread
 # what was never seen moving is an animal only if it is no longer than so many largest spines,
 # higher than so many times what stands out at all, and larger than so many of the least areas
 _LONGEST = 2.0
@@ -102,7 +104,8 @@ def with_its_still_part(
     """The scene with the floor put under an animal that was partly taken for background.
 
     Such a part is a lump on the floor that the moving animal touches in (nearly, nine tenths of)
-    every frame, and together with which it is still no larger than an animal.
+    every frame in which it is read, and together with which it is still no larger than an animal.
+    It is read in all frames, or until the animal goes and leaves floor that is never read.
 
     Args:
         scene: the scene as it was learned.
@@ -118,7 +121,8 @@ def with_its_still_part(
     best, best_area = scene, area
     for lump in _lumps(scene, wanted):
         near = _around(lump)
-        if moving[:, near].any(axis=1).mean() < _TOUCH_SHARE:
+        there = (sample[crops.found][:, lump] > 0).mean(axis=1) > _READ
+        if not there.any() or moving[there][:, near].any(axis=1).mean() < _TOUCH_SHARE:
             continue
         whole = _with_floor_at(scene, near, wanted)
         whole_area, share = whole.usual_area(sample, wanted.spine_mm)

@@ -3,7 +3,8 @@
 An outline ends for one of two reasons: the animal does, and what lies behind it is seen; or
 something before it begins, and the animal goes on behind that. The second shows as a step in depth
 towards the camera (an occluding contour). Such an outline is not the animal's own, and a pose that
-was fitted to it is not, either.
+was fitted to it is not, either. The animal itself hides nothing of itself: a mouse that rears is
+unread along its steep flank, and its head is nearer than the feet beyond by far.
 """
 
 from __future__ import annotations
@@ -58,10 +59,23 @@ def _share_behind(heights, origin, step, depths, nearer_mm, reach_px, out):
                     if heights[i, r + dr, c + dc] > 0:
                         continue
                     n_edges += 1
-                    n_behind += z > 0 and is_behind(
-                        depths[i], v, u, dr, dc, z - nearer_mm, reach_px
+                    n_behind += z > 0 and _is_behind_another(
+                        heights[i], step[i], r, c, depths[i], v, u, dr, dc, z - nearer_mm, reach_px
                     )
         out[i] = n_behind / max(n_edges, 1)
+
+
+@njit(cache=True)
+def _is_behind_another(height, step, r, c, depth, v, u, dr, dc, nearer, reach_px):
+    """The same as `is_behind` for the cell (r, c), without readings of the animal's own cells."""
+    size = height.shape[0]
+    for k in range(1, reach_px + 1):
+        cells = (k + step - 1) // step
+        row, column = r + cells * dr, c + cells * dc
+        own = 0 <= row < size and 0 <= column < size and height[row, column] > 0
+        if not own and is_behind(depth, v + (k - 1) * dr, u + (k - 1) * dc, dr, dc, nearer, 1):
+            return True
+    return False
 
 
 @njit(cache=True)

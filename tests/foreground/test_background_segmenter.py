@@ -38,7 +38,10 @@ def with_box(
 
 def recording_of(frames: list[np.ndarray]) -> Recording:
     rng = np.random.default_rng(0)
-    noisy = [np.maximum(f + rng.normal(0, 1.0, f.shape), 1).astype(np.float32) for f in frames]
+    noisy = [
+        np.where(f > 0, np.maximum(f + rng.normal(0, 1.0, f.shape), 1), 0).astype(np.float32)
+        for f in frames
+    ]
     return Recording(
         name="boxes",
         format="synthetic",

@@ -37,6 +37,26 @@ def test_an_animal_that_only_turns_its_head_is_found_whole(n_frames):
     assert np.linalg.norm(crops.moments[:, 3:5] - whole[:, 3:5], axis=1).max() < 8.0
 
 
+def test_an_animal_that_goes_from_where_the_floor_is_never_read_was_whole_before():
+    floor = tilted(2.0)
+    bare = floor.depth(160, 120)
+
+    def frame(k: int) -> np.ndarray:
+        there = with_box(floor, *BODY) if k < 28 else with_box(floor, (40, 60), (20, 8))
+        if k < 28:  # its fore part goes from one side to the other
+            there[slice(46, 60) if k % 2 else slice(60, 74), 88:108] -= 25.0
+        unread = (there > bare - 1.0)[40:80, 60:110]
+        there[40:80, 60:110][unread] = 0.0
+        return there
+
+    frames = [frame(k) for k in range(40)]
+    scene, sample = BackgroundSubtraction.learn(recording_of(frames), SPINES)
+    crops = scene.extract(sample, 1.0)
+    assert crops.found.all()
+    whole = BackgroundSubtraction.from_floor(scene.camera, scene.floor).extract(sample, 1.0).moments
+    np.testing.assert_allclose(crops.moments[:, 1], whole[:, 1], rtol=0.3)
+
+
 @pytest.mark.parametrize("step_mm", [0.0, 6.0])
 def test_where_nothing_moves_the_floor_is_what_the_animal_lies_on(step_mm):
     """An arena's floor lies 6 mm above the bench around it, and both are as large."""

@@ -132,6 +132,18 @@ def test_an_outline_under_a_roof_ends_there_and_beside_a_low_step_it_does_not() 
     assert roofed(10.0) == 0.0
 
 
+def test_an_animal_that_rears_stands_before_nothing_of_itself() -> None:
+    crops = HeightMaps.blank(1, 700.0)
+    crops.heights[0, 20:40, 20:40] = 16 * 15  # the feet
+    crops.heights[0, 25:35, 25:35] = 16 * 90  # the head above them
+    depth = np.full((1, CROP, CROP), 700.0, np.float32)
+    depth -= crops.heights / 16.0
+    crops.heights[0, 23:25, 23:37] = depth[0, 23:25, 23:37] = 0  # the steep flank is unread
+    assert behind_something(crops, depth) == 0.0
+    depth[0, 40:60, 15:45] = 600.0  # what is another's is before it as ever
+    assert behind_something(crops, depth)[0] > 0.15
+
+
 def test_an_outline_that_leaves_the_picture_goes_on_outside() -> None:
     crops = HeightMaps.blank(1, 700.0)
     crops.heights[0, 1:21, 30:50] = 16 * 25
