@@ -200,15 +200,18 @@ class HypothesisAssociation:
                 cost[rows] -= self._likeness(cost[rows])
         if self._skeleton.is_chain:
             other = np.arange(cost.shape[1]) ^ 1
-            told = told_ends(seen) * self._independent(seen)
+            told = told_ends(seen) * self.independent(seen)
             both = seen.known & seen.known[:, other]
             least = np.fmin(cost, cost[:, other])
             cost[:] = np.where(both, least + told * (cost - least), cost)
         return cost
 
-    def _independent(self, seen: Observations) -> float:
-        """How much of an independent measurement a frame is: pictures shortly after each other show
-        the same posture, and the metric errs in the one as in the other.
+    def independent(self, seen: Observations) -> float:
+        """How much of an independent measurement a frame is, 0 to 1: pictures shortly after each
+        other show the same posture, and the metric errs in the one as in the other.
+
+        Args:
+            seen: hypotheses (n, H) of consecutive frames.
         """
         if len(seen) < 2:
             return 1.0

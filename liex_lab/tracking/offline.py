@@ -32,6 +32,7 @@ from liex_lab.optics.camera import Camera
 from liex_lab.runtime.memory import Allocator, blocks
 from liex_lab.tracking.association import NONE, HypothesisAssociation
 from liex_lab.tracking.gaps import short_gaps, spans, whole_gaps
+from liex_lab.tracking.larger_animal import cost_of_the_other
 from liex_lab.tracking.motion_model import TrackingParameters
 from liex_lab.tracking.observations import Observations, joints_of, reversed_pose
 from liex_lab.tracking.smoother import Curve, smooth
@@ -130,6 +131,9 @@ def track_whole(
     joints = chain.joints(seen, allocate)
     emission = chain.emission(seen, joints, allocate)
     path = chain.path(seen, joints=joints, allocate=allocate, emission=emission)
+    if subject.n_animals > 1 and (other := cost_of_the_other(seen, path)) is not None:
+        emission += chain.independent(seen) * other
+        path = chain.path(seen, joints=joints, allocate=allocate, emission=emission)
     doubt = chain.doubt(seen, path, joints, allocate, emission)
     del joints, emission
     error = seen.along(seen.error_mm, path)

@@ -33,6 +33,10 @@ _MOST_BESIDE = 0.6
 # an animal is in full view where it shows this share of the usual pixels, at least and at most
 _LEAST_SHOWN = 0.6
 _MOST_SHOWN = 1.6
+# one thing is two animals where it shows so much of the other's pixels beside the usual ones, and
+# no less than so many times these: where both touch, a part of each is behind the other
+_OF_OTHER = 0.6
+_LEAST_TOGETHER = 1.25
 # an animal is partly behind something where so much of its outline ends there, and it shows less
 # than this share of its usual pixels; what lies before it is there for some frames at least
 _BEHIND = 0.03
@@ -114,12 +118,21 @@ def median_of_whole(shown: Array, behind: Array) -> float:
 def together(seen: Observations, path: NDArray[np.int64], usual_px: float) -> NDArray[np.bool_]:
     """Whether (n,) an animal touches another, so that both are one thing in the picture.
 
+    How large both are is told by the frames in which each is a thing of its own.
+
     Args:
         seen: hypotheses (n, H) of the frames.
         path: (n,) which of them is meant, negative for none.
         usual_px: pixels that the animal usually shows.
     """
-    return np.asarray((path >= 0) & (seen.along(seen.n_px, path) > _MOST_SHOWN * usual_px))
+    shown = seen.along(seen.n_px, path)
+    others = np.where(seen.known & (seen.n_px != shown[:, None]), seen.n_px, 0).max(axis=1)
+    apart = (path >= 0) & (others > 0)
+    other_px = float(np.median(others[apart])) if apart.any() else np.inf
+    most_px = np.clip(
+        usual_px + _OF_OTHER * other_px, _LEAST_TOGETHER * usual_px, _MOST_SHOWN * usual_px
+    )
+    return np.asarray((path >= 0) & (shown > most_px))
 
 
 def share_in_view(seen: Observations, path: NDArray[np.int64], usual_px: float) -> Array:
