@@ -162,6 +162,8 @@ def track_whole(
 
     usual_px = usual_pixels(seen, path)
     in_view = share_in_view(seen, path, usual_px)
+    # fitted to what is seen, a pose is off by about what is hidden
+    error = np.hypot(error, (1.0 - in_view) * subject.length_mm)
     unknown = lies_unknown(in_view, doubt)
     path[unknown] = NONE
     for rows in blocks(len(seen), _BLOCK):
