@@ -46,6 +46,7 @@ MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
 _FOOTER = struct.Struct(
     "<BQQQI"
 )  # its record: opcode, length, where the summary and its offsets begin, CRC
+_START = struct.Struct("<16xQ")  # of a chunk, in its index
 _CHUNK = struct.Struct(
     "<QQQII"
 )  # first and last log time, unpacked size, its CRC, length of the packing's name
@@ -125,7 +126,7 @@ class McapFile(MessageFile):
         super().__init__(path, file)
         self._by_id: dict[int, Channel] = {}
         self._schemas: dict[int, str] = {0: "no schema"}
-        self.listed: list[tuple[int, int]] = []  # where the indexes of its chunks begin and end
+        self.listed: list[bytes] = []  # the indexes of its chunks, as they are written
         self.n_messages: int | None = None  # in all chunks, as the file's own statistics say
         self._coming: dict[
             int, Future[bytes]
@@ -246,9 +247,10 @@ class McapFile(MessageFile):
                 return
             while at < ending:
                 kind, start, end = self._record(at)
-                if kind == Opcode.CHUNK_INDEX:
-                    self.listed.append((start, end))
-                    self.starts.append(struct.unpack("<QQQ", self.file.read(24))[2])
+                if kind == Opcode.CHUNK_INDEX and end - start <= LARGEST_FACT:
+                    content = self.file.read(end - start)
+                    self.starts.append(_START.unpack_from(content)[0])
+                    self.listed.append(content)
                 elif kind == Opcode.STATISTICS:
                     (self.n_messages,) = struct.unpack("<Q", self.file.read(8))
                 elif kind in FACTS and end - start <= LARGEST_FACT:

@@ -5,10 +5,6 @@ index tells of every chunk and every message; of each picture only the beginning
 the sensor's stamp is. Where anything is odd the file is walked as ever (`mcap`). A chunk is checked
 against its CRC-32 when a picture in it is read, and not before: that is for whoever refuses what is
 damaged (`open_recording(..., strict=True)`).
-
-`open_replay` opens the pictures of a session's replay. It was written by this program, under the
-times of its frames, and holds almost as many bytes of still scene as frames; of an hour's, some
-pictures are wanted at once. So its index is believed, and of a damaged one the rest is read.
 """
 
 from __future__ import annotations
@@ -50,11 +46,18 @@ from liex_lab.recordings.formats.messages.parsers import stamp_reader
 from liex_lab.recordings.recording import Recording
 from liex_lab.runtime.progress import Progress, silent
 
-_UNTOLD = -1  # the length of a message that only its chunk tells
+UNTOLD = -1  # the length of a message that only its chunk tells
 _LARGEST_INDEX = 1 << 26  # bytes of one
-_LARGEST_OFFSET = 1 << 40
+LARGEST_OFFSET = 1 << 40
 _INDEX = struct.Struct("<HI")  # of a message index: channel, bytes of its entries
-_ENTRY = np.dtype([("time_ns", "<u8"), ("offset", "<u8")])
+# of a chunk's index: first and last time, where it begins, its length, bytes of the places of its
+# message indexes; the channel and place of each; how long these are, bytes of the packing's name;
+# packed and unpacked bytes
+_OF_CHUNK = struct.Struct("<4QI")
+_AT = struct.Struct("<HQ")
+_LENGTHS = struct.Struct("<QI")
+_SIZES = struct.Struct("<QQ")
+ENTRY = np.dtype([("time_ns", "<u8"), ("offset", "<u8")])
 _HEAD = 512  # bytes of a message's record in which its stamp is
 # of the unpacked bytes; where so much has to be unpacked for the stamps, threads unpack all of it
 _WORTH_IT = 0.6
@@ -85,25 +88,7 @@ def open_indexed(
     return open_topic(_Skimmed(path, open_file(path)), "mcap", camera, topic, progress)
 
 
-def open_replay(path: Path, progress: Progress = silent) -> Recording:
-    """Open the depth of a session's replay as a recording.
-
-    Args:
-        path: session.mcap.
-        progress: told how far the walk is, where there is no index.
-
-    Raises:
-        RecordingError: it cannot be read, or holds no depth.
-    """
-    try:
-        return open_topic(_Replay(path, open_file(path)), "mcap", None, None, progress)
-    except OSError as error:
-        raise RecordingError(
-            f"{path} cannot be read ({error.strerror or error}); check it"
-        ) from None
-
-
-class _Indexed(McapFile):
+class IndexedMcap(McapFile):
     """An MCAP file whose messages are found by its index.
 
     Attributes:
@@ -121,7 +106,7 @@ class _Indexed(McapFile):
         Raises:
             RecordingError: its chunk is damaged.
         """
-        if place.length != _UNTOLD:
+        if place.length != UNTOLD:
             return super().read(place)
         try:
             return self._message(place)
@@ -140,8 +125,18 @@ class _Indexed(McapFile):
             raise DamagedChunk("there is no message where its index says")
         return data[begin + MESSAGE.size : begin + length]
 
-    def _take_chunk(self, index: ChunkIndex) -> int:
-        """Note a chunk; its number."""
+    def take_chunk(self, index: ChunkIndex) -> int:
+        """Note a chunk.
+
+        Args:
+            index: its index.
+
+        Returns:
+            Its number.
+
+        Raises:
+            DamagedChunk: there is none where its index says.
+        """
         opcode, start, end = self._record(index.chunk_start_offset)
         if opcode != Opcode.CHUNK:
             raise DamagedChunk("there is no chunk where its index says")
@@ -155,13 +150,13 @@ class _Indexed(McapFile):
             raise DamagedChunk("there is no index where it should be")
         table = self._message_index(begin, stop)
         places = np.empty((len(table), 3), np.int64)
-        places[:] = number, 0, _UNTOLD
+        places[:] = number, 0, UNTOLD
         places[:, 1] = table["offset"]
         return Listed(channel, table["time_ns"], places)
 
-    def _indexes(self) -> list[ChunkIndex]:
+    def indexes(self) -> list[ChunkIndex]:
         """The indexes of its chunks, in file order."""
-        found = [ChunkIndex.read(self._stream(*place)) for place in self.listed]
+        found = [chunk_index(content) for content in self.listed]
         return sorted(found, key=lambda index: index.chunk_start_offset)
 
     def _message_index(self, begin: int, stop: int) -> NDArray[np.void]:
@@ -169,28 +164,32 @@ class _Indexed(McapFile):
 
         An hour's index lists a hundred thousand, so they are read as a table.
         """
-        content = self._bytes(begin, stop)
-        _, length = _INDEX.unpack_from(content)
-        if length != len(content) - _INDEX.size or length % _ENTRY.itemsize:
-            raise ValueError("an index does not fit into its record")
-        table = np.frombuffer(content, _ENTRY, offset=_INDEX.size)
-        if len(table) and table["offset"].max() > _LARGEST_OFFSET:
+        table = np.frombuffer(entries(self.between(begin, stop)), ENTRY)
+        if len(table) and table["offset"].max() > LARGEST_OFFSET:
             raise ValueError("an index leads out of its chunk")
         return table[np.argsort(table["offset"], kind="stable")]
 
     def _stream(self, start: int, end: int) -> ReadDataStream:
         """The bytes between, of a record of some kilobytes."""
-        return ReadDataStream(BytesIO(self._bytes(start, end)))
+        return ReadDataStream(BytesIO(self.between(start, end)))
 
-    def _bytes(self, start: int, end: int) -> bytes:
-        """The bytes between, of a record of some kilobytes."""
+    def between(self, start: int, end: int) -> bytes:
+        """The bytes of records of some kilobytes.
+
+        Args:
+            start: where they begin in the file.
+            end: where they end.
+
+        Raises:
+            ValueError: they are more than a file's index can be.
+        """
         if not 0 <= end - start <= min(_LARGEST_INDEX, self.size):
             raise ValueError("an index is larger than its file")
         self.file.seek(start)
         return self.file.read(end - start)
 
 
-class _Skimmed(_Indexed):
+class _Skimmed(IndexedMcap):
     """An MCAP file that is whole as its index says; one about which that is not sure is walked."""
 
     advice = (
@@ -224,7 +223,7 @@ class _Skimmed(_Indexed):
         self, index: ChunkIndex, wanted: Wanted, met: set[Channel]
     ) -> Iterator[Envelope | Listed]:
         """The wanted messages of one chunk; of channels met before with nothing but the stamps."""
-        number = self._take_chunk(index)
+        number = self.take_chunk(index)
         for channel_id, at in index.message_index_offsets.items():
             channel = self._by_id[channel_id]
             if not wanted(channel):
@@ -270,7 +269,7 @@ class _Skimmed(_Indexed):
             if chunk.length != chunk.size:
                 raise DamagedChunk("its parts do not fit into it")
             places = [(chunk.offset + at, chunk.offset + chunk.length) for at in offsets]
-            return [memoryview(self._bytes(at, min(at + _HEAD, end))) for at, end in places]
+            return [memoryview(self.between(at, min(at + _HEAD, end))) for at, end in places]
         need = min(offsets[-1] + _HEAD, chunk.size)
         data = memoryview(first_bytes(self.file, chunk, need))
         return [data[at : at + _HEAD] for at in offsets]
@@ -280,7 +279,7 @@ class _Skimmed(_Indexed):
         sure, or where unpacking all is no more work.
         """
         try:
-            indexes = self._indexes()
+            indexes = self.indexes()
             by_start = {index.chunk_start_offset: index for index in indexes}
             if len(by_start) == len(indexes) and self._agrees(by_start, progress):
                 return indexes if self._is_worth_it(indexes) else []
@@ -303,7 +302,7 @@ class _Skimmed(_Indexed):
                 if at not in expected:
                     return False
                 expected.remove(at)
-                n_messages += (end - start - _INDEX.size) // _ENTRY.itemsize
+                n_messages += (end - start - _INDEX.size) // ENTRY.itemsize
             elif expected:
                 return False
             elif opcode == Opcode.CHUNK:
@@ -338,55 +337,46 @@ class _Skimmed(_Indexed):
         return needed <= _WORTH_IT * size
 
 
-class _Replay(_Indexed):
-    """An MCAP file whose index is believed; one without an index is walked."""
+def entries(index: bytes) -> bytes:
+    """The times and offsets of messages, as they are written.
 
-    advice = "copy it again, or run `liex run` on its recording"
+    Args:
+        index: content of a message index's record.
 
-    def walk(self, wanted: Wanted, progress: Progress) -> Iterator[Envelope | Listed]:
-        """The messages of the wanted channels by chunk: the first of each channel with its data.
+    Raises:
+        struct.error, ValueError: they do not fit into it.
+    """
+    _, length = _INDEX.unpack_from(index)
+    if length != len(index) - _INDEX.size or length % ENTRY.itemsize:
+        raise ValueError("an index does not fit into its record")
+    return index[_INDEX.size :]
 
-        Args:
-            wanted: says of a channel whether its messages are of use.
-            progress: told how many MB were walked over, where there is no index.
 
-        Yields:
-            The messages.
-        """
-        self._learn_ending()
-        try:
-            indexes = self._indexes()
-        except DAMAGE:
-            indexes = []
-        if not indexes or not all(index.message_index_length for index in indexes):
-            yield from super().walk(wanted, progress)
-            return
-        met = set[Channel]()
-        for index in indexes:
-            try:
-                parts = self._listed_in(index, wanted)
-            except (*DAMAGE, DamagedChunk):
-                self.whole = False
-                continue
-            for part in parts:
-                rest = part
-                if part.channel not in met and len(part.places):
-                    met.add(part.channel)
-                    place = Place(*part.places[0].tolist())
-                    yield Envelope(part.channel, int(part.log_time_ns[0]), place, self.read(place))
-                    rest = Listed(part.channel, part.log_time_ns[1:], part.places[1:])
-                if len(rest.places) and wanted(part.channel):
-                    yield rest
+def chunk_index(content: bytes) -> ChunkIndex:
+    """The index of a chunk; the library reads it a number at a time, and of an hour there are
+    sixteen thousand.
 
-    def _listed_in(self, index: ChunkIndex, wanted: Wanted) -> list[Listed]:
-        """The wanted messages of one chunk, by channel and in file order."""
-        if self._record(index.chunk_start_offset)[0] != Opcode.CHUNK:
-            raise DamagedChunk("there is no chunk where its index says")
-        number = len(self.chunks)
-        found = [
-            self._listed(self._by_id[channel_id], at, number)
-            for channel_id, at in index.message_index_offsets.items()
-            if wanted(self._by_id[channel_id])
-        ]
-        self._take_chunk(index)
-        return found
+    Args:
+        content: of its record.
+
+    Raises:
+        struct.error: it is shorter than it says.
+        ValueError: a part does not fit into it.
+    """
+    first_ns, last_ns, start, length, n_bytes = _OF_CHUNK.unpack_from(content)
+    at = _OF_CHUNK.size
+    places = dict(_AT.iter_unpack(content[at : at + n_bytes]))
+    index_length, n_name = _LENGTHS.unpack_from(content, at + n_bytes)
+    at += n_bytes + _LENGTHS.size
+    packed, size = _SIZES.unpack_from(content, at + n_name)
+    return ChunkIndex(
+        chunk_length=length,
+        chunk_start_offset=start,
+        compression=content[at : at + n_name].decode(),
+        compressed_size=packed,
+        message_end_time=last_ns,
+        message_index_length=index_length,
+        message_index_offsets=places,
+        message_start_time=first_ns,
+        uncompressed_size=size,
+    )
