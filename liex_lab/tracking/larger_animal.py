@@ -20,14 +20,16 @@ _LEAST = 0.08  # of the logarithm of the larger one's pixels over the smaller on
 _NOISE = 0.08  # standard deviation of it, at least
 _IN_ORDER = 0.9  # of the frames, while both are apart: the larger one is the larger one throughout
 _MOST = 2.0  # nats that a frame says
+_CLEARLY = 1.5  # times the residual of one animal is that of another body
 
 
 def cost_of_the_other(seen: Observations, path: NDArray[np.int64]) -> Array | None:
     """What it costs (n, H) each hypothesis not to be of the animal that a path follows, nats.
 
     The likelihood ratio of one order of sizes over the other, log-normal, at most 2 nats a frame.
-    Which of the two, the larger or the smaller one, is followed is what the path says of most
-    frames.
+    Which of the two, the larger or the smaller one, is to be followed is the one that the body of
+    this session fits clearly better, for its size and girth were measured on that one; else what
+    the path says of most frames.
 
     Args:
         seen: hypotheses (n, H) of the frames, those of a frame's second thing after the first's.
@@ -49,12 +51,28 @@ def cost_of_the_other(seen: Observations, path: NDArray[np.int64]) -> Array | No
     own = np.where(path >= 2, -ratio, ratio)[followed]
     if usual < _LEAST or not len(own) or not _keeps_order(own, np.flatnonzero(followed)):
         return None
-    is_larger = 1.0 if own.sum() > 0.0 else -1.0
+    fits = _better_fit(seen, ratio, apart)
+    is_larger = fits or (1.0 if own.sum() > 0.0 else -1.0)
     said = np.clip(2.0 * is_larger * usual / noise**2 * ratio, -_MOST, _MOST)
     cost = np.zeros(seen.score.shape)
     cost[:, :2] = np.maximum(-said, 0.0)[:, None]
     cost[:, 2:] = np.maximum(said, 0.0)[:, None]
     return cost
+
+
+def _better_fit(seen: Observations, ratio: Array, apart: NDArray[np.bool_]) -> float:
+    """1 where the session's body fits the larger one clearly better while both are apart, -1 where
+    it fits the smaller one, 0 where neither, by their residuals in the frames `apart` (n,).
+    """
+    first, second = (seen.residual_mm[apart, h].astype(float) for h in (0, 2))
+    first_larger = ratio[apart] > 0.0
+    larger = np.where(first_larger, first, second)
+    smaller = np.where(first_larger, second, first)
+    known = np.isfinite(larger) & np.isfinite(smaller)
+    if known.sum() < _FEWEST:
+        return 0.0
+    off = float(np.log(np.median(smaller[known]) / max(np.median(larger[known]), 1e-9)))
+    return float(np.sign(off)) if abs(off) > np.log(_CLEARLY) else 0.0
 
 
 def _keeps_order(own: Array, frames: NDArray[np.int64]) -> bool:

@@ -35,7 +35,7 @@ _LEAST_SHOWN = 0.6
 _MOST_SHOWN = 1.6
 # one thing is two animals where it shows so much of the other's pixels beside the usual ones, and
 # no less than so many times these: where both touch, a part of each is behind the other
-_OF_OTHER = 0.6
+_OF_OTHER = 0.4
 _LEAST_TOGETHER = 1.25
 # an animal is partly behind something where so much of its outline ends there, and it shows less
 # than this share of its usual pixels; what lies before it is there for some frames at least

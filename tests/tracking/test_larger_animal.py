@@ -84,3 +84,14 @@ def test_the_track_leaves_a_meeting_with_the_animal_that_it_came_with(sizes):
     first = (off[0] < off[1])[[5, 20, 35, 70, 80, 95]]
     assert first[:3].all() or not first[:3].any()
     assert (first[:3] == first[3:]).all() == (sizes != (720, 720))
+
+
+@pytest.mark.parametrize("fits", [0, 2])
+def test_the_one_that_the_session_has_measured_is_followed(fits):
+    """Its size and girth are those of one of two; the pose of the other one does not agree."""
+    seen = meeting(600, 800)
+    seen.residual_mm[:] = 6.0
+    seen.residual_mm[:, fits : fits + 2] = 2.0
+    cost = cost_of_the_other(seen, second_until(100))
+    assert cost is not None
+    assert cost[APART, fits].mean() < 0.1 < cost[APART, 2 - fits].mean()
