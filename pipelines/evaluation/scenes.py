@@ -35,8 +35,11 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-SEEDS: Final = (1001, 1002)  # one of another build, one of those that models were trained on
-SEALED_SEEDS: Final = (931_507_211, 931_507_212, 931_507_213)
+# every other one of another build, the rest of those that models were trained on
+SEEDS: Final = tuple(range(1001, 1013))
+# 931_507_211 to 213 were measured on 25 November 2026, and what was mended after that was chosen by
+# their figures: these are others
+SEALED_SEEDS: Final = (958_204_331, 958_204_332, 958_204_333)
 N_FRAMES: Final = 300
 
 

@@ -81,8 +81,8 @@ def test_the_sealed_seeds_are_used_where_asked_only(monkeypatch):
 def test_slips_are_told():
     with pytest.raises(LiexError, match="there is no scene 'moon'; known are plain"):
         evaluate_scenes(["moon"])
-    with pytest.raises(LiexError, match="1 to 2 recordings, got 3"):
-        evaluate_scenes(["plain"], n_recordings=3)
+    with pytest.raises(LiexError, match="1 to 12 recordings, got 13"):
+        evaluate_scenes(["plain"], n_recordings=13)
 
 
 def test_every_row_stands_beside_a_row():
