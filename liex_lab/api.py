@@ -31,7 +31,13 @@ if TYPE_CHECKING:
 DEMO = "mouse_walk.mcap"
 # what a run needs after its first frames, and takes seconds to import: of the replay, of the table
 # `transitions`, of the figures
-_HEAVY = ("pandas", "rerun", "scipy.stats", "matplotlib.figure", "matplotlib.backends.backend_svg")
+_HEAVY = (
+    "pandas",
+    "rerun",
+    "scipy.special",
+    "matplotlib.figure",
+    "matplotlib.backends.backend_pdf",
+)
 
 
 def run_session(
