@@ -144,6 +144,6 @@ def count_animals(first: Agreement, second: Agreement, rows: NDArray[np.int64], 
     alike = (
         (second.residual_mm <= 1.5 * usual)
         & (second.covered >= 0.8 * np.median(first.covered))
-        & (second.beside <= np.median(first.beside) + 0.15)
+        & (second.beside <= _MOST_BESIDE)  # a shorter animal fills less of a body of this length
     )
     return 2 if alike.sum() >= max(2.0, _TWIN_SHARE * n) else 1

@@ -207,6 +207,15 @@ def test_two_animals_are_two_where_the_second_fits_as_well_as_the_first() -> Non
     assert count_animals(agreement(96, 0.8), agreement(0, 0.8), rows[:0], 96) == 1
 
 
+def test_an_animal_that_is_shorter_than_the_other_is_counted_and_a_thing_is_not() -> None:
+    """A body of the first one's length lies beside a shorter one; but on a thing it lies nowhere."""
+    rows = np.arange(40)
+    shorter = replace(agreement(40, 0.8), beside=np.full(40, 0.4))
+    assert count_animals(agreement(96, 0.8), shorter, rows, 96) == 2
+    thing = replace(shorter, residual_mm=np.full(40, 11.0))
+    assert count_animals(agreement(96, 0.8), thing, rows, 96) == 1
+
+
 def test_a_slim_mouse_beside_a_stout_one_of_its_length_is_counted() -> None:
     """The girth of the one that is measured says nothing of the other's."""
     recording = film("two-animals", 1003, 60, family="other")
