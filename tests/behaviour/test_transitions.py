@@ -29,7 +29,9 @@ def test_where_chance_leaves_no_choice_there_is_no_p() -> None:
 def test_a_run_does_without_the_statistics_of_scipy() -> None:
     """They take longer to import than all poses of a second take to measure."""
     code = (
-        "import sys, tempfile; from liex_lab.api import run_session; from liex_lab.plan import Plan;"
+        "import sys, tempfile;"
+        "from liex_lab.api import run_session;"
+        "from liex_lab.plan import Plan;"
         "run_session('synthetic:walk?seed=3&frames=40&sensor=primesense-qvga&spine_mm=70',"
         " Plan.load('mouse'), tempfile.mkdtemp());"
         "assert 'scipy.stats' not in sys.modules"

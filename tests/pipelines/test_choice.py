@@ -208,7 +208,7 @@ def test_two_animals_are_two_where_the_second_fits_as_well_as_the_first() -> Non
 
 
 def test_an_animal_that_is_shorter_than_the_other_is_counted_and_a_thing_is_not() -> None:
-    """A body of the first one's length lies beside a shorter one; but on a thing it lies nowhere."""
+    """A body of the first one's length lies beside a shorter one, but on a thing nowhere."""
     rows = np.arange(40)
     shorter = replace(agreement(40, 0.8), beside=np.full(40, 0.4))
     assert count_animals(agreement(96, 0.8), shorter, rows, 96) == 2
