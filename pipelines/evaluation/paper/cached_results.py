@@ -169,6 +169,8 @@ def why_refused(
     other = _other_hash(row, hashes, views)
     if not other:
         return ""
+    if apart := _other_postures(made, hashes):
+        return apart
     why = f"the kept row is of {other}"
     if made.get("processor", processor()) == processor():  # or nobody knows of which
         return why
@@ -193,6 +195,17 @@ def _other_hash(
         if row["splits"].get(split, {}).get("fingerprint") != fingerprint_of(ours):
             return f"other test pictures or another foreground on {split}"
     return ""
+
+
+def _other_postures(made: Mapping[str, Any], hashes: Mapping[str, Any]) -> str:
+    """That test postures come from elsewhere today, which alone makes other pictures; '' if not."""
+    then, now = made.get("test_postures"), hashes.get("test_postures")
+    if not then or then == now:
+        return ""
+    return (
+        f"the kept row is of hands in postures {then}, and those of today are {now}; labels of "
+        f"hands are looked for in the folder that LIEX_NYU names, or else beside the repository"
+    )
 
 
 def _apart(row: Mapping[str, Any], hashes: Mapping[str, Any], given: Mapping[str, Given]) -> str:
@@ -220,12 +233,14 @@ def taken(
     """A kept row that is not refused, as it stands in the results.
 
     Where every hash is today's, the row was given what is given today: it gets the numbers that say
-    so, and today's processor as the one on which its pictures come out, unless it has its own.
-    Where one is not, the row names the processor that it is of (`other_processor`).
+    so, where test postures come from, and today's processor as the one on which its pictures come
+    out, unless it has its own. Where one is not, the row names the processor that it is of
+    (`other_processor`).
 
     Args:
         row: the kept row.
-        hashes: of today's training pictures and models, and the pictures in numbers.
+        hashes: of today's training pictures and models, the pictures in numbers, and where test
+            postures come from.
         views: what every row is given now, by split and recording.
         given: the same in numbers, by split.
     """
@@ -233,6 +248,8 @@ def taken(
     if _other_hash(row, hashes, views):
         return {**row, ELSEWHERE: made["processor"]}
     known = {"training_given": hashes["training_given"], "processor": processor()}
+    if "test_postures" in hashes:
+        known["test_postures"] = hashes["test_postures"]
     splits = {
         split: {"given": given[split].to_dict(), **numbers} if split in given else numbers
         for split, numbers in row["splits"].items()

@@ -1,7 +1,7 @@
 """Tables 1 to 3 of Lie-X (section 5.2) and the numbers behind its figures, on rendered data.
 
 `liex evaluate tables` measures six rows on an animal's test splits (40 recordings each): our
-default, Lie-X as the paper has it, its ablations without multiple initial poses and without the
+default, the paper's variant of Lie-X, its ablations without multiple initial poses and without the
 learned metric, and the baselines RF and CNN. All see the same frames and, in each, the same object
 with the same size (`common_view`). Numbers: those of `rows`, 101 quantiles of the error (Fig 8),
 frames/s on at most two cores, sensitivity to five parameters (Fig 7), candidates and convergence of
@@ -163,6 +163,7 @@ def results_of(animal: str, budget: Budget, command: str, progress: Progress) ->
         progress: told how far the job is.
     """
     from liex_lab.body.skeleton import Skeleton
+    from liex_lab.simulation.simulator import world_of
 
     from .illustrations import illustrate
     from .rows import measured_rows
@@ -170,6 +171,7 @@ def results_of(animal: str, budget: Budget, command: str, progress: Progress) ->
     skeleton = Skeleton.load(animal)
     tests = _tests(skeleton, budget)
     results = Results(skeleton.name, list(skeleton.names), list(tests), sealed=budget.sealed)
+    results.test_postures = world_of(skeleton).test_postures
     default = _subjects(animal, ["default"], budget, results, progress)
     chooser = cast("PoseEstimator", default["default"][0])
     wanted = [name for name in budget.fresh if name != "default"]
@@ -308,15 +310,21 @@ def made_from(variant: str, skeleton: Skeleton) -> dict[str, Any]:
 
 
 def hashes_of(animal: str, variant: str) -> dict[str, Any]:
-    """Hashes of what a row was made with today, see `fingerprints`, and its pictures in numbers.
+    """What a row was made with today: hashes, see `fingerprints`, its pictures in numbers, and
+    where test postures come from.
 
     Args:
         animal: the animal's name.
         variant: a name of `ROWS`.
     """
+    from liex_lab.body.skeleton import Skeleton
+    from liex_lab.simulation.simulator import world_of
+
     from .fingerprints import learning_code, model_digests, training_given, training_pictures
 
+    postures = world_of(Skeleton.load(animal)).test_postures
     return {
+        **({"test_postures": postures} if postures else {}),
         "learning_code": learning_code(variant),
         "training_pictures": training_pictures(variant, animal),
         "training_given": training_given(variant, animal),

@@ -323,7 +323,8 @@ def words(results: Results, quick: bool) -> list[str]:
     Returns:
         Sentences.
     """
-    sentences = [
+    sentences = [f"Test postures are {results.test_postures}."] if results.test_postures else []
+    sentences += [
         f"{TITLES.get(variant, variant)} was not measured: {why}."
         for variant, why in results.missing.items()
     ]

@@ -192,6 +192,23 @@ def test_a_row_that_is_taken_by_its_hashes_gets_the_numbers_and_todays_processor
     assert other == {**elsewhere, "other_processor": "elsewhere"}
 
 
+def test_a_row_of_hands_in_other_postures_is_refused_with_that_reason():
+    """Without the labels that they are fitted to, the same command renders other hands."""
+    row = kept_row("elsewhere")
+    row["made"]["test_postures"] = "fitted to labels"
+    other = OTHERS["test pictures"]["views"]
+    with_labels = {"test_postures": "fitted to labels"}
+    without = {"test_postures": "drawn from statistics"}
+    assert why(row, hashes=with_labels, views=other) == ""  # the last digit of another processor
+    told = why(row, hashes=without, views=other)
+    assert "postures fitted to labels, and those of today are drawn from statistics" in told
+    assert "LIEX_NYU" in told
+    del row["made"]["test_postures"]  # as rows were kept before
+    taken = cached_results.taken(row, HASHES | with_labels, VIEWS, TODAY)
+    assert taken["made"]["test_postures"] == "fitted to labels"
+    assert "test_postures" not in cached_results.taken(row, HASHES, VIEWS, TODAY)["made"]
+
+
 def test_rows_that_were_given_alike_keep_it_once_and_read_it_each(tmp_path):
     rows = {name: kept_row("elsewhere") for name in ("default", "paper", "rf")}
     path = cached_results.keep_results(tmp_path, "mouse", rows, {})

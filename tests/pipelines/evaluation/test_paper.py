@@ -38,6 +38,7 @@ from liex_lab.pipelines.evaluation.paper import (
 from liex_lab.pipelines.evaluation.paper.deviations import DEVIATIONS
 from liex_lab.pipelines.evaluation.paper.drawers import Drawers
 from liex_lab.pipelines.evaluation.paper.further import PARTS, Further
+from liex_lab.pipelines.evaluation.paper.rows import TRAINING_DRAWS
 from liex_lab.pipelines.evaluation.paper.sensitivity import (
     Sweep,
     chosen_values,
@@ -47,6 +48,7 @@ from liex_lab.pipelines.evaluation.paper.sensitivity import (
 from liex_lab.pipelines.training import pose_model
 from liex_lab.pipelines.training.baselines import training_of
 
+from liex_lab.baselines.cnn import CnnPlan
 from liex_lab.baselines.forest import ForestPlan, train_forests
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.catalog import bundled_models, kept_results_folder
@@ -491,11 +493,27 @@ def test_words_follow_the_numbers():
 
 def test_what_differs_from_the_paper_is_what_the_methods_say():
     told = " ".join(DEVIATIONS)
+    cnn = CnnPlan()
+    assert f"half its width, hidden layers of {cnn.connected:,} " in told
+    assert cnn.width == 0.5
+    several = {name for name, n in TRAINING_DRAWS.items() if n == 3}
+    assert several == {"paper", "paper-one-pose", "paper-no-metric"}
     for animal in ("fish", "mouse", "hand"):
         skeleton = Skeleton.load(animal)
         method = method_of("paper", skeleton)
         recipe = run.made_from("paper", skeleton)["recipe"]
-        assert f"K: {method.training_candidates} " in told
+        k, images = {
+            "fish": (40, 95_104), "mouse": (40, 104_096), "hand": (20, 72_757)
+        }[animal]  # fmt: skip
+        examples = method.training_candidates * recipe["n_images"]
+        assert f"{examples:,} ({animal})" in told
+        assert re.search(rf"\b{k * images / examples:.0f}\b[\w, ]* times fewer", told)
+        assert f"K is {method.training_candidates} " in told
+        own = run.made_from("default", skeleton)
+        assert f"{own['method']['training_candidates']} (" in told
+        for numbers in (recipe, own["recipe"]):
+            for name in ("n_images", "n_correction", "n_calibration"):
+                assert f"{numbers[name]:,}" in told or not numbers[name]
         assert f"m: {method.regressors.n_tests};" in told
         assert f"{recipe['n_images']:,} ({animal})" in told
         for plan in (method.regressors, method.metric):
