@@ -4,7 +4,7 @@
   comments, docstrings and spaces; what is rendered and cut out is told by the pictures themselves.
 - `training_pictures`: of the first block of training pictures as the foreground cuts it out.
 - `fingerprint_of`: of the pictures, components, choice and size of all test recordings of a split.
-- `model_digests`: of the model files, where they are at hand.
+- `model_digests`: of the model files, where they are at hand and today's code trained them.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from __future__ import annotations
 import ast
 import hashlib
 import io
+import platform
 import tokenize
 from collections.abc import Sequence
 from functools import cache
@@ -155,19 +156,24 @@ def fingerprint_of(views: Sequence[CommonView]) -> str:
     return told.hexdigest()[:_DIGITS]
 
 
-def model_digests(animal: str, variant: str, draws: int) -> list[str | None]:
+def model_digests(
+    animal: str, variant: str, draws: int, *, of_today: bool = False
+) -> list[str | None]:
     """SHA-256 of a row's model files; None for one that is not at hand.
 
     Args:
         animal: a bundled animal's name.
         variant: a row of the tables.
         draws: number of models that the row is the mean of.
+        of_today: only those of the cache that a note says today's learning code trained: another
+            one says nothing about what training gives (`trained_by`).
     """
     from liex_lab.body.skeleton import Skeleton
     from liex_lab.catalog import bundled_models, find_model
 
     from ...training.baselines import BASELINES, cached_baseline, training_of
     from ...training.pose_model import cache_path
+    from .trained_by import is_of
 
     if variant == "default" and animal in bundled_models():
         paths = [find_model(animal)]
@@ -176,7 +182,29 @@ def model_digests(animal: str, variant: str, draws: int) -> list[str | None]:
         paths = [cached_baseline(variant, skeleton, training_of(variant, skeleton))]
     else:
         paths = [cache_path(animal, _base_of(variant), draw) for draw in range(draws)]
+    code = learning_code(variant if variant in BASELINES else _base_of(variant))
+    asked = of_today and variant != "default"
     return [
-        hashlib.sha256(path.read_bytes()).hexdigest()[:_DIGITS] if path.is_file() else None
+        hashlib.sha256(path.read_bytes()).hexdigest()[:_DIGITS]
+        if path.is_file() and (not asked or is_of(path, code))
+        else None
         for path in paths
     ]
+
+
+def made_by() -> dict[str, str]:
+    """The program and the machine that measure now, as a row states them."""
+    from liex_lab.sessions.provenance import package_version
+
+    from .given import processor
+
+    sources = hashlib.sha256()
+    for path in sorted(MODELS.parent.rglob("*.py")):
+        sources.update(path.read_bytes())
+    machine = f"{platform.processor() or platform.machine()}, Python {platform.python_version()}"
+    return {
+        "version": package_version("liex_lab"),
+        "code": sources.hexdigest()[:12],
+        "machine": machine,
+        "processor": processor(),
+    }

@@ -8,6 +8,7 @@ from typing import Any
 ELSEWHERE = (
     "other_processor"  # of a kept row: the processor, where the row is of another's pictures
 )
+OTHER_MODEL = "other_model"  # of a kept row: what another file of its model says of it, if any
 
 
 @dataclass

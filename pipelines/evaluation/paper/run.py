@@ -13,20 +13,17 @@ stands in its place.
 
 from __future__ import annotations
 
-import hashlib
-import platform
 import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
-from liex_lab.catalog import MODELS
 from liex_lab.errors import MissingPackageError
 from liex_lab.evaluation.pose import plain
 from liex_lab.runtime.progress import Progress, silent
 
 from .budget import CURVES, Budget
-from .results import ELSEWHERE, Results
+from .results import ELSEWHERE, OTHER_MODEL, Results
 from .rows import ROWS, SWEPT, TRAINING_DRAWS
 
 if TYPE_CHECKING:
@@ -148,7 +145,11 @@ def _command(
 
 def _unmarked(rows: Mapping[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
     return {
-        name: {key: value for key, value in row.items() if key not in ("origin", ELSEWHERE)}
+        name: {
+            key: value
+            for key, value in row.items()
+            if key not in ("origin", ELSEWHERE, OTHER_MODEL)
+        }
         for name, row in rows.items()
     }
 
@@ -165,6 +166,7 @@ def results_of(animal: str, budget: Budget, command: str, progress: Progress) ->
     from liex_lab.body.skeleton import Skeleton
     from liex_lab.simulation.simulator import world_of
 
+    from .fingerprints import made_by
     from .illustrations import illustrate
     from .rows import measured_rows
 
@@ -189,7 +191,7 @@ def results_of(animal: str, budget: Budget, command: str, progress: Progress) ->
                 "command": command,
                 "seeds": list(range(n_models)),
                 **known,
-                **_made_by(),
+                **made_by(),
             },
             **row,
         }
@@ -239,7 +241,7 @@ def _kept(
 ) -> Mapping[str, Any]:
     """Kept rows that fit go into the results, why another does not into `missing`; the curves."""
     from .cached_results import kept_results, taken, why_refused
-    from .kept_examples import examples_of_kept
+    from .kept_examples import examples_of_kept, other_model
 
     if not budget.kept:
         for name in ROWS:
@@ -255,10 +257,15 @@ def _kept(
         if row is not None:
             made, hashes = made_from(name, skeleton), hashes_of(skeleton.name, name)
             why = why_refused(row, made, hashes, views, given)
+            if not why:
+                other = other_model(skeleton.name, name, row, hashes["models"], tests, views)
+                why = other.refused
         if row is None or why:
             results.missing[name] = f"{why}; {_anew(skeleton.name, name)} measures it"
         else:
             results.rows[name] = {**taken(row, hashes, views, given), "origin": "kept"}
+            if other.told:
+                results.rows[name][OTHER_MODEL] = other.told
             if found := examples_of_kept(skeleton.name, name, row, tests, views):
                 results.rows[name]["examples"] = found
     return cast("Mapping[str, Any]", kept["sensitivity"])
@@ -328,25 +335,7 @@ def hashes_of(animal: str, variant: str) -> dict[str, Any]:
         "learning_code": learning_code(variant),
         "training_pictures": training_pictures(variant, animal),
         "training_given": training_given(variant, animal),
-        "models": model_digests(animal, variant, TRAINING_DRAWS.get(variant, 1)),
-    }
-
-
-def _made_by() -> dict[str, str]:
-    """The program and the machine."""
-    from liex_lab.sessions.provenance import package_version
-
-    from .given import processor
-
-    sources = hashlib.sha256()
-    for path in sorted(MODELS.parent.rglob("*.py")):
-        sources.update(path.read_bytes())
-    machine = f"{platform.processor() or platform.machine()}, Python {platform.python_version()}"
-    return {
-        "version": package_version("liex_lab"),
-        "code": sources.hexdigest()[:12],
-        "machine": machine,
-        "processor": processor(),
+        "models": model_digests(animal, variant, TRAINING_DRAWS.get(variant, 1), of_today=True),
     }
 
 
@@ -365,7 +354,7 @@ def _sensitivities(
     """
     from liex_lab.estimation.method import method_of
 
-    from .fingerprints import learning_code
+    from .fingerprints import learning_code, made_by
     from .quick import QUICK_SWEEP
     from .sensitivity import Sweep, sensitivity, without_void
 
@@ -391,7 +380,7 @@ def _sensitivities(
         curve = sensitivity(skeleton, variant, sweep, progress)
         curves[variant] = {
             **curve,
-            "made": {"from": made, "command": command, "learning_code": code, **_made_by()},
+            "made": {"from": made, "command": command, "learning_code": code, **made_by()},
             "origin": "measured",
         }
     return curves

@@ -48,7 +48,6 @@ VIEWS = {"clean": [view_of_one("x")]}
 TODAY = {"clean": recordings_given()}
 OTHERS: dict[str, dict[str, Any]] = {  # each as another processor's last digit would make it
     "training pictures": {"hashes": {"training_pictures": "z"}},
-    "model file": {"hashes": {"models": ["z", None]}},
     "test pictures": {"views": {"clean": [view_of_one("z")]}},
 }
 
@@ -101,6 +100,8 @@ def test_other_code_and_another_training_are_refused_whatever_the_processor():
         row = kept_row(processor)
         assert "other code" in why(row, hashes={"learning_code": "z"})
         assert "number of models" in why(row, hashes={"models": ["c"]})
+        # its numbers are of its own models: see `kept_examples.other_model`
+        assert why(row, hashes={"models": ["z", None]}) == ""
         made = {"recipe": {"n_images": 4, "seed": 5}}
         told = cached_results.why_refused(row, made, HASHES, VIEWS, TODAY)
         assert "another training or method" in told

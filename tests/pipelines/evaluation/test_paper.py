@@ -4,7 +4,9 @@ follow numbers.
 
 from __future__ import annotations
 
+import copy
 import csv
+import hashlib
 import json
 import re
 from pathlib import Path
@@ -251,6 +253,57 @@ def test_a_kept_row_without_poses_gets_them_only_from_the_very_model_it_was_meas
     assert np.linalg.norm(off, axis=-1).mean() < 15
 
 
+def test_another_model_file_is_compared_by_the_poses_in_the_row_s_examples(monkeypatch):
+    """Another calibration makes another file, and no other pose."""
+    recordings = {"hard": SmallWorld().test_split("hard")[:1]}
+    own = PoseEstimator.load("mouse")
+    view = common_view.common_view(recordings["hard"][0], plan_of("mouse"), own)[2]
+    views = {"hard": [view]}
+    monkeypatch.setattr(pose, "subject_of", lambda *_: own)
+    told = kept_examples._poses_of_model("mouse", "rf", recordings, views)
+    row = {"made": {"models": ["a"]}, "examples": told}
+
+    def of(row: Any, models: list[str | None]) -> kept_examples.OtherModel:
+        return kept_examples.other_model("mouse", "rf", row, models, recordings, views)
+
+    nothing = kept_examples.OtherModel()
+    for models in (["a"], [None]):
+        assert of(row, list(models)) == nothing
+    assert of({"made": row["made"]}, ["b"]) == nothing  # there is nothing to compare
+    same = of(row, ["b"])
+    assert same.refused == ""
+    assert "file of its model is a, and training gives b here" in same.told
+    assert "1 example frames are the same within 0.03 mm" in same.told
+    moved = copy.deepcopy(row)
+    moved["examples"][0]["joints_mm"][2][1] += 0.5
+    other = of(moved, ["b"])
+    assert other.told == ""
+    assert "its file is a, and training gives b here" in other.refused
+    assert "up to 0.50 mm apart" in other.refused
+    moved["examples"][0]["joints_mm"] = None
+    assert "inf mm apart" in of(moved, ["b"]).refused
+    results = run.Results("mouse", [], [], rows={"paper": {"other_model": same.told}})
+    assert table_text.words(results, quick=True) == [f"Lie-X, the paper's variant: {same.told}."]
+
+
+@pytest.mark.parametrize("note", [None, "other code", "today"])
+def test_only_a_model_that_today_s_code_is_known_to_have_trained_is_set_against_a_row(
+    note, monkeypatch, tmp_path
+):
+    monkeypatch.setenv("LIEX_CACHE", str(tmp_path))
+    path = pose_model.cache_path("mouse", "paper", 1)
+    path.write_bytes(b"model")
+    if note:
+        code = fingerprints.learning_code("paper") if note == "today" else note
+        trained_by.note(path, code)
+    digest = hashlib.sha256(b"model").hexdigest()[:16]
+    for variant in ("paper", "paper-no-metric"):  # of the same models
+        found = fingerprints.model_digests("mouse", variant, 3, of_today=True)
+        assert found == [None, digest if note == "today" else None, None]
+        assert fingerprints.model_digests("mouse", variant, 3) == [None, digest, None]
+    assert fingerprints.model_digests("mouse", "default", 1, of_today=True) != [None]
+
+
 def test_every_figure_of_the_paper_is_made_or_said_to_be_a_drawing():
     told = exhibits.exhibits([], Further(), [], quick=False)
     assert len(told) == 23
@@ -380,7 +433,6 @@ def test_a_kept_row_is_refused_for_every_reason_by_its_name():
     assert "other code" in why(row, made, hashes | {"learning_code": "z"}, views)
     pictures = hashes | {"training_pictures": "z"}
     assert "other training pictures" in why(row, made, pictures, views)
-    assert "another model" in why(row, made, hashes | {"models": ["z", None]}, views)
     assert "another number of models" in why(row, made, hashes | {"models": ["c"]}, views)
     fewer = {"clean": views["clean"][:1]}  # `--frames` never mixes with kept rows
     turned = {"clean": views["clean"][::-1]}
