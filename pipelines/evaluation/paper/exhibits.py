@@ -74,8 +74,8 @@ _SENTENCES = {
     "Fig. 18": "Same: error over time of tracking beside single frames, and the worst moments. Not "
     "the same: a rendered sequence instead of two real mice; single frames are those of our "
     "default, and Algorithm 3 runs on our parts. The paper's own comparison, 8.42 to 7.19 mm with "
-    "its own parts, is `liex evaluate tracking --paper`, which trains its variant first. On rendered "
-    "mice it is not reproduced, with noise that was searched: the manual's page Evidence.",
+    "its own parts, is `liex evaluate tracking --paper`, which trains its variant first. It is not "
+    "reproduced on rendered mice, with noise that was searched: see the manual's page Evidence.",
     "Fig. 19": "Same: key frames and path of the nine actions of fish, surface and dive from the "
     "side. Not the same: the fish act by kinematic definitions; the grey points are what the "
     "virtual camera sees, the lines the true skeletons.",
