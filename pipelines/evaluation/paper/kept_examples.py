@@ -56,7 +56,7 @@ def examples_of_kept(
     """
     if "examples" in row:
         return list(row["examples"])
-    from .fingerprints import model_digests
+    from .trained_by import model_digests
 
     known = row["made"].get("models", [])
     if not known or model_digests(animal, variant, 1)[0] != known[0]:

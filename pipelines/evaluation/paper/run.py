@@ -327,7 +327,8 @@ def hashes_of(animal: str, variant: str) -> dict[str, Any]:
     from liex_lab.body.skeleton import Skeleton
     from liex_lab.simulation.simulator import world_of
 
-    from .fingerprints import learning_code, model_digests, training_given, training_pictures
+    from .fingerprints import learning_code, training_given, training_pictures
+    from .trained_by import model_digests
 
     postures = world_of(Skeleton.load(animal)).test_postures
     return {

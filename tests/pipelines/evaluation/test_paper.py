@@ -237,7 +237,7 @@ def test_a_kept_row_without_poses_gets_them_only_from_the_very_model_it_was_meas
     chooser = PoseEstimator.load("mouse")
     view = common_view.common_view(recordings["hard"][0], plan_of("mouse"), chooser)[2]
     views = {"hard": [view]}
-    monkeypatch.setattr(fingerprints, "model_digests", lambda *_: ["a"])
+    monkeypatch.setattr(trained_by, "model_digests", lambda *_: ["a"])
     monkeypatch.setattr(pose, "subject_of", lambda *_: chooser)
     found, refused = (
         kept_examples.examples_of_kept(
@@ -298,10 +298,10 @@ def test_only_a_model_that_today_s_code_is_known_to_have_trained_is_set_against_
         trained_by.note(path, code)
     digest = hashlib.sha256(b"model").hexdigest()[:16]
     for variant in ("paper", "paper-no-metric"):  # of the same models
-        found = fingerprints.model_digests("mouse", variant, 3, of_today=True)
+        found = trained_by.model_digests("mouse", variant, 3, of_today=True)
         assert found == [None, digest if note == "today" else None, None]
-        assert fingerprints.model_digests("mouse", variant, 3) == [None, digest, None]
-    assert fingerprints.model_digests("mouse", "default", 1, of_today=True) != [None]
+        assert trained_by.model_digests("mouse", variant, 3) == [None, digest, None]
+    assert trained_by.model_digests("mouse", "default", 1, of_today=True) != [None]
 
 
 def test_every_figure_of_the_paper_is_made_or_said_to_be_a_drawing():
