@@ -42,7 +42,8 @@ AnimalName = Annotated[
 VariantName = Annotated[
     str,
     typer.Option(
-        "--variant", help="default, or paper: as the paper describes it, on fewer pictures."
+        "--variant",
+        help="default, or paper: the paper's; `liex evaluate tables --help` lists what differs.",
     ),
 ]
 RowName = Annotated[

@@ -17,7 +17,8 @@ from liex_lab.body.skeleton import Skeleton
 from liex_lab.simulation import generic, locomotion, recording, training_patches
 from liex_lab.simulation.fish import FishSpecies
 from liex_lab.simulation.generic import GenericSpecies
-from liex_lab.simulation.hand.simulator import HandSimulator, find_reference
+from liex_lab.simulation.hand.reference import find_reference
+from liex_lab.simulation.hand.simulator import HandSimulator
 from liex_lab.simulation.recording import SyntheticSession, TrueRecording
 from liex_lab.simulation.species import MouseSpecies, Species
 from liex_lab.simulation.training_patches import TrainingPatches
@@ -40,6 +41,12 @@ class Simulator(Protocol):
     @property
     def protocol(self) -> str:
         """One sentence on the test splits, to stand beside figures measured on them."""
+
+    @property
+    def test_postures(self) -> str:
+        """One phrase on where the postures of the test splits come from; '' where seeds alone say
+        so.
+        """
 
     @property
     def sources(self) -> str:
@@ -128,6 +135,11 @@ class BodySimulator:
             "each with its own camera, arena, animal; the background, the floor, the blob and the "
             "animal's size are found by the product, nothing is handed over. "
         )
+
+    @property
+    def test_postures(self) -> str:
+        """Postures follow from the seeds alone: ''."""
+        return ""
 
     @property
     def sources(self) -> str:

@@ -30,8 +30,8 @@ _SHOWN = 10  # hands in Fig 12 of Lie-X
 _OURS = "liex_lab"
 _LABELS = (
     "The bone lengths of our hand, and {share:.0f} % of the postures that our bundled model was "
-    "trained on, come from labels of the NYU test frames 1 to {last}. Frames among these that ours "
-    "was measured on: {n} of {of}."
+    "trained on, come from labels of the NYU test frames 1 to {last}, whose source states no "
+    "licence. Frames among these that ours was measured on: {n} of {of}."
 )
 _PUBLISHED = {
     "liex": "Lie-X (Xu et al. 2017), palm placed on the true palm",

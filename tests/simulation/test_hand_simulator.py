@@ -11,8 +11,9 @@ import pytest
 from liex_lab.body import Skeleton
 from liex_lab.errors import LiexError
 from liex_lab.recordings.formats.images.nyu_labels import N_FIRST_PERSON, NyuReference
-from liex_lab.simulation.hand import simulator
-from liex_lab.simulation.hand.simulator import HandSimulator, find_reference, gesture_session
+from liex_lab.simulation.hand import reference, simulator
+from liex_lab.simulation.hand.reference import find_reference
+from liex_lab.simulation.hand.simulator import HandSimulator, gesture_session
 from liex_lab.simulation.simulator import world_of
 from liex_lab.simulation.training_patches import TrainingPatches
 
@@ -109,15 +110,25 @@ def test_with_the_reference_test_postures_are_the_second_persons(reference_data:
     assert np.median(off) < 6.0  # each has its model among the labelled frames
 
 
-def test_the_reference_is_looked_for_beside_the_repository(
+def test_the_labels_are_looked_for_in_one_place_whatever_folder_a_command_runs_in(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    folder = tmp_path / "shared" / "data" / "hand_nyu"
-    folder.mkdir(parents=True)
-    (folder / "nyu_test_14joints.npz").touch()
+    beside = tmp_path / "shared" / "data" / "hand_nyu"
+    beside.mkdir(parents=True)
+    (beside / "nyu_test_14joints.npz").touch()
     (tmp_path / "work").mkdir()
+    monkeypatch.setattr(reference, "_REPOSITORY", tmp_path / "elsewhere" / "repository")
+    monkeypatch.delenv("LIEX_NYU", raising=False)
     monkeypatch.chdir(tmp_path / "work")
-    assert find_reference() == folder
+    assert find_reference() is None  # what lies beside the current folder does not count
+    monkeypatch.setattr(reference, "_REPOSITORY", tmp_path / "repository")
+    assert find_reference() == beside
+    monkeypatch.setattr(reference, "_REPOSITORY", tmp_path / "elsewhere" / "repository")
+    monkeypatch.setenv("LIEX_NYU", str(beside))
+    assert find_reference() == beside
+    monkeypatch.setenv("LIEX_NYU", str(tmp_path))
+    with pytest.raises(LiexError, match=r"LIEX_NYU should name a folder with nyu_test_14joints"):
+        find_reference()
 
 
 def test_gestures_flow() -> None:

@@ -4,6 +4,8 @@ goes slowly.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -11,7 +13,6 @@ from liex_lab.estimation.cascade import Candidates, ImageSet
 from liex_lab.estimation.estimator import PoseEstimator
 from liex_lab.foreground.crop_camera import view_of
 from liex_lab.foreground.hand_segmenter import HandSegmenter
-from liex_lab.forests.forest import predict
 from liex_lab.geometry import SE3
 from liex_lab.recordings.frame import DepthFrame
 from liex_lab.simulation.hand.simulator import HandSimulator
@@ -82,36 +83,60 @@ def test_the_metric_of_a_hand_sees_what_it_has_learned_from():
     assert max(off) < 30.0
 
 
-def test_a_base_round_is_the_last_correction_of_the_cascade(estimator, toy):
-    """Without noise particles stay where they are; a round moves them as it moves candidates."""
-    quiet = ProcessNoise(n_particles=3, turn_rad=0.0, shift_mm=0.0)
-    cascade = estimator.model.cascade
-    roots = {}
-    for base_rounds in (0, 1):
-        particles = ParticleFilter(
-            estimator, SCENE, 1.0, np.random.default_rng(0), quiet, base_rounds
-        )
-        steps = [particles.step(DepthFrame(k, k * STEP_NS, toy.depths[k])) for k in range(2)]
-        roots[base_rounds] = [step[0].root for step in steps if step is not None]
-    first, stayed = roots[0]
-    np.testing.assert_allclose(stayed.matrix, first.matrix, atol=1e-6)
-    crops = SCENE.extract(toy.depths[1:2], 1.0)
-    crop_cameras = SCENE.crop_cameras(crops, False)
+QUIET = ProcessNoise(n_particles=3, turn_rad=0.0, shift_mm=0.0)
+
+
+def after_two_frames(
+    estimator: PoseEstimator, depths: np.ndarray, base_rounds: int
+) -> tuple[list[np.ndarray], float]:
+    """Joints (J, 3) mm in the camera frame at both frames, and the error expected at the second.
+
+    Without noise particles stay where they are until regressors move them.
+    """
+    particles = ParticleFilter(estimator, SCENE, 1.0, np.random.default_rng(0), QUIET, base_rounds)
+    steps = [particles.step(DepthFrame(k, k * STEP_NS, depths[k])) for k in range(2)]
+    found = [step for step in steps if step is not None]
+    assert len(found) == 2
+    return [pose.joints(estimator.skeleton) for pose, _ in found], found[1][1]
+
+
+@pytest.mark.parametrize("variant", ["default", "paper"])
+@pytest.mark.parametrize("base_rounds", [0, 1, 99])
+def test_a_particle_is_moved_and_scored_as_the_cascade_moves_and_scores_candidates(
+    variant, base_rounds, toy
+):
+    """With the mode of the trees' votes where the method has one. With all rounds of the base it is
+    Algorithm 1 as it is written, from where the particle stands.
+    """
+    estimator = PoseEstimator(trained(variant).model)
+    model = estimator.model
+    cascade = model.cascade
+    base_rounds = min(base_rounds, len(cascade.forests[0]))
+    joints, expected_mm = after_two_frames(estimator, toy.depths, base_rounds)
+
+    pose = estimator.estimate(toy.depths[:1], SCENE, 1.0).chosen.pose
+    camera_view = cascade.method.camera_view
+    crops = SCENE.extract(toy.depths[1:2], 1.0, camera_view=camera_view)
+    crop_cameras = SCENE.crop_cameras(crops, camera_view)
     view = view_of(crop_cameras)
     T_view_camera = SE3(view.rotation[0], view.translation[0])
-    base = T_view_camera @ first
+    base = T_view_camera @ pose.root
     candidates = Candidates.start(
         cascade.skeleton,
         np.zeros(1, np.int32),
-        base.rotation[None],
-        base.translation[None],
-        estimator.estimate(toy.depths[:1], SCENE, 1.0).chosen.pose.scale,
+        base.rotation,
+        base.translation,
+        pose.scale,
         np.ones(1),
     )
     images = ImageSet(crops.heights, crop_cameras, crops.moments)
-    values = predict(cascade.forests[0][-1], cascade.samples(images, candidates, [0]))
-    cascade.apply(candidates, 0, values)
-    moved = SE3(candidates.rotations[0, 0], candidates.positions[0, 0])
-    wanted = T_view_camera.inverse() @ moved
-    np.testing.assert_allclose(roots[1][1].matrix, wanted.matrix, atol=1e-5)
-    assert np.abs(wanted.matrix - first.matrix).max() > 1e-2
+    left_out = len(cascade.forests[0]) - base_rounds
+    written = replace(cascade, forests=[cascade.forests[0][left_out:], *cascade.forests[1:]])
+    for _ in written.steps(images, candidates):
+        pass
+    wanted = T_view_camera.inverse() @ candidates.positions[0]
+    np.testing.assert_allclose(joints[1], wanted, atol=1e-3)
+    assert np.abs(joints[1] - joints[0]).max() > 1.0  # the other mouse lies otherwise
+    score = float(cascade.predict(model.metric, cascade.metric_samples(images, candidates))[0, 0])
+    calibration = model.calibration
+    assert expected_mm == pytest.approx(calibration.offset + calibration.slope * score, abs=1e-3)

@@ -26,7 +26,6 @@ from liex_lab.geometry import SE3
 from liex_lab.recordings.formats.images.nyu_labels import (
     N_FIRST_PERSON,
     NYU_CAMERA,
-    REFERENCE_FILE,
     NyuReference,
     fit_hands,
 )
@@ -35,6 +34,7 @@ from liex_lab.simulation._sensor_kernels import PRIMESENSE_KIND
 from liex_lab.simulation.hand import scene
 from liex_lab.simulation.hand.gestures import draw_gestures
 from liex_lab.simulation.hand.pose_prior import draw_seen, draw_wide
+from liex_lab.simulation.hand.reference import DRAWN, FITTED
 from liex_lab.simulation.pose_prior import SIZE_RANGE
 from liex_lab.simulation.recording import OTHER_CAMERA, SEALED, TrueRecording, split_of
 from liex_lab.simulation.sensors import KINECT_V2_SENSOR, Sensor, unseen
@@ -159,15 +159,17 @@ class HandSimulator:
             "found by the product, nothing is handed over; flips are told by the direction from "
             "the palm to the wrist. "
         )
-        if self.reference is None:
-            return (
-                f"{how}Postures: drawn from statistics of one person's hand, as part of the "
-                "training pictures are. "
-            )
-        return (
-            f"{how}Postures: fitted to the labels of the NYU test frames from {N_FIRST_PERSON + 1} "
-            "on, a person after whom no training picture is drawn. "
+        as_trained = (
+            "as part of the training pictures are"
+            if self.reference is None
+            else "a person after whom no training picture is drawn"
         )
+        return f"{how}Postures: {self.test_postures}, {as_trained}. "
+
+    @property
+    def test_postures(self) -> str:
+        """One phrase on where the postures of the test splits come from."""
+        return DRAWN if self.reference is None else FITTED
 
     @property
     def sources(self) -> str:
@@ -402,19 +404,6 @@ class HandSimulator:
             The recording with its truth.
         """
         return gesture_session(self.skeleton, seed, n_frames, **settings)
-
-
-def find_reference() -> Path | None:
-    """The folder of labelled hands beside the repository or the current folder.
-
-    Returns:
-        `../shared/data/hand_nyu` of either; None where neither holds the labels.
-    """
-    for base in (Path.cwd(), Path(__file__).resolve().parents[3]):
-        folder = base.parent / "shared" / "data" / "hand_nyu"
-        if (folder / REFERENCE_FILE).is_file():
-            return folder
-    return None
 
 
 def gesture_session(

@@ -1,12 +1,13 @@
 """Cache of evaluation results whose models take long to train: JSON in `datasets/kept_results`.
 
 Each row is kept with how it was made (recipe, method, command, version) and with hashes of code,
-training pictures, models, test pictures and foreground; it is used again where all of them agree
-with what would be measured now. Code, recipe and method must. The hashes of pictures and models
+training pictures, models, test pictures and foreground; it is used again where those but of the
+models agree with what would be measured now. Code, recipe and method must. The hashes of pictures
 change with the last digit of a float, and so with the kind of processor: a row that was kept on
 another one is used where what it was given agrees in numbers (`given`), and the tables say so.
-Anything else is refused with the reason. The files are part of the repository, so they hold what
-the page needs and no more, a list a line.
+Anything else is refused with the reason. A model that training gave here in another file is
+compared by its poses (`kept_examples`). The files are part of the repository, so they hold what the
+page needs and no more, a list a line.
 """
 
 from __future__ import annotations
@@ -169,6 +170,8 @@ def why_refused(
     other = _other_hash(row, hashes, views)
     if not other:
         return ""
+    if apart := _other_postures(made, hashes):
+        return apart
     why = f"the kept row is of {other}"
     if made.get("processor", processor()) == processor():  # or nobody knows of which
         return why
@@ -184,15 +187,21 @@ def _other_hash(
     made = row["made"]
     if made.get("training_pictures") != hashes["training_pictures"]:
         return "other training pictures"
-    if any(
-        now is not None and now != then
-        for now, then in zip(hashes["models"], made.get("models", []), strict=True)
-    ):
-        return "another model file"
     for split, ours in views.items():
         if row["splits"].get(split, {}).get("fingerprint") != fingerprint_of(ours):
             return f"other test pictures or another foreground on {split}"
     return ""
+
+
+def _other_postures(made: Mapping[str, Any], hashes: Mapping[str, Any]) -> str:
+    """That test postures come from elsewhere today, which alone makes other pictures; '' if not."""
+    then, now = made.get("test_postures"), hashes.get("test_postures")
+    if not then or then == now:
+        return ""
+    return (
+        f"the kept row is of hands in postures {then}, and those of today are {now}; labels of "
+        f"hands are looked for in the folder that LIEX_NYU names, or else beside the repository"
+    )
 
 
 def _apart(row: Mapping[str, Any], hashes: Mapping[str, Any], given: Mapping[str, Given]) -> str:
@@ -220,12 +229,14 @@ def taken(
     """A kept row that is not refused, as it stands in the results.
 
     Where every hash is today's, the row was given what is given today: it gets the numbers that say
-    so, and today's processor as the one on which its pictures come out, unless it has its own.
-    Where one is not, the row names the processor that it is of (`other_processor`).
+    so, where test postures come from, and today's processor as the one on which its pictures come
+    out, unless it has its own. Where one is not, the row names the processor that it is of
+    (`other_processor`).
 
     Args:
         row: the kept row.
-        hashes: of today's training pictures and models, and the pictures in numbers.
+        hashes: of today's training pictures and models, the pictures in numbers, and where test
+            postures come from.
         views: what every row is given now, by split and recording.
         given: the same in numbers, by split.
     """
@@ -233,6 +244,8 @@ def taken(
     if _other_hash(row, hashes, views):
         return {**row, ELSEWHERE: made["processor"]}
     known = {"training_given": hashes["training_given"], "processor": processor()}
+    if "test_postures" in hashes:
+        known["test_postures"] = hashes["test_postures"]
     splits = {
         split: {"given": given[split].to_dict(), **numbers} if split in given else numbers
         for split, numbers in row["splits"].items()

@@ -4,7 +4,6 @@
   comments, docstrings and spaces; what is rendered and cut out is told by the pictures themselves.
 - `training_pictures`: of the first block of training pictures as the foreground cuts it out.
 - `fingerprint_of`: of the pictures, components, choice and size of all test recordings of a split.
-- `model_digests`: of the model files, where they are at hand.
 """
 
 from __future__ import annotations
@@ -12,6 +11,7 @@ from __future__ import annotations
 import ast
 import hashlib
 import io
+import platform
 import tokenize
 from collections.abc import Sequence
 from functools import cache
@@ -23,7 +23,7 @@ from liex_lab.catalog import MODELS
 if TYPE_CHECKING:
     from .common_view import CommonView
 
-_DIGITS = 16
+DIGITS = 16
 # modules that matter to every row, under `liex_lab` and `pipelines`
 _ESTIMATION = (
     "_cascade_kernels",
@@ -65,7 +65,7 @@ def learning_code(variant: str) -> str:
         paths.append("pipelines/training/baselines.py")
     for path in paths:
         told.update(f"{path}\n{bare_source(_source(path))}\n".encode())
-    return told.hexdigest()[:_DIGITS]
+    return told.hexdigest()[:DIGITS]
 
 
 def _source(path: str) -> str:
@@ -110,7 +110,7 @@ def training_pictures(variant: str, animal: str) -> str:
         variant: a row of the tables.
         animal: a bundled animal's name.
     """
-    return _first_pictures(_base_of(variant), animal)[0]
+    return _first_pictures(base_of(variant), animal)[0]
 
 
 def training_given(variant: str, animal: str) -> dict[str, float]:
@@ -120,10 +120,15 @@ def training_given(variant: str, animal: str) -> dict[str, float]:
         variant: a row of the tables.
         animal: a bundled animal's name.
     """
-    return _first_pictures(_base_of(variant), animal)[1]
+    return _first_pictures(base_of(variant), animal)[1]
 
 
-def _base_of(variant: str) -> str:
+def base_of(variant: str) -> str:
+    """The variant of the pose model that a row is made with, or whose pictures it learns from.
+
+    Args:
+        variant: a row of the tables.
+    """
     return "default" if variant == "default" else "paper"
 
 
@@ -142,7 +147,7 @@ def _first_pictures(base: str, animal: str) -> tuple[str, dict[str, float]]:
     )
     told = hashlib.sha256(data.images.heights.tobytes())
     told.update(data.truth.positions.round(3).tobytes())
-    return told.hexdigest()[:_DIGITS], of_training(data)
+    return told.hexdigest()[:DIGITS], of_training(data)
 
 
 def fingerprint_of(views: Sequence[CommonView]) -> str:
@@ -152,31 +157,22 @@ def fingerprint_of(views: Sequence[CommonView]) -> str:
         views: of the recordings.
     """
     told = hashlib.sha256("\n".join(one.fingerprint for one in views).encode())
-    return told.hexdigest()[:_DIGITS]
+    return told.hexdigest()[:DIGITS]
 
 
-def model_digests(animal: str, variant: str, draws: int) -> list[str | None]:
-    """SHA-256 of a row's model files; None for one that is not at hand.
+def made_by() -> dict[str, str]:
+    """The program and the machine that measure now, as a row states them."""
+    from liex_lab.sessions.provenance import package_version
 
-    Args:
-        animal: a bundled animal's name.
-        variant: a row of the tables.
-        draws: number of models that the row is the mean of.
-    """
-    from liex_lab.body.skeleton import Skeleton
-    from liex_lab.catalog import bundled_models, find_model
+    from .given import processor
 
-    from ...training.baselines import BASELINES, cached_baseline, training_of
-    from ...training.pose_model import cache_path
-
-    if variant == "default" and animal in bundled_models():
-        paths = [find_model(animal)]
-    elif variant in BASELINES:
-        skeleton = Skeleton.load(animal)
-        paths = [cached_baseline(variant, skeleton, training_of(variant, skeleton))]
-    else:
-        paths = [cache_path(animal, _base_of(variant), draw) for draw in range(draws)]
-    return [
-        hashlib.sha256(path.read_bytes()).hexdigest()[:_DIGITS] if path.is_file() else None
-        for path in paths
-    ]
+    sources = hashlib.sha256()
+    for path in sorted(MODELS.parent.rglob("*.py")):
+        sources.update(path.read_bytes())
+    machine = f"{platform.processor() or platform.machine()}, Python {platform.python_version()}"
+    return {
+        "version": package_version("liex_lab"),
+        "code": sources.hexdigest()[:12],
+        "machine": machine,
+        "processor": processor(),
+    }

@@ -8,6 +8,7 @@ from typing import Any
 ELSEWHERE = (
     "other_processor"  # of a kept row: the processor, where the row is of another's pictures
 )
+OTHER_MODEL = "other_model"  # of a kept row: what another file of its model says of it, if any
 
 
 @dataclass
@@ -21,6 +22,7 @@ class Results:
         rows: figures by variant, see `rows.measured_rows`.
         missing: by variant, why its row is not there; by figure and variant, why its curve is not.
         sealed: the split is the one that is measured once.
+        test_postures: where the postures of the test splits come from; '' where seeds say so.
         sensitivity: curves by variant, see `sensitivity.sensitivity`.
         illustration: of the default, see `illustrations.illustrate`.
         examples: poses of all rows in fixed frames, see `examples.shown_poses`.
@@ -33,6 +35,7 @@ class Results:
     rows: dict[str, dict[str, Any]] = field(default_factory=dict)
     missing: dict[str, str] = field(default_factory=dict)
     sealed: bool = False
+    test_postures: str = ""
     sensitivity: dict[str, Any] = field(default_factory=dict)
     illustration: dict[str, Any] = field(default_factory=dict)
     examples: list[dict[str, Any]] = field(default_factory=list)

@@ -1,7 +1,7 @@
 """Tables 1 to 3 of Lie-X (section 5.2) and the numbers behind its figures, on rendered data.
 
 `liex evaluate tables` measures six rows on an animal's test splits (40 recordings each): our
-default, Lie-X as the paper has it, its ablations without multiple initial poses and without the
+default, the paper's variant of Lie-X, its ablations without multiple initial poses and without the
 learned metric, and the baselines RF and CNN. All see the same frames and, in each, the same object
 with the same size (`common_view`). Numbers: those of `rows`, 101 quantiles of the error (Fig 8),
 frames/s on at most two cores, sensitivity to five parameters (Fig 7), candidates and convergence of
@@ -13,20 +13,17 @@ stands in its place.
 
 from __future__ import annotations
 
-import hashlib
-import platform
 import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
-from liex_lab.catalog import MODELS
 from liex_lab.errors import MissingPackageError
 from liex_lab.evaluation.pose import plain
 from liex_lab.runtime.progress import Progress, silent
 
 from .budget import CURVES, Budget
-from .results import ELSEWHERE, Results
+from .results import ELSEWHERE, OTHER_MODEL, Results
 from .rows import ROWS, SWEPT, TRAINING_DRAWS
 
 if TYPE_CHECKING:
@@ -148,7 +145,11 @@ def _command(
 
 def _unmarked(rows: Mapping[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
     return {
-        name: {key: value for key, value in row.items() if key not in ("origin", ELSEWHERE)}
+        name: {
+            key: value
+            for key, value in row.items()
+            if key not in ("origin", ELSEWHERE, OTHER_MODEL)
+        }
         for name, row in rows.items()
     }
 
@@ -163,13 +164,16 @@ def results_of(animal: str, budget: Budget, command: str, progress: Progress) ->
         progress: told how far the job is.
     """
     from liex_lab.body.skeleton import Skeleton
+    from liex_lab.simulation.simulator import world_of
 
+    from .fingerprints import made_by
     from .illustrations import illustrate
     from .rows import measured_rows
 
     skeleton = Skeleton.load(animal)
     tests = _tests(skeleton, budget)
     results = Results(skeleton.name, list(skeleton.names), list(tests), sealed=budget.sealed)
+    results.test_postures = world_of(skeleton).test_postures
     default = _subjects(animal, ["default"], budget, results, progress)
     chooser = cast("PoseEstimator", default["default"][0])
     wanted = [name for name in budget.fresh if name != "default"]
@@ -187,7 +191,7 @@ def results_of(animal: str, budget: Budget, command: str, progress: Progress) ->
                 "command": command,
                 "seeds": list(range(n_models)),
                 **known,
-                **_made_by(),
+                **made_by(),
             },
             **row,
         }
@@ -237,7 +241,7 @@ def _kept(
 ) -> Mapping[str, Any]:
     """Kept rows that fit go into the results, why another does not into `missing`; the curves."""
     from .cached_results import kept_results, taken, why_refused
-    from .kept_examples import examples_of_kept
+    from .kept_examples import examples_of_kept, other_model
 
     if not budget.kept:
         for name in ROWS:
@@ -253,10 +257,15 @@ def _kept(
         if row is not None:
             made, hashes = made_from(name, skeleton), hashes_of(skeleton.name, name)
             why = why_refused(row, made, hashes, views, given)
+            if not why:
+                other = other_model(skeleton.name, name, row, hashes["models"], tests, views)
+                why = other.refused
         if row is None or why:
             results.missing[name] = f"{why}; {_anew(skeleton.name, name)} measures it"
         else:
             results.rows[name] = {**taken(row, hashes, views, given), "origin": "kept"}
+            if other.told:
+                results.rows[name][OTHER_MODEL] = other.told
             if found := examples_of_kept(skeleton.name, name, row, tests, views):
                 results.rows[name]["examples"] = found
     return cast("Mapping[str, Any]", kept["sensitivity"])
@@ -308,37 +317,26 @@ def made_from(variant: str, skeleton: Skeleton) -> dict[str, Any]:
 
 
 def hashes_of(animal: str, variant: str) -> dict[str, Any]:
-    """Hashes of what a row was made with today, see `fingerprints`, and its pictures in numbers.
+    """What a row was made with today: hashes, see `fingerprints`, its pictures in numbers, and
+    where test postures come from.
 
     Args:
         animal: the animal's name.
         variant: a name of `ROWS`.
     """
-    from .fingerprints import learning_code, model_digests, training_given, training_pictures
+    from liex_lab.body.skeleton import Skeleton
+    from liex_lab.simulation.simulator import world_of
 
+    from .fingerprints import learning_code, training_given, training_pictures
+    from .trained_by import model_digests
+
+    postures = world_of(Skeleton.load(animal)).test_postures
     return {
+        **({"test_postures": postures} if postures else {}),
         "learning_code": learning_code(variant),
         "training_pictures": training_pictures(variant, animal),
         "training_given": training_given(variant, animal),
-        "models": model_digests(animal, variant, TRAINING_DRAWS.get(variant, 1)),
-    }
-
-
-def _made_by() -> dict[str, str]:
-    """The program and the machine."""
-    from liex_lab.sessions.provenance import package_version
-
-    from .given import processor
-
-    sources = hashlib.sha256()
-    for path in sorted(MODELS.parent.rglob("*.py")):
-        sources.update(path.read_bytes())
-    machine = f"{platform.processor() or platform.machine()}, Python {platform.python_version()}"
-    return {
-        "version": package_version("liex_lab"),
-        "code": sources.hexdigest()[:12],
-        "machine": machine,
-        "processor": processor(),
+        "models": model_digests(animal, variant, TRAINING_DRAWS.get(variant, 1), of_today=True),
     }
 
 
@@ -357,7 +355,7 @@ def _sensitivities(
     """
     from liex_lab.estimation.method import method_of
 
-    from .fingerprints import learning_code
+    from .fingerprints import learning_code, made_by
     from .quick import QUICK_SWEEP
     from .sensitivity import Sweep, sensitivity, without_void
 
@@ -383,7 +381,7 @@ def _sensitivities(
         curve = sensitivity(skeleton, variant, sweep, progress)
         curves[variant] = {
             **curve,
-            "made": {"from": made, "command": command, "learning_code": code, **_made_by()},
+            "made": {"from": made, "command": command, "learning_code": code, **made_by()},
             "origin": "measured",
         }
     return curves

@@ -1,7 +1,8 @@
 """Sensitivity of the pose error to the method's five numbers (Lie-X Fig 7), one varied at a time.
 
 Swept are the number of initial poses Kt, rounds C, regressor trees, their depth, and metric trees,
-around the method's own values. Numbers: mean and median joint error, mm at home size, on 1,024
+around the method's own values; a base that has rounds of its own (`Method.base_rounds`, our hand's)
+keeps them. Numbers: mean and median joint error, mm at home size, on 1,024
 rendered images that no tree has seen, half of them degraded. Every point but those of Kt is a model
 of its own, on 2,048 images, so errors are larger than in the tables; only the course counts.
 """

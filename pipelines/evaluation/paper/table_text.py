@@ -21,7 +21,7 @@ from liex_lab.evaluation.pose import POSE_PROTOCOL, plain
 from .deviations import DEVIATIONS, HAND
 from .given import elsewhere
 from .published import OTHERS_FPS, OTHERS_MM, PUBLISHED_FPS, PUBLISHED_MM, TITLES
-from .results import ELSEWHERE
+from .results import ELSEWHERE, OTHER_MODEL
 
 if TYPE_CHECKING:
     from .results import Results
@@ -323,12 +323,18 @@ def words(results: Results, quick: bool) -> list[str]:
     Returns:
         Sentences.
     """
-    sentences = [
+    sentences = [f"Test postures are {results.test_postures}."] if results.test_postures else []
+    sentences += [
         f"{TITLES.get(variant, variant)} was not measured: {why}."
         for variant, why in results.missing.items()
     ]
     sentences += [
         told for name, row in results.rows.items() if (told := elsewhere(TITLES[name], row))
+    ]
+    sentences += [
+        f"{TITLES[name]}: {row[OTHER_MODEL]}."
+        for name, row in results.rows.items()
+        if row.get(OTHER_MODEL)
     ]
     if quick:
         return sentences

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 from liex_lab.runtime.progress import Progress, silent
 
-from .fingerprints import learning_code
+from .fingerprints import DIGITS, base_of, learning_code
 
 if TYPE_CHECKING:
     from liex_lab.baselines.baseline import Baseline
@@ -78,6 +78,41 @@ def is_of(path: Path, code: str) -> bool:
         and told.get("learning_code") == code
         and told.get("sha256") == _digest(path)
     )
+
+
+def model_digests(
+    animal: str, variant: str, draws: int, *, of_today: bool = False
+) -> list[str | None]:
+    """SHA-256 of a row's model files; None for one that is not at hand.
+
+    Args:
+        animal: a bundled animal's name.
+        variant: a row of the tables.
+        draws: number of models that the row is the mean of.
+        of_today: only those of the cache that a note says today's learning code trained: another
+            one says nothing about what training gives (`trained_by`).
+    """
+    from liex_lab.body.skeleton import Skeleton
+    from liex_lab.catalog import bundled_models, find_model
+
+    from ...training.baselines import BASELINES, cached_baseline, training_of
+    from ...training.pose_model import cache_path
+
+    if variant == "default" and animal in bundled_models():
+        paths = [find_model(animal)]
+    elif variant in BASELINES:
+        skeleton = Skeleton.load(animal)
+        paths = [cached_baseline(variant, skeleton, training_of(variant, skeleton))]
+    else:
+        paths = [cache_path(animal, base_of(variant), draw) for draw in range(draws)]
+    code = learning_code(variant if variant in BASELINES else base_of(variant))
+    asked = of_today and variant != "default"
+    return [
+        hashlib.sha256(path.read_bytes()).hexdigest()[:DIGITS]
+        if path.is_file() and (not asked or is_of(path, code))
+        else None
+        for path in paths
+    ]
 
 
 def forget_unless_of(path: Path, code: str) -> None:

@@ -48,7 +48,6 @@ VIEWS = {"clean": [view_of_one("x")]}
 TODAY = {"clean": recordings_given()}
 OTHERS: dict[str, dict[str, Any]] = {  # each as another processor's last digit would make it
     "training pictures": {"hashes": {"training_pictures": "z"}},
-    "model file": {"hashes": {"models": ["z", None]}},
     "test pictures": {"views": {"clean": [view_of_one("z")]}},
 }
 
@@ -101,6 +100,8 @@ def test_other_code_and_another_training_are_refused_whatever_the_processor():
         row = kept_row(processor)
         assert "other code" in why(row, hashes={"learning_code": "z"})
         assert "number of models" in why(row, hashes={"models": ["c"]})
+        # its numbers are of its own models: see `kept_examples.other_model`
+        assert why(row, hashes={"models": ["z", None]}) == ""
         made = {"recipe": {"n_images": 4, "seed": 5}}
         told = cached_results.why_refused(row, made, HASHES, VIEWS, TODAY)
         assert "another training or method" in told
@@ -190,6 +191,23 @@ def test_a_row_that_is_taken_by_its_hashes_gets_the_numbers_and_todays_processor
     assert cached_results.taken(elsewhere, HASHES, VIEWS, TODAY) == elsewhere
     other = cached_results.taken(elsewhere, HASHES, OTHERS["test pictures"]["views"], TODAY)
     assert other == {**elsewhere, "other_processor": "elsewhere"}
+
+
+def test_a_row_of_hands_in_other_postures_is_refused_with_that_reason():
+    """Without the labels that they are fitted to, the same command renders other hands."""
+    row = kept_row("elsewhere")
+    row["made"]["test_postures"] = "fitted to labels"
+    other = OTHERS["test pictures"]["views"]
+    with_labels = {"test_postures": "fitted to labels"}
+    without = {"test_postures": "drawn from statistics"}
+    assert why(row, hashes=with_labels, views=other) == ""  # the last digit of another processor
+    told = why(row, hashes=without, views=other)
+    assert "postures fitted to labels, and those of today are drawn from statistics" in told
+    assert "LIEX_NYU" in told
+    del row["made"]["test_postures"]  # as rows were kept before
+    taken = cached_results.taken(row, HASHES | with_labels, VIEWS, TODAY)
+    assert taken["made"]["test_postures"] == "fitted to labels"
+    assert "test_postures" not in cached_results.taken(row, HASHES, VIEWS, TODAY)["made"]
 
 
 def test_rows_that_were_given_alike_keep_it_once_and_read_it_each(tmp_path):

@@ -4,7 +4,9 @@ follow numbers.
 
 from __future__ import annotations
 
+import copy
 import csv
+import hashlib
 import json
 import re
 from pathlib import Path
@@ -38,6 +40,7 @@ from liex_lab.pipelines.evaluation.paper import (
 from liex_lab.pipelines.evaluation.paper.deviations import DEVIATIONS
 from liex_lab.pipelines.evaluation.paper.drawers import Drawers
 from liex_lab.pipelines.evaluation.paper.further import PARTS, Further
+from liex_lab.pipelines.evaluation.paper.rows import TRAINING_DRAWS
 from liex_lab.pipelines.evaluation.paper.sensitivity import (
     Sweep,
     chosen_values,
@@ -47,6 +50,7 @@ from liex_lab.pipelines.evaluation.paper.sensitivity import (
 from liex_lab.pipelines.training import pose_model
 from liex_lab.pipelines.training.baselines import training_of
 
+from liex_lab.baselines.cnn import CnnPlan
 from liex_lab.baselines.forest import ForestPlan, train_forests
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.catalog import bundled_models, kept_results_folder
@@ -233,7 +237,7 @@ def test_a_kept_row_without_poses_gets_them_only_from_the_very_model_it_was_meas
     chooser = PoseEstimator.load("mouse")
     view = common_view.common_view(recordings["hard"][0], plan_of("mouse"), chooser)[2]
     views = {"hard": [view]}
-    monkeypatch.setattr(fingerprints, "model_digests", lambda *_: ["a"])
+    monkeypatch.setattr(trained_by, "model_digests", lambda *_: ["a"])
     monkeypatch.setattr(pose, "subject_of", lambda *_: chooser)
     found, refused = (
         kept_examples.examples_of_kept(
@@ -247,6 +251,57 @@ def test_a_kept_row_without_poses_gets_them_only_from_the_very_model_it_was_meas
     assert (one["recording"], one["frame"]) == (k, i)
     off = np.array(one["joints_mm"]) - recordings["hard"][0].joints_camera[i]
     assert np.linalg.norm(off, axis=-1).mean() < 15
+
+
+def test_another_model_file_is_compared_by_the_poses_in_the_row_s_examples(monkeypatch):
+    """Another calibration makes another file, and no other pose."""
+    recordings = {"hard": SmallWorld().test_split("hard")[:1]}
+    own = PoseEstimator.load("mouse")
+    view = common_view.common_view(recordings["hard"][0], plan_of("mouse"), own)[2]
+    views = {"hard": [view]}
+    monkeypatch.setattr(pose, "subject_of", lambda *_: own)
+    told = kept_examples._poses_of_model("mouse", "rf", recordings, views)
+    row = {"made": {"models": ["a"]}, "examples": told}
+
+    def of(row: Any, models: list[str | None]) -> kept_examples.OtherModel:
+        return kept_examples.other_model("mouse", "rf", row, models, recordings, views)
+
+    nothing = kept_examples.OtherModel()
+    for models in (["a"], [None]):
+        assert of(row, list(models)) == nothing
+    assert of({"made": row["made"]}, ["b"]) == nothing  # there is nothing to compare
+    same = of(row, ["b"])
+    assert same.refused == ""
+    assert "file of its model is a, and training gives b here" in same.told
+    assert "1 example frames are the same within 0.03 mm" in same.told
+    moved = copy.deepcopy(row)
+    moved["examples"][0]["joints_mm"][2][1] += 0.5
+    other = of(moved, ["b"])
+    assert other.told == ""
+    assert "its file is a, and training gives b here" in other.refused
+    assert "up to 0.50 mm apart" in other.refused
+    moved["examples"][0]["joints_mm"] = None
+    assert "inf mm apart" in of(moved, ["b"]).refused
+    results = run.Results("mouse", [], [], rows={"paper": {"other_model": same.told}})
+    assert table_text.words(results, quick=True) == [f"Lie-X, the paper's variant: {same.told}."]
+
+
+@pytest.mark.parametrize("note", [None, "other code", "today"])
+def test_only_a_model_that_today_s_code_is_known_to_have_trained_is_set_against_a_row(
+    note, monkeypatch, tmp_path
+):
+    monkeypatch.setenv("LIEX_CACHE", str(tmp_path))
+    path = pose_model.cache_path("mouse", "paper", 1)
+    path.write_bytes(b"model")
+    if note:
+        code = fingerprints.learning_code("paper") if note == "today" else note
+        trained_by.note(path, code)
+    digest = hashlib.sha256(b"model").hexdigest()[:16]
+    for variant in ("paper", "paper-no-metric"):  # of the same models
+        found = trained_by.model_digests("mouse", variant, 3, of_today=True)
+        assert found == [None, digest if note == "today" else None, None]
+        assert trained_by.model_digests("mouse", variant, 3) == [None, digest, None]
+    assert trained_by.model_digests("mouse", "default", 1, of_today=True) != [None]
 
 
 def test_every_figure_of_the_paper_is_made_or_said_to_be_a_drawing():
@@ -378,7 +433,6 @@ def test_a_kept_row_is_refused_for_every_reason_by_its_name():
     assert "other code" in why(row, made, hashes | {"learning_code": "z"}, views)
     pictures = hashes | {"training_pictures": "z"}
     assert "other training pictures" in why(row, made, pictures, views)
-    assert "another model" in why(row, made, hashes | {"models": ["z", None]}, views)
     assert "another number of models" in why(row, made, hashes | {"models": ["c"]}, views)
     fewer = {"clean": views["clean"][:1]}  # `--frames` never mixes with kept rows
     turned = {"clean": views["clean"][::-1]}
@@ -491,11 +545,27 @@ def test_words_follow_the_numbers():
 
 def test_what_differs_from_the_paper_is_what_the_methods_say():
     told = " ".join(DEVIATIONS)
+    cnn = CnnPlan()
+    assert f"half its width, hidden layers of {cnn.connected:,} " in told
+    assert cnn.width == 0.5
+    several = {name for name, n in TRAINING_DRAWS.items() if n == 3}
+    assert several == {"paper", "paper-one-pose", "paper-no-metric"}
     for animal in ("fish", "mouse", "hand"):
         skeleton = Skeleton.load(animal)
         method = method_of("paper", skeleton)
         recipe = run.made_from("paper", skeleton)["recipe"]
-        assert f"K: {method.training_candidates} " in told
+        k, images = {
+            "fish": (40, 95_104), "mouse": (40, 104_096), "hand": (20, 72_757)
+        }[animal]  # fmt: skip
+        examples = method.training_candidates * recipe["n_images"]
+        assert f"{examples:,} ({animal})" in told
+        assert re.search(rf"\b{k * images / examples:.0f}\b[\w, ]* times fewer", told)
+        assert f"K is {method.training_candidates} " in told
+        own = run.made_from("default", skeleton)
+        assert f"{own['method']['training_candidates']} (" in told
+        for numbers in (recipe, own["recipe"]):
+            for name in ("n_images", "n_correction", "n_calibration"):
+                assert f"{numbers[name]:,}" in told or not numbers[name]
         assert f"m: {method.regressors.n_tests};" in told
         assert f"{recipe['n_images']:,} ({animal})" in told
         for plan in (method.regressors, method.metric):
