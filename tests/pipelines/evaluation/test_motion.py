@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -25,7 +26,7 @@ def few(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(motion, "_N_POSTURES", 1600)
 
 
-def own_mouse(path: Path, above: float = 0.4, **also: object) -> Path:
+def own_mouse(path: Path, above: float = 0.4, **also: Any) -> Path:
     """The points of a virtual mouse, as a file of a real one."""
     bodies = motion._postures(MOUSE)[:400]
     points = motion.on_back(MOUSE, bodies, np.array([0.0, 0.3, 0.55, 0.7, 1.0]), above)
