@@ -406,6 +406,42 @@ def evaluate_nyu(
         keep_numbers(result, json_file)
 
 
+@evaluate.command("motion")
+def evaluate_motion(
+    reference: Annotated[
+        Path,
+        typer.Option(
+            "--reference",
+            metavar="NPZ",
+            help="Points of a real mouse: points_mm (n, P, 3), names (P,), perhaps clip_frames.",
+        ),
+    ],
+    names: Annotated[
+        str,
+        typer.Option(
+            "--points", metavar="NAME,...", help="The five from the tail's base to the nose."
+        ),
+    ] = "TTI,Trunk,Spine,Neck,Nose",
+    up: Annotated[str, typer.Option("--up", help="x, y, z, -x, -y or -z: what points up.")] = "z",
+    rate_hz: Annotated[
+        float | None,
+        typer.Option("--rate", min=1.0, help="Frames a second; without it no speeds are compared."),
+    ] = None,
+    json_file: JsonFile = None,
+) -> None:
+    """How a real mouse holds itself and moves, beside the virtual one: 5, 50 and 95 % quantiles."""
+    from liex_lab.pipelines.evaluation.motion import evaluate_motion as measure
+    from liex_lab.pipelines.evaluation.motion import in_short
+
+    with progress_bar() as progress:
+        result = measure(
+            reference, names=names.split(","), up=up, rate_hz=rate_hz, progress=progress
+        )
+    if json_file is not None:
+        keep_numbers(result, json_file)
+    tell_rows(in_short(result))
+
+
 @evaluate.command("reference")
 def evaluate_reference(
     session: SessionPath,

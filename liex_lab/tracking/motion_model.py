@@ -9,7 +9,7 @@ sequences whose seeds are not those of any test.
 from __future__ import annotations
 
 import tomllib
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -29,6 +29,7 @@ _STORED_AS = {
     "calibration": "honest",
     "root_calibration": "honest_root",
     "bend_calibration": "honest_bend",
+    "joint_calibration": "honest_joints",
 }
 _USUAL = "mouse"  # what an animal is taken for that has none of its own
 
@@ -57,7 +58,11 @@ class TrackingParameters:
             The parameters, read once per name.
         """
         known = tomllib.loads(TUNINGS.read_text(encoding="utf-8"))
-        return TrackingParameters.from_table(known.get(name, known[_USUAL]))
+        if name in known:
+            return TrackingParameters.from_table(known[name])
+        usual = TrackingParameters.from_table(known[_USUAL])
+        # its joints are others
+        return replace(usual, motion=replace(usual.motion, joint_calibration=()))
 
     @staticmethod
     def from_table(table: dict[str, Any]) -> TrackingParameters:
@@ -83,6 +88,7 @@ class TrackingParameters:
             "bend_calibration",
         ):
             motion[name] = tuple(motion[name])
+        motion["joint_calibration"] = tuple(motion.get("joint_calibration", ()))
         motion["calibration"] = tuple((stated, factor) for stated, factor in motion["calibration"])
         return TrackingParameters(AssociationCosts(**table["chain"]), Motion(**motion))
 

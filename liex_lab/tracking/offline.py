@@ -395,7 +395,7 @@ def _write(subject: Subject, track: Track, curve: Curve, tuning: TrackingParamet
     height, shift = (share * subject.length_mm for share in unseen)
     track.sd_mm[:] = np.hypot(
         (curve.error_mm / ERROR_PER_SD)[:, None] * np.array(subject.joint_share), away
-    )
+    ) * (motion.joint_calibration or 1.0)
     # sd_mm is what speeds and headings are made of; what is off throughout changes none
     track.sd_xy_mm[:] = np.hypot(track.sd_mm, np.sqrt(0.5) * shift)
     track.sd_z_mm[:] = np.hypot(track.sd_mm, height)

@@ -84,6 +84,8 @@ class Motion:
         bend_calibration: calibration factors of the other joints' angles about their x, y and z
             axis,
             likewise.
+        joint_calibration: factors of the joints' standard deviations along each axis, one a joint;
+            () leaves them as they are.
     """
 
     position_error: tuple[float, float, float]
@@ -102,6 +104,7 @@ class Motion:
     unseen_shift: float = 0.0
     root_calibration: tuple[float, float, float, float, float, float] = (1.0,) * 6
     bend_calibration: tuple[float, float, float] = (1.0,) * 3
+    joint_calibration: tuple[float, ...] = ()
 
     @property
     def packed(self) -> kernels.Moves:

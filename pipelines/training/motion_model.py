@@ -9,7 +9,8 @@ seeds, frame by frame once. Three fits follow on these observations:
   bisection, together with the standard deviation of the body's stretch over a grid of two
   coefficients, so that nine errors in ten lie within the 90 % interval, in all sequences and in
   each of them.
-- The same factors for the root's six coordinates and for the bend angles about three axes.
+- The same factors for the root's six coordinates and for the bend angles about three axes, and,
+  over all of these sequences and animals of other builds, one for each joint.
 - What nobody sees of a build, on animals of builds that no forest was trained on: the spread of
   heights and of places along the body (`unseen_height`, `unseen_shift`).
 
@@ -61,6 +62,7 @@ _STEP = 0.5  # sd of the logarithm of a number that is changed
 _BINS = 3
 _Z90 = 1.645
 _FACTORS = (0.3, 3.0)
+_HELD = (0.85, 0.96)  # by each joint's 90 % intervals in each kind of sequences
 _LEAST = 0.01
 # how fast a session's stretch may grow with what it is told by, see `Motion.stretch`
 _PER_BLUR = np.arange(0.0, 6.5, 0.5)
@@ -75,6 +77,7 @@ _FOUND_OTHERWISE = (
     "unseen_shift",
     "root_calibration",
     "bend_calibration",
+    "joint_calibration",
 )
 _CHUNK = 32
 
@@ -152,7 +155,8 @@ def train_tracking(
         measured, TrackingParameters.of(animal), n_tries, np.random.default_rng(0), progress
     )
     tuning = calibrate_roots(measured, calibrate_joints(measured, tuning))
-    tuning = calibrate_builds(other_builds(animal, progress, seeds or BUILD_SEEDS), tuning)
+    builds = other_builds(animal, progress, seeds or BUILD_SEEDS)
+    tuning = calibrate_each_joint([*measured, *builds], calibrate_builds(builds, tuning))
     out.write_text(tunings_with(animal, tuning), encoding="utf-8")
     return out
 
@@ -406,6 +410,7 @@ def calibrate_joints(measured: Sequence[Seen], tuning: TrackingParameters) -> Tr
         usual_stretch=0.0,
         unseen_height=0.0,
         unseen_shift=0.0,
+        joint_calibration=(),
     )
     claims = [_claim(each, plain) for each in measured]
     best = (0.0, 0.0)
@@ -474,6 +479,41 @@ def calibrate_builds(builds: Sequence[Seen], tuning: TrackingParameters) -> Trac
         for needed in (upwards, lengthways)
     )
     return with_motion(tuning, unseen_height=height, unseen_shift=shift)
+
+
+def calibrate_each_joint(
+    measured: Sequence[Seen], tuning: TrackingParameters
+) -> TrackingParameters:
+    """The same tuning with factors by which no joint's 90 % intervals hold far more or far less.
+
+    The factors of `calibrate_joints` are of all joints together: of some the intervals are too wide
+    then, and of others too narrow. A joint's own factor is as near to 1 as it may be so that its
+    intervals hold 85 to 96 % of the coordinates in each kind of sequences; where no factor does
+    that, the geometric mean of the bounds. Where an animal's intervals are mostly what nobody sees
+    of a build (`unseen_height`, `unseen_shift`), they stay as they are.
+
+    Args:
+        measured: the sequences, and recordings of other builds.
+        tuning: what is changed: `joint_calibration` of its motion.
+    """
+    plain = with_motion(tuning, joint_calibration=())
+    if tuning.motion.unseen_height or tuning.motion.unseen_shift:
+        return plain
+    off: dict[str, list[Array]] = {}
+    per_blur, per_spread = plain.motion.stretch
+    for each in measured:
+        stretch = float(np.hypot(per_blur * each.blur, per_spread * each.size_spread))
+        track = _track(replace(each, subject=replace(each.subject, stretch_sd=stretch)), plain)
+        there = track.posed
+        deviation = np.abs(track.joints_mm[there] - each.truth[there])
+        off.setdefault(each.kind, []).append(deviation / track.sd_mm[there][..., None])
+    low, high = (
+        np.stack([np.quantile(np.concatenate(z), held, axis=(0, 2)) for z in off.values()]) / _Z90
+        for held in _HELD
+    )
+    least, most = low.max(axis=0), high.min(axis=0)
+    factor = np.where(least > most, np.sqrt(least * most), np.clip(1.0, least, most))
+    return with_motion(plain, joint_calibration=tuple(factor.round(3).tolist()))
 
 
 def calibration_knots(claims: Sequence[_Claim], stretch: tuple[float, float]) -> Knots:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tomllib
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -17,11 +18,11 @@ def test_a_tuning_is_the_table_that_it_writes(animal):
 
 
 def test_an_animal_without_its_own_is_taken_for_a_mouse_and_a_fish_is_none():
-    assert (
-        TrackingParameters.of("snake")
-        == TrackingParameters.of("mouse")
-        != TrackingParameters.of("fish")
-    )
+    mouse, snake = (TrackingParameters.of(name) for name in ("mouse", "snake"))
+    assert mouse != TrackingParameters.of("fish")
+    # but for what is of the mouse's own joints
+    assert mouse.motion.joint_calibration
+    assert snake == replace(mouse, motion=replace(mouse.motion, joint_calibration=()))
 
 
 def test_the_kernels_get_every_number_of_it():

@@ -11,6 +11,7 @@ import pytest
 from liex_lab.pipelines.training.motion_model import (
     Seen,
     calibrate_builds,
+    calibrate_each_joint,
     calibrate_joints,
     calibrate_roots,
     changed,
@@ -136,6 +137,40 @@ def test_heights_that_are_off_throughout_a_recording_are_covered(measured):
     assert 0.85 < np.mean(inside) < 0.95
     blind = calibrate_builds([], tuning).motion
     assert (blind.unseen_height, blind.unseen_shift) == (0.0, 0.0)
+
+
+def test_each_joint_has_intervals_of_its_own(measured):
+    # of one joint the truth lies nearer than its spread says, and of another farther away
+    plain = TrackingParameters.of("mouse")
+    rng = np.random.default_rng(4)
+    wrong = []
+    for known in measured:
+        each = replace(known, subject=replace(known.subject, stretch_sd=0.0))  # as of no blur
+        track = track_whole(each.subject, each.seen, (), with_motion(plain, joint_calibration=()))
+        sd = track.track.sd_mm[..., None] * np.array([3.0, 1.0, 1.0, 0.2, 1.0])[:, None]
+        off = sd * rng.standard_normal(each.truth.shape)
+        wrong.append(replace(each, truth=track.track.joints_mm + off))
+    tuning = calibrate_each_joint(wrong, plain)
+    rump, *inner, neck, _ = tuning.motion.joint_calibration
+    assert rump > 2.0
+    assert neck < 0.4
+    assert inner == [1.0, 1.0], "what holds nine in ten stays as it is"
+    held = np.concatenate(
+        [
+            np.abs(track.joints_mm - each.truth) <= 1.645 * track.sd_mm[..., None]
+            for each in wrong
+            for track in (track_whole(each.subject, each.seen, (), tuning).track,)
+        ]
+    ).mean(axis=(0, 2))
+    assert held.min() > 0.83
+    assert held.max() < 0.97
+    unseen = with_motion(plain, unseen_height=0.02)
+    assert calibrate_each_joint(wrong, unseen).motion.joint_calibration == ()
+
+
+def test_an_animal_without_a_table_of_its_own_has_no_factors_of_the_mouses_joints():
+    assert len(TrackingParameters.of("mouse").motion.joint_calibration) == MOUSE.n_joints
+    assert TrackingParameters.of("starling").motion.joint_calibration == ()
 
 
 def test_bodies_that_lie_further_along_throughout_a_recording_are_covered(measured):

@@ -1,0 +1,107 @@
+"""`liex evaluate motion`: a real mouse's points beside the virtual mouse."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from liex_lab.pipelines.evaluation import motion
+from typer.testing import CliRunner
+
+from liex_lab import cli
+from liex_lab.body.skeleton import Skeleton
+from liex_lab.errors import LiexError
+
+MOUSE = Skeleton.load("mouse")
+NAMES = motion.NAMES
+
+
+@pytest.fixture
+def few(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Fewer virtual mice."""
+    monkeypatch.setattr(motion, "_SEEDS", range(300, 302))
+    monkeypatch.setattr(motion, "_N_POSTURES", 1600)
+
+
+def own_mouse(path: Path, above: float = 0.4, **also: Any) -> Path:
+    """The points of a virtual mouse, as a file of a real one."""
+    bodies = motion._postures(MOUSE)[:400]
+    points = motion.on_back(MOUSE, bodies, np.array([0.0, 0.3, 0.55, 0.7, 1.0]), above)
+    feet = points[:, :1] - [0.0, 0.0, 9.0]
+    np.savez(path, points_mm=np.concatenate([points, feet], axis=1), names=[*NAMES, "Foot"], **also)
+    return path
+
+
+@pytest.mark.usefixtures("few")
+def test_a_mouse_that_is_drawn_like_the_virtual_one_is_like_it(tmp_path: Path) -> None:
+    file, told = own_mouse(tmp_path / "mouse.npz"), tmp_path / "told.json"
+    words = ["evaluate", "motion", "--reference", str(file), "--json", str(told)]
+    result = CliRunner().invoke(cli.app, words)
+    assert result.exit_code == 0, result.output
+    assert "trunk_bend" in result.output
+    figures = json.loads(told.read_text())
+    assert figures["above"] == pytest.approx(0.4, abs=0.06)
+    for measure in ("trunk_bend", "head_turn", "pitch"):
+        own, drawn = (figures["quantiles"][measure][whose] for whose in ("real", "training"))
+        np.testing.assert_allclose(own, drawn, rtol=0.2, atol=2.0)
+        assert figures["outside"]["training"][measure] < 0.03
+    assert figures["nearest_degrees"]["training"][0] < 1.0
+    assert "speed" not in figures["quantiles"]  # nobody said how fast the frames come
+
+
+@pytest.mark.usefixtures("few")
+def test_a_stated_rate_tells_speeds(tmp_path: Path) -> None:
+    file = own_mouse(tmp_path / "mouse.npz", clip_frames=100)
+    figures = motion.evaluate_motion(file, rate_hz=30.0)
+    assert set(figures["quantiles"]["speed"]) == {"real", "walk"}
+
+
+def test_what_cannot_be_read_is_told(tmp_path: Path) -> None:
+    file = own_mouse(tmp_path / "mouse.npz")
+    for words, expected in (
+        (["--up", "-z"], "mm below the other points"),
+        (["--up", "w"], "up is one of"),
+        (["--points", "TTI,Nose"], "five points are needed"),
+        (["--points", "TTI,Trunk,Spine,Neck,Snout"], "has no point Snout"),
+    ):
+        result = CliRunner().invoke(
+            cli.app, ["evaluate", "motion", "--reference", str(file), *words]
+        )
+        assert isinstance(result.exception, LiexError)
+        assert expected in str(result.exception)
+    other = tmp_path / "other.npz"
+    np.savez(other, x=np.zeros(3))
+    for path in (other, tmp_path / "absent.npz", own_mouse(tmp_path / "m.npz", clip_frames=0)):
+        with pytest.raises(LiexError, match=str(path)):
+            motion.read_motion(path, NAMES, "z", None)
+
+
+def test_frames_without_a_point_are_left_out_and_are_a_break(tmp_path: Path) -> None:
+    file = own_mouse(tmp_path / "mouse.npz")
+    with np.load(file) as held:
+        points = held["points_mm"]
+        points[100:110, 2] = np.nan
+        np.savez(file, points_mm=points, names=held["names"])
+    read = motion.read_motion(file, NAMES, "z", 30.0)
+    assert len(read.points_mm) == 390
+    assert read.clips is not None
+    assert (np.diff(read.clips) != 0).nonzero()[0].tolist() == [99]
+    points[:360, 2] = np.nan
+    np.savez(file, points_mm=points, names=[*NAMES, "Foot"])
+    with pytest.raises(LiexError, match="40 frames have all five points"):
+        motion.read_motion(file, NAMES, "z", None)
+
+
+def test_postures_of_training_hold_those_of_a_real_mouse(reference_data: Path) -> None:
+    file = reference_data / "mouse_motion_3d" / "mouse_motion_3d.npz"
+    figures = motion.evaluate_motion(file, up="-y")
+    outside = figures["outside"]["training"]
+    for measure in ("trunk_bend", "trunk_arch", "head_turn", "head_pitch", "stretch"):
+        assert outside[measure] < 0.02
+    assert outside["pitch"] < 0.12  # this one goes with its neck lower than the virtual mouse does
+    about = figures["quantiles"]["trunk_bend_about_lean"]
+    assert about["training"][1] > about["real"][1]
+    assert figures["nearest_degrees"]["training"][0] < 3.0
