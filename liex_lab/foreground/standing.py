@@ -45,6 +45,7 @@ _STEP_MM = 2.5
 _LEVEL_MM = 3.0  # so near to it is that ground
 _EVEN_MM = 1.5  # and so near must what moves then stand
 _ROUNDS = 4
+_ROOM = 3.0  # times the area of an animal: a ground that it moves about on is larger
 _SMALLER = 1.0 / 3.0  # of the usual volume of the largest: less is another thing
 
 
@@ -246,7 +247,12 @@ def _choose(scene: SampledScene, things: list[Thing]) -> Standing:
         and len(things) >= _MIN_THINGS
     ):
         return largest
-    grounds = flat_grounds(background, camera, scene.least_ground_mm2)
+    least_mm2 = scene.least_ground_mm2
+    if len(things) >= _MIN_THINGS:  # the back of one that keeps still is flat, and no ground
+        moving_mm2 = float(np.percentile([thing.area_mm2 for thing in things], 90))
+        usual_mm2 = float(np.sqrt(np.prod(scene.areas_mm2)))  # perhaps it moves only its head
+        least_mm2 = max(least_mm2, _ROOM * max(moving_mm2, usual_mm2))
+    grounds = flat_grounds(background, camera, least_mm2)
     if len(things) >= _MIN_THINGS:
         least = largest.support if isinstance(largest, Standing) else 0.0
         chosen = _stood_on(grounds, things, least)

@@ -10,9 +10,11 @@ import pytest
 
 from liex_lab.arena.floor import find_floor
 from liex_lab.arena.outline import find_arena
+from liex_lab.arena.scene import LARGEST
 from liex_lab.errors import EstimationError
 from liex_lab.foreground.background_segmenter import BackgroundSubtraction
 from liex_lab.recordings.recording import Recording
+from liex_lab.simulation.scenes.catalogue import film
 from tests.arena.staged import changed, stage, walk
 
 SPINES = (40.0, 115.0)
@@ -135,3 +137,15 @@ def test_a_scene_in_which_nothing_is_flat_is_refused_in_one_sentence():
     rough = changed(mouse, lambda k, depth: rubble)
     with pytest.raises(EstimationError, match="no floor was found"):
         BackgroundSubtraction.learn(rough, SPINES, 4)
+
+
+@pytest.mark.parametrize("seed", [2027, 2048])
+def test_the_back_of_a_mouse_on_unread_floor_is_no_ground(seed: int) -> None:
+    """It keeps still but for its head, and all around it the glossy floor is unread."""
+    recording = film("glossy", seed, 120, family="train" if seed % 2 == 0 else "other")
+    scene, _ = BackgroundSubtraction.learn(recording, (40.0, 110.0))
+    assert scene.standing is not None
+    assert scene.standing.origin == LARGEST
+    assert scene.standing.floor.distance_mm == pytest.approx(recording.floor.distance_mm, abs=5.0)
+    assert scene.level is None
+    assert scene.changed is None
