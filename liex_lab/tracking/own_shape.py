@@ -1,10 +1,12 @@
 """The session's own shape: fitted over many frames, and kept only where other frames bear it out.
 
 The regression of `estimation.session_shape` tells the animal's build from two thirds of the
-sampled frames that are seen well. The body of that build, in the poses that are corrected for it,
-is then held against the depth of the other third, beside the average body at its best girth in the
-poses as they were (hold-out validation): whichever leaves the smaller median residual is the
-session's. With fewer than 50 such frames it is the average one.
+sampled frames that are seen well. The body of that build, at the girth that fits these best and in
+the poses that are corrected for it, is then held against the depth of the other third, beside the
+average body at its best girth in the poses as they were (hold-out validation). It is the session's
+where it leaves the smaller median residual or, the same frames beside each other, the smaller one
+in the mean: a near tie speaks for neither, and a told build is the likelier. With fewer than 50
+such frames it is the average one.
 
 A shape that is stated, as sessions of one animal share it, is taken as it is and only held against
 the depth of all well-seen frames.
@@ -141,8 +143,10 @@ def fit_shape(
             why = f"of {stated.by} too few bear out another, and they share it"
             return OwnShape(None, len(good), why=why, shared_by=stated.by), average
         build = Build.of(prior, stated.labels)
-        own, before, after = _beside(average, build, estimator, scene, estimates, size, good)
-        return OwnShape(build, len(good), before, after, shared_by=stated.by), own
+        own = _at_best_girth(average, build, estimator, scene, estimates, size, good)
+        before, after = _beside(average, own, build, estimator, scene, estimates, size, good)
+        mm = _median(before), _median(after)
+        return OwnShape(build, len(good), *mm, shared_by=stated.by), own
     if len(good) < FEWEST_FRAMES:
         why = (
             f"{len(good)} frames of the sample show the animal well, and a shape of its own is "
@@ -152,14 +156,33 @@ def fit_shape(
     held_out = good[::_HELD_OUT]
     fitted = np.setdiff1d(good, held_out)
     build = Build.told(prior, _clues(estimator, scene, estimates, size, fitted))
-    own, before, after = _beside(average, build, estimator, scene, estimates, size, held_out)
-    if not after < before:
+    own = _at_best_girth(average, build, estimator, scene, estimates, size, fitted)
+    before, after = _beside(average, own, build, estimator, scene, estimates, size, held_out)
+    mm = _median(before), _median(after)
+    if not borne_out(before, after):
         why = (
             "on frames that were held out a body of its own leaves "
-            f"{after:.2f} mm to the depth and the average one {before:.2f} mm"
+            f"{mm[1]:.2f} mm to the depth and the average one {mm[0]:.2f} mm"
         )
-        return OwnShape(None, len(good), before, after, why), average
-    return OwnShape(build, len(good), before, after), own
+        return OwnShape(None, len(good), *mm, why), average
+    return OwnShape(build, len(good), *mm), own
+
+
+def borne_out(before: Array, after: Array) -> bool:
+    """Whether frames that were held out bear a body of its own out.
+
+    Args:
+        before: (n,) residuals of the average body, mm; NaN where too little is covered.
+        after: (n,) of the other one.
+
+    Returns:
+        True where the median falls, or the mean of what falls in each frame is above nought.
+    """
+    if _median(after) < _median(before):
+        return True
+    fallen = before - after
+    fallen = fallen[np.isfinite(fallen)]
+    return bool(len(fallen)) and float(fallen.mean()) > 0.0
 
 
 def _clues(
@@ -175,7 +198,7 @@ def _clues(
     return session_clues(estimator.skeleton, pose, estimates.crops.heights[rows], cameras, size)
 
 
-def _beside(
+def _at_best_girth(
     average: BodyResidual,
     build: Build,
     estimator: PoseEstimator,
@@ -183,21 +206,39 @@ def _beside(
     estimates: Estimates,
     size: float,
     rows: NDArray[np.int64],
-) -> tuple[BodyResidual, float, float]:
-    """The body of a build, and the median residuals of the average body and of it, mm."""
-    skeleton = estimator.skeleton
-    own = BodyResidual(build.surface(skeleton), camera_view=average.camera_view)
-    pose = estimates.chosen.pose[rows]
-    crops = estimates.crops[rows]
-    before, after = (
-        _median_residual(body, shown.moved(scene.floor.T_arena_camera), crops, scene)
-        for body, shown in ((average, pose), (own, build.corrected(skeleton, pose, size)))
+) -> BodyResidual:
+    """The body of a build at the girth that fits some frames best, as the average one is."""
+    pose = build.corrected(estimator.skeleton, estimates.chosen.pose[rows], size)
+    return BodyResidual.fit(
+        build.surface(estimator.skeleton),
+        pose.moved(scene.floor.T_arena_camera),
+        estimates.crops[rows],
+        scene,
+        average.camera_view,
     )
-    return own, before, after
 
 
-def _median_residual(body: BodyResidual, pose: Pose, crops: Any, scene: Segmenter) -> float:
-    """Median over the frames of a body's residual, mm; NaN where nothing is covered."""
-    residual = body.of(pose, crops, scene)
+def _beside(
+    average: BodyResidual,
+    own: BodyResidual,
+    build: Build,
+    estimator: PoseEstimator,
+    scene: Segmenter,
+    estimates: Estimates,
+    size: float,
+    rows: NDArray[np.int64],
+) -> tuple[Array, Array]:
+    """Residuals (n,) mm of the average body and of a build's own in some frames, NaN unknown."""
+    pose = estimates.chosen.pose[rows]
+    moved = build.corrected(estimator.skeleton, pose, size)
+    before, after = (
+        body.of(shown.moved(scene.floor.T_arena_camera), estimates.crops[rows], scene)
+        for body, shown in ((average, pose), (own, moved))
+    )
+    return before, after
+
+
+def _median(residual: Array) -> float:
+    """Median over the frames, mm; NaN where nothing is covered."""
     known = residual[np.isfinite(residual)]
     return float(np.median(known)) if len(known) else float("nan")

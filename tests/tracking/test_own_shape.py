@@ -11,7 +11,13 @@ from liex_lab.body.shape import BodyShape
 from liex_lab.body.surface import Surface
 from liex_lab.estimation.estimator import Estimates, PoseEstimator
 from liex_lab.estimation.session_shape import PLACES, ShapePrior, labels_of
-from liex_lab.tracking.own_shape import FEWEST_FRAMES, OwnShape, StatedShape, fit_shape
+from liex_lab.tracking.own_shape import (
+    FEWEST_FRAMES,
+    OwnShape,
+    StatedShape,
+    borne_out,
+    fit_shape,
+)
 from liex_lab.tracking.residual import BodyResidual
 from tests.estimation.test_session_shape import session_clues_of
 from tests.estimation.toy import SCENE, Toy, rendered, toy_mice, trained
@@ -96,6 +102,32 @@ def test_a_build_that_other_frames_contradict_is_not(toy, estimator, estimates, 
     assert body.girth == average(toy, estimates).girth
     assert shape.corrected(estimator, estimates.chosen.pose, 1.0) is estimates.chosen.pose
     assert shape.to_dict()["why"] == shape.why
+
+
+def test_a_near_tie_of_medians_is_decided_frame_by_frame():
+    before = np.array([1.0, 1.0, 1.0, 2.0, 3.0])
+    assert borne_out(before, np.array([1.01, 1.01, 1.01, 1.0, 1.5])), "less in the mean"
+    assert borne_out(before, np.array([0.9, 0.9, 0.9, 4.0, 5.0])), "less in the median"
+    assert not borne_out(before, before + 0.01)
+    assert not borne_out(before, before)
+    unseen = np.where(np.arange(5) < 3, np.nan, before)  # what is not covered has no say
+    assert borne_out(before, unseen - 0.1)
+    assert not borne_out(before, unseen + 0.1)
+    assert not borne_out(np.full(3, np.nan), np.ones(3)), "nothing speaks for it"
+
+
+def test_a_build_that_is_told_a_little_too_stout_is_held_at_its_best_girth(
+    toy, estimator, estimates
+):
+    prior = certain(toy, estimator, LIFTED, HIGHER)
+    labels = prior.table[-1].copy()
+    labels[-2 * len(PLACES) :] += np.log(1.15)
+    stout = replace(prior, table=np.vstack([prior.table[:-1], labels]))
+    shape, body = fitted(toy, estimator, estimates, stout)
+    assert shape is not None
+    assert shape.build is not None
+    assert body.girth < 1.0
+    assert shape.residual_mm < shape.average_residual_mm
 
 
 def test_too_few_good_frames_leave_the_average_body_and_say_so(toy, estimator, estimates):
