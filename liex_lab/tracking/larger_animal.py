@@ -40,6 +40,7 @@ def cost_of_the_other(seen: Observations, path: NDArray[np.int64]) -> Array | No
     """
     first, second = seen.n_px[:, 0], seen.n_px[:, 2]
     apart = seen.known[:, 0] & seen.known[:, 2] & (first != second)
+    apart &= np.minimum(first, second) > 0  # of a session that does not know, none is told
     ratio = np.zeros(len(seen))
     ratio[apart] = np.log(first[apart] / second[apart])
     if apart.sum() < _FEWEST:
