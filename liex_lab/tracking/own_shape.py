@@ -138,13 +138,14 @@ def fit_shape(
     if prior.model != estimator.model.fingerprint:
         why = f"shapes were learned for the bundled model of the {skeleton.name} alone"
         return OwnShape(None, len(good), why=why), average
+    frames = _Frames(estimator, scene, estimates, size)
     if stated is not None:
         if stated.labels is None:
             why = f"of {stated.by} too few bear out another, and they share it"
             return OwnShape(None, len(good), why=why, shared_by=stated.by), average
         build = Build.of(prior, stated.labels)
-        own = _at_best_girth(average, build, estimator, scene, estimates, size, good)
-        before, after = _beside(average, own, build, estimator, scene, estimates, size, good)
+        own = frames.at_best_girth(build, good, average.camera_view)
+        before, after = frames.residuals(average, good), frames.residuals(own, good, build)
         mm = _median(before), _median(after)
         return OwnShape(build, len(good), *mm, shared_by=stated.by), own
     if len(good) < FEWEST_FRAMES:
@@ -155,9 +156,9 @@ def fit_shape(
         return OwnShape(None, len(good), why=why), average
     held_out = good[::_HELD_OUT]
     fitted = np.setdiff1d(good, held_out)
-    build = Build.told(prior, _clues(estimator, scene, estimates, size, fitted))
-    own = _at_best_girth(average, build, estimator, scene, estimates, size, fitted)
-    before, after = _beside(average, own, build, estimator, scene, estimates, size, held_out)
+    build = Build.told(prior, frames.clues(fitted))
+    own = frames.at_best_girth(build, fitted, average.camera_view)
+    before, after = frames.residuals(average, held_out), frames.residuals(own, held_out, build)
     mm = _median(before), _median(after)
     if not borne_out(before, after):
         why = (
@@ -185,57 +186,43 @@ def borne_out(before: Array, after: Array) -> bool:
     return bool(len(fallen)) and float(fallen.mean()) > 0.0
 
 
-def _clues(
-    estimator: PoseEstimator,
-    scene: Segmenter,
-    estimates: Estimates,
-    size: float,
-    rows: NDArray[np.int64],
-) -> Array:
-    """(F,) clues of some of the sampled frames."""
-    cameras = scene.crop_cameras(estimates.crops, estimator.model.method.camera_view)[rows]
-    pose = estimates.chosen.pose[rows].moved(view_of(cameras))
-    return session_clues(estimator.skeleton, pose, estimates.crops.heights[rows], cameras, size)
+@dataclass(frozen=True)
+class _Frames:
+    """The sampled frames, of which some (`rows`) are asked; see `fit_shape`."""
 
+    estimator: PoseEstimator
+    scene: Segmenter
+    estimates: Estimates
+    size: float
 
-def _at_best_girth(
-    average: BodyResidual,
-    build: Build,
-    estimator: PoseEstimator,
-    scene: Segmenter,
-    estimates: Estimates,
-    size: float,
-    rows: NDArray[np.int64],
-) -> BodyResidual:
-    """The body of a build at the girth that fits some frames best, as the average one is."""
-    pose = build.corrected(estimator.skeleton, estimates.chosen.pose[rows], size)
-    return BodyResidual.fit(
-        build.surface(estimator.skeleton),
-        pose.moved(scene.floor.T_arena_camera),
-        estimates.crops[rows],
-        scene,
-        average.camera_view,
-    )
+    def clues(self, rows: NDArray[np.int64]) -> Array:
+        """(F,) clues to the animal's build."""
+        camera_view = self.estimator.model.method.camera_view
+        cameras = self.scene.crop_cameras(self.estimates.crops, camera_view)[rows]
+        pose = self.estimates.chosen.pose[rows].moved(view_of(cameras))
+        heights = self.estimates.crops.heights[rows]
+        return session_clues(self.estimator.skeleton, pose, heights, cameras, self.size)
 
+    def at_best_girth(
+        self, build: Build, rows: NDArray[np.int64], camera_view: bool
+    ) -> BodyResidual:
+        """The body of a build at the girth that fits best, as the average one is."""
+        surface = build.surface(self.estimator.skeleton)
+        crops = self.estimates.crops[rows]
+        return BodyResidual.fit(surface, self._pose(rows, build), crops, self.scene, camera_view)
 
-def _beside(
-    average: BodyResidual,
-    own: BodyResidual,
-    build: Build,
-    estimator: PoseEstimator,
-    scene: Segmenter,
-    estimates: Estimates,
-    size: float,
-    rows: NDArray[np.int64],
-) -> tuple[Array, Array]:
-    """Residuals (n,) mm of the average body and of a build's own in some frames, NaN unknown."""
-    pose = estimates.chosen.pose[rows]
-    moved = build.corrected(estimator.skeleton, pose, size)
-    before, after = (
-        body.of(shown.moved(scene.floor.T_arena_camera), estimates.crops[rows], scene)
-        for body, shown in ((average, pose), (own, moved))
-    )
-    return before, after
+    def residuals(
+        self, body: BodyResidual, rows: NDArray[np.int64], build: Build | None = None
+    ) -> Array:
+        """Residuals (n,) mm of a body, NaN unknown, in the poses that are corrected for a build."""
+        return body.of(self._pose(rows, build), self.estimates.crops[rows], self.scene)
+
+    def _pose(self, rows: NDArray[np.int64], build: Build | None) -> Pose:
+        """Poses (n), arena frame, corrected for a build where there is one."""
+        pose = self.estimates.chosen.pose[rows]
+        if build is not None:
+            pose = build.corrected(self.estimator.skeleton, pose, self.size)
+        return pose.moved(self.scene.floor.T_arena_camera)
 
 
 def _median(residual: Array) -> float:

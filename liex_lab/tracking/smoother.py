@@ -106,6 +106,16 @@ class Motion:
     bend_calibration: tuple[float, float, float] = (1.0,) * 3
     joint_calibration: tuple[float, ...] = ()
 
+    def stretch_sd(self, blur: float, size_spread: float) -> float:
+        """Standard deviation of the share by which an animal's lengths may be off, see `Subject`.
+
+        Args:
+            blur: usual residual of its body over its length.
+            size_spread: standard deviation of the logarithm of the sizes that frames tell.
+        """
+        per_blur, per_spread = self.stretch
+        return float(np.hypot(per_blur * blur, per_spread * size_spread))
+
     @property
     def packed(self) -> kernels.Moves:
         """The parameters as arrays for the numba kernels, level process variance twice, then up."""

@@ -186,8 +186,8 @@ class FrameTracker:
     @property
     def stretch_sd(self) -> float:
         """Standard deviation of the share by which lengths may be off, see `Subject`."""
-        per_blur, per_spread = TrackingParameters.of(self.estimator.skeleton.name).motion.stretch
-        return float(np.hypot(per_blur * self.blur, per_spread * self.size_spread))
+        motion = TrackingParameters.of(self.estimator.skeleton.name).motion
+        return motion.stretch_sd(self.blur, self.size_spread)
 
     def observe(self, frames: Sequence[DepthFrame]) -> Observations:
         """The pose hypotheses of consecutive frames, each by itself.

@@ -500,9 +500,8 @@ def calibrate_each_joint(
     if tuning.motion.unseen_height or tuning.motion.unseen_shift:
         return plain
     off: dict[str, list[Array]] = {}
-    per_blur, per_spread = plain.motion.stretch
     for each in measured:
-        stretch = float(np.hypot(per_blur * each.blur, per_spread * each.size_spread))
+        stretch = plain.motion.stretch_sd(each.blur, each.size_spread)
         track = _track(replace(each, subject=replace(each.subject, stretch_sd=stretch)), plain)
         there = track.posed
         deviation = np.abs(track.joints_mm[there] - each.truth[there])

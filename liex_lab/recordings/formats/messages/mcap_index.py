@@ -46,7 +46,7 @@ from liex_lab.recordings.formats.messages.parsers import stamp_reader
 from liex_lab.recordings.recording import Recording
 from liex_lab.runtime.progress import Progress, silent
 
-UNTOLD = -1  # the length of a message that only its chunk tells
+_UNTOLD = -1  # the length of a message that only its chunk tells
 _LARGEST_INDEX = 1 << 26  # bytes of one
 LARGEST_OFFSET = 1 << 40
 _INDEX = struct.Struct("<HI")  # of a message index: channel, bytes of its entries
@@ -106,7 +106,7 @@ class IndexedMcap(McapFile):
         Raises:
             RecordingError: its chunk is damaged.
         """
-        if place.length != UNTOLD:
+        if place.length != _UNTOLD:
             return super().read(place)
         try:
             return self._message(place)
@@ -148,11 +148,7 @@ class IndexedMcap(McapFile):
         kind, begin, stop = self._record(at)
         if kind != Opcode.MESSAGE_INDEX:
             raise DamagedChunk("there is no index where it should be")
-        table = self._message_index(begin, stop)
-        places = np.empty((len(table), 3), np.int64)
-        places[:] = number, 0, UNTOLD
-        places[:, 1] = table["offset"]
-        return Listed(channel, table["time_ns"], places)
+        return listed_in(channel, number, self._message_index(begin, stop))
 
     def indexes(self) -> list[ChunkIndex]:
         """The indexes of its chunks, in file order."""
@@ -350,6 +346,21 @@ def entries(index: bytes) -> bytes:
     if length != len(index) - _INDEX.size or length % ENTRY.itemsize:
         raise ValueError("an index does not fit into its record")
     return index[_INDEX.size :]
+
+
+def listed_in(channel: Channel, number: int | NDArray[np.int64], table: NDArray[np.void]) -> Listed:
+    """Messages whose lengths only their chunks tell.
+
+    Args:
+        channel: theirs.
+        number: of the chunk that they are in, or (n,) of each one's.
+        table: (n,) `ENTRY` of each.
+    """
+    places = np.empty((len(table), 3), np.int64)
+    places[:, 0] = number
+    places[:, 1] = table["offset"]
+    places[:, 2] = _UNTOLD
+    return Listed(channel, table["time_ns"], places)
 
 
 def chunk_index(content: bytes) -> ChunkIndex:

@@ -20,9 +20,9 @@ from liex_lab.recordings.formats.messages.mcap import DAMAGE, RECORD, Wanted, op
 from liex_lab.recordings.formats.messages.mcap_index import (
     ENTRY,
     LARGEST_OFFSET,
-    UNTOLD,
     IndexedMcap,
     entries,
+    listed_in,
 )
 from liex_lab.recordings.formats.messages.message_file import (
     Channel,
@@ -132,8 +132,4 @@ def _together(channel: Channel, tables: Sequence[tuple[int, bytes]]) -> Listed:
     number = np.repeat(np.array([number for number, _ in tables], np.int64), counts)
     order = np.lexsort((table["offset"], number))
     order = order[table["offset"][order] <= LARGEST_OFFSET]
-    places = np.empty((len(order), 3), np.int64)
-    places[:, 0] = number[order]
-    places[:, 1] = table["offset"][order]
-    places[:, 2] = UNTOLD
-    return Listed(channel, table["time_ns"][order], places)
+    return listed_in(channel, number[order], table[order])
