@@ -20,7 +20,7 @@ import numpy as np
 
 from liex_lab.errors import PlanError, RecordingError
 from liex_lab.plan import Plan
-from liex_lab.recordings.frame import in_one_block
+from liex_lab.recordings.frame import FrameRooms
 from liex_lab.runtime.memory import Allocator, rest
 from liex_lab.runtime.places import inside
 from liex_lab.runtime.progress import Progress, silent
@@ -274,11 +274,12 @@ def read_ahead(opened: Recording, first: int) -> Generator[list[DepthFrame], Non
         opened: an open recording.
         first: row of the first frame.
     """
-    chunks = opened.chunks(CHUNK, first)
     if opened.format == "synthetic":
-        yield from chunks
-    else:
-        yield from prefetch(in_one_block(frames) for frames in chunks)
+        yield from opened.chunks(CHUNK, first)
+        return
+    rooms = FrameRooms()
+    frames = (opened.frame(row) for row in range(first, len(opened)))
+    yield from prefetch(iter(lambda: rooms.filled(frames, CHUNK), []))
 
 
 def make_track(writer: SessionWriter, fitted: Fitted) -> Verdict:

@@ -4,7 +4,9 @@ stays quick.
 
 from __future__ import annotations
 
+import atexit
 import errno
+import gc
 import os
 import shlex
 import sys
@@ -347,6 +349,7 @@ def main() -> None:
     ours shows itself.
     """
     os.environ.setdefault("RUST_LOG", _RUST_LOG)
+    atexit.register(gc.freeze)  # else all there is would be gone through twice more, for a second
     if told := liex_lab._KERNELS_TOLD:
         typer.echo(f"note: {printable(told)}", err=True)
     try:

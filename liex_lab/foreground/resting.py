@@ -118,11 +118,14 @@ def with_its_still_part(
     """
     crops = replace(scene, area_mm2=area).extract(sample, 1.0)
     moving = np.array(scene.places(crops)).reshape(-1, *scene.limit.shape)
+    shown = sample if crops.found.all() else sample[crops.found]
     best, best_area = scene, area
     for lump in _lumps(scene, wanted):
         near = _around(lump)
-        there = (sample[crops.found][:, lump] > 0).mean(axis=1) > _READ
-        if not there.any() or moving[there][:, near].any(axis=1).mean() < _TOUCH_SHARE:
+        box = _box(near)
+        there = (shown[:, *box][:, lump[box]] > 0).mean(axis=1) > _READ
+        touched = moving[there][:, *box][:, near[box]].any(axis=1)
+        if not there.any() or touched.mean() < _TOUCH_SHARE:
             continue
         whole = _with_floor_at(scene, near, wanted)
         whole_area, share = whole.usual_area(sample, wanted.spine_mm)
@@ -237,6 +240,12 @@ def _around(lump: Mask) -> Mask:
     """A lump (H, W) with its edge."""
     square = np.ones((2 * _AROUND_PX + 1, 2 * _AROUND_PX + 1), np.uint8)
     return cv2.dilate(lump.astype(np.uint8), square).astype(bool)
+
+
+def _box(mask: Mask) -> tuple[slice, slice]:
+    """The rows and columns of the picture between which a mask (H, W) lies."""
+    left, top, width, height = cv2.boundingRect(mask.astype(np.uint8))
+    return slice(top, top + height), slice(left, left + width)
 
 
 def _with_floor_at(scene: AnyScene, where: Mask, wanted: Wanted) -> AnyScene:

@@ -6,14 +6,19 @@ along the ray); 0 means that there is no reading.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import sys
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from itertools import islice
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 Depth = NDArray[np.float32]
+
+_FEW = 16  # one row and column of so many
+_UNUSED = 2  # references to an array that only its list holds, while they are counted
 
 
 @dataclass(frozen=True)
@@ -31,21 +36,47 @@ class DepthFrame:
     depth: Depth
 
 
-def in_one_block(frames: Sequence[DepthFrame]) -> list[DepthFrame]:
-    """The same frames, their depth copied into one array, which `stacked` then need not do.
+class FrameRooms:
+    """Room for frames that lie side by side, used again once nobody holds a frame in it.
 
-    Args:
-        frames: at least one, of one size.
+    What is new in memory has to be blanked by the system first, which takes longer than copying a
+    picture into room that was used before.
     """
-    block = np.stack([frame.depth for frame in frames])
-    return [
-        DepthFrame(frame.index, frame.time_ns, depth)
-        for frame, depth in zip(frames, block, strict=True)
-    ]
+
+    def __init__(self) -> None:
+        self._rooms: list[Depth] = []
+
+    def filled(self, frames: Iterable[DepthFrame], n_frames: int) -> list[DepthFrame]:
+        """The same frames, the depth of each copied into one array as it comes.
+
+        `stacked` then need not copy them.
+
+        Args:
+            frames: of one size.
+            n_frames: so many are taken at most.
+        """
+        taken: list[DepthFrame] = []
+        room = None
+        for frame in islice(frames, n_frames):
+            if room is None:
+                room = self._free((n_frames, *frame.depth.shape))
+            depth = room[len(taken)]
+            depth[...] = frame.depth
+            taken.append(DepthFrame(frame.index, frame.time_ns, depth))
+        return taken
+
+    def _free(self, shape: tuple[int, ...]) -> Depth:
+        """Room of this shape in which nobody holds a frame: a frame's depth refers to its room."""
+        for k in range(len(self._rooms)):
+            if self._rooms[k].shape == shape and sys.getrefcount(self._rooms[k]) == _UNUSED:
+                return self._rooms[k]
+        self._rooms = [room for room in self._rooms if room.shape == shape]
+        self._rooms.append(np.empty(shape, np.float32))
+        return self._rooms[-1]
 
 
 def stacked(frames: Sequence[DepthFrame]) -> NDArray[np.float32]:
-    """Depth of frames as one array, not copied where they are those of one `in_one_block`.
+    """Depth of frames as one array, not copied where they lie side by side in one of `FrameRooms`.
 
     Args:
         frames: at least one, of one size.
@@ -53,18 +84,29 @@ def stacked(frames: Sequence[DepthFrame]) -> NDArray[np.float32]:
     Returns:
         (n, H, W) float32 mm; not to be written to.
     """
-    block = frames[0].depth.base
+    room = frames[0].depth.base
     if (
-        isinstance(block, np.ndarray)
-        and block.shape == (len(frames), *frames[0].depth.shape)
-        and block.dtype == np.float32
+        isinstance(room, np.ndarray)
+        and room.ndim == 3
+        and len(room) >= len(frames)
+        and room.shape[1:] == frames[0].depth.shape
+        and room.dtype == np.float32
         and all(
-            frame.depth.base is block and frame.depth.ctypes.data == row.ctypes.data
-            for frame, row in zip(frames, block, strict=True)
+            frame.depth.base is room and frame.depth.ctypes.data == row.ctypes.data
+            for frame, row in zip(frames, room, strict=False)
         )
     ):
-        return block
+        return room[: len(frames)]
     return np.stack([frame.depth for frame in frames])
+
+
+def has_readings(depth: Depth) -> bool:
+    """Whether a picture shows anything at all; of one that does a few pixels tell, as a rule.
+
+    Args:
+        depth: (H, W) float32 mm, 0 where unread.
+    """
+    return bool(depth[::_FEW, ::_FEW].any() or depth.any())
 
 
 def depth_mm(stored: NDArray[Any], unit_mm: float = 1.0, unread: Sequence[float] = (0.0,)) -> Depth:

@@ -8,6 +8,7 @@ given back, so nobody else need think of memory.
 from __future__ import annotations
 
 import errno
+import gc
 import mmap
 import os
 import shutil
@@ -16,6 +17,7 @@ import tempfile
 import threading
 import weakref
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
 
@@ -68,6 +70,21 @@ def rest() -> None:
         trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
         if trim is not None:
             trim(0)
+
+
+@contextmanager
+def uncollected() -> Iterator[None]:
+    """Within the block Python's collector of garbage is off, where it was on.
+
+    For imports: what they make stays, and would be gone through again and again meanwhile.
+    """
+    was_on = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if was_on:
+            gc.enable()
 
 
 def on_disk(folder: Path) -> Allocator:

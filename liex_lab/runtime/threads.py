@@ -8,6 +8,8 @@ from contextlib import contextmanager, suppress
 from importlib import import_module
 from typing import TypeVar
 
+from liex_lab.runtime.memory import uncollected
+
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
@@ -85,11 +87,12 @@ def imported_ahead(*modules: str) -> Iterator[None]:
     """
 
     def fetch() -> None:
-        for name in modules:
-            if left:
-                return
-            with suppress(ImportError):
-                import_module(name)
+        with uncollected():
+            for name in modules:
+                if left:
+                    return
+                with suppress(ImportError):
+                    import_module(name)
 
     left: list[bool] = []
     with in_background(fetch):

@@ -9,13 +9,13 @@ their messages, end of data, summary with offsets, footer.
 
 from __future__ import annotations
 
-import zlib
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
 import zstandard
+from isal import isal_zlib
 from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
 from mcap.records import (
@@ -76,7 +76,7 @@ class _Chunk:
     def put(self, data: bytes) -> None:
         """Append bytes."""
         self._packed.append(self._packing.compress(data))
-        self._checksum = zlib.crc32(data, self._checksum)
+        self._checksum = isal_zlib.crc32(data, self._checksum)
         self.size += len(data)
 
     def note(self, channel: int, time_ns: int) -> None:
@@ -200,7 +200,7 @@ class McapFile:
         content = summary.end() + offsets.end()
         self._write(content)
         head = _bytes_of(Footer(start, offsets_at, 0))[:-4]
-        told = zlib.crc32(head, zlib.crc32(content))
+        told = isal_zlib.crc32(head, isal_zlib.crc32(content))
         self._write(head + told.to_bytes(4, "little"))
         self._write(MAGIC)
 

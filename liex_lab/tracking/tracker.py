@@ -20,7 +20,7 @@ from liex_lab.estimation.estimator import Estimates, PoseEstimator
 from liex_lab.estimation.session_shape import ShapePrior
 from liex_lab.foreground.background_segmenter import BackgroundSubtraction
 from liex_lab.foreground.segmenter import Segmenter
-from liex_lab.recordings.frame import DepthFrame, stacked
+from liex_lab.recordings.frame import DepthFrame, has_readings, stacked
 from liex_lab.runtime.memory import Allocator
 from liex_lab.runtime.threads import threads
 from liex_lab.tracking.motion_model import TrackingParameters
@@ -201,7 +201,7 @@ class FrameTracker:
         depths = stacked(frames)
         times = np.array([frame.time_ns for frame in frames], np.int64)
         seen = Observations.empty(self.estimator.skeleton, times)
-        seen.has_depth[:] = depths.max(axis=(1, 2)) > 0
+        seen.has_depth[:] = [has_readings(depth) for depth in depths]
         with threads(
             len(frames) > 1
         ):  # kernels share frames out: of one, the other cores would only wait

@@ -7,7 +7,6 @@ too; afterwards every message is fetched from its position.
 from __future__ import annotations
 
 import bz2
-import zlib
 from abc import ABC, abstractmethod
 from bisect import bisect_right
 from collections.abc import Callable, Iterator
@@ -15,6 +14,7 @@ from pathlib import Path
 from typing import IO, NamedTuple
 
 import numpy as np
+from isal import isal_zlib
 from numpy.typing import NDArray
 
 from liex_lab.errors import RecordingError
@@ -268,7 +268,7 @@ def unpacked(packed: bytes, chunk: Chunk) -> bytes:
         return data
     if len(data) != chunk.size:
         raise DamagedChunk(f"{len(data)} bytes came out of it and {chunk.size} went in")
-    if chunk.crc and zlib.crc32(data) != chunk.crc:
+    if chunk.crc and isal_zlib.crc32(data) != chunk.crc:
         raise DamagedChunk("its checksum is wrong")
     return data
 
