@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from liex_lab.plan import Plan
+from liex_lab.recordings.frame import FrameRooms
 from liex_lab.runtime.progress import Progress
 
 from .build import build_estimator, build_recording
@@ -75,9 +76,10 @@ def measure_shard(shard: Shard) -> Shard:
 
     opened = _opened(shard.recording, shard.plan.to_toml(), shard.origin.input_sha256)
     first_ns = int(opened.times_ns[0]) if shard.start else None
+    rooms = FrameRooms()
+    coming = (opened.frame(row) for row in range(shard.start, shard.stop))
     with ShardWriter(shard.folder, shard.origin, first_ns) as writer:
-        for start in range(shard.start, shard.stop, CHUNK):
-            frames = [opened.frame(row) for row in range(start, min(start + CHUNK, shard.stop))]
+        while frames := rooms.filled(coming, CHUNK):
             writer.add(frames, shard.tracker.observe(frames))
     return shard
 
