@@ -114,7 +114,7 @@ def follow_live(
     if view is not None:
         view.close()
     tracked = tracker.track(Observations.join(seen))
-    quantiles = np.quantile(latency, [0.5, 0.95]) * 1e3 if latency else [None, None]
+    quantiles = (np.quantile(latency, [0.5, 0.95]) * 1e3).tolist() if latency else [None, None]
     numbers = {
         "name": arriving.name,
         "n_frames": len(seen),

@@ -330,13 +330,22 @@ def evaluate_live(
     n_frames: Annotated[
         int, typer.Option("--frames", min=200, help="So many are sent at the camera's pace.")
     ] = 1500,
+    rate_hz: Annotated[
+        float | None,
+        typer.Option("--fps", min=1.0, max=1000.0, help="Frames per second, instead of its own."),
+    ] = None,
+    n_cameras: Annotated[
+        int, typer.Option("--cameras", min=1, max=16, help="So many film at once.")
+    ] = 1,
     json_file: JsonFile = None,
 ) -> None:
     """How late skeletons are while a virtual animal is filmed."""
     from liex_lab.pipelines.evaluation.live import evaluate_live as measure
 
     with progress_bar() as progress:
-        result = measure(animal, n_frames=n_frames, progress=progress)
+        result = measure(
+            animal, n_frames=n_frames, rate_hz=rate_hz, n_cameras=n_cameras, progress=progress
+        )
     tell_numbers(result, json_file)
 
 

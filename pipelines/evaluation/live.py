@@ -4,12 +4,16 @@
 sends them through a local socket at the camera's pace, forwards and backwards in turn. Numbers:
 median and 95 % latency, ms, over every frame from the first on that came when all before it had
 been answered, so that learning the background is not in it; frames measured and bridged. 60 frames
-after the learning are followed beforehand, so that all is compiled.
+after the learning are followed beforehand, so that all is compiled. Several cameras have a process
+and an animal each, as where a command is given for each of them, and begin to film together.
 """
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from functools import partial
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -21,6 +25,9 @@ from liex_lab.simulation.simulator import world_of
 
 from ..build import plan_of
 from ..live import follow_live
+
+if TYPE_CHECKING:
+    from multiprocessing.synchronize import Barrier
 
 LIVE_PROTOCOL = (
     "Frames are rendered beforehand, kept in memory, and sent through a socket of this machine at "
@@ -34,6 +41,8 @@ _KEPT = 150  # frames rendered
 # frames followed beforehand, and how many times as fast
 _WARM = 60
 _WARM_SPEED = 1000.0
+_OF_EACH = ("latency_median_ms", "latency_p95_ms", "n_frames", "n_live", "n_measured")
+_meeting: Barrier | None = None  # of a process that films beside others
 
 
 def evaluate_live(
@@ -41,25 +50,55 @@ def evaluate_live(
     *,
     n_frames: int = 1500,
     learn_frames: int = 90,
+    rate_hz: float | None = None,
+    n_cameras: int = 1,
     progress: Progress = silent,
 ) -> dict[str, Any]:
     """Latencies of live tracking over n frames; `liex evaluate live`.
 
     Args:
         animal: a bundled animal's name, or the path of a skeleton's TOML.
-        n_frames: frames that are sent.
+        n_frames: frames that each camera sends.
         learn_frames: frames that background, floor and size are learned from.
-        progress: told how far rendering and following are.
+        rate_hz: frames per second that are sent, those of a motion filmed at the camera's own rate;
+            None takes that.
+        n_cameras: cameras that film at once.
+        progress: told how far rendering and following are, where there is one camera.
 
     Returns:
-        `rate_hz`, the numbers of `follow_live`, and the protocol.
+        `rate_hz`, the numbers of `follow_live`, and the protocol; of several cameras the largest
+        latencies, beside which `cameras` lists the numbers of each.
     """
-    filmed = world_of(Skeleton.load(animal)).motion(_SEED, min(_KEPT, n_frames))
+    film = partial(_film, animal, n_frames, learn_frames, rate_hz)
+    if n_cameras == 1:
+        return {**film(_SEED, progress=progress), "protocol": LIVE_PROTOCOL}
+    progress(0, None, f"filming with {n_cameras} cameras at once")
+    cameras = _at_once(film, n_cameras)
+    latest = {
+        name: max((one[name] for one in cameras if one[name] is not None), default=None)
+        for name in ("latency_median_ms", "latency_p95_ms")
+    }
+    told = {name: [one[name] for one in cameras] for name in _OF_EACH}
+    about = {"animal": animal, "rate_hz": cameras[0]["rate_hz"], **latest}
+    return {**about, "cameras": told, "protocol": LIVE_PROTOCOL}
+
+
+def _film(
+    animal: str,
+    n_frames: int,
+    learn_frames: int,
+    rate_hz: float | None,
+    seed: int,
+    ready: Callable[[], object] = int,
+    progress: Progress = silent,
+) -> dict[str, Any]:
+    """The numbers of one camera, which begins to film when it and the others are `ready`."""
+    filmed = world_of(Skeleton.load(animal)).motion(seed, min(_KEPT, n_frames))
     kept = []
     for frame in filmed:
         kept.append(frame.depth)
         progress(frame.index + 1, len(filmed), "rendering frames")
-    step_ns = int(np.median(np.diff(filmed.times_ns)))
+    step_ns = round(1e9 / rate_hz) if rate_hz else int(np.median(np.diff(filmed.times_ns)))
     again = Recording(
         name=f"live-{animal}",
         format="synthetic",
@@ -71,8 +110,30 @@ def evaluate_live(
     follow_live(
         replayed(again[: learn_frames + _WARM], _WARM_SPEED), plan, learn_frames=learn_frames
     )
+    ready()
     numbers, _ = follow_live(replayed(again), plan, learn_frames=learn_frames, progress=progress)
-    return {"animal": animal, "rate_hz": 1e9 / step_ns, **numbers, "protocol": LIVE_PROTOCOL}
+    return {"animal": animal, "rate_hz": 1e9 / step_ns, **numbers}
+
+
+def _at_once(film: Callable[..., dict[str, Any]], n: int) -> list[dict[str, Any]]:
+    """The numbers of n cameras, each of which films in a process of its own."""
+    import multiprocessing
+
+    spawn = multiprocessing.get_context("spawn")
+    together = (spawn.Barrier(n),)
+    with ProcessPoolExecutor(n, spawn, initializer=_meet_at, initargs=together) as pool:
+        return list(pool.map(partial(_film_together, film), range(_SEED, _SEED + n)))
+
+
+def _film_together(film: Callable[..., dict[str, Any]], seed: int) -> dict[str, Any]:
+    assert _meeting is not None
+    return film(seed, ready=_meeting.wait)
+
+
+def _meet_at(barrier: Barrier) -> None:
+    """Keep what the cameras' processes wait at for each other."""
+    global _meeting
+    _meeting = barrier
 
 
 def _to_and_fro(index: int, n: int) -> int:

@@ -8,7 +8,7 @@ import time
 
 import numpy as np
 import pytest
-from liex_lab.pipelines.evaluation.live import _to_and_fro
+from liex_lab.pipelines.evaluation.live import _to_and_fro, evaluate_live
 from liex_lab.pipelines.live import follow_live, open_live
 
 from liex_lab.errors import RecordingError
@@ -138,3 +138,12 @@ def test_frames_go_to_and_fro_and_keep_the_time_when_they_came():
     ]
     assert [_to_and_fro(k, 3) for k in range(8)] == [0, 1, 2, 2, 1, 0, 0, 1]
     assert [arrival.at_s for arrival in _stamped(iter(frames))] == [0.0, 0.1, 0.2]
+
+
+def test_cameras_that_film_at_once_have_an_animal_each_and_the_pace_that_is_asked_for():
+    told = evaluate_live("mouse", n_frames=200, rate_hz=60.0, n_cameras=2)
+    assert told["rate_hz"] == pytest.approx(60.0, rel=1e-6)
+    assert told["cameras"]["n_frames"] == [200, 200]
+    assert min(told["cameras"]["n_measured"]) > 150
+    late = [ms for ms in told["cameras"]["latency_p95_ms"] if ms is not None]
+    assert told["latency_p95_ms"] == max(late, default=None)
