@@ -23,7 +23,7 @@ from liex_lab.sessions.provenance import Provenance
 from liex_lab.sessions.reading import reading_from
 from liex_lab.tables.rows import LOST
 from liex_lab.tracking.observations import COLUMNS, Observations
-from liex_lab.tracking.offline import Subject
+from liex_lab.tracking.subject import Subject
 from liex_lab.tracking.track import Flip
 
 if TYPE_CHECKING:

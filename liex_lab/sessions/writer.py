@@ -57,7 +57,7 @@ if TYPE_CHECKING:
 
     from liex_lab.recordings.frame import DepthFrame
     from liex_lab.sessions.session import Session
-    from liex_lab.tracking.offline import Subject
+    from liex_lab.tracking.subject import Subject
 
 INDEX = "frame_index"
 TIMES = "frame_time_ns"

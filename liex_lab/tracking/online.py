@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 from liex_lab.tracking.association import NONE, HypothesisAssociation
 from liex_lab.tracking.motion_model import TrackingParameters
 from liex_lab.tracking.observations import Observations
-from liex_lab.tracking.offline import Subject, hide, to_track
 from liex_lab.tracking.smoother import smooth
+from liex_lab.tracking.subject import Subject
 from liex_lab.tracking.track import Track
+from liex_lab.tracking.track_rows import hide, to_track
 from liex_lab.tracking.trust import Watch
 
 # frames that have a say in which hypothesis is the animal, and before the one that is told in where

@@ -17,7 +17,7 @@ from liex_lab.foreground.height_maps import HeightMaps, Patches
 from liex_lab.geometry import SE3
 from liex_lab.optics.camera import Camera
 from liex_lab.tracking.observations import Observations
-from liex_lab.tracking.offline import Subject
+from liex_lab.tracking.subject import Subject
 from liex_lab.tracking.tracker import BRIDGE_S
 
 Array = NDArray[np.float64]

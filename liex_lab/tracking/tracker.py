@@ -27,11 +27,13 @@ from liex_lab.tracking.motion_model import TrackingParameters
 from liex_lab.tracking.observations import Observations
 from liex_lab.tracking.occluders import behind_something
 from liex_lab.tracking.occlusion import OcclusionCorrection
-from liex_lab.tracking.offline import Subject, single_frames, track_whole
+from liex_lab.tracking.offline import track_whole
 from liex_lab.tracking.own_shape import OwnShape, StatedShape, fit_shape
 from liex_lab.tracking.residual import Agreement, BodyResidual
 from liex_lab.tracking.sample_fit import SampleFit, count_animals
+from liex_lab.tracking.subject import Subject
 from liex_lab.tracking.track import Flip, Track, Tracked
+from liex_lab.tracking.track_rows import single_frames
 from liex_lab.tracking.trust import WHOLE, in_view, median_of_whole
 
 BRIDGE_S = 0.5

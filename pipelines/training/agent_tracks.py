@@ -34,8 +34,9 @@ from liex_lab.simulation.agents.render import CameraPath, render_agent
 from liex_lab.simulation.fish import FishSpecies
 from liex_lab.simulation.species import MouseSpecies
 from liex_lab.tracking.observations import COLUMNS, Observations
-from liex_lab.tracking.offline import Subject, track_whole
+from liex_lab.tracking.offline import track_whole
 from liex_lab.tracking.patch_observer import PatchObserver
+from liex_lab.tracking.subject import Subject
 
 from .pose_model import cache_folder
 

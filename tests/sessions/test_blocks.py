@@ -16,7 +16,7 @@ from liex_lab.tables import rows as rows_module
 from liex_lab.tables import schema
 from liex_lab.tables.rows import Rows, seconds
 from liex_lab.tracking.observations import COLUMNS, Observations
-from liex_lab.tracking.offline import Subject
+from liex_lab.tracking.subject import Subject
 from tests.sessions.walking_mouse import WalkingMouse, steady, write
 
 MOUSE = WalkingMouse(np.delete(steady(3.0), slice(30, 36)), lost=(40, 41, 70))

@@ -23,7 +23,7 @@ from liex_lab.recordings.timestamps import find_gaps, median_step
 from liex_lab.sessions import SessionWriter
 from liex_lab.sessions.rrd_body import BODY, body_parts
 from liex_lab.tracking.observations import Observations
-from liex_lab.tracking.offline import Subject
+from liex_lab.tracking.subject import Subject
 from liex_lab.tracking.track import Tracked
 from tests.oracles.rvl import unpack_rvl
 from tests.sessions.walking_mouse import WalkingMouse, steady, write

@@ -1,0 +1,305 @@
+"""Rows of a track: what a smoothed curve says of them, which of them hold, and how far they may be
+off.
+
+A row is measured, bridged over a gap, or missing; it is doubtful where its predicted error is large
+or its picture contradicts it, and hidden where the animal is behind something. Its spread is that
+of the curve, and what a body of another build or size is off throughout.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from liex_lab.geometry import so3
+from liex_lab.tracking.association import NONE
+from liex_lab.tracking.gaps import short_gaps
+from liex_lab.tracking.motion_model import TrackingParameters
+from liex_lab.tracking.observations import Observations, joints_of
+from liex_lab.tracking.smoother import Curve
+from liex_lab.tracking.subject import Subject
+from liex_lab.tracking.track import Track
+from liex_lab.tracking.trust import (
+    MOST_ERROR,
+    WHOLE,
+    contradicted,
+    lies_unknown,
+    share_in_view,
+    together,
+    usual_pixels,
+)
+
+Array = NDArray[np.float64]
+
+MEAN_PER_SD = 0.8  # the mean of |x| over the standard deviation of a Gaussian x, sqrt(2 / pi)
+# a mean distance in space over the standard deviation along one axis: 1.6 of a Gaussian, but tails
+# are heavier
+ERROR_PER_SD = 1.4
+
+
+def to_track(
+    subject: Subject,
+    seen: Observations,
+    path: NDArray[np.int64],
+    curve: Curve,
+    doubt: Array,
+    ahead: bool = False,
+    told: slice = slice(None),
+    tuning: TrackingParameters | None = None,
+    usual_px: float | None = None,
+) -> Track:
+    """The rows of a track that a smoothed curve gives: measured, bridged over a gap, or missing.
+
+    Args:
+        subject: whom the track is of.
+        seen: hypotheses (n, H) of the frames that the curve covers.
+        path: (n,) hypothesis of each frame, `NONE` where it was passed by.
+        curve: smoothed poses of the n frames, arena frame.
+        doubt: (n,) probability that head and tail are exchanged.
+        ahead: the curve also goes on for up to `bridge_s` after the last measurement (prediction).
+        told: only these rows are returned; gaps are judged by all n.
+        tuning: motion parameters with the calibration factors; None takes the animal's own.
+        usual_px: pixels that the animal usually shows; None takes the median of these frames.
+
+    Returns:
+        A track of the rows `told`; NaN where nothing was measured or bridged, flagged as hidden
+        where too little of the animal is in view beside something nearer.
+    """
+    tuning = tuning or TrackingParameters.of(subject.skeleton.name)
+    measured = curve.used & (path >= 0)
+    bridged = short_gaps(seen.seconds, measured, subject.bridge_s, ahead)
+    track = Track.empty(subject.skeleton, seen.times_ns[told])
+    write_curve(subject, track, curve[told], tuning)
+    usual_px = usual_pixels(seen, path) if usual_px is None else usual_px
+    in_view = share_in_view(seen, path, usual_px)
+    strayed = doubted(subject, seen, path, in_view, usual_px)
+    unknown = lies_unknown(in_view, doubt)
+    measured &= ~unknown
+    mask_and_flag(
+        subject,
+        track,
+        seen[told],
+        path[told],
+        doubt[told],
+        measured[told],
+        bridged[told],
+        strayed[told],
+    )
+    hide(track, unknown[told] & ~bridged[told])
+    return track
+
+
+def hide(track: Track, hidden: NDArray[np.bool_]) -> None:
+    """Flag rows (n,) of a track in which nothing was measured as hidden, in place.
+
+    Args:
+        track: n rows.
+        hidden: where the animal is behind or under something; what was bridged there is no pose.
+    """
+    hidden = hidden & (track.flag == "not_found")
+    _mask(track, hidden)
+    track.bridged[hidden] = False
+    track.flag[hidden] = "hidden"
+
+
+def _mask(track: Track, rows: NDArray[np.bool_]) -> None:
+    """Take the pose, with its spread and projection, out of rows (n,) of a track."""
+    for column in (
+        track.joints_mm,
+        track.uv_px,
+        track.predicted_error_mm,
+        track.root_rotation,
+        track.root_mm,
+        track.angles_rad,
+        track.scale,
+        track.sd_mm,
+        track.sd_xy_mm,
+        track.sd_z_mm,
+        track.cov_root,
+        track.sd_angles_rad,
+        track.p_flip,
+    ):
+        column[rows] = np.nan
+
+
+def write_curve(subject: Subject, track: Track, curve: Curve, tuning: TrackingParameters) -> None:
+    """Write a curve into rows of a track, whether anything was measured there or not.
+
+    Args:
+        subject: whom the track is of.
+        track: its n rows, filled in place.
+        curve: smoothed poses of these n frames, arena frame.
+        tuning: motion parameters with the calibration factors.
+    """
+    pose = curve.pose
+    motion = tuning.motion
+    track.joints_mm[:] = curve.joints
+    track.root_rotation[:] = pose.root.rotation
+    track.root_mm[:] = pose.root.translation
+    track.angles_rad[:] = pose.angles
+    track.scale[:] = pose.scale
+    stretch = motion.usual_stretch if subject.stretch_sd is None else subject.stretch_sd
+    away = stretch_of(stretch, curve.joints)
+    # two of three axes: up, and along the body, whose direction on the floor is any
+    unseen = subject.unseen or (motion.unseen_height, motion.unseen_shift)
+    height, shift = (share * subject.length_mm for share in unseen)
+    track.sd_mm[:] = np.hypot(
+        (curve.error_mm / ERROR_PER_SD)[:, None] * np.array(subject.joint_share), away
+    ) * (motion.joint_calibration or 1.0)
+    # sd_mm is what speeds and headings are made of; what is off throughout changes none
+    track.sd_xy_mm[:] = np.hypot(track.sd_mm, np.sqrt(0.5) * shift)
+    track.sd_z_mm[:] = np.hypot(track.sd_mm, height)
+    constant = np.hypot(ERROR_PER_SD * away.mean(axis=1), MEAN_PER_SD * np.hypot(height, shift))
+    track.predicted_error_mm[:] = np.hypot(curve.error_mm, constant)
+    calibration = np.array(motion.root_calibration)
+    R = pose.root.rotation
+    up = height * R[:, 2]  # of the arena, in the root's own frame
+    along = curve.joints[:, 0] - curve.joints[:, subject.skeleton.tip]
+    along *= shift / np.maximum(np.linalg.norm(along, axis=1), 1e-9)[:, None]
+    along = np.einsum("nji,nj->ni", R, along)
+    track.cov_root[:] = covariance_of_root(curve) * (calibration[:, None] * calibration)
+    for constant_mm in (up, along):
+        track.cov_root[:, 3:, 3:] += constant_mm[:, :, None] * constant_mm[:, None, :]
+    track.sd_angles_rad[:] = (curve.sd_bend * motion.bend_calibration)[
+        :, None
+    ] * subject.skeleton.axes
+    track.sd_angles_rad[:, 0] = 0.0
+
+
+def mask_and_flag(
+    subject: Subject,
+    track: Track,
+    seen: Observations,
+    path: NDArray[np.int64],
+    doubt: Array,
+    measured: NDArray[np.bool_],
+    bridged: NDArray[np.bool_],
+    strayed: NDArray[np.bool_],
+) -> None:
+    """Mask rows of a track to those measured or bridged; add projections, flags and sight.
+
+    Args:
+        subject: whom the track is of.
+        track: its n rows, changed in place.
+        seen: hypotheses (n, H) of these frames.
+        path: (n,) hypothesis of each frame, `NONE` where it was passed by.
+        doubt: (n,) probability that head and tail are exchanged.
+        measured: (n,) bool, where a hypothesis was taken.
+        bridged: (n,) bool, where the curve goes over a gap.
+        strayed: (n,) bool, where the picture contradicts the pose, which is doubtful then, as is
+            one of a large predicted error.
+    """
+    there = measured | bridged
+    _mask(track, ~there)
+    track.uv_px[there] = subject.camera.project(
+        subject.T_arena_camera.inverse() @ track.joints_mm[there]
+    )
+    track.p_flip[there] = doubt[there]
+    _add_sight(track, seen, path, measured)
+    track.bridged[:] = bridged
+    limit = min(subject.doubtful_mm, MOST_ERROR * subject.length_mm)
+    doubtful = strayed | (track.predicted_error_mm > limit)
+    track.flag[measured] = np.where(doubtful, "doubtful", "")[measured]
+    track.flag[~measured & ~seen.has_depth] = "no_depth"
+
+
+def covariance_of_root(curve: Curve) -> Array:
+    """Covariance (n, 6, 6) of the root: rotation, rad, then translation, mm, in its own frame.
+
+    First-order propagation: the joints' middle is off by `cov_middle_mm2`, and a small turn φ about
+    that middle moves the root by φ x l, with l the lever from the middle to the root; hence the
+    blocks Σ_φ, -[l] Σ_φ and R^T Σ_m R + [l] Σ_φ [l]^T, with [l] the skew matrix.
+
+    Args:
+        curve: smoothed poses of n frames with the spread of the middle and of the turn.
+
+    Returns:
+        (n, 6, 6) symmetric, rad^2, rad mm and mm^2.
+    """
+    root = curve.pose.root
+    out = np.zeros((len(curve.joints), 6, 6))
+    lever = np.einsum("nij,ni->nj", root.rotation, curve.joints[:, 0] - curve.joints.mean(axis=1))
+    moved = -so3.hat(lever)  # of a small turn: the shift is its cross product with the lever
+    turn = curve.sd_turn[:, :, None] ** 2 * np.eye(3)
+    out[:, :3, :3] = turn
+    out[:, 3:, :3] = moved @ turn
+    out[:, :3, 3:] = np.swapaxes(out[:, 3:, :3], 1, 2)
+    middle = np.swapaxes(root.rotation, 1, 2) @ curve.cov_middle_mm2 @ root.rotation
+    out[:, 3:, 3:] = middle + moved @ turn @ np.swapaxes(moved, 1, 2)
+    return np.asarray(0.5 * (out + np.swapaxes(out, 1, 2)))
+
+
+def stretch_of(stretch_sd: float, joints: Array) -> Array:
+    """Standard deviations (n, J) mm of joints whose distances from the base are all off.
+
+    Args:
+        stretch_sd: share by which the distances are off, as a standard deviation.
+        joints: (n, J, 3) mm, the base first.
+
+    Returns:
+        (n, J) mm along one axis: stretch_sd times the distance from the base over sqrt(3).
+    """
+    return np.asarray(stretch_sd * np.linalg.norm(joints - joints[:, :1], axis=-1) / np.sqrt(3.0))
+
+
+def _add_sight(
+    track: Track, seen: Observations, path: NDArray[np.int64], measured: NDArray[np.bool_]
+) -> None:
+    """What was seen of the animal where it was measured."""
+    rows = np.flatnonzero(measured)
+    taken = path[measured]
+    track.n_foreground_px[rows] = seen.n_px[rows, taken]
+    track.centroid_mm[rows] = seen.centroid_mm[rows, taken]
+    track.centroid_px[rows] = seen.centroid_px[rows, taken]
+    track.residual_mm[rows] = seen.residual_mm[rows, taken]
+
+
+def single_frames(subject: Subject, seen: Observations) -> Track:
+    """The track of each frame by itself, without its neighbours: its first hypothesis.
+
+    No association, no smoothing and no bridging; p_flip is 0 throughout. The spread is that of one
+    measurement.
+
+    Args:
+        subject: whom the track is of; its `bridge_s` is not used.
+        seen: hypotheses (n, H), arena frame.
+
+    Returns:
+        A track of n rows, NaN where a frame has no first hypothesis.
+    """
+    path = np.where(seen.known[:, 0], 0, NONE)
+    pose = seen.pose(path)
+    error = seen.along(seen.error_mm, path)
+    moves = TrackingParameters.of(subject.skeleton.name).motion.packed
+    turn, bend = (
+        group[:, 0] * error[:, None] / subject.length_mm for group in (moves.turn, moves.bend)
+    )
+    middle = (moves.position_error * error[:, None])[:, :, None] ** 2 * np.eye(3)
+    curve = Curve(pose, joints_of(subject.skeleton, pose), error, middle, turn, bend, path >= 0)
+    return to_track(replace(subject, bridge_s=0.0), seen, path, curve, np.zeros(len(seen)))
+
+
+def doubted(
+    subject: Subject,
+    seen: Observations,
+    path: NDArray[np.int64],
+    in_view: Array,
+    usual_px: float,
+) -> NDArray[np.bool_]:
+    """Whether (n,) a pose is doubtful for what its picture shows.
+
+    It contradicts the pose, a part of the animal is behind something, or it touches another animal.
+
+    Args:
+        subject: whom the track is of.
+        seen: hypotheses (n, H).
+        path: (n,) hypothesis of each frame, `NONE` where it was passed by.
+        in_view: (n,) share of the animal that is in view.
+        usual_px: pixels that it usually shows.
+    """
+    found = contradicted(seen, path, subject.length_mm) | (in_view < WHOLE)
+    if subject.n_animals > 1:
+        found |= together(seen, path, usual_px)
+    return found
