@@ -276,8 +276,6 @@ class FrameTracker:
         seen.error_mm[:, h] = chosen.error_mm
         seen.score[:, h] = chosen.score
         seen.n_px[found, h] = crops.n_px[found]
-        # of all frames, as those without it are thrown away for less than pictures are copied
-        seen.behind[found, h] = behind_something(crops, cleared)[found]
         if not len(found):
             return
         centre = self.scene.middles(crops[found], self.estimator.model.method.camera_view)
@@ -286,9 +284,11 @@ class FrameTracker:
         seen.centroid_px[found, h] = self.scene.camera.project(from_camera)
         columns = (seen.residual_mm, seen.covered, seen.beside, seen.part_mm)
         if h % 2:  # the body turned round covers the same pixels, nearly
-            for column in columns:
+            for column in (*columns, seen.behind):
                 column[found, h] = column[found, h - 1]
             return
+        # of all frames, as those without it are thrown away for less than pictures are copied
+        seen.behind[found, h] = behind_something(crops, cleared)[found]
         told = self.body.agreement(pose[found], crops[found], self.scene)
         for column, values in zip(
             columns, (told.residual_mm, told.covered, told.beside, told.part_mm), strict=True
