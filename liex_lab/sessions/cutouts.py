@@ -88,12 +88,12 @@ class PictureKeeper:
         self._kept = origin.replay_depth
 
     def keep(
-        self, depth: Sequence[Depth], seen: Observations | None
+        self, depth: Sequence[NDArray[np.float32]], seen: Observations | None
     ) -> tuple[list[Depth], Boxes | None]:
         """The pictures as they are kept, and where they are not the background.
 
         Args:
-            depth: n pictures (H, W) uint16 mm, 0 where unread.
+            depth: n pictures (H, W) float32 mm, 0 where unread.
             seen: the hypotheses of these n frames; None where nobody looked for an animal.
 
         Returns:
@@ -105,13 +105,14 @@ class PictureKeeper:
             return [], None
         background = self._origin.background
         if self._kept == ALL or background is None or seen is None:
-            return list(depth), None
+            return [to_millimetres(image) for image in depth], None
         if self._kept == ARENA:
             boxes = np.zeros((len(depth), N_BOXES, 4), np.int16)
             boxes[:, 0] = self._arena
+            whole = [to_millimetres(image) for image in depth]
             if self._region is None:
-                return list(depth), boxes
-            return [np.where(self._region, image, background) for image in depth], boxes
+                return whole, boxes
+            return [np.where(self._region, image, background) for image in whole], boxes
         boxes = boxes_around(seen, self._origin)
         camera = self._origin.camera
         nothing = ~boxes.any(axis=(1, 2))
@@ -235,11 +236,11 @@ def boxes_around(seen: Observations, origin: Provenance) -> Boxes:
     return found
 
 
-def composed(depth: Depth, boxes: Boxes, background: Depth) -> Depth:
+def composed(depth: NDArray[np.float32], boxes: Boxes, background: Depth) -> Depth:
     """A picture inside its boxes, and the background outside of them.
 
     Args:
-        depth: (H, W) uint16 mm, 0 where unread.
+        depth: (H, W) float32 mm, 0 where unread.
         boxes: (K, 4) left, top, right, bottom, px.
         background: (H, W) uint16 mm.
 
@@ -248,7 +249,7 @@ def composed(depth: Depth, boxes: Boxes, background: Depth) -> Depth:
     """
     picture = background.copy()
     for left, top, right, bottom in boxes.tolist():
-        picture[top:bottom, left:right] = depth[top:bottom, left:right]
+        picture[top:bottom, left:right] = to_millimetres(depth[top:bottom, left:right])
     return picture
 
 

@@ -106,9 +106,7 @@ class ShardWriter:
             frames: consecutive frames.
             seen: their observations, one row per frame.
         """
-        from liex_lab.recordings.rvl import to_millimetres
-
-        depth, boxes = self._keeper.keep([to_millimetres(frame.depth) for frame in frames], seen)
+        depth, boxes = self._keeper.keep([frame.depth for frame in frames], seen)
         times = [int(frame.time_ns) for frame in frames]
         self._replay.add([int(frame.index) for frame in frames], times, depth, boxes)
         self._mcap.add(times, depth)

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.optics.camera import Camera
+from liex_lab.recordings.rvl import to_millimetres
 from liex_lab.tables.rows import Rows
 from liex_lab.tracking.observations import Observations
 
@@ -31,14 +32,14 @@ class Keepsakes:
         self._seen = 0
         self._kept: dict[int, NDArray[np.uint16]] = {}  # row -> depth
 
-    def add(self, depth: NDArray[np.uint16]) -> None:
+    def add(self, depth: NDArray[np.float32]) -> None:
         """Take the next frame.
 
         Args:
-            depth: (H, W) uint16 mm, 0 where unread.
+            depth: (H, W) float32 mm, 0 where unread.
         """
         if self._seen % self._every == 0:
-            self._kept[self._seen] = depth
+            self._kept[self._seen] = to_millimetres(depth)
             self._thin_out()
         self._seen += 1
 
@@ -47,18 +48,18 @@ class Keepsakes:
             self._every *= 2
             self._kept = {row: image for row, image in self._kept.items() if row % self._every == 0}
 
-    def again(self, n_frames: int, read: Callable[[int], NDArray[np.uint16]]) -> None:
+    def again(self, n_frames: int, read: Callable[[int], NDArray[np.float32]]) -> None:
         """Put the sample into the state as if the first frames had been added.
 
         Args:
             n_frames: how many frames.
-            read: depth (H, W) uint16 mm of one of them by its row.
+            read: depth (H, W) float32 mm of one of them by its row.
         """
         for row in range(n_frames):
             if row % self._every == 0:
                 self._kept[row] = np.empty(0, np.uint16)
                 self._thin_out()
-        self._kept = {row: read(row) for row in self._kept}
+        self._kept = {row: to_millimetres(read(row)) for row in self._kept}
         self._seen = n_frames
 
     def save(self, folder: Path, rows: Rows, camera: Camera) -> list[dict[str, Any]]:

@@ -190,9 +190,7 @@ class SessionWriter:
         Args:
             depth: depth (H, W) float32 mm of a frame by its row.
         """
-        from liex_lab.recordings.rvl import to_millimetres
-
-        self._keepsakes.again(self.n_frames, lambda row: to_millimetres(depth(row)))
+        self._keepsakes.again(self.n_frames, depth)
 
     def add(
         self,
@@ -212,8 +210,6 @@ class SessionWriter:
         Raises:
             SessionError: the track part is of other frames, or a log could not be written.
         """
-        from liex_lab.recordings.rvl import to_millimetres
-
         if not frames:
             return
         began = time.perf_counter()
@@ -227,7 +223,7 @@ class SessionWriter:
             0, len(frames), 16
         ):  # bounds the copies, however many frames come at once
             part = slice(start, start + 16)
-            depth = [to_millimetres(frame.depth) for frame in frames[part]]
+            depth = [frame.depth for frame in frames[part]]
             found = seen[part] if isinstance(seen, Observations) else None
             kept, cuts = self._keeper.keep(depth, found)
             self._drain(_BEHIND)

@@ -255,7 +255,6 @@ def _decode_and_write(session: Any, recording: Path, plan: Plan, place: Path) ->
             pass
         decode = time.perf_counter() - began
         from liex_lab.body.skeleton import Skeleton
-        from liex_lab.recordings.rvl import to_millimetres
 
         place.mkdir()
         origin = Provenance(
@@ -276,13 +275,12 @@ def _decode_and_write(session: Any, recording: Path, plan: Plan, place: Path) ->
         messages = McapWriter(place / "session.mcap", origin)
         began = time.perf_counter()
         for frames in opened.chunks(CHUNK):
-            depth = [to_millimetres(frame.depth) for frame in frames]
             times = [frame.time_ns for frame in frames]
             rows = [frame.index for frame in frames]
             cuts = boxes[rows[0] : rows[-1] + 1]
             depth = [
-                composed(image, cut, origin.background)
-                for image, cut in zip(depth, cuts, strict=True)
+                composed(frame.depth, cut, origin.background)
+                for frame, cut in zip(frames, cuts, strict=True)
             ]
             replay.add(rows, times, depth, cuts)
             messages.add(times, depth)

@@ -192,8 +192,7 @@ def test_in_the_replay_a_cut_out_is_seen_by_a_camera_of_its_own(session: Session
         assert (width, height) == (right - left, bottom - top) == sizes[which]
         assert lenses["Pinhole:resolution"][row][0] == [right - left, bottom - top]
         cut = unpack_rvl(blob[20:], width, height)
-        read = to_millimetres(MOUSE.frame(row).depth)
-        shown = composed(read, boxes[row], BACKGROUND)
+        shown = composed(MOUSE.frame(row).depth, boxes[row], BACKGROUND)
         np.testing.assert_array_equal(cut, shown[top:bottom, left:right])
         lens = np.array(lenses["Pinhole:image_from_camera"][row][0]).reshape(3, 3).T
         point = np.linalg.inv(lens) @ [3.0, 5.0, 1.0]
@@ -337,10 +336,10 @@ def test_damaged_boxes_are_told_in_a_sentence(session: Session, tmp_path: Path) 
 
 def test_nobody_looked_so_everything_is_kept() -> None:
     keeper = PictureKeeper(MOUSE.provenance(replay_depth="animal", background=BACKGROUND))
-    depth = [to_millimetres(MOUSE.frame(0).depth)]
-    kept, boxes = keeper.keep(depth, None)
+    depth = MOUSE.frame(0).depth
+    kept, boxes = keeper.keep([depth], None)
     assert boxes is None
-    assert kept[0] is depth[0]
+    np.testing.assert_array_equal(kept[0], to_millimetres(depth))
 
 
 def test_a_session_says_where_its_recording_is_also_when_both_were_moved(
