@@ -1,9 +1,9 @@
 """Benchmark of whole runs by kind of recording: frames a second, decoding beside it, size, memory.
 
 A rendered mouse is written as raw MCAP and as .oni of 640 x 480 pixels, and as a MoSeq archive
-(.tar.gz) of 512 x 424. Each is measured by `liex run` in a process of its own, all logs written,
-and read in another on one thread before and after it: the mean of both rates is what one core
-decodes in the same run. Numbers: frames/s, their ratio, bytes of session and recording, MB.
+(.tar.gz) of 512 x 424. Each is measured as by `liex run` in a process of its own, all files
+written, and read in another on one thread before and after it: the mean of both rates is what one
+core decodes in the same run. Numbers: frames/s, their ratio, bytes of session and recording, MB.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from liex_lab.errors import LiexError, MisfitError
+from liex_lab.errors import LiexError
 from liex_lab.runtime.progress import Progress, silent
 
 from ..convert import convert
@@ -28,14 +28,23 @@ if TYPE_CHECKING:
     from liex_lab.recordings.recording import Recording
 
 _VIRTUAL = "synthetic:walk?seed=5&frames=150&sensor={sensor}"
-_ENDED_WELL = (0, MisfitError.exit_code)
+# what `liex run` does, timed; it ends as the command line does
+_TIMED_RUN = """
+import gc, sys, time
+from liex_lab.api import run_session
+from liex_lab.plan import Plan
+began = time.perf_counter()
+run_session(sys.argv[1], Plan.load("mouse"), sys.argv[2])
+print(time.perf_counter() - began)
+gc.freeze()
+"""
 
 DEFINITIONS = {
     "frames_per_s": (
         "frames over the seconds from opening the recording to the finished session, all logs, "
-        "tables, figures and the report written; Python's start and its imports are in "
-        "frames_per_s_with_start"
+        "tables, figures and the report written; Python's start is in frames_per_s_with_start"
     ),
+    "report_s": "of these seconds, those after the logs and tables: figures and report",
     "decoding_frames_per_s_1core": (
         "the same recording read to float32 millimetres in a process of its own on one thread, "
         "the mean of once before and once after the run"
@@ -89,20 +98,21 @@ def _measured(recording: Path, place: Path) -> dict[str, float]:
     from liex_lab.sessions.room import folder_bytes
 
     before = read_alone(recording, 1)
-    seconds = _run(recording, place / "results")
+    with_start, whole = _run(recording, place / "results")
     after = read_alone(recording, 1)
     (path,) = (place / "results").glob("*.liex")
     facts = Session.open(path).metadata
     n = facts["frames"]["n_frames"]
-    whole = facts["timings_s"]["prepare"] + facts["timings_s"]["total"]
+    spent = facts["timings_s"]
     decoding = (before["frames_per_s"] + after["frames_per_s"]) / 2.0
     size = folder_bytes(path)
     return {
         "frames_per_s": n / whole,
-        "frames_per_s_with_start": n / seconds,
+        "frames_per_s_with_start": n / with_start,
         "decoding_frames_per_s_1core": decoding,
         "times_decoding": n / whole / decoding,
-        "prepare_s": facts["timings_s"]["prepare"],
+        "prepare_s": spent["prepare"],
+        "report_s": whole - spent["prepare"] - spent["total"],
         "opening_s": n * (before["open_ms_per_frame"] + after["open_ms_per_frame"]) / 2000.0,
         "recording_mb": recording.stat().st_size / 1e6,
         "session_mb": size / 1e6,
@@ -111,21 +121,23 @@ def _measured(recording: Path, place: Path) -> dict[str, float]:
     }
 
 
-def _run(recording: Path, out: Path) -> float:
-    """Run the command line on a recording; seconds by the wall clock."""
-    command = [sys.executable, "-m", "liex_lab", "run", str(recording)]
+def _run(recording: Path, out: Path) -> tuple[float, float]:
+    """Run a recording in a process of its own; seconds by the wall clock, with Python's start and
+    without.
+    """
     began = time.perf_counter()
     ran = subprocess.run(
-        [*command, "--plan", "mouse", "--out", str(out)],
+        [sys.executable, "-c", _TIMED_RUN, str(recording), str(out)],
         capture_output=True,
         text=True,
         check=False,
     )
-    if ran.returncode not in _ENDED_WELL:
+    seconds = time.perf_counter() - began
+    if ran.returncode:
         raise LiexError(
             f"a run of {recording.name} failed ({ran.stderr.strip()[-300:]}); report this"
         )
-    return time.perf_counter() - began
+    return seconds, float(ran.stdout.split()[-1])
 
 
 def _as_mcap(recording: Recording, place: Path) -> Path:
