@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 Depth = NDArray[np.float32]
 
 _FEW = 16  # one row and column of so many
-_UNUSED = 2  # references to an array that only its list holds, while they are counted
+_MOST_ROOMS = 4  # that are kept: being filled, waiting, looked at, written
 
 
 @dataclass(frozen=True)
@@ -68,11 +68,19 @@ class FrameRooms:
     def _free(self, shape: tuple[int, ...]) -> Depth:
         """Room of this shape in which nobody holds a frame: a frame's depth refers to its room."""
         for k in range(len(self._rooms)):
-            if self._rooms[k].shape == shape and sys.getrefcount(self._rooms[k]) == _UNUSED:
+            if self._rooms[k].shape == shape and _references(self._rooms, k) == _UNUSED:
                 return self._rooms[k]
-        self._rooms = [room for room in self._rooms if room.shape == shape]
-        self._rooms.append(np.empty(shape, np.float32))
+        alike = [room for room in self._rooms if room.shape == shape]
+        self._rooms = [*alike[1 - _MOST_ROOMS :], np.empty(shape, np.float32)]
         return self._rooms[-1]
+
+
+def _references(rooms: list[Depth], k: int) -> int:
+    """How often room k of a list is referred to, by the list and by whoever holds a frame in it."""
+    return sys.getrefcount(rooms[k])
+
+
+_UNUSED = _references([np.empty(0, np.float32)], 0)  # by its list alone
 
 
 def stacked(frames: Sequence[DepthFrame]) -> NDArray[np.float32]:

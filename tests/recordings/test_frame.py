@@ -60,3 +60,10 @@ def test_one_reading_anywhere_is_enough() -> None:
     assert not has_readings(depth)
     depth[-1, -3] = 900.0
     assert has_readings(depth)
+
+
+def test_rooms_that_somebody_holds_are_not_kept_for_ever() -> None:
+    rooms = FrameRooms()
+    held = [rooms.filled(FRAMES, 6) for _ in range(9)]
+    assert len({frames[0].depth.ctypes.data for frames in held}) == 9
+    assert len(rooms._rooms) == 4
