@@ -124,7 +124,7 @@ def _main(out: str, what: str, source: str, target: str = "", n: str = "") -> No
         stream.do("oniCreateRecorder", target.encode(), ctypes.byref(recorder))
         stream.do("oniRecorderAttachStream", recorder, stream.handle, 0)
         stream.do("oniRecorderStart", recorder)
-        time.sleep(0.2)  # it starts in a thread, and frames before that are lost
+        time.sleep(1.0)  # it starts in a thread, and frames before that are lost
     stream.do("oniStreamStart", stream.handle)
     frames, times = zip(
         *(stream.read() for _ in range(int(n or stream.number(N_FRAMES, ctypes.c_int)))),
