@@ -209,7 +209,9 @@ class _Frames:
         """The body of a build at the girth that fits best, as the average one is."""
         surface = build.surface(self.estimator.skeleton)
         crops = self.estimates.crops[rows]
-        return BodyResidual.fit(surface, self._pose(rows, build), crops, self.scene, camera_view)
+        return BodyResidual.fit(
+            surface, self._pose(rows, build), crops, self.scene, camera_view, self.size
+        )
 
     def residuals(
         self, body: BodyResidual, rows: NDArray[np.int64], build: Build | None = None

@@ -1,9 +1,11 @@
 """Analysis-by-synthesis residual: the rendered body of a pose against the observed depth.
 
 r = median over the pixels that both cover of |z_rendered - z_observed|, with a default body of the
-skeleton whose girth is found once per recording by a grid search from 0.75 to 1.35. The readings
-are those of the height maps, taken back to depth: z = (1 - h / d) / (a u + b v + c), with h the
-height, d the camera's distance and a u + b v + c the inverse depth of the plane. Beside the
+skeleton whose girth is found once per recording by a grid search from 0.75 to 1.35. A tube that
+stretches keeps its volume, as the virtual mouse does: of bones of scale s its girth is that of the
+session's size times sqrt(size / s), for an animal that draws itself up is thicker, not thinner. The
+readings are those of the height maps, taken back to depth: z = (1 - h / d) / (a u + b v + c), with
+h the height, d the camera's distance and a u + b v + c the inverse depth of the plane. Beside the
 distance stand the two shares of the outlines: |S and B| / |S| of the silhouette S that the body B
 covers, and |B without S| / |B| of the body that lies beside it. For a trunk that fits hides a head
 that does not, the same median is taken over each part of the body, the pixels nearest to one of its
@@ -64,11 +66,14 @@ class BodyResidual:
         surface: the body's surface.
         girth: factor on the default girth at the animal's size.
         camera_view: how the height maps were cut, see `BackgroundSubtraction.extract`.
+        size: the animal's size over home size, about which a tube keeps its volume; None, and of
+            any other body, lengths across are those of the bones' scale.
     """
 
     surface: Surface
     girth: float = 1.0
     camera_view: bool = False
+    size: float | None = None
 
     def of(self, pose_arena: Pose, crops: HeightMaps, scene: Segmenter) -> Array:
         """Median absolute difference between body and reading over the pixels that both cover.
@@ -98,7 +103,8 @@ class BodyResidual:
         check_shapes("poses", ("heights", crops.heights, (n, CROP, CROP)))
         if n == 0:
             return Agreement(np.zeros(0), np.zeros(0), np.zeros(0), np.zeros(0))
-        rendered = render_crops(self.surface, pose_arena, self.girth, crops, scene)
+        across = self.girth * self._usual_across(pose_arena.scale)
+        rendered = render_crops(self.surface, pose_arena, across, crops, scene)
         out = np.empty((4, n))
         planes = scene.planes(crops, self.camera_view)
         joints = scene.camera.project(
@@ -109,6 +115,12 @@ class BodyResidual:
         )
         return Agreement(*out)
 
+    def _usual_across(self, scale: Array) -> Array:
+        """Factors (n,) of all lengths across a body of girth 1 whose bones have a scale (n,)."""
+        if self.size is None or self.surface.shape is None:
+            return scale
+        return np.asarray(self.size * np.sqrt(self.size / scale))
+
     @staticmethod
     def fit(
         surface: Surface,
@@ -116,6 +128,7 @@ class BodyResidual:
         crops: HeightMaps,
         scene: Segmenter,
         camera_view: bool = False,
+        size: float | None = None,
     ) -> BodyResidual:
         """The girth with which the default body explains these frames best: 13 are tried.
 
@@ -125,16 +138,17 @@ class BodyResidual:
             crops: their n height maps.
             scene: the segmenter that cut them.
             camera_view: how the height maps were cut, see `BackgroundSubtraction.extract`.
+            size: of the animal, see `BodyResidual`.
 
         Returns:
             The body whose median residual over the frames is least; the default girth where no
             frame shows enough of any body.
         """
         placed = pose_arena.placed(surface.skeleton)
-        best = BodyResidual(surface, camera_view=camera_view)
+        best = BodyResidual(surface, camera_view=camera_view, size=size)
         least = np.inf
         for girth in _GIRTHS:
-            body = BodyResidual(surface, float(girth), camera_view)
+            body = BodyResidual(surface, float(girth), camera_view, size)
             cost = _median(body.of(placed, crops, scene))
             if cost < least:
                 best = body
@@ -149,14 +163,14 @@ def _median(residual_mm: Array) -> float:
 
 
 def render_crops(
-    surface: Surface, pose_arena: Pose, girth: float, crops: HeightMaps, scene: Segmenter
+    surface: Surface, pose_arena: Pose, across: Array, crops: HeightMaps, scene: Segmenter
 ) -> NDArray[np.float32]:
     """The body's depth on the pixels of the height maps, by rasterising its mesh.
 
     Args:
         surface: the body's surface.
         pose_arena: (n) poses, arena frame.
-        girth: factor on the default girth at the animal's size.
+        across: (n,) factor of all lengths across the body.
         crops: the n height maps whose pixels are rendered.
         scene: the segmenter that cut them, for its camera and floor.
 
@@ -165,7 +179,7 @@ def render_crops(
     """
     camera = scene.camera
     n = len(pose_arena.scale)
-    vertices = surface.vertices(pose_arena, girth=girth * pose_arena.scale)
+    vertices = surface.vertices(pose_arena, girth=across)
     # a crop of every second pixel is the picture of a camera of half the resolution
     step = crops.step.astype(float)
     scaled = np.stack(

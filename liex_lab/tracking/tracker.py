@@ -126,9 +126,9 @@ class FrameTracker:
         camera_view = estimator.model.method.camera_view
         average = Surface.of(estimator.skeleton)
         body = (
-            BodyResidual.fit(average, pose[used], crops[used], scene, camera_view)
+            BodyResidual.fit(average, pose[used], crops[used], scene, camera_view, size)
             if stated is None or stated.girth is None
-            else BodyResidual(average, stated.girth, camera_view)
+            else BodyResidual(average, stated.girth, camera_view, size)
         )
         shape = None
         if adapt:
@@ -338,7 +338,12 @@ def _count(
     own = body
     if there.any():  # the girth of the first says nothing of another's
         own = BodyResidual.fit(
-            Surface.of(estimator.skeleton), pose, other.crops[there], scene, body.camera_view
+            Surface.of(estimator.skeleton),
+            pose,
+            other.crops[there],
+            scene,
+            body.camera_view,
+            body.size,
         )
     second = own.agreement(pose, other.crops[there], scene)
     n = len(n_things) * len(rows) // len(unsure)  # as many of all frames as were looked at of these

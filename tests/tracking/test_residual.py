@@ -11,6 +11,7 @@ import pytest
 
 from liex_lab.arena.floor import Floor
 from liex_lab.body.pose import Pose
+from liex_lab.body.skeleton import Skeleton
 from liex_lab.body.surface import Surface
 from liex_lab.foreground.background_segmenter import BackgroundSubtraction
 from liex_lab.geometry import SE3
@@ -56,7 +57,7 @@ def test_a_crop_of_every_second_pixel_is_explained_as_well(clean, surface):
 
 def test_the_body_is_drawn_on_the_pixels_of_the_height_map(clean, surface):
     crops = SCENE.extract(clean.depths, 1.0)
-    drawn = render_crops(surface, clean.pose, 1.0, crops, SCENE)
+    drawn = render_crops(surface, clean.pose, clean.pose.scale, crops, SCENE)
     for k in range(0, 40, 8):
         (u, v), size = crops.origin[k], drawn.shape[1]
         v0, u0 = max(v, 0), max(u, 0)
@@ -102,6 +103,25 @@ def test_the_girth_of_an_animal_is_found_again(clean, surface, girth):
     depths = rendered(clean.skeleton, clean.pose, girth).astype(np.float32)
     body = BodyResidual.fit(surface, clean.pose, SCENE.extract(depths, 1.0), SCENE)
     assert body.girth == pytest.approx(girth, abs=0.051)
+
+
+@pytest.mark.parametrize("stretch", [0.85, 1.15])
+def test_a_tube_that_stretches_is_drawn_with_the_volume_that_it_had(clean, surface, stretch):
+    """As the virtual mouse: girth is size / sqrt(stretch), and the true pose explains it again."""
+    pose = replace(clean.pose, scale=np.full(40, stretch))
+    girth = stretch**-1.5  # over the bones' scale, which `rendered` multiplies it by
+    crops = SCENE.extract(rendered(clean.skeleton, pose, girth).astype(np.float32), 1.0)
+    keeps = BodyResidual(surface, size=1.0).of(pose, crops, SCENE)
+    with_bones = BodyResidual(surface).of(pose, crops, SCENE)
+    assert np.median(keeps) < 0.5
+    assert np.median(with_bones) > 3.0 * np.median(keeps)
+
+
+def test_a_hand_is_as_thick_as_its_bones_are_long():
+    hand = Skeleton.load("hand")
+    pose = Pose.home(hand, 3)
+    told = BodyResidual(Surface.of(hand), size=2.0)._usual_across(pose.scale)
+    np.testing.assert_array_equal(told, pose.scale)
 
 
 def test_frames_that_cannot_be_compared_do_not_disturb_the_girth(clean, surface):
