@@ -5,6 +5,7 @@ told beforehand.
 from __future__ import annotations
 
 import errno
+import gc
 import os
 import shutil
 import sys
@@ -13,7 +14,7 @@ import numpy as np
 import pytest
 
 from liex_lab.body.skeleton import Skeleton
-from liex_lab.runtime.memory import blocks, mapped, on_disk, rest
+from liex_lab.runtime.memory import blocks, mapped, on_disk, rest, uncollected
 from liex_lab.tracking.track import Track
 
 _MB = 1 << 20
@@ -88,3 +89,14 @@ def test_where_files_cannot_be_mapped_arrays_are_in_memory_and_a_full_disk_is_to
     refuse(errno.ENOSPC)
     with pytest.raises(OSError, match="No space left"):
         on_disk(tmp_path)((5, 2), np.float64)
+
+
+def test_garbage_is_collected_again_after_a_block_without() -> None:
+    assert gc.isenabled()
+    with pytest.raises(ValueError, match="no"), uncollected():
+        assert not gc.isenabled()
+        with uncollected():
+            assert not gc.isenabled()
+        assert not gc.isenabled()
+        raise ValueError("no")
+    assert gc.isenabled()
