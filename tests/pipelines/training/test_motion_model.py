@@ -96,13 +96,15 @@ def covered(measured: list[Seen], tuning: TrackingParameters) -> list[float]:
 
 
 def test_an_honest_track_covers_nine_in_ten(measured):
-    wrong = replace(TrackingParameters.of("mouse").motion, calibration=((0.03, 0.3),))
+    mouse = TrackingParameters.of("mouse").motion
+    # joints get widths of their own afterwards, which here would be those of other errors
+    wrong = replace(mouse, calibration=((0.03, 0.3),), joint_calibration=())
     tuning = calibrate_joints(
         measured, TrackingParameters(TrackingParameters.of("mouse").chain, wrong)
     )
     knots = tuning.motion.calibration
     assert [said for said, _ in knots] == sorted(said for said, _ in knots)
-    assert 0.85 < np.mean(covered(measured, tuning)) < 0.96
+    assert 0.86 < np.mean(covered(measured, tuning)) < 0.94
 
 
 def test_who_is_taken_for_smaller_has_wider_intervals_and_who_is_not_has_none(measured):
