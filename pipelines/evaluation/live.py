@@ -127,7 +127,11 @@ def _at_once(film: Callable[..., dict[str, Any]], n: int) -> list[dict[str, Any]
 
 def _film_together(film: Callable[..., dict[str, Any]], seed: int) -> dict[str, Any]:
     assert _meeting is not None
-    return film(seed, ready=_meeting.wait)
+    try:
+        return film(seed, ready=_meeting.wait)
+    except BaseException:
+        _meeting.abort()  # the others would wait for ever
+        raise
 
 
 def _meet_at(barrier: Barrier) -> None:
