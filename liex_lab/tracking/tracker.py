@@ -336,14 +336,9 @@ def _count(
     there = other.found
     pose = other.chosen.pose.moved(scene.floor.T_arena_camera)[there]
     own = body
-    if there.any():  # the girth of the first says nothing of another's
+    if there.any():  # girth and size of the first say nothing of another's
         own = BodyResidual.fit(
-            Surface.of(estimator.skeleton),
-            pose,
-            other.crops[there],
-            scene,
-            body.camera_view,
-            body.size,
+            Surface.of(estimator.skeleton), pose, other.crops[there], scene, body.camera_view
         )
     second = own.agreement(pose, other.crops[there], scene)
     n = len(n_things) * len(rows) // len(unsure)  # as many of all frames as were looked at of these

@@ -13,6 +13,7 @@ from __future__ import annotations
 import platform
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, cast
@@ -20,6 +21,7 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from liex_lab.errors import MissingPackageError
 from liex_lab.runtime.progress import Progress, silent
 
 if TYPE_CHECKING:
@@ -168,7 +170,8 @@ def _rivals(animal: str, progress: Progress) -> dict[str, PoseEstimator | Baseli
     skeleton = Skeleton.load(animal)
     for name in BASELINES:
         if cached_baseline(name, skeleton, training_of(name, skeleton)).is_file():
-            rivals[name] = trained_baseline(animal, name)
+            with suppress(MissingPackageError):  # the CNN's, which does not run without it
+                rivals[name] = trained_baseline(animal, name)
     return rivals
 
 
