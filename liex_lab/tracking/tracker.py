@@ -151,7 +151,7 @@ class FrameTracker:
                 estimator.skeleton, scene, estimates.chosen.pose[used], crops[used], shown
             )
         fit = SampleFit.of(
-            sum(bool(image.any()) for image in sample),
+            sum(has_readings(image) for image in sample),
             size * home,
             estimates.chosen.error_mm[used],
             agreement,

@@ -89,10 +89,9 @@ def _film(
     learn_frames: int,
     rate_hz: float | None,
     seed: int,
-    ready: Callable[[], object] = int,
     progress: Progress = silent,
 ) -> dict[str, Any]:
-    """The numbers of one camera, which begins to film when it and the others are `ready`."""
+    """The numbers of one camera, which begins to film when those beside it are ready, too."""
     filmed = world_of(Skeleton.load(animal)).motion(seed, min(_KEPT, n_frames))
     kept = []
     for frame in filmed:
@@ -110,7 +109,8 @@ def _film(
     follow_live(
         replayed(again[: learn_frames + _WARM], _WARM_SPEED), plan, learn_frames=learn_frames
     )
-    ready()
+    if _meeting is not None:
+        _meeting.wait()
     numbers, _ = follow_live(replayed(again), plan, learn_frames=learn_frames, progress=progress)
     return {"animal": animal, "rate_hz": 1e9 / step_ns, **numbers}
 
@@ -128,7 +128,7 @@ def _at_once(film: Callable[..., dict[str, Any]], n: int) -> list[dict[str, Any]
 def _film_together(film: Callable[..., dict[str, Any]], seed: int) -> dict[str, Any]:
     assert _meeting is not None
     try:
-        return film(seed, ready=_meeting.wait)
+        return film(seed)
     except BaseException:
         _meeting.abort()  # the others would wait for ever
         raise

@@ -129,17 +129,24 @@ def _rounded(value: Any) -> Any:
 
 
 def _a_list_a_line(value: Any, indent: str = "") -> str:
-    """JSON with sorted keys in which a short value or a list of numbers takes one line."""
+    """JSON with sorted keys in which a short value, a pose and a list of anything but poses take
+    one line.
+    """
     short = json.dumps(value, sort_keys=True, allow_nan=False)
     inner = indent + " "
-    if isinstance(value, Mapping) and value and len(short) > _LINE and "joints_mm" not in value:
+    if isinstance(value, Mapping) and len(short) > _LINE and not _is_pose(value):
         items = [f"{json.dumps(k)}: {_a_list_a_line(value[k], inner)}" for k in sorted(value)]
-    elif isinstance(value, list) and value and isinstance(value[0], Mapping):
+    elif isinstance(value, list) and value and _is_pose(value[0]):
         items = [_a_list_a_line(one, inner) for one in value]
     else:
         return short
     opened, closed = "{}" if isinstance(value, Mapping) else "[]"
     return opened + ",".join(f"\n{inner}{item}" for item in items) + f"\n{indent}{closed}"
+
+
+def _is_pose(value: Any) -> bool:
+    """Whether a value is what an example or a failure shows."""
+    return isinstance(value, Mapping) and "joints_mm" in value
 
 
 def why_refused(
