@@ -345,19 +345,17 @@ def nearest_ends(blocks, labels, n_surfaces, size, intrinsics, chosen):
         n = walk_from(blocks, labels, slot, last_i, last_j, position, order, hops)
         n_tips = ends(blocks, order, hops, position, n, focal, _STICKS_OUT_MM * size, tips, n_tips)
     ranked = np.argsort(tips[:n_tips, END_RANK])
-    p = np.empty(3)
-    q = np.empty(3)
     n_chosen = 0
     for t in ranked:
         if n_chosen == len(chosen):
             break
         tip = tips[t]
-        point_of_block(blocks, int(tip[END_ROW]), int(tip[END_COLUMN]), intrinsics, p)
+        x, y, z = point_of_block(blocks, int(tip[END_ROW]), int(tip[END_COLUMN]), intrinsics)
         own = True
-        for c in range(n_chosen):
-            end = chosen[c]
-            point_of_block(blocks, int(end[END_ROW]), int(end[END_COLUMN]), intrinsics, q)
-            off = np.sqrt((p[0] - q[0]) ** 2 + (p[1] - q[1]) ** 2 + (p[2] - q[2]) ** 2)
+        for k in range(n_chosen):
+            end = chosen[k]
+            a, b, c = point_of_block(blocks, int(end[END_ROW]), int(end[END_COLUMN]), intrinsics)
+            off = np.sqrt((x - a) ** 2 + (y - b) ** 2 + (z - c) ** 2)
             own &= off > _APART * AROUND_MM * size
         if own:
             chosen[n_chosen] = tip
@@ -366,7 +364,7 @@ def nearest_ends(blocks, labels, n_surfaces, size, intrinsics, chosen):
 
 
 @njit(cache=True)
-def point_of_block(blocks, i, j, intrinsics, out):
+def point_of_block(blocks, i, j, intrinsics):
     """The point of a block's centre at its depth.
 
     Args:
@@ -374,12 +372,14 @@ def point_of_block(blocks, i, j, intrinsics, out):
         i: row of the block.
         j: column of the block.
         intrinsics: (4,) fx, fy, cx, cy px.
-        out: (3,) mm, camera frame, out.
+
+    Returns:
+        x, y and z, mm, camera frame: three numbers, for an array would be made anew for each block.
     """
-    z = blocks[i, j]
-    out[0] = (j * BLOCK + 0.5 * (BLOCK - 1) - intrinsics[2]) / intrinsics[0] * z
-    out[1] = (i * BLOCK + 0.5 * (BLOCK - 1) - intrinsics[3]) / intrinsics[1] * z
-    out[2] = z
+    z = np.float64(blocks[i, j])
+    x = (j * BLOCK + 0.5 * (BLOCK - 1) - intrinsics[2]) / intrinsics[0] * z
+    y = (i * BLOCK + 0.5 * (BLOCK - 1) - intrinsics[3]) / intrinsics[1] * z
+    return x, y, z
 
 
 @njit(cache=True)

@@ -98,12 +98,11 @@ def locate(blocks, labels, tip, size, intrinsics):
     Returns:
         A `HandFind`.
     """
-    middle = np.empty(3)
     fingers = np.zeros(3)
     row = int(tip[END_ROW])
     column = int(tip[END_COLUMN])
     slot = labels[row, column]
-    point_of_block(blocks, row, column, intrinsics, middle)
+    middle = np.array(point_of_block(blocks, row, column, intrinsics))
     _mean_shift(blocks, labels, slot, _TIP_MM * size, intrinsics, middle)
     around = AROUND_MM * size
     focal2 = intrinsics[0] * intrinsics[1]
@@ -124,7 +123,6 @@ def _within(blocks, labels, slot, radius, intrinsics, middle):
     """The points of a surface within `radius` mm of the middle, rows of x, y, z, distance, block
     row, block column.
     """
-    p = np.empty(3)
     box = np.empty(4, np.int64)
     box_around(blocks.shape, middle, radius, intrinsics, box)
     points = np.empty(((box[1] - box[0] + 1) * (box[3] - box[2] + 1), _N_POINT))
@@ -133,12 +131,12 @@ def _within(blocks, labels, slot, radius, intrinsics, middle):
         for j in range(box[2], box[3] + 1):
             if labels[i, j] != slot:
                 continue
-            point_of_block(blocks, i, j, intrinsics, p)
-            off2 = (p[0] - middle[0]) ** 2 + (p[1] - middle[1]) ** 2 + (p[2] - middle[2]) ** 2
+            x, y, z = point_of_block(blocks, i, j, intrinsics)
+            off2 = (x - middle[0]) ** 2 + (y - middle[1]) ** 2 + (z - middle[2]) ** 2
             if off2 < radius * radius:
-                points[n, _POINT_X] = p[0]
-                points[n, _POINT_Y] = p[1]
-                points[n, _POINT_Z] = p[2]
+                points[n, _POINT_X] = x
+                points[n, _POINT_Y] = y
+                points[n, _POINT_Z] = z
                 points[n, _POINT_DISTANCE] = np.sqrt(off2)
                 points[n, _POINT_ROW] = i
                 points[n, _POINT_COLUMN] = j
@@ -226,7 +224,6 @@ def _along(p, middle, fingers):
 @njit(cache=True)
 def _mean_shift(blocks, labels, slot, radius, intrinsics, middle):
     """One step of mean shift: `middle` (3,) moves to the mean of what is within `radius` mm."""
-    p = np.empty(3)
     box = np.empty(4, np.int64)
     total = 0.0
     moved = np.zeros(3)
@@ -234,13 +231,14 @@ def _mean_shift(blocks, labels, slot, radius, intrinsics, middle):
     for i in range(box[0], box[1] + 1):
         for j in range(box[2], box[3] + 1):
             if labels[i, j] == slot:
-                point_of_block(blocks, i, j, intrinsics, p)
-                off = (p[0] - middle[0]) ** 2 + (p[1] - middle[1]) ** 2 + (p[2] - middle[2]) ** 2
+                x, y, z = point_of_block(blocks, i, j, intrinsics)
+                off = (x - middle[0]) ** 2 + (y - middle[1]) ** 2 + (z - middle[2]) ** 2
                 if off < radius * radius:
-                    w = p[2] * p[2]
+                    w = z * z
                     total += w
-                    for k in range(3):
-                        moved[k] += w * p[k]
+                    moved[0] += w * x
+                    moved[1] += w * y
+                    moved[2] += w * z
     for k in range(3):
         middle[k] = moved[k] / total
 

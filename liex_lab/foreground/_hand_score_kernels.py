@@ -114,11 +114,9 @@ def _side(depth, focal):
 @njit(cache=True)
 def _behind_cut(blocks, i, j, found, size, intrinsics):
     """Whether a block lies close behind the cut through the arm."""
-    p = np.empty(3)
-    off = 0.0
-    point_of_block(blocks, i, j, intrinsics, p)
+    x, y, z = point_of_block(blocks, i, j, intrinsics)
     fingers = found.fingers
-    along = p[0] * fingers[0] + p[1] * fingers[1] + p[2] * fingers[2] - found.cut
-    for k in range(3):
-        off += (p[k] - found.middle[k]) ** 2
+    middle = found.middle
+    along = x * fingers[0] + y * fingers[1] + z * fingers[2] - found.cut
+    off = (x - middle[0]) ** 2 + (y - middle[1]) ** 2 + (z - middle[2]) ** 2
     return -_WRIST_MM * size < along <= 0.0 and off < (1.4 * AROUND_MM * size) ** 2
