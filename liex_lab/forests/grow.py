@@ -102,10 +102,14 @@ class _Growth(NamedTuple):
 
 
 class _Scratch(NamedTuple):
-    """Room for the samples that a test is tried on: their rows, responses and running sums."""
+    """Room for the samples that tests are tried on: their rows, responses and running sums."""
 
     chosen: Any
-    values: Any
+    labels: Any
+    tests: Any
+    first: Any
+    kept: Any
+    second: Any
     sums: Any
 
 
@@ -245,7 +249,7 @@ def _draw_test(state, n_views, n_scalars, growth, test):
 
 
 @njit(cache=True)
-def _best_threshold(values, n, chosen, labels, min_share, sums, result):
+def _best_threshold(values, n, labels, min_share, sums, result):
     """Best of evenly spread thresholds for the responses of a node's samples: gain and threshold.
 
     Plain variance reduction (Eq. 16 with Eq. 17 as a mean): up to a constant, |sum_left|^2 / n_left
@@ -254,8 +258,7 @@ def _best_threshold(values, n, chosen, labels, min_share, sums, result):
     Args:
         values: (n,) responses of the samples to a test, the first n of which count.
         n: number of samples.
-        chosen: (n,) rows of the samples in labels.
-        labels: (N, D) labels of all samples.
+        labels: (n, D) labels of the samples, likewise.
         min_share: smallest share of the samples that may go to one side.
         sums: (thresholds + 1, D + 1) scratch: running sums of labels and counts.
         result: (2,) filled with the gain, -1 where there is none, and the threshold.
@@ -271,20 +274,28 @@ def _best_threshold(values, n, chosen, labels, min_share, sums, result):
         return
     n_labels = labels.shape[1]
     for b in range(_N_THRESHOLDS + 1):
-        for d in range(n_labels + 1):
-            sums[b, d] = 0.0
+        sums[b, n_labels] = 0.0
     scale = _N_THRESHOLDS / (high - low)
     for i in range(n):
         b = int((values[i] - low) * scale + 0.5)
+        if sums[b, n_labels] == 0.0:
+            for d in range(n_labels):
+                sums[b, d] = 0.0
         sums[b, n_labels] += 1.0
         for d in range(n_labels):
-            sums[b, d] += labels[chosen[i], d]
-    for b in range(1, _N_THRESHOLDS + 1):
-        for d in range(n_labels + 1):
-            sums[b, d] += sums[b - 1, d]
-    total = sums[_N_THRESHOLDS]
+            sums[b, d] += labels[i, d]
+    # thresholds between which no sample lies split alike: the first of them stands for all
+    before = -1
+    for b in range(_N_THRESHOLDS + 1):
+        if sums[b, n_labels] == 0.0:
+            continue
+        if before >= 0:
+            for d in range(n_labels + 1):
+                sums[b, d] += sums[before, d]
+        before = b
+    total = sums[before]
     least = max(1.0, min_share * n)
-    for b in range(_N_THRESHOLDS):
+    for b in range(before):
         n_left = sums[b, n_labels]
         n_right = total[n_labels] - n_left
         if n_left < least or n_right < least:
@@ -313,13 +324,24 @@ def _response(samples, s, test):
 
 
 @njit(cache=True)
-def _try_test(samples, n, test, least_share, scratch, result):
-    """Gain and threshold of a test on the first n of the chosen samples into `result` (2,)."""
+def _respond(samples, n, tests, scratch, values):
+    """Responses (tests, n) and labels of the first n of the chosen samples, sample by sample.
+
+    A sample's height map is fetched from memory once for all tests; test by test it would be gone
+    from the cache each time.
+    """
     for i in range(n):
-        scratch.values[i] = _response(samples, scratch.chosen[i], test)
-    _best_threshold(
-        scratch.values, n, scratch.chosen, samples.labels, least_share, scratch.sums, result
-    )
+        s = scratch.chosen[i]
+        scratch.labels[i] = samples.labels[s]
+        heights = samples.heights[samples.image[s]]
+        inverse_size = samples.inverse_size[s]
+        views = samples.views[s]
+        scalars = samples.scalars[s]
+        for k in range(len(tests)):
+            test = tests[k]
+            values[k, i] = response(
+                heights, inverse_size, views, scalars, test[0], test[1], test[2]
+            )
 
 
 @njit(cache=True)
@@ -338,32 +360,57 @@ def _find_split(samples, growth, members, state, scratch, best):
     n_first = min(n, _N_FIRST)
     for i in range(n_first):
         chosen[i] = members[i] if n <= _N_FIRST else members[random_below(state, n)]
-    tests = np.empty((n_tried, 3), np.int32)
+    tests = scratch.tests[:n_tried]
     gains = np.empty(n_tried)
+    thresholds = np.empty(n_tried)
     result = np.empty(2)
     for k in range(n_tried):
         _draw_test(state, samples.views.shape[1], samples.scalars.shape[1], growth, tests[k])
-        _try_test(samples, n_first, tests[k], least_share, scratch, result)
+    _respond(samples, n_first, tests, scratch, scratch.first)
+    for k in range(n_tried):
+        _best_threshold(
+            scratch.first[k], n_first, scratch.labels, least_share, scratch.sums, result
+        )
         gains[k] = -result[0]
+        thresholds[k] = result[1]
+    ranked = np.argsort(gains)
+    if n <= _N_FIRST:  # all of the node's samples were looked at
+        k = ranked[0]
+        if gains[k] > 0.0:
+            return False
+        _keep(tests[k], thresholds[k], best)
+        return True
     n_second = min(n, _N_SECOND)
     for i in range(n_second):
         chosen[i] = members[i] if n <= _N_SECOND else members[random_below(state, n)]
     found = False
     best_gain = -1.0
-    ranked = np.argsort(gains)
+    n_kept = 0
     for r in range(min(_N_KEPT, n_tried)):
-        k = ranked[r]
-        if gains[k] > 0.0:
+        if gains[ranked[r]] > 0.0:
             break
-        _try_test(samples, n_second, tests[k], least_share, scratch, result)
+        scratch.kept[r] = tests[ranked[r]]
+        n_kept += 1
+    kept = scratch.kept[:n_kept]
+    _respond(samples, n_second, kept, scratch, scratch.second)
+    for k in range(n_kept):
+        _best_threshold(
+            scratch.second[k], n_second, scratch.labels, least_share, scratch.sums, result
+        )
         if result[0] > best_gain:
             found = True
             best_gain = result[0]
-            best[0] = tests[k, 0]
-            best[1] = tests[k, 1]
-            best[2] = tests[k, 2]
-            best[3] = min(max(int(np.ceil(result[1])), -32768), 32767)
+            _keep(kept[k], result[1], best)
     return found
+
+
+@njit(cache=True)
+def _keep(test, threshold, best):
+    """A test (3,) and its threshold into `best` (4,), as a node holds them."""
+    best[0] = test[0]
+    best[1] = test[1]
+    best[2] = test[2]
+    best[3] = min(max(int(np.ceil(threshold)), -32768), 32767)
 
 
 @njit(cache=True)
@@ -393,7 +440,11 @@ def _grow_tree(samples, growth, members, seed, nodes, leaves, counts):
     n_labels = labels.shape[1]
     scratch = _Scratch(
         np.empty(max(_N_FIRST, _N_SECOND), np.int32),
-        np.empty(max(_N_FIRST, _N_SECOND), np.float32),
+        np.empty((max(_N_FIRST, _N_SECOND), n_labels), np.float32),
+        np.empty((growth.n_tests, 3), np.int32),
+        np.empty((growth.n_tests, _N_FIRST), np.float32),
+        np.empty((_N_KEPT, 3), np.int32),
+        np.empty((_N_KEPT, _N_SECOND), np.float32),
         np.empty((_N_THRESHOLDS + 1, n_labels + 1)),
     )
     best = np.empty(4, np.int32)

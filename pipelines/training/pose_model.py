@@ -19,6 +19,9 @@ import hashlib
 import json
 import os
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -72,6 +75,8 @@ class Recipe:
     )
 
 
+# the pictures of the last training by what they depend on, see `shared_pictures`; None keeps none
+_shared: ContextVar[list[tuple[Any, TrainingSet]] | None] = ContextVar("_shared", default=None)
 # numbers of their own random numbers, so that each can be made again by itself
 _CALIBRATION = 1
 _CORRECTION = 2
@@ -294,6 +299,42 @@ def rendered_set(
     Returns:
         The images, animals and other objects of about their size.
     """
+    shared = _shared.get()
+    if shared is None or first:
+        return _rendered(skeleton, method, recipe, first, n, progress, family)
+    # what pictures and labels depend on
+    key = (skeleton.table, method.camera_view, method.session_size, vars(recipe), n, family)
+    for known, data in shared:
+        if known == key:
+            return data
+    data = _rendered(skeleton, method, recipe, first, n, progress, family)
+    shared[:] = [(key, data)]
+    return data
+
+
+@contextmanager
+def shared_pictures() -> Iterator[None]:
+    """Within the block the pictures of a training are kept for the next one that learns from them.
+
+    Those of the last training that learned from others only, for they take a gigabyte.
+    """
+    before = _shared.set([])
+    try:
+        yield
+    finally:
+        _shared.reset(before)
+
+
+def _rendered(
+    skeleton: Skeleton,
+    method: Method,
+    recipe: Recipe,
+    first: int,
+    n: int,
+    progress: Progress,
+    family: str,
+) -> TrainingSet:
+    """See `rendered_set`."""
     from liex_lab.estimation.training import TrainingSet
     from liex_lab.simulation.simulator import world_of
     from liex_lab.simulation.training_patches import BLOCK

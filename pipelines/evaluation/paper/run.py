@@ -166,6 +166,7 @@ def results_of(animal: str, budget: Budget, command: str, progress: Progress) ->
     from liex_lab.body.skeleton import Skeleton
     from liex_lab.simulation.simulator import world_of
 
+    from ...training.pose_model import shared_pictures
     from .fingerprints import made_by
     from .illustrations import illustrate
     from .rows import measured_rows
@@ -177,7 +178,8 @@ def results_of(animal: str, budget: Budget, command: str, progress: Progress) ->
     default = _subjects(animal, ["default"], budget, results, progress)
     chooser = cast("PoseEstimator", default["default"][0])
     wanted = [name for name in budget.fresh if name != "default"]
-    runs = default | _subjects(animal, wanted, budget, results, progress)
+    with shared_pictures():
+        runs = default | _subjects(animal, wanted, budget, results, progress)
     rows, views, given = measured_rows(animal, runs, chooser, tests, progress)
     kept = _kept(skeleton, budget, tests, views, given, results)
     for name, row in rows.items():

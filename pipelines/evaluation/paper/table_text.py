@@ -21,7 +21,7 @@ from liex_lab.evaluation.pose import POSE_PROTOCOL, plain
 from .deviations import DEVIATIONS, HAND
 from .given import elsewhere
 from .published import OTHERS_FPS, OTHERS_MM, PUBLISHED_FPS, PUBLISHED_MM, TITLES
-from .results import ELSEWHERE, OTHER_MODEL
+from .results import ELSEWHERE, OTHER_MODEL, SAME_AS
 
 if TYPE_CHECKING:
     from .results import Results
@@ -312,7 +312,8 @@ def _flips(numbers: dict[str, Any]) -> str:
 
 
 def words(results: Results, quick: bool) -> list[str]:
-    """Which rows are missing or of another processor, and where the order is not the paper's.
+    """Which rows are missing, of another processor or of earlier code, and where the order is not
+    the paper's.
 
     Of a quick run nothing is said of the order.
 
@@ -330,6 +331,12 @@ def words(results: Results, quick: bool) -> list[str]:
     ]
     sentences += [
         told for name, row in results.rows.items() if (told := elsewhere(TITLES[name], row))
+    ]
+    sentences += [
+        f"{TITLES[name]} was measured with earlier code ({', '.join(row['made'][SAME_AS])}), which "
+        "learns from 2,048 pictures the same as today's to the last bit."
+        for name, row in results.rows.items()
+        if row["made"].get(SAME_AS)
     ]
     sentences += [
         f"{TITLES[name]}: {row[OTHER_MODEL]}."
