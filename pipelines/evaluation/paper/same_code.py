@@ -28,7 +28,16 @@ from liex_lab.errors import LiexError
 from .cached_results import keep_results, kept_results
 from .results import SAME_AS
 
-_SCRIPT = Path(__file__).with_name("small_models.py")
+_FILE = Path(__file__).with_name("small_models.py")
+# this version's file as a module of the version that the interpreter has
+_ASK = """
+import importlib.util, json, sys
+name, path, animal = sys.argv[1:]
+spec = importlib.util.spec_from_file_location(name, path)
+module = sys.modules[name] = importlib.util.module_from_spec(spec)
+spec.loader.exec_module(module)
+print(json.dumps(module.learned(animal)))
+"""
 Learned = Mapping[str, Mapping[str, str]]  # see `small_models.learned`
 
 
@@ -70,12 +79,16 @@ def learned_with(python: str, animal: str) -> Learned:
         LiexError: it ended with an error.
     """
     ended = subprocess.run(
-        [python, str(_SCRIPT), animal], capture_output=True, text=True, check=False
+        # not what lies in the working folder, which may be a checkout of the other version
+        [python, "-P", "-c", _ASK, f"{__package__}.{_FILE.stem}", str(_FILE), animal],
+        capture_output=True,
+        text=True,
+        check=False,
     )
     if ended.returncode:
         why = (ended.stderr.strip().splitlines() or ["no word"])[-1]
         raise LiexError(
-            f"{python} should train small models of {animal} with {_SCRIPT.name}, but: {why}; "
+            f"{python} should train small models of {animal} with {_FILE.name}, but: {why}; "
             "install liex_lab in its environment"
         )
     return dict(json.loads(ended.stdout.splitlines()[-1]))

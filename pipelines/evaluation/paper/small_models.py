@@ -1,15 +1,12 @@
 """What a version of the program learns from few pictures, and the poses that come of it, as hashes.
 
-Run as a file it prints them as JSON for the version that is installed with the interpreter,
-`PYTHON small_models.py ANIMAL`. So two versions are asked by one file (`same_code`), and it uses
-nothing but what both have.
+`same_code` puts this file into the version that another interpreter has, so that two versions are
+asked in the same way. It uses nothing but what both have.
 """
 
 from __future__ import annotations
 
 import hashlib
-import json
-import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
@@ -33,18 +30,18 @@ def learned(animal: str) -> dict[str, dict[str, str]]:
         its small models and of their poses in a recording; without the CNN where torch is not
         installed.
     """
-    from liex_lab.pipelines.build import plan_of
-    from liex_lab.pipelines.evaluation.paper.common_view import common_view, measured
-    from liex_lab.pipelines.evaluation.paper.fingerprints import learning_code
-    from liex_lab.pipelines.evaluation.paper.quick import quick_runs
-    from liex_lab.pipelines.evaluation.paper.rows import ROWS, runs_of_models
-    from liex_lab.pipelines.evaluation.pose import estimator_of
-    from liex_lab.pipelines.training.baselines import BASELINES
-
     from liex_lab.body.skeleton import Skeleton
     from liex_lab.errors import MissingPackageError
     from liex_lab.estimation.estimator import PoseEstimator
     from liex_lab.simulation.simulator import world_of
+
+    from ...build import plan_of
+    from ...training.baselines import BASELINES
+    from ..pose import estimator_of
+    from .common_view import common_view, measured
+    from .fingerprints import learning_code
+    from .quick import quick_runs
+    from .rows import ROWS, runs_of_models
 
     skeleton = Skeleton.load(animal)
     world = world_of(skeleton)
@@ -76,10 +73,10 @@ def learned(animal: str) -> dict[str, dict[str, str]]:
 
 def _small(skeleton: Any, variant: str) -> Model:
     """A model of the variant as it is trained, but for the number of pictures."""
-    from liex_lab.pipelines.training.pose_model import make_model, recipe_of
-
     from liex_lab.estimation.method import method_of
     from liex_lab.runtime.progress import silent
+
+    from ...training.pose_model import make_model, recipe_of
 
     recipe = recipe_of(variant, skeleton)
     few = replace(
@@ -89,7 +86,3 @@ def _small(skeleton: Any, variant: str) -> Model:
         n_calibration=_N_AFTERWARDS,
     )
     return make_model(skeleton, method_of(variant, skeleton), few, silent)
-
-
-if __name__ == "__main__":
-    print(json.dumps(learned(sys.argv[1])))
