@@ -16,6 +16,7 @@ The files in `datasets/kept_results` are written anew, and what became of each r
 from __future__ import annotations
 
 import json
+import shutil
 import subprocess
 import sys
 from collections.abc import Mapping, Sequence
@@ -76,8 +77,13 @@ def learned_with(python: str, animal: str) -> Learned:
         animal: a bundled animal's name.
 
     Raises:
-        LiexError: it ended with an error.
+        LiexError: there is no such interpreter, or it ended with an error.
     """
+    if shutil.which(python) is None:
+        raise LiexError(
+            f"{python} should be the interpreter of an environment, and is no program here; name "
+            "the path of its python"
+        )
     ended = subprocess.run(
         # not what lies in the working folder, which may be a checkout of the other version
         [python, "-P", "-c", _ASK, f"{__package__}.{_FILE.stem}", str(_FILE), animal],
@@ -130,6 +136,26 @@ def taken_over(
     return out, told
 
 
+def main(words: Sequence[str]) -> str:
+    """What the command does, and what it prints in the end.
+
+    Args:
+        words: of the command line: the interpreter, and animals; none stands for all.
+
+    Raises:
+        LiexError: there is no interpreter, or an animal that is not bundled.
+    """
+    known = list(bundled_models())
+    if not words or set(words[1:]) - set(known):
+        raise LiexError(
+            "expected the interpreter of an environment with the version before the change, and "
+            f"then any of {', '.join(known)}; got '{' '.join(words)}'"
+        )
+    return "\n".join(take_over(words[0], words[1:] or known))
+
+
 if __name__ == "__main__":
-    for said in take_over(sys.argv[1], sys.argv[2:] or list(bundled_models())):
-        print(said)
+    try:
+        print(main(sys.argv[1:]))
+    except LiexError as error:
+        sys.exit(str(error))

@@ -333,10 +333,10 @@ def words(results: Results, quick: bool) -> list[str]:
         told for name, row in results.rows.items() if (told := elsewhere(TITLES[name], row))
     ]
     sentences += [
-        f"{TITLES[name]} was measured with earlier code ({', '.join(row['made'][SAME_AS])}), which "
-        "learns from 2,048 pictures the same as today's to the last bit."
+        f"{TITLES[name]} was measured with earlier code ({', '.join(before)}), which learns from "
+        "2,048 pictures the same as today's to the last bit."
         for name, row in results.rows.items()
-        if row["made"].get(SAME_AS)
+        if (before := row.get("made", {}).get(SAME_AS))
     ]
     sentences += [
         f"{TITLES[name]}: {row[OTHER_MODEL]}."

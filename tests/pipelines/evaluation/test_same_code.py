@@ -121,3 +121,11 @@ def test_a_version_that_cannot_train_is_named_in_a_sentence(tmp_path):
     python.chmod(0o755)
     with pytest.raises(LiexError, match=r"python should train small models of mouse.*No module"):
         same_code.learned_with(str(python), "mouse")
+
+
+@pytest.mark.parametrize("words", [[], ["python", "rat"], ["/nowhere/python", "mouse"]])
+def test_a_word_that_makes_no_sense_is_refused_and_nothing_is_written(words):
+    before = {path: path.read_bytes() for path in kept_results_folder().glob("*.json")}
+    with pytest.raises(LiexError, match=r"^(expected the interpreter|/nowhere/python should be)"):
+        same_code.main(words)
+    assert {path: path.read_bytes() for path in kept_results_folder().glob("*.json")} == before
