@@ -69,8 +69,10 @@ def run_session(
         folder: the session folder itself, where it should have another name.
         overwrite: replace a session that is there already.
         notes: further facts for session.json, see `SessionWriter.note`.
-        workers: processes that look at shards of a long recording side by side; the tables are the
-            same for any number of them.
+        workers: processes that look at shards of a long recording side by side; 0 takes one for
+            every two cores, four at most, for more than 6,000 frames. The tables are the same for
+            any number of them. A script that asks for more than one begins its work below
+            `if __name__ == "__main__":`, as processes are spawned.
         pool: a worker pool of the caller's own instead of `workers` processes of this machine.
         progress: told how far the work is.
 
@@ -82,11 +84,9 @@ def run_session(
             to do.
     """
     from liex_lab.pipelines.session import measure_session
-    from liex_lab.pipelines.workers import Processes
+    from liex_lab.pipelines.workers import processes_for
 
     check_limits()
-    if workers > 1 and pool is None:
-        pool = Processes(workers)
     with imported_ahead(*_HEAVY), telling_of_compiling(progress) as progress:
         return measure_session(
             recording,
@@ -98,7 +98,7 @@ def run_session(
             notes=notes,
             blueprint=_layout,
             report=_views,
-            pool=pool,
+            pool=pool or processes_for(workers),
             progress=progress,
         )
 
@@ -127,7 +127,8 @@ def run_arenas(
         settings: changes of the plan where none is named.
         overwrite: replace sessions that are there already.
         notes: further facts for every session.json.
-        workers: processes that look at shards of a long recording side by side.
+        workers: processes that look at shards of a long recording side by side, each arena by
+            itself; 0 or 1 measure all of them in one pass.
         pool: a worker pool of the caller's own instead.
         progress: told how far the work is.
 
@@ -138,10 +139,8 @@ def run_arenas(
         LiexError: the recording or the plan cannot be used, or arenas overlap.
     """
     from liex_lab.pipelines.arenas import measure_arenas
-    from liex_lab.pipelines.workers import Processes
+    from liex_lab.pipelines.workers import processes_for
 
-    if workers > 1 and pool is None:
-        pool = Processes(workers)
     with imported_ahead(*_HEAVY), telling_of_compiling(progress) as progress:
         return measure_arenas(
             recording,
@@ -152,7 +151,7 @@ def run_arenas(
             notes=notes,
             blueprint=_layout,
             report=_views,
-            pool=pool,
+            pool=pool or processes_for(workers or 1),
             progress=progress,
         )
 

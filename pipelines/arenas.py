@@ -151,7 +151,7 @@ def measure_arenas(
             try:
                 work.prepared = _prepare(work, named, settings, shared, progress)
                 if pool is not None and isinstance(recording, str | Path):
-                    work.prepared.measure_by(pool, str(recording), progress)
+                    work.prepared.measure_by(pool, recording, progress)
             except LiexError as error:
                 work.error = error
         going = [work for work in works if work.prepared is not None and work.error is None]

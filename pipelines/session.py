@@ -75,8 +75,8 @@ def measure_session(
     An unfinished session of the same recording and plan is continued. A plan that the recording
     does not fit is refused before anything is measured; where none is named the bundled one that
     fits is used. Where a pool of workers is
-    given and the recording is long (more than two shards) and stated by its path, its shards are
-    measured side by side; the tables are the same.
+    given and the recording is long (more than two shards, and than the pool says) and stated by
+    its path, its shards are measured side by side; the tables are the same.
 
     Args:
         recording: a path or address, or a recording that is open already.
@@ -128,7 +128,7 @@ def measure_session(
             hashed()
         prepared = prepare(fitted, folder, started, progress)
         if pool is not None and isinstance(recording, str | Path):
-            prepared.measure_by(pool, str(recording), progress)
+            prepared.measure_by(pool, recording, progress)
         with SessionWriter(
             folder, prepared.origin, overwrite=overwrite, blueprint=blueprint, report=report
         ) as writer:
@@ -193,19 +193,21 @@ class Prepared:
         self.timings["track"] += time.perf_counter() - began
         writer.add(frames, seen=seen)
 
-    def measure_by(self, pool: WorkerPool, recording: str, progress: Progress) -> None:
+    def measure_by(self, pool: WorkerPool, recording: str | Path, progress: Progress) -> None:
         """Let workers measure the shards of a long recording (more than two shards).
 
         Args:
             pool: the workers.
-            recording: path or address, which each of them opens.
+            recording: path or address, which each of them opens; of an archive that is unpacked
+                here, workers of this machine open what came out.
             progress: told shard by shard.
         """
         n = len(self.recording)
-        if n <= 2 * LENGTH:
+        if n <= max(2 * LENGTH, pool.fewest):
             return
         opened_as = pinned(self.fitted.plan, self.recording)
-        whole = Shard(recording, opened_as, self.fitted.tracker, self.origin, self.folder, 0, n)
+        place = str((pool.here and self.recording.unpacked) or recording)
+        whole = Shard(place, opened_as, self.fitted.tracker, self.origin, self.folder, 0, n)
         measure_shards(pool, whole, self.folder, progress)
 
     def finish(

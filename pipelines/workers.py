@@ -18,12 +18,26 @@ from typing import Protocol, TypeVar
 from liex_lab.errors import SessionError
 from liex_lab.runtime.children import end_children, end_with_parent
 
+# that one process keeps busy: it uses more than one and a half
+_CORES = 2
+# each takes some 400 MB
+_MOST = 4
+# frames; a process takes two seconds to begin
+_WORTH_SHARING = 6000
 Work = TypeVar("Work")
 Done = TypeVar("Done")
 
 
 class WorkerPool(Protocol):
     """Whoever can do several tasks at once, such as processes or the workers of a cluster."""
+
+    @property
+    def fewest(self) -> int:
+        """Recordings of no more frames are measured by one process: sharing them takes longer."""
+
+    @property
+    def here(self) -> bool:
+        """Its workers read this machine's temporary files."""
 
     def each(self, do: Callable[[Work], Done], works: Sequence[Work]) -> Iterator[Done]:
         """What `do` makes of each of the tasks, as soon as it is there, in any order.
@@ -41,10 +55,14 @@ class Processes:
     Attributes:
         n: how many, at most one for each task.
         threads: cores of each; 0 takes an equal share.
+        fewest: recordings of no more frames are not worth the start of processes.
+        here: they read this machine's temporary files.
     """
 
     n: int
     threads: int = 0
+    fewest: int = 0
+    here: bool = True
 
     def each(self, do: Callable[[Work], Done], works: Sequence[Work]) -> Iterator[Done]:
         """What `do` makes of each of the tasks, as soon as it is there, in any order.
@@ -80,6 +98,19 @@ class Processes:
                 raise
             finally:
                 pool.shutdown(cancel_futures=True)
+
+
+def processes_for(workers: int) -> Processes | None:
+    """The pool of so many workers; None where one process does the work.
+
+    Args:
+        workers: how many; 0 takes one for every two cores, four at most, for recordings that are
+            long enough.
+    """
+    if workers:
+        return Processes(workers) if workers > 1 else None
+    n = min(n_cores() // _CORES, _MOST)
+    return Processes(n, fewest=_WORTH_SHARING) if n > 1 else None
 
 
 def n_cores() -> int:

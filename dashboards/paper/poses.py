@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from textwrap import fill
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -17,10 +18,12 @@ from .looks import DPI, METHODS, TRUE
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 Array = NDArray[np.float64]
 
 _PANEL_INCH = 1.65
+_LETTER_INCH = 0.07  # of a title
 _NEAR = 0.55  # of the animal's length: half of the depth that pictures show
 _BESIDE = 1.5  # of the truth's reach: what lies farther off is not of the animal
 _GREY = "#8a8f94"
@@ -54,9 +57,8 @@ def draw_poses(animal: str, shown: Sequence[Mapping[str, Any]], path: Path, side
     for panel, one in zip(grid[0], shown, strict=True):
         panel.set_title(f"{one['split']}\n{panel.get_title()}", fontsize=8)
     where = "from the side" if side else "from the camera"
-    figure.suptitle(
-        f"{animal}, {where}: truth, blue; pose of each method, red; dot: base; error in mm",
-        fontsize=9,
+    _entitle(
+        figure, f"{animal}, {where}: truth, blue; pose of each method, red; dot: base; error in mm"
     )
     figure.savefig(path, dpi=DPI)
     return path
@@ -90,9 +92,14 @@ def draw_failures(
             _panel(panel, one, name, False)
             panel.set_title(f"{one['split']}\n{panel.get_title()}", fontsize=8)
         line[0].set_ylabel(METHODS[name][0].replace(", ", ",\n"), fontsize=8)
-    figure.suptitle(f"{animal}, the largest errors: truth, blue; measured, red", fontsize=9)
+    _entitle(figure, f"{animal}, the largest errors: truth, blue; measured, red")
     figure.savefig(path, dpi=DPI)
     return path
+
+
+def _entitle(figure: Figure, title: str) -> None:
+    """A title above the panels, on as many lines as it takes: of few frames a figure is narrow."""
+    figure.suptitle(fill(title, int(figure.get_figwidth() / _LETTER_INCH)), fontsize=9)
 
 
 def _panel(panel: Axes, one: Mapping[str, Any], name: str, side: bool) -> None:

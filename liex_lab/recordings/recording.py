@@ -57,6 +57,8 @@ class Recording:
             with zone).
         optics: what was undone on reading (distortion, water, mirroring), empty where nothing was;
             see `rectify`.
+        unpacked: folder with what an archive was unpacked to, which opens as the same recording
+            while this one is open; None where nothing was.
         region_px: (u, v) corners, pixels, of the polygon outside of which every picture was made
             unread; () where the whole picture is there, see `masked`.
     """
@@ -79,6 +81,7 @@ class Recording:
         stored: NDArray[np.int64] | None = None,
         faults: NDArray[np.uint8] | None = None,
         grow: Callable[[], Recording | None] | None = None,
+        unpacked: Path | None = None,
     ) -> None:
         """Check and freeze the time stamps; no frame is read.
 
@@ -102,6 +105,8 @@ class Recording:
                 none.
             grow: opens what was appended to the files since, see `grown`; None where the format
                 cannot.
+            unpacked: folder with what an archive was unpacked to, if it opens as the same
+                recording.
 
         Raises:
             RecordingError: there is no frame, or the stamps do not increase strictly.
@@ -115,6 +120,7 @@ class Recording:
         self.metadata: dict[str, Any] = {} if metadata is None else dict(metadata)
         self.optics: dict[str, Any] = {}
         self.region_px: tuple[tuple[float, float], ...] = ()
+        self.unpacked = unpacked
         self._read = read
         self.files = sources if isinstance(sources, SourceFiles) else SourceFiles(sources)
         self._stored = np.arange(len(self.times_ns)) if stored is None else stored
@@ -407,6 +413,7 @@ class Recording:
             stored=self._stored,
             close=None if lent else self.close,
             faults=self._faults,
+            unpacked=self.unpacked,
             grow=lambda: (more := self.grown()) and more.seen_by(camera, change, optics),
         )
         other._whole = self._whole or self

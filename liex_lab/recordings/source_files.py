@@ -120,14 +120,15 @@ def file_digest(files: Iterable[Path], progress: Progress = silent) -> str:
     sizes = [path.stat().st_size for path in ordered]
     whole = hashlib.sha256()
     done = 0
+    room = memoryview(bytearray(_BLOCK))  # new memory for each block takes as long as reading it
     total = sum(sizes) // _BLOCK + 1
     for path, size in zip(ordered, sizes, strict=True):
         if len(ordered) > 1:
             whole.update(f"{path.name}\0{size}\0".encode())
-        with path.open("rb") as file:
-            while block := file.read(_BLOCK):
-                whole.update(block)
-                done += len(block)
+        with path.open("rb", buffering=0) as file:
+            while n := file.readinto(room):
+                whole.update(room[:n])
+                done += n
                 progress(done // _BLOCK, total, "reading the recording's hash (MB)")
     return whole.hexdigest()
 

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
+from functools import lru_cache
 from importlib import import_module
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 from liex_lab.runtime.memory import uncollected
+
+if TYPE_CHECKING:
+    from threadpoolctl import ThreadpoolController
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -127,7 +132,16 @@ def threads(parallel: bool) -> Iterator[None]:
 @contextmanager
 def serial_products() -> Iterator[None]:
     """Within the block, BLAS multiplies on one thread: the same bits on any number of cores."""
-    from threadpoolctl import threadpool_limits
-
-    with threadpool_limits(1, user_api="blas"):
+    with _loaded(len(sys.modules)).limit(limits=1, user_api="blas"):
         yield
+
+
+@lru_cache(maxsize=1)
+def _loaded(n_modules: int) -> ThreadpoolController:
+    """The libraries that are loaded, which takes milliseconds to find out.
+
+    Of more modules there may be more libraries.
+    """
+    from threadpoolctl import ThreadpoolController
+
+    return ThreadpoolController()

@@ -34,6 +34,9 @@ from mcap.records import (
 
 from liex_lab.recordings.formats.messages.mcap import MAGIC, MESSAGE, RECORD
 
+# bytes of a repetition that is looked for so far back: of the usual 64 many are within a cut-out,
+# and end where the still scene would go on
+_REPETITION = 256
 _WINDOW = 23  # log2 of the bytes in which a repetition is found: some ten pictures of 640 x 480
 
 
@@ -120,7 +123,7 @@ class McapFile:
         self._at = 0
         self._chunk_size = chunk_size
         packing = zstandard.ZstdCompressionParameters.from_level(
-            level, enable_ldm=True, window_log=_WINDOW
+            level, enable_ldm=True, window_log=_WINDOW, ldm_min_match=_REPETITION
         )
         self._packer = zstandard.ZstdCompressor(compression_params=packing)
         self._schemas: dict[str, Schema] = {}

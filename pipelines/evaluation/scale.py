@@ -181,6 +181,7 @@ class _Timed:
 
     def __init__(self, pool: WorkerPool) -> None:
         self._crew = pool
+        self.fewest, self.here = pool.fewest, pool.here
         self.came: list[tuple[float, int]] = []
 
     def each(self, do: Callable[[Work], Done], works: Sequence[Work]) -> Iterator[Done]:

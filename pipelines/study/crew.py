@@ -207,7 +207,15 @@ def _teller(session: PlannedSession) -> Progress:
 
 
 class Workers:
-    """All workers of the cluster that a task runs on, as a pool for the shards of its session."""
+    """All workers of the cluster that a task runs on, as a pool for the shards of its session.
+
+    Attributes:
+        fewest: any session of more than two shards is shared, as workers would be idle else.
+        here: they may be on other machines, without this one's temporary files.
+    """
+
+    fewest = 0
+    here = False
 
     def each(self, do: Callable[[Work], Done], works: Sequence[Work]) -> Iterator[Done]:
         """Results of a task per shard as they come; see `workers.WorkerPool`.

@@ -277,7 +277,7 @@ def test_workers_make_the_same_tables_of_every_arena(tmp_path, monkeypatch):
     class Inline:
         """A pool whose only worker is this process."""
 
-        n_done = 0
+        n_done, fewest, here = 0, 0, True
 
         def each(self, do, works):
             for work in works:

@@ -9,9 +9,10 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from liex_lab.pipelines import session as job
-from liex_lab.pipelines import shards
+from liex_lab.pipelines import shards, workers
 from liex_lab.pipelines.build import build_recording, build_tracker
 from liex_lab.pipelines.origin import build_provenance
 from liex_lab.pipelines.verify import verify_session
@@ -20,9 +21,12 @@ from liex_lab.pipelines.workers import Processes
 from liex_lab.api import run_session
 from liex_lab.errors import RecordingError, SessionError
 from liex_lab.plan import Plan
+from liex_lab.recordings.formats.moseq import reader
 from liex_lab.recordings.recording import Recording
 from liex_lab.sessions import Session
+from liex_lab.sessions.source import linked_recording
 from tests.pipelines.test_session import N_RENDERED, folder, mouse, pictures, session, times_ns  # noqa: F401
+from tests.recordings.writers import write_archive, write_camera, write_moseq_folder
 from tests.sessions.test_checkpoint import depth_messages, tables_of
 
 LENGTH = 8  # frames of a stretch here
@@ -33,8 +37,10 @@ class InTurn:
     accident.
     """
 
-    def __init__(self, accident_after: int = 1000) -> None:
-        self.left, self.n_done = accident_after, 0
+    here = True
+
+    def __init__(self, accident_after: int = 1000, fewest: int = 0) -> None:
+        self.left, self.n_done, self.fewest = accident_after, 0, fewest
 
     def each(self, do: Callable[[Any], Any], works: Sequence[Any]) -> Iterator[Any]:
         for work in reversed(works):
@@ -129,6 +135,61 @@ def test_a_short_recording_and_one_that_is_open_are_looked_at_by_one(
     pool = InTurn()
     assert tables_of(run(folder, tmp_path, pool=pool)) == tables_of(session.path)
     assert pool.n_done == 0
+
+
+def test_what_takes_longer_to_share_than_to_do_is_done_by_one(
+    session: Session,  # noqa: F811
+    folder: Path,  # noqa: F811
+    tmp_path: Path,
+) -> None:
+    pool = InTurn(fewest=1000)
+    assert tables_of(run(folder, tmp_path, pool=pool)) == tables_of(session.path)
+    assert pool.n_done == 0
+
+
+@pytest.mark.parametrize("here", [True, False])
+def test_workers_of_this_machine_read_what_an_archive_was_unpacked_to(
+    here: bool,
+    pictures: np.ndarray,  # noqa: F811
+    mouse: Any,  # noqa: F811
+    times_ns: list[int],  # noqa: F811
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    stamps = [t / 1e6 for t in times_ns]
+    packed = write_moseq_folder(tmp_path / "walk", pictures, stamps)
+    archive = write_archive(packed, tmp_path / "walk.tar.gz")
+    write_camera(tmp_path, mouse.camera)
+    told: list[Any] = []
+    unpack = reader.unpack
+
+    def unpack_and_tell(*what: Any) -> Any:
+        told.append(what[0])
+        return unpack(*what)
+
+    monkeypatch.setattr(reader, "unpack", unpack_and_tell)
+    shards._opened.cache_clear()
+    pool = InTurn()
+    pool.here = here
+    shared = run(archive, tmp_path / "shared", pool=pool)
+    assert pool.n_done > 2
+    assert len(told) == (1 if here else 2)
+    assert tables_of(shared) == tables_of(run(archive, tmp_path / "alone"))
+    assert linked_recording(Session.open(shared)) == str(archive)
+
+
+def test_as_many_processes_as_pay(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(workers, "n_cores", lambda: 6)
+    assert workers.processes_for(1) is None
+    assert workers.processes_for(3) == Processes(3)
+    chosen = workers.processes_for(0)
+    assert chosen is not None
+    assert (chosen.n, chosen.fewest) == (3, 6000)
+    monkeypatch.setattr(workers, "n_cores", lambda: 64)
+    assert workers.processes_for(0) == Processes(4, fewest=6000)
+    for few in (1, 2, 3):  # one process keeps them busy
+        monkeypatch.setattr(workers, "n_cores", lambda few=few: few)
+        assert workers.processes_for(0) is None
 
 
 def test_cuts_are_at_the_same_places_wherever_the_work_goes_on() -> None:

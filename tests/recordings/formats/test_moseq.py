@@ -200,6 +200,25 @@ def test_an_archive_is_unpacked_once_and_cleared_away(
     assert not list(tmp_path.glob("liex-*"))
 
 
+@pytest.mark.parametrize("camera", ["in the archive", "beside it"])
+def test_what_an_archive_was_unpacked_to_opens_as_the_same_recording(
+    camera: str, folder: Path, tmp_path: Path
+) -> None:
+    if camera == "beside it":
+        (folder / "camera.toml").rename(tmp_path / "camera.toml")
+    with open_recording(write_archive(folder, tmp_path / "s.tar.gz")) as recording:
+        assert recording.unpacked is not None
+        assert recording[2:5].unpacked is None  # rows of the whole are not its rows
+        with open_recording(recording.unpacked) as again:
+            assert again.camera == recording.camera
+            assert again.times_ns.tolist() == recording.times_ns.tolist()
+            for frame in again:
+                np.testing.assert_array_equal(frame.depth, STORED[frame.index])
+    write_camera(folder)
+    with open_recording(folder) as session:
+        assert session.unpacked is None
+
+
 def test_members_may_lie_in_folders_and_a_tar_may_be_unpacked_already(
     folder: Path, tmp_path: Path
 ) -> None:

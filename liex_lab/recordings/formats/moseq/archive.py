@@ -1,32 +1,32 @@
 """Streaming extraction of a session from .tar or .tar.gz that keeps every byte a cut archive holds.
 
-The archive is decompressed in order (DEFLATE has no random access): once and by ISA-L, nearly three
-times as fast as zlib, where it is whole. One that is cut or damaged is unpacked once more by zlib,
-whose state can be copied: smaller and smaller pieces are tried until the last good byte has come
-out; the tar walk is then fed zeros, and each file is written only as far as its bytes are real.
+The archive is decompressed in order (DEFLATE has no random access): once, by ISA-L on a thread of
+its own, nearly three times as fast as zlib, where it is whole. One that is cut or damaged is
+unpacked once more by zlib, whose state can be copied: smaller and smaller pieces are tried until
+the last good byte has come out; the tar walk is then fed zeros, and each file is written only as
+far as its bytes are real.
 """
 
 from __future__ import annotations
 
 import errno
+import gzip
 import shutil
 import tarfile
 import zlib
-from collections.abc import Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import suppress
+from collections.abc import Generator, Sequence
+from contextlib import closing, suppress
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import IO
 
-from isal import isal_zlib
+from isal import igzip_threaded, isal_zlib
 
 from liex_lab.errors import RecordingError
 from liex_lab.runtime.progress import Progress
 
-_BLOCK = 1 << 16
-_PACKED = 1 << 16  # bytes read at once
-_UNPACKED = 1 << 20  # and unpacked at once: an empty picture is a thousand times its packed size
+_PACKED = 1 << 18  # bytes read at once
+_UNPACKED = 1 << 17  # and unpacked at once: an empty picture is a thousand times its packed size
 _PIECE = 256  # packed bytes tried at once where there is damage
 _ENOUGH_ZEROS = (
     1 << 22
@@ -36,6 +36,7 @@ _MOST_TIMES = 200  # what more than that unpacks to: true pictures have noise
 _MOST_HEADER = 1 << 20  # bytes of a member's name and notes
 _MOST_NOTES = 1 << 28  # bytes of any file but the pictures: stamps of days
 _GZIP_MAGIC = b"\x1f\x8b"
+Pieces = Generator[bytes | memoryview, None, None]
 
 
 class _Member(tarfile.TarInfo):
@@ -88,7 +89,7 @@ class _Patient:
 
     tarfile throws away the block in which an archive ends too early. Here it never ends, and
     `n_true` says how many of the bytes were real; a tar ends in zeros by itself, so the walk over
-    its members ends too.
+    its members ends too. It is walked forwards alone.
 
     Args:
         file: the open archive.
@@ -103,108 +104,138 @@ class _Patient:
         self._progress = progress
         self.zipped = file.read(2) == _GZIP_MAGIC
         file.seek(0)
-        self._fast = fast
-        self._inflate = self._inflater()
-        self._buffer = bytearray()
-        self._pending = b""
+        self.whole = not self.zipped or fast  # it ended where it should
+        self._coming = (
+            _read(file) if not self.zipped else _by_isal(file) if fast else self._by_zlib()
+        )
+        self._piece = memoryview(b"")  # what is left of the last one
+        self._at = 0
         self.n_true = 0
-        self._n_zeros = 0
-        self.ended = False  # nothing more will come
-        self.whole = not self.zipped  # it ended where it should
 
-    def _inflater(self) -> zlib._Decompress:
-        """What unpacks a gzip file from its beginning."""
-        if self._fast:
-            return isal_zlib.decompressobj(31)  # type: ignore[return-value]
-        return zlib.decompressobj(31)
+    def tell(self) -> int:
+        """How many bytes were handed out, zeros included."""
+        return self._at
+
+    def seek(self, to: int) -> None:
+        """Leave out what lies before a place further on."""
+        while self._at < to and (n := len(self._next(to - self._at))):
+            self._at += n
+        self._at = max(self._at, to)
 
     def read(self, n: int) -> bytes:
         """Exactly n bytes, zeros where the archive has broken off."""
-        while len(self._buffer) < n and not self.ended:
-            self._fill()
-        with memoryview(self._buffer) as view:
-            block = bytes(view[:n])
-        del self._buffer[:n]
-        self.n_true += len(block)
-        self._bound()
-        self._n_zeros += n - len(block)
-        if self._n_zeros > _ENOUGH_ZEROS:
+        parts = []
+        left = n
+        while left and (part := self._next(left)):
+            parts.append(bytes(part))
+            left -= len(part)
+        self._at += n
+        if self._at - self.n_true > _ENOUGH_ZEROS:
             raise tarfile.ReadError("the archive ended long ago")
-        return block + bytes(n - len(block)) if len(block) < n else block
+        return b"".join([*parts, bytes(left)])
 
-    def _bound(self, n_more: int = 0) -> None:
-        """Raises RecordingError where more comes out than of any recording, of what is packed."""
-        n = self.n_true + n_more
-        if n > _ALWAYS and n > _MOST_TIMES * max(self._file.tell(), 1):
-            raise RecordingError(
-                f"the archive unpacks to more than {_MOST_TIMES} times its size, which no "
-                "recording does; pack the session's folder again"
-            )
+    def copy(self, n: int, to: IO[bytes]) -> int:
+        """Write the next n bytes into a file, as far as they are real; how many were."""
+        left = n
+        while left and (part := self._next(left)):
+            to.write(part)
+            left -= len(part)
+        self._at += n - left
+        return n - left
 
     def finish(self) -> None:
         """Read to the end.
 
         A tar is over before the gzip around it is, and only gzip's end tells that it is whole.
         """
-        n_more = 0
-        while not self.ended:
-            n_more += len(self._buffer)
-            self._bound(n_more)
-            self._buffer.clear()
-            self._fill()
+        while self._next(_UNPACKED):
+            pass
 
-    def _fill(self) -> None:
-        """Some more bytes into the buffer, or the end."""
-        if not self._pending:
-            self._pending = self._file.read(_PACKED)
+    def close(self) -> None:
+        """Unpack no more."""
+        self._coming.close()
+
+    def _next(self, most: int) -> memoryview:
+        """The next real bytes, some, at most so many; none where there are no more.
+
+        Raises:
+            RecordingError: more comes out than of any recording, of what is packed.
+        """
+        while not self._piece:
+            piece = next(self._coming, None)
             self._progress(
                 self._file.tell() >> 20, (self._size >> 20) + 1, "unpacking the recording (MB)"
             )
-        if not self._pending:
-            self.ended = True
-            self._buffer += b"" if self.whole else self._inflate.flush()
-        elif self.zipped:
-            self._unzip()
-        else:
-            self._buffer += self._pending
-            self._pending = b""
-
-    def _unzip(self) -> None:
-        if (
-            self._inflate.eof
-        ):  # a gzip file may be several, one after the other; anything else behind it is padding
-            if len(self._pending) < len(_GZIP_MAGIC):
-                self._pending += self._file.read(_PACKED)
-            if not self._pending.startswith(_GZIP_MAGIC):
-                self.ended = True
-                return
-            self._inflate = self._inflater()
-        spare = None if self._fast else self._inflate.copy()
-        try:
-            self._buffer += self._inflate.decompress(self._pending, _UNPACKED)
-            self._pending = (
-                self._inflate.unused_data if self._inflate.eof else self._inflate.unconsumed_tail
+            if piece is None:
+                return self._piece
+            self._piece = memoryview(piece)
+        part = self._piece[:most]
+        self._piece = self._piece[most:]
+        self.n_true += len(part)
+        if self.n_true > _ALWAYS and self.n_true > _MOST_TIMES * max(self._file.tell(), 1):
+            raise RecordingError(
+                f"the archive unpacks to more than {_MOST_TIMES} times its size, which no "
+                "recording does; pack the session's folder again"
             )
-            self.whole = self._inflate.eof
-        except isal_zlib.error as error:  # type: ignore[misc]  # stated to be an instance
-            raise _Damaged from error
-        except zlib.error:
-            assert spare is not None
-            self._salvage(spare)
-            self.ended = True
-            self.whole = False
+        return part
 
-    def _salvage(self, inflate: zlib._Decompress) -> None:
-        """What comes out before the damage: zlib keeps back all of a piece in which it
-        finds some.
-        """
-        for size in (_PIECE, 1):
-            with suppress(zlib.error):
-                while self._pending:
-                    before = inflate.copy() if size > 1 else inflate
-                    self._buffer += inflate.decompress(self._pending[:size])
-                    self._pending = self._pending[size:]
-            inflate = before
+    def _by_zlib(self) -> Pieces:
+        """What zlib makes of the archive, up to the last good byte."""
+        inflate = zlib.decompressobj(31)
+        while packed := self._file.read(_PACKED):
+            while packed:
+                if inflate.eof:
+                    # a gzip file may be several, one after the other; anything else behind it is
+                    # padding
+                    if len(packed) < len(_GZIP_MAGIC):
+                        packed += self._file.read(_PACKED)
+                    if not packed.startswith(_GZIP_MAGIC):
+                        return
+                    inflate = zlib.decompressobj(31)
+                spare = inflate.copy()
+                try:
+                    yield inflate.decompress(packed, _UNPACKED)
+                except zlib.error:
+                    self.whole = False
+                    yield _salvaged(spare, packed)
+                    return
+                self.whole = inflate.eof
+                packed = inflate.unused_data if inflate.eof else inflate.unconsumed_tail
+        if not self.whole:
+            yield inflate.flush()
+
+
+def _read(file: IO[bytes]) -> Pieces:
+    """The bytes of a tar that is not packed."""
+    while piece := file.read(_PACKED):
+        yield piece
+
+
+def _by_isal(file: IO[bytes]) -> Pieces:
+    """What ISA-L makes of a whole archive, each piece until the next is asked for.
+
+    It unpacks on a thread of its own, while what came out is written.
+    """
+    room = bytearray(_UNPACKED)
+    try:
+        with igzip_threaded.open(file, "rb", block_size=_UNPACKED) as unpacked:
+            while n := unpacked.readinto(room):
+                yield memoryview(room)[:n]
+    except (EOFError, gzip.BadGzipFile, isal_zlib.error) as error:  # type: ignore[misc]
+        raise _Damaged from error
+
+
+def _salvaged(inflate: zlib._Decompress, packed: bytes) -> bytes:
+    """What comes out before the damage: zlib keeps back all of a piece in which it finds some."""
+    found = bytearray()
+    for size in (_PIECE, 1):
+        with suppress(zlib.error):
+            while packed:
+                before = inflate.copy() if size > 1 else inflate
+                found += inflate.decompress(packed[:size])
+                packed = packed[size:]
+        inflate = before
+    return bytes(found)
 
 
 def unpack(archive: Path, wanted: Sequence[str], folder: Path, progress: Progress) -> Unpacked:
@@ -238,10 +269,12 @@ def _unpack(
     files: dict[str, Path] = {}
     seen: set[str] = set()
     cut = False
-    with archive.open("rb") as file:
-        stream = _Patient(file, archive.stat().st_size, progress, fast)
+    with (
+        archive.open("rb") as file,
+        closing(_Patient(file, archive.stat().st_size, progress, fast)) as stream,
+    ):
         try:
-            with tarfile.open(fileobj=stream, mode="r|", bufsize=_BLOCK, tarinfo=_Member) as tar:  # type: ignore[call-overload]
+            with tarfile.open(fileobj=stream, mode="r:", tarinfo=_Member) as tar:  # type: ignore[call-overload]
                 for member in tar:
                     name = PurePosixPath(member.name).name
                     if cut or not member.isfile() or name.startswith("._"):
@@ -256,7 +289,7 @@ def _unpack(
                         (folder / name).unlink(missing_ok=True)  # it needs its room
                         _check_size(archive, member, folder)
                         files[name] = folder / name
-                        cut = _copy(tar, member, files[name], stream)
+                        cut = _copy(member, files[name], stream)
         except tarfile.TarError:
             if not seen and not (fast and stream.zipped):
                 raise RecordingError(
@@ -293,27 +326,12 @@ def _check_size(archive: Path, member: tarfile.TarInfo, folder: Path) -> None:
         )
 
 
-def _copy(tar: tarfile.TarFile, member: tarfile.TarInfo, to: Path, stream: _Patient) -> bool:
-    """Write one member as far as its bytes are real; True where some are missing."""
-    source = tar.extractfile(member)
-    assert source is not None
-    written = 0
-    coming: Future[int] | None = None  # the write under way: the next block is unpacked meanwhile
+def _copy(member: tarfile.TarInfo, to: Path, stream: _Patient) -> bool:
+    """Write the member that comes next as far as its bytes are real; True where some miss."""
+    stream.seek(member.offset_data)
     try:
-        with to.open("wb") as out, ThreadPoolExecutor(1) as writer:
-            while written < member.size:
-                block = source.read(min(_BLOCK, member.size - written))
-                # tarfile reads ahead by whole blocks, never behind: what lies beyond n_true is
-                # padding
-                real = min(len(block), max(0, stream.n_true - member.offset_data - written))
-                if coming is not None:
-                    coming.result()
-                coming = writer.submit(out.write, memoryview(block)[:real])
-                written += real
-                if real < len(block):
-                    break
-            if coming is not None:
-                coming.result()
+        with to.open("wb") as out:
+            written = stream.copy(member.size, out)
     except OSError as error:
         if error.errno in (errno.ENOSPC, errno.EDQUOT):
             raise RecordingError(

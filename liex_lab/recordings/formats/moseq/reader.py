@@ -7,6 +7,7 @@ an Azure Kinect; stamps lie beside the depth, or are the video's own, or follow 
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -173,6 +174,9 @@ def open_moseq(
     scratch = Scratch()
     try:
         found = unpack(path, (*DEPTHS, *names), scratch.folder, progress)
+        beside = path.parent / CAMERA_FILE
+        if CAMERA_FILE not in found.files and beside.is_file():  # others may open what came out
+            shutil.copy(beside, scratch.folder)
         inside = next((found.files[name] for name in DEPTHS if name in found.files), None)
         if inside is None:
             raise _no_depth(path, found)
@@ -247,7 +251,8 @@ class _Session:
                 scratch.close()
 
         try:
-            return self._recording(name, sources, stack, track, close)
+            unpacked = None if scratch is None or self.cut else scratch.folder
+            return self._recording(name, sources, stack, track, close, unpacked)
         except BaseException:
             stack.close()
             raise
@@ -321,6 +326,7 @@ class _Session:
         stack: Stack,
         track: DepthTrack | None,
         close: Callable[[], None],
+        unpacked: Path | None,
     ) -> Recording:
         camera = self._camera(stack, track)
         times = self._times(len(stack), track)
@@ -343,6 +349,7 @@ class _Session:
             close=close,
             faults=monotone.faults,
             metadata={**start, **self.metadata.facts, **self.camera_file.metadata},
+            unpacked=unpacked,
         )
 
     def _camera(self, stack: Stack, track: DepthTrack | None) -> Camera:
