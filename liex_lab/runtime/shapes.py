@@ -21,18 +21,20 @@ def check_shapes(whose: str, *wanted: tuple[str, NDArray, tuple[int | str, ...]]
     Raises:
         ValueError: an array has other dimensions, or two lengths of one letter differ.
     """
-    lengths: dict[str, int] = {}
-    for name, array, shape in wanted:
-        known = [lengths.get(n, n) if isinstance(n, str) else n for n in shape]
-        fits = array.ndim == len(shape) and all(
-            isinstance(n, str) or n == length for n, length in zip(known, array.shape, strict=True)
-        )
+    lengths: dict[int | str, int] = {}
+    for name, array, shape in wanted:  # some forty arrays of a live frame come by here
+        known = [lengths.get(n, n) for n in shape]
+        fits = array.ndim == len(shape)
+        for n, length in zip(known, array.shape, strict=False):
+            if isinstance(n, str):
+                lengths[n] = length
+            else:
+                fits &= n == length
         if not fits:
             raise ValueError(
                 f"{name} of {whose} should have the shape ({', '.join(map(str, known))}), but has "
                 f"({', '.join(map(str, array.shape))}); give arrays of the same frames and animal"
             )
-        lengths |= {n: at for n, at in zip(shape, array.shape, strict=True) if isinstance(n, str)}
 
 
 def check_index(whose: str, index: NDArray, n: int) -> None:
