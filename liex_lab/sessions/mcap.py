@@ -35,10 +35,10 @@ Array = NDArray[np.float64]
 
 _SECOND = 10**9
 _BLOCK = 8192  # frames of a track that are in memory
-# level and bytes of the chunks: whole pictures, one to a chunk; and those that are alike but for a
-# cut-out
-_WHOLE = (3, 128 * 1024)
-_ALIKE = (1, 32 * 1024 * 1024)
+# level, bytes of the chunks, and of repetitions far back: whole pictures, one to a chunk; and those
+# that are alike but for a cut-out, in which short repetitions end where the still scene would go on
+_WHOLE = (3, 128 * 1024, 0)
+_ALIKE = (1, 32 * 1024 * 1024, 256)
 _ACTION_SCHEMA: dict[str, Any] = {
     "title": "liex_lab.ActionState",
     "description": "The action that begins now; an empty word ends the last one.",
@@ -97,6 +97,7 @@ class McapWriter:
             library=f"liex_lab {package_version('liex_lab')}",
             level=usual[0] if level is None else level,
             chunk_size=usual[1] if chunk_size is None else chunk_size,
+            repetition=usual[2],
         )
         self._depth = self._topic("/camera/depth", messages.RawImage)
         self._calibration = self._topic("/camera/calibration", messages.CameraCalibration)

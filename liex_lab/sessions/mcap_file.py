@@ -34,9 +34,6 @@ from mcap.records import (
 
 from liex_lab.recordings.formats.messages.mcap import MAGIC, MESSAGE, RECORD
 
-# bytes of a repetition that is looked for so far back: of the usual 64 many are within a cut-out,
-# and end where the still scene would go on
-_REPETITION = 256
 _WINDOW = 23  # log2 of the bytes in which a repetition is found: some ten pictures of 640 x 480
 
 
@@ -108,7 +105,14 @@ class McapFile:
     """Writer of one MCAP file with an index; call `log`, `flush` at will, and `close` once."""
 
     def __init__(
-        self, sink: Sink, *, profile: str, library: str, level: int, chunk_size: int
+        self,
+        sink: Sink,
+        *,
+        profile: str,
+        library: str,
+        level: int,
+        chunk_size: int,
+        repetition: int = 0,
     ) -> None:
         """Write the file's beginning.
 
@@ -118,12 +122,14 @@ class McapFile:
             library: name and version of the program that writes.
             level: of Zstandard, 1 to 22.
             chunk_size: bytes of messages that are packed at once.
+            repetition: bytes that are at least the same where something far back is looked for; 0
+                for Zstandard's usual 64.
         """
         self._sink = sink
         self._at = 0
         self._chunk_size = chunk_size
         packing = zstandard.ZstdCompressionParameters.from_level(
-            level, enable_ldm=True, window_log=_WINDOW, ldm_min_match=_REPETITION
+            level, enable_ldm=True, window_log=_WINDOW, ldm_min_match=repetition
         )
         self._packer = zstandard.ZstdCompressor(compression_params=packing)
         self._schemas: dict[str, Schema] = {}
