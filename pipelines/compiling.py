@@ -86,12 +86,14 @@ class _Compilers:
     """Processes that compile the rows of a list, each its share.
 
     They are started by their own command, and not by `multiprocessing`, which would run the script
-    of somebody who calls `run_session` in it once more in each of them.
+    of somebody who calls `run_session` in it once more in each of them; and without the folder that
+    they are started in, which may hold another liex_lab, such as the one that this was installed
+    from.
     """
 
     def __init__(self, animal: str, shares: Sequence[Sequence[int]]) -> None:
         self._commands = [
-            [sys.executable, "-m", __name__, animal, *map(str, share)] for share in shares
+            [sys.executable, "-P", "-m", __name__, animal, *map(str, share)] for share in shares
         ]
         self._running: list[subprocess.Popen[str]] = []
 

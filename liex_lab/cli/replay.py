@@ -92,6 +92,7 @@ def _show(replay: Path, more: list[Path], at_s: float | None, web: bool) -> None
     shown = [str(file) for file in replays_with(replay, more)]
     command = [
         sys.executable,
+        "-P",  # nothing is taken from the folder that it is called in
         "-m",
         "rerun",
         *shown,

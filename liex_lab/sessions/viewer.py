@@ -154,8 +154,9 @@ def _free_port() -> int:
 
 
 def _begin(*arguments: str, stays: bool = False) -> subprocess.Popen[bytes]:
-    # RERUN_ANALYTICS: what a laboratory looks at is nobody else's business
-    command = [sys.executable, "-m", "rerun", *arguments, "--bind", "127.0.0.1"]
+    # RERUN_ANALYTICS: what a laboratory looks at is nobody else's business; -P: nothing is taken
+    # from the folder that it is called in
+    command = [sys.executable, "-P", "-m", "rerun", *arguments, "--bind", "127.0.0.1"]
     viewer = subprocess.Popen(
         command,
         env={**os.environ, "RERUN_ANALYTICS": "0"},

@@ -201,7 +201,7 @@ def read_alone(path: Path, n_repeats: int) -> dict[str, float]:
         LiexError: the process failed.
     """
     environment = os.environ | dict.fromkeys(_ONE_CORE, "1")
-    command = [sys.executable, "-c", _READ, str(path), str(n_repeats)]
+    command = [sys.executable, "-P", "-c", _READ, str(path), str(n_repeats)]
     ran = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     if ran.returncode:
         raise LiexError(

@@ -127,7 +127,7 @@ def _run(recording: Path, out: Path) -> tuple[float, float]:
     """
     began = time.perf_counter()
     ran = subprocess.run(
-        [sys.executable, "-c", _TIMED_RUN, str(recording), str(out)],
+        [sys.executable, "-P", "-c", _TIMED_RUN, str(recording), str(out)],
         capture_output=True,
         text=True,
         check=False,

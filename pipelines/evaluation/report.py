@@ -33,7 +33,7 @@ _COPIED = ("plan.toml", "session.rrd", "session.mcap")
 _MEASURE = """
 import json, resource, subprocess, sys, time
 began = time.perf_counter()
-command = [sys.executable, "-m", "liex_lab", "report", sys.argv[1]]
+command = [sys.executable, "-P", "-m", "liex_lab", "report", sys.argv[1]]
 code = subprocess.run(command, stdout=subprocess.DEVNULL).returncode
 unit = 1024.0 if sys.platform == "linux" else 1048576.0
 peak = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / unit
@@ -65,7 +65,7 @@ def evaluate_report(
         n_frames, seconds = repeat_session(Session.open(session, raw=True), folder, 60.0 * minutes)
         progress(0, None, "writing its report")
         ran = subprocess.run(
-            [sys.executable, "-c", _MEASURE, str(folder)],
+            [sys.executable, "-P", "-c", _MEASURE, str(folder)],
             capture_output=True,
             text=True,
             check=False,

@@ -375,7 +375,7 @@ def _memory(minutes: float, folder: Path) -> float:
     second.
     """
     done = subprocess.run(
-        [sys.executable, "-c", _WRITE_LONG, str(minutes), str(folder / f"long-{minutes:g}")],
+        [sys.executable, "-P", "-c", _WRITE_LONG, str(minutes), str(folder / f"long-{minutes:g}")],
         capture_output=True,
         text=True,
         check=True,

@@ -137,6 +137,18 @@ def test_processes_compile_and_tell_of_every_kernel() -> None:
     assert not compiling._Compilers("mouse", [[10_000]]).run(lambda: None)
 
 
+def test_they_compile_what_is_installed_wherever_they_are_started(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    other = tmp_path / "liex_lab"
+    other.mkdir()
+    (other / "__init__.py").write_text("raise SystemExit(3)  # the sources of another version")
+    monkeypatch.chdir(tmp_path)
+    told: list[None] = []
+    assert compiling._Compilers("mouse", [[0]]).run(lambda: told.append(None))
+    assert len(told) == 1
+
+
 def test_a_kernel_that_is_called_otherwise_now_is_left_to_the_run() -> None:
     compiling.compile_kernel({"kernel": "liex_lab.body._kernels:gone", "args": []})
     compiling.compile_kernel({"kernel": "liex_lab.no_such_module:gone", "args": []})
