@@ -14,7 +14,7 @@ import gzip
 import shutil
 import tarfile
 import zlib
-from collections.abc import Generator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from contextlib import closing, suppress
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
@@ -118,30 +118,22 @@ class _Patient:
 
     def seek(self, to: int) -> None:
         """Leave out what lies before a place further on."""
-        while self._at < to and (n := len(self._next(to - self._at))):
-            self._at += n
+        for _ in self._parts(to - self._at):
+            pass
         self._at = max(self._at, to)
 
     def read(self, n: int) -> bytes:
         """Exactly n bytes, zeros where the archive has broken off."""
-        parts = []
-        left = n
-        while left and (part := self._next(left)):
-            parts.append(bytes(part))
-            left -= len(part)
-        self._at += n
+        block = b"".join([bytes(part) for part in self._parts(n)])
+        missing = n - len(block)
+        self._at += missing
         if self._at - self.n_true > _ENOUGH_ZEROS:
             raise tarfile.ReadError("the archive ended long ago")
-        return b"".join([*parts, bytes(left)])
+        return block + bytes(missing)
 
     def copy(self, n: int, to: IO[bytes]) -> int:
         """Write the next n bytes into a file, as far as they are real; how many were."""
-        left = n
-        while left and (part := self._next(left)):
-            to.write(part)
-            left -= len(part)
-        self._at += n - left
-        return n - left
+        return sum(to.write(part) for part in self._parts(n))
 
     def finish(self) -> None:
         """Read to the end.
@@ -154,6 +146,13 @@ class _Patient:
     def close(self) -> None:
         """Unpack no more."""
         self._coming.close()
+
+    def _parts(self, n: int) -> Iterator[memoryview]:
+        """The next n bytes as far as they are real, each part until the next is asked for."""
+        while n > 0 and (part := self._next(n)):
+            self._at += len(part)
+            n -= len(part)
+            yield part
 
     def _next(self, most: int) -> memoryview:
         """The next real bytes, some, at most so many; none where there are no more.
