@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Any
 
 from liex_lab.catalog import MODELS
+from liex_lab.runtime.children import own_python
 from liex_lab.runtime.progress import COMPILING, Progress, silent
 
 from .workers import n_cores
@@ -86,15 +87,11 @@ class _Compilers:
     """Processes that compile the rows of a list, each its share.
 
     They are started by their own command, and not by `multiprocessing`, which would run the script
-    of somebody who calls `run_session` in it once more in each of them; and without the folder that
-    they are started in, which may hold another liex_lab, such as the one that this was installed
-    from.
+    of somebody who calls `run_session` in it once more in each of them.
     """
 
     def __init__(self, animal: str, shares: Sequence[Sequence[int]]) -> None:
-        self._commands = [
-            [sys.executable, "-P", "-m", __name__, animal, *map(str, share)] for share in shares
-        ]
+        self._commands = [own_python("-m", __name__, animal, *map(str, share)) for share in shares]
         self._running: list[subprocess.Popen[str]] = []
 
     def run(self, tell: Callable[[], None]) -> bool:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import socket
 import subprocess
-import sys
 import tempfile
 from contextlib import ExitStack
 from pathlib import Path
@@ -72,6 +71,7 @@ def _whole_depth(session: Path, scratch: Path, recording: str | None) -> list[Pa
 
 def _show(replay: Path, more: list[Path], at_s: float | None, web: bool) -> None:
     """Open a replay and wait until its viewer is closed."""
+    from liex_lab.runtime.children import own_python
     from liex_lab.sessions.viewer import replays_with, show_replay
 
     if at_s is not None:
@@ -90,16 +90,7 @@ def _show(replay: Path, more: list[Path], at_s: float | None, web: bool) -> None
         say(f"replay: http://{_HERE}:{page}?url={source}   (Ctrl+C ends it)")
         hosted = ["--web-viewer", "--web-viewer-port", str(page), "--port", str(data)]
     shown = [str(file) for file in replays_with(replay, more)]
-    command = [
-        sys.executable,
-        "-P",  # nothing is taken from the folder that it is called in
-        "-m",
-        "rerun",
-        *shown,
-        "--bind",
-        _HERE,
-        *hosted,
-    ]
+    command = own_python("-m", "rerun", *shown, "--bind", _HERE, *hosted)
     quiet = {"RUST_LOG": "warn"} if web else {}  # its own lines would hide the address
     around = {**quiet, **os.environ, "RERUN_ANALYTICS": "0"}
     raise typer.Exit(subprocess.run(command, env=around, check=False).returncode)

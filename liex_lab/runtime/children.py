@@ -1,11 +1,24 @@
-"""Processes of a pool that end with the process that started them, however that one ended."""
+"""Processes that this one starts: in what they find its modules, and that they end with it."""
 
 from __future__ import annotations
 
 import multiprocessing
 import os
 import signal
+import sys
 import threading
+
+
+def own_python(*arguments: str) -> list[str]:
+    """The command of another Python with the packages of this one.
+
+    It takes nothing from the folder that it is started in, which may hold another liex_lab, such as
+    the sources that this one was installed from, or anything that is called like a package.
+
+    Args:
+        *arguments: what it runs, as "-m" and a module, or "-c" and a program, and that one's own.
+    """
+    return [sys.executable, "-P", *arguments]
 
 
 def end_with_parent() -> None:

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from liex_lab.errors import LiexError
+from liex_lab.runtime.children import own_python
 
 _PATIENCE_S = 30.0  # for a viewer to come up
 
@@ -154,9 +155,8 @@ def _free_port() -> int:
 
 
 def _begin(*arguments: str, stays: bool = False) -> subprocess.Popen[bytes]:
-    # RERUN_ANALYTICS: what a laboratory looks at is nobody else's business; -P: nothing is taken
-    # from the folder that it is called in
-    command = [sys.executable, "-P", "-m", "rerun", *arguments, "--bind", "127.0.0.1"]
+    # RERUN_ANALYTICS: what a laboratory looks at is nobody else's business
+    command = own_python("-m", "rerun", *arguments, "--bind", "127.0.0.1")
     viewer = subprocess.Popen(
         command,
         env={**os.environ, "RERUN_ANALYTICS": "0"},

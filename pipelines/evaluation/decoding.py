@@ -28,6 +28,7 @@ from liex_lab.optics.camera import Camera
 from liex_lab.recordings.formats.messages.mcap_writer import McapDepthWriter
 from liex_lab.recordings.frame import Depth, DepthFrame
 from liex_lab.recordings.writer import OniRecordingWriter, PictureFolderWriter, RecordingWriter
+from liex_lab.runtime.children import own_python
 from liex_lab.runtime.progress import Progress, silent
 
 _N_FRAMES = 150
@@ -201,7 +202,7 @@ def read_alone(path: Path, n_repeats: int) -> dict[str, float]:
         LiexError: the process failed.
     """
     environment = os.environ | dict.fromkeys(_ONE_CORE, "1")
-    command = [sys.executable, "-P", "-c", _READ, str(path), str(n_repeats)]
+    command = own_python("-c", _READ, str(path), str(n_repeats))
     ran = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     if ran.returncode:
         raise LiexError(

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import shutil
 import subprocess
-import sys
 import tarfile
 import time
 from collections.abc import Callable
@@ -18,6 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from liex_lab.errors import LiexError
+from liex_lab.runtime.children import own_python
 from liex_lab.runtime.progress import Progress, silent
 
 from ..convert import convert
@@ -127,7 +127,7 @@ def _run(recording: Path, out: Path) -> tuple[float, float]:
     """
     began = time.perf_counter()
     ran = subprocess.run(
-        [sys.executable, "-P", "-c", _TIMED_RUN, str(recording), str(out)],
+        own_python("-c", _TIMED_RUN, str(recording), str(out)),
         capture_output=True,
         text=True,
         check=False,

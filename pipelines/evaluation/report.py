@@ -10,7 +10,6 @@ from __future__ import annotations
 import json
 import shutil
 import subprocess
-import sys
 import tempfile
 from dataclasses import fields
 from pathlib import Path
@@ -19,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from liex_lab.errors import SessionError
+from liex_lab.runtime.children import own_python
 from liex_lab.runtime.progress import Progress, silent
 
 if TYPE_CHECKING:
@@ -32,8 +32,9 @@ _COPIED = ("plan.toml", "session.rrd", "session.mcap")
 # them together
 _MEASURE = """
 import json, resource, subprocess, sys, time
+from liex_lab.runtime.children import own_python
 began = time.perf_counter()
-command = [sys.executable, "-P", "-m", "liex_lab", "report", sys.argv[1]]
+command = own_python("-m", "liex_lab", "report", sys.argv[1])
 code = subprocess.run(command, stdout=subprocess.DEVNULL).returncode
 unit = 1024.0 if sys.platform == "linux" else 1048576.0
 peak = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / unit
@@ -65,7 +66,7 @@ def evaluate_report(
         n_frames, seconds = repeat_session(Session.open(session, raw=True), folder, 60.0 * minutes)
         progress(0, None, "writing its report")
         ran = subprocess.run(
-            [sys.executable, "-P", "-c", _MEASURE, str(folder)],
+            own_python("-c", _MEASURE, str(folder)),
             capture_output=True,
             text=True,
             check=False,

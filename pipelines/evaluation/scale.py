@@ -16,7 +16,6 @@ import json
 import os
 import shutil
 import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -28,6 +27,7 @@ import numpy as np
 
 from liex_lab.plan import Plan
 from liex_lab.plan.study import Study
+from liex_lab.runtime.children import own_python
 from liex_lab.runtime.progress import Progress, silent
 
 from ..build import build_recording, build_tracker, kept_estimator
@@ -375,7 +375,7 @@ def _memory(minutes: float, folder: Path) -> float:
     second.
     """
     done = subprocess.run(
-        [sys.executable, "-P", "-c", _WRITE_LONG, str(minutes), str(folder / f"long-{minutes:g}")],
+        own_python("-c", _WRITE_LONG, str(minutes), str(folder / f"long-{minutes:g}")),
         capture_output=True,
         text=True,
         check=True,
