@@ -9,7 +9,7 @@ made of all frames at once.
 from __future__ import annotations
 
 import time
-from collections.abc import Generator, Mapping, Sequence
+from collections.abc import Generator, Iterable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
@@ -37,6 +37,7 @@ from .build import (
 from .choice import USUAL, Fitted, fit_plan
 from .compiling import compile_ahead
 from .hashing import hashed_ahead
+from .observing import observed
 from .origin import build_provenance, build_surroundings, session_bytes
 from .regions import pinned
 from .shards import CHUNK, LENGTH, MEASURING, Shard, measure_shards
@@ -134,9 +135,7 @@ def measure_session(
         ) as writer:
             writer.go_on(lambda row: prepared.recording.frame(row).depth)
             with closing(read_ahead(prepared.recording, writer.n_frames)) as chunks:
-                for frames in chunks:
-                    prepared.measure(frames, writer)
-                    progress(frames[-1].index + 1, len(opened), MEASURING)
+                prepared.measure_all(chunks, writer, progress)
             session = prepared.finish(writer, recording, notes)
     return session.path
 
@@ -192,6 +191,24 @@ class Prepared:
         seen = self.fitted.tracker.observe(frames)
         self.timings["track"] += time.perf_counter() - began
         writer.add(frames, seen=seen)
+
+    def measure_all(
+        self, stretches: Iterable[list[DepthFrame]], writer: SessionWriter, progress: Progress
+    ) -> None:
+        """Measure consecutive stretches of frames, some at once, and hand them to the writer.
+
+        Args:
+            stretches: as this recording shows them.
+            writer: of the session.
+            progress: told frame by frame.
+        """
+        with closing(observed(self.fitted.tracker, stretches)) as coming:
+            began = time.perf_counter()
+            for frames, seen in coming:
+                self.timings["track"] += time.perf_counter() - began
+                writer.add(frames, seen=seen)
+                progress(frames[-1].index + 1, len(self.recording), MEASURING)
+                began = time.perf_counter()
 
     def measure_by(self, pool: WorkerPool, recording: str | Path, progress: Progress) -> None:
         """Let workers measure the shards of a long recording (more than two shards).

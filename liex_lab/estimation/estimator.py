@@ -97,11 +97,11 @@ class Detection:
     positions: Array
     scores: Array
 
-    def __getitem__(self, index: NDArray[np.int64] | NDArray[np.bool_]) -> Detection:
+    def __getitem__(self, index: NDArray[np.int64] | NDArray[np.bool_] | slice) -> Detection:
         """Some of the frames.
 
         Args:
-            index: (m,) row numbers, or (n,) bool.
+            index: (m,) row numbers, (n,) bool, or a slice, which copies nothing.
         """
         return Detection(
             self.crops[index],
@@ -458,13 +458,16 @@ class PoseEstimator:
         """
         camera_view = self.model.method.camera_view
         crops, others = scene.extract_both(depths, size, parallel, camera_view)
-        first = self._sighted(crops, scene.crop_cameras(crops, camera_view), size, parallel)
-        second = first.nothing()
-        turned = np.zeros(len(depths), np.bool_)
+        n = len(depths)
         unsure = np.flatnonzero(crops.n_blobs > 1)
+        # in one go, as a call costs as much as a frame
+        seen = HeightMaps.join([crops, others[unsure]]) if len(unsure) else crops
+        both = self._sighted(seen, scene.crop_cameras(seen, camera_view), size, parallel)
+        first = both[:n] if len(unsure) else both
+        second = first.nothing()
+        turned = np.zeros(n, np.bool_)
         if len(unsure):
-            others = others[unsure]
-            other = self._sighted(others, scene.crop_cameras(others, camera_view), size, parallel)
+            other = both[n:]
             better = self._is_animal(depths[unsure], scene, size, first[unsure], other)
             second.put(unsure, other)
             rows = unsure[better]

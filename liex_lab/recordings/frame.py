@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 Depth = NDArray[np.float32]
 
 _FEW = 16  # one row and column of so many
-_MOST_ROOMS = 4  # that are kept: being filled, waiting, looked at, written
+_MOST_ROOMS = 6  # that are kept: being filled, waiting, looked at (two at once), written
 
 
 @dataclass(frozen=True)

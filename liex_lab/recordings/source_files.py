@@ -10,7 +10,7 @@ from liex_lab.runtime.progress import Progress, silent
 
 Stamp = list[list[str | int]]
 
-_BLOCK = 1 << 20
+_BLOCK = 1 << 24  # bytes read at once: after each, other threads may hold Python's lock for a while
 _GONE = -1  # size of a file that is not there
 
 
@@ -121,7 +121,7 @@ def file_digest(files: Iterable[Path], progress: Progress = silent) -> str:
     whole = hashlib.sha256()
     done = 0
     room = memoryview(bytearray(_BLOCK))  # new memory for each block takes as long as reading it
-    total = sum(sizes) // _BLOCK + 1
+    total = (sum(sizes) >> 20) + 1
     for path, size in zip(ordered, sizes, strict=True):
         if len(ordered) > 1:
             whole.update(f"{path.name}\0{size}\0".encode())
@@ -129,7 +129,7 @@ def file_digest(files: Iterable[Path], progress: Progress = silent) -> str:
             while n := file.readinto(room):
                 whole.update(room[:n])
                 done += n
-                progress(done // _BLOCK, total, "reading the recording's hash (MB)")
+                progress(done >> 20, total, "reading the recording's hash (MB)")
     return whole.hexdigest()
 
 

@@ -14,7 +14,7 @@ import os
 from collections.abc import Sequence
 from itertools import zip_longest
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from foxglove import messages
@@ -35,10 +35,7 @@ Array = NDArray[np.float64]
 
 _SECOND = 10**9
 _BLOCK = 8192  # frames of a track that are in memory
-# level, bytes of the chunks, and of repetitions far back: whole pictures, one to a chunk; and those
-# that are alike but for a cut-out, in which short repetitions end where the still scene would go on
-_WHOLE = (3, 128 * 1024, 0)
-_ALIKE = (1, 32 * 1024 * 1024, 256)
+_DATA = b"\x32"  # tag of the field of RawImage that holds the pixels: number 6, bytes
 _ACTION_SCHEMA: dict[str, Any] = {
     "title": "liex_lab.ActionState",
     "description": "The action that begins now; an empty word ends the last one.",
@@ -64,6 +61,36 @@ _BONE = messages.Color(r=1.0, g=1.0, b=1.0, a=1.0)
 _JOINT = messages.Color(r=1.0, g=0.31, b=0.24, a=1.0)
 
 
+class _Packing(NamedTuple):
+    """How pictures are packed.
+
+    Attributes:
+        level: of Zstandard.
+        chunk_size: bytes packed together.
+        repetition: bytes of what is looked for far back, see `McapFile`.
+        window: bytes in which that is looked for.
+    """
+
+    level: int
+    chunk_size: int
+    repetition: int
+    window: int
+
+
+def _packing_of(origin: Provenance) -> _Packing:
+    """Whole pictures one to a chunk; or those that are alike but for a cut-out.
+
+    The still scene of these is in the picture before, and short repetitions would end where it goes
+    on.
+    """
+    if origin.background is None:
+        return _Packing(level=3, chunk_size=128 * 1024, repetition=0, window=1 << 23)
+    picture = 2 * origin.camera.width * origin.camera.height
+    return _Packing(
+        level=1, chunk_size=32 * 1024 * 1024, repetition=256, window=2 * picture + picture // 2
+    )
+
+
 class McapWriter:
     """Writer of `session.mcap`.
 
@@ -87,7 +114,7 @@ class McapWriter:
                 takes what suits the pictures that are kept.
             chunk_size: bytes packed at once; None as well.
         """
-        usual = _WHOLE if origin.background is None else _ALIKE
+        usual = _packing_of(origin)
         self._origin = origin
         self._dot_m = dot_mm(origin.skeleton) / 1000.0
         self._file = _WatchedFile(path)
@@ -95,9 +122,10 @@ class McapWriter:
             self._file,
             profile="liex_lab",
             library=f"liex_lab {package_version('liex_lab')}",
-            level=usual[0] if level is None else level,
-            chunk_size=usual[1] if chunk_size is None else chunk_size,
-            repetition=usual[2],
+            level=usual.level if level is None else level,
+            chunk_size=usual.chunk_size if chunk_size is None else chunk_size,
+            repetition=usual.repetition,
+            window=usual.window,
         )
         self._depth = self._topic("/camera/depth", messages.RawImage)
         self._calibration = self._topic("/camera/calibration", messages.CameraCalibration)
@@ -126,17 +154,7 @@ class McapWriter:
                 self._log_camera(int(time_ns))
             if image is None:
                 continue
-            height, width = image.shape
-            message = messages.RawImage(
-                timestamp=_stamp(time_ns),
-                frame_id="camera",
-                encoding="16UC1",
-                width=width,
-                height=height,
-                step=2 * width,
-                data=image.astype("<u2", copy=False).tobytes(),
-            )
-            self._depth.log(message, log_time=int(time_ns))
+            self._depth.log_parts(_picture(time_ns, image), log_time=int(time_ns))
         self._file.check()
 
     def finish(
@@ -285,7 +303,7 @@ class McapWriter:
                 "index": list(words).index(action) if action else -1,
                 "frame_index": int(rows.frame_index[row]),
             }
-            self._writer.log("/actions", _ACTIONS, json.dumps(state).encode(), first + at)
+            self._writer.log("/actions", _ACTIONS, [json.dumps(state).encode()], first + at)
 
     def _log_notes(self, time_ns: int, problems: Sequence[str]) -> None:
         for problem in problems:
@@ -309,7 +327,11 @@ class _Topic:
 
     def log(self, message: Any, log_time: int) -> None:
         """Write a message at a time in ns."""
-        self._file.log(self._name, self._schema, message.encode(), log_time)
+        self.log_parts([message.encode()], log_time)
+
+    def log_parts(self, parts: Sequence[bytes | memoryview], log_time: int) -> None:
+        """Write a message that is encoded already, in its parts, at a time in ns."""
+        self._file.log(self._name, self._schema, parts, log_time)
 
 
 class _WatchedFile:
@@ -388,6 +410,34 @@ def _transform(
 
 def _quaternion(transform: SE3) -> Array:
     return so3.quaternion(transform.rotation)
+
+
+def _picture(time_ns: int | np.int64, image: NDArray[np.uint16]) -> list[bytes | memoryview]:
+    """A depth picture as a `RawImage`, in parts: the pixels are not copied into it.
+
+    Protobuf's fields follow each other by their numbers, and only that of the frame comes after the
+    pixels.
+    """
+    height, width = image.shape
+    pixels = np.ascontiguousarray(image, "<u2")
+    before = messages.RawImage(
+        timestamp=_stamp(time_ns), encoding="16UC1", width=width, height=height, step=2 * width
+    )
+    after = messages.RawImage(frame_id="camera")
+    return [
+        before.encode() + _DATA + _varint(pixels.nbytes),
+        pixels.reshape(-1).view(np.uint8).data,
+        after.encode(),
+    ]
+
+
+def _varint(number: int) -> bytes:
+    """A number as Protobuf writes lengths: seven bits a byte, the lowest first."""
+    out = bytearray()
+    while number > 127:
+        out.append(number & 127 | 128)
+        number >>= 7
+    return bytes([*out, number])
 
 
 def _stamp(time_ns: int | np.int64) -> Any:

@@ -34,7 +34,7 @@ from mcap.records import (
 
 from liex_lab.recordings.formats.messages.mcap import MAGIC, MESSAGE, RECORD
 
-_WINDOW = 23  # log2 of the bytes in which a repetition is found: some ten pictures of 640 x 480
+_WINDOW = 1 << 23
 
 
 class Sink(Protocol):
@@ -73,7 +73,7 @@ class _Chunk:
         self.first_ns = 0
         self.last_ns = 0
 
-    def put(self, data: bytes) -> None:
+    def put(self, data: bytes | memoryview) -> None:
         """Append bytes."""
         self._packed.append(self._packing.compress(data))
         self._checksum = isal_zlib.crc32(data, self._checksum)
@@ -113,6 +113,7 @@ class McapFile:
         level: int,
         chunk_size: int,
         repetition: int = 0,
+        window: int = _WINDOW,
     ) -> None:
         """Write the file's beginning.
 
@@ -124,12 +125,17 @@ class McapFile:
             chunk_size: bytes of messages that are packed at once.
             repetition: bytes that are at least the same where something far back is looked for; 0
                 for Zstandard's usual 64.
+            window: bytes that it is looked for in, rounded up to a power of two; what is more than
+                the processor's cache holds costs time.
         """
         self._sink = sink
         self._at = 0
         self._chunk_size = chunk_size
         packing = zstandard.ZstdCompressionParameters.from_level(
-            level, enable_ldm=True, window_log=_WINDOW, ldm_min_match=repetition
+            level,
+            enable_ldm=True,
+            window_log=(window - 1).bit_length(),
+            ldm_min_match=repetition,
         )
         self._packer = zstandard.ZstdCompressor(compression_params=packing)
         self._schemas: dict[str, Schema] = {}
@@ -140,13 +146,15 @@ class McapFile:
         self._write(MAGIC)
         self._write(_bytes_of(Header(profile, library)))
 
-    def log(self, topic: str, schema: SchemaOf, data: bytes, time_ns: int) -> None:
+    def log(
+        self, topic: str, schema: SchemaOf, data: Sequence[bytes | memoryview], time_ns: int
+    ) -> None:
         """Add a message.
 
         Args:
             topic: its topic, which has one schema.
             schema: of the topic.
-            data: the message, encoded.
+            data: the message, encoded, in one part or more.
             time_ns: when it was logged and published, ns.
         """
         channel = self._channels.get(topic) or self._channel(topic, schema)
@@ -154,9 +162,10 @@ class McapFile:
         chunk = self._open
         chunk.note(channel.id, time_ns)
         number = self._counts[channel.id]
-        head = RECORD.pack(Opcode.MESSAGE, MESSAGE.size + len(data))
+        head = RECORD.pack(Opcode.MESSAGE, MESSAGE.size + sum(map(len, data)))
         chunk.put(head + MESSAGE.pack(channel.id, number, time_ns, time_ns))
-        chunk.put(data)
+        for part in data:
+            chunk.put(part)
         if chunk.size > self._chunk_size:
             self.flush()
 

@@ -14,11 +14,13 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from liex_lab.body.pose import Pose
 from liex_lab.body.surface import Surface
 from liex_lab.errors import EstimationError
 from liex_lab.estimation.estimator import Estimates, PoseEstimator
 from liex_lab.estimation.session_shape import ShapePrior
 from liex_lab.foreground.background_segmenter import BackgroundSubtraction
+from liex_lab.foreground.height_maps import HeightMaps
 from liex_lab.foreground.segmenter import Segmenter
 from liex_lab.recordings.frame import DepthFrame, has_readings, stacked
 from liex_lab.runtime.memory import Allocator
@@ -209,8 +211,10 @@ class FrameTracker:
         ):  # kernels share frames out: of one, the other cores would only wait
             hypotheses = self.estimator.hypotheses(depths, self.scene, self.size)
             cleared = self.scene.cleared(depths)
-            for h, estimates in enumerate(hypotheses):
-                self._put(seen, h, estimates, depths, cleared)
+            poses = [
+                self._put(seen, h, estimates, depths) for h, estimates in enumerate(hypotheses)
+            ]
+            self._put_agreement(seen, hypotheses, poses, cleared)
         return seen
 
     def follow(self, frames: Sequence[DepthFrame]) -> Track:
@@ -251,18 +255,15 @@ class FrameTracker:
         return track_whole(self.subject, seen, corrections, allocate=allocate)
 
     def _put(
-        self,
-        seen: Observations,
-        h: int,
-        estimates: Estimates,
-        depths: NDArray[np.float32],
-        cleared: NDArray[np.float32],
-    ) -> None:
-        """Put estimates in as hypothesis h, with their component's pixels and centroid; `cleared`
-        are the pictures without what the animal wears.
+        self, seen: Observations, h: int, estimates: Estimates, depths: NDArray[np.float32]
+    ) -> Pose:
+        """Put estimates in as hypothesis h, with their component's pixels and centroid; their poses
+        (n) in the arena frame.
         """
         found = np.flatnonzero(estimates.found)
         chosen = estimates.chosen
+        if not len(found):
+            return chosen.pose
         crops = estimates.crops
         in_camera = (
             chosen.pose
@@ -276,24 +277,46 @@ class FrameTracker:
         seen.error_mm[:, h] = chosen.error_mm
         seen.score[:, h] = chosen.score
         seen.n_px[found, h] = crops.n_px[found]
-        if not len(found):
-            return
         centre = self.scene.middles(crops[found], self.estimator.model.method.camera_view)
         seen.centroid_mm[found, h] = centre
         from_camera = self.scene.floor.T_arena_camera.inverse() @ centre
         seen.centroid_px[found, h] = self.scene.camera.project(from_camera)
+        return pose
+
+    def _put_agreement(
+        self,
+        seen: Observations,
+        hypotheses: Sequence[Estimates],
+        poses: Sequence[Pose],
+        cleared: NDArray[np.float32],
+    ) -> None:
+        """Put in how the best pose (n) of each component lies over the depth, arena frame.
+
+        `cleared` are the pictures without what the animal wears. All components are set against the
+        depth in one go, as a call costs as much as a frame.
+        """
+        rows = [np.flatnonzero(one.found) for one in hypotheses]
+        best = [h for h in range(0, len(hypotheses), 2) if len(rows[h])]
         columns = (seen.residual_mm, seen.covered, seen.beside, seen.part_mm)
-        if h % 2:  # the body turned round covers the same pixels, nearly
+        if best:
+            told = self.body.agreement(
+                Pose.join([poses[h][rows[h]] for h in best]),
+                HeightMaps.join([hypotheses[h].crops[rows[h]] for h in best]),
+                self.scene,
+            )
+            hypothesis = np.repeat(best, [len(rows[h]) for h in best])
+            frame = np.concatenate([rows[h] for h in best])
+            for column, values in zip(
+                columns, (told.residual_mm, told.covered, told.beside, told.part_mm), strict=True
+            ):
+                column[frame, hypothesis] = values
+        for h in best:
+            # of all frames, as those without it are thrown away for less than pictures are copied
+            behind = behind_something(hypotheses[h].crops, cleared)
+            seen.behind[rows[h], h] = behind[rows[h]]
+            # the body turned round covers the same pixels, nearly
             for column in (*columns, seen.behind):
-                column[found, h] = column[found, h - 1]
-            return
-        # of all frames, as those without it are thrown away for less than pictures are copied
-        seen.behind[found, h] = behind_something(crops, cleared)[found]
-        told = self.body.agreement(pose[found], crops[found], self.scene)
-        for column, values in zip(
-            columns, (told.residual_mm, told.covered, told.beside, told.part_mm), strict=True
-        ):
-            column[found, h] = values
+                column[rows[h + 1], h + 1] = column[rows[h + 1], h]
 
 
 def _whole(

@@ -66,4 +66,4 @@ def test_rooms_that_somebody_holds_are_not_kept_for_ever() -> None:
     rooms = FrameRooms()
     held = [rooms.filled(FRAMES, 6) for _ in range(9)]
     assert len({frames[0].depth.ctypes.data for frames in held}) == 9
-    assert len(rooms._rooms) == 4
+    assert len(rooms._rooms) == 6

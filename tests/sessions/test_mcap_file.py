@@ -29,6 +29,11 @@ def said(n: int = 60) -> Said:
     return told
 
 
+def parts(data: bytes) -> list[bytes | memoryview]:
+    """A message in two parts, either of which may be empty."""
+    return [data[:70], memoryview(data)[70:]]
+
+
 def written(told: Said, chunk_size: int = 4_000, level: int = 1, flush_at: int = -1) -> io.BytesIO:
     sink = io.BytesIO()
     file = McapFile(sink, profile="p", library="l", level=level, chunk_size=chunk_size)
@@ -36,7 +41,7 @@ def written(told: Said, chunk_size: int = 4_000, level: int = 1, flush_at: int =
         if k == flush_at:
             file.flush()
             file.flush()  # what does not wait is not written
-        file.log(topic, ONE if topic == "/a" else OTHER, data, time_ns)
+        file.log(topic, ONE if topic == "/a" else OTHER, parts(data), time_ns)
     file.close()
     sink.seek(0)
     return sink
@@ -80,10 +85,10 @@ def test_a_file_that_ends_after_a_flush_holds_what_was_written_before() -> None:
     whole = io.BytesIO()
     file = McapFile(whole, profile="p", library="l", level=1, chunk_size=10**9)
     for topic, time_ns, data in told[:25]:
-        file.log(topic, ONE if topic == "/a" else OTHER, data, time_ns)
+        file.log(topic, ONE if topic == "/a" else OTHER, parts(data), time_ns)
     file.flush()
     for topic, time_ns, data in told[25:]:
-        file.log(topic, ONE if topic == "/a" else OTHER, data, time_ns)
+        file.log(topic, ONE if topic == "/a" else OTHER, parts(data), time_ns)
     cut = io.BytesIO(whole.getvalue())
     found = []
     with suppress(McapError, EOFError):  # it has no end

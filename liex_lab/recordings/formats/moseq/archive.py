@@ -23,6 +23,7 @@ from typing import IO
 from isal import igzip_threaded, isal_zlib
 
 from liex_lab.errors import RecordingError
+from liex_lab.runtime.disk import write_through
 from liex_lab.runtime.progress import Progress
 
 _PACKED = 1 << 18  # bytes read at once
@@ -133,7 +134,7 @@ class _Patient:
 
     def copy(self, n: int, to: IO[bytes]) -> int:
         """Write the next n bytes into a file, as far as they are real; how many were."""
-        return sum(to.write(part) for part in self._parts(n))
+        return write_through(self._parts(n), to)
 
     def finish(self) -> None:
         """Read to the end.

@@ -42,6 +42,7 @@ from liex_lab.recordings.timestamps import (
     match_counts,
     median_step,
 )
+from liex_lab.runtime.disk import STRETCH, let_go
 from liex_lab.runtime.progress import Progress, silent
 from liex_lab.runtime.scratch import Scratch
 
@@ -76,6 +77,7 @@ class RawFrames:
         n: how many whole frames there are.
         truncated: True where the file ends in the middle of a frame, or its archive is cut.
         problems: sentences about the file.
+        once: True of a file that was unpacked for this, and is read from front to back.
     """
 
     path: Path
@@ -85,10 +87,12 @@ class RawFrames:
     n: int
     truncated: bool
     problems: list[str] = field(default_factory=list)
+    once: bool = False
 
     def __post_init__(self) -> None:
         self._file = self.path.open("rb")
         self._lock = Lock()
+        self._kept_from = 0  # what lies before may have been given up
 
     def __len__(self) -> int:
         return self.n
@@ -114,11 +118,20 @@ class RawFrames:
         with self._lock:
             self._file.seek(index * n_bytes)
             raw = self._file.read(n_bytes)
+            if self.once:
+                self._go_by((index + 1) * n_bytes)
         if len(raw) < n_bytes:
             raise RecordingError(
                 f"{self.path} became shorter while it was read; frame {index} is no longer there"
             )
         return np.frombuffer(raw, self.dtype).reshape(self.height, self.width)
+
+    def _go_by(self, end: int) -> None:
+        """Keep no more than a stretch of what was read up to there in the system's memory."""
+        if 0 <= end - self._kept_from < STRETCH:
+            return
+        let_go(self._file, min(self._kept_from, end), end)
+        self._kept_from = end
 
     def label(self, index: int) -> str:
         """Name of a frame, for a sentence.
@@ -243,7 +256,7 @@ class _Session:
         Returns:
             The recording.
         """
-        stack, track = self._open_depth()
+        stack, track = self._open_depth(once=scratch is not None)
 
         def close() -> None:
             stack.close()
@@ -257,9 +270,9 @@ class _Session:
             stack.close()
             raise
 
-    def _open_depth(self) -> tuple[Stack, DepthTrack | None]:
+    def _open_depth(self, once: bool) -> tuple[Stack, DepthTrack | None]:
         if self.depth.suffix.lower() == ".dat":
-            return self._open_raw(), None
+            return self._open_raw(once), None
         from liex_lab.recordings.formats.video.video import open_video
 
         video = open_video(self.depth, self.progress)
@@ -274,7 +287,7 @@ class _Session:
             )
         return video, video.track
 
-    def _open_raw(self) -> RawFrames:
+    def _open_raw(self, once: bool) -> RawFrames:
         n_bytes = self.depth.stat().st_size
         width, height = self.metadata.size or self._size_of_camera() or self._guess_size(n_bytes)
         n, left_over = divmod(n_bytes, 2 * width * height)
@@ -292,7 +305,13 @@ class _Session:
             )
             self.problems.append(f"{DEPTH} {where}; its {n} whole frames can be read")
         return RawFrames(
-            self.depth, width, height, self.metadata.dtype, n, bool(left_over) or self.cut
+            self.depth,
+            width,
+            height,
+            self.metadata.dtype,
+            n,
+            bool(left_over) or self.cut,
+            once=once,
         )
 
     def _size_of_camera(self) -> tuple[int, int] | None:
