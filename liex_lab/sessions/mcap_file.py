@@ -35,6 +35,7 @@ from mcap.records import (
 from liex_lab.recordings.formats.messages.mcap import MAGIC, MESSAGE, RECORD
 
 _WINDOW = 1 << 23
+_LEAST, _MOST = 10, 27  # log2 of the windows that every reader of Zstandard takes
 
 
 class Sink(Protocol):
@@ -125,8 +126,8 @@ class McapFile:
             chunk_size: bytes of messages that are packed at once.
             repetition: bytes that are at least the same where something far back is looked for; 0
                 for Zstandard's usual 64.
-            window: bytes that it is looked for in, rounded up to a power of two; what is more than
-                the processor's cache holds costs time.
+            window: bytes that it is looked for in, rounded up to a power of two, 1 kB to 128 MB;
+                what is more than the processor's cache holds costs time.
         """
         self._sink = sink
         self._at = 0
@@ -134,7 +135,7 @@ class McapFile:
         packing = zstandard.ZstdCompressionParameters.from_level(
             level,
             enable_ldm=True,
-            window_log=(window - 1).bit_length(),
+            window_log=min(max(_LEAST, (window - 1).bit_length()), _MOST),
             ldm_min_match=repetition,
         )
         self._packer = zstandard.ZstdCompressor(compression_params=packing)

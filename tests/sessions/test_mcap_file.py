@@ -71,6 +71,18 @@ def test_every_message_comes_back_by_the_index_in_the_order_of_time(
     }
 
 
+@pytest.mark.parametrize("window", [1, 40, 1 << 20, 1 << 33])
+def test_pictures_of_any_size_have_a_window_that_readers_take(window: int) -> None:
+    sink = io.BytesIO()
+    file = McapFile(sink, profile="p", library="l", level=1, chunk_size=4_000, window=window)
+    for _, time_ns, data in said():
+        file.log("/a", ONE, parts(data), time_ns)
+    file.close()
+    sink.seek(0)
+    found = [message.data for _, _, message in make_reader(sink).iter_messages()]
+    assert sorted(found) == sorted(data for _, _, data in said())
+
+
 def test_records_follow_each_other_as_the_format_says_and_checksums_hold() -> None:
     sink = written(said())
     names = [type(one).__name__ for one in StreamReader(sink, validate_crcs=True).records]
