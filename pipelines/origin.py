@@ -50,7 +50,7 @@ def build_provenance(
         arena=arena,
         zones=zones,
         scene=build_described_scene(tracker.scene, arena),
-        background=build_background(recording, plan),
+        background=build_background(recording, plan, tracker.scene),
     )
 
 
@@ -74,16 +74,23 @@ def animal_facts(plan: Plan, tracker: FrameTracker) -> dict[str, Any]:
     }
 
 
-def build_background(recording: Recording, plan: Plan) -> NDArray[np.uint16] | None:
+def build_background(
+    recording: Recording, plan: Plan, segmenter: Segmenter
+) -> NDArray[np.uint16] | None:
     """The still scene (H, W) mm before which the replay shows cut-outs; None where it shows none.
 
     Args:
         recording: an open recording.
         plan: its section `replay`.
+        segmenter: the learned segmentation, which tells an animal at rest from the scene.
     """
+    from liex_lab.foreground.background_segmenter import BackgroundSubtraction
     from liex_lab.sessions.cutouts import ANIMAL, ARENA, still_scene
 
-    return still_scene(recording) if plan.replay.depth in (ANIMAL, ARENA) else None
+    if plan.replay.depth not in (ANIMAL, ARENA):
+        return None
+    known = segmenter if isinstance(segmenter, BackgroundSubtraction) else None
+    return still_scene(recording, known)
 
 
 def build_described_scene(segmenter: Segmenter, arena: Arena) -> Scene | None:

@@ -1,11 +1,12 @@
 """Cut-outs: what a session keeps of every depth picture, and the still scene that stands behind it.
 
 The scene's background is the farthest depth that keeps coming back in each pixel (see
-`foreground.background`). Of a frame, the boxes around the two likeliest things are kept as they
-were read, unread pixels as 0; outside of them a kept picture shows the background. A frame in which
-nothing was found is kept whole, for people will want to know why. A box holds the joints
-of the thing's pose, projected, and a square of 1.4 square roots of its pixels about its centroid,
-with a margin of 15 % of the spine all around:
+`foreground.background`). An animal that hardly leaves its place would stand in it for good; the
+segmentation has learned what is behind it (see `foreground.resting`) and says so. Of a frame, the
+boxes around the two likeliest things are kept as they were read, unread pixels as 0; outside of
+them a kept picture shows the background. A frame in which nothing was found is kept whole, for
+people will want to know why. A box holds the joints of the thing's pose, projected, and a square
+of 1.4 square roots of its pixels about its centroid, with a margin of 15 % of the spine all around:
 
     box = hull(joints, centroid -+ 0.7 sqrt(n_px)) -+ (0.15 spine f / z + 4 px).
 
@@ -37,6 +38,7 @@ from liex_lab.sessions.reading import reading_from
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from liex_lab.foreground.still_scene import StillScene
     from liex_lab.recordings.recording import Recording
     from liex_lab.sessions.provenance import Provenance
     from liex_lab.sessions.session import Session
@@ -52,6 +54,7 @@ ALL = "all"
 NONE = "none"
 N_BOXES = 2  # things that a frame may hold
 _FRAMES = 16  # that show the background
+_LARGEST = 4.0  # usual areas of the animal; what is larger is no animal that rests
 _REACH = 0.7  # of the square root of a thing's pixels, to each side of its centroid
 _MARGIN = 0.15  # of the spine
 _MARGIN_PX = 4.0
@@ -59,11 +62,13 @@ _SIDES = (1.0, 1.15, 1.4)  # of windows, in lengths of the animal's box on the f
 N_WINDOWS = len(_SIDES) ** 2 + 1  # at most; the last is the whole picture
 
 
-def still_scene(recording: Recording) -> Depth:
+def still_scene(recording: Recording, known: StillScene | None = None) -> Depth:
     """The background of the whole picture, outside of any region too, from 16 frames.
 
     Args:
         recording: an open recording.
+        known: the segmentation's own scene, learned from more frames, which tells an animal that
+            rests; None where there is none, as of a hand.
 
     Returns:
         (H, W) uint16 mm, smoothed by a median of 3 x 3 pixels, 0 where nothing keeps coming back.
@@ -73,7 +78,40 @@ def still_scene(recording: Recording) -> Depth:
     from liex_lab.foreground.background import learn_background, sample_frames
 
     learned = to_millimetres(learn_background(sample_frames(recording, _FRAMES))[0])
-    return np.asarray(cv2.medianBlur(learned, 3), np.uint16)  # specks of 16 frames are no scene
+    # specks of 16 frames are no scene
+    smooth: Depth = np.asarray(cv2.medianBlur(learned, 3), np.uint16)
+    return smooth if known is None else _without_animals(smooth, known)
+
+
+def _without_animals(picture: Depth, known: StillScene) -> Depth:
+    """A picture in which what the segmentation would take for the animal is its background.
+
+    Things of more than four times the animal's usual area stay: where the bare plane is all that is
+    known of the floor, so does what always stands on it.
+
+    Args:
+        picture: (H, W) uint16 mm.
+        known: the segmentation's scene, of every so many-th of its pixels.
+    """
+    import cv2
+
+    step = known.stride
+    limit, background = (
+        np.repeat(np.repeat(values, step, axis=0), step, axis=1)[
+            : picture.shape[0], : picture.shape[1]
+        ]
+        for values in (known.limit, known.background)
+    )
+    stands = (picture > 0) & (picture < limit)
+    _, labels = cv2.connectedComponents(stands.astype(np.uint8))
+    areas = np.bincount(labels.ravel(), picture.ravel().astype(np.float64) ** 2)
+    rests = areas / (known.camera.fx * known.camera.fy) < _LARGEST * known.area_mm2
+    rests[0] = False  # what does not stand out
+    # its edge stands out by less than what counts as the animal
+    around = np.ones((2 * step + 3, 2 * step + 3), np.uint8)
+    own = cv2.dilate(rests[labels].astype(np.uint8), around).astype(bool)
+    behind = to_millimetres(background)
+    return np.where(own & (behind > picture), behind, picture)
 
 
 class PictureKeeper:
