@@ -233,13 +233,18 @@ def build_tracker(
         EstimationError: no floor or no animal is found in the sampled frames.
         PlanError: the file of zones or the model does not fit.
     """
+    from liex_lab.body.skeleton import Skeleton
     from liex_lab.tracking.tracker import FrameTracker
 
     build_zones(plan)  # a slip in their file is told before any work is done
-    estimator = estimator_of() if estimator_of else build_estimator(plan)
-    scene, sample = build_scene(
-        recording, plan, estimator.skeleton, plan.foreground.n_background_frames
-    )
+    n_frames = plan.foreground.n_background_frames
+    stated = Skeleton.load(plan.animal.skeleton)
+    try:  # while the model is read; a model that cannot be used is told first
+        scene, sample = build_scene(recording, plan, stated, n_frames)
+    finally:
+        estimator = estimator_of() if estimator_of else build_estimator(plan)
+    if estimator.skeleton.view != stated.view:  # a model of an older description of the animal
+        scene, sample = build_scene(recording, plan, estimator.skeleton, n_frames)
     shared = plan.animal.shared
     return FrameTracker.prepare(
         estimator,
