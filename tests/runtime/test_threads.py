@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import gc
+import sys
 import threading
+import time
 from collections.abc import Iterator
 
 import numba
 import pytest
 
-from liex_lab.runtime.threads import in_background, prefetch, side_by_side
+from liex_lab.runtime.threads import imported_ahead, in_background, prefetch, side_by_side
 
 
 def test_items_made_ahead_are_the_same_in_the_same_order() -> None:
@@ -78,3 +81,16 @@ def test_results_side_by_side_are_in_order_and_what_goes_wrong_is_raised(n_threa
             side_by_side(lambda number: 1 // number, [1, 0, 2])
     finally:
         numba.set_num_threads(before)
+
+
+def test_what_is_in_memory_is_left_alone_by_the_collector_while_a_block_has_its_modules() -> None:
+    assert gc.get_freeze_count() == 0
+    with imported_ahead("colorsys", "there_is_no_such_module"):
+        for _ in range(500):
+            if gc.get_freeze_count():
+                break
+            time.sleep(0.01)
+        assert gc.get_freeze_count() > 10_000
+        assert gc.isenabled(), "what is made from now on is collected as ever"
+        assert "colorsys" in sys.modules
+    assert gc.get_freeze_count() == 0

@@ -52,7 +52,7 @@ _CHUNK = struct.Struct(
 )  # first and last log time, unpacked size, its CRC, length of the packing's name
 _BLOCK = 1 << 20
 # chunks of so many bytes at most are unpacked before it is their turn
-_THREADS = 2
+THREADS = 2
 _SMALL_CHUNK = 1 << 23
 FACTS = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA)
 LARGEST_FACT = 1 << 24  # bytes of one of them
@@ -164,7 +164,7 @@ class McapFile(MessageFile):
             The messages.
         """
         self._learn_ending()
-        with ThreadPoolExecutor(_THREADS) as unpackers:
+        with ThreadPoolExecutor(THREADS) as unpackers:
             try:
                 yield from self._walk(wanted, progress, unpackers)
             finally:
@@ -205,7 +205,7 @@ class McapFile(MessageFile):
         where they are.
         """
         n = bisect_right(self.starts, at)
-        for later in self.starts[n : n + _THREADS]:
+        for later in self.starts[n : n + THREADS]:
             if later + RECORD.size + _CHUNK.size > self.size:
                 return
             opcode, start, end = self._record(later)

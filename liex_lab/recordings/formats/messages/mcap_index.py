@@ -1,18 +1,9 @@
-"""MCAP files opened by their index, without unpacking their chunks.
-
-`open_indexed` opens a recording. Record by record it is looked whether the file is whole and its
-index tells of every chunk and every message; of each picture only the beginning is unpacked, where
-the sensor's stamp is. Where anything is odd the file is walked as ever (`mcap`). A chunk is checked
-against its CRC-32 when a picture in it is read, and not before: that is for whoever refuses what is
-damaged (`open_recording(..., strict=True)`).
-"""
+"""The index of an MCAP file: its chunks, and the messages in them without unpacking."""
 
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator, Sequence
 from io import BytesIO
-from pathlib import Path
 
 import numpy as np
 from mcap.data_stream import ReadDataStream
@@ -21,35 +12,18 @@ from mcap.records import ChunkIndex
 from numpy.typing import NDArray
 
 from liex_lab.errors import RecordingError
-from liex_lab.optics.camera import Lens
-from liex_lab.recordings.formats.messages.depth_topics import open_topic
-from liex_lab.recordings.formats.messages.mcap import (
-    DAMAGE,
-    FACTS,
-    LARGEST_FACT,
-    MAGIC,
-    MESSAGE,
-    RECORD,
-    McapFile,
-    Wanted,
-    open_file,
-)
+from liex_lab.recordings.formats.messages.mcap import MESSAGE, RECORD, McapFile
 from liex_lab.recordings.formats.messages.message_file import (
     Channel,
     DamagedChunk,
-    Envelope,
     Listed,
     Place,
-    first_bytes,
 )
-from liex_lab.recordings.formats.messages.parsers import stamp_reader
-from liex_lab.recordings.recording import Recording
-from liex_lab.runtime.progress import Progress, silent
 
 _UNTOLD = -1  # the length of a message that only its chunk tells
 _LARGEST_INDEX = 1 << 26  # bytes of one
 LARGEST_OFFSET = 1 << 40
-_INDEX = struct.Struct("<HI")  # of a message index: channel, bytes of its entries
+INDEX = struct.Struct("<HI")  # of a message index: channel, bytes of its entries
 # of a chunk's index: first and last time, where it begins, its length, bytes of the places of its
 # message indexes; the channel and place of each; how long these are, bytes of the packing's name;
 # packed and unpacked bytes
@@ -58,34 +32,6 @@ _AT = struct.Struct("<HQ")
 _LENGTHS = struct.Struct("<QI")
 _SIZES = struct.Struct("<QQ")
 ENTRY = np.dtype([("time_ns", "<u8"), ("offset", "<u8")])
-_HEAD = 512  # bytes of a message's record in which its stamp is
-# of the unpacked bytes; where so much has to be unpacked for the stamps, threads unpack all of it
-_WORTH_IT = 0.6
-
-
-def open_indexed(
-    path: Path,
-    camera: Lens | None = None,
-    fps: float | None = None,
-    progress: Progress = silent,
-    topic: str | None = None,
-) -> Recording:
-    """Open one depth topic of an MCAP file by its index, or as `open_mcap` does where it has none.
-
-    Args:
-        path: the .mcap file.
-        camera: comes before whatever the files state.
-        fps: not needed, for every message has its time.
-        progress: told how far the file was looked through.
-        topic: name of the depth topic; None for the only one.
-
-    Returns:
-        The recording. Reading a frame of it raises a `RecordingError` where its chunk is damaged.
-
-    Raises:
-        RecordingError: the file is no MCAP file, or holds no depth that can be chosen.
-    """
-    return open_topic(_Skimmed(path, open_file(path)), "mcap", camera, topic, progress)
 
 
 class IndexedMcap(McapFile):
@@ -185,154 +131,6 @@ class IndexedMcap(McapFile):
         return self.file.read(end - start)
 
 
-class _Skimmed(IndexedMcap):
-    """An MCAP file that is whole as its index says; one about which that is not sure is walked."""
-
-    advice = (
-        "copy it again, or go on with what is whole by adding --set recording.accept_truncated=true"
-    )
-
-    def walk(self, wanted: Wanted, progress: Progress) -> Iterator[Envelope | Listed]:
-        """The messages of the wanted channels by chunk: the first of each channel with its data.
-
-        Args:
-            wanted: says of a channel whether its messages are of use.
-            progress: told how many MB were looked through.
-
-        Yields:
-            The messages.
-        """
-        self._learn_ending()
-        indexes = self._whole_by_index(progress)
-        if not indexes:
-            yield from super().walk(wanted, progress)
-            return
-        self.parsed = False
-        met = set[Channel]()
-        for index in indexes:
-            try:
-                yield from self._skim(index, wanted, met)
-            except (*DAMAGE, DamagedChunk):
-                self.whole = False
-
-    def _skim(
-        self, index: ChunkIndex, wanted: Wanted, met: set[Channel]
-    ) -> Iterator[Envelope | Listed]:
-        """The wanted messages of one chunk; of channels met before with nothing but the stamps."""
-        number = self.take_chunk(index)
-        for channel_id, at in index.message_index_offsets.items():
-            channel = self._by_id[channel_id]
-            if not wanted(channel):
-                continue
-            listed = self._listed(channel, at, number)
-            stamps = self._stamps(listed, channel_id) if channel in met else None
-            if stamps is not None:
-                yield Listed(channel, listed.log_time_ns, listed.places, stamps)
-                continue
-            for time_ns, numbers in zip(
-                listed.log_time_ns.tolist(), listed.places.tolist(), strict=True
-            ):
-                if wanted(channel):
-                    met.add(channel)
-                    place = Place(*numbers)
-                    yield Envelope(channel, time_ns, place, self._message(place))
-
-    def _stamps(self, listed: Listed, channel_id: int) -> NDArray[np.int64] | None:
-        """Stamps (n,) of messages of one chunk, ns; None where their beginnings do not tell."""
-        read = stamp_reader(listed.channel)
-        if read is None:
-            return None
-        found = []
-        number = int(listed.places[0, 0]) if len(listed.places) else 0
-        heads = self._heads(number, listed.places[:, 1].tolist())
-        for time_ns, head in zip(listed.log_time_ns.tolist(), heads, strict=True):
-            opcode, length = RECORD.unpack_from(head)
-            whose, _, logged_ns, _ = MESSAGE.unpack_from(head, RECORD.size)
-            if opcode != Opcode.MESSAGE or (whose, logged_ns) != (channel_id, time_ns):
-                raise DamagedChunk("there is another message than its index says")
-            stamp_ns = read(head[RECORD.size + MESSAGE.size : RECORD.size + length])
-            if stamp_ns is None:
-                return None
-            found.append(stamp_ns)
-        return np.array(found, np.int64)
-
-    def _heads(self, number: int, offsets: Sequence[int]) -> list[memoryview]:
-        """The first bytes of the records at these offsets of a chunk."""
-        if not offsets:
-            return []
-        chunk = self.believable(number)
-        if chunk.packing in ("", "none"):
-            if chunk.length != chunk.size:
-                raise DamagedChunk("its parts do not fit into it")
-            places = [(chunk.offset + at, chunk.offset + chunk.length) for at in offsets]
-            return [memoryview(self.between(at, min(at + _HEAD, end))) for at, end in places]
-        need = min(offsets[-1] + _HEAD, chunk.size)
-        data = memoryview(first_bytes(self.file, chunk, need))
-        return [data[at : at + _HEAD] for at in offsets]
-
-    def _whole_by_index(self, progress: Progress) -> list[ChunkIndex]:
-        """The indexes of all chunks of a file that is whole as they say; none where that is not
-        sure, or where unpacking all is no more work.
-        """
-        try:
-            indexes = self.indexes()
-            by_start = {index.chunk_start_offset: index for index in indexes}
-            if len(by_start) == len(indexes) and self._agrees(by_start, progress):
-                return indexes if self._is_worth_it(indexes) else []
-        except (*DAMAGE, DamagedChunk):
-            pass  # the walk says what it finds
-        return []
-
-    def _agrees(self, by_start: dict[int, ChunkIndex], progress: Progress) -> bool:
-        """Whether the file's records are those that its index tells of, from its beginning to its
-        end.
-        """
-        at, n_messages = len(MAGIC), 0
-        unseen = dict(by_start)
-        expected = set[int]()  # where the indexes of the messages in the last chunk are
-        while at + RECORD.size <= self.size:
-            opcode, start, end = self._record(at)
-            if opcode in (0, Opcode.MESSAGE) or end > self.size:
-                return False
-            if opcode == Opcode.MESSAGE_INDEX:
-                if at not in expected:
-                    return False
-                expected.remove(at)
-                n_messages += (end - start - _INDEX.size) // ENTRY.itemsize
-            elif expected:
-                return False
-            elif opcode == Opcode.CHUNK:
-                index = unseen.pop(at, None)
-                if index is None or index.chunk_length != end - at:
-                    return False
-                expected = set(index.message_index_offsets.values())
-            elif opcode in FACTS and end - start <= LARGEST_FACT:
-                self._learn(opcode, self._stream(start, end))
-            elif opcode == Opcode.FOOTER:
-                whole = end + len(MAGIC) <= self.size
-                known = {i for index in by_start.values() for i in index.message_index_offsets}
-                told = n_messages == self.n_messages and known <= set(self._by_id)
-                return whole and told and not unseen
-            at = end
-            progress(at >> 20, (self.size >> 20) + 1, "looking through the recording (MB)")
-        return False
-
-    def _is_worth_it(self, indexes: Sequence[ChunkIndex]) -> bool:
-        """Whether the stamps are in so few of the bytes that the rest need not be unpacked."""
-        size, needed = 1, 0
-        for index in indexes:
-            if index.compression in ("", "none"):
-                continue
-            size += index.uncompressed_size
-            last = 0
-            for at in index.message_index_offsets.values():
-                _, begin, stop = self._record(at)
-                offsets = self._message_index(begin, stop)["offset"]
-                last = max(last, int(offsets[-1]) + _HEAD if len(offsets) else 0)
-            needed += min(last, index.uncompressed_size)
-        return needed <= _WORTH_IT * size
-
-
 def entries(index: bytes) -> bytes:
     """The times and offsets of messages, as they are written.
 
@@ -342,10 +140,10 @@ def entries(index: bytes) -> bytes:
     Raises:
         struct.error, ValueError: they do not fit into it.
     """
-    _, length = _INDEX.unpack_from(index)
-    if length != len(index) - _INDEX.size or length % ENTRY.itemsize:
+    _, length = INDEX.unpack_from(index)
+    if length != len(index) - INDEX.size or length % ENTRY.itemsize:
         raise ValueError("an index does not fit into its record")
-    return index[_INDEX.size :]
+    return index[INDEX.size :]
 
 
 def listed_in(channel: Channel, number: int | NDArray[np.int64], table: NDArray[np.void]) -> Listed:
