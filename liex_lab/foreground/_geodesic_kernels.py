@@ -8,10 +8,13 @@ by the difference.
 
 Arrays that all kernels share: blocks (h, w) float32, the depth in mm of what is nearest in every
 block of BLOCK x BLOCK pixels, 0 for nothing within range; labels (h, w) int32, which surface a
-block belongs to, -1 none.
+block belongs to, -1 none. The blocks of one surface are also listed (`Surface`), for most of a
+picture is none.
 """
 
 from __future__ import annotations
+
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
@@ -40,6 +43,20 @@ END_RANK = 0
 END_ROW = 1
 END_COLUMN = 2
 END_DEPTH = 3
+
+
+class Surface(NamedTuple):
+    """The n blocks of a surface, row by row.
+
+    Attributes:
+        slot: its label.
+        cells: (n, 2) int32 row and column.
+        points: (n, 3) x, y, z mm of their centres, camera frame.
+    """
+
+    slot: Any
+    cells: Any
+    points: Any
 
 
 @njit(cache=True)
@@ -141,7 +158,50 @@ def label_surfaces(blocks, labels, focal2, least_mm2, areas):
 
 
 @njit(cache=True)
-def walk(blocks, labels, slot, position, order, hops):
+def list_surfaces(blocks, labels, n_surfaces, intrinsics):
+    """The blocks of all surfaces.
+
+    Args:
+        blocks: (h, w) float32 mm.
+        labels: (h, w) int32.
+        n_surfaces: surfaces that are labelled.
+        intrinsics: (4,) fx, fy, cx, cy px.
+
+    Returns:
+        A `Surface` of each.
+    """
+    starts = np.zeros(n_surfaces + 1, np.int64)
+    for i in range(labels.shape[0]):
+        for j in range(labels.shape[1]):
+            if labels[i, j] >= 0:
+                starts[labels[i, j] + 1] += 1
+    starts = np.cumsum(starts)
+    cells = np.empty((starts[-1], 2), np.int32)
+    points = np.empty((starts[-1], 3))
+    filled = starts.copy()
+    for i in range(labels.shape[0]):
+        for j in range(labels.shape[1]):
+            slot = labels[i, j]
+            if slot >= 0:
+                at = filled[slot]
+                filled[slot] += 1
+                cells[at, 0] = i
+                cells[at, 1] = j
+                points[at, 0], points[at, 1], points[at, 2] = point_of_block(
+                    blocks, i, j, intrinsics
+                )
+    return [
+        Surface(
+            slot,
+            cells[starts[slot] : starts[slot + 1]],
+            points[starts[slot] : starts[slot + 1]],
+        )
+        for slot in range(n_surfaces)
+    ]
+
+
+@njit(cache=True)
+def walk(blocks, labels, surface, position, order, hops):
     """All blocks of a surface by geodesic distance from where it leaves the picture.
 
     Breadth-first search in steps of one block. Of the border, only the farther part counts as the
@@ -151,7 +211,7 @@ def walk(blocks, labels, slot, position, order, hops):
     Args:
         blocks: (h, w) float32 mm.
         labels: (h, w) int32.
-        slot: the surface.
+        surface: the `Surface`.
         position: (h, w) int32, out: where in the order a block is; comes in as -1.
         order: (n_blocks, 2) int32, out: row and column of the blocks.
         hops: (n_blocks,) int32, out: their distances in blocks.
@@ -163,34 +223,35 @@ def walk(blocks, labels, slot, position, order, hops):
     deepest = np.float32(0.0)
     nearest = np.float32(1e9)
     far_border = np.float32(0.0)
-    far_i = -1
-    far_j = -1
+    farthest = 0
     last_i = labels.shape[0] - 1
     last_j = labels.shape[1] - 1
-    for i in range(last_i + 1):
-        for j in range(last_j + 1):
-            if labels[i, j] == slot:
-                nearest = min(nearest, blocks[i, j])
-                if blocks[i, j] > deepest:
-                    deepest = blocks[i, j]
-                    far_i = i
-                    far_j = j
-                if min(i, j, last_i - i, last_j - j) < _MARGIN:
-                    far_border = max(far_border, blocks[i, j])
+    cells = surface.cells
+    for k in range(len(cells)):
+        i = cells[k, 0]
+        j = cells[k, 1]
+        nearest = min(nearest, blocks[i, j])
+        if blocks[i, j] > deepest:
+            deepest = blocks[i, j]
+            farthest = k
+        if min(i, j, last_i - i, last_j - j) < _MARGIN:
+            far_border = max(far_border, blocks[i, j])
     # a hand may touch the border, too; the arm is farther away
     arm = 0.5 * (nearest + far_border)
-    for i in range(last_i + 1):
-        for j in range(last_j + 1):
-            on_border = min(i, j, last_i - i, last_j - j) < _MARGIN
-            if on_border and labels[i, j] == slot and blocks[i, j] >= arm:
-                order[n, 0] = i
-                order[n, 1] = j
-                hops[n] = 0
-                position[i, j] = n
-                n += 1
+    for k in range(len(cells)):
+        i = cells[k, 0]
+        j = cells[k, 1]
+        if min(i, j, last_i - i, last_j - j) < _MARGIN and blocks[i, j] >= arm:
+            order[n, 0] = i
+            order[n, 1] = j
+            hops[n] = 0
+            position[i, j] = n
+            n += 1
     if n == 0:
-        return walk_from(blocks, labels, slot, far_i, far_j, position, order, hops)
-    return _spread(blocks, labels, slot, n, position, order, hops)
+        i = cells[farthest, 0]
+        j = cells[farthest, 1]
+        return walk_from(blocks, labels, surface.slot, i, j, position, order, hops)
+    return _spread(blocks, labels, surface.slot, n, position, order, hops)
 
 
 @njit(cache=True)
@@ -226,8 +287,9 @@ def _spread(blocks, labels, slot, n, position, order, hops):
         j = order[at, 1]
         for a in range(max(i - 1, 0), min(i + 2, labels.shape[0])):
             for b in range(max(j - 1, 0), min(j + 2, labels.shape[1])):
-                near = abs(blocks[a, b] - blocks[i, j]) < _JUMP_MM
-                if labels[a, b] == slot and position[a, b] < 0 and near:
+                if position[a, b] >= 0 or labels[a, b] != slot:
+                    continue
+                if abs(blocks[a, b] - blocks[i, j]) < _JUMP_MM:
                     order[n, 0] = a
                     order[n, 1] = b
                     hops[n] = hops[at] + 1
@@ -263,12 +325,14 @@ def ends(blocks, order, hops, position, n, focal, least_mm, tips, n_tips):
     for k in range(n - 1, -1, -1):
         i = order[k, 0]
         j = order[k, 1]
+        mine = k
         for a in range(max(i - 1, 0), min(i + 2, blocks.shape[0])):
             for b in range(max(j - 1, 0), min(j + 2, blocks.shape[1])):
                 other = position[a, b]
                 if other <= k or other >= n or order[other, 0] != a or order[other, 1] != b:
                     continue
-                mine = find_root(parent, k)
+                if parent[other] == mine:  # most blocks are of the same island, one step away
+                    continue
                 theirs = find_root(parent, other)
                 if mine == theirs:
                     continue
@@ -276,6 +340,7 @@ def ends(blocks, order, hops, position, n, focal, least_mm, tips, n_tips):
                 low = min(mine, theirs)
                 high = max(mine, theirs)
                 parent[low] = high
+                mine = high
                 z = blocks[order[low, 0], order[low, 1]]
                 out_mm = (hops[low] - hops[k]) * BLOCK * z / focal
                 if out_mm >= least_mm:
@@ -304,7 +369,7 @@ def _note(tips, n_tips, z, out, block):
 
 
 @njit(cache=True)
-def nearest_ends(blocks, labels, n_surfaces, size, intrinsics, chosen):
+def nearest_ends(blocks, labels, surfaces, size, intrinsics, chosen):
     """Positions where a hand may be, the nearest first, no two alike.
 
     A surface is walked twice: from where it leaves the picture, and from the extremum that lies
@@ -314,7 +379,7 @@ def nearest_ends(blocks, labels, n_surfaces, size, intrinsics, chosen):
     Args:
         blocks: (h, w) float32 mm.
         labels: (h, w) int32.
-        n_surfaces: surfaces that are labelled.
+        surfaces: a `Surface` of each.
         size: the hand's length over the skeleton's home length.
         intrinsics: (4,) fx, fy, cx, cy px.
         chosen: (m, N_END), out: rows as in `ends`, at least 0.6 of the hand's sphere apart.
@@ -329,8 +394,8 @@ def nearest_ends(blocks, labels, n_surfaces, size, intrinsics, chosen):
     hops = np.empty(n_blocks, np.int32)
     tips = np.empty((MAX_TIPS, N_END))
     n_tips = 0
-    for slot in range(n_surfaces):
-        n = walk(blocks, labels, slot, position, order, hops)
+    for surface in surfaces:
+        n = walk(blocks, labels, surface, position, order, hops)
         n_tips = ends(blocks, order, hops, position, n, focal, _STICKS_OUT_MM * size, tips, n_tips)
         last_i = order[n - 1, 0]
         last_j = order[n - 1, 1]
@@ -342,7 +407,7 @@ def nearest_ends(blocks, labels, n_surfaces, size, intrinsics, chosen):
         i = order[nearest, 0]
         j = order[nearest, 1]
         n_tips = _note(tips, n_tips, blocks[i, j], 0.5, order[nearest])
-        n = walk_from(blocks, labels, slot, last_i, last_j, position, order, hops)
+        n = walk_from(blocks, labels, surface.slot, last_i, last_j, position, order, hops)
         n_tips = ends(blocks, order, hops, position, n, focal, _STICKS_OUT_MM * size, tips, n_tips)
     ranked = np.argsort(tips[:n_tips, END_RANK])
     n_chosen = 0
@@ -383,48 +448,13 @@ def point_of_block(blocks, i, j, intrinsics):
 
 
 @njit(cache=True)
-def box_around(shape, middle, radius, intrinsics, box):
-    """The blocks whose points can lie within a sphere: its bounding box in the picture.
-
-    All of the grid, where the sphere reaches behind the camera.
-
-    Args:
-        shape: (h, w) of the grid of blocks.
-        middle: (3,) mm, camera frame.
-        radius: mm.
-        intrinsics: (4,) fx, fy, cx, cy px.
-        box: (4,) int64, out: first and last row, first and last column.
-    """
-    near = middle[2] - radius
-    far = middle[2] + radius
-    for axis in range(2):
-        last = shape[axis] - 1
-        box[2 * axis] = 0
-        box[2 * axis + 1] = last
-        if near <= 0.0:
-            continue
-        x = middle[1 - axis]
-        f = intrinsics[1 - axis]
-        c = intrinsics[3 - axis]
-        low = x - radius
-        high = x + radius
-        low = min(low / near, low / far) * f + c
-        high = max(high / near, high / far) * f + c
-        box[2 * axis] = min(max(int(np.floor(low / BLOCK)) - 1, 0), last)
-        box[2 * axis + 1] = min(max(int(np.ceil(high / BLOCK)) + 1, 0), last)
-
-
-@njit(cache=True)
-def relabel(labels, box, mark, slot):
-    """Give the blocks labelled `mark` within a box the label `slot`.
+def relabel(labels, surface):
+    """Give all blocks of a surface its own label again.
 
     Args:
         labels: (h, w) int32; changed in place.
-        box: (4,) as `box_around` fills it.
-        mark: the label that goes.
-        slot: the label that comes.
+        surface: the `Surface`.
     """
-    for i in range(box[0], box[1] + 1):
-        for j in range(box[2], box[3] + 1):
-            if labels[i, j] == mark:
-                labels[i, j] = slot
+    cells = surface.cells
+    for k in range(len(cells)):
+        labels[cells[k, 0], cells[k, 1]] = surface.slot

@@ -24,8 +24,8 @@ from liex_lab.foreground._geodesic_kernels import (
     MAX_SURFACES,
     N_END,
     block_depths,
-    box_around,
     label_surfaces,
+    list_surfaces,
     nearest_ends,
     point_of_block,
     relabel,
@@ -82,7 +82,7 @@ class HandSight(NamedTuple):
 
 
 @njit(cache=True)
-def locate(blocks, labels, tip, size, intrinsics):
+def locate(blocks, labels, surface, tip, size, intrinsics):
     """Where the hand at an extremum of a surface is; its blocks get the label MAX_SURFACES.
 
     What leaves the sphere around it is the arm; the hand is what lies at the other end, one hand's
@@ -91,6 +91,7 @@ def locate(blocks, labels, tip, size, intrinsics):
     Args:
         blocks: (h, w) float32 mm.
         labels: (h, w) int32; the hand's blocks are marked in it.
+        surface: the `Surface`.
         tip: (N_END,) the extremum, a row of `_geodesic_kernels.ends`.
         size: the hand's length over the skeleton's home length.
         intrinsics: (4,) fx, fy, cx, cy px.
@@ -101,16 +102,16 @@ def locate(blocks, labels, tip, size, intrinsics):
     fingers = np.zeros(3)
     row = int(tip[END_ROW])
     column = int(tip[END_COLUMN])
-    slot = labels[row, column]
     middle = np.array(point_of_block(blocks, row, column, intrinsics))
-    _mean_shift(blocks, labels, slot, _TIP_MM * size, intrinsics, middle)
+    _mean_shift(surface.points, _TIP_MM * size, middle)
     around = AROUND_MM * size
     focal2 = intrinsics[0] * intrinsics[1]
     cut = -1e9
     area = 0.0
     base = 0.0
+    near = np.empty((len(surface.cells), _N_POINT))
     for step in range(3):
-        points = _within(blocks, labels, slot, around, intrinsics, middle)
+        points = near[: _within(surface, around, middle, near)]
         has_arm = _away_from_arm(points, size, focal2, middle, fingers)
         cut = _wrist(points, size, focal2, middle, fingers) if has_arm else -1e9
         base = middle[0] * fingers[0] + middle[1] * fingers[1] + middle[2] * fingers[2]
@@ -119,29 +120,26 @@ def locate(blocks, labels, tip, size, intrinsics):
 
 
 @njit(cache=True)
-def _within(blocks, labels, slot, radius, intrinsics, middle):
-    """The points of a surface within `radius` mm of the middle, rows of x, y, z, distance, block
-    row, block column.
+def _within(surface, radius, middle, near):
+    """The points of a surface within `radius` mm of the middle, into rows of x, y, z, distance,
+    block row, block column; how many there are.
     """
-    box = np.empty(4, np.int64)
-    box_around(blocks.shape, middle, radius, intrinsics, box)
-    points = np.empty(((box[1] - box[0] + 1) * (box[3] - box[2] + 1), _N_POINT))
+    points = surface.points
     n = 0
-    for i in range(box[0], box[1] + 1):
-        for j in range(box[2], box[3] + 1):
-            if labels[i, j] != slot:
-                continue
-            x, y, z = point_of_block(blocks, i, j, intrinsics)
-            off2 = (x - middle[0]) ** 2 + (y - middle[1]) ** 2 + (z - middle[2]) ** 2
-            if off2 < radius * radius:
-                points[n, _POINT_X] = x
-                points[n, _POINT_Y] = y
-                points[n, _POINT_Z] = z
-                points[n, _POINT_DISTANCE] = np.sqrt(off2)
-                points[n, _POINT_ROW] = i
-                points[n, _POINT_COLUMN] = j
-                n += 1
-    return points[:n]
+    for k in range(len(points)):
+        x = points[k, 0]
+        y = points[k, 1]
+        z = points[k, 2]
+        off2 = (x - middle[0]) ** 2 + (y - middle[1]) ** 2 + (z - middle[2]) ** 2
+        if off2 < radius * radius:
+            near[n, _POINT_X] = x
+            near[n, _POINT_Y] = y
+            near[n, _POINT_Z] = z
+            near[n, _POINT_DISTANCE] = np.sqrt(off2)
+            near[n, _POINT_ROW] = surface.cells[k, 0]
+            near[n, _POINT_COLUMN] = surface.cells[k, 1]
+            n += 1
+    return n
 
 
 @njit(cache=True)
@@ -222,29 +220,29 @@ def _along(p, middle, fingers):
 
 
 @njit(cache=True)
-def _mean_shift(blocks, labels, slot, radius, intrinsics, middle):
-    """One step of mean shift: `middle` (3,) moves to the mean of what is within `radius` mm."""
-    box = np.empty(4, np.int64)
+def _mean_shift(points, radius, middle):
+    """One step of mean shift: `middle` (3,) moves to the mean of the points (n, 3) mm within
+    `radius` mm.
+    """
     total = 0.0
     moved = np.zeros(3)
-    box_around(blocks.shape, middle, radius, intrinsics, box)
-    for i in range(box[0], box[1] + 1):
-        for j in range(box[2], box[3] + 1):
-            if labels[i, j] == slot:
-                x, y, z = point_of_block(blocks, i, j, intrinsics)
-                off = (x - middle[0]) ** 2 + (y - middle[1]) ** 2 + (z - middle[2]) ** 2
-                if off < radius * radius:
-                    w = z * z
-                    total += w
-                    moved[0] += w * x
-                    moved[1] += w * y
-                    moved[2] += w * z
+    for k in range(len(points)):
+        x = points[k, 0]
+        y = points[k, 1]
+        z = points[k, 2]
+        off = (x - middle[0]) ** 2 + (y - middle[1]) ** 2 + (z - middle[2]) ** 2
+        if off < radius * radius:
+            w = z * z
+            total += w
+            moved[0] += w * x
+            moved[1] += w * y
+            moved[2] += w * z
     for k in range(3):
         middle[k] = moved[k] / total
 
 
 @njit(cache=True)
-def compare_ends(blocks, labels, ends, size, intrinsics, unlike):
+def compare_ends(blocks, labels, surfaces, ends, size, intrinsics, unlike):
     """How unlike a hand what would be cut at each of the extrema is.
 
     The score of `unlikeness`, and 0.012 for every mm by which one lies behind the nearest (up to
@@ -253,6 +251,7 @@ def compare_ends(blocks, labels, ends, size, intrinsics, unlike):
     Args:
         blocks: (h, w) float32 mm.
         labels: (h, w) int32; comes back as it was.
+        surfaces: a `Surface` of each.
         ends: (n, N_END) rows of `_geodesic_kernels.ends`.
         size: the hand's length over the skeleton's home length.
         intrinsics: (4,) fx, fy, cx, cy px.
@@ -261,10 +260,10 @@ def compare_ends(blocks, labels, ends, size, intrinsics, unlike):
     depth = np.empty(len(unlike))
     nearest = 1e9
     for k in range(len(unlike)):
-        slot = labels[int(ends[k, END_ROW]), int(ends[k, END_COLUMN])]
-        found = locate(blocks, labels, ends[k], size, intrinsics)
+        surface = surfaces[labels[int(ends[k, END_ROW]), int(ends[k, END_COLUMN])]]
+        found = locate(blocks, labels, surface, ends[k], size, intrinsics)
         depth[k], unlike[k] = unlikeness(
-            blocks, labels, slot, MAX_SURFACES, found, size, intrinsics
+            blocks, labels, surface, MAX_SURFACES, found, size, intrinsics
         )
         nearest = min(nearest, depth[k])
     for k in range(len(unlike)):
@@ -272,11 +271,12 @@ def compare_ends(blocks, labels, ends, size, intrinsics, unlike):
 
 
 @njit(cache=True)
-def box_of(labels, mark, box):
-    """The bounding box of the blocks labelled `mark`.
+def box_of(labels, surface, mark, box):
+    """The bounding box of the blocks of a surface that are labelled `mark`.
 
     Args:
         labels: (h, w) int32.
+        surface: the `Surface`.
         mark: the label.
         box: (4,) int64, out: first and last row, first and last column; first beyond last for none.
     """
@@ -284,11 +284,13 @@ def box_of(labels, mark, box):
     box[1] = -1
     box[2] = labels.shape[1]
     box[3] = -1
-    for i in range(labels.shape[0]):
-        for j in range(labels.shape[1]):
-            if labels[i, j] == mark:
-                box[0], box[1] = min(box[0], i), max(box[1], i)
-                box[2], box[3] = min(box[2], j), max(box[3], j)
+    cells = surface.cells
+    for k in range(len(cells)):
+        i = cells[k, 0]
+        j = cells[k, 1]
+        if labels[i, j] == mark:
+            box[0], box[1] = min(box[0], i), max(box[1], i)
+            box[2], box[3] = min(box[2], j), max(box[3], j)
 
 
 @njit(cache=True)
@@ -410,9 +412,10 @@ def extract_one(depth, n_things, sight, crops, k):
     focal2 = intrinsics[0] * intrinsics[1]
     block_depths(depth, sight.near, sight.far, blocks)
     n_surfaces = label_surfaces(blocks, labels, focal2, _LEAST_MM2 * size * size, areas)
-    n_ends = nearest_ends(blocks, labels, n_surfaces, size, intrinsics, ends)
+    surfaces = list_surfaces(blocks, labels, n_surfaces, intrinsics)
+    n_ends = nearest_ends(blocks, labels, surfaces, size, intrinsics, ends)
     unlike = np.empty(n_ends)
-    compare_ends(blocks, labels, ends, size, intrinsics, unlike)
+    compare_ends(blocks, labels, surfaces, ends, size, intrinsics, unlike)
     ranked = np.argsort(unlike)
     n_alike = min(n_ends, 2)
     if n_ends > 1 and unlike[ranked[1]] > unlike[ranked[0]] + _AS_LIKE:
@@ -421,17 +424,20 @@ def extract_one(depth, n_things, sight, crops, k):
         row = k + rank * (len(crops.n_px) // n_things)
         crops.n_blobs[row] = n_alike
         if rank < n_alike:
-            cut_end(depth, blocks, labels, ends[ranked[rank]], sight, crops, row)
+            end = ends[ranked[rank]]
+            surface = surfaces[labels[int(end[END_ROW]), int(end[END_COLUMN])]]
+            cut_end(depth, blocks, labels, surface, end, sight, crops, row)
 
 
 @njit(cache=True)
-def cut_end(depth, blocks, labels, end, sight, crops, k):
+def cut_end(depth, blocks, labels, surface, end, sight, crops, k):
     """The height map of the hand at an extremum, and its moments; labels stay as they are.
 
     Args:
         depth: (H, W) mm, 0 where unread.
         blocks: (h, w) float32 mm.
         labels: (h, w) int32.
+        surface: the `Surface` of the extremum.
         end: (N_END,) the extremum.
         sight: `HandSight` of the picture.
         crops: `CropRows`, out.
@@ -439,9 +445,8 @@ def cut_end(depth, blocks, labels, end, sight, crops, k):
     """
     intrinsics = sight.intrinsics
     box = np.empty(4, np.int64)
-    slot = labels[int(end[END_ROW]), int(end[END_COLUMN])]
-    found = locate(blocks, labels, end, sight.size, intrinsics)
-    box_of(labels, MAX_SURFACES, box)
+    found = locate(blocks, labels, surface, end, sight.size, intrinsics)
+    box_of(labels, surface, MAX_SURFACES, box)
     if box[1] < 0:
         return
     heights = crops.heights[k]
@@ -480,7 +485,7 @@ def cut_end(depth, blocks, labels, end, sight, crops, k):
         sight.far,
         raw,
     )
-    relabel(labels, box, MAX_SURFACES, slot)
+    relabel(labels, surface)
     blob_kernels.keep_largest(raw, np.empty((crop * crop, 5), np.int32))
     mm_per_px = step * found.middle[2] / np.sqrt(intrinsics[0] * intrinsics[1])
     radius = min(3, max(1, int(sight.smooth / mm_per_px + 0.5)))

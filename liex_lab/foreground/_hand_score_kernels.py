@@ -16,7 +16,7 @@ import numpy as np
 from numba import njit
 
 from liex_lab.foreground._blob_kernels import BLOCK
-from liex_lab.foreground._geodesic_kernels import AROUND_MM, box_around, point_of_block, relabel
+from liex_lab.foreground._geodesic_kernels import AROUND_MM, relabel
 
 # what tells rendered hands from elbows, chests and heads by logistic regression, in units of the
 # first: the logarithm of circumference^2 over area, which fingers make large
@@ -29,9 +29,6 @@ _WIDE_MM = 100.0
 _PER_WIDTH = 0.25
 _MOST_WIDTHS = 4.0
 _MARGIN = 2  # blocks
-# of `AROUND_MM`, from the hand's middle: all blocks that are marked, and what lies close behind the
-# cut
-_WITHIN = 2.0
 _ACROSS = ((-1, 0), (1, 0), (0, -1), (0, 1))
 
 
@@ -52,13 +49,13 @@ class HandFind(NamedTuple):
 
 
 @njit(cache=True)
-def unlikeness(blocks, labels, slot, mark, found, size, intrinsics):
+def unlikeness(blocks, labels, surface, mark, found, size, intrinsics):
     """Mean depth of the blocks labelled `mark`, and how unlike a hand they are.
 
     Args:
         blocks: (h, w) float32 mm.
-        labels: (h, w) int32; changed in place.
-        slot: the label of the rest of the surface, which the blocks get back.
+        labels: (h, w) int32; the blocks get the label of their surface back.
+        surface: the `Surface` that they are of.
         mark: the label of the blocks.
         found: `HandFind` of the hand.
         size: the hand's length over the skeleton's home length.
@@ -67,8 +64,6 @@ def unlikeness(blocks, labels, slot, mark, found, size, intrinsics):
     Returns:
         The mean depth, mm, and the score: the less, the more alike.
     """
-    box = np.empty(4, np.int64)
-    box_around(labels.shape, found.middle, _WITHIN * AROUND_MM * size, intrinsics, box)
     n_rows, n_columns = labels.shape
     focal = np.sqrt(intrinsics[0] * intrinsics[1])
     area = 0.0
@@ -77,25 +72,25 @@ def unlikeness(blocks, labels, slot, mark, found, size, intrinsics):
     on_border = 0
     n = 0
     depth = 0.0
-    for i in range(box[0], box[1] + 1):
-        for j in range(box[2], box[3] + 1):
-            if labels[i, j] == slot:
-                side = _side(blocks[i, j], focal)
-                behind += side * side * _behind_cut(blocks, i, j, found, size, intrinsics)
-            if labels[i, j] != mark:
-                continue
-            side = _side(blocks[i, j], focal)
-            area += side * side
-            depth += blocks[i, j]
-            n += 1
-            on_border += min(i, j, n_rows - 1 - i, n_columns - 1 - j) < _MARGIN
-            for a, b in _ACROSS:
-                r = i + a
-                c = j + b
-                inside = 0 <= r < n_rows and 0 <= c < n_columns
-                if not inside or (labels[r, c] != mark and labels[r, c] != slot):
-                    around += side
-    relabel(labels, box, mark, slot)
+    cells = surface.cells
+    for k in range(len(cells)):
+        i = cells[k, 0]
+        j = cells[k, 1]
+        side = _side(blocks[i, j], focal)
+        if labels[i, j] != mark:
+            behind += side * side * _behind_cut(surface.points[k], found, size)
+            continue
+        area += side * side
+        depth += blocks[i, j]
+        n += 1
+        on_border += min(i, j, n_rows - 1 - i, n_columns - 1 - j) < _MARGIN
+        for a, b in _ACROSS:
+            r = i + a
+            c = j + b
+            inside = 0 <= r < n_rows and 0 <= c < n_columns
+            if not inside or (labels[r, c] != mark and labels[r, c] != surface.slot):
+                around += side
+    relabel(labels, surface)
     area = max(area, 1.0)
     n = max(n, 1)
     width = min(behind / (_WRIST_MM * _WIDE_MM * size * size), _MOST_WIDTHS)
@@ -112,9 +107,11 @@ def _side(depth, focal):
 
 
 @njit(cache=True)
-def _behind_cut(blocks, i, j, found, size, intrinsics):
-    """Whether a block lies close behind the cut through the arm."""
-    x, y, z = point_of_block(blocks, i, j, intrinsics)
+def _behind_cut(point, found, size):
+    """Whether a point (3,) lies close behind the cut through the arm."""
+    x = point[0]
+    y = point[1]
+    z = point[2]
     fingers = found.fingers
     middle = found.middle
     along = x * fingers[0] + y * fingers[1] + z * fingers[2] - found.cut

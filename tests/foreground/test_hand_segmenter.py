@@ -208,11 +208,12 @@ def test_ends_agree_with_what_a_reader_would_count(seed: int) -> None:
     labels, areas = np.empty(blocks.shape, np.int32), np.empty(geodesic_kernels.MAX_SURFACES)
     focal, least_mm = 500.0, 2.0 * BLOCK * 800.0 / 500.0
     n = geodesic_kernels.label_surfaces(blocks, labels, focal * focal, 1.0, areas)
-    for slot in range(n):
+    intrinsics = np.array([focal, focal, 40.0, 30.0])
+    for surface in geodesic_kernels.list_surfaces(blocks, labels, n, intrinsics):
         position = np.full(blocks.shape, -1, np.int32)
         order, hops = np.empty((blocks.size, 2), np.int32), np.empty(blocks.size, np.int32)
-        size = geodesic_kernels.walk(blocks, labels, slot, position, order, hops)
-        assert size == (labels == slot).sum()
+        size = geodesic_kernels.walk(blocks, labels, surface, position, order, hops)
+        assert size == (labels == surface.slot).sum()
         tips = np.zeros((geodesic_kernels.MAX_TIPS, 4))
         found = geodesic_kernels.ends(blocks, order, hops, position, size, focal, least_mm, tips, 0)
         expected = ends_by_hand(order[:size], hops[:size], blocks, focal, least_mm)
