@@ -101,6 +101,8 @@ def imported_ahead(*modules: str) -> Iterator[None]:
                 with suppress(ImportError):
                     import_module(name)
             gc.freeze()
+            if left:  # the block has ended meanwhile, and nobody else would take that back
+                gc.unfreeze()
 
     left: list[bool] = []
     with in_background(fetch):

@@ -94,3 +94,24 @@ def test_what_is_in_memory_is_left_alone_by_the_collector_while_a_block_has_its_
         assert gc.isenabled(), "what is made from now on is collected as ever"
         assert "colorsys" in sys.modules
     assert gc.get_freeze_count() == 0
+
+
+def test_a_block_that_ends_before_its_modules_are_there_leaves_the_collector_as_it_was(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    importing = threading.Event()
+    ended = threading.Event()
+
+    def slowly(name: str) -> None:
+        importing.set()
+        assert ended.wait(10.0)
+
+    monkeypatch.setattr("liex_lab.runtime.threads.import_module", slowly)
+    others = set(threading.enumerate())
+    with imported_ahead("colorsys"):
+        assert importing.wait(10.0)
+        (fetching,) = set(threading.enumerate()) - others
+    ended.set()
+    fetching.join(10.0)
+    assert gc.get_freeze_count() == 0
+    assert gc.isenabled()
