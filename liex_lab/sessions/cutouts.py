@@ -125,39 +125,47 @@ class PictureKeeper:
         self._origin = origin
         self._kept = origin.replay_depth
 
-    def keep(
-        self, depth: Sequence[NDArray[np.float32]], seen: Observations | None
-    ) -> tuple[list[Depth], Boxes | None]:
-        """The pictures as they are kept, and where they are not the background.
+    def boxes(self, n: int, seen: Observations | None) -> Boxes | None:
+        """Where the pictures of some frames are kept as they are read, and not as the background.
 
         Args:
-            depth: n pictures (H, W) float32 mm, 0 where unread.
-            seen: the hypotheses of these n frames; None where nobody looked for an animal.
+            n: the number of frames.
+            seen: the hypotheses of these frames; None where nobody looked for an animal.
 
         Returns:
-            The n pictures, none where no depth is kept; and boxes (n, K, 4) int16 of left, top,
-            right and bottom (px, the latter two exclusive, all 0 for no box), None where whole
-            pictures are kept.
+            (n, K, 4) int16 of left, top, right and bottom (px, the latter two exclusive, all 0 for
+            no box); None where whole pictures are kept, or none.
         """
-        if self._kept == NONE:
-            return [], None
-        background = self._origin.background
-        if self._kept == ALL or background is None or seen is None:
-            return [to_millimetres(image) for image in depth], None
+        if self._kept in (NONE, ALL) or self._origin.background is None or seen is None:
+            return None
         if self._kept == ARENA:
-            boxes = np.zeros((len(depth), N_BOXES, 4), np.int16)
+            boxes = np.zeros((n, N_BOXES, 4), np.int16)
             boxes[:, 0] = self._arena
-            whole = [to_millimetres(image) for image in depth]
-            if self._region is None:
-                return whole, boxes
-            return [np.where(self._region, image, background) for image in whole], boxes
+            return boxes
         boxes = boxes_around(seen, self._origin)
         camera = self._origin.camera
         nothing = ~boxes.any(axis=(1, 2))
         boxes[nothing, 0] = (0, 0, camera.width, camera.height)  # to be looked at why
-        return [
-            composed(image, cuts, background) for image, cuts in zip(depth, boxes, strict=True)
-        ], boxes
+        return boxes
+
+    def keep(self, depth: Sequence[NDArray[np.float32]], boxes: Boxes | None) -> list[Depth]:
+        """The pictures as they are kept; none where no depth is.
+
+        Args:
+            depth: n pictures (H, W) float32 mm, 0 where unread.
+            boxes: of these frames, see `boxes`.
+        """
+        if self._kept == NONE:
+            return []
+        background = self._origin.background
+        if boxes is None or background is None:
+            return [to_millimetres(image) for image in depth]
+        if self._kept == ARENA:
+            whole = [to_millimetres(image) for image in depth]
+            if self._region is None:
+                return whole
+            return [np.where(self._region, image, background) for image in whole]
+        return [composed(image, cuts, background) for image, cuts in zip(depth, boxes, strict=True)]
 
     @cached_property
     def _region(self) -> NDArray[np.bool_] | None:

@@ -106,11 +106,12 @@ class ShardWriter:
             frames: consecutive frames.
             seen: their observations, one row per frame.
         """
-        depth, boxes = self._keeper.keep([frame.depth for frame in frames], seen)
+        boxes = self._keeper.boxes(len(frames), seen)
+        depth = self._keeper.keep([frame.depth for frame in frames], boxes)
         times = [int(frame.time_ns) for frame in frames]
         self._replay.add([int(frame.index) for frame in frames], times, depth, boxes)
         self._mcap.add(times, depth)
-        self._seen.append(seen_rows(frames, seen, [] if boxes is None else [boxes]))
+        self._seen.append(seen_rows(frames, seen, boxes))
 
     def __exit__(
         self,

@@ -218,14 +218,15 @@ class SessionWriter:
             _check_times(np.array(times, np.int64), track_part)
             self._held.append(track_part)
         index = [int(frame.index) for frame in frames]
-        boxes: list[Boxes] = []
+        # of all frames at once, as a call costs as much as a frame
+        boxes = self._keeper.boxes(len(frames), seen if isinstance(seen, Observations) else None)
         for start in range(
             0, len(frames), 16
         ):  # bounds the copies, however many frames come at once
             part = slice(start, start + 16)
             depth = [frame.depth for frame in frames[part]]
-            found = seen[part] if isinstance(seen, Observations) else None
-            kept, cuts = self._keeper.keep(depth, found)
+            cuts = None if boxes is None else boxes[part]
+            kept = self._keeper.keep(depth, cuts)
             self._drain(_BEHIND)
             replay, messages = (self._loggers[log] for log in LOGS)
             self._logging.append(
@@ -234,8 +235,6 @@ class SessionWriter:
             self._logging.append(messages.submit(self._mcap.add, times[part], kept))
             for image in depth:
                 self._keepsakes.add(image)
-            if cuts is not None:
-                boxes.append(cuts)
         self._rows = None
         self._index.extend(index)
         self._times_ns.extend(times)
@@ -539,22 +538,22 @@ def full_disk(folder: Path, error: BaseException | None) -> str | None:
 
 
 def seen_rows(
-    frames: Sequence[DepthFrame], seen: Columnar, boxes: Sequence[Boxes] = ()
+    frames: Sequence[DepthFrame], seen: Columnar, boxes: Boxes | None = None
 ) -> dict[str, NDArray[Any]]:
     """Columns kept on disk of consecutive frames: observations, camera's frame count, time (ns).
 
     Args:
         frames: n consecutive frames.
         seen: their observations, n rows.
-        boxes: where their kept pictures are not the background, in order; none where whole pictures
-            are kept.
+        boxes: (n, K, 4) where their kept pictures are not the background; None where whole
+            pictures are kept.
 
     Returns:
         Arrays (n, ...) by name.
     """
     index, times = ([getattr(frame, name) for frame in frames] for name in ("index", "time_ns"))
     counted = {INDEX: np.array(index, np.int64), TIMES: np.array(times, np.int64)}
-    return {**columns_of(seen), **counted, **({BOXES: np.concatenate(boxes)} if boxes else {})}
+    return {**columns_of(seen), **counted, **({} if boxes is None else {BOXES: boxes})}
 
 
 def unfinished(path: Path, origin: Provenance) -> Checkpoint:
