@@ -103,13 +103,15 @@ def locate(blocks, labels, surface, tip, size, intrinsics):
     row = int(tip[END_ROW])
     column = int(tip[END_COLUMN])
     middle = np.array(point_of_block(blocks, row, column, intrinsics))
-    _mean_shift(surface.points, _TIP_MM * size, middle)
     around = AROUND_MM * size
     focal2 = intrinsics[0] * intrinsics[1]
     cut = -1e9
     area = 0.0
     base = 0.0
     near = np.empty((len(surface.cells), _N_POINT))
+    # the step of mean shift: nothing is cut off yet
+    tips = near[: _within(surface, _TIP_MM * size, middle, near)]
+    _beyond(tips, middle, fingers, cut, labels, False)
     for step in range(3):
         points = near[: _within(surface, around, middle, near)]
         has_arm = _away_from_arm(points, size, focal2, middle, fingers)
@@ -217,28 +219,6 @@ def _along(p, middle, fingers):
         + (p[1] - middle[1]) * fingers[1]
         + (p[2] - middle[2]) * fingers[2]
     )
-
-
-@njit(cache=True)
-def _mean_shift(points, radius, middle):
-    """One step of mean shift: `middle` (3,) moves to the mean of the points (n, 3) mm within
-    `radius` mm.
-    """
-    total = 0.0
-    moved = np.zeros(3)
-    for k in range(len(points)):
-        x = points[k, 0]
-        y = points[k, 1]
-        z = points[k, 2]
-        off = (x - middle[0]) ** 2 + (y - middle[1]) ** 2 + (z - middle[2]) ** 2
-        if off < radius * radius:
-            w = z * z
-            total += w
-            moved[0] += w * x
-            moved[1] += w * y
-            moved[2] += w * z
-    for k in range(3):
-        middle[k] = moved[k] / total
 
 
 @njit(cache=True)

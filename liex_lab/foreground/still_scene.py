@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Self
+from typing import Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,6 +35,7 @@ from liex_lab.runtime.shapes import check_shapes
 from liex_lab.runtime.threads import threads
 
 Array = NDArray[np.float64]
+AnyNumber = TypeVar("AnyNumber", bound=np.generic)
 
 # of the logarithms, from posture to posture of one animal
 _AREA_SD = 0.25
@@ -257,9 +258,7 @@ class StillScene(Segmenter):
             return depths
         step = 1 if depths.shape[1:] == self.limit.shape else self.stride
         worn = self.cable.worn(depths[:, ::step, ::step], self.limit)
-        for axis in (1, 2):
-            worn = np.repeat(worn, step, axis=axis)
-        return np.where(worn[:, : depths.shape[1], : depths.shape[2]], np.float32(0), depths)
+        return np.where(at_every_pixel(worn, step, depths.shape[1:]), np.float32(0), depths)
 
     def places(self, crops: HeightMaps) -> list[NDArray[np.bool_]]:
         """The animal's pixels (H, W) bool in each frame that shows it.
@@ -400,3 +399,21 @@ class StillScene(Segmenter):
             for values, factor in ((crops.origin, 1), (crops.step, 1), (crops.n_px, self.stride)):
                 values *= self.stride * factor
         return crops
+
+
+def at_every_pixel(
+    values: NDArray[AnyNumber], step: int, shape: tuple[int, ...]
+) -> NDArray[AnyNumber]:
+    """Values of every so many-th pixel, repeated for the pixels of the whole picture.
+
+    Args:
+        values: (..., h, w) of every `step`-th row and column.
+        step: pixels from one to the next, at least 1.
+        shape: (H, W) of the picture.
+
+    Returns:
+        (..., H, W) the values.
+    """
+    for axis in (-2, -1):
+        values = np.repeat(values, step, axis=axis)
+    return values[..., : shape[0], : shape[1]]

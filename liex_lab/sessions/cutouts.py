@@ -95,12 +95,11 @@ def _without_animals(picture: Depth, known: StillScene) -> Depth:
     """
     import cv2
 
+    from liex_lab.foreground.still_scene import at_every_pixel
+
     step = known.stride
     limit, background = (
-        np.repeat(np.repeat(values, step, axis=0), step, axis=1)[
-            : picture.shape[0], : picture.shape[1]
-        ]
-        for values in (known.limit, known.background)
+        at_every_pixel(values, step, picture.shape) for values in (known.limit, known.background)
     )
     stands = (picture > 0) & (picture < limit)
     _, labels = cv2.connectedComponents(stands.astype(np.uint8))
@@ -125,12 +124,11 @@ class PictureKeeper:
         self._origin = origin
         self._kept = origin.replay_depth
 
-    def boxes(self, n: int, seen: Observations | None) -> Boxes | None:
+    def boxes(self, seen: Observations | None) -> Boxes | None:
         """Where the pictures of some frames are kept as they are read, and not as the background.
 
         Args:
-            n: the number of frames.
-            seen: the hypotheses of these frames; None where nobody looked for an animal.
+            seen: the hypotheses of these n frames; None where nobody looked for an animal.
 
         Returns:
             (n, K, 4) int16 of left, top, right and bottom (px, the latter two exclusive, all 0 for
@@ -139,7 +137,7 @@ class PictureKeeper:
         if self._kept in (NONE, ALL) or self._origin.background is None or seen is None:
             return None
         if self._kept == ARENA:
-            boxes = np.zeros((n, N_BOXES, 4), np.int16)
+            boxes = np.zeros((len(seen), N_BOXES, 4), np.int16)
             boxes[:, 0] = self._arena
             return boxes
         boxes = boxes_around(seen, self._origin)

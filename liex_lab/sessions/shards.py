@@ -106,7 +106,7 @@ class ShardWriter:
             frames: consecutive frames.
             seen: their observations, one row per frame.
         """
-        boxes = self._keeper.boxes(len(frames), seen)
+        boxes = self._keeper.boxes(seen)
         depth = self._keeper.keep([frame.depth for frame in frames], boxes)
         times = [int(frame.time_ns) for frame in frames]
         self._replay.add([int(frame.index) for frame in frames], times, depth, boxes)

@@ -219,7 +219,7 @@ class SessionWriter:
             self._held.append(track_part)
         index = [int(frame.index) for frame in frames]
         # of all frames at once, as a call costs as much as a frame
-        boxes = self._keeper.boxes(len(frames), seen if isinstance(seen, Observations) else None)
+        boxes = self._keeper.boxes(seen if isinstance(seen, Observations) else None)
         for start in range(
             0, len(frames), 16
         ):  # bounds the copies, however many frames come at once

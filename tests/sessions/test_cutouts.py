@@ -337,7 +337,7 @@ def test_damaged_boxes_are_told_in_a_sentence(session: Session, tmp_path: Path) 
 def test_nobody_looked_so_everything_is_kept() -> None:
     keeper = PictureKeeper(MOUSE.provenance(replay_depth="animal", background=BACKGROUND))
     depth = MOUSE.frame(0).depth
-    boxes = keeper.boxes(1, None)
+    boxes = keeper.boxes(None)
     assert boxes is None
     kept = keeper.keep([depth], boxes)
     np.testing.assert_array_equal(kept[0], to_millimetres(depth))
