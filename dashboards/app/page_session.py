@@ -15,7 +15,6 @@ from dash import (
     Dash,
     Input,
     Output,
-    Patch,
     State,
     ctx,
     dcc,
@@ -120,9 +119,9 @@ def session_page(
     ]
 
 
-def _figures(data: StudyData, key: str, may_show: bool) -> list[Any]:
+def _figures(data: StudyData, key: str, at_s: float, may_show: bool) -> list[Any]:
     """What comes after the first picture, for it keeps a browser busy: curves, numbers, replay."""
-    whole = _whole(data, key, data.session(key))
+    whole = _whole(data, key, data.session(key), at_s)
     return [
         html.H2("The whole session"),
         html.P("A click goes to that moment.", className="muted"),
@@ -146,13 +145,16 @@ def _figures(data: StudyData, key: str, may_show: bool) -> list[Any]:
     ]
 
 
-def _whole(data: StudyData, key: str, session: Session) -> dict[str, Any]:
-    """The figure of the whole session."""
+def _whole(data: StudyData, key: str, session: Session, at_s: float) -> dict[str, Any]:
+    """The figure of the whole session, marked at a moment."""
     one = data.ethograms([key]).get(key)
     if one is None:
         raise SessionError(f"the bouts of '{key}' cannot be read; {data.damage(key)}")
     coloured = colours_of(shown_words([one]), one.vocabulary)
-    return plots.whole_session(one, coloured, traces(session))
+    figure = plots.whole_session(one, coloured, traces(session))
+    unit_s = plots.time_unit(float(session.metadata["frames"]["duration_s"]))[1]
+    figure["layout"]["shapes"] = [plots.cursor(at_s / unit_s)]
+    return figure
 
 
 def failed_page(data: StudyData, key: str) -> list[Any]:
@@ -378,32 +380,26 @@ def register(app: Dash, data: StudyData, show_replay: ShowReplay | None) -> None
     @app.callback(
         Output("around", "figure"),
         Output("frame-facts", "children"),
-        Output("whole", "figure"),
         Output("replay-command", "children"),
         Input("moment", "value"),
         Input("corrections-made", "data"),
         State("session-key", "data"),
-        State("session-unit-s", "data"),
     )
-    def follow(at_s: float | None, _made: str, key: str, unit_s: float) -> tuple[Any, ...]:
-        """All that shows the moment.
+    def follow(at_s: float | None, _made: str, key: str) -> tuple[Any, ...]:
+        """What is read of a session to show the moment.
 
         Args:
             at_s: the moment, s.
             _made: changes with every correction.
             key: the session's name in the study.
-            unit_s: seconds per unit of the whole session's axis.
         """
         moment = float(at_s or 0.0)
-        marked = Patch()
-        marked["layout"]["shapes"] = [plots.cursor(moment / unit_s)]
 
         def shown_of(session: Session) -> tuple[Any, ...]:
-            """Curves, facts, cursor and command of the opened `session`."""
+            """Curves, facts and command of the opened `session`."""
             return (
                 plots.around(traces(session), moment, _HALF_S),
                 facts(session, nearest_row(session, moment)),
-                marked,
                 f"liex show {shlex.quote(str(session.path))} --at {moment:.3f}",
             )
 
@@ -422,12 +418,13 @@ def register(app: Dash, data: StudyData, show_replay: ShowReplay | None) -> None
         Output("session-figures", "children"),
         Input("desk", "className"),
         State("session-key", "data"),
+        State("moment", "value"),
         prevent_initial_call=True,
     )
-    def figures(_opened: str, key: str) -> list[Any]:
-        """The figures of the session `key`, once its first picture is there (`_opened`)."""
+    def figures(_opened: str, key: str, at_s: float | None) -> list[Any]:
+        """The figures of the session `key` at `at_s`, once there is a first picture (`_opened`)."""
         try:
-            return _figures(data, key, show_replay is not None)
+            return _figures(data, key, float(at_s or 0.0), show_replay is not None)
         except LiexError as error:
             return [html.P(str(error), className="problems", role="alert")]
 
@@ -437,23 +434,21 @@ def register(app: Dash, data: StudyData, show_replay: ShowReplay | None) -> None
         Input("corrections-made", "data"),
         State("session-key", "data"),
         State("moment", "value"),
-        State("session-unit-s", "data"),
         prevent_initial_call=True,
     )
-    def again(_made: str, key: str, at_s: float | None, unit_s: float) -> Any:
+    def again(_made: str, key: str, at_s: float | None) -> Any:
         """The curves and the list of corrections of the session `key` once more were made.
 
         Args:
             _made: changes with every correction.
             key: the session's name in the study.
             at_s: the present moment, s.
-            unit_s: seconds per unit of the whole session's axis.
         """
-        figure, made = data.read(
-            key, lambda session: (_whole(data, key, session), page_corrections.made(session))
+        moment = float(at_s or 0.0)
+        return data.read(
+            key,
+            lambda session: (_whole(data, key, session, moment), page_corrections.made(session)),
         )
-        figure["layout"]["shapes"] = [plots.cursor(float(at_s or 0.0) / unit_s)]
-        return figure, made
 
     @app.callback(
         Output({"part": "order", "table": ALL}, "data", allow_duplicate=True),
@@ -475,6 +470,14 @@ def register(app: Dash, data: StudyData, show_replay: ShowReplay | None) -> None
         ClientsideFunction("liex", "again"),
         Output("desk", "lang"),
         Input("corrections-made", "data"),
+    )
+    # in the browser: an answer that changes a part of a figure fails where the page was just left
+    app.clientside_callback(
+        ClientsideFunction("liex", "cursor"),
+        Output("whole", "figure"),
+        Input("moment", "value"),
+        State("session-unit-s", "data"),
+        State("whole", "figure"),
     )
     app.clientside_callback(
         ClientsideFunction("liex", "moment"),

@@ -5,11 +5,12 @@ and nothing else.
 from __future__ import annotations
 
 import csv
+import re
 import time
 from pathlib import Path
 
 import pytest
-from playwright.sync_api import Page, expect
+from playwright.sync_api import Page, Route, expect
 
 from liex_lab.cli.study import page_that_opens
 from liex_lab.sessions import Session
@@ -102,6 +103,81 @@ def test_an_ethogram_leads_to_the_frame_and_its_replay(served: Served, watched: 
     assert not any("hare" in tool or "loud" in tool for tool in tools), (
         tools
     )  # it would send the figure away
+    watched.nothing_went_wrong()
+
+
+def line_comes_to(page: Page, at_s: float) -> bool:
+    """Whether the line through the curves of the whole session comes to stand at a moment."""
+    plot = page.locator("#whole .js-plotly-plot")
+    last = time.monotonic() + 20.0
+    while abs(plot.evaluate("plot => plot.layout.shapes[0].x0") - at_s) > 1e-6:
+        if time.monotonic() > last:
+            return False
+        page.wait_for_timeout(50)
+    return True
+
+
+def test_the_line_through_the_whole_session_goes_along_with_the_moment(
+    served: Served, watched: Watched
+) -> None:
+    page = watched.page
+    held: list[Route] = []
+
+    def hold_figures(route: Route) -> None:
+        if "session-figures.children" in (route.request.post_data or ""):
+            held.append(route)
+        else:
+            route.fallback()
+
+    page.route("**/_dash-update-component*", hold_figures)
+    page.goto(f"{served.address}/session/{KEY}?t=2.5")
+    page.wait_for_selector("#desk.is-open")
+    page.locator("#moment").fill("1.5")  # before there are figures
+    page.locator("#moment").blur()
+    expect(page.locator("#moment-link a")).to_have_attribute("href", re.compile("t=1.5"))
+    assert len(held) == 1
+    held[0].continue_()
+    page.wait_for_selector("#frame-facts dd")
+    at_s = page.locator("#moment").input_value()
+    assert float(at_s) == pytest.approx(1.5, abs=0.05)  # the frame that is nearest
+    assert line_comes_to(page, float(at_s))
+    page.get_by_role("button", name="bout ▶").click()
+    expect(page.locator("#moment")).not_to_have_value(at_s)
+    expect(page.locator("#replay-command")).not_to_contain_text(f"--at {float(at_s):.3f}")
+    assert line_comes_to(page, float(page.locator("#moment").input_value()))
+    watched.nothing_went_wrong()
+
+
+_HELD_ANSWERS = """
+window.held = {numbers: [], page: []};
+const plain = window.fetch;
+window.fetch = async (address, more) => {
+  const answer = await plain(address, more), asked = String(more && more.body);
+  const kind = asked.includes("frame-facts.children") ? "numbers"
+    : window.leaving && asked.includes("page.children") ? "page" : null;
+  if (kind) await new Promise((go) => {
+    window.held[kind].push(go);
+    document.documentElement.classList.add(`held-${kind}`);
+  });
+  return answer;
+};
+"""
+
+
+def test_a_page_that_is_left_as_its_numbers_come_complains_of_nothing(
+    served: Served, watched: Watched
+) -> None:
+    page = watched.page
+    page.add_init_script(_HELD_ANSWERS)
+    page.goto(f"{served.address}/session/{KEY}")
+    page.wait_for_selector("#whole .js-plotly-plot")
+    page.wait_for_selector("html.held-numbers")
+    page.evaluate("window.leaving = true")
+    page.get_by_role("link", name="Draw the region of the arena").click()
+    page.wait_for_selector("html.held-page")
+    page.evaluate("[...held.page, ...held.numbers].forEach((go) => go())")
+    page.wait_for_selector("#region.is-open")
+    page.wait_for_load_state("networkidle")
     watched.nothing_went_wrong()
 
 

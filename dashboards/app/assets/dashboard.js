@@ -84,6 +84,12 @@
     return window.dash_clientside.no_update;
   }
 
+  function cursor(at, unit, figure) {  // the line through the curves of the whole session
+    const [line] = figure.layout.shapes, place = (Number(at) || 0) / unit;
+    if (line.x0 === place) return window.dash_clientside.no_update;
+    return { ...figure, layout: { ...figure.layout, shapes: [{ ...line, x0: place, x1: place }] } };
+  }
+
   function again(made) {  // a correction was made, here or in the form
     if (desk && made) desk.then((module) => module.again(made));
     return window.dash_clientside.no_update;
@@ -99,5 +105,5 @@
     return window.dash_clientside.no_update;
   }
 
-  window.dash_clientside = Object.assign({}, window.dash_clientside, { liex: { draw: draw, open: open, moment: moment, again: again, review: review, region: region } });
+  window.dash_clientside = Object.assign({}, window.dash_clientside, { liex: { draw: draw, open: open, moment: moment, cursor: cursor, again: again, review: review, region: region } });
 })();
