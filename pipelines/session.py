@@ -121,10 +121,10 @@ def measure_session(
         if told := unwritable_times(opened.times_ns):
             raise RecordingError(f"of {opened.name} {told}")
         check_unused(folder, overwrite)
-        compile_ahead(first.animal.skeleton, progress)
-        progress(0, None, "learning the background, the floor and the animal's size")
         unnamed = None if plan else settings
         with hashed_ahead(opened, part_folder(folder), progress) as hashed:
+            compile_ahead(first.animal.skeleton, progress)
+            progress(0, None, "learning the background, the floor and the animal's size")
             fitted = fit_plan(opened, first, estimator, settings=unnamed, progress=progress)
             hashed()
         prepared = prepare(fitted, folder, started, progress)

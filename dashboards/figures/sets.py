@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from liex_lab.behaviour.cohort import WHO
 from liex_lab.errors import SessionError
 from liex_lab.runtime.durable import replacing
+from liex_lab.runtime.memory import uncollected
 from liex_lab.runtime.places import inside, safe_name, unlinked
 from liex_lab.runtime.progress import Progress, silent
 from liex_lab.runtime.spreadsheets import read_harmless
@@ -282,7 +283,7 @@ def for_the_page(session: Session, folder: Path | None) -> dict[str, str]:
     there = set() if folder is None else {path.name for path in _files(folder)}
     asked = _asked(session)
     paged = PAGES in asked or _PAGES_FILE in there
-    with drawing(), _one_pdf(folder if paged else None) as pages:
+    with uncollected(), drawing(), _one_pdf(folder if paged else None) as pages:
         for one in session_figures(session):
             if one.figure is None:
                 continue

@@ -76,7 +76,8 @@ def rest() -> None:
 def uncollected() -> Iterator[None]:
     """Within the block Python's collector of garbage is off, where it was on.
 
-    For imports: what they make stays, and would be gone through again and again meanwhile.
+    For what makes many small objects at once, as imports and figures do: they would be gone
+    through again and again meanwhile.
     """
     was_on = gc.isenabled()
     gc.disable()
