@@ -151,10 +151,7 @@ def _whole(data: StudyData, key: str, session: Session, at_s: float) -> dict[str
     if one is None:
         raise SessionError(f"the bouts of '{key}' cannot be read; {data.damage(key)}")
     coloured = colours_of(shown_words([one]), one.vocabulary)
-    figure = plots.whole_session(one, coloured, traces(session))
-    unit_s = plots.time_unit(float(session.metadata["frames"]["duration_s"]))[1]
-    figure["layout"]["shapes"] = [plots.cursor(at_s / unit_s)]
-    return figure
+    return plots.whole_session(one, coloured, traces(session), at_s)
 
 
 def failed_page(data: StudyData, key: str) -> list[Any]:

@@ -306,7 +306,10 @@ def differences(stats: pd.DataFrame, unit: str) -> dict[str, Any]:
 
 
 def whole_session(
-    one: Ethogram, coloured: Mapping[str, str], traces: Sequence[tuple[str, Array, Array, str]]
+    one: Ethogram,
+    coloured: Mapping[str, str],
+    traces: Sequence[tuple[str, Array, Array, str]],
+    moment_s: float,
 ) -> dict[str, Any]:
     """A lane per action over a whole session, and curves below them.
 
@@ -314,6 +317,7 @@ def whole_session(
         one: the session's ethogram.
         coloured: word -> colour; each word has a lane.
         traces: the curves: (name with unit, time s (n,), values (n,), colour).
+        moment_s: the moment that is marked, s since the first frame.
     """
     n = 1200
     stop_s = max(one.duration_s, 1e-3)
@@ -382,10 +386,8 @@ def whole_session(
         "range": [0, stop_s / size],
         "anchor": f"y{len(traces) + 1}" if traces else "y",
     }
-    return {
-        "data": data,
-        "layout": _layout(sum(heights) + 70, **layout, annotations=notes, showlegend=False),
-    }
+    more = {"shapes": [cursor(moment_s / size)], "annotations": notes, "showlegend": False}
+    return {"data": data, "layout": _layout(sum(heights) + 70, **layout, **more)}
 
 
 def _only(one: Ethogram, word: str) -> Ethogram:

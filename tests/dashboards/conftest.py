@@ -4,7 +4,8 @@ kept.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
 import pytest
@@ -43,6 +44,14 @@ def watch(page: Page) -> Watched:
     )
     page.on("pageerror", lambda error: watched.complaints.append(str(error)))
     return watched
+
+
+def until(page: Page, true: Callable[[], bool]) -> None:
+    """Wait for something that a page's own script may not be asked for, by its policy."""
+    end = time.monotonic() + 30.0
+    while not true():
+        assert time.monotonic() < end
+        page.wait_for_timeout(50)
 
 
 @pytest.fixture

@@ -137,7 +137,7 @@ def test_names_are_text_in_every_figure(data: StudyData) -> None:
         plots.differences(data.stats("mean_speed_mm_s"), "<u>"),
         plots.time_budgets(shares, {"<i>x": "#000"}),
         plots.whole_session(
-            ones["<b>s"], {"<i>x": "#000"}, [("<u>", np.arange(3.0), np.arange(3.0), "#000")]
+            ones["<b>s"], {"<i>x": "#000"}, [("<u>", np.arange(3.0), np.arange(3.0), "#000")], 0.5
         ),
     ]
     for figure in figures:

@@ -16,7 +16,7 @@ from liex_lab.cli.study import page_that_opens
 from liex_lab.sessions import Session
 from liex_lab.sessions.corrections import read_log
 from tests.dashboards import copies
-from tests.dashboards.conftest import Watched
+from tests.dashboards.conftest import Watched, until
 from tests.dashboards.served import Served
 
 N_SESSIONS = 200
@@ -106,15 +106,10 @@ def test_an_ethogram_leads_to_the_frame_and_its_replay(served: Served, watched: 
     watched.nothing_went_wrong()
 
 
-def line_comes_to(page: Page, at_s: float) -> bool:
-    """Whether the line through the curves of the whole session comes to stand at a moment."""
+def line_s(page: Page) -> float:
+    """Where the line through the curves of the whole session stands, s."""
     plot = page.locator("#whole .js-plotly-plot")
-    last = time.monotonic() + 20.0
-    while abs(plot.evaluate("plot => plot.layout.shapes[0].x0") - at_s) > 1e-6:
-        if time.monotonic() > last:
-            return False
-        page.wait_for_timeout(50)
-    return True
+    return float(plot.evaluate("plot => plot.layout.shapes[0].x0"))
 
 
 def test_the_line_through_the_whole_session_goes_along_with_the_moment(
@@ -140,11 +135,12 @@ def test_the_line_through_the_whole_session_goes_along_with_the_moment(
     page.wait_for_selector("#frame-facts dd")
     at_s = page.locator("#moment").input_value()
     assert float(at_s) == pytest.approx(1.5, abs=0.05)  # the frame that is nearest
-    assert line_comes_to(page, float(at_s))
+    until(page, lambda: line_s(page) == pytest.approx(float(at_s)))
     page.get_by_role("button", name="bout ▶").click()
     expect(page.locator("#moment")).not_to_have_value(at_s)
     expect(page.locator("#replay-command")).not_to_contain_text(f"--at {float(at_s):.3f}")
-    assert line_comes_to(page, float(page.locator("#moment").input_value()))
+    now_s = float(page.locator("#moment").input_value())
+    until(page, lambda: line_s(page) == pytest.approx(now_s))
     watched.nothing_went_wrong()
 
 

@@ -5,7 +5,6 @@ exchanged, playing, taking back, doubtful places and crossings one after the oth
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +17,7 @@ from liex_lab.arena.outline import Arena
 from liex_lab.plan import Plan
 from liex_lab.sessions import Session
 from liex_lab.sessions.corrections import read_log
-from tests.dashboards.conftest import Watched
+from tests.dashboards.conftest import Watched, until
 from tests.dashboards.served import Served
 from tests.dashboards.test_crossings import put_flips
 from tests.sessions.walking_mouse import WalkingMouse, steady, write
@@ -60,14 +59,6 @@ def opened(served: Served, page: Page, at_s: float) -> Locator:
 
 def session(served: Served) -> Session:
     return Session.open(served.study / f"{KEY}.liex")
-
-
-def until(page: Page, true: Callable[[], bool]) -> None:
-    """Wait for something that a page's own script may not be asked for, by its policy."""
-    end = time.monotonic() + 30.0
-    while not true():
-        assert time.monotonic() < end
-        page.wait_for_timeout(50)
 
 
 def joint_on_screen(page: Page, stage: Locator, row: int, joint: int) -> tuple[float, float]:
