@@ -15,6 +15,7 @@ import typer
 from sphinx.application import Sphinx
 
 _MARK = re.compile(r"^<!-- generated: ([\w-]+) -->$", re.MULTILINE)
+_SCRIPT = re.compile(r"\]\((?:\.\./)*examples/(plot_\w+)\.py\)")  # a page of the gallery, in the site
 
 
 def _cell(text: str) -> str:
@@ -156,7 +157,8 @@ def replace(app: Sphinx, docname: str, source: list[str]) -> None:
         docname: the page.
         source: its text, the only element, changed in place.
     """
-    source[0] = _MARK.sub(lambda mark: PAGES[mark[1]](), source[0])
+    text = _MARK.sub(lambda mark: PAGES[mark[1]](), source[0])
+    source[0] = _SCRIPT.sub(r"](/auto_examples/\1.rst)", text)
 
 
 def setup(app: Sphinx) -> dict[str, Any]:
