@@ -69,13 +69,20 @@ _EIGHT_BIT = (
     "the depth itself"
 )
 _NOT_YET = "is in a format that is not read yet; export it as 16-bit PNG pictures, one to a frame"
+_PACKED = "is packed, and only .tar.gz is read as it is; unpack it and give what comes out"
+_TRACKS = (
+    "is a database, such as Live Mouse Tracker's, with tracks but without depth images; give the "
+    "depth recording itself"
+)
 _NOT_READ = {
     **dict.fromkeys((".ray", ".rays"), _RAYTRIX),
     **dict.fromkeys((".ply", ".xyz"), _CLOUD),
     **dict.fromkeys(
         (".jpg", ".jpeg", ".bmp", ".gif", ".webp", ".mp4", ".mov", ".webm"), _EIGHT_BIT
     ),
-    **dict.fromkeys((".h5", ".npy", ".npz", ".rrd"), _NOT_YET),
+    **dict.fromkeys((".h5", ".npy", ".npz", ".rrd", ".xef", ".svo", ".svo2"), _NOT_YET),
+    **dict.fromkeys((".zip", ".gz", ".xz", ".bz2", ".7z", ".rar"), _PACKED),
+    **dict.fromkeys((".sqlite", ".sqlite3", ".db"), _TRACKS),
 }
 
 
