@@ -332,6 +332,7 @@ def make_track(writer: SessionWriter, fitted: Fitted) -> Verdict:
         misfits=fitted.misfits,
         doubts=(
             *tracker.scene.doubts,
+            *fitted.recording.doubts,
             *fitted.recording.clock_doubts,
             *filter(None, [fast]),
             *files.rewritten(),

@@ -52,6 +52,8 @@ class Recording:
         times_ns: (n,) int64 time stamps on the recording's own clock, ns, strictly increasing;
             read-only.
         problems: sentences about what is odd in the file, also those found while reading.
+        doubts: those of the problems that may make lengths or times wrong; each becomes a reason
+            of the verdict.
         truncated: True where the file is cut or damaged.
         metadata: facts that the files state, such as subject_id and session_start_time (ISO 8601
             with zone).
@@ -82,6 +84,7 @@ class Recording:
         faults: NDArray[np.uint8] | None = None,
         grow: Callable[[], Recording | None] | None = None,
         unpacked: Path | None = None,
+        doubts: list[str] | None = None,
     ) -> None:
         """Check and freeze the time stamps; no frame is read.
 
@@ -107,6 +110,8 @@ class Recording:
                 cannot.
             unpacked: folder with what an archive was unpacked to, if it opens as the same
                 recording.
+            doubts: sentences about what may make lengths or times wrong; they are added to the
+                problems. The list is shared, so reading may append to it.
 
         Raises:
             RecordingError: there is no frame, or the stamps do not increase strictly.
@@ -116,6 +121,8 @@ class Recording:
         self.camera = camera
         self.times_ns = np.ascontiguousarray(times_ns, np.int64)
         self.problems: list[str] = [] if problems is None else problems
+        self.doubts: list[str] = [] if doubts is None else doubts
+        self.problems += [doubt for doubt in self.doubts if doubt not in self.problems]
         self.truncated = truncated
         self.metadata: dict[str, Any] = {} if metadata is None else dict(metadata)
         self.optics: dict[str, Any] = {}
@@ -305,6 +312,7 @@ class Recording:
             step_ns=self._step_ns * step,
             stored=self._stored[rows],
             faults=self._faults[rows],
+            doubts=self.doubts,
         )
         cut._whole = self._whole or self
         cut.optics = self.optics
@@ -415,6 +423,7 @@ class Recording:
             faults=self._faults,
             unpacked=self.unpacked,
             grow=lambda: (more := self.grown()) and more.seen_by(camera, change, optics),
+            doubts=self.doubts,
         )
         other._whole = self._whole or self
         other.optics = optics

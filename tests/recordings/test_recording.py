@@ -89,6 +89,21 @@ def test_a_short_slice_keeps_the_rate_and_so_sees_its_gap() -> None:
     assert recording[::2].rate_hz == pytest.approx(recording.rate_hz / 2)
 
 
+def test_a_doubt_is_a_problem_too_and_every_view_shares_it() -> None:
+    times = np.array(even_times(5))
+    recording = Recording(
+        name="memory",
+        format="synthetic",
+        camera=SMALL,
+        times_ns=times,
+        read=lambda index: np.full((48, 64), float(index), np.float32),
+        doubts=["the lens is another one"],
+    )
+    views = (recording, recording[1:4], recording.remembering(10**6)[::2])
+    for view in views:
+        assert view.problems == view.doubts == ["the lens is another one"]
+
+
 def test_one_frame_is_taken_by_name_not_by_index() -> None:
     recording = in_memory()
     with pytest.raises(TypeError, match="frame"):
