@@ -28,8 +28,9 @@ from tests.conftest import REPOSITORY
 
 README = (REPOSITORY / "README.md").read_text(encoding="utf-8")
 DOCS = REPOSITORY / "docs"
-PAGES = {
-    path.relative_to(DOCS).as_posix(): path.read_text(encoding="utf-8")
+GENERATED = re.compile(r"<!-- generated: .*?<!-- end of generated -->", re.DOTALL)
+PAGES = {  # as people wrote them
+    path.relative_to(DOCS).as_posix(): GENERATED.sub("", path.read_text(encoding="utf-8"))
     for path in DOCS.rglob("*.md")
     if not {"auto_examples", "_build"} & set(path.parts)
 }
