@@ -6,13 +6,13 @@ The examples of docs/examples are run, and their figures are those of this build
 from __future__ import annotations
 
 import os
+import re
 import shutil
-import sys
 import warnings
 from pathlib import Path
+from typing import Any
 
 HERE = Path(__file__).parent
-sys.path.insert(0, str(HERE / "_ext"))
 os.environ.setdefault("MPLBACKEND", "agg")
 
 import liex_lab  # noqa: E402
@@ -26,24 +26,13 @@ language = "en"
 
 extensions = [
     "myst_parser",
-    "sphinx.ext.autodoc",
-    "sphinx.ext.napoleon",
     "sphinx_gallery.gen_gallery",
-    "generated",
 ]
 source_suffix = {".md": "markdown", ".rst": "restructuredtext"}
 exclude_patterns = ["_build", "examples", "**/GALLERY_HEADER.md"]
 suppress_warnings = ["config.cache"]
-myst_enable_extensions = ["colon_fence", "deflist"]
 myst_heading_anchors = 3
 nitpicky = False
-
-autodoc_typehints = "signature"
-autodoc_member_order = "bysource"
-autodoc_preserve_defaults = True
-python_use_unqualified_type_names = True
-napoleon_numpy_docstring = False
-add_module_names = False
 
 html_theme = "pydata_sphinx_theme"
 html_title = "liex_lab"
@@ -82,3 +71,33 @@ sphinx_gallery_conf = {
     "image_scrapers": ("matplotlib",),
     "reset_modules": ("matplotlib",),
 }
+
+# Pages are plain Markdown, read where the repository is read, too. In the site a link to an example
+# leads to its page in the gallery, and the links of an index page are the site's contents.
+_EXAMPLE = re.compile(r"\]\((?:\.\./)*examples/(plot_\w+)\.py\)")
+_ENTRY = re.compile(r"^(?:- |\| )\[[^\]]*\]\(([^)]+)\.(?:md|rst)\)", re.MULTILINE)
+
+
+def fit_to_site(app: Any, docname: str, source: list[str]) -> None:
+    """Turn links to examples into links to the gallery, and add an index page's contents.
+
+    Args:
+        app: Sphinx.
+        docname: the page.
+        source: its text, the only element, changed in place.
+    """
+    text = _EXAMPLE.sub(r"](/auto_examples/\1.rst)", source[0])
+    if docname.endswith("index") and not docname.startswith("auto_examples"):
+        text = text.replace("](examples)", "](/auto_examples/index.rst)")
+        entries = "\n".join(_ENTRY.findall(text))
+        text += f"\n```{{toctree}}\n:hidden:\n\n{entries}\n```\n"
+    source[0] = text
+
+
+def setup(app: Any) -> None:
+    """Register with Sphinx.
+
+    Args:
+        app: Sphinx.
+    """
+    app.connect("source-read", fit_to_site)

@@ -1,6 +1,6 @@
 """The pictures of README.md and of the manual's pages, made again: `python docs/pictures.py`.
 
-It measures the bundled sample and three virtual animals, and wants a Chromium and, for the replay,
+It measures the bundled sample and some virtual animals, and needs a Chromium and, for the replay,
 Vulkan (.ci/run says which packages).
 """
 
@@ -9,6 +9,7 @@ from __future__ import annotations
 import importlib.util
 import os
 import re
+import runpy
 import shutil
 import socket
 import subprocess
@@ -101,6 +102,23 @@ def draw_animals(folder: Path) -> None:
     save_small(STATIC / "animals.png", np.asarray(figure.canvas.buffer_rgba())[..., :3])
 
 
+def draw_examples(folder: Path) -> None:
+    """The first figure of each example that a page of the manual shows.
+
+    Args:
+        folder: where the sessions are put.
+    """
+    os.chdir(folder)
+    for script in sorted((REPOSITORY / "docs" / "examples").glob("plot_[1-5]_*.py")):
+        plt.close("all")
+        runpy.run_path(str(script))
+        figure = plt.figure(plt.get_fignums()[0])
+        figure.set_dpi(100)
+        figure.canvas.draw()
+        picture = np.asarray(figure.canvas.buffer_rgba())[..., :3]  # type: ignore[attr-defined]
+        save_small(STATIC / f"{script.stem}.png", picture, 32)
+
+
 def shoot_replay(session: Path, moment: int = 120) -> None:
     """The replay as Rerun shows it, without a screen.
 
@@ -171,6 +189,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory(prefix="liex-") as name:
         folder = Path(name)
         draw_animals(folder)
+        draw_examples(folder)
         session = run_demo(folder)
         save_small(DEMO, cv2.imread(str(photograph(session, folder / "demo.png")))[..., ::-1])
         shoot_pages(session)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from importlib.util import find_spec
+from importlib.util import find_spec, module_from_spec, spec_from_file_location
 from pathlib import Path
 
 import pytest
@@ -34,12 +34,6 @@ def is_there(path: str) -> bool:
     return any((REPOSITORY / room / path).exists() for room in ROOMS)
 
 
-def is_drawn(path: Path) -> bool:
-    """Whether an example of the gallery draws this picture when the site is built."""
-    drawn = re.fullmatch(r"sphx_glr_(plot_\w+)_\d{3}\.png", path.name)
-    return drawn is not None and (REPOSITORY / f"docs/examples/{drawn[1]}.py").is_file()
-
-
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_every_file_that_a_page_names_exists(page: Path) -> None:
     text = page.read_text(encoding="utf-8")
@@ -54,9 +48,37 @@ def test_every_file_that_a_page_names_exists(page: Path) -> None:
     }  # by the program, or by a user
     made |= {"figures/", "study/study.toml", "derivatives/liex-lab/sub-m01/ses-01/behav/"}
     missing = [path for path in named if path not in made and not is_there(path)]
-    files = {link: page.parent / link for link in linked}
-    missing += [link for link, file in files.items() if not (file.exists() or is_drawn(file))]
+    missing += [link for link in linked if not (page.parent / link).exists()]
+    missing += [link for link in linked if {"auto_examples", "_build"} & set(Path(link).parts)]
     assert not missing
+
+
+@pytest.mark.parametrize("page", [*PAGES, REPOSITORY / "README.md"], ids=lambda page: page.name)
+def test_a_page_reads_well_where_the_repository_is_read(page: Path) -> None:
+    """It is plain Markdown: no directive or role of Sphinx is left in it as dead text."""
+    text = re.sub(r"```\w+\n.*?```", "", page.read_text(encoding="utf-8"), flags=re.DOTALL)
+    dead = re.findall(
+        r"`{3,}\{[\w-]+\}|^:{3,}.*|\{[a-z]+\}`|sphx_glr\w*|:[a-z]+:`", text, re.MULTILINE
+    )
+    assert not dead
+    parts = re.findall(r"<!-- generated: ([\w-]+) -->\n(.*?)<!-- end of generated", text, re.DOTALL)
+    assert len(re.findall(r"^<!-- generated: ", text, re.MULTILINE)) == len(parts)
+    assert [name for name, part in parts if part.count("\n") < 5] == []
+
+
+def test_generated_parts_are_those_that_the_program_writes_now() -> None:
+    spec = spec_from_file_location("generate", REPOSITORY / "docs" / "generate.py")
+    assert spec is not None
+    assert spec.loader is not None
+    generate = module_from_spec(spec)
+    spec.loader.exec_module(generate)
+    found = []
+    for page in PAGES:
+        text = page.read_text(encoding="utf-8")
+        found += re.findall(r"^<!-- generated: ([\w-]+) -->", text, re.MULTILINE)
+        where = page.relative_to(REPOSITORY)
+        assert generate.renewed(text) == text, f"{where} is stale: run python docs/generate.py"
+    assert sorted(found) == sorted(generate.PARTS)
 
 
 def test_every_dotted_path_that_is_called_public_can_be_imported() -> None:

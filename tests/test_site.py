@@ -87,6 +87,7 @@ def test_generated_pages_hold_what_the_program_says(site: Path) -> None:
     for page in site.rglob("*.html"):
         assert "&lt;!-- generated" not in page.read_text(encoding="utf-8"), page
     assert "spine_max_mm" in (site / "reference" / "plan.html").read_text(encoding="utf-8")
+    assert ">run_session<" in (site / "reference" / "python.html").read_text(encoding="utf-8")
 
 
 @pytest.mark.slow

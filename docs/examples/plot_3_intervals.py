@@ -43,7 +43,7 @@ plt.show()
 # %%
 # How often the interval holds the truth here, coordinate by coordinate. This is one recording of
 # one animal: frames of one recording err together, so that it may well be 75 or 100 per cent. Over
-# many recordings see :doc:`/evidence`.
+# many recordings see docs/evidence.md.
 inside = np.abs(measured - true_mm) <= 1.64 * sd[:, :, None]
 for name, share in zip(truth.skeleton.names, inside.mean(axis=(0, 2)), strict=True):
     print(f"{name:8}{share:.0%}")
@@ -54,4 +54,4 @@ print(f"expected         {session.metadata['verdict']['expected_error_mm']:.1f} 
 # %%
 # What it means for you: an interval is about the joint's place in this frame. It is not about the
 # animal's behaviour, and not about your group. It knows the errors that the training pictures had;
-# on a build or fur that was not among them it is too narrow (:doc:`/concepts/how-it-fails`).
+# on a build or fur that was not among them it is too narrow (docs/concepts/how-it-fails.md).

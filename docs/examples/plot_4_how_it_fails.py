@@ -59,4 +59,4 @@ for scene, (error, session) in rows.items():
 
 # %%
 # Two animals are noticed and said, and one of them is followed. All limits that are known stand in
-# :doc:`/concepts/how-it-fails`.
+# docs/concepts/how-it-fails.md.

@@ -1,7 +1,7 @@
-"""The list of columns in docs/reference/columns.md, printed from the columns' own descriptions.
+"""The columns that are used most, listed from the columns' own descriptions.
 
-The columns are those that a reader is told of first. `python -m liex_lab.behaviour.listing` prints
-the list; a test holds the page to it.
+`python -m liex_lab.behaviour.listing` prints the list; docs/generate.py writes it into
+docs/reference/columns.md.
 """
 
 from __future__ import annotations
