@@ -158,8 +158,8 @@ def transitions(seen: Seen) -> Figure | None:
     n = int(np.nansum(found["n"]))
     heading(
         figure,
-        f"Transitions, {seen.who}, n = {counted(n, 'transition')}; % of a row's successors, "
-        "in brackets by chance;\nblue: more, orange: less often than chance "
+        f"Transitions, {seen.who}, n = {counted(n, 'transition')}; percentage of transitions out "
+        "of each row (in brackets: expected by chance);\nblue: more, orange: less often than chance "
         f"(corrected p ≤ {CERTAIN:g})",
     )
     return figure
