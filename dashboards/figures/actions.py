@@ -159,8 +159,8 @@ def transitions(seen: Seen) -> Figure | None:
     heading(
         figure,
         f"Transitions, {seen.who}, n = {counted(n, 'transition')}; percentage of transitions out "
-        "of each row (in brackets: expected by chance);\nblue: more, orange: less often than chance "
-        f"(corrected p ≤ {CERTAIN:g})",
+        "of each row\n(in brackets: expected by chance); blue: more, orange: less often than "
+        f"chance (corrected p ≤ {CERTAIN:g})",
     )
     return figure
 
