@@ -436,12 +436,12 @@ def _told_refused(notes: dict[str, Any]) -> list[str]:
     n = len(notes.get("refused_bouts", {}).get("bouts", []))
     if not n:
         return []
-    told = "1 bout" if n == 1 else f"{n} bouts"
-    return [
-        f"{told} as the recogniser first named {'it' if n == 1 else 'them'} contradicted the "
-        "definition of the name, and got another name or none; the report lists "
-        f"{'it' if n == 1 else 'them'}."
-    ]
+    told = (
+        "1 bout did not meet the definition of its label and was"
+        if n == 1
+        else f"{n} bouts did not meet the definitions of their labels and were"
+    )
+    return [f"{told} relabelled or left unlabelled (refused_bouts in session.json)."]
 
 
 def _refusals(found: Recognised, times_ns: NDArray[np.int64]) -> list[dict[str, Any]]:

@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
+import os
 import re
 import subprocess
+import sys
+import sysconfig
 import tomllib
+from pathlib import Path
+
+import pytest
 
 from tests.conftest import REPOSITORY
 
@@ -91,3 +97,55 @@ def test_ci_runs_exactly_the_line_of_the_readme() -> None:
     assert read.stdout == TEST_LINE
     assert 'bash -euo pipefail -c "$test_line"' in script
     assert "export CI=true" in script
+
+
+IMPORTS = "import liex_lab.pipelines.session, liex_lab.dashboards.report.views, liex_lab.api"
+
+
+def python_in_the_clone(*arguments: str, clone: Path = REPOSITORY) -> str:
+    """What Python prints where README leaves a reader: in the clone, installed without `-e`.
+
+    `-S` leaves out the finder of an editable installation, which would find the clone anywhere.
+    """
+    packages = os.pathsep.join({sysconfig.get_path("purelib"), sysconfig.get_path("platlib")})
+    ran = subprocess.run(
+        [sys.executable, "-S", *arguments],
+        cwd=clone,
+        env={**os.environ, "PYTHONPATH": packages},
+        capture_output=True,
+        text=True,
+    )
+    assert ran.returncode == 0, ran.stderr[-2000:]
+    return ran.stdout
+
+
+def test_the_readmes_snippet_runs_in_the_folder_of_the_clone(tmp_path: Path) -> None:
+    text = (REPOSITORY / "README.md").read_text(encoding="utf-8")
+    (snippet,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+    recording = "synthetic:walk?seed=3&frames=40"
+    for name, value in (("recording.tar.gz", recording), ("results", str(tmp_path))):
+        assert f'"{name}"' in snippet
+        snippet = snippet.replace(f'"{name}"', repr(value))
+    printed = python_in_the_clone("-c", snippet).splitlines()
+    assert len(printed) == 2
+    assert list(tmp_path.glob("*.liex/report.html"))
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("-c", IMPORTS),
+        ("script.py",),
+        ("-m", "liex_lab", "info", "--plan", "mouse"),
+        ("-c", "import runpy; runpy.run_path('docs/conf.py'); " + IMPORTS),
+        ("-c", "from liex_lab.catalog import find_sample; print(find_sample('mouse_walk.mcap'))"),
+    ],
+    ids=["console", "script", "module", "site", "sample"],
+)
+def test_everything_is_importable_in_the_folder_of_the_clone(
+    arguments: tuple[str, ...], tmp_path: Path
+) -> None:
+    for room in ("liex_lab", "pipelines", "dashboards", "datasets", "docs"):
+        (tmp_path / room).symlink_to(REPOSITORY / room)
+    (tmp_path / "script.py").write_text(IMPORTS)
+    python_in_the_clone(*arguments, clone=tmp_path)

@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import ast
 import re
 import tomllib
 from dataclasses import fields
 from pathlib import Path
 
 import pytest
-from liex_lab.pipelines.convert import convert
 from typer.testing import CliRunner
 
-import liex_lab
 from liex_lab import cli
 from liex_lab.arena.scene import Fixture, Scene
 from liex_lab.arena.zones import read_zones
@@ -104,33 +101,6 @@ def test_every_verb_option_setting_and_format_that_is_named_exists() -> None:
             assert key in plan[table], f"{table}.{key}"
     formats = set(re.findall(r"--to ([a-z]+)\b", EVERYTHING)) - {"study", "live"}
     assert {"csv", "xlsx", "nwb"} <= formats <= {*TARGETS, "video"}
-
-
-def test_every_python_example_runs(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """Each is run as it stands, on a short virtual recording that has the name it asks for."""
-    monkeypatch.chdir(tmp_path)
-    convert("synthetic:walk?seed=3&frames=60", "recording.mcap")
-    examples = [
-        example
-        for text in (README, PAGES["reference/python.md"], PAGES["howto/ephys.md"])
-        for example in blocks("python", text)
-    ]
-    assert len(examples) == 3
-    for example in examples:
-        for asked in set(re.findall(r'"(recording\.[a-z.]+)"', example)):
-            example = example.replace(asked, "recording.mcap")
-        for _ in range(2):  # again it replaces what is there
-            exec(compile(example, "README.md", "exec"), {})
-        names = {
-            node.attr
-            for node in ast.walk(ast.parse(example))
-            if isinstance(node, ast.Attribute) and ast.unparse(node.value) == "liex_lab"
-        }
-        assert names <= set(liex_lab.__all__)
-    assert (tmp_path / "results" / "recording.liex" / "session.json").is_file()
-    assert capsys.readouterr().out.count("\n") >= 2 * len(examples)
 
 
 def test_every_column_that_is_named_is_one() -> None:

@@ -37,7 +37,7 @@ def sessions_page(data: StudyData) -> list[Any]:
             children=[
                 html.Div([html.P("Study", className="kind"), html.H1(data.name)]),
                 html.Button(
-                    "Look again",
+                    "Refresh",
                     id="look-again",
                     n_clicks=0,
                     type="button",

@@ -61,7 +61,7 @@ SESSIONS = {
     "n_flips": "flips",
     "flips_s": "flips, s",
     "warnings": "warnings",
-    "reason": "what is to be said",
+    "reason": "notes",
 }
 STATS = {
     "measure": "measure",
@@ -190,7 +190,7 @@ def block(name: str, caption: str, *, searched: bool = True) -> html.Div:
         tools.append(
             html.Label(
                 [
-                    html.Span("Show rows with "),
+                    html.Span("Filter "),
                     dcc.Input(
                         id={"part": "filter", "table": name},
                         type="text",

@@ -158,9 +158,9 @@ def transitions(seen: Seen) -> Figure | None:
     n = int(np.nansum(found["n"]))
     heading(
         figure,
-        f"Transitions, {seen.who}, n = {counted(n, 'transition')}; % of a row's successors, "
-        "in brackets by chance;\nblue: more, orange: less often than chance "
-        f"(corrected p ≤ {CERTAIN:g})",
+        f"Transitions, {seen.who}, n = {counted(n, 'transition')}; percentage of transitions out "
+        "of each row\n(in brackets: expected by chance); blue: more, orange: less often than "
+        f"chance (corrected p ≤ {CERTAIN:g})",
     )
     return figure
 

@@ -256,7 +256,7 @@ def budget_rows(session: Session, words: list[str]) -> list[tuple[str, str, list
 
 
 def zone_rows(session: Session) -> list[tuple[str, list[str]]]:
-    """A row per zone: name; time, share, visits, first after, mean visit, distance.
+    """A row per zone: name; time, share, visits, latency, mean visit, distance.
 
     Args:
         session: the opened session.

@@ -37,16 +37,16 @@ session.poses[session.poses.frame_index == 10][["joint", "x_mm", "y_mm", "z_mm",
 session.bouts[["action", "start_s", "stop_s", "path_mm", "peak_speed_mm_s"]]
 
 # %%
-# And what is asked for most, the way over the floor and the speed. Empty values are frames without
+# And what is used most: the path over the floor and the speed. Empty values are frames without
 # a measurement, and the curve has a gap there.
 frames, kinematics = session.frames, session.kinematics
 figure, (way, speed) = plt.subplots(1, 2, figsize=(9, 3.4), layout="constrained")
 way.plot(frames.centroid_x_mm, frames.centroid_y_mm)
-way.set(xlabel="x (mm)", ylabel="y (mm)", aspect="equal", title="Way over the floor")
+way.set(xlabel="x (mm)", ylabel="y (mm)", aspect="equal", title="Path over the floor")
 speed.plot(kinematics.time_s, kinematics.speed_mm_s)
 noise = float(session.summary.speed_noise_mm_s.iloc[0])
 speed.axhline(noise, color="0.6", linewidth=1)
-speed.set(xlabel="time (s)", ylabel="speed (mm/s)", title="Grey: slower cannot be told from rest")
+speed.set(xlabel="time (s)", ylabel="speed (mm/s)", title="Below the grey line: noise at rest")
 plt.show()
 
 # %%

@@ -4,7 +4,7 @@ Means, directions and steps on a manifold
 
 A pose is where the animal is, which way it faces, and how each joint is bent. Angles are no
 ordinary numbers: halfway between 170 degrees and -170 degrees lies 180, not 0. And bones do not
-change their length. liex_lab therefore reckons with poses as points of a curved space (a manifold,
+change their length. liex_lab therefore computes with poses as points of a curved space (a manifold,
 here products of the groups SE(3) and SO(3)), and all its means, speeds and smoothed curves follow
 that space.
 """

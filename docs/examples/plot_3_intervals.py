@@ -2,9 +2,8 @@
 Intervals against the truth
 ===========================
 
-Beside every joint stands a standard deviation, and beside every frame the error to be expected of
-it. This example measures a virtual mouse, whose joints are known, and looks how often the truth
-lies inside.
+Every joint comes with a standard deviation, and every frame with an expected error. This example
+measures a virtual mouse, whose joints are known, and counts how often the truth lies inside.
 """
 
 import matplotlib.pyplot as plt
@@ -42,7 +41,7 @@ plt.show()
 
 # %%
 # How often the interval holds the truth here, coordinate by coordinate. This is one recording of
-# one animal: frames of one recording err together, so that it may well be 75 or 100 per cent. Over
+# one animal: frames of one recording err together, so that it may well be 75 or 100 per cent. For
 # many recordings see docs/evidence.md.
 inside = np.abs(measured - true_mm) <= 1.64 * sd[:, :, None]
 for name, share in zip(truth.skeleton.names, inside.mean(axis=(0, 2)), strict=True):

@@ -58,5 +58,5 @@ for scene, (error, session) in rows.items():
     print(f"{scene:12} true {np.nanmedian(error):5.1f} mm, expected {expected:4.1f} mm (medians)")
 
 # %%
-# Two animals are noticed and said, and one of them is followed. All limits that are known stand in
+# Two animals are reported, and one of them is followed. All known limits are listed in
 # docs/concepts/how-it-fails.md.

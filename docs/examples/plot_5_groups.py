@@ -2,8 +2,9 @@
 Two groups, and what is a unit
 ==============================
 
-What was given to a group is the unit: a cage, where whole cages were treated; an animal, where a
-cage holds both. Sessions and bouts are never units. A study without any effect shows why.
+The unit is whatever the treatment was assigned to: a cage, where whole cages were treated; an
+animal, where a cage holds both groups. Sessions and bouts are never units. A study without any
+effect shows why.
 """
 
 import matplotlib.pyplot as plt

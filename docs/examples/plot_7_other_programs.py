@@ -45,6 +45,6 @@ with xarray.open_dataset(place / "mouse_walk.nc") as data:
         xlabel="x (mm)",
         ylabel="y (mm)",
         aspect="equal",
-        title="The nose's way, from movement's file",
+        title="Path of the nose, from movement's file",
     )
     plt.show()

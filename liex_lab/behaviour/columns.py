@@ -84,7 +84,7 @@ KINEMATICS: tuple[Column, ...] = columns(
         "step_mm",
         "float64",
         "mm",
-        "way of the body centre that this frame stands for",
+        "distance travelled by the body centre that this frame stands for",
         "speed_mm_s x time to the next frame",
     ),
     (

@@ -49,7 +49,7 @@ _GENERAL = (
         "distance_m",
         "float64",
         "m",
-        "way of the body centre; at rest the tracking's jitter adds to it",
+        "distance travelled by the body centre, including tracking jitter at rest",
         "sum of step_mm / 1000",
     ),
     (
@@ -107,8 +107,8 @@ _WALKER = (
         "distance_moving_m",
         "float64",
         "m",
-        "way of the body centre in the frames in which it moves for certain: free of jitter at "
-        "rest, and the same whatever the actions are named",
+        "distance travelled by the body centre in the frames in which it moves for certain: free "
+        "of jitter at rest, and the same whatever the actions are named",
         "sum of step_mm / 1000 over the frames faster than the plan's behaviour.pause_below_mm_s "
         "and than speed_noise_mm_s",
         OWN,
@@ -368,7 +368,13 @@ ZONES: tuple[Column, ...] = columns(
         "time from the first sight of the animal to its first visit; empty where it never came",
     ),
     ("mean_visit_s", "float64", "s", "mean length of a visit"),
-    ("distance_mm", "float64", "mm", "way of the body centre within the zone", "sum of step_mm"),
+    (
+        "distance_mm",
+        "float64",
+        "mm",
+        "distance travelled by the body centre in the zone",
+        "sum of step_mm",
+    ),
 )
 
 
@@ -386,7 +392,13 @@ def activity_columns(words: Sequence[str]) -> tuple[Column, ...]:
         ("start_s", "float64", "s", "beginning of the interval, since the first frame"),
         ("stop_s", "float64", "s", "its end, exclusive"),
         ("observed_s", "float64", "s", "time with a pose in it"),
-        ("distance_mm", "float64", "mm", "way of the body centre in it", "sum of step_mm"),
+        (
+            "distance_mm",
+            "float64",
+            "mm",
+            "distance travelled by the body centre in it",
+            "sum of step_mm",
+        ),
         (
             "mean_speed_mm_s",
             "float64",

@@ -25,7 +25,12 @@ SessionPath = Annotated[
     Path, typer.Argument(metavar="SESSION", help="A session folder, NAME.liex.")
 ]
 Author = Annotated[
-    str, typer.Option("--by", metavar="NAME", help="Who says so; else who is logged in.")
+    str,
+    typer.Option(
+        "--by",
+        metavar="NAME",
+        help="Author of the correction; by default the account that is logged in.",
+    ),
 ]
 NewWord = Annotated[
     bool, typer.Option("--new-word", help="The action need not be one of the ethogram's words.")
@@ -43,7 +48,7 @@ def flip(
     ],
     by: Author = "",
 ) -> None:
-    """Head and tail are exchanged in a span."""
+    """Exchange head and tail in a span."""
     from liex_lab.sessions.correcting import flip_span
 
     _do(session, [flip_span(_opened(session), start_s, stop_s)], by)
@@ -56,7 +61,7 @@ def joint(
     name: Annotated[str, typer.Option("--joint", help="The joint's name.")],
     to_mm: Annotated[
         tuple[float, float, float] | None,
-        typer.Option("--to-mm", metavar="X Y Z", help="Its place in the arena."),
+        typer.Option("--to-mm", metavar="X Y Z", help="Its position in the arena."),
     ] = None,
     to_px: Annotated[
         tuple[float, float] | None,
@@ -66,7 +71,7 @@ def joint(
     ] = None,
     by: Author = "",
 ) -> None:
-    """A joint lies elsewhere in one frame; the others follow as bones and limits allow."""
+    """Move a joint in one frame; the others follow as bones and limits allow."""
     from liex_lab.sessions.correcting import joint_move, joint_move_at_pixel
 
     if (to_mm is None) == (to_px is None):
@@ -87,7 +92,7 @@ def bout(
         float | None, typer.Option("--at", metavar="S", help="A time within the bout to edit.")
     ] = None,
     action: Annotated[
-        str | None, typer.Option("--action", help="What the animal does there.")
+        str | None, typer.Option("--action", help="The action that the animal performs.")
     ] = None,
     start_s: Annotated[
         float | None, typer.Option("--from", metavar="S", help="Seconds since the first frame.")
@@ -95,7 +100,7 @@ def bout(
     stop_s: Annotated[
         float | None, typer.Option("--to", metavar="S", help="Seconds, exclusive.")
     ] = None,
-    delete: Annotated[bool, typer.Option("--delete", help="There is no such bout.")] = False,
+    delete: Annotated[bool, typer.Option("--delete", help="Delete the bout.")] = False,
     labels: Annotated[
         Path | None,
         typer.Option(
@@ -105,9 +110,9 @@ def bout(
     new_word: NewWord = False,
     by: Author = "",
 ) -> None:
-    """Rename a bout (--at, --action), cut it anew (--at, --from, --to), delete it (--at, --delete),
-    add one (--action, --from, --to), or take the whole ethogram from a file (--labels). The name
-    that it has confirms it.
+    """Rename a bout (--at, --action), change its span (--at, --from, --to), delete it (--at,
+    --delete), add one (--action, --from, --to), or read the whole ethogram from a file (--labels).
+    Its present name confirms it.
     """
     from liex_lab.sessions import correcting
 
@@ -138,7 +143,7 @@ def bout(
 
 @correct.command("list")
 def list_corrections(session: SessionPath) -> None:
-    """Every correction: who made it and when, and which were taken back."""
+    """List every correction: who made it, when, and whether it was taken back."""
     from liex_lab.sessions import Session
     from liex_lab.sessions.corrections import FOLDER, applies, read_log
 
@@ -170,7 +175,7 @@ def list_corrections(session: SessionPath) -> None:
 def undo(
     session: SessionPath,
     numbers: Annotated[
-        list[int] | None, typer.Argument(metavar="[NUMBER]...", help="The last one if none.")
+        list[int] | None, typer.Argument(metavar="[NUMBER]...", help="By default the last one.")
     ] = None,
     by: Author = "",
 ) -> None:
@@ -198,12 +203,12 @@ def describe(
         typer.Argument(
             metavar="KEY=VALUE...",
             help="subject_id, group, cage, sex, batch, species, age or session_start_time; KEY= "
-            "takes it away.",
+            "removes it.",
         ),
     ],
     by: Author = "",
 ) -> None:
-    """Say who the animal is: subject_id=m07 group=drug. Nothing is measured again."""
+    """Set subject, group, age and more: subject_id=m07 group=drug. Nothing is measured again."""
     from liex_lab.api import describe_session
 
     said = {}

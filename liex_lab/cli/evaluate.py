@@ -46,11 +46,13 @@ def evaluate_pose(
     ] = None,
     sealed: Annotated[
         bool,
-        typer.Option("--sealed", help="Of other-build what is kept for the end: never develop."),
+        typer.Option(
+            "--sealed", help="Measure the sealed part of other-build; never develop on it."
+        ),
     ] = False,
     json_file: JsonFile = None,
 ) -> None:
-    """Joint errors on a fixed split of rendered test frames; of other-build, of whole tracks."""
+    """Measure joint errors on a fixed split of rendered frames; of other-build on whole tracks."""
     if split == "other-build":
         from liex_lab.pipelines.evaluation.builds import evaluate_builds
 
@@ -95,7 +97,7 @@ def evaluate_speed(
     ] = False,
     json_file: JsonFile = None,
 ) -> None:
-    """Frames per second on one and two cores, stage by stage, and the ratio to the paper's
+    """Measure frames per second on one and two cores by stage, and the ratio to the paper's
     variant.
     """
     with progress_bar() as progress:
@@ -118,7 +120,7 @@ def evaluate_sizes(
     ] = None,
     json_file: JsonFile = None,
 ) -> None:
-    """Joint errors of animals between 45 and 100 mm long, their size estimated and not given."""
+    """Measure joint errors of animals 45 to 100 mm long, with their size estimated, not given."""
     from liex_lab.pipelines.evaluation.pose import evaluate_sizes as measure
 
     with progress_bar() as progress:
@@ -147,21 +149,21 @@ def evaluate_tables(
     quick: Annotated[
         bool,
         typer.Option(
-            "--quick", help="See within minutes that everything runs; the numbers mean nothing."
+            "--quick", help="Check within minutes that everything runs; the numbers mean nothing."
         ),
     ] = False,
     fresh: Annotated[
         bool,
         typer.Option(
             "--fresh",
-            help="Train and measure every row anew, which takes long; use no kept result.",
+            help="Train and measure every row again, which takes long; use no kept result.",
         ),
     ] = False,
     rows: Annotated[
         list[str] | None,
         typer.Option(
             "--row",
-            help="Train and measure this row anew, beside the default, and take the others from "
+            help="Train and measure this row again, besides the default, and take the others from "
             "kept results: paper, paper-one-pose, paper-no-metric, rf, cnn, or fig7 for the curves "
             "of Fig. 7; repeatable.",
         ),
@@ -171,7 +173,7 @@ def evaluate_tables(
         typer.Option(
             "--sealed",
             help="Measure the sealed split instead: recordings that no test, training or "
-            "development looks at. To be run once, when an issue ends.",
+            "development uses. Run it once, when an issue ends.",
         ),
     ] = False,
     without: Annotated[
@@ -185,7 +187,7 @@ def evaluate_tables(
         typer.Option("--nyu", metavar="FOLDER", help="Count the NYU hand data as well."),
     ] = None,
 ) -> None:
-    """Every table and figure of the paper on one page, DIR/index.html: measured now, or kept."""
+    """Make every table and figure of the paper on one page, DIR/index.html, measured or kept."""
     from liex_lab.api import run_tables
 
     with progress_bar() as progress:
@@ -216,14 +218,14 @@ def evaluate_actions(
         typer.Option("--model", metavar="FILE", help="The model that measures poses, .npz."),
     ] = None,
     minutes: Annotated[
-        float, typer.Option("--minutes", min=1.0, help="Of uncut test recordings.")
+        float, typer.Option("--minutes", min=1.0, help="Minutes of uncut test recordings.")
     ] = 30.0,
     out: Annotated[
         Path | None, typer.Option("--out", metavar="DIR", help="Draw the confusion matrices there.")
     ] = None,
     json_file: JsonFile = None,
 ) -> None:
-    """Actions named: the paper's recogniser and ours, on cut-out sequences and on uncut recordings.
+    """Score the paper's action recogniser and ours, on cut-out sequences and on uncut recordings.
 
     The recordings are rendered and measured first, which takes about half an hour for all 30
     minutes on two cores. What has been measured is kept in the cache folder (LIEX_CACHE), so that a
@@ -267,8 +269,8 @@ def evaluate_tracking(
     ] = None,
     json_file: JsonFile = None,
 ) -> None:
-    """Joint errors over a sequence: single frames, Algorithm 3 on our parts, and the default
-    tracker online and smoothed.
+    """Measure joint errors over a sequence: single frames, Algorithm 3 on our parts, and the
+    default tracker online and smoothed.
     """
     from liex_lab.api import evaluate_tracking as measure
 
@@ -290,13 +292,18 @@ def evaluate_scenes(
     only: Annotated[
         str | None, typer.Option("--only", metavar="NAME,...", help="Only these scenes.")
     ] = None,
-    n_frames: Annotated[int, typer.Option("--frames", min=20, help="Of each recording.")] = 300,
+    n_frames: Annotated[
+        int, typer.Option("--frames", min=20, help="Frames of each recording.")
+    ] = 300,
     n_recordings: Annotated[
-        int, typer.Option("--recordings", min=1, help="Of each scene, each of another animal.")
+        int,
+        typer.Option(
+            "--recordings", min=1, help="Recordings of each scene, each of another animal."
+        ),
     ] = 1,
     sealed: Annotated[
         bool,
-        typer.Option("--sealed", help="The split that is kept for the end: never develop on it."),
+        typer.Option("--sealed", help="Use the sealed split; never develop on it."),
     ] = False,
     pictures: Annotated[
         Path | None,
@@ -304,7 +311,7 @@ def evaluate_scenes(
     ] = None,
     json_file: JsonFile = None,
 ) -> None:
-    """What stands before a lab's camera, scene by scene: found, joint errors, and what is wrong but
+    """Measure rendered scenes of a lab: frames found, joint errors, and frames that are wrong but
     trusted.
     """
     from liex_lab.api import evaluate_scenes as measure
@@ -328,18 +335,18 @@ def evaluate_scenes(
 def evaluate_live(
     animal: AnimalName = "fish",
     n_frames: Annotated[
-        int, typer.Option("--frames", min=200, help="So many are sent at the camera's pace.")
+        int, typer.Option("--frames", min=200, help="Number of frames sent at the camera's pace.")
     ] = 1500,
     rate_hz: Annotated[
         float | None,
         typer.Option("--fps", min=1.0, max=1000.0, help="Frames per second, instead of its own."),
     ] = None,
     n_cameras: Annotated[
-        int, typer.Option("--cameras", min=1, max=16, help="So many film at once.")
+        int, typer.Option("--cameras", min=1, max=16, help="Number of cameras at once.")
     ] = 1,
     json_file: JsonFile = None,
 ) -> None:
-    """How late skeletons are while a virtual animal is filmed."""
+    """Measure the latency of skeletons while a virtual animal is filmed."""
     from liex_lab.pipelines.evaluation.live import evaluate_live as measure
 
     with progress_bar() as progress:
@@ -355,12 +362,15 @@ def evaluate_statistics(
         int, typer.Option("--studies", min=20, help="Simulated studies of each kind.")
     ] = 2000,
     effect: Annotated[
-        float, typer.Option("--effect", help="Of the studies for the power, in sd between animals.")
+        float,
+        typer.Option(
+            "--effect", help="Effect in the studies for the power, in sd between animals."
+        ),
     ] = 1.0,
     json_file: JsonFile = None,
 ) -> None:
-    """How often the comparison of groups is wrong on studies without an effect, and how often it
-    finds one.
+    """Measure how often the comparison of groups is wrong on studies without an effect, and how
+    often it finds one.
     """
     from liex_lab.pipelines.evaluation.statistics import evaluate_statistics as measure
 
@@ -373,11 +383,11 @@ def evaluate_statistics(
 def evaluate_report(
     session: SessionPath,
     minutes: Annotated[
-        float, typer.Option("--minutes", min=1.0, help="Of the long session.")
+        float, typer.Option("--minutes", min=1.0, help="Length of the long session, minutes.")
     ] = 60.0,
     json_file: JsonFile = None,
 ) -> None:
-    """How long the report of a long session takes, and its memory: SESSION repeated until it is so
+    """Measure time and memory of the report of a long session: SESSION repeated until it is so
     long.
     """
     from liex_lab.pipelines.evaluation.report import evaluate_report as measure
@@ -402,8 +412,8 @@ def evaluate_nyu(
     ] = None,
     json_file: JsonFile = None,
 ) -> None:
-    """Hands by the NYU protocol: 14 points, the root given and estimated; published answers and
-    ours.
+    """Compare published answers and ours on hands by the NYU protocol: 14 points, the root given
+    and estimated.
     """
     from liex_lab.pipelines.evaluation.nyu import evaluate_nyu as measure
     from liex_lab.pipelines.evaluation.nyu import in_short
@@ -434,11 +444,13 @@ def evaluate_motion(
     up: Annotated[str, typer.Option("--up", help="x, y, z, -x, -y or -z: what points up.")] = "z",
     rate_hz: Annotated[
         float | None,
-        typer.Option("--rate", min=1.0, help="Frames a second; without it no speeds are compared."),
+        typer.Option(
+            "--rate", min=1.0, help="Frames per second; without it no speeds are compared."
+        ),
     ] = None,
     json_file: JsonFile = None,
 ) -> None:
-    """How a real mouse holds itself and moves, beside the virtual one: 5, 50 and 95 % quantiles."""
+    """Compare posture and movement of a real mouse with the virtual one: 5, 50, 95 % quantiles."""
     from liex_lab.pipelines.evaluation.motion import evaluate_motion as measure
     from liex_lab.pipelines.evaluation.motion import in_short
 
@@ -456,7 +468,9 @@ def evaluate_reference(
     session: SessionPath,
     reference: Annotated[
         Path,
-        typer.Option("--reference", metavar="CSV", help="The reference's table, one row a frame."),
+        typer.Option(
+            "--reference", metavar="CSV", help="The reference's table, one row per frame."
+        ),
     ],
     json_file: JsonFile = None,
 ) -> None:
@@ -469,18 +483,20 @@ def evaluate_reference(
 @evaluate.command("scale")
 def evaluate_scale(
     n_frames: Annotated[
-        int, typer.Option("--frames", min=2000, help="Of each virtual recording.")
+        int, typer.Option("--frames", min=2000, help="Frames of each virtual recording.")
     ] = 3000,
     minutes: Annotated[
         list[float] | None,
-        typer.Option("--minutes", min=0.1, help="Measure the memory of so long; repeatable."),
+        typer.Option(
+            "--minutes", min=0.1, help="Measure memory for a recording of this length; repeatable."
+        ),
     ] = None,
     json_file: JsonFile = None,
 ) -> None:
-    """What a study costs: sessions per hour by workers, memory by length of recording, and where
+    """Measure the cost of a study: sessions per hour by workers, memory by length, and where
     the time goes.
 
-    Takes about eleven minutes on two cores, and wants a machine without other work; with --minutes
+    Takes about eleven minutes on two cores, and needs a machine without other work; with --minutes
     10 alone, half of that.
     """
     from liex_lab.api import run_scale

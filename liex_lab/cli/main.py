@@ -85,7 +85,10 @@ def _version(wanted: bool) -> None:
 @app.callback()
 def _options(
     version: Annotated[
-        bool, typer.Option("--version", callback=_version, is_eager=True, help="Say which.")
+        bool,
+        typer.Option(
+            "--version", callback=_version, is_eager=True, help="Show the version and exit."
+        ),
     ] = False,
 ) -> None:
     """Depth recordings of animals in; 3D skeletons, a replay and behaviour tables out."""
@@ -93,7 +96,7 @@ def _options(
 
 @app.command(rich_help_panel=START)
 def demo(out: OutFolder = Path()) -> None:
-    """Run the bundled sample recording, to see what comes out."""
+    """Measure the bundled sample recording, to see the results."""
     from liex_lab.api import export_video, run_demo
 
     with progress_bar() as progress:
@@ -113,12 +116,12 @@ def run(
     topic: TopicName = None,
     settings: Settings = None,
     no_depth: Annotated[
-        bool, typer.Option("--no-depth", help="A replay without the depth pictures.")
+        bool, typer.Option("--no-depth", help="Leave depth images out of the replay.")
     ] = False,
     candidates: Annotated[
         bool,
         typer.Option(
-            "--candidates", help="A replay with every pose that single frames thought possible."
+            "--candidates", help="Put every candidate pose of single frames into the replay."
         ),
     ] = False,
     overwrite: Annotated[
@@ -136,13 +139,13 @@ def run(
     accept: Annotated[
         bool,
         typer.Option(
-            "--accept", help="Measure it although it does not look like the plan's animal."
+            "--accept", help="Measure even if the recording does not fit the plan's animal."
         ),
     ] = False,
 ) -> None:
     """Turn a recording into a session folder: poses, behaviour tables, replay, report.
 
-    Ends with a line that says how it went, and with exit code 4 where someone has to look at it.
+    Ends with one line on how it went; exit code 4 means: check this result.
     Several arenas in one picture (`[[arenas]]` of the plan, or --set arenas=auto) become a session
     each.
     """
@@ -185,14 +188,14 @@ def doctor(
         typer.Option(
             "--region",
             metavar='"X,Y X,Y ..."',
-            help="Look only inside this polygon, corners in pixels, or 'circle X,Y R'; a last word "
-            "mm: millimetres on the floor.",
+            help="Use only the inside of this polygon, corners in pixels, or 'circle X,Y R'; a "
+            "last word mm: millimetres on the floor.",
         ),
     ] = None,
     plan: WhichPlan = None,
     settings: Settings = None,
 ) -> None:
-    """Say what is in a recording, what is wrong with it, and which plan fits."""
+    """Report what a recording contains, what is wrong with it, and which plan fits."""
     from liex_lab.plan import Plan
 
     asked = [*(settings or []), *region_setting(region)]
@@ -229,13 +232,11 @@ def suggest(
     model: Annotated[
         str | None, typer.Option("--actions", metavar="FILE", help="An action model, .skops.")
     ] = None,
-    n: Annotated[int, typer.Option("--n", min=1, help="How many stretches.")] = 10,
-    video: Annotated[
-        bool, typer.Option("--video", help="Make a clip of each, to look at it.")
-    ] = False,
+    n: Annotated[int, typer.Option("--n", min=1, help="Number of suggestions.")] = 10,
+    video: Annotated[bool, typer.Option("--video", help="Make a clip of each.")] = False,
 ) -> None:
-    """List the stretches of a session most worth labelling next: where the recogniser is least
-    sure.
+    """List the parts of a session that are most worth labelling: where the recogniser is least
+    certain.
     """
     from rich.console import Console
     from rich.table import Table
@@ -270,17 +271,20 @@ def live(
     plan: PlanName = "mouse",
     settings: Settings = None,
     replay: Annotated[
-        bool, typer.Option("--replay", help="Send a whole recording at its own pace.")
+        bool, typer.Option("--replay", help="Send a finished recording at its own pace.")
     ] = False,
     to: Annotated[
         str, typer.Option("--to", help="viewer, the address of one, or a file .rrd.")
     ] = "viewer",
     patience_s: Annotated[
-        float, typer.Option("--patience-s", min=0.1, help="It is over after so long a wait.")
+        float,
+        typer.Option(
+            "--patience-s", min=0.1, help="Stop after this many seconds without a new frame."
+        ),
     ] = 3.0,
     json_file: JsonFile = None,
 ) -> None:
-    """Show skeletons while a recording goes on, in Rerun, and say how late they were."""
+    """Show skeletons in Rerun during a recording, and measure their latency."""
     from liex_lab.plan import Plan
 
     chosen = Plan.load(plan).with_settings(settings or [])
@@ -309,11 +313,11 @@ def info(
         str | None, typer.Option("--plan", help="Print this plan, to copy and change it.")
     ] = None,
     everything: Annotated[
-        bool, typer.Option("--all", help="Every package, and every line of the models' cards.")
+        bool, typer.Option("--all", help="Show every package, and every line of the models' cards.")
     ] = False,
 ) -> None:
-    """Versions, bundled plans and models; `liex info --plan mouse > my-plan.toml` makes a plan of
-    your own.
+    """Show versions, bundled plans and models; `liex info --plan mouse > my-plan.toml` copies a
+    plan.
     """
     from liex_lab.plan import Plan, known_plans
 

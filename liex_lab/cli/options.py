@@ -22,7 +22,7 @@ PlanName = Annotated[
 WhichPlan = Annotated[
     str | None,
     typer.Option(
-        "--plan", help="A bundled plan, or a .toml file; not named: the bundled one that fits."
+        "--plan", help="A bundled plan, or a .toml file; by default the bundled one that fits."
     ),
 ]
 OutFolder = Annotated[

@@ -37,7 +37,7 @@ def convert(
         ),
     ] = None,
     ros: Annotated[
-        bool, typer.Option("--ros", help="MCAP with ROS 2's messages instead of Foxglove's.")
+        bool, typer.Option("--ros", help="Write ROS 2 messages instead of Foxglove's (MCAP).")
     ] = False,
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Replace what is there under this name.")
@@ -68,7 +68,11 @@ def pack(
     recording: RecordingPath,
     to: Annotated[
         Path | None,
-        typer.Option("--to", metavar="NAME.mcap", help="The archive; NAME.pack.mcap beside it."),
+        typer.Option(
+            "--to",
+            metavar="NAME.mcap",
+            help="The archive; by default NAME.pack.mcap beside the recording.",
+        ),
     ] = None,
     plan: WhichPlan = None,
     region: Annotated[
@@ -78,11 +82,11 @@ def pack(
     whole: Annotated[bool, typer.Option("--whole", help="Keep whole pictures.")] = False,
     verify: Annotated[
         bool,
-        typer.Option("--verify", help="Read it again and compare, an archive with its hash."),
+        typer.Option("--verify", help="Read it again and compare; an archive with its own hash."),
     ] = False,
     delete_original: Annotated[
         bool,
-        typer.Option("--delete-original", help="Remove the recording once it was verified."),
+        typer.Option("--delete-original", help="Remove the recording after it was verified."),
     ] = False,
     topic: TopicName = None,
     settings: Settings = None,

@@ -23,7 +23,10 @@ _HERE = "127.0.0.1"
 def show(
     session: SessionPath,
     web: Annotated[
-        bool, typer.Option("--web", help="In the browser, where Rerun calls tel.rerun.io.")
+        bool,
+        typer.Option(
+            "--web", help="Open it in the browser; Rerun's viewer there calls tel.rerun.io."
+        ),
     ] = False,
     at_s: Annotated[
         float | None, typer.Option("--at", metavar="S", min=0.0, help="Open it at this time.")
@@ -34,7 +37,9 @@ def show(
     ] = "kept",
     recording: Annotated[
         str | None,
-        typer.Option("--recording", metavar="FILE", help="For --depth all, where it has moved."),
+        typer.Option(
+            "--recording", metavar="FILE", help="The recording, for --depth all if it has moved."
+        ),
     ] = None,
 ) -> None:
     """Open a session's replay in Rerun."""

@@ -22,7 +22,9 @@ def compare(
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="The folder for the tables.")],
     measures: Annotated[
         list[str] | None,
-        typer.Option("--measure", help="A column of summary.csv; repeatable; the usual ones."),
+        typer.Option(
+            "--measure", help="A column of summary.csv; repeatable; by default the usual ones."
+        ),
     ] = None,
     reference: Annotated[
         str | None, typer.Option("--reference", help="Compare with this group only.")
@@ -37,6 +39,7 @@ def compare(
     level.
     """
     from liex_lab.api import compare_groups
+    from liex_lab.dashboards.units import counted
 
     with progress_bar() as progress:
         found = compare_groups(
@@ -62,7 +65,7 @@ def compare(
     for why, names in refused.items():  # said once, not once for each measure
         say(f"not tested: {', '.join(dict.fromkeys(names))}\n    {why}")
     say(f"tables: {found['folder']}")
-    say(f"figures: {len(found['figures'])} files in {found['folder'] / 'figures'}")
+    say(f"figures: {counted(len(found['figures']), 'file')} in {found['folder'] / 'figures'}")
 
 
 def report(
@@ -70,7 +73,7 @@ def report(
         Path, typer.Argument(metavar="SESSION", help="A session folder, NAME.liex.")
     ],
 ) -> None:
-    """Write a session's report.html again, with what people corrected since."""
+    """Write a session's report.html again, with all corrections."""
     from liex_lab.dashboards.report.report import write_report
 
     say(f"report: {write_report(session)}")
@@ -97,11 +100,12 @@ def figures(
     ] = None,
     out: Annotated[
         Path | None,
-        typer.Option("--out", metavar="DIR", help="The folder for them; PLACE/figures."),
+        typer.Option("--out", metavar="DIR", help="The folder for them; by default PLACE/figures."),
     ] = None,
 ) -> None:
     """Draw figures for a paper: occupancy, trajectory, ethogram, transitions, groups and others."""
     from liex_lab.api import draw_figures
+    from liex_lab.dashboards.units import counted
 
     with progress_bar() as progress:
         found = draw_figures(
@@ -109,7 +113,7 @@ def figures(
         )
     if found["empty"]:
         say(f"note: there is nothing to draw of {', '.join(found['empty'])}")
-    say(f"figures: {len(found['files'])} files in {found['folder']}")
+    say(f"figures: {counted(len(found['files']), 'file')} in {found['folder']}")
 
 
 def export(
@@ -128,7 +132,7 @@ def export(
     out: Annotated[
         Path | None,
         typer.Option(
-            "--out", metavar="DIR", help="The folder for it; the session's own if not named."
+            "--out", metavar="DIR", help="The folder for it; by default the session's own."
         ),
     ] = None,
     overwrite: Annotated[
@@ -149,11 +153,11 @@ def export(
         float | None, typer.Option("--until", metavar="S", min=0.0, help="Video: until this time.")
     ] = None,
     slower: Annotated[
-        float, typer.Option("--slower", metavar="N", help="Video: so many times slower.")
+        float, typer.Option("--slower", metavar="N", help="Video: this many times slower.")
     ] = 1.0,
 ) -> None:
-    """Write sessions for another program: NWB, BORIS, DeepLabCut, movement, SLEAP, every table as
-    CSV or in one Excel workbook; or as a video, with several beside each other.
+    """Write sessions as NWB, BORIS, DeepLabCut, movement, SLEAP, CSV or Excel files, or as a video,
+    several side by side.
     """
     from liex_lab.exchange import export as job
     from liex_lab.sessions import Session

@@ -33,7 +33,8 @@ Scheduler = Annotated[
     str | None, typer.Option("--scheduler", help="Address of a running Dask scheduler.")
 ]
 SlurmFile = Annotated[
-    str | None, typer.Option("--slurm", metavar="FILE", help="How to ask Slurm for workers.")
+    str | None,
+    typer.Option("--slurm", metavar="FILE", help="A .toml file with the settings of Slurm jobs."),
 ]
 
 
@@ -41,7 +42,7 @@ def cohort(
     study: StudyOrInit,
     folder: InitFolder = None,
     dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Only say what would be done, and why.")
+        bool, typer.Option("--dry-run", help="Only print what would be done, and why.")
     ] = False,
     retry: Annotated[bool, typer.Option("--retry", help="Try the failed sessions again.")] = False,
     again: Annotated[
@@ -57,7 +58,7 @@ def cohort(
         bool, typer.Option("--overwrite", help="With init: replace a study file.")
     ] = False,
 ) -> None:
-    """Measure every session of a study; what is done is left out, what fails stops no other (exit
+    """Measure every session of a study that is not done; one that fails stops no other (exit
     code 3).
     """
     if study == "init":
@@ -102,16 +103,14 @@ def dashboard(
     ],
     host: Annotated[
         str,
-        typer.Option(
-            "--host", help="Another address than this machine's own; traffic is not encrypted."
-        ),
+        typer.Option("--host", help="The address to listen on; traffic is not encrypted."),
     ] = "127.0.0.1",
     port: Annotated[
-        int, typer.Option("--port", min=0, max=65535, help="0: any that is free.")
+        int, typer.Option("--port", min=0, max=65535, help="The port; 0: any free one.")
     ] = 8050,
     open_browser: Annotated[bool, typer.Option("--open", help="Open it in the browser.")] = False,
 ) -> None:
-    """Look at a study in the browser: sessions, ethograms, groups, any frame; Ctrl+C ends it."""
+    """Open a study in the browser: sessions, ethograms, groups, any frame; Ctrl+C ends it."""
     from liex_lab.api import serve_dashboard
 
     with progress_bar() as progress, ExitStack() as stack:
@@ -147,8 +146,8 @@ def verify(
         typer.Option("--recording", help="Measure this recording again and compare the tables."),
     ] = None,
 ) -> None:
-    """Check a session: its hashes, what it says of its origin and, with --recording, whether it
-    comes out again.
+    """Check a session: its hashes, its origin and, with --recording, whether measuring again gives
+    the same tables.
     """
     from liex_lab.api import verify_session
 

@@ -78,8 +78,8 @@ def train(
     ] = None,
     json_file: JsonFile = None,
 ) -> None:
-    """Make an animal's model from rendered pictures, the same again, byte for byte, whenever it is
-    run.
+    """Train an animal's model on rendered depth images; every run gives the same model, byte for
+    byte.
 
     `liex train actions` makes the model that names actions: from sessions that people labelled, or,
     without any, from virtual animals that act. `liex train tracking` measures how far off an

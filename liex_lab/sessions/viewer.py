@@ -99,7 +99,7 @@ def show_replay(
     if not replay.is_file():
         raise LiexError(f"there is no replay {replay}; run `liex run` on the recording again")
     if not headless:
-        need_screen(f"open {replay} on a computer that has one")
+        need_screen(f"open {replay} on a computer with a screen")
     from rerun.experimental import ViewerClient
 
     port = _free_port()

@@ -69,6 +69,25 @@ def test_every_verb_explains_itself(words: list[str]) -> None:
     assert all(word in result.output for word in expected)
 
 
+IMPERATIVES = {
+    *("Apply", "Check", "Compare", "Correct", "Draw", "Exchange", "List", "Make", "Measure"),
+    *("Move", "Open", "Pack", "Rename", "Report", "Score", "Set", "Show", "Take", "Train", "Turn"),
+    *("Write",),
+}
+
+
+@pytest.mark.parametrize("words", [[], ["evaluate"], ["correct"]])
+def test_the_list_of_verbs_is_whole_on_a_narrow_screen_and_each_begins_with_a_verb(
+    words: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    printed = CliRunner().invoke(cli.app, [*words, "--help"], env={"COLUMNS": "80"}).output
+    lists = printed.split("--help")[1]
+    begun = re.findall(r"^  [a-z]+ +([A-Z]\w+)", lists, re.MULTILINE)
+    assert len(begun) >= 6
+    assert set(begun) <= IMPERATIVES, set(begun) - IMPERATIVES
+    assert "..." not in lists
+
+
 def test_it_says_which_version_it_is() -> None:
     assert CliRunner().invoke(cli.app, ["--version"]).output == f"liex_lab {liex_lab.__version__}\n"
 

@@ -130,6 +130,19 @@ def test_a_report_with_something_to_say_does_not_say_that_there_is_nothing(
     assert caution in page
 
 
+def test_a_warning_is_a_sentence_and_the_list_that_it_names_is_below(session, monkeypatch):
+    told = ["the clock jumps", "depth_ts.txt has 3 rows too many.", "is it so?"]
+    told += ["2 bouts were left unlabelled (refused_bouts in session.json)."]
+    monkeypatch.setattr("liex_lab.dashboards.report.report.warnings", lambda _: told)
+    items = re.findall(r"<li>(.*?)</li>", render(session).split("Read this first")[1], re.DOTALL)
+    assert items[:4] == [
+        "The clock jumps.",
+        "depth_ts.txt has 3 rows too many.",
+        "Is it so?",
+        "2 bouts were left unlabelled (list below).",
+    ]
+
+
 def test_exchanges_of_head_and_tail_are_warned_of_and_listed(session, monkeypatch):
     flips = schema.to_pandas(
         schema.FLIPS,
