@@ -21,6 +21,7 @@ from liex_lab.behaviour.listing import FIRST, all_columns, first_columns
 from liex_lab.body import Skeleton
 from liex_lab.catalog import bundled_models
 from liex_lab.exchange import TARGETS
+from liex_lab.exchange.export import ALIASES
 from liex_lab.optics.sensor_card import SensorCard
 from liex_lab.plan import Plan
 from liex_lab.sessions.session import FILES
@@ -109,7 +110,7 @@ def test_every_verb_option_setting_and_format_that_is_named_exists() -> None:
         if key not in ("parquet", "csv", "json", "toml", "rrd", "mcap", "rbl", "html"):
             assert key in plan[table], f"{table}.{key}"
     formats = set(re.findall(r"--to ([a-z]+)\b", EVERYTHING)) - {"study", "live"}
-    assert {"csv", "xlsx", "nwb"} <= formats <= {*TARGETS, "video"}
+    assert {"csv", "xlsx", "nwb"} <= formats <= {*TARGETS, *ALIASES, "video"}
 
 
 def test_every_python_example_runs(
@@ -120,10 +121,14 @@ def test_every_python_example_runs(
     convert("synthetic:walk?seed=3&frames=60", "recording.mcap")
     examples = [
         example
-        for text in (README, PAGES["reference/python.md"], PAGES["howto/ephys.md"])
+        for text in (
+            README,
+            *(PAGES[f"{name}.md"] for name in ("reference/python", "howto/ephys")),
+            PAGES["reference/session-folder.md"],
+        )
         for example in blocks("python", text)
     ]
-    assert len(examples) == 3
+    assert len(examples) == 6
     for example in examples:
         for asked in set(re.findall(r'"(recording\.[a-z.]+)"', example)):
             example = example.replace(asked, "recording.mcap")

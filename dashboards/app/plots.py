@@ -394,7 +394,7 @@ def whole_session(
 
 def _only(one: Ethogram, word: str) -> Ethogram:
     chosen = np.array([name == word for name in one.words], bool)
-    return Ethogram(one.spans_s[chosen], [word] * int(chosen.sum()), one.lost_s[:0], one.duration_s)
+    return Ethogram(one.spans_s[chosen], [word] * int(chosen.sum()), one.lost_s, one.duration_s)
 
 
 def around(
