@@ -241,7 +241,7 @@ def _time_problems(recording: Recording) -> list[str]:
     if jumps := [gap for gap in recording.gaps if gap not in gaps]:
         found.append(
             f"the camera was stopped, or its clock set, in {len(jumps)} places, the first before "
-            f"frame {jumps[0].start_frame}; nothing is measured across them"
+            f"frame {jumps[0].start_frame}; no speed or distance is measured across them"
         )
     if gaps:
         missing = sum(gap.n_frames_missing for gap in gaps)
@@ -250,9 +250,9 @@ def _time_problems(recording: Recording) -> list[str]:
         places = "1 gap" if len(gaps) == 1 else f"{len(gaps)} gaps"
         found.append(
             f"the camera left out about {missing} frames ({share:.1%}) in {places}; the longest "
-            f"time between two frames is {longest_s:.2f} s; nothing is measured across a gap, but "
-            "if there are many, record to a faster disk or with fewer cameras on one USB "
-            "controller"
+            f"time between two frames is {longest_s:.2f} s; no speed or distance is measured "
+            "across a gap, but if there are many, record to a faster disk or with fewer cameras on "
+            "one USB controller"
         )
     if len(recording) == 1:
         found.append("a single frame has no rate and no duration; give the whole recording")

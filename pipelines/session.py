@@ -21,6 +21,7 @@ import numpy as np
 from liex_lab.errors import PlanError, RecordingError
 from liex_lab.plan import Plan
 from liex_lab.recordings.frame import FrameRooms
+from liex_lab.recordings.timestamps import JUMPED, PULSES_UNKNOWN
 from liex_lab.runtime.memory import Allocator, rest
 from liex_lab.runtime.places import inside
 from liex_lab.runtime.progress import Progress, silent
@@ -325,6 +326,7 @@ def make_track(writer: SessionWriter, fitted: Fitted) -> Verdict:
     water = build_water(fitted.plan)
     # water makes an ideal camera with a focal length of its own
     lens = unusual_lens(fitted.recording.camera) if water is None else ""
+    jumps = [gap.start_frame for gap in fitted.recording.gaps if gap.reason == JUMPED]
     place = tracker.scene.floor.unusual(None if water is None else water.lift_mm)
     verdict = Verdict.of(
         tracked.track,
@@ -344,6 +346,7 @@ def make_track(writer: SessionWriter, fitted: Fitted) -> Verdict:
             *files.grown(),
             *filter(None, [lens]),
             *place,
+            *(f"{PULSES_UNKNOWN}, first before frame {k}" for k in jumps[:1]),
         ),
         accepted=fitted.plan.estimation.accept_misfit,
     )

@@ -18,6 +18,7 @@ from liex_lab.behaviour.listing import all_columns
 from liex_lab.body import Skeleton
 from liex_lab.catalog import bundled_models
 from liex_lab.exchange import TARGETS
+from liex_lab.exchange.export import ALIASES
 from liex_lab.optics.sensor_card import SensorCard
 from liex_lab.plan import Plan
 from liex_lab.sessions.session import FILES
@@ -100,7 +101,7 @@ def test_every_verb_option_setting_and_format_that_is_named_exists() -> None:
         if key not in ("parquet", "csv", "json", "toml", "rrd", "mcap", "rbl", "html"):
             assert key in plan[table], f"{table}.{key}"
     formats = set(re.findall(r"--to ([a-z]+)\b", EVERYTHING)) - {"study", "live"}
-    assert {"csv", "xlsx", "nwb"} <= formats <= {*TARGETS, "video"}
+    assert {"csv", "xlsx", "nwb"} <= formats <= {*TARGETS, *ALIASES, "video"}
 
 
 def test_every_column_that_is_named_is_one() -> None:

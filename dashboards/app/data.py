@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 DONE = ("done", "changed")  # states in which there is a session to look at
 NO_POSE = "no pose"
 OTHER = "other actions"
-GREY = "#dcdcd7"
+GREY = "#a3a39b"
 VOID = "#ffffff"
 _READERS = 4  # threads; most of the time goes into opening files
 _HELD = 6  # sessions whose tables stay in memory
@@ -375,6 +375,8 @@ def raster(
         seconds[kind, first : last + 1] += 1.0
         seconds[kind, first] -= low - first
         seconds[kind, last] -= last + 1 - high
+    # a bout that continues across a gap is not observed there
+    seconds[:-1] = np.minimum(seconds[:-1], 1.0 - seconds[-1])
     best = seconds.argmax(axis=0)
     best[best == len(words)] = -2
     best[seconds.max(axis=0) <= 0.0] = -1

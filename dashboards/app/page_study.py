@@ -7,7 +7,7 @@ from typing import Any
 
 from dash import Dash, Input, Output, State, dcc, html, no_update
 
-from liex_lab.actions.colours import PALETTE
+from liex_lab.actions.colours import PALETTE, UNLABELLED
 
 from . import plots
 from .data import GREY, NO_POSE, OTHER, StudyData, colours_of, shown_words, vocabulary_of
@@ -118,7 +118,7 @@ def ethograms_page(data: StudyData) -> list[Any]:
             "share of the time in each action, by session",
         ),
         html.P(
-            "Shares are of the observed time and add up to one, so they are not independent.",
+            "Shares are fractions of the observed time; with unlabelled time they sum to 1.",
             className="muted",
         ),
         html.P([download("All shares as CSV", csv_address("summaries"))]),
@@ -171,6 +171,7 @@ def register(app: Dash, data: StudyData) -> None:
         marks = [
             *coloured.items(),
             *([(OTHER, GREY)] if len(words) > MOST_COLOURS else []),
+            ("unlabelled", UNLABELLED),
             (NO_POSE, plots.NO_POSE_COLOUR),
         ]
         key = [
@@ -178,7 +179,12 @@ def register(app: Dash, data: StudyData) -> None:
             for word, colour in marks
         ]
         size = plots.time_unit(max((one.duration_s for one in ones.values()), default=0.0))[1]
-        return plots.ethograms(ones, coloured), plots.time_budgets(table, coloured), key, size
+        return (
+            plots.ethograms(ones, coloured),
+            plots.time_budgets(table, coloured, words),
+            key,
+            size,
+        )
 
     @app.callback(
         Output("url", "href", allow_duplicate=True),

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from liex_lab.actions.colours import UNLABELLED
 from liex_lab.behaviour.design import animal_means
 
 from ..figures.style import INK, LINE, MUTED
@@ -108,23 +109,24 @@ def ethograms(ones: Mapping[str, Ethogram], coloured: Mapping[str, str]) -> dict
     }
 
 
-def time_budgets(shares: pd.DataFrame, coloured: Mapping[str, str]) -> dict[str, Any]:
+def time_budgets(
+    shares: pd.DataFrame, coloured: Mapping[str, str], words: Sequence[str]
+) -> dict[str, Any]:
     """A stacked bar per session: shares of the observed time in %, uncoloured actions in one grey.
 
     Args:
-        shares: one row per session: `key`, and the columns WORD_share and WORD_s for each action.
+        shares: one row per session: `key`, and the column WORD_share of each action and of
+            `unlabelled`.
         coloured: word -> colour.
+        words: the actions.
     """
     if shares.empty:
         return empty("No session is chosen, or none of those has a summary.")
-    actions = [str(name).removesuffix("_share") for name in shares if str(name).endswith("_share")]
-    actions = [
-        word for word in actions if f"{word}_s" in shares
-    ]  # other columns are shares of something else
-    known = {word: colour for word, colour in coloured.items() if word in actions}
-    rest = [f"{word}_share" for word in actions if word not in known]
+    known = {**coloured, "unlabelled": UNLABELLED}
+    known = {word: colour for word, colour in known.items() if f"{word}_share" in shares}
+    rest = [f"{word}_share" for word in words if word not in known and f"{word}_share" in shares]
     parts = [(word, shares[f"{word}_share"].fillna(0.0), colour) for word, colour in known.items()]
-    parts.append((OTHER, shares[rest].fillna(0.0).sum(axis=1), GREY))
+    parts.insert(-1, (OTHER, shares[rest].fillna(0.0).sum(axis=1), GREY))
     keys = [str(key) for key in shares["key"]]
     data = [
         {
@@ -392,7 +394,7 @@ def whole_session(
 
 def _only(one: Ethogram, word: str) -> Ethogram:
     chosen = np.array([name == word for name in one.words], bool)
-    return Ethogram(one.spans_s[chosen], [word] * int(chosen.sum()), one.lost_s[:0], one.duration_s)
+    return Ethogram(one.spans_s[chosen], [word] * int(chosen.sum()), one.lost_s, one.duration_s)
 
 
 def around(

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from liex_lab.actions.colours import action_colours
+from liex_lab.actions.colours import UNLABELLED, action_colours
 from liex_lab.behaviour.around import Around, around_onsets
 
 from ..units import counted, shown
@@ -44,13 +44,13 @@ _BESIDE = 4  # panels of a row
 
 
 def time_budget(seen: Seen) -> Figure | None:
-    """Share of the observed time in each action; None without actions.
+    """Share of the observed time in each action and without a name; None without actions.
 
     Args:
         seen: the animal.
     """
     row = seen.summary
-    colours = action_colours(seen.words)
+    colours = {**action_colours(seen.words), "unlabelled": UNLABELLED}
     words = [word for word in colours if row is not None and f"{word}_share" in row]
     if row is None or not words or not np.isfinite([row[f"{word}_share"] for word in words]).any():
         return None
@@ -83,6 +83,8 @@ def time_budget(seen: Seen) -> Figure | None:
 def activity(seen: Seen) -> Figure | None:
     """Stacked shares of the observed time in each action per interval; None without actions.
 
+    Sessions of schema 7 and before counted lost frames in bouts; their shares are scaled to one.
+
     Args:
         seen: the animal.
     """
@@ -97,7 +99,11 @@ def activity(seen: Seen) -> Figure | None:
     if not words or not observed.sum() > 0:
         return None
     unit, size = time_unit(float(stop[-1]))
-    seen_words = [word for word in words if table[f"{word}_s"].sum() > 0]
+    spent = {word: table[f"{word}_s"].to_numpy(float) for word in words}
+    total = np.maximum(observed, np.sum([*spent.values()], axis=0))
+    spent["unlabelled"] = total - np.sum([*spent.values()], axis=0)
+    colours["unlabelled"] = UNLABELLED
+    seen_words = [word for word, seconds in spent.items() if seconds.sum() > 1e-6]
     low = 9.0 + 4.0 * key_rows(seen_words)
     figure = sheet(TWO_COLUMNS_MM, low + 31.0)
     axes = panel(figure, LEFT_MM, low, TWO_COLUMNS_MM - LEFT_MM - RIGHT_MM, 23.0)
@@ -106,9 +112,8 @@ def activity(seen: Seen) -> Figure | None:
         f"{stop[0] - start[0]:.3g} s"
     )
     below = np.zeros(len(table))
-    for word in words:
-        spent = table[f"{word}_s"].to_numpy(float)
-        share = np.divide(spent, observed, out=np.zeros(len(table)), where=observed > 0)
+    for word, seconds in spent.items():
+        share = np.divide(seconds, total, out=np.zeros(len(table)), where=observed > 0)
         if share.any():
             axes.bar(
                 start / size,

@@ -23,6 +23,7 @@ from .style import (
     LINE,
     MUTED,
     ONE_COLUMN_MM,
+    PAPER,
     RIGHT_MM,
     TWO_COLUMNS_MM,
     action_key,
@@ -95,10 +96,11 @@ def ethograms(all_seen: Sequence[Seen]) -> Figure | None:
         axes.broken_barh(
             [(a / size, (b - a) / size) for a, b in joined(lost, least)],
             (k - 0.42, 0.84),
-            facecolor="none",
+            facecolor=PAPER,
             edgecolor=MUTED,
             linewidth=0.0,
             hatch="//////",
+            zorder=1.5,
         )
         for word in seen.words:
             own = seen.bouts.loc[seen.bouts["action"] == word, ["start_s", "stop_s"]]

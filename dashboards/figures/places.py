@@ -9,6 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.arena.scene import Fixture
+from liex_lab.behaviour.body import BRANCHES
+from liex_lab.behaviour.curves import axis_of
 from liex_lab.behaviour.occupancy import Occupancy, occupancy
 from liex_lab.sessions import Session
 
@@ -166,13 +168,13 @@ def occupancy_of(seen: Seen) -> Occupancy:
 
 
 def occupancy_map(seen: Seen) -> Figure | None:
-    """Heatmap of the time per area, with walls and zones; None where no place is known.
+    """Heatmap of the time per area, with walls and zones; None without a place, and for a hand.
 
     Args:
         seen: the animal.
     """
     found = occupancy_of(seen)
-    if found.n == 0:
+    if found.n == 0 or _is_hand(seen):
         return None
     title = (
         f"Occupancy, {seen.who}\nn = {counted(found.n, 'frame')}, {found.observed_s:.1f} s observed"
@@ -187,14 +189,19 @@ def occupancy_map(seen: Seen) -> Figure | None:
     return figure
 
 
+def _is_hand(seen: Seen) -> bool:
+    """Whether the animal is held up before the camera: where it is over the floor says nothing."""
+    return axis_of(seen.session.metadata["animal"]).kind == BRANCHES
+
+
 def trajectory(seen: Seen) -> Figure | None:
-    """The way of the body's centre from above, coloured by time; None where no place is known.
+    """Path of the body's centre from above by time; None without a place, and for a hand.
 
     Args:
         seen: the animal.
     """
     known = np.isfinite(seen.xy_mm).all(axis=1)
-    if not known.any():
+    if not known.any() or _is_hand(seen):
         return None
     from matplotlib import colormaps
     from matplotlib.cm import ScalarMappable

@@ -21,6 +21,7 @@ from .style import (
     LINE,
     MUTED,
     ONE_COLUMN_MM,
+    PAPER,
     RIGHT_MM,
     TWO_COLUMNS_MM,
     halo,
@@ -74,10 +75,11 @@ def ethogram(seen: Seen) -> Figure | None:
     axes.broken_barh(
         [(a / size, (b - a) / size) for a, b in joined(spans, least)],
         (-0.5, max(len(words), 1)),
-        facecolor="none",
+        facecolor=PAPER,  # over the bars: a bout that continues across a gap has none there
         edgecolor=MUTED,
         linewidth=0.0,
         hatch="//////",
+        zorder=1.5,
         gid="no pose",
     )
     for k, (word, colour) in enumerate(action_colours(words).items()):

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from liex_lab.actions.ethogram import ACROSS_GAPS
 from liex_lab.behaviour.body import BRANCHES, SWIMS
 from liex_lab.behaviour.curves import axis_of
 from liex_lab.sessions import Session
@@ -133,7 +134,10 @@ def _behaviour(session: Session) -> list[str]:
         n = int((session.bouts["source"] == "human").sum())
         sentences.append(f"{counted(n, 'bout was', 'bouts were')} named by a person.")
     if session.metadata.get("actions"):
-        sentences.append(f"Shares are of the {observed_s:.1f} s in which the animal was observed.")
+        sentences.append(
+            f"Shares are fractions of the {observed_s:.1f} s in which the animal was observed; "
+            f"with unlabelled time they sum to 1. {ACROSS_GAPS}"
+        )
     return [" ".join(sentences)]
 
 

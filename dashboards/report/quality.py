@@ -103,7 +103,7 @@ def _of_frames(session: Session) -> list[str]:
     if frames["n_missing"]:
         found.append(
             f"The camera did not deliver {counted(frames['n_missing'], 'frame')}, in "
-            f"{counted(frames['n_gaps'], 'gap')}; nothing is measured across them."
+            f"{counted(frames['n_gaps'], 'gap')}; no speed or distance is measured across them."
         )
     hidden = int(frames["flags"].get("hidden", 0))
     if hidden:
@@ -162,6 +162,11 @@ def _of_measures(session: Session) -> list[str]:
             f"Errors of the pose alone may look like a speed of up to {noise:.3g} {unit}, and a "
             f"pause is one below {pause:g} {unit}: pauses, and distance and speed at rest, are not "
             "to be trusted."
+        )
+    if session.metadata["schema_version"] < 8 and len(session.gaps):
+        found.append(
+            "An earlier version of liex_lab wrote this session and counted lost frames in the time "
+            "of bouts: shares of actions can be too high. Run `liex run` on the recording again."
         )
     described = session.columns
     fps = session.metadata["frames"]["fps_median"] or 0.0

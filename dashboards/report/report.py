@@ -12,7 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from liex_lab.actions.colours import NO_POSE, action_colours
+from liex_lab.actions.colours import NO_POSE, UNLABELLED, action_colours
+from liex_lab.actions.ethogram import ACROSS_GAPS
 from liex_lab.runtime.durable import write_whole
 from liex_lab.sessions import Session
 from liex_lab.sessions.verdict import verdict_in
@@ -94,6 +95,7 @@ def render(session: Session, figures: Path | None = None) -> str:
         actions=action_rows(session, words),
         summary=summary_rows(session, words),
         budget=budget_rows(session, words),
+        across_gaps=ACROSS_GAPS,
         zones=zone_rows(session),
         facts=facts(session),
         gaps=gap_rows(session),
@@ -199,10 +201,11 @@ def summary_rows(session: Session, words: list[str]) -> list[tuple[str, str, str
         return []
     described = session.columns[session.columns["table"] == "summary"].set_index("name")
     row = session.summary.iloc[0]
+    budgeted = [*words, "unlabelled"] if words else []
     elsewhere = {
         "session_id",
         "individual",
-        *(f"{word}_{what}" for word in words for what, _ in _BUDGET),
+        *(f"{word}_{what}" for word in budgeted for what, _ in _BUDGET),
     }
     elsewhere |= {f"zone_{zone.name}_{what}" for zone in session.zones for what in ("s", "share")}
     found = []
@@ -234,17 +237,17 @@ _BUDGET = (  # what of an action, and its unit
 
 
 def budget_rows(session: Session, words: list[str]) -> list[tuple[str, str, list[str]]]:
-    """Time budget, a row per action: word, colour, and the numbers that `_BUDGET` names.
+    """Time budget, a row per action and for unlabelled time: word, colour, numbers of `_BUDGET`.
 
     Args:
         session: the opened session.
         words: the actions, in the order in which they are coloured.
     """
-    if not session.has("summary.csv"):
+    if not words or not session.has("summary.csv"):
         return []
     row = session.summary.iloc[0]
     rows = []
-    for word, colour in action_colours(words).items():
+    for word, colour in (*action_colours(words).items(), ("unlabelled", UNLABELLED)):
         if f"{word}_s" in row:  # sessions of an older version lack some of the others
             values = [row.get(f"{word}_{what}", np.nan) for what, _ in _BUDGET]
             texts = [

@@ -16,6 +16,7 @@ from liex_lab.runtime.durable import replacing
 from liex_lab.runtime.places import unlinked
 
 _CODECS = ("libx264", "libopenh264")
+_CLOCK = Fraction(1, 90_000)  # s, the usual unit of time in MP4
 _THREADS = 2  # always: their number is in what comes out
 
 
@@ -48,7 +49,7 @@ class Video:
 
     Args:
         path: the file to write.
-        fps: pictures per second.
+        fps: pictures per second, as usual in it; each is shown at its own time.
 
     Raises:
         SessionError: there is no encoder.
@@ -66,11 +67,12 @@ class Video:
     def __enter__(self) -> Video:
         return self
 
-    def add(self, picture: NDArray[np.uint8]) -> None:
+    def add(self, picture: NDArray[np.uint8], time_s: float) -> None:
         """Append a picture; all are as large as the first.
 
         Args:
             picture: (H, W, 3) uint8 RGB; an odd row or column is left out.
+            time_s: when it is shown, s, later than the one before; 0 at the first.
         """
         import av
 
@@ -83,12 +85,15 @@ class Video:
             self._stream.width = width
             self._stream.height = height
             self._stream.pix_fmt = "yuv420p"
+            self._stream.codec_context.time_base = _CLOCK
             self._stream.codec_context.thread_count = _THREADS
             if self._codec == "libx264":
                 self._stream.options = {"crf": "20", "preset": "veryfast"}
         frame = av.VideoFrame.from_ndarray(
             np.ascontiguousarray(picture[:height, :width]), format="rgb24"
         )
+        frame.time_base = _CLOCK
+        frame.pts = round(time_s / _CLOCK)
         self._box.mux(self._stream.encode(frame))
 
     def __exit__(

@@ -90,7 +90,8 @@ def write_session(
 ) -> Path:
     """Write a session, or a stretch of it, as a video; returns its path.
 
-    The video of a whole session has the session's own clock: its time t is time t of the tables.
+    Picture k is row k of the tables (of the stretch), shown at its own time, so the rate varies:
+    the time t of the video of a whole session is the time t of the tables.
 
     Args:
         session: the opened session.
@@ -113,11 +114,14 @@ def write_session(
                 f"the session {session.name} lasts {end:.2f} s, and {low:.2f} to {high:.2f} s is "
                 "no part of it; name other times"
             )
+        first, last = np.searchsorted(film.time_s, np.array([low, high]) - 1e-6)
+        rows = range(first, last) or [film.row_at(low)]  # in a gap, the frame before it
+        after_s = film.time_s[rows] - low
         near = start_s is not None or stop_s is not None
         cell = Cell(film, low, high, session.name, 0 if near else None)
         view = film.whole_view()
         size = (480, 480) if near else _fitted(view.width, view.height, (_WHOLE_PX, _WHOLE_PX))
-        _write(path, film.fps, high - low, slower, lambda t: cell.picture(t, size), progress)
+        _write(path, film.fps, after_s, slower, lambda t: cell.picture(t, size), progress)
     return path
 
 
@@ -163,7 +167,8 @@ def write_clips(
         longest = max(cell.stop_s - cell.start_s for cell in cells)
         counts = {name: len(some) for name, some in blocks.items()}
         grid = _Grid(chosen, counts, " or ".join(actions) or "session")
-        _write(path, fps, longest, slower, grid.picture, progress)
+        n = max(int(round(longest * fps * slower)), 1)
+        _write(path, fps, np.arange(n) / (fps * slower), slower, grid.picture, progress)
     return path
 
 
@@ -251,17 +256,17 @@ def _fitted(width: int, height: int, room: tuple[int, int]) -> tuple[int, int]:
 def _write(
     path: Path,
     fps: float,
-    duration_s: float,
+    after_s: NDArray[np.float64],
     slower: float,
     picture: Callable[[float], NDArray[np.uint8]],
     progress: Progress,
 ) -> None:
-    """Pictures at a steady rate, each of the frame that was there at its time."""
+    """The pictures at some times (n,) s after the beginning, each shown at its time."""
     unlinked(path).parent.mkdir(parents=True, exist_ok=True)
-    n = max(int(round(duration_s * fps * slower)), 1)
+    n = len(after_s)
     with Video(path, fps) as video:
-        for k in range(n):
+        for k, at_s in enumerate(after_s.tolist()):
             if k % 20 == 0:
                 progress(k, n, "drawing the video")
-            video.add(picture(k / (fps * slower)))
+            video.add(picture(at_s), slower * (at_s - after_s[0]))
         progress(n, n, "drawing the video")

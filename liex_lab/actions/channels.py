@@ -16,13 +16,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from liex_lab.actions.ethogram import LONGEST_GAP_S
 from liex_lab.body.skeleton import VIEWS, Skeleton
 from liex_lab.runtime.memory import Allocator, blocks
 from liex_lab.tracking.track import Track
 
 Array = NDArray[np.float64]
 
-LONGEST_GAP_S = 0.4  # is bridged; within a longer one nobody knows what happened
 _FLIP_S = 0.15  # to either side: a body that points the other way for a moment was measured wrongly
 _WALL_BL = 0.6  # a wall this many lengths away hardly matters
 _DOUBT = 1.5  # the usual error's logarithm is one of order one

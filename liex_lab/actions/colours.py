@@ -13,6 +13,7 @@ from itertools import cycle
 
 NO_POSE = "#EE6677"
 PREDICTED_ERROR = "#997700"
+UNLABELLED = "#E2E2DC"
 PALETTE = (
     "#FFAABB",
     "#CCBB44",

@@ -12,6 +12,13 @@ from numpy.typing import NDArray
 from liex_lab.errors import LiexError
 
 UNLABELLED = ""  # the word of a frame that no action names
+LONGEST_GAP_S = 0.4  # that the recogniser bridges; nobody knows what happened in a longer one
+ACROSS_GAPS = (  # for every reader: in columns.json, the report and the methods
+    f"The recogniser continues a bout across gaps of up to {LONGEST_GAP_S:g} s (2.5 frame "
+    "intervals of a slower camera), a person's bout may span any gap, and a bout named by a rule "
+    "ends at a gap. The duration of a bout runs by the clock, gaps included; the time and the "
+    "share of an action count observed frames only. No speed or distance is measured across a gap."
+)
 
 
 def runs_of(values: NDArray[Any]) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[Any]]:

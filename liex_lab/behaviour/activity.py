@@ -1,7 +1,8 @@
 """Activity over a session in bins of one minute: distance, mean speed and time in each action.
 
 Time-binned activity as in open-field and locomotor assays; a recording of less than ten minutes is
-cut into ten bins.
+cut into ten bins. Every time is a sum over observed frames of the time to the next frame, so the
+actions and the time without a name add up to the observed time.
 """
 
 from __future__ import annotations
@@ -31,14 +32,12 @@ def activity(kinematics: pd.DataFrame, bouts: pd.DataFrame, words: Sequence[str]
         words: the actions' names.
 
     Returns:
-        The columns of `activity_columns`; a frame counts in the bin in which it begins, a bout in
-        every bin it overlaps.
+        The columns of `activity_columns`; a frame counts in the bin in which it begins.
     """
     time_s = kinematics["time_s"].to_numpy(float)
-    hold = stop_times(time_s) - time_s
-    edges = intervals(float(time_s[-1] + hold[-1]))
+    edges = intervals(float(stop_times(time_s)[-1]))
     row = np.clip(np.searchsorted(edges, time_s, side="right") - 1, 0, len(edges) - 2)
-    observed = np.isfinite(kinematics["x_mm"].to_numpy(float))
+    hold = observed_hold(kinematics)
     step = kinematics["step_mm"].to_numpy(float)
     moved = np.isfinite(step)
     n = len(edges) - 1
@@ -49,22 +48,18 @@ def activity(kinematics: pd.DataFrame, bouts: pd.DataFrame, words: Sequence[str]
 
     distance = total(step, moved)
     timed = total(hold, moved)
-    spent = {}
-    for word in words:
-        own = bouts[bouts["action"] == word]
-        spent[f"{word}_s"] = time_within(
-            own["start_s"].to_numpy(float), own["stop_s"].to_numpy(float), edges
-        )
+    spent = time_named(kinematics, bouts, words, row, n)
     return to_pandas(
         activity_columns(words),
         {
             **{name: [str(kinematics[name].iloc[0])] * n for name in ("session_id", "individual")},
             "start_s": edges[:-1],
             "stop_s": edges[1:],
-            "observed_s": total(hold, observed),
+            "observed_s": total(hold, hold > 0.0),
             "distance_mm": distance,
             "mean_speed_mm_s": np.divide(distance, timed, out=np.full(n, np.nan), where=timed > 0),
-            **spent,
+            "unlabelled_s": spent[:, 0],
+            **{f"{word}_s": spent[:, k] for k, word in enumerate(words, 1)},
         },
     )
 
@@ -82,19 +77,44 @@ def intervals(duration_s: float) -> Array:
     return np.append(np.arange(0.0, duration_s - 1e-9, BIN_S), duration_s)
 
 
-def time_within(start_s: Array, stop_s: Array, edges: Array) -> Array:
-    """(k,) time of spans within each of k intervals, s.
+def observed_hold(kinematics: pd.DataFrame) -> Array:
+    """How long each frame counts, (n,) s: until the next frame; 0 without a measured pose.
+
+    Before a gap of the camera and at the end it is one median step.
 
     Args:
-        start_s: (n,) beginnings of the spans, s, in order; spans do not overlap.
-        stop_s: (n,) their ends, s.
-        edges: (k + 1,) edges of the intervals, s.
+        kinematics: the table `kinematics` of n frames.
     """
-    if len(start_s) == 0:
-        return np.zeros(len(edges) - 1)
-    # time spent in spans before each edge: a broken line through (start, so far) and (stop, so far
-    # + length)
-    so_far = np.append(0.0, np.cumsum(stop_s - start_s))
-    at = np.stack([start_s, stop_s], axis=1).ravel()
-    spent = np.stack([so_far[:-1], so_far[1:]], axis=1).ravel()
-    return np.diff(np.interp(edges, at, spent))
+    time_s = kinematics["time_s"].to_numpy(float)
+    observed = np.isfinite(kinematics["x_mm"].to_numpy(float))
+    return np.where(observed, stop_times(time_s) - time_s, 0.0)
+
+
+def time_named(
+    kinematics: pd.DataFrame,
+    bouts: pd.DataFrame,
+    words: Sequence[str],
+    row: NDArray[np.int64] | int = 0,
+    n: int = 1,
+) -> Array:
+    """Observed time without a name and in each action, (n, 1 + len(words)) s, in n intervals.
+
+    A row adds up to the observed time of its interval, whatever gaps the bouts continue across.
+
+    Args:
+        kinematics: the table `kinematics`.
+        bouts: the table `bouts`.
+        words: the actions' names; bouts of any other count as unlabelled.
+        row: the interval of each frame.
+        n: number of intervals.
+    """
+    time_s = kinematics["time_s"].to_numpy(float)
+    place = {word: k for k, word in enumerate(words, 1)}
+    code = np.zeros(len(time_s), np.int64)
+    # a frame at a bout's start belongs to it, one at its stop does not, however seconds are rounded
+    spans = np.searchsorted(time_s, bouts[["start_s", "stop_s"]].to_numpy(float) - 1e-6)
+    for (start, stop), word in zip(spans, bouts["action"], strict=True):
+        code[start:stop] = place.get(word, 0)
+    width = len(place) + 1
+    spent = np.bincount(row * width + code, observed_hold(kinematics), n * width)
+    return np.asarray(spent.reshape(n, width))

@@ -272,7 +272,14 @@ SWIMMING = tuple(
 
 BOUT_MEASURES: tuple[Column, ...] = columns(
     "bouts",
-    ("path_mm", "float64", "mm", "way of the body centre within the bout", "sum of step_mm"),
+    (
+        "path_mm",
+        "float64",
+        "mm",
+        "distance travelled by the body centre in the observed frames of the bout; the distance "
+        "across a gap is not included, so it can be shorter than displacement_mm there",
+        "sum of step_mm",
+    ),
     (
         "path_bl",
         "float64",
@@ -284,7 +291,7 @@ BOUT_MEASURES: tuple[Column, ...] = columns(
         "displacement_mm",
         "float64",
         "mm",
-        "how far the bout's last place is from its first",
+        "distance between the first and the last observed place of the bout, across gaps too",
         "|p(last) - p(first)|",
     ),
     (

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from liex_lab.arena.outline import UNKNOWN, Arena
 from liex_lab.arena.zones import SEPARATOR
+from liex_lab.behaviour.activity import observed_hold
 from liex_lab.behaviour.bouts import MouseRules, tidy
 from liex_lab.behaviour.kinematics import segments
 from liex_lab.behaviour.summary_columns import ZONES
@@ -80,7 +81,7 @@ def visits(
     number = segments(time_s, observed)
     step = np.nan_to_num(kinematics["step_mm"].to_numpy(float))
     first = time_s[observed][0] if observed.any() else np.nan
-    hold = np.where(observed, stop_s - time_s, 0.0)
+    hold = observed_hold(kinematics)
     rows = []
     for zone, inside in zip(zones, inside_zones(frames, zones), strict=True):
         here = inside & observed

@@ -2,7 +2,8 @@
 
 Glue over `kinematics`, `bouts`, `measures`, `transitions`, `activity` and `places`; the summary
 adds distance, speeds, turn bias, time budget (count, time, share, rate and latency of each action,
-and of all rears together) and times in zones. Shares are of the observed time.
+and of all rears together) and times in zones. Shares are of the observed time, and count observed
+frames only.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from liex_lab.behaviour.activity import activity
+from liex_lab.behaviour.activity import activity, observed_hold, time_named
 from liex_lab.behaviour.body import SWIMS, parents_of
 from liex_lab.behaviour.bouts import ACTIONS, MouseRules, find_bouts
 from liex_lab.behaviour.columns import kind_of
@@ -268,7 +269,7 @@ def summarise(
     around = around or Surroundings()
     time_s = kinematics["time_s"].to_numpy(float)
     observed = np.isfinite(kinematics["x_mm"].to_numpy(float))
-    hold = np.where(observed, stop_times(time_s) - time_s, 0.0)
+    hold = observed_hold(kinematics)
     first = float(time_s[observed][0]) if observed.any() else np.nan
     block: dict[str, Any] = {
         "session_id": str(frames["session_id"].iloc[0]),
@@ -281,7 +282,7 @@ def summarise(
         "spine_mm": _median(frames["spine_mm"]) if "spine_mm" in frames else np.nan,
         **_motion(kinematics, hold),
         **place_measures(frames, hold, around.arena),
-        **_budget(bouts, words.words, float(hold.sum()), first),
+        **_budget(kinematics, bouts, words.words, first),
         **_time_in_zones(frames, words.zones, hold),
     }
     if words.kind == SWIMS:
@@ -325,35 +326,33 @@ def _moving_m(kinematics: pd.DataFrame, faster_than_mm_s: float) -> float:
 
 
 def _budget(
-    bouts: pd.DataFrame, words: Sequence[str], observed_s: float, first_s: float
+    kinematics: pd.DataFrame, bouts: pd.DataFrame, words: Sequence[str], first_s: float
 ) -> dict[str, float]:
     """Time, number and latency of each action, and the time that has no name."""
+    spent = time_named(kinematics, bouts, words)[0]
+    observed_s = float(spent.sum())
+    share = spent / observed_s if observed_s > 0 else np.full(len(spent), np.nan)
     found: dict[str, float] = {}
-    for word in words:
+    for k, word in enumerate(words, 1):
         own = bouts[bouts["action"] == word]
         n = len(own)
-        seconds = float(own["duration_s"].sum())
         found |= {
             f"{word}_count": n,
-            f"{word}_s": seconds,
-            f"{word}_share": seconds / observed_s if observed_s > 0 else np.nan,
-            f"{word}_mean_s": seconds / n if n else np.nan,
+            f"{word}_s": float(spent[k]),
+            f"{word}_share": float(share[k]),
+            f"{word}_mean_s": float(own["duration_s"].mean()) if n else np.nan,
             f"{word}_per_min": 60.0 * n / observed_s if observed_s > 0 else np.nan,
             f"{word}_latency_s": float(own["start_s"].min()) - first_s if n else np.nan,
         }
-    rest = max(0.0, observed_s - sum(found[f"{word}_s"] for word in words))
     if kinds := rears_of(words):
         own = bouts[bouts["action"].isin(kinds)]
-        seconds = sum(found[f"{kind}_s"] for kind in kinds)
         found |= {
             "rear_count": len(own),
-            "rear_s": seconds,
-            "rear_share": seconds / observed_s if observed_s > 0 else np.nan,
+            "rear_s": sum(found[f"{kind}_s"] for kind in kinds),
+            "rear_share": sum(found[f"{kind}_share"] for kind in kinds),
             "rear_latency_s": float(own["start_s"].min()) - first_s if len(own) else np.nan,
         }
-    found["unlabelled_s"] = rest if rest > 1e-9 else 0.0  # rounding of sums of seconds
-    found["unlabelled_share"] = found["unlabelled_s"] / observed_s if observed_s > 0 else np.nan
-    return found
+    return found | {"unlabelled_s": float(spent[0]), "unlabelled_share": float(share[0])}
 
 
 def _time_in_zones(frames: pd.DataFrame, zones: Sequence[str], hold: Array) -> dict[str, float]:

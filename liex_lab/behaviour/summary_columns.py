@@ -17,7 +17,7 @@ _WHO = (
     ("session_id", "string", "", "name of the session: one recording's results"),
     ("individual", "string", "", "name of the animal within the session"),
 )
-_SHARE = "shares add up to one, so they are not independent"
+_SHARE = "with unlabelled_share the shares of all actions sum to 1"
 
 _GENERAL = (
     *_WHO,
@@ -185,14 +185,14 @@ def summary_columns(
             "unlabelled_s",
             "float64",
             "s",
-            "observed time that has no name",
-            "observed_s - time in bouts",
+            "observed time without an action",
+            "observed_s - time of all actions",
         ),
         (
             "unlabelled_share",
             "float64",
             "",
-            "share of the observed time that has no name",
+            "share of the observed time without an action",
             "unlabelled_s / observed_s",
         ),
     )
@@ -238,7 +238,14 @@ def _of_rears(kinds: Sequence[str]) -> tuple[tuple[str, ...], ...]:
 def _of_action(word: str) -> tuple[tuple[str, ...], ...]:
     return (
         (f"{word}_count", "int64", "", f"number of bouts of {word}"),
-        (f"{word}_s", "float64", "s", f"time in {word}", "sum of duration_s", OWN),
+        (
+            f"{word}_s",
+            "float64",
+            "s",
+            f"observed time in {word}",
+            "sum over the observed frames of its bouts of the time to the next frame",
+            OWN,
+        ),
         (
             f"{word}_share",
             "float64",
@@ -251,8 +258,8 @@ def _of_action(word: str) -> tuple[tuple[str, ...], ...]:
             f"{word}_mean_s",
             "float64",
             "s",
-            f"mean length of a bout of {word}; empty where there is none",
-            f"{word}_s / {word}_count",
+            f"mean duration of a bout of {word}; empty where there is none",
+            "mean of duration_s",
         ),
         (
             f"{word}_per_min",
@@ -357,7 +364,7 @@ ZONES: tuple[Column, ...] = columns(
         "",
         "how often the animal was there; shorter absences than the plan's "
         "behaviour.merge_pauses_s are bridged, then shorter visits than behaviour.min_bout_s "
-        "dropped",
+        "dropped; a gap ends a visit",
         "",
         OWN,
     ),
@@ -406,13 +413,20 @@ def activity_columns(words: Sequence[str]) -> tuple[Column, ...]:
             "mean speed over the time with a speed",
             "distance / time",
         ),
+        (
+            "unlabelled_s",
+            "float64",
+            "s",
+            "observed time without an action in it",
+            "observed_s - time of all actions",
+        ),
         *(
             (
                 f"{word}_s",
                 "float64",
                 "s",
-                f"time in {word} in it",
-                "overlap of its bouts with the interval",
+                f"observed time in {word} in it; with unlabelled_s all actions sum to observed_s",
+                "sum over the observed frames of its bouts of the time to the next frame",
             )
             for word in words
         ),

@@ -126,7 +126,7 @@ def export(
         typer.Option(
             "--to",
             metavar="FORMAT",
-            help="nwb, boris, dlc, movement, sleap, csv, xlsx or video.",
+            help="nwb, boris, dlc (or deeplabcut), movement, sleap, csv, xlsx or video.",
         ),
     ],
     out: Annotated[

@@ -42,6 +42,7 @@ TARGETS: dict[str, tuple[str, str, str]] = {
         "an Excel workbook with every table as a sheet, and what every column means",
     ),
 }
+ALIASES = {"deeplabcut": "dlc"}
 
 
 def export(
@@ -53,22 +54,25 @@ def export(
 
     Args:
         session: the session.
-        to: the format, a word of `TARGETS`.
+        to: the format, a word of `TARGETS` or `ALIASES`.
         out: the folder it goes into, made if needed; None takes the session's own.
         overwrite: replace what is there already.
 
     Raises:
         SessionError: the format is not known, a file is there already, or packages are missing.
     """
+    to = ALIASES.get(to, to)
     if to not in TARGETS:
         if to == "video":
             raise SessionError(
-                "a video is no file of another program; `liex_lab.api.export_video` writes it"
+                "`liex_lab.api.export_video` writes a video (on the command line `liex export --to "
+                "video`)"
             )
-        near = difflib.get_close_matches(to, TARGETS, 1)
+        near = difflib.get_close_matches(to, [*TARGETS, *ALIASES, "video"], 1)
         hint = f"did you mean '{near[0]}'? " if near else ""
         raise SessionError(
-            f"there is no format '{to}' to export to: {hint}known are {', '.join(TARGETS)}"
+            f"there is no format '{to}' to export to: {hint}known are {', '.join(TARGETS)}, "
+            f"{', '.join(ALIASES)} (the same as dlc) and video"
         )
     home, ending, _ = TARGETS[to]
     folder = session.path if out is None else Path(out)

@@ -23,6 +23,7 @@ import numpy as np
 from liex_lab.errors import SessionError
 from liex_lab.sessions import Session
 from liex_lab.sessions.pose_arrays import Poses
+from liex_lab.sessions.session import PULSE
 
 from .hdf5 import hdf5_file
 from .nwb_intervals import add_intervals
@@ -36,7 +37,10 @@ _FRAME = (
     "the arena: z up from the floor, origin at the foot of the camera's perpendicular, x along "
     "the picture's rows; joints lie on the body's mid-axis"
 )
-_CONFIDENCE = "probability that the joint lies within 10 % of the spine's length of the truth"
+_SCORE = "probability that the joint lies within 10 % of the spine's length of the truth"
+_CONFIDENCE = (
+    "0.6 + 0.4 x score where the pose of the frame is trusted, 0.5 x score where it is not"
+)
 
 
 def write(session: Session, path: Path) -> None:
@@ -139,6 +143,7 @@ def _add_poses(made: NWBFile, module: Any, session: Session, poses: Poses, versi
     PoseEstimation.
     """
     from ndx_pose import PoseEstimation, PoseEstimationSeries, Skeleton, Skeletons
+    from pynwb import TimeSeries
 
     skeleton = Skeleton(
         name=session.metadata["animal"]["name"],
@@ -161,7 +166,7 @@ def _add_poses(made: NWBFile, module: Any, session: Session, poses: Poses, versi
                 unit="millimeters",
                 reference_frame=_FRAME,
                 timestamps=series[0] if series else poses.time_s,
-                confidence=poses.score[:, k].astype(np.float32),
+                confidence=poses.likelihood[:, k].astype(np.float32),
                 confidence_definition=_CONFIDENCE,
             )
         )
@@ -176,6 +181,18 @@ def _add_poses(made: NWBFile, module: Any, session: Session, poses: Poses, versi
         skeleton=skeleton,
     )
     module.add(estimate)
+    for name, data, unit, what in (
+        (
+            "score",
+            poses.score.astype(np.float32),
+            "probability",
+            f"{', '.join(poses.joints)}: {_SCORE}",
+        ),
+        ("pulse_index", poses.pulse_index, "count", PULSE.meaning),
+    ):
+        module.add(
+            TimeSeries(name=name, data=data, unit=unit, timestamps=poses.time_s, description=what)
+        )
     return estimate
 
 

@@ -1,8 +1,8 @@
 """SLEAP's analysis file (HDF5), in its own order of axes, which is Matlab's.
 
 The format has two coordinates: joints are in pixels of the depth picture. It has no times and no
-actions: true times stand beside SLEAP's own data sets as `time_s` (s), which its readers leave
-alone.
+actions: true times stand beside SLEAP's own data sets as `time_s` (s) and `pulse_index`, which its
+readers leave alone. Scores of points are `Poses.likelihood`.
 """
 
 from __future__ import annotations
@@ -38,15 +38,16 @@ def write(session: Session, path: Path) -> None:
         "tracking_scores": ("track", "frame"),
     }
     mean_score = np.where(
-        seen.any(axis=1), np.nanmean(np.where(seen, poses.score, 0.0), axis=1), np.nan
+        seen.any(axis=1), np.nanmean(np.where(seen, poses.likelihood, 0.0), axis=1), np.nan
     )
     arrays = {
         "tracks": poses.uv_px.transpose(2, 1, 0)[None],
-        "point_scores": poses.score.T[None],
+        "point_scores": poses.likelihood.T[None],
         "track_occupancy": seen.any(axis=1, keepdims=True).astype(np.uint8),
         "instance_scores": mean_score[None],
         "tracking_scores": np.where(seen.any(axis=1), 1.0, np.nan)[None],
         "time_s": poses.time_s,
+        "pulse_index": poses.pulse_index,
     }
     edges = [(poses.joints[a], poses.joints[b]) for a, b in poses.bones]
     texts = {"node_names": poses.joints, "track_names": (poses.individual,), "edge_names": edges}

@@ -34,6 +34,10 @@ _PLAUSIBLE_START_NS = (
 
 DROPPED = "camera_dropped"
 JUMPED = "clock_jumped"
+PULSES_UNKNOWN = (
+    "the camera was stopped or its clock set: how many pulses are missing there is unknown, and "
+    "pulse_index is a guess from there on"
+)
 
 
 @dataclass(frozen=True)
@@ -50,7 +54,7 @@ class Gap:
         stop_frame: row behind its last frame.
         start_ns: beginning of the interval, ns.
         stop_ns: its end, ns.
-        n_frames_missing: how many frames the camera left out, estimated from the median step.
+        n_frames_missing: how many frames the camera left out, estimated from the mean step.
         reason: `DROPPED`, or one of `FAULTS`.
     """
 
@@ -141,8 +145,10 @@ def find_gaps(times_ns: Times, step_ns: int) -> list[Gap]:
     if step_ns <= 0:
         return []
     dt = np.diff(times_ns)
+    after = np.flatnonzero(dt > GAP_FACTOR * step_ns)
+    period_ns = _period_ns(dt, step_ns) if len(after) else 0.0
     found = []
-    for i in np.flatnonzero(dt > GAP_FACTOR * step_ns):
+    for i in after:
         jumped = dt[i] > CLOCK_JUMP_NS
         found.append(
             Gap(
@@ -150,11 +156,30 @@ def find_gaps(times_ns: Times, step_ns: int) -> list[Gap]:
                 stop_frame=int(i) + 1,
                 start_ns=int(times_ns[i]) + step_ns,
                 stop_ns=int(times_ns[i + 1]),
-                n_frames_missing=1 if jumped else round(int(dt[i]) / step_ns) - 1,
+                n_frames_missing=1 if jumped else max(1, round(int(dt[i]) / period_ns) - 1),
                 reason=JUMPED if jumped else DROPPED,
             )
         )
     return found
+
+
+def _period_ns(dt: Times, step_ns: int) -> float:
+    """Mean frame interval of steps `dt` (n,), ns: least squares over stretches without long gaps.
+
+    Longer and longer gaps count as their number of frames becomes certain. A median step is not
+    enough: that of whole milliseconds or of a jittering clock is off by a hundredth.
+    """
+    period = float(step_ns)
+    for longest in (GAP_FACTOR, 4.0, 16.0, 64.0):
+        stretch = np.cumsum(np.append(False, dt > longest * period))
+        pulse = np.cumsum(np.append(0.0, np.maximum(np.rint(dt / period), 1.0)))
+        x, t = (
+            values - (np.bincount(stretch, values) / np.bincount(stretch))[stretch]
+            for values in (pulse, np.cumsum(np.append(0.0, dt)))
+        )
+        found = float(x @ t) / max(float(x @ x), 1e-9)
+        period = found if abs(found - step_ns) < 0.1 * step_ns else period
+    return period
 
 
 def find_faults(times_ns: Times, step_ns: int, faults: NDArray[np.uint8]) -> list[Gap]:

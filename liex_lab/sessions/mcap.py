@@ -1,7 +1,8 @@
 """MCAP log of a session for Foxglove: depth, camera, skeleton, transforms, action states; metres.
 
 Messages follow Foxglove's schemas (RawImage 16UC1 in mm, CameraCalibration, FrameTransforms,
-SceneUpdate, PosesInFrame, ImageAnnotations, Log) and one JSON schema of our own for actions.
+SceneUpdate, PosesInFrame, ImageAnnotations, Log) and JSON schemas of our own for actions and the
+predicted error.
 Pictures are whole, for Foxglove shows one image; where the still scene stands behind cut-outs,
 Zstandard finds it in the picture before, some 50 pictures to a chunk. Depth streams in as it comes;
 everything small is written at the end from the same track the tables are made of.
@@ -36,16 +37,17 @@ Array = NDArray[np.float64]
 _SECOND = 10**9
 _BLOCK = 8192  # frames of a track that are in memory
 _DATA = b"\x32"  # tag of the field of RawImage that holds the pixels: number 6, bytes
+_TIME = {
+    "type": "object",
+    "title": "time",
+    "properties": {"sec": {"type": "integer"}, "nsec": {"type": "integer"}},
+}
 _ACTION_SCHEMA: dict[str, Any] = {
     "title": "liex_lab.ActionState",
     "description": "The action that begins now; an empty word ends the last one.",
     "type": "object",
     "properties": {
-        "timestamp": {
-            "type": "object",
-            "title": "time",
-            "properties": {"sec": {"type": "integer"}, "nsec": {"type": "integer"}},
-        },
+        "timestamp": _TIME,
         "action": {"type": "string"},
         "index": {
             "type": "integer",
@@ -54,8 +56,15 @@ _ACTION_SCHEMA: dict[str, Any] = {
         "frame_index": {"type": "integer"},
     },
 }
-_ACTIONS = SchemaOf(
-    _ACTION_SCHEMA["title"], "jsonschema", json.dumps(_ACTION_SCHEMA).encode(), "json"
+_ERROR_SCHEMA: dict[str, Any] = {
+    "title": "liex_lab.PredictedError",
+    "description": "The joint error to be expected in a frame with a pose, mean over the joints.",
+    "type": "object",
+    "properties": {"timestamp": _TIME, "predicted_error_mm": {"type": "number"}},
+}
+_ACTIONS, _ERRORS = (
+    SchemaOf(one["title"], "jsonschema", json.dumps(one).encode(), "json")
+    for one in (_ACTION_SCHEMA, _ERROR_SCHEMA)
 )
 _BONE = messages.Color(r=1.0, g=1.0, b=1.0, a=1.0)
 _JOINT = messages.Color(r=1.0, g=0.31, b=0.24, a=1.0)
@@ -193,6 +202,13 @@ class McapWriter:
             if seen:
                 root = _transform(time_ns, "arena", "root", track.root_mm[i], quaternions[i])
                 self._transforms.log(messages.FrameTransforms(transforms=[root]), log_time=time_ns)
+            if np.isfinite(track.predicted_error_mm[i]):
+                sec, nsec = divmod(time_ns, _SECOND)
+                error = {
+                    "timestamp": {"sec": sec, "nsec": nsec},
+                    "predicted_error_mm": float(track.predicted_error_mm[i]),
+                }
+                self._writer.log("/predicted_error", _ERRORS, [json.dumps(error).encode()], time_ns)
 
     def flushed(self) -> int:
         """Hand everything to the operating system; returns the file's bytes.

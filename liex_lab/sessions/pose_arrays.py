@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.errors import MissingPackageError, how_to_install
+from liex_lab.tracking.track import CORRECTED
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -18,7 +19,11 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
+_KEPT = 0.6  # the usual cut at a likelihood: what is trusted reaches it
+_UNSURE = 0.5  # the highest likelihood of what is not
+
+
+@dataclass(frozen=True, repr=False)
 class Poses:
     """Poses of one animal, one row for every recorded frame; NaN where there is no pose.
 
@@ -26,12 +31,15 @@ class Poses:
         individual: the animal's name.
         joints: names of the J joints.
         bones: pairs of joint indices, parent and child.
-        frame_index: (n,) int64, the camera's frame count.
+        frame_index: (n,) int64, number of the frame in the recording.
+        pulse_index: (n,) int64, number of the camera's pulse, see the column of `frames`.
         time_s: (n,) s since the first frame.
         xyz_mm: (n, J, 3) mm, arena frame.
         uv_px: (n, J, 2) px of the depth picture; (0, 0) is the centre of the top-left pixel.
         score: (n, J) probability that the joint lies within 10 % of the spine's length of the
             truth.
+        trusted: (n,) bool, whether the pose was measured and nothing contradicts it, or a person
+            corrected it.
         sd_mm: (n, J, 3) standard deviation of x, y and z, mm; see the columns sd_xy_mm and sd_z_mm.
     """
 
@@ -39,23 +47,43 @@ class Poses:
     joints: tuple[str, ...]
     bones: tuple[tuple[int, int], ...]
     frame_index: NDArray[np.int64]
+    pulse_index: NDArray[np.int64]
     time_s: Array
     xyz_mm: Array
     uv_px: Array
     score: Array
+    trusted: NDArray[np.bool_]
     sd_mm: Array
 
+    def __repr__(self) -> str:
+        n, posed = len(self.time_s), int(np.isfinite(self.xyz_mm).all(axis=(1, 2)).sum())
+        return (
+            f"<Poses {self.individual}: {n} frames, {posed} with a pose; {', '.join(self.joints)}>"
+        )
+
+    @property
+    def likelihood(self) -> Array:
+        """(n, J) what exports give as likelihood or confidence; NaN where there is no pose.
+
+        The field's usual cut at 0.6 keeps what is trusted: it is 0.6 + 0.4 x score in a trusted
+        frame and 0.5 x score in any other.
+        """
+        sure = self.trusted[:, None]
+        return np.where(sure, _KEPT + (1.0 - _KEPT) * self.score, _UNSURE * self.score)
+
     @staticmethod
-    def of(about: Mapping[str, Any], table: pd.DataFrame) -> Poses:
+    def of(about: Mapping[str, Any], table: pd.DataFrame, frames: pd.DataFrame) -> Poses:
         """The poses of a session, see `Session.pose_arrays`.
 
         Args:
             about: content of session.json.
             table: table `poses`.
+            frames: table `frames`.
         """
         joints = tuple(about["animal"]["joints"])
         n = len(joints)
         shape = (-1, len(joints))
+        measured = ~frames["bridged"].to_numpy(bool) if "bridged" in frames else True
 
         def array(*names: str) -> Array:
             columns = [table[name].to_numpy(float).reshape(shape) for name in names]
@@ -66,10 +94,12 @@ class Poses:
             joints,
             tuple((int(a), int(b)) for a, b in about["animal"]["bones"]),
             table["frame_index"].to_numpy()[::n],
+            frames["pulse_index"].to_numpy(),
             table["time_s"].to_numpy(float)[::n],
             array("x_mm", "y_mm", "z_mm"),
             array("u_px", "v_px"),
             array("score"),
+            np.asarray(frames["flag"].isin(["", CORRECTED]) & measured, np.bool_),
             spreads(table).reshape(*shape, 3),
         )
 
@@ -91,7 +121,8 @@ def dataset_of(
     """A session as the poses data set of the Python package movement, see `Session.to_xarray`.
 
     The dimensions are time (s since the first frame), space (x, y, z; mm, arena frame), keypoints
-    and individuals; the variables position, confidence, sd_mm and action.
+    and individuals; the variables position, confidence (`Poses.likelihood`), score, sd_mm and
+    action.
 
     Args:
         poses: its poses.
@@ -123,7 +154,8 @@ def dataset_of(
     return xarray.Dataset(
         data_vars={
             "position": (dims, np.moveaxis(poses.xyz_mm, 1, 2)[..., None]),
-            "confidence": (("time", "keypoints", "individuals"), poses.score[..., None]),
+            "confidence": (("time", "keypoints", "individuals"), poses.likelihood[..., None]),
+            "score": (("time", "keypoints", "individuals"), poses.score[..., None]),
             "sd_mm": (dims, np.moveaxis(poses.sd_mm, 1, 2)[..., None]),
             "action": (("time", "individuals"), _actions(poses, bouts)[:, None]),
         },
@@ -132,6 +164,7 @@ def dataset_of(
             "space": ["x", "y", "z"],
             "keypoints": list(poses.joints),
             "individuals": [poses.individual],
+            "pulse_index": ("time", poses.pulse_index),
         },
         attrs=attrs,
     )

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from liex_lab.recordings.recording import Recording
     from liex_lab.recordings.timestamps import Gap
 
-SCHEMA_VERSION = 7
+SCHEMA_VERSION = 8
 _PACKAGES = (
     "liex_lab",
     "numpy",

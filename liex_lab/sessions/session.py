@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from dataclasses import asdict
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -34,6 +35,7 @@ from liex_lab.sessions.older import put_back_session
 from liex_lab.sessions.pose_arrays import Poses, dataset_of
 from liex_lab.sessions.reading import reading_from
 from liex_lab.tables.checks import check_footer, check_rows
+from liex_lab.tables.schema import FRAMES
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -62,6 +64,7 @@ FILES = (
     "replay.rbl",
     "foxglove.json",
 )
+PULSE = next(column for column in FRAMES if column.name == "pulse_index")
 _OPTIONAL = {
     "kinematics.parquet",
     "summary.csv",
@@ -233,7 +236,10 @@ class Session:
 
     @cached_property
     def zone_visits(self) -> pd.DataFrame:
-        """Table `zones`, one row per zone: time in it (s), entries, latency (s)."""
+        """Table `zones` (zones.parquet), one row per zone: time in it (s), visits, latency (s).
+
+        `zones` are the shapes of the zones; `table("zones")` is this table, too.
+        """
         return self.table("zones")
 
     @cached_property
@@ -261,6 +267,8 @@ class Session:
             found = pd.DataFrame(json.loads(path.read_text(encoding="utf-8")))
             if not {"table", "name", "unit", "meaning"} <= set(found.columns):
                 raise ValueError("it does not describe columns")
+            if PULSE.name not in set(found["name"]):
+                found = pd.concat([found, pd.DataFrame([asdict(PULSE)])], ignore_index=True)
             return found
 
     @cached_property
@@ -286,7 +294,7 @@ class Session:
 
     @cached_property
     def zones(self) -> list[Zone]:
-        """The zones that a person has drawn on the floor."""
+        """The zones that a person has drawn on the floor; their table is `zone_visits`."""
         with reading_from(self.path / "session.json"):
             return [Zone.from_dict(zone) for zone in self.metadata.get("zones", [])]
 
@@ -326,7 +334,7 @@ class Session:
         Args:
             name: the table's name, such as 'poses'.
             columns: only these columns; None takes all.
-            frame_index: only the rows of these frames, the camera's count; then no more than one
+            frame_index: only the rows of these frames, by their number; then no more than one
                 row group of the file is in memory at a time. None takes all rows.
 
         Raises:
@@ -344,6 +352,12 @@ class Session:
             else:
                 found = _rows_of(path, columns, frame_index)
             check_rows(name, found, self.metadata["animal"]["joints"])
+            if name == "frames" and columns is None and PULSE.name not in found:  # before schema 8
+                before = pd.read_parquet(path, columns=["frame_index", "gap_before"])
+                pulse = np.arange(len(before)) + before["gap_before"].cumsum()
+                found[PULSE.name] = pulse[
+                    before["frame_index"].isin(found["frame_index"])
+                ].to_numpy()
             said = self.described if name == "sessions" else {}
             return found.assign(**{key: said[key] for key in said if key in found})
 
@@ -351,7 +365,8 @@ class Session:
         """The poses as a labelled data set, in the form of the Python package movement.
 
         The dimensions are time (s since the first frame), space (x, y, z; mm, arena frame),
-        keypoints and individuals; the variables position, confidence, sd_mm and action.
+        keypoints and individuals; the variables position, confidence, score, sd_mm and action;
+        pulse_index is a coordinate along time. See `Poses.likelihood` on the confidence.
 
         Raises:
             MissingPackageError: xarray is not installed.
@@ -359,8 +374,11 @@ class Session:
         return dataset_of(self.pose_arrays(), self.bouts, self.metadata, self.path.name)
 
     def pose_arrays(self) -> Poses:
-        """The poses as arrays by frame and joint, NaN where there is no pose."""
-        return Poses.of(self.metadata, self.table("poses"))
+        """The poses as arrays by frame and joint, NaN where there is no pose.
+
+        `session.pose_arrays().xyz_mm[10]` are the joints (J, 3) of the recording's row 10, mm.
+        """
+        return Poses.of(self.metadata, self.table("poses"), self.table("frames"))
 
 
 def _narrow(path: Path, columns: list[str]) -> pd.DataFrame:

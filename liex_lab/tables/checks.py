@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 # columns that tables of schema 1 do not have; one that a later schema adds is listed here, too
 _LATER = {
-    "frames": {"wall_distance_mm", "zone", "p_flip", "bridged"},
+    "frames": {"wall_distance_mm", "zone", "p_flip", "bridged", "pulse_index"},
     "poses": {"sd_xy_mm", "sd_z_mm"},
     "rotations": set(ROOT_COVARIANCES),
     "gaps": {"x_mm", "y_mm"},

@@ -45,11 +45,11 @@ _NEAR = 0.1  # of the spine: how near a joint must be to count in its score
 
 @dataclass(frozen=True)
 class Rows:
-    """A track with what its rows also carry: the camera's frame count, names, and the arena.
+    """A track with what its rows also carry: numbers of the frames, names, and the arena.
 
     Attributes:
         track: one animal's track of n frames.
-        frame_index: (n,) the camera's own count of each frame.
+        frame_index: (n,) number of each frame in the recording.
         session_id: name of the session.
         individual: name of the animal within the session.
         camera_gaps: where the recording's time is not a steady camera's.
@@ -100,11 +100,13 @@ class Rows:
         """The columns (n,) of the table `frames`, made once for all who read or write it."""
         track = self.track
         wall, zone = self._in_arena()
+        missing = self.missing_before()
         return {
             **self._who,
             **self._when(slice(0, track.n_frames), 1),
             "time_ns": track.times_ns,
-            "gap_before": self.missing_before(),
+            "gap_before": missing,
+            "pulse_index": np.arange(track.n_frames) + np.cumsum(missing),
             "predicted_error_mm": track.predicted_error_mm,
             "residual_mm": track.residual_mm,
             "n_foreground_px": track.n_foreground_px,
@@ -386,10 +388,10 @@ def stop_times(time_s: Array) -> Array:
 
 
 def frame_count(frame_index: NDArray[np.int64]) -> NDArray[np.int64]:
-    """The camera's count of every row and of the row after the last.
+    """The frame number of every row and of the row after the last.
 
     Args:
-        frame_index: (n,) the camera's own count.
+        frame_index: (n,) number of each frame in the recording.
 
     Returns:
         (n + 1,) int64.

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from liex_lab.actions.ethogram import ACROSS_GAPS
 from liex_lab.errors import SessionError
 from liex_lab.runtime.memory import blocks
 
@@ -83,7 +84,15 @@ _WHO = (
     ),
 )
 _WHEN = (
-    ("frame_index", "int64", "", "the camera's own count of the frame", "", "recording"),
+    (
+        "frame_index",
+        "int64",
+        "",
+        "number of the frame in the recording, from 0; frames that the camera did not deliver are "
+        "not counted, see frames pulse_index. Of a live stream it is the sender's count",
+        "",
+        "recording",
+    ),
     (
         "time_s",
         "float64",
@@ -107,7 +116,8 @@ _SPAN = (
         "stop_s",
         "float64",
         "s",
-        "time of the first frame outside; at a gap or the end, last frame + median dt",
+        "time of the first frame outside; where the last frame inside precedes a gap or ends the "
+        "recording, its time + median dt",
         "",
         "",
     ),
@@ -131,9 +141,20 @@ FRAMES = columns(
         "gap_before",
         "int64",
         "",
-        "frames that the camera did not deliver just before this one",
+        "frames that the camera did not deliver just before this one; 1 where the clock jumped, "
+        "for how many were missing is unknown",
+        "time since the frame before / mean frame interval, rounded, - 1",
+        "the recording's clock",
+    ),
+    (
+        "pulse_index",
+        "int64",
         "",
-        "recording",
+        "number of the camera's pulse that took the frame, from 0 at the first frame; frames that "
+        "the camera did not deliver are counted. After a gap whose reason is clock_jumped it is a "
+        "guess",
+        "row number + sum of gap_before so far",
+        "the recording's clock",
     ),
     (
         "predicted_error_mm",
@@ -275,7 +296,8 @@ POSES = columns(
         "score",
         "float64",
         "",
-        "probability that the joint lies within 10 % of the spine's length of the truth",
+        "probability that the joint lies within 10 % of the spine's length of the truth; exports "
+        "give a likelihood made of it and of the frame's flag",
         "chi distribution with 3 degrees of freedom at 0.1 spine_mm / s, where s^2 = "
         "(2 sd_xy_mm^2 + sd_z_mm^2) / 3",
         "sd_xy_mm, sd_z_mm",
@@ -388,7 +410,7 @@ BOUTS = columns(
     *_WHO,
     ("action", "string", "", "a word of the ethogram's vocabulary"),
     *_SPAN[:2],
-    ("duration_s", "float64", "s", "length of the bout", "stop_s - start_s"),
+    ("duration_s", "float64", "s", f"duration of the bout. {ACROSS_GAPS}", "stop_s - start_s"),
     *_SPAN[2:],
     (
         "score",

@@ -3,21 +3,25 @@
 from __future__ import annotations
 
 import time
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
 import pandas as pd
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from liex_lab.arena.outline import Arena
 from liex_lab.arena.zones import Zone, zone_names
 from liex_lab.behaviour import ACTIONS, Surroundings, measure, measure_session
-from liex_lab.behaviour.activity import activity, intervals, time_within
+from liex_lab.behaviour.activity import activity, intervals
 from liex_lab.behaviour.measures import measure_bouts
 from liex_lab.behaviour.multiplicity import false_discovery
 from liex_lab.behaviour.places import outer_margin_mm, visits
+from liex_lab.behaviour.summary import summarise
+from liex_lab.behaviour.summary_columns import Vocabulary
 from liex_lab.behaviour.transitions import by_chance, count_transitions, transitions
+from liex_lab.tables.rows import stop_times
 from liex_lab.tables.schema import BOUTS, GAPS, empty_table, to_pandas
 from tests.behaviour.test_kinematics import tables_of
 from tests.sessions.walking_mouse import WalkingMouse, steady, write
@@ -255,12 +259,56 @@ def test_long_sessions_are_cut_into_minutes():
     assert edges[-1] == 3600.5
 
 
-def test_time_within_agrees_with_the_loop_a_reader_would_write():
-    rng = np.random.default_rng(4)
-    at = np.sort(rng.uniform(0, 100, 40)).reshape(-1, 2)
-    edges = np.linspace(0, 100, 8)
-    slow = [sum(max(0.0, min(b, hi) - max(a, lo)) for a, b in at) for lo, hi in pairwise(edges)]
-    np.testing.assert_allclose(time_within(at[:, 0], at[:, 1], edges), slow)
+@st.composite
+def gappy_bouts(draw):
+    """A table `kinematics` with random times, gaps and lost frames, and random bouts of it."""
+    n = draw(st.integers(1, 40))
+    steps = draw(st.lists(st.sampled_from([0.031, 0.033, 0.036, 0.1, 0.3, 5.0]), min_size=n))
+    time_s = np.cumsum([0.0, *steps])[:n]
+    lost = draw(st.lists(st.booleans(), min_size=n, max_size=n))
+    moved = pd.DataFrame(
+        {
+            "session_id": "s",
+            "individual": "m",
+            "frame_index": np.arange(n),
+            "time_s": time_s,
+            "x_mm": np.where(lost, np.nan, 1.0),
+            "step_mm": np.where(lost, np.nan, 0.5),
+        }
+    )
+    ends = draw(st.lists(st.floats(-0.5, float(time_s[-1]) + 0.5), max_size=20, unique=True))
+    ends = sorted(ends)[: len(ends) // 2 * 2]
+    words = draw(st.lists(st.sampled_from(["a", "b", "c"]), min_size=len(ends) // 2))
+    at = np.reshape(ends, (-1, 2))
+    bouts = pd.DataFrame({"action": words[: len(at)], "start_s": at[:, 0], "stop_s": at[:, 1]})
+    return moved, bouts.assign(duration_s=bouts["stop_s"] - bouts["start_s"])
+
+
+@given(gappy_bouts())
+def test_named_and_unlabelled_time_is_the_observed_time_whatever_was_lost(case):
+    moved, bouts = case
+    words = ("a", "b", "c")
+    parts = [f"{word}_s" for word in ("unlabelled", *words)]
+    table = activity(moved, bouts, words)
+    np.testing.assert_allclose(table[parts].sum(axis=1), table["observed_s"], atol=1e-9)
+    frames = pd.DataFrame({"session_id": ["s"], "individual": ["m"], "flag": [""]})
+    row = summarise(
+        frames,
+        moved.assign(speed_mm_s=1.0, yaw_rate_rad_s=np.nan, speed_sd_mm_s=1.0),
+        bouts,
+        Vocabulary(words),
+    ).iloc[0]
+    # the loop that a reader would write: each observed frame has the last bout around it
+    time_s, stop_s = moved["time_s"].to_numpy(), stop_times(moved["time_s"].to_numpy())
+    slow = dict.fromkeys(("unlabelled", *words), 0.0)
+    for k in np.flatnonzero(moved["x_mm"].notna()):
+        inside = (bouts["start_s"] - 1e-6 <= time_s[k]) & (bouts["stop_s"] - 1e-6 > time_s[k])
+        slow[[*bouts["action"][inside], "unlabelled"][0]] += stop_s[k] - time_s[k]
+    for word, seconds in slow.items():
+        assert row[f"{word}_s"] == pytest.approx(seconds, abs=1e-9)
+        assert table[f"{word}_s"].sum() == pytest.approx(seconds, abs=1e-9)
+    if row["observed_s"] > 0:
+        assert sum(row[f"{word}_share"] for word in slow) == pytest.approx(1.0)
 
 
 def test_activity_has_a_row_for_every_interval_of_an_animal_never_seen():

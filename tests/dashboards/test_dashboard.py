@@ -135,7 +135,7 @@ def test_names_are_text_in_every_figure(data: StudyData) -> None:
         plots.groups(table, "mean_speed_mm_s", "<u>"),
         plots.ethograms(ones, {"<i>x": "#000"}),
         plots.differences(data.stats("mean_speed_mm_s"), "<u>"),
-        plots.time_budgets(shares, {"<i>x": "#000"}),
+        plots.time_budgets(shares, {"<i>x": "#000"}, ["<i>x"]),
         plots.whole_session(
             ones["<b>s"], {"<i>x": "#000"}, [("<u>", np.arange(3.0), np.arange(3.0), "#000")], 0.5
         ),

@@ -8,6 +8,7 @@ import json
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 
@@ -22,6 +23,9 @@ from liex_lab import cli
 from liex_lab.errors import MissingPackageError, SessionError
 from liex_lab.exchange import TARGETS, export
 from liex_lab.sessions import Session
+from liex_lab.sessions.pose_arrays import Poses
+from liex_lab.tables.rows import Rows
+from liex_lab.tables.schema import POSES, to_pandas
 from tests.sessions.walking_mouse import WalkingMouse, steady, write
 
 
@@ -133,6 +137,30 @@ def test_deeplabcut_s_tables_have_its_header_and_a_row_for_every_frame(session, 
     times = pd.read_csv(folder / "times.csv")
     np.testing.assert_allclose(times["time_s"], session.frames["time_s"], atol=1e-9)
     assert len(solid) == len(flat) == len(times) == 116
+    np.testing.assert_array_equal(times["pulse_index"], session.frames["pulse_index"])
+
+
+def test_the_usual_cut_at_a_likelihood_keeps_what_is_trusted_and_nothing_else(tmp_path):
+    rng = np.random.default_rng(3)
+    mouse = WalkingMouse(steady(4.0), sd_mm=8.0)
+    made = mouse.track()
+    flags = rng.choice(["", "doubtful", "corrected", "hidden"], 120)
+    bridged = rng.random(120) < 0.2
+    sd = np.geomspace(0.1, 60.0, 120)[:, None] * rng.uniform(0.7, 1.3, made.sd_mm.shape)
+    track = replace(made, flag=flags, bridged=bridged, sd_xy_mm=sd, sd_z_mm=sd)
+    table = Rows(track, np.arange(120), "s", "m")
+    about = {"individual": "m", "animal": {"joints": track.skeleton.names, "bones": []}}
+    joints = pd.concat([to_pandas(POSES, block) for block in table.poses()])
+    poses = Poses.of(about, joints, table.frames_table)
+    trusted = np.isin(flags, ["", "corrected"]) & ~bridged
+    np.testing.assert_array_equal(poses.likelihood >= 0.6, np.repeat(trusted[:, None], 5, axis=1))
+    np.testing.assert_array_equal(  # in a file of single precision, too
+        poses.likelihood.astype(np.float32) >= 0.6, np.repeat(trusted[:, None], 5, axis=1)
+    )
+    for some in (trusted, ~trusted):
+        worse = np.argsort(sd[some], axis=None)
+        assert (np.diff(poses.likelihood[some].ravel()[worse]) <= 1e-12).all()
+    assert len(repr(poses)) < 120
 
 
 def test_every_table_of_a_session_is_an_attribute_and_arrays_need_xarray(session, monkeypatch):
@@ -155,6 +183,10 @@ def test_movement_s_data_set_has_the_true_times_and_the_actions(session, out):
         spread = data["sd_mm"].sel(keypoints="nose", individuals="mouse_1", space=axis)
         np.testing.assert_array_equal(spread, session.poses.query("joint == 'nose'")[column])
     assert data.attrs["ds_type"] == "poses"
+    np.testing.assert_array_equal(data["pulse_index"], session.frames["pulse_index"])
+    np.testing.assert_array_equal(
+        data["confidence"] >= 0.6, data["position"].notnull().all("space")
+    )
     rear = session.bouts[session.bouts["action"] == "rear"].iloc[0]
     inside = (data["time"] >= rear["start_s"]) & (data["time"] < rear["stop_s"])
     np.testing.assert_array_equal((data["action"][:, 0] == "rear").to_numpy(), inside.to_numpy())

@@ -126,6 +126,28 @@ def test_a_few_frames_out_of_order_are_no_jump_of_the_clock() -> None:
     assert {FAULTS[fault] for fault in found.faults} == {"", "stamp_out_of_order"}
 
 
+@given(
+    st.integers(0, 2**32 - 1),
+    st.floats(0.0, 0.2),
+    st.sampled_from([12_500_000, 33_333_333, 33_366_667, 66_666_667]),
+    st.sampled_from([1, 1_000_000]),
+)
+def test_gaps_count_every_missing_pulse_whatever_the_jitter(
+    seed: int, jitter: float, period_ns: int, rounding_ns: int
+) -> None:
+    rng = np.random.default_rng(seed)
+    n = int(rng.integers(60, 400))
+    missing = np.where(rng.random(n) < 0.1, rng.choice([1, 2, 5, 60, 400], n), 0)
+    pulse = np.arange(n) + np.cumsum(missing) - missing[0]
+    room = jitter * period_ns - min(rounding_ns / 2, jitter * period_ns)
+    stamps = np.rint(pulse * period_ns + rng.uniform(-room, room, n)).astype(np.int64)
+    stamps = stamps // rounding_ns * rounding_ns  # a recorder that writes whole milliseconds
+    before = np.zeros(n, np.int64)
+    for gap in find_gaps(stamps, median_step(stamps)):
+        before[gap.start_frame] = gap.n_frames_missing
+    np.testing.assert_array_equal(np.arange(n) + np.cumsum(before), pulse)
+
+
 def test_clocks_in_noise_stay_within_what_an_integer_holds() -> None:
     rng = np.random.default_rng(0)
     for _ in range(50):

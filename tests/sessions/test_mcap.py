@@ -53,7 +53,7 @@ def messages(session):
                 found[channel.topic].append((message.log_time, json.loads(message.data)))
         summary = reader.get_summary()
         assert summary is not None
-        topics = {channel.topic for channel in summary.channels.values()} - {"/actions"}
+        topics = {channel.topic for channel in summary.channels.values()} - set(found)
         for _, channel, message, decoded in reader.iter_decoded_messages(topics=sorted(topics)):
             found[channel.topic].append((message.log_time, decoded))
     return found
@@ -122,6 +122,14 @@ def test_actions_are_told_on_change_with_word_and_place(messages, session):
     assert [state["frame_index"] for _, state in states if state["action"]] == list(
         session.bouts["start_frame"]
     )
+
+
+def test_the_predicted_error_is_that_of_the_table(messages, session):
+    frames = session.frames[session.frames["predicted_error_mm"].notna()]
+    stated = messages["/predicted_error"]
+    assert [time for time, _ in stated] == frames["time_ns"].tolist()
+    errors = [error["predicted_error_mm"] for _, error in stated]
+    assert errors == frames["predicted_error_mm"].tolist()
 
 
 def test_what_is_odd_about_the_recording_is_in_the_log(messages):

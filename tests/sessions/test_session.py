@@ -5,10 +5,13 @@ from __future__ import annotations
 import errno
 import json
 import os
+import re
 import resource
+import shutil
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,9 +22,11 @@ from liex_lab.arena.zones import Zone
 from liex_lab.errors import SessionError
 from liex_lab.plan import Plan
 from liex_lab.recordings.recording import Recording
+from liex_lab.recordings.timestamps import find_gaps
 from liex_lab.sessions import Provenance, Session, SessionWriter
 from liex_lab.sessions.provenance import SCHEMA_VERSION
 from liex_lab.tracking.track import Track
+from tests.conftest import REPOSITORY
 from tests.sessions.walking_mouse import SPINE_MM, WalkingMouse, part, steady, write
 
 MOUSE = WalkingMouse(steady(1.0))
@@ -366,3 +371,42 @@ def test_memory_does_not_grow_with_the_recording(tmp_path):
     )
     assert long - short < 90.0  # 330 frames more are 405 MB of float32 depth
     assert long < 1500.0
+
+
+def test_the_recipe_for_neural_data_finds_the_true_pulse_of_every_frame(tmp_path, monkeypatch):
+    rng = np.random.default_rng(5)
+    pulse = np.delete(np.arange(150), [1, 2, 3, 40, 90, 91])  # lost at the start and in between
+    stamps = pulse / 30 + np.append(0.0, rng.uniform(-0.006, 0.006, len(pulse) - 1))
+    write(
+        tmp_path / "results" / "recording.liex",
+        WalkingMouse(stamps, rear_s=(1.0, 2.0)),
+        gaps=find_gaps((stamps * 1e9).astype(np.int64) + MOUSE.times_ns[0], 33_333_333),
+    )
+    page = (REPOSITORY / "docs" / "howto" / "ephys.md").read_text()
+    (recipe,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    monkeypatch.chdir(tmp_path)
+    found: dict[str, Any] = {}
+    exec(recipe, found)
+    np.testing.assert_allclose(found["on_your_clock"], pulse / 30, atol=1e-9)
+    heights = found["session"].kinematics.nose_height_mm.to_numpy()
+    at = np.interp([1.05, 1.5], found["on_your_clock"], heights)
+    np.testing.assert_allclose(at, np.interp([1.05, 1.5], stamps, heights), rtol=0.2)
+
+
+def test_a_session_of_an_earlier_version_numbers_its_pulses_too(session, tmp_path):
+    import pyarrow.parquet as pq
+
+    old = tmp_path / "old.liex"
+    shutil.copytree(session.path, old)
+    frames = session.frames.drop(columns="pulse_index").assign(gap_before=0)
+    frames.loc[[4, 9], "gap_before"] = [2, 3]
+    frames.to_parquet(old / "frames.parquet")
+    columns = json.loads((old / "columns.json").read_text())
+    (old / "columns.json").write_text(
+        json.dumps([one for one in columns if one["name"] != "pulse_index"])
+    )
+    again = Session.open(old)
+    assert "pulse_index" not in pq.read_schema(old / "frames.parquet").names
+    assert again.frames["pulse_index"].tolist() == [*range(4), *range(6, 11), *range(14, 35)]
+    assert again.table("frames", frame_index=[9, 10])["pulse_index"].tolist() == [14, 15]
+    assert (again.columns["name"] == "pulse_index").sum() == 1

@@ -33,6 +33,9 @@ def test_a_dropped_and_a_lost_stretch_become_two_half_open_gaps():
     np.testing.assert_allclose(gaps["stop_s"] - gaps["start_s"], [6 / 30, 3 / 30], atol=1e-8)
     assert rows.missing_before()[20] == 6
     assert rows.missing_before().sum() == 6
+    frames = rows.frames_table
+    assert frames["pulse_index"].tolist() == np.rint(30 * times).astype(int).tolist()
+    assert frames["frame_index"].tolist() == list(range(54))
 
 
 def test_stamps_that_were_moved_have_rows_of_their_own():
