@@ -60,7 +60,7 @@ def correct_session(
     Args:
         session: the session folder.
         what: corrections to add.
-        undo: numbers of corrections to take back.
+        undo: numbers of corrections to take back, or of the undo to take back (`Log.redoable`).
         author: who corrects.
         blueprint: makes the layout of the corrected replay, see `SessionWriter`.
         report: makes the report again, see `SessionWriter`; None leaves it.
@@ -87,7 +87,7 @@ def correct_session(
             raise SessionError(
                 f"the corrections of {raw.path} were made on another measurement of this "
                 "recording; look at them with `liex correct list`, then apply them with `liex "
-                f"correct redo`, or remove the folder {FOLDER}"
+                f"correct apply`, or remove the folder {FOLDER}"
             )
         log = replace(log.added(what, undo, author), made_of=made_of, files={}, facts={})
         if not log.entries:
@@ -192,15 +192,21 @@ def _behaviour(
     """
     from liex_lab.behaviour.summary import measure_rows, stated_by
     from liex_lab.sessions.applying import edited_bouts, spliced_bouts
+    from liex_lab.tables.rows import frame_count
 
     rules, around = stated_by(raw)
+    count = frame_count(results.rows.frame_index)
+    around = replace(around, seams=[int(count[row]) for row in found.seams])
     frames = results.rows.frames_table
     bouts = raw.bouts
     actions = dict(raw.metadata.get("actions") or {})
     facts: dict[str, Any] = {}
     if len(found.turned):
         again, facts = measure_behaviour(
-            results.rows, Plan.from_toml(raw.plan, "plan.toml"), results.origin
+            results.rows,
+            Plan.from_toml(raw.plan, "plan.toml"),
+            results.origin,
+            seams=around.seams,
         )
         bouts = spliced_bouts(bouts, again.bouts, found.turned, frames)
         actions = {**again.actions, **actions}

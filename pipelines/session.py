@@ -11,7 +11,7 @@ from __future__ import annotations
 import time
 from collections.abc import Generator, Iterable, Mapping, Sequence
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -369,7 +369,11 @@ def conclude(writer: SessionWriter, plan: Plan, timings: dict[str, float]) -> Se
 
 
 def measure_behaviour(
-    rows: Rows, plan: Plan, origin: Provenance, allocate: Allocator = np.empty
+    rows: Rows,
+    plan: Plan,
+    origin: Provenance,
+    allocate: Allocator = np.empty,
+    seams: Sequence[int] = (),
 ) -> tuple[Behaviour, dict[str, Any]]:
     """The behaviour of a track as the plan names it, and notes on the recogniser for session.json.
 
@@ -378,13 +382,14 @@ def measure_behaviour(
         plan: rules and action model.
         origin: skeleton, arena, zones and water.
         allocate: allocator of large arrays, such as one of files on disk.
+        seams: where nothing is measured across, see `Surroundings`.
     """
     from liex_lab.behaviour.summary import measure_rows, moving_rows
     from liex_lab.tables.schema import BOUTS, empty_table
 
     recogniser = build_recogniser(plan, origin.skeleton)
     rules = build_rules(plan)
-    around = build_surroundings(origin)
+    around = replace(build_surroundings(origin), seams=seams)
     moved = moving_rows(rows, rules, around, allocate)
     if recogniser is not None:
         named, notes = name_actions(recogniser, rows, moved, allocate)

@@ -137,12 +137,12 @@ def _corrections(session: Session) -> Iterator[Finding]:
     if not applies(log, session.path, session.metadata):
         yield Finding(
             "note",
-            "its corrections were made on another measurement; `liex correct redo` applies them",
+            "its corrections were made on another measurement; `liex correct apply` applies them",
         )
         return
     wrong = _changed(corrected_folder(session.path), log.files)
     yield from (
-        Finding("wrong", f"of the corrected tables, {sentence}; see `liex correct redo`")
+        Finding("wrong", f"of the corrected tables, {sentence}; see `liex correct apply`")
         for sentence in wrong
     )
     if not wrong:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from liex_lab.sessions import Session
+from liex_lab.sessions.correcting import disagreements
 
 from ..units import counted, shown
 
@@ -30,6 +31,7 @@ def warnings(session: Session) -> list[str]:
         *_of_company(session),
         *_of_frames(session),
         *_of_flips(session),
+        *disagreements(session),
         *_of_measures(session),
         *_of_names(session),
     ]

@@ -1,7 +1,8 @@
 """Kinematics per frame: central differences over true times, with propagated standard deviations.
 
 Rate of v at t: (v(t + h) - v(t - h)) / true time between the two frames, h about `HALF_WINDOW_S`,
-never across a gap, one-sided at the ends of an unbroken stretch; speed, acceleration, yaw rate. Its
+never across a gap nor across the end of a person's exchange of head and tail, one-sided at the ends
+of an unbroken stretch; speed, acceleration, yaw rate. Its
 standard deviation is sqrt(s1^2 + s2^2 - 2 r s1 s2) / span with r = exp(-span / `ERROR_LASTS_S`),
 the autocorrelation of an Ornstein-Uhlenbeck process: the nearer two frames, the more their errors
 agree. Errors of the joints of one frame are taken as one common error (the body is off as a whole),
@@ -85,15 +86,21 @@ class Spans:
     rows: slice
 
     @staticmethod
-    def of(time_s: Array, observed: NDArray[np.bool_], half_window_s: float) -> Spans:
+    def of(
+        time_s: Array,
+        observed: NDArray[np.bool_],
+        half_window_s: float,
+        begins: NDArray[np.bool_] | bool = False,
+    ) -> Spans:
         """The neighbours about `half_window_s` away; a frame that stands alone has an empty span.
 
         Args:
             time_s: (n,) times of the frames, s.
             observed: (n,) bool, whether the frame has a pose.
             half_window_s: how far before and after the frame its neighbours are, s.
+            begins: (n,) bool, see `segments`.
         """
-        before, after = neighbours(time_s, observed, half_window_s)
+        before, after = neighbours(time_s, observed, half_window_s, begins)
         span_s = np.where(after > before, time_s[after] - time_s[before], np.nan)
         return Spans(before, after, span_s, slice(None))
 
@@ -140,6 +147,7 @@ def kinematics(
     half_window_s: float = HALF_WINDOW_S,
     impossible_above_mm_s: float = IMPOSSIBLE_MM_S,
     surface_z_mm: float | None = None,
+    seams: Sequence[int] = (),
     allocate: Allocator = np.empty,
 ) -> pd.DataFrame:
     """The table `kinematics` of one animal: one row per frame, rates with standard deviations.
@@ -151,6 +159,7 @@ def kinematics(
         impossible_above_mm_s: a faster speed is a tracking error and left empty, mm/s.
         surface_z_mm: height of the water's surface above the floor, mm, for an animal that swims;
             None where it is not known.
+        seams: frames (of `frame_index`) that begin a stretch of their own, see `Surroundings`.
         allocate: makes the arrays of the columns (an allocator, as `np.empty`).
 
     Returns:
@@ -162,7 +171,8 @@ def kinematics(
     shape, own = _frame_by_frame(body, joints, allocate)
     time_s = frames["time_s"].to_numpy(float)
     observed = np.isfinite(shape.centre[:, 0])
-    spans = Spans.of(time_s, observed, half_window_s)
+    begins = np.isin(frames["frame_index"].to_numpy(), seams)
+    spans = Spans.of(time_s, observed, half_window_s, begins)
     block: dict[str, Any] = {
         name: _put_away(frames[name], allocate) for name in ("frame_index", "time_s", "dt_s")
     }
@@ -177,7 +187,7 @@ def kinematics(
         **own,
     }
     if body.kind == SWIMS:
-        block |= _swimming(shape, time_s, segments(time_s, observed), surface_z_mm)
+        block |= _swimming(shape, time_s, segments(time_s, observed, begins), surface_z_mm)
     return to_pandas(kinematics_columns(body.kind), block, copy=False)
 
 
@@ -378,7 +388,9 @@ def _apart(xyz: Sequence[Array]) -> Array:
     return np.moveaxis(np.stack(xyz), 0, -1)
 
 
-def segments(time_s: Array, observed: NDArray[np.bool_]) -> Rows:
+def segments(
+    time_s: Array, observed: NDArray[np.bool_], begins: NDArray[np.bool_] | bool = False
+) -> Rows:
     """(n,) int64 number of the unbroken stretch each frame belongs to, from 0 upwards.
 
     A stretch has no missing frame and no lost animal inside.
@@ -386,15 +398,19 @@ def segments(time_s: Array, observed: NDArray[np.bool_]) -> Rows:
     Args:
         time_s: (n,) times of the frames, s.
         observed: (n,) bool, whether the frame has a pose.
+        begins: (n,) bool, whether a stretch begins with the frame for another reason.
     """
     broken = np.append(True, gap_follows(time_s)[:-1] | (observed[1:] != observed[:-1]))[
         : len(time_s)
     ]
-    return np.asarray(np.cumsum(broken) - 1)
+    return np.asarray(np.cumsum(broken | begins) - 1)
 
 
 def neighbours(
-    time_s: Array, observed: NDArray[np.bool_], half_window_s: float = HALF_WINDOW_S
+    time_s: Array,
+    observed: NDArray[np.bool_],
+    half_window_s: float = HALF_WINDOW_S,
+    begins: NDArray[np.bool_] | bool = False,
 ) -> tuple[Rows, Rows]:
     """Rows to difference between: about `half_window_s` before and after, within the own stretch.
 
@@ -406,6 +422,7 @@ def neighbours(
         observed: (n,) bool, whether the frame has a pose.
         half_window_s: how far before and after the frame its neighbours are, s; at the camera's own
             rate the next frame counts, jitter of its clock or not.
+        begins: (n,) bool, see `segments`.
 
     Returns:
         before and after, (n,) int64 rows each.
@@ -417,7 +434,7 @@ def neighbours(
     )  # at the camera's own rate the next frame counts, jitter of its clock or not
     before = np.searchsorted(time_s, time_s - reach, side="right") - 1
     after = np.searchsorted(time_s, time_s + reach, side="left")
-    number = segments(time_s, observed)
+    number = segments(time_s, observed, begins)
     first = np.searchsorted(number, number, side="left")
     last = np.searchsorted(number, number, side="right") - 1
     before = np.clip(np.minimum(before, np.maximum(rows - 1, 0)), first, last)

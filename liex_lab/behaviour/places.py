@@ -38,11 +38,14 @@ class Surroundings:
         zones: names of the zones.
         surface_z_mm: height of the water's surface above the floor, mm; None where there is none or
             it is not known.
+        seams: frames (the camera's count) at which a person's exchange of head and tail begins or
+            ends; nothing is measured across one, as across a gap.
     """
 
     arena: Arena = UNKNOWN
     zones: Sequence[str] = field(default=())
     surface_z_mm: float | None = None
+    seams: Sequence[int] = field(default=())
 
 
 def surface_height_mm(floor_distance_mm: float, optics: dict[str, object]) -> float | None:

@@ -16,6 +16,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from liex_lab.actions.labels import HUMAN
 from liex_lab.behaviour.activity import activity, observed_hold, time_named
 from liex_lab.behaviour.body import SWIMS, parents_of
 from liex_lab.behaviour.bouts import ACTIONS, MouseRules, find_bouts
@@ -35,6 +36,7 @@ from liex_lab.behaviour.transitions import transitions
 from liex_lab.runtime.memory import Allocator
 from liex_lab.tables.rows import stop_times
 from liex_lab.tables.schema import GAPS, empty_table, to_pandas
+from liex_lab.tracking.track import ends_of
 
 if TYPE_CHECKING:
     from liex_lab.tables.rows import Rows
@@ -100,7 +102,7 @@ def moving(
         frames: the table `frames`.
         poses: the table `poses` of these frames, or its joints.
         rules: window of the speed, and from where on it is impossible.
-        around: the water's surface.
+        around: the water's surface, and where nothing is measured across.
         allocate: makes the arrays of the table (an allocator, as `np.empty`).
     """
     return kinematics(
@@ -109,6 +111,7 @@ def moving(
         rules.speed_half_window_s,
         rules.impossible_above_mm_s,
         around.surface_z_mm,
+        around.seams,
         allocate,
     )
 
@@ -216,9 +219,11 @@ def stated_by(session: SessionTables) -> tuple[MouseRules, Surroundings]:
     surface = surface_height_mm(
         about["camera"]["floor_distance_mm"], about["camera"].get("optics", {})
     )
-    return MouseRules(**stated), Surroundings(
-        session.arena, [zone.name for zone in session.zones], surface
-    )
+    flips = session.table("flips", ["start_frame", "stop_frame", "source"])
+    by_hand = flips[flips["source"] == HUMAN]
+    seams = ends_of(zip(by_hand["start_frame"], by_hand["stop_frame"], strict=True))
+    zones = [zone.name for zone in session.zones]
+    return MouseRules(**stated), Surroundings(session.arena, zones, surface, seams)
 
 
 def measure_session(session: SessionTables, rules: MouseRules | None = None) -> Behaviour:

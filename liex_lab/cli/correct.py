@@ -149,7 +149,7 @@ def list_corrections(session: SessionPath) -> None:
 
     opened = Session.open(session, raw=True)
     log = read_log(opened.path)
-    standing = {entry.number for entry in log.standing}
+    standing = {entry.number for entry in log.standing} | set(log.undos)
     from rich.console import Console
     from rich.table import Table
     from rich.text import Text
@@ -167,7 +167,7 @@ def list_corrections(session: SessionPath) -> None:
     if log.standing and not applies(log, opened.path, opened.metadata):
         say(
             "note: they were made on another measurement of this recording and are not applied; "
-            f"`liex correct redo` applies them, and without the folder {FOLDER} they are gone"
+            f"`liex correct apply` applies them, and without the folder {FOLDER} they are gone"
         )
 
 
@@ -179,7 +179,7 @@ def undo(
     ] = None,
     by: Author = "",
 ) -> None:
-    """Take corrections back, by their numbers in `liex correct list`."""
+    """Take corrections back, by their numbers in `liex correct list`; `redo` makes them again."""
     from liex_lab.sessions.corrections import read_log
 
     standing = read_log(_opened(session).path).standing
@@ -189,7 +189,23 @@ def undo(
 
 
 @correct.command()
-def redo(session: SessionPath) -> None:
+def redo(session: SessionPath, by: Author = "") -> None:
+    """Make the correction again that was taken back last."""
+    from liex_lab.sessions.corrections import read_log
+
+    redoable = read_log(_opened(session).path).redoable
+    if redoable is None:
+        raise SessionError(
+            f"{session} has no correction to make again: none was taken back since the last new "
+            "one; `liex correct apply` makes the corrected tables and the report again"
+        )
+    number, what = redoable
+    _do(session, [], by, [number])
+    say(f"again:     {what}")
+
+
+@correct.command()
+def apply(session: SessionPath) -> None:
     """Make the corrected tables and the report again, from what was measured and all corrections
     that stand.
     """
@@ -232,11 +248,14 @@ def _opened(session: Path) -> Session:
 
 def _do(session: Path, what: Sequence[Correction], by: str, undo: Sequence[int] = ()) -> None:
     from liex_lab.api import correct_session
+    from liex_lab.sessions.correcting import disagreements
 
     with progress_bar() as progress:
         correct_session(session, what, undo=undo, author=by, progress=progress)
     for one in what[:5]:
         say(f"corrected: {one}")
+    for sentence in disagreements(_opened(session)):
+        say(f"note:      {sentence}")
     if len(what) > 5:
         say(f"corrected: {len(what) - 5} further bouts")
     say(f"tables:    {session / 'corrected'}")

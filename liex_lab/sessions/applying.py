@@ -1,14 +1,15 @@
 """Application of human corrections: flips and joint moves to the track, bout edits to the ethogram.
 
-A flip makes the track again from the observations with the association constrained in its span. A
-moved joint is fitted by weighted least squares over joint angles (inverse kinematics), so that
-bones keep their lengths and joints their limits. Bout edits cut and replace half-open intervals.
+A flip makes the track again from the observations with the association constrained in its span;
+frames outside of it follow only where the exchange agrees with them. A moved joint is fitted by
+weighted least squares over joint angles (inverse kinematics), so that bones keep their lengths and
+joints their limits. Bout edits cut and replace half-open intervals.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -26,8 +27,9 @@ from liex_lab.sessions.tracks import track_of
 from liex_lab.tables.rows import frame_count
 from liex_lab.tables.schema import BOUTS
 from liex_lab.tracking.following import let_follow
+from liex_lab.tracking.observations import reversed_pose
 from liex_lab.tracking.offline import MARGIN, track_whole
-from liex_lab.tracking.track import CORRECTED, Flip, Track
+from liex_lab.tracking.track import CORRECTED, Flip, Track, ends_of
 
 if TYPE_CHECKING:
     from liex_lab.body.skeleton import Skeleton
@@ -57,6 +59,11 @@ class CorrectedTrack:
     flips: tuple[Flip, ...]
 
     @property
+    def seams(self) -> list[int]:
+        """Rows at which an exchange of head and tail by a person begins or ends."""
+        return ends_of((flip.start, flip.stop) for flip in self.flips if flip.source == HUMAN)
+
+    @property
     def changed(self) -> bool:
         """Whether any pose is another one than was measured."""
         return bool(len(self.turned) + len(self.moved))
@@ -81,7 +88,7 @@ def corrected_track(session: Session, log: Log, skeleton: Skeleton) -> Corrected
     spans: list[FlipSpan] = log.corrections(FlipSpan)
     if spans:
         track, flips, turned = _turned_round(session, track, index, spans)
-    moves: list[JointMove] = log.corrections(JointMove)
+    moves = _moves_of(log, skeleton)
     root = SE3(track.root_rotation.copy(), track.root_mm.copy())
     was = Pose(root, track.angles_rad.copy(), track.scale)
     moved = place_joints(track, index, moves, session.camera, session.T_arena_camera)
@@ -93,12 +100,31 @@ def corrected_track(session: Session, log: Log, skeleton: Skeleton) -> Corrected
     return CorrectedTrack(track, turned, moved, flips)
 
 
+def _moves_of(log: Log, skeleton: Skeleton) -> list[JointMove]:
+    """The standing moves; one whose frame was exchanged later is of the joint at the other end."""
+    names = list(skeleton.names)
+    moves: list[JointMove] = []
+    for one in (entry.what for entry in log.standing):
+        if isinstance(one, JointMove):
+            moves.append(one)
+        elif isinstance(one, FlipSpan):
+            moves = [
+                replace(move, joint=names[-1 - names.index(move.joint)])
+                if one.start_frame <= move.frame < one.stop_frame
+                else move
+                for move in moves
+            ]
+    return moves
+
+
 def _turned_round(
     session: Session, track: Track, index: Rows, spans: Sequence[FlipSpan]
 ) -> tuple[Track, tuple[Flip, ...], Rows]:
     """The track made again from the observations, with the spans turned round.
 
-    Rows farther than `MARGIN` from every span keep what they had.
+    Rows outside of the spans keep what they had, but for those within `MARGIN` of an end at which
+    the exchange agrees with its neighbour: there the curve was bent by the half turn that is gone.
+    No row loses its pose or its trust.
     """
     seen, subject = read_evidence(session)
     wanted = [Flip(*_rows_of(index, span), 1.0, True, HUMAN) for span in spans]
@@ -106,13 +132,41 @@ def _turned_round(
         flip for flip in read_flips(session) if flip.source == HUMAN
     ]  # of versions that wrote into the table
     again = track_whole(subject, seen, [*earlier, *wanted])
-    near = np.zeros(len(index), bool)
-    for flip in wanted:
-        near[max(0, flip.start - MARGIN) : flip.stop + MARGIN] = True
+    ends = ends_of((flip.start, flip.stop) for flip in wanted)
+    exchanged = np.cumsum(np.bincount(ends, minlength=len(index) + 1))[:-1] % 2 == 1
+    near = exchanged.copy()
+    parts = [0, *again.cuts, len(index)]
+    for end in set(ends) - set(parts):
+        k = int(np.searchsorted(parts, end))
+        near[max(parts[k - 1], end - MARGIN) : min(parts[k], end + MARGIN)] = True
+    was, now = (
+        one.joints_mm[:, one.skeleton.tip] - one.joints_mm[:, 0] for one in (track, again.track)
+    )
+    lost = near & (
+        (track.posed & ~again.track.posed)
+        | (track.observed & ~again.track.observed)
+        | (exchanged & (np.einsum("nd,nd->n", was, now) > 0.0))  # passed by, and bridged as it was
+    )
+    trusted = near & (track.flag == "")
     for column in fields(Track):
         if column.name not in ("skeleton", "times_ns"):
-            getattr(track, column.name)[near] = getattr(again.track, column.name)[near]
+            getattr(track, column.name)[near & ~lost] = getattr(again.track, column.name)[
+                near & ~lost
+            ]
+    track.flag[trusted] = ""
+    rows = np.flatnonzero(lost & exchanged)
+    turned = reversed_pose(track.skeleton, Pose(track.root, track.angles_rad, track.scale)[rows])
+    _put(track, rows, turned, session.camera, session.T_arena_camera)
     return track, again.flips, np.flatnonzero(near)
+
+
+def _put(track: Track, rows: Rows, pose: Pose, camera: Camera, T_arena_camera: SE3) -> None:
+    """Write poses into some rows of a track, in place."""
+    track.root_rotation[rows] = pose.root.rotation
+    track.root_mm[rows] = pose.root.translation
+    track.angles_rad[rows] = pose.angles
+    track.joints_mm[rows] = pose.joints(track.skeleton)
+    track.uv_px[rows] = camera.project(T_arena_camera.inverse() @ track.joints_mm[rows])
 
 
 def place_joints(
@@ -163,13 +217,7 @@ def place_joints(
     for k in range(len(rows)):
         pull = np.diag(weight[k])
         fit = fit_poses(skeleton, (pull @ points[k])[None], pull, start[k : k + 1], keep_scale=True)
-        row = rows[k]
-        pose = fit.pose
-        track.root_rotation[row] = pose.root.rotation[0]
-        track.root_mm[row] = pose.root.translation[0]
-        track.angles_rad[row] = pose.angles[0]
-        track.joints_mm[row] = pose.joints(skeleton)[0]
-    track.uv_px[rows] = camera.project(T_arena_camera.inverse() @ track.joints_mm[rows])
+        _put(track, rows[k : k + 1], fit.pose, camera, T_arena_camera)
     track.bridged[rows] = False
     track.flag[rows] = CORRECTED
     return rows

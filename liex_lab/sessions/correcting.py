@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import difflib
 import math
+import shlex
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -37,6 +38,14 @@ Array = NDArray[np.float64]
 _ROUNDED_S = 5e-4  # times are typed with three decimals
 _INSET_FRAMES = 24  # in so many frames it is looked up how deep under the skin a joint lies
 _WORD_LENGTH = 60
+# of the animal's length: what stands out less from the still scene is not the animal, nor is what
+# lies farther from every joint; where the session shows no scene, it stands on the floor, and half
+# of that distance counts
+_STANDS_OUT = 0.05
+_BESIDE = 0.5
+_SCENE_FRAMES = 256  # in so many frames the still scene is looked for
+_APART_S = 0.5  # after a longer time without a pose a turn contradicts nothing
+OFF_THE_ANIMAL = "height kept: the pixel is not on the animal"
 
 
 def flip_span(session: Session, start_s: float, stop_s: float) -> FlipSpan:
@@ -48,14 +57,87 @@ def flip_span(session: Session, start_s: float, stop_s: float) -> FlipSpan:
         stop_s: stop, s, exclusive.
 
     Raises:
-        SessionError: the span holds no frame.
+        SessionError: the span holds no frame, or none with a pose, or the animal is no chain of
+            joints with a head and a tail.
     """
     first, last = rows_between(session, start_s, stop_s, "a span to flip")
+    if any(b - a != 1 for a, b in session.metadata["animal"]["bones"]):
+        raise SessionError(
+            f"head and tail cannot be exchanged in a {session.metadata['animal']['name']}: its "
+            "joints branch; move single joints with `liex correct joint`"
+        )
+    if not np.isfinite(_ahead(session)[first:last]).all(axis=1).any():
+        raise SessionError(
+            f"no frame from {start_s:g} to {stop_s:g} s has a pose, so there is nothing to exchange"
+        )
     count = frame_count(session.frames["frame_index"].to_numpy(np.int64))
     return FlipSpan(int(count[first]), int(count[last]))
 
 
-def joint_move(session: Session, frame: int, joint: str, place_mm: Any) -> JointMove:
+def disagreements(session: Session) -> list[str]:
+    """Sentences on exchanges of head and tail that contradict the frames around them.
+
+    At an end of such an exchange the body turns by more than 90 degrees from one frame with a pose
+    to the next. The nearest span that agrees begins and ends where the body turns so without the
+    exchange, where the pose is lost for longer than 0.5 s, or where the recording does.
+
+    Args:
+        session: the session with its corrections.
+
+    Returns:
+        One sentence for each exchange that stands and disagrees, with the commands to change it.
+    """
+    exchanges = [one for one in session.log.standing if isinstance(one.what, FlipSpan)]
+    if not exchanges:
+        return []
+    index, time_s = (session.frames[name].to_numpy() for name in ("frame_index", "time_s"))
+    ahead = _ahead(session)
+    rows = np.flatnonzero(np.isfinite(ahead).all(axis=1))
+    apart = np.diff(time_s[rows]) > _APART_S
+    ends_s = np.append(time_s, stop_times(time_s)[-1:])
+    path = shlex.quote(str(session.path))
+    found = []
+    for one in exchanges:
+        assert isinstance(one.what, FlipSpan)
+        ends = np.searchsorted(index, (one.what.start_frame, one.what.stop_frame))
+        before = ahead.copy()
+        before[slice(*ends)] *= -1.0
+        now, then = ((way[1:] * way[:-1]).sum(axis=1) for way in (ahead[rows], before[rows]))
+        half_turns = np.flatnonzero(~apart & (now < 0.0))
+        at = [k for k in np.searchsorted(rows, ends) - 1 if k in half_turns]
+        if not at:
+            continue
+        free = np.array([0, *rows[1:][apart | (then < 0.0)], len(index)])
+        start = free[np.abs(free[:-1] - ends[0]).argmin()]
+        stop = free[free > start][np.abs(free[free > start] - ends[1]).argmin()]
+        turns = (
+            f"{np.degrees(np.arccos(now[k])):.0f} degrees at frame {index[rows[k + 1]]}" for k in at
+        )
+        found.append(
+            f"{one.what}: this disagrees with the frames around it (a turn of "
+            f"{' and '.join(turns)}). Take it back with `liex correct undo {path} {one.number}`; "
+            "the nearest span that agrees is then exchanged by `liex correct flip "
+            f"{path} --from {ends_s[start]:.3f} --to {ends_s[stop]:.3f}`"
+        )
+    return found
+
+
+def _joints(session: Session) -> Array:
+    """(n, J, 3) places of the joints of every frame, mm, arena frame; NaN without a pose."""
+    places = session.poses[["x_mm", "y_mm", "z_mm"]].to_numpy(float)
+    return places.reshape(len(session.frames), -1, 3)
+
+
+def _ahead(session: Session) -> Array:
+    """(n, 3) unit vectors from the first joint to the last, arena frame; NaN without a pose."""
+    joints = _joints(session)
+    along = joints[:, -1] - joints[:, 0]
+    return np.asarray(along / np.linalg.norm(along, axis=1, keepdims=True))
+
+
+def joint_move(
+    session: Session, frame: int, joint: str, place_mm: Any, note: str = ""
+) -> JointMove:
     """Correction that puts a joint of one frame to a position.
 
     Args:
@@ -63,16 +145,22 @@ def joint_move(session: Session, frame: int, joint: str, place_mm: Any) -> Joint
         frame: the frame, the camera's count.
         joint: the joint's name.
         place_mm: (3,) position, mm, arena frame.
+        note: how the height was chosen, see `JointMove`.
 
     Raises:
-        SessionError: there is no such frame, joint or pose, or the position is farther from where
-            the joint was than the animal is long.
+        SessionError: there is no such frame, joint or pose, or the position is below the floor or
+            farther from where the joint was than the animal is long.
     """
     row, was = _joint_row(session, frame, joint)
     place = np.asarray(place_mm, float)
     if place.shape != (3,) or not np.isfinite(place).all():
         raise SessionError(
             f"a joint's place is x, y and z in mm of the arena frame, got {place_mm}"
+        )
+    if place[2] < min(0.0, was[2]) - 1e-6:
+        raise SessionError(
+            f"{joint} of frame {frame} cannot be {-place[2]:.1f} mm below the floor; give a height "
+            f"z of 0 mm or more (it is at {was[2]:.1f} mm now)"
         )
     length = float(session.frames["spine_mm"].iloc[row])
     distance = float(np.linalg.norm(place - was))
@@ -82,17 +170,20 @@ def joint_move(session: Session, frame: int, joint: str, place_mm: Any) -> Joint
             f"({was[0]:.1f}, {was[1]:.1f}, {was[2]:.1f}) mm, for the animal is {length:.0f} mm "
             "long; check the place"
         )
-    return JointMove(int(frame), joint, *(round(float(x), 3) for x in place))
+    x, y, z = (round(float(one), 3) for one in place)
+    return JointMove(int(frame), joint, x, y, z, note)
 
 
 def joint_move_at_pixel(
     session: Session, frame: int, joint: str, u_px: float, v_px: float
 ) -> JointMove:
-    """Correction that puts a joint of one frame under a pixel of the depth picture.
+    """Correction that puts a joint of one frame under a pixel of the depth image.
 
-    The depth read there is that of the skin: the median over 3 x 3 pixels. The joint is put as deep
-    under it as it usually lies: the median over up to 24 frames of the recording in which the pose
-    is trusted.
+    Where the pixel shows the animal, the depth read there is that of its skin (the median over
+    3 x 3 pixels), and the joint is put as deep under it as it usually lies: the median over up to
+    24 frames of the recording in which the pose is trusted. Elsewhere, on the floor, a wall or an
+    unread pixel, the joint keeps its height above the floor and moves along the pixel's ray. It is
+    never put below the floor.
 
     Args:
         session: the session.
@@ -102,12 +193,12 @@ def joint_move_at_pixel(
         v_px: row, px; 0 is the centre of the first one.
 
     Raises:
-        SessionError: the pixel is outside the picture, or of what the session keeps of it, or has
-            no depth, or see `joint_move`.
+        SessionError: the pixel is outside the image, the session keeps no depth, the pixel's ray
+            does not reach the joint's height, or see `joint_move`.
     """
     from liex_lab.sessions.cutouts import Kept, open_pictures
 
-    row, _ = _joint_row(session, frame, joint)
+    row, was = _joint_row(session, frame, joint)
     camera = session.camera
     if not (
         math.isfinite(u_px)
@@ -116,27 +207,51 @@ def joint_move_at_pixel(
         and 0 <= round(v_px) < camera.height
     ):
         raise SessionError(
-            f"a pixel is a column and a row of the depth picture of {camera.width} x "
+            f"a pixel is a column and a row of the depth image of {camera.width} x "
             f"{camera.height}, the top-left one (0, 0); got ({u_px:g}, {v_px:g})"
         )
     kept = Kept(session)
-    if not kept.holds(row, u_px, v_px):
-        raise SessionError(
-            f"pixel ({u_px:g}, {v_px:g}) of frame {frame} is outside of the cut-out that the "
-            "session keeps of it, and shows the still scene; give the joint's place in mm, or run "
-            "`liex run` on the recording again with --set replay.depth=all (in Python "
-            "plan.with_settings(['replay.depth=all']))"
-        )
     with open_pictures(session) as recording:
-        skin_mm = depth_under(recording.frame(row).depth, u_px, v_px)
-        if math.isnan(skin_mm):
-            raise SessionError(
-                f"frame {frame} has no depth at pixel ({u_px:g}, {v_px:g}); choose one beside it, "
-                "or give the joint's place in mm"
-            )
-        inset_mm = _inset_mm(session, recording, kept, joint)
-    place = camera.unproject(np.array([u_px, v_px]), np.array(skin_mm + inset_mm))
-    return joint_move(session, frame, joint, session.T_arena_camera @ place)
+        skin_mm = _skin_under(session, recording, kept, row, u_px, v_px)
+        inset_mm = 0.0 if math.isnan(skin_mm) else _inset_mm(session, recording, kept, joint)
+    eye = session.T_arena_camera.translation
+    along = session.T_arena_camera.rotation @ camera.unproject(
+        np.array([u_px, v_px]), np.array(1.0)
+    )
+    off = math.isnan(skin_mm)
+    height = was[2] if off else eye[2] + (skin_mm + inset_mm) * along[2]
+    depth_mm = (max(height, min(0.0, was[2])) - eye[2]) / along[2]
+    if depth_mm <= 0.0:
+        raise SessionError(
+            f"the line of sight of pixel ({u_px:g}, {v_px:g}) does not reach the height of the "
+            f"{joint}; choose a pixel nearer to the animal, or give the place in mm"
+        )
+    note = OFF_THE_ANIMAL if off else ""
+    return joint_move(session, frame, joint, eye + depth_mm * along, note)
+
+
+def _skin_under(
+    session: Session, recording: Recording, kept: Kept, row: int, u_px: float, v_px: float
+) -> float:
+    """Depth of the animal's skin under a pixel of a frame, mm; NaN where it shows something else.
+
+    The animal stands out from the still scene, or from the floor where the session shows no scene
+    at the pixel, and lies beside the posed joints.
+    """
+    if not kept.holds(row, u_px, v_px):
+        return math.nan  # the still scene
+    skin_mm = depth_under(recording.frame(row).depth, u_px, v_px)
+    rows = np.linspace(0, len(session.frames) - 1, _SCENE_FRAMES).astype(int).tolist()
+    empty = next((k for k in rows if not kept.holds(k, u_px, v_px)), None)
+    scene_mm = math.nan if empty is None else depth_under(recording.frame(empty).depth, u_px, v_px)
+    pixel = np.array([u_px, v_px])
+    point = session.T_arena_camera @ session.camera.unproject(pixel, np.array(skin_mm))
+    stands_mm, reach = (
+        (point[2], 0.5 * _BESIDE) if math.isnan(scene_mm) else (scene_mm - skin_mm, _BESIDE)
+    )
+    away_mm = np.linalg.norm(_joints(session)[row] - point, axis=-1).min()
+    length = float(session.frames["spine_mm"].iloc[row])
+    return skin_mm if stands_mm > _STANDS_OUT * length and away_mm < reach * length else math.nan
 
 
 def depth_under(depth: NDArray[Any], u_px: float, v_px: float) -> float:

@@ -27,7 +27,7 @@ from liex_lab.sessions.listed import ALSO, WHO
 FOLDER = "corrected"
 LOG = "corrections.json"
 REPLAY = "corrected.rrd"
-SCHEMA_VERSION = 2  # since 2 species and age are described, too
+SCHEMA_VERSION = 3  # 2: species and age are described; 3: a correction was made again (redo)
 FACTS = {
     "frames",
     "actions",
@@ -71,6 +71,7 @@ class JointMove:
         x_mm: position in the arena frame, mm.
         y_mm: position in the arena frame, mm.
         z_mm: height above the floor, mm.
+        note: how the height was chosen, where the depth under the pixel did not give it.
     """
 
     kind: ClassVar[str] = "joint"
@@ -79,12 +80,13 @@ class JointMove:
     x_mm: float
     y_mm: float
     z_mm: float
+    note: str = ""
 
     def __str__(self) -> str:
         """The sentence for a list of corrections."""
         return (
             f"{self.joint} of frame {self.frame} to ({self.x_mm:.1f}, {self.y_mm:.1f}, "
-            f"{self.z_mm:.1f}) mm"
+            f"{self.z_mm:.1f}) mm" + (f", {self.note}" if self.note else "")
         )
 
 
@@ -169,14 +171,14 @@ _UNDO = "undo"
 
 @dataclass(frozen=True)
 class Entry:
-    """One line of the log: a correction, or that an earlier entry is taken back.
+    """One line of the log: a correction, an undo of one, or an undo of an undo, which is a redo.
 
     Attributes:
         number: of the entry, from 1.
         author: who made it.
         made_at: when, ISO 8601 with time zone.
         what: the correction; None where the entry takes another one back.
-        undoes: number of the entry that is taken back; 0 for a correction.
+        undoes: number of the entry that is taken back, a correction or an undo; 0 for a correction.
     """
 
     number: int
@@ -208,7 +210,8 @@ class Entry:
         if entry["kind"] == _UNDO:
             return Entry(*about, None, int(entry["undoes"]))
         kind = _KINDS[entry["kind"]]
-        values = {f.name: _typed(entry[f.name], f.type) for f in fields(kind)}
+        # entries of earlier versions lack what was added since
+        values = {f.name: _typed(entry[f.name], f.type) for f in fields(kind) if f.name in entry}
         return Entry(*about, kind(**values))
 
 
@@ -236,10 +239,31 @@ class Log:
     @property
     def standing(self) -> tuple[Entry, ...]:
         """The corrections that nobody took back, in the order in which they were made."""
-        gone = {entry.undoes for entry in self.entries if entry.what is None}
+        gone = set(self.undos.values())
         return tuple(
             entry for entry in self.entries if entry.what is not None and entry.number not in gone
         )
+
+    @property
+    def undos(self) -> dict[int, int]:
+        """The undos that no redo took back, by number: the number of the correction of each."""
+        found: dict[int, int] = {}
+        for entry in self.entries:
+            if entry.undoes in found:  # a redo
+                del found[entry.undoes]
+            elif entry.what is None:
+                found[entry.number] = entry.undoes
+        return found
+
+    @property
+    def redoable(self) -> tuple[int, Correction] | None:
+        """The undo that a redo takes back, by its number, and the correction that returns.
+
+        It is the last undo that stands; a new correction after it leaves none.
+        """
+        whats = {entry.number: entry.what for entry in self.entries if entry.what is not None}
+        number, undone = max(self.undos.items(), default=(0, 0))
+        return (number, whats[undone]) if number > max(whats, default=0) else None
 
     def corrections(self, kind: type[Any]) -> list[Any]:
         """The standing corrections of one kind.
@@ -264,15 +288,16 @@ class Log:
 
         Args:
             what: new corrections.
-            undo: numbers of standing entries to take back.
+            undo: numbers of standing entries to take back, or of the undo that `redoable` names.
             author: who makes them; "" takes who is logged in.
 
         Raises:
             SessionError: an entry to take back does not stand.
         """
         known = {entry.number for entry in self.standing}
+        redoable = self.redoable
         for number in undo:
-            if number not in known:
+            if number not in known and (redoable is None or number != redoable[0]):
                 told = ", ".join(str(n) for n in sorted(known)) or "none"
                 raise SessionError(
                     f"there is no correction {number} to take back; those that stand are {told}"
@@ -288,8 +313,10 @@ class Log:
 
     def to_json(self) -> str:
         """The content of corrections.json, with its own hash in it."""
+        undos = {entry.number for entry in self.entries if entry.what is None}
+        redone = any(entry.undoes in undos for entry in self.entries)
         document = {
-            "schema_version": SCHEMA_VERSION,
+            "schema_version": SCHEMA_VERSION if redone else 2,  # which earlier versions read
             "made_of": self.made_of,
             "entries": [entry.to_dict() for entry in self.entries],
             "files": {name: dict(facts) for name, facts in self.files.items()},

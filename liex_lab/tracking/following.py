@@ -9,7 +9,8 @@ off the curve by δ at frame k moves the curve by what the same smoother makes o
 coordinate by coordinate: the joints' middle (mm), the base's turn log(R^T R') and the joints'
 angles (rad), each an integrated Ornstein-Uhlenbeck process with the parameters of `smoother`. As
 there, errors have heavy tails, w = (ν + 1) / (ν + δ^2) in four passes: frames from which the person
-departs by more than their predicted errors have less to say, and the curve is even.
+departs by more than their predicted errors have less to say, and the curve is even. A frame follows
+no farther than to where a joint of it reaches the floor.
 """
 
 from __future__ import annotations
@@ -30,6 +31,7 @@ Rows = NDArray[np.int64]
 _REACH = 160  # frames on either side that may follow
 _CERTAIN = 1e-3  # of a frame's predicted error: how far a person may err
 _PASSES = 4
+_HALVINGS = 10  # how exactly it is found how far a frame can follow before it reaches the floor
 _LEAST_MM = 0.02  # a pose that moves less stays as it was
 _LEAST_ERROR = 0.005  # of the length: so much a frame errs at least
 
@@ -78,6 +80,15 @@ def _follow(track: Track, was: Pose, rows: Rows, placed: NDArray[np.bool_]) -> R
         pose = _moved(track, was, rows, moved)
         apart = np.linalg.norm(pose.joints(skeleton) - joints_were, axis=-1).mean(axis=1)
         weight = np.where(placed, 1.0, (nu + 1.0) / (nu + (apart / error) ** 2))
+    lowest = np.minimum(joints_were[..., 2], 0.0)
+    share = high = np.ones((len(rows), 1))
+    low = np.zeros((len(rows), 1))  # the share of the move that a frame can follow
+    for _ in range(_HALVINGS):
+        joints = _moved(track, was, rows, share * moved).joints(skeleton)
+        above = (joints[..., 2] >= lowest).all(axis=1, keepdims=True)
+        low, high = np.where(above, share, low), np.where(above, high, share)
+        share = 0.5 * (low + high)
+    pose = _moved(track, was, rows, low * moved)
     joints = pose.joints(skeleton)
     far = np.linalg.norm(joints - joints_were, axis=-1).max(axis=1) > _LEAST_MM
     chosen = np.flatnonzero(far & ~placed)

@@ -5,7 +5,8 @@
 2. A forward-backward pass over two states, head and tail as they are or exchanged, gives the flip
    posterior; spans that a person corrected are exchanged with certainty.
 3. A Kalman filter and Rauch-Tung-Striebel smoother of an integrated Ornstein-Uhlenbeck process
-   (`smoother`) runs over blocks of 4096 frames with a margin of 160 frames on either side.
+   (`smoother`) runs over blocks of 4096 frames with a margin of 160 frames on either side. It is
+   cut where a person's exchange makes a half turn: neither side has a say about the other.
 4. Validation gate: a hypothesis that was passed by, but lies within one predicted error of the
    curve, its own and the curve's together, is a measurement after all; twice over, for each time
    the curve comes nearer to others.
@@ -20,6 +21,7 @@ The default tracker of the package; it replaces the particle filter of Lie-X sec
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,7 +36,7 @@ from liex_lab.tracking.motion_model import TrackingParameters
 from liex_lab.tracking.observations import Observations, joints_of, reversed_pose
 from liex_lab.tracking.smoother import smooth
 from liex_lab.tracking.subject import Subject
-from liex_lab.tracking.track import Flip, Track, Tracked
+from liex_lab.tracking.track import Flip, Track, Tracked, ends_of
 from liex_lab.tracking.track_rows import doubted, hide, mask_and_flag, write_curve
 from liex_lab.tracking.trust import (
     elsewhere,
@@ -99,6 +101,7 @@ def track_whole(
     del joints, emission
     error = seen.along(seen.error_mm, path)
     turned = _turn_round(seen, path, doubt, corrections)
+    cuts = _half_turns(subject.skeleton, seen, path, turned, corrections)
     track = Track.empty(subject.skeleton, seen.times_ns, allocate=allocate)
     used = np.zeros(len(seen), np.bool_)
     seconds = seen.seconds
@@ -109,17 +112,25 @@ def track_whole(
         Args:
             rows: consecutive frames, one block.
         """
-        first = max(0, rows.start - MARGIN)
-        last = min(len(seen), rows.stop + MARGIN)
-        around = slice(first, last)
-        pose = seen[around].pose(path[around])
-        _reverse(subject.skeleton, pose, turned[around])
-        curve = smooth(
-            subject.skeleton, seconds[around], pose, error[around], subject.length_mm, tuning.motion
-        )
-        curve = curve[rows.start - first : rows.stop - first]
-        write_curve(subject, track[rows], curve, tuning)
-        used[rows] = curve.used
+        for start, stop in pairwise([0, *cuts, len(seen)]):
+            part = slice(max(rows.start, start), min(rows.stop, stop))
+            if part.start >= part.stop:
+                continue
+            first = max(start, part.start - MARGIN)
+            around = slice(first, min(stop, part.stop + MARGIN))
+            pose = seen[around].pose(path[around])
+            _reverse(subject.skeleton, pose, turned[around])
+            curve = smooth(
+                subject.skeleton,
+                seconds[around],
+                pose,
+                error[around],
+                subject.length_mm,
+                tuning.motion,
+            )
+            curve = curve[part.start - first : part.stop - first]
+            write_curve(subject, track[part], curve, tuning)
+            used[part] = curve.used
 
     usual_px = usual_pixels(seen, path)
     in_view = share_in_view(seen, path, usual_px)
@@ -170,7 +181,9 @@ def track_whole(
         hide(track[rows], hidden[rows])
     flips = _flips(seen, track)
     return Tracked(
-        track, tuple(sorted([*flips, *corrections], key=lambda flip: (flip.start, flip.source)))
+        track,
+        tuple(sorted([*flips, *corrections], key=lambda flip: (flip.start, flip.source))),
+        tuple(cuts),
     )
 
 
@@ -195,6 +208,33 @@ def _turn_round(
                 turned[t] += 1
         doubt[span.start : span.stop] = 0.0
     return turned
+
+
+def _half_turns(
+    skeleton: Skeleton,
+    seen: Observations,
+    path: NDArray[np.int64],
+    turned: NDArray[np.int64],
+    corrections: Sequence[Flip],
+) -> list[int]:
+    """The ends of a person's exchanges at which the body turns by more than 90 degrees.
+
+    Compared are the last measured frame before an end and the first one after it.
+    """
+
+    def ahead(row: int) -> Array:
+        """From base to tip (3,) of the pose in a `row`, mm."""
+        base, tip = seen[row : row + 1].joints_as(int(path[row]), [0, skeleton.tip])[0]
+        return (tip - base) * (-1.0) ** turned[row]
+
+    ends = ends_of((flip.start, flip.stop) for flip in corrections if not flip.undone_at)
+    rows = np.flatnonzero(path != NONE)
+    after = np.searchsorted(rows, ends)
+    return [
+        end
+        for end, k in zip(ends, after, strict=True)
+        if 0 < k < len(rows) and ahead(rows[k - 1]) @ ahead(rows[k]) < 0.0
+    ]
 
 
 def _reverse(skeleton: Skeleton, pose: Pose, turned: NDArray[np.int64]) -> None:

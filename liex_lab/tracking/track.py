@@ -7,6 +7,7 @@ positions, bone scale, predicted error, flip posterior and flags. The tables `fr
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -239,6 +240,21 @@ class Flip:
     undone_at: str = ""
 
 
+def ends_of(spans: Iterable[tuple[int, int]]) -> list[int]:
+    """Where an exchange of head and tail begins or ends; what is exchanged twice is as it was.
+
+    Args:
+        spans: start and stop (exclusive) of each exchange, rows or frames; they may overlap.
+
+    Returns:
+        First rows (or frames) of the stretches that the exchanges make, ascending.
+    """
+    ends: set[int] = set()
+    for span in spans:
+        ends ^= set(span)
+    return sorted(ends)
+
+
 @dataclass(frozen=True)
 class Tracked:
     """A track and what was found out about head and tail on the way.
@@ -246,7 +262,10 @@ class Tracked:
     Attributes:
         track: one row for every frame.
         flips: spans of exchanged or uncertain head and tail, in order of time.
+        cuts: first rows of stretches that were smoothed by themselves, since a person's exchange
+            makes a half turn there.
     """
 
     track: Track
     flips: tuple[Flip, ...]
+    cuts: tuple[int, ...] = ()

@@ -241,7 +241,7 @@ def test_a_session_measured_again_keeps_what_people_said(session: Session) -> No
     faster = WalkingMouse(MOUSE.times_s, speed_mm_s=150.0)
     other = write(session.path, faster, plan_toml=toml, overwrite=True)
     assert "run" not in set(other.bouts["action"])
-    with pytest.raises(SessionError, match=r"made on another measurement .*liex correct redo"):
+    with pytest.raises(SessionError, match=r"made on another measurement .*liex correct apply"):
         corrected(other, correcting.add_bout(other, "walk", 1.0, 2.0))
     correct_session(session.path)
     assert "run" in set(Session.open(session.path).bouts["action"])
@@ -332,7 +332,7 @@ def test_the_command_line_corrects_lists_and_takes_back(session: Session) -> Non
     assert "ada" in listed
     assert listed.count("taken back") >= 3
     assert "run" in set(Session.open(place).bouts["action"])
-    liex("redo", place)
+    liex("apply", place)
     assert "corrections were made by hand by ada" in (place / "report.html").read_text(
         encoding="utf-8"
     )
