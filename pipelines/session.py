@@ -121,12 +121,15 @@ def measure_session(
         folder = folder or inside(Path(out), first.session.name or opened.name, ".liex")
         if told := unwritable_times(opened.times_ns):
             raise RecordingError(f"of {opened.name} {told}")
+        read = isinstance(recording, str | Path) and opened.sources
+        whose = _check_subject(opened, Path(recording), first) if read else []
         check_unused(folder, overwrite)
         unnamed = None if plan else settings
         with hashed_ahead(opened, part_folder(folder), progress) as hashed:
             compile_ahead(first.animal.skeleton, progress)
             progress(0, None, "learning the background, the floor and the animal's size")
             fitted = fit_plan(opened, first, estimator, settings=unnamed, progress=progress)
+            fitted = replace(fitted, notes=(*fitted.notes, *whose))
             hashed()
         prepared = prepare(fitted, folder, started, progress)
         if pool is not None and isinstance(recording, str | Path):
@@ -139,6 +142,27 @@ def measure_session(
                 prepared.measure_all(chunks, writer, progress)
             session = prepared.finish(writer, recording, notes)
     return session.path
+
+
+def _check_subject(opened: Recording, path: Path, plan: Plan) -> list[str]:
+    """Note the animal that metadata, folders or the file name give where the plan names none; a
+    caution where it names another one than the metadata.
+    """
+    from liex_lab.plan.subject import animal_part, find_subject, letters, same
+    from liex_lab.sessions.verdict import OTHER_ANIMAL
+
+    told = str(opened.metadata.get("subject_id", ""))
+    found = find_subject(path, told)
+    in_metadata = found.origin == "metadata"
+    stated = plan.session.subject_id
+    if stated is None:
+        named = animal_part(told) if in_metadata else found.id if found.origin else ""
+        opened.metadata["subject_id"] = named
+        return []
+    # of several arenas the metadata name one animal at most
+    whose = in_metadata and plan.arena.region is None
+    differ = same(found.id) != same(letters(animal_part(stated)))
+    return [f"{OTHER_ANIMAL}, {told} instead of {stated}"] if whose and differ else []
 
 
 def check_unused(folder: Path, overwrite: bool) -> None:

@@ -64,7 +64,9 @@ def cohort(
     if study == "init":
         from liex_lab.pipelines.study.init import begin_study
 
-        say(f"study: {begin_study(folder or Path(), overwrite)}")
+        with progress_bar() as progress:
+            file = begin_study(folder or Path(), overwrite, say=say, progress=progress)
+        say(f"study: {file}")
         return
     if folder is not None:
         raise typer.BadParameter(

@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 from liex_lab.errors import LiexError, RecordingError
 from liex_lab.optics.camera import Lens
@@ -165,6 +166,39 @@ def open_recording(
             "plan.with_settings(['recording.accept_truncated=true']))"
         )
     return recording
+
+
+def stated_subject(path: Path, progress: Progress = silent) -> str:
+    """The animal's name in a recording's metadata, without its frames being read.
+
+    Args:
+        path: a file or a folder.
+        progress: told while an archive is searched.
+
+    Returns:
+        As the recording states it; '' where it states none, or cannot be read.
+    """
+    from liex_lab.recordings.camera_file import CameraFile
+    from liex_lab.recordings.formats.moseq.archive import unpack
+    from liex_lab.recordings.formats.moseq.metadata import METADATA, read_metadata
+
+    folder = path if path.is_dir() else path.parent
+    notes = {CAMERA_FILE: folder / CAMERA_FILE}
+    try:
+        if path.suffix.lower() == ".mcap":
+            with open_recording(path, strict=True) as recording:
+                return str(recording.metadata.get("subject_id", ""))
+        with TemporaryDirectory() as scratch:
+            if path.name.lower().endswith((".tar.gz", ".tgz", ".tar")):
+                notes |= unpack(path, (METADATA, CAMERA_FILE), Path(scratch), progress).files
+            elif path.suffix.lower() not in (".oni", ".bag", ".db3"):
+                notes[METADATA] = folder / METADATA
+            file = notes.get(METADATA)
+            facts = read_metadata(file if file and file.is_file() else None, cut=True).facts
+            facts |= CameraFile.read(notes[CAMERA_FILE]).metadata
+    except (LiexError, OSError):
+        return ""
+    return str(facts.get("subject_id", ""))
 
 
 def _open(path: Path, how: _How) -> Recording:

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
 LOOK_AT_IT = "look at it"
 CAUTION = "note"
+OTHER_ANIMAL = "the recording names another animal"  # how that caution begins
 _MEASURED_SHARE = 0.5  # of the frames in which something of the animal's size is in view
 _LEAST_SHARE = 0.2  # of all frames that hold depth
 _DOUBTFUL_SHARE = 0.05

@@ -1,28 +1,32 @@
 """A study file to begin from, made of the recordings found in a folder: `liex cohort init`.
 
-Animals and sessions are named after BIDS-like folders (`sub-m01`, `ses-01_date-20260821`) where
-there are such, else after folders and files.
+Animals and sessions are named by the recordings' metadata, BIDS-like folders (`sub-m01`,
+`ses-01_date-20260821`), other folders and file names, see `plan.subject`. A recording that is there
+twice is listed once.
 """
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import re
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from liex_lab.errors import StudyError
 from liex_lab.plan.study import DERIVED, RAW, STUDY_FILE, Study
+from liex_lab.plan.subject import CONTAINER, find_subject, letters, same
+from liex_lab.recordings.open import stated_subject
 from liex_lab.runtime.durable import write_whole
+from liex_lab.runtime.progress import Progress, silent
 
-_FILES = (".mcap", ".bag", ".db3", ".oni", ".tar.gz", ".tgz", ".avi", ".mkv")
-_FOLDERS = (
-    "camera.toml",
-    "raytrix.toml",
-    "depth.dat",
-    "depth.avi",
-    "depth.mkv",
-)  # what marks a folder as a recording
+_FILES = (".mcap", ".bag", ".db3", ".oni", ".tar.gz", ".tgz", ".mkv", ".avi")
+_DEPTHS = ("depth.dat", "depth.avi", "depth.mkv")  # each marks a folder as a recording
+_NOTES = ("camera.toml", "raytrix.toml")  # these, too, where they are not beside files of depth
+_COMPARED_BYTES = 1 << 20  # of the beginning and the end of two files of one size
+_MOST_LISTED = 4  # sessions of an animal
+Named = tuple[str, str, Path, str]  # animal, session, recording, what names the animal
 _SKIPPED = {"derivatives", "thumbnails"}
 _HEADER = """\
 # A study of liex_lab: which animals, in which groups, recorded in which sessions. Correct what is wrong here, then
@@ -33,15 +37,20 @@ _HEADER = """\
 """  # noqa: E501
 
 
-def begin_study(folder: str | Path, overwrite: bool = False) -> Path:
+def begin_study(
+    folder: str | Path,
+    overwrite: bool = False,
+    *,
+    say: Callable[[str], object] = lambda _: None,
+    progress: Progress = silent,
+) -> Path:
     """Write FOLDER/study.toml with every recording below FOLDER/rawdata, or else below FOLDER.
-
-    Animal and session are taken from folder names such as sub-m01 and ses-01_date-20260821 where
-    there are such, otherwise from the recording's own name.
 
     Args:
         folder: the study's folder.
         overwrite: replace a study file that is there already.
+        say: gets the animals with their sessions, and what to check, line by line.
+        progress: told recording by recording.
 
     Returns:
         The path of the study file.
@@ -66,11 +75,73 @@ def begin_study(folder: str | Path, overwrite: bool = False) -> Path:
         raise StudyError(
             f"no recording was found below {raw}; a study needs at least one, see `liex run --help`"
         )
-    named = name_sessions(found, raw)
-    text = _text(root, named)
-    write_whole(file, text)
+    stated = []
+    for k, path in enumerate(found):
+        progress(k, len(found), "reading who the animals are")
+        stated.append(stated_subject(path, progress))
+    twins = find_twins(found)
+    kept = [(path, told) for path, told in zip(found, stated, strict=True) if path not in twins]
+    named, notes = name_sessions([path for path, _ in kept], raw, [told for _, told in kept])
+    notes += [
+        f"{one.relative_to(root).as_posix()} is the same recording as "
+        f"{other.relative_to(root).as_posix()}, and is left out"
+        for one, other in twins.items()
+    ]
+    write_whole(file, _text(root, named, notes))
     Study.load(file)
+    for line in (*_listed(named), *notes):
+        say(line)
     return file
+
+
+def _listed(named: Sequence[Named]) -> list[str]:
+    """The animals with their sessions, for a person to check."""
+    sessions: dict[str, list[str]] = {}
+    for animal, session, _, _ in named:
+        sessions.setdefault(animal, []).append(session)
+    counts = f"{len(named)} recording{'s' * (len(named) != 1)}, {len(sessions)} animal"
+    lines = [f"{counts}{'s' * (len(sessions) != 1)}: is that so?"]
+    for animal, own in sessions.items():
+        more = f" and {len(own) - _MOST_LISTED} more" if len(own) > _MOST_LISTED else ""
+        lines.append(f"    {animal}: {', '.join(own[:_MOST_LISTED])}{more}")
+    return lines
+
+
+def find_twins(recordings: Sequence[Path]) -> dict[Path, Path]:
+    """Recordings that are there twice: the one to leave out, and the one that stays.
+
+    Two are the same where they lie in one folder and differ by the ending of their names alone, as
+    an archive beside the folder that was packed, or where their largest files have the same size,
+    beginning and end.
+
+    Args:
+        recordings: paths of recordings.
+    """
+    kept: dict[object, Path] = {}
+    twins: dict[Path, Path] = {}
+    packed = (".gz", ".tgz", ".mkv", ".avi")  # the folder or container beside it is read instead
+    ranks = {path: (path.suffix.lower() in packed, len(path.name), path) for path in recordings}
+    for path in sorted(recordings, key=ranks.__getitem__):  # copies have longer names
+        keys = ((path.parent, CONTAINER.sub("", path.name).lower()), _content(path))
+        twin = next((kept[key] for key in keys if key in kept), None)
+        if twin is not None:
+            twins[path] = twin
+        kept |= {key: twin or path for key in keys if key}
+    return twins
+
+
+def _content(path: Path) -> tuple[object, ...]:
+    """Size, beginning and end of a recording's largest file, () of an empty one."""
+    files = [path] if path.is_file() else [file for file in path.rglob("*") if file.is_file()]
+    sizes = {file: (file.name in _DEPTHS, file.stat().st_size) for file in files}
+    largest = max(sizes, key=sizes.__getitem__, default=path)
+    size = largest.stat().st_size if largest.is_file() else 0
+    if not size:
+        return ()
+    with largest.open("rb") as file:
+        ends = file.read(_COMPARED_BYTES)
+        file.seek(max(size - _COMPARED_BYTES, 0))
+        return size, hashlib.sha256(ends + file.read()).hexdigest()
 
 
 def find_recordings(folder: Path) -> list[Path]:
@@ -90,51 +161,62 @@ def find_recordings(folder: Path) -> list[Path]:
             and not name.endswith((".liex", ".part"))
             and not (here / name / "session.json").exists()
         )
-        if here != folder and any(name in names for name in _FOLDERS):
+        files = [name for name in sorted(names) if name.lower().endswith(_FILES)]
+        noted = any(name in names for name in _NOTES) and not files
+        if here != folder and (noted or any(name in names for name in _DEPTHS)):
             found.append(here)
             folders.clear()
             continue
-        found += [
-            here / name
-            for name in sorted(names)
-            if name.lower().endswith(_FILES) and name[0] != "."
-        ]
+        found += [here / name for name in files if name[0] != "."]
     return found
 
 
-def name_sessions(recordings: list[Path], raw: Path) -> list[tuple[str, str, Path]]:
-    """(animal, session, recording) for each recording, no pair of names twice.
+def name_sessions(
+    recordings: Sequence[Path], raw: Path, stated: Sequence[str] = ()
+) -> tuple[list[Named], list[str]]:
+    """Animal and session of each recording, no pair of names twice, and what to check.
 
-    Names that differ by capitals alone are one, as they are to some file systems.
+    Names that differ in capitals, spaces, _ or - alone are one animal.
 
     Args:
         recordings: paths below `raw`.
         raw: the folder that the names count from.
+        stated: the animal's name in each recording's metadata; () where none was read.
+
+    Returns:
+        Animal, session, recording and what names the animal (metadata, folder or file name; '' for
+        nothing), in the recordings' order; and sentences.
     """
-    named = []
+    named: list[Named] = []
     taken = set()
-    spelled: dict[str, str] = {}  # some file systems take M1 and m1 for one, so here they are one
-    for path in recordings:
-        parts = path.relative_to(raw).parts
-        stem = path.name if path.is_dir() else path.name.split(".")[0]
-        animal = next((part[4:] for part in parts if part.startswith("sub-")), None)
-        session = next((part[4:] for part in parts if part.startswith("ses-")), None)
-        if animal is None:
-            animal = parts[0] if len(parts) > 1 and not parts[0].startswith("ses-") else stem
-        animal = spelled.setdefault(_letters(animal).lower(), _letters(animal))
-        session = _pairs(session or (stem if _letters(stem) != animal else "01"))
-        base = session
+    spelled: dict[str, str] = {}
+    notes = []
+    for path, told in zip(recordings, stated or [""] * len(recordings), strict=True):
+        found = find_subject(path, told, raw)
+        by_name = find_subject(path, "", raw)
+        if by_name.origin and same(by_name.id) != same(found.id):
+            notes.append(
+                f"{path.relative_to(raw).as_posix()}: its metadata name the animal {found.id} and "
+                f"its {by_name.origin} {by_name.id}"
+            )
+        animal = spelled.setdefault(found.id.lower(), found.id)
+        if animal != found.id:
+            notes.append(f"{animal} and {found.id} are taken for one animal, {animal}")
+        session = base = _pairs(found.session or "01")
         k = 1
         while (animal.lower(), session.lower()) in taken:
             k += 1
             session = f"{base}_rec-{k}"
         taken.add((animal.lower(), session.lower()))
-        named.append((animal, session, path))
-    return named
-
-
-def _letters(text: str) -> str:
-    return re.sub(r"[^A-Za-z0-9]", "", text)[:64] or "animal"
+        named.append((animal, session, path, found.origin))
+    if unknown := [animal for animal, _, _, origin in named if not origin]:
+        notes.append(
+            f"nothing names the animal of {', '.join(unknown[:_MOST_LISTED])}"
+            f"{' and others' if len(unknown) > _MOST_LISTED else ''}: each recording is listed as "
+            "an animal of its own, which counts one mouse several times if it was recorded more "
+            "than once; state the animal of each session in the study file"
+        )
+    return named, list(dict.fromkeys(notes))
 
 
 def _pairs(text: str) -> str:
@@ -144,13 +226,14 @@ def _pairs(text: str) -> str:
     first, *pairs = text.split("_")
     whole = re.fullmatch(r"[A-Za-z0-9]{1,32}", first) and len(pairs) <= 5
     kept = all(re.fullmatch(r"[A-Za-z0-9]{1,32}-[A-Za-z0-9]{1,64}", pair) for pair in pairs)
-    return text if whole and kept else _letters(text)[:32]
+    return text if whole and kept else letters(text)[:32]
 
 
-def _text(root: Path, named: list[tuple[str, str, Path]]) -> str:
+def _text(root: Path, named: Sequence[Named], notes: Sequence[str]) -> str:
     """The study file."""
     lines = [
         _HEADER.format(file=STUDY_FILE, raw=RAW),
+        *(f"# note: {note}" for note in notes),
         f"name = {_quoted(root.resolve().name or 'study')}",
     ]
     lines += [
@@ -162,14 +245,17 @@ def _text(root: Path, named: list[tuple[str, str, Path]]) -> str:
         "[set]",
         "",
     ]
-    for animal in dict.fromkeys(animal for animal, _, _ in named):
+    origins: dict[str, dict[str, None]] = {}
+    for animal, _, _, origin in named:
+        origins.setdefault(animal, {})[origin or "nothing, so check it"] = None
+    for animal, own in origins.items():
         lines += [
             "[[animals]]",
-            f"id = {_quoted(animal)}",
+            f"id = {_quoted(animal)}  # named by: {', '.join(own)}",
             'group = ""                     # cage, sex, batch too',
             "",
         ]
-    for animal, session, path in named:
+    for animal, session, path, _ in named:
         lines += [
             "[[sessions]]",
             f"animal = {_quoted(animal)}",

@@ -99,8 +99,9 @@ def read_metadata(path: Path | None, cut: bool) -> Metadata:
     facts = {}
     problems = []
     for key, ours in (("SubjectName", "subject_id"), ("SessionName", "session_name")):
-        if isinstance(document.get(key), str) and document[key].strip():
-            facts[ours] = document[key].strip()
+        stated = document.get(key)
+        if isinstance(stated, str | int) and not isinstance(stated, bool) and str(stated).strip():
+            facts[ours] = str(stated).strip()
     if (stated := document.get("StartTime")) is not None:
         if (start := start_of_day(stated if isinstance(stated, str) else None)) is not None:
             facts["session_start_time"] = start
