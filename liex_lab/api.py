@@ -339,22 +339,26 @@ def compare_groups(
     reference: str | None = None,
     animals: str | Path | None = None,
     engine: str = "auto",
+    only_trusted: bool = False,
     progress: Progress = silent,
 ) -> dict[str, Any]:
     """Compare the groups of sessions; writes tables, a text of methods, and figures.
 
     Args:
-        places: session folders, or folders with sessions anywhere in them.
+        places: study files, session folders, or folders with sessions anywhere in them.
         out: folder of the tables; it is made where it is missing.
         measures: columns of the summary; () takes the usual ones and every action's share.
         reference: compare with this group only; None compares all pairs.
         animals: a CSV with `subject_id` and any of group, cage, sex, batch, which overrules what
             the sessions say.
         engine: `auto`, `permutation` or `mixed`.
+        only_trusted: leave out sessions that someone has to look at.
         progress: told session by session and figure by figure.
 
     Returns:
-        `stats`: the table's rows; `folder`: where the files are; `figures`: their paths.
+        `stats`: the table's rows; `folder`: where the files are; `figures`: their paths;
+        `sessions`: a sentence that accounts for every session; `check`: sentences on what may be
+        wrong.
 
     Raises:
         SessionError: there are no two groups, or a folder, column, engine or CSV cannot be used.
@@ -368,6 +372,7 @@ def compare_groups(
         reference=reference,
         animals=animals,
         engine=engine,
+        only_trusted=only_trusted,
         progress=progress,
     )
     return {**found, "figures": draw_figures(found["folder"], progress=progress)["files"]}

@@ -214,11 +214,15 @@ class StudyData:
             if isinstance(table, pd.DataFrame):
                 stated = {name: value for name, value in entry.who.items() if value}
                 tables.append(table.assign(key=entry.key, **stated))
-        return (
-            pd.concat(tables, ignore_index=True)
-            if tables
-            else pd.DataFrame(columns=["key", "session_id", *WHO])
-        )
+        if not tables:
+            return pd.DataFrame(columns=["key", "session_id", *WHO])
+        whole, notes = cohort.unified(pd.concat(tables, ignore_index=True))
+        whole.attrs["check"] = notes
+        return whole
+
+    def to_check(self) -> list[str]:
+        """Sentences on what may be wrong with the names of animals and groups."""
+        return list(self.collected().attrs.get("check", ()))
 
     def stats(self, measure: str, reference: str | None = None) -> pd.DataFrame:
         """The table `stats` of the usual measures and this one, with p corrected for all of them.

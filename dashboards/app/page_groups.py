@@ -12,8 +12,9 @@ from dash import Dash, Input, Output, dcc, html, no_update
 
 from liex_lab.behaviour import cohort
 from liex_lab.errors import LiexError
+from liex_lab.plan.subject import references_first
 
-from ..units import shown, titled
+from ..units import titled
 from . import plots
 from .data import StudyData
 from .parts import graph
@@ -35,7 +36,7 @@ def groups_page(data: StudyData) -> list[Any]:
     usual = [name for name in cohort.usual_measures(table) if name in measures]
     ordered = [*usual, *(name for name in measures if name not in usual)]
     units = data.units()
-    names = sorted({str(name) for name in table["group"].fillna("")} - {""})
+    names = references_first({str(name) for name in table["group"].fillna("")} - {""})
     if not ordered or len(names) < 2:
         said = f"{len(table)} measured sessions have {', '.join(names) or 'no group'}"
         return [
@@ -49,6 +50,7 @@ def groups_page(data: StudyData) -> list[Any]:
     return [
         html.P("Study", className="kind"),
         html.H1("Groups"),
+        *(html.P(f"Check this result: {note}", className="note") for note in data.to_check()),
         html.Div(
             className="tools",
             children=[
@@ -132,33 +134,17 @@ def verdict(row: dict[str, Any], unit: str) -> html.Div:
         row: a row of the table `stats`, see `cohort.compare`.
         unit: the measure's unit in the table; empty where it has none.
     """
-    factor, read = shown(1.0, unit)
-    estimate, low, high = (factor * row[name] for name in ("estimate", "ci_low", "ci_high"))
-    sized = f"{number(estimate)}{f' {read}' if read else ''}, 95 % interval {number(low)} to "
-    sized += (
-        f"{number(high)}; Hedges' g {number(row['effect_size'])} ({number(row['effect_low'])} to "
-    )
-    sized += f"{number(row['effect_high'])})"
-    if row["test"]:
-        tested = (
-            f"p = {number(row['p'])}, corrected for {row['n_family']} tests "
-            f"{number(row['p_fdr'])}; {row['test']}."
-        )
-    else:
-        tested = f"No test: {row['refused']}."
     cages = f"{row['n_cages']} cages, " if row["n_cages"] else ""
     counts = (
-        f"{row['n_units_first']} and {row['n_units_second']} units ({row['unit'] or 'none'}); "
-        f"{row['n_animals']} animals, {cages}{row['n_sessions']} sessions, {row['n_bouts']:,} "
-        f"bouts, {number(row['observed_min'])} min; {row['n_without_value']} sessions without a "
-        "value."
+        f"{cohort.counted_units(row)}; {row['n_animals']} animals, {cages}{row['n_sessions']} "
+        f"sessions, {row['n_bouts']:,} bouts, {number(row['observed_min'])} min; "
+        f"{row['n_without_value']} sessions without a value."
     )
     kind = "verdict" if row["test"] else "verdict is-refused"
     return html.Div(
         [
             html.H3(row["contrast"]),
-            html.P(sized),
-            html.P(tested, className="tested"),
+            html.P(cohort.result(row, unit), className="tested"),
             html.P(counts, className="muted"),
         ],
         className=kind,
@@ -193,11 +179,11 @@ def register(app: Dash, data: StudyData) -> None:
             return plots.empty(str(error)), plots.empty(""), [], [], "", meaning
         own = stats[stats["measure"] == measure]
         return (
-            plots.groups(data.collected(), measure, unit),
+            plots.groups(data.collected(), measure, unit, against),
             plots.differences(own, unit),
             [verdict(row, unit) for row in records(own)],
             block(f"stats/{measure}/{against or ''}", "Every comparison"),
-            cohort.methods(stats),
+            cohort.methods(stats, data.collected(), [f"{note}." for note in data.to_check()]),
             meaning,
         )
 

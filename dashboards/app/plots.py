@@ -15,7 +15,9 @@ import numpy as np
 import pandas as pd
 
 from liex_lab.actions.colours import UNLABELLED
+from liex_lab.behaviour.cohort import counted_units
 from liex_lab.behaviour.design import animal_means
+from liex_lab.plan.subject import references_first
 
 from ..figures.style import INK, LINE, MUTED
 from ..figures.times import kept_rows
@@ -24,7 +26,8 @@ from ..units import read_as, shown
 from .data import GREY, NO_POSE, OTHER, Ethogram, raster
 
 # Okabe and Ito's colours; beside them every group has its own mark
-GROUP_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
+# the first group is the reference, in grey
+GROUP_COLOURS = ("#7F7F7F", "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 GROUP_MARKS = ("circle", "square", "diamond", "triangle-up", "cross", "x", "star")
 NO_POSE_COLOUR = "#3a3f45"
 FEW = 60  # sessions; with more, rows are thin
@@ -156,7 +159,9 @@ def time_budgets(
     }
 
 
-def groups(table: pd.DataFrame, measure: str, unit: str) -> dict[str, Any]:
+def groups(
+    table: pd.DataFrame, measure: str, unit: str, reference: str | None = None
+) -> dict[str, Any]:
     """Strip plot of a measure by group: each animal's mean, its sessions, the mean of the animals.
 
     Args:
@@ -164,12 +169,15 @@ def groups(table: pd.DataFrame, measure: str, unit: str) -> dict[str, Any]:
             `StudyData.collected`.
         measure: the column to draw.
         unit: its unit in the table; empty where it has none.
+        reference: the group that stands first, in grey; None takes one named like a control group.
     """
     factor = shown(1.0, unit)[0]
     known = table[np.isfinite(table[measure].astype(float))] if measure in table else table.iloc[:0]
     if known.empty:
         return empty("No session has a value of this measure.")
-    names = sorted(set(known["group"].fillna("").astype(str)))
+    names = references_first(set(known["group"].fillna("").astype(str)))
+    if reference in names:
+        names = [reference, *(name for name in names if name != reference)]
     rng = np.random.default_rng(0)
     data = []
     lines = []
@@ -291,7 +299,10 @@ def differences(stats: pd.DataFrame, unit: str) -> dict[str, Any]:
     }
     y = {
         "tickvals": places,
-        "ticktext": [text(name) for name in known["contrast"]],
+        "ticktext": [
+            f"{text(row['contrast'])}<br>{text(counted_units(row))}"
+            for row in known.to_dict("records")
+        ],
         "automargin": True,
         "autorange": "reversed",
         "showgrid": False,

@@ -16,6 +16,7 @@ from dash import dcc, html
 
 from liex_lab.errors import SessionError
 from liex_lab.runtime.spreadsheets import harmless_table
+from liex_lab.sessions.listed import state_in_words
 
 from ..units import counted, read_as
 from ..units import shown as as_read
@@ -66,6 +67,10 @@ SESSIONS = {
 STATS = {
     "measure": "measure",
     "contrast": "contrast",
+    "group": "group",
+    "n_group": "n of group",
+    "reference": "reference",
+    "n_reference": "n of reference",
     "refused": "not tested, because",
     "estimate": "difference",
     "ci_low": "from",
@@ -77,8 +82,6 @@ STATS = {
     "p_fdr": "p, corrected",
     "test": "test",
     "unit": "unit",
-    "n_units_first": "units, first",
-    "n_units_second": "units, second",
     "n_animals": "animals",
     "n_cages": "cages",
     "n_sessions": "sessions",
@@ -379,7 +382,8 @@ def _cell(table: Table, row: dict[str, Any], column: str) -> dict[str, Any]:
     if unit := table.units.get(about if column in _ESTIMATES else column, ""):
         value = as_read(value, unit)[0]
     if column == "state":
-        return {"kind": "state", "text": STATES.get(str(value), str(value)), "to": str(value)}
+        said = state_in_words(str(value), str(row.get("reason", "")))
+        return {"kind": "state", "text": STATES.get(said, said), "to": str(value)}
     if column == "reason" and "remedy" in row:
         texts = (str(row[name]) for name in ("reason", "remedy", "damage"))
         return {

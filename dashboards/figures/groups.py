@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
@@ -9,10 +10,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from liex_lab.actions.colours import action_colours
+from liex_lab.behaviour.cohort import counted_units
 from liex_lab.behaviour.design import animal_means
 from liex_lab.behaviour.occupancy import Occupancy, occupancy
+from liex_lab.plan.subject import references_first
 
-from ..units import counted, shown, titled
+from ..units import counted, read_as, shown, titled
 from .places import aligned, extent_mm, occupancy_panels
 from .seen import Array, Seen
 from .style import (
@@ -44,14 +47,15 @@ NO_GROUP = "no group"
 
 
 def by_group(all_seen: Sequence[Seen]) -> dict[str, dict[str, list[Seen]]]:
-    """The sessions of each subject of each group, groups and subjects in order of their names.
+    """The sessions of each subject of each group, groups in their order, subjects by their names.
 
     Args:
-        all_seen: animals of sessions; one without a subject's name is a subject of its own.
+        all_seen: animals of sessions, those of the reference group first; one without a subject's
+            name is a subject of its own.
     """
-    out: dict[str, dict[str, list[Seen]]] = {}
-    for seen in sorted(all_seen, key=lambda one: (one.group, one.who)):
-        out.setdefault(seen.group or NO_GROUP, {}).setdefault(seen.who, []).append(seen)
+    out: dict[str, dict[str, list[Seen]]] = {seen.group or NO_GROUP: {} for seen in all_seen}
+    for seen in sorted(all_seen, key=lambda one: one.who):
+        out[seen.group or NO_GROUP].setdefault(seen.who, []).append(seen)
     return out
 
 
@@ -60,9 +64,9 @@ def group_colour(name: str, names: Sequence[str]) -> str:
 
     Args:
         name: of the group.
-        names: of all groups.
+        names: of all groups, the reference first.
     """
-    return GROUP_COLOURS[sorted(names).index(name) % len(GROUP_COLOURS)]
+    return GROUP_COLOURS[names.index(name) % len(GROUP_COLOURS)]
 
 
 def ethograms(all_seen: Sequence[Seen]) -> Figure | None:
@@ -243,7 +247,9 @@ def distance_by_group(all_seen: Sequence[Seen]) -> Figure | None:
     return figure
 
 
-def comparison(table: pd.DataFrame, stats: pd.DataFrame, measure: str, unit: str) -> Figure | None:
+def comparison(
+    table: pd.DataFrame, stats: pd.DataFrame, measure: str, unit: str, accounted: str = ""
+) -> Figure | None:
     """A measure by group: every session and animal, and the differences with 95 % intervals.
 
     Args:
@@ -252,6 +258,7 @@ def comparison(table: pd.DataFrame, stats: pd.DataFrame, measure: str, unit: str
         stats: rows of the table `stats`.
         measure: the column that is drawn.
         unit: its unit in the table; "" for none.
+        accounted: a sentence below the figure that accounts for every session.
 
     Returns:
         The figure; None where no session has a value.
@@ -264,11 +271,14 @@ def comparison(table: pd.DataFrame, stats: pd.DataFrame, measure: str, unit: str
     if known.empty:
         return None
     own = stats[stats["measure"] == measure]
-    names = sorted(set(known["group"]))
+    first = list(own["reference"])[:1]
+    names = list(dict.fromkeys([*first, *references_first(set(known["group"]))]))
     factor, read = shown(1.0, unit)
-    title = titled(measure, unit)
-    figure = sheet(TWO_COLUMNS_MM, 66.0)
-    left = panel(figure, 16.0, 14.0, 72.0, 42.0)
+    height = max(42.0, 13.0 * len(own))
+    lines = textwrap.wrap(accounted, 150)
+    figure = sheet(TWO_COLUMNS_MM, height + 22.0 + 2.6 * len(lines))
+    bottom = 13.0 + 2.6 * len(lines)
+    left = panel(figure, 16.0, bottom, 72.0, height)
     for k, name in enumerate(names):
         rows = known[known["group"] == name]
         _strip(left, k, rows, factor * rows[measure].to_numpy(float), name, names)
@@ -279,13 +289,16 @@ def comparison(table: pd.DataFrame, stats: pd.DataFrame, measure: str, unit: str
     ]
     left.set_xticks(range(len(names)), counts)
     left.set_xlim(-0.6, len(names) - 0.4)
-    left.set_ylabel(read or title)
-    n_animals = known.groupby("group")["subject_id"].nunique().sum()
-    left.set_title(
-        f"{title}, n = {counted(int(n_animals), 'animal')}, {counted(len(known), 'session')}"
-    )
+    left.set_ylabel(read_as(measure, unit))
+    n_animals = known.groupby("group")["subject_id"].nunique()
+    each = ", ".join(f"{n_animals.get(name, 0)} {name}" for name in names[::-1])
+    left.set_title(f"{titled(measure, unit)}, n = {each} (animals)")
     left.grid(axis="y", color=LINE, linewidth=0.4)
-    right = panel(figure, 122.0, 14.0, 56.0, 42.0)
+    edge = figure.get_size_inches()[1] * 25.4
+    figure.text(
+        2.0 / TWO_COLUMNS_MM, 2.0 / edge, "\n".join(lines), size=5.5, color=MUTED, va="bottom"
+    )
+    right = panel(figure, 122.0, bottom, 36.0, height)
     _differences(right, own, factor, read)
     return figure
 
@@ -306,14 +319,9 @@ def effects(stats: pd.DataFrame, units: Mapping[str, str]) -> Figure | None:
     axes.set_yticks(
         range(len(known)),
         [
-            f"{titled(str(m), units.get(str(m), ''))}: {c}, n = {a} and {b}"
-            for m, c, a, b in zip(
-                known["measure"],
-                known["contrast"],
-                known["n_units_first"],
-                known["n_units_second"],
-                strict=True,
-            )
+            f"{titled(str(row['measure']), units.get(str(row['measure']), ''))}: "
+            f"{row['contrast']}, n = {counted_units(row)}"
+            for row in known.to_dict("records")
         ],
         size=5.5,
     )
@@ -359,30 +367,22 @@ def _differences(axes: Axes, own: pd.DataFrame, factor: float, unit: str) -> Non
     texts = []
     for row in known.to_dict("records"):
         g = f"g {row['effect_size']:.2f}" if np.isfinite(row["effect_size"]) else "no g"
-        p = f"p {row['p']:.2g}, corrected {row['p_fdr']:.2g}" if row["test"] else "no test"
-        texts.append(f"{g}; {p}")
+        p = f"p {row['p']:.2g}\ncorrected {row['p_fdr']:.2g}" if row["test"] else "no test"
+        texts.append(f"{g}\n{p}")
     for k, text in enumerate(texts):
         axes.annotate(
             text,
-            (0.5, k),
-            (0, 6),
+            (1.02, k),
             xycoords=("axes fraction", "data"),
-            textcoords="offset points",
-            ha="center",
+            va="center",
             size=5.5,
             color=MUTED,
         )
     axes.set_yticks(
         range(len(known)),
         [
-            f"{c}\nn = {a} and {b} {u.split(',')[0]}s"
-            for c, a, b, u in zip(
-                known["contrast"],
-                known["n_units_first"],
-                known["n_units_second"],
-                known["unit"].astype(str),
-                strict=True,
-            )
+            f"{row['contrast']}\nn = {counted_units(row)}".replace(", ", ",\n")
+            for row in known.to_dict("records")
         ],
         size=5.5,
     )

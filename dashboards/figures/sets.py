@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from liex_lab.behaviour.cohort import WHO
 from liex_lab.errors import SessionError
+from liex_lab.plan.subject import references_first
 from liex_lab.runtime.durable import replacing
 from liex_lab.runtime.memory import uncollected
 from liex_lab.runtime.places import inside, safe_name, unlinked
@@ -123,14 +124,19 @@ def comparison_figures(
         yield Drawn("effects", "effect sizes with their intervals", groups.effects(stats, units))
     for measure in measures:
         if not only or measure in only:
-            drawn = groups.comparison(table, stats, measure, units.get(measure, ""))
+            unit, said = units.get(measure, ""), str(table.attrs.get("accounted", ""))
+            drawn = groups.comparison(table, stats, measure, unit, said)
             yield Drawn(safe_name(f"compare_{measure}"), "every animal, and the difference", drawn)
     wanted = [name for name in OF_STUDY if not only or name in only]
     if sessions and wanted:
-        yield from _of_many(_grouped(sessions, table), wanted)
+        yield from _of_many(_grouped(sessions, table), wanted, list(stats["reference"])[:1])
 
 
-def _of_many(all_seen: Sequence[Seen], only: Sequence[str]) -> Iterator[Drawn]:
+def _of_many(
+    all_seen: Sequence[Seen], only: Sequence[str], reference: Sequence[str] = ()
+) -> Iterator[Drawn]:
+    groups_in_order = [*reference, *references_first(seen.group for seen in all_seen)]
+    all_seen = sorted(all_seen, key=lambda seen: groups_in_order.index(seen.group))
     for name in only or OF_STUDY:
         what, draw = OF_STUDY[name]
         yield Drawn(name, what, draw(all_seen))
@@ -210,7 +216,8 @@ def put_figure(folder: Path, name: str, content: bytes) -> Path:
 def read_comparison(folder: Path) -> tuple[pd.DataFrame, pd.DataFrame, list[Session]]:
     """What `liex compare` wrote: its sessions' table, its table `stats`, and the opened sessions.
 
-    A session that has gone from its place is left out.
+    A session that has gone from its place is left out. `attrs` of the sessions' table has the
+    sentence that accounts for all sessions.
 
     Args:
         folder: the folder of the comparison.
@@ -223,8 +230,13 @@ def read_comparison(folder: Path) -> tuple[pd.DataFrame, pd.DataFrame, list[Sess
     try:
         table = read_harmless(folder / "sessions.csv", ("session_id", "individual", *WHO))
         stats = pd.read_parquet(folder / "stats.parquet")
-        listed = json.loads((folder / COMPARISON_FILE).read_text(encoding="utf-8"))["sessions"]
-        places = [folder / str(place) for place in listed]
+        document = json.loads((folder / COMPARISON_FILE).read_text(encoding="utf-8"))
+        places = [folder / str(place) for place in document["sessions"]]
+        table.attrs["accounted"] = str(document.get("accounted", ""))
+        if "n_units_first" in stats:  # written by an earlier version
+            ends = stats["contrast"].str.rpartition(" - ")
+            old = {"n_units_first": "n_reference", "n_units_second": "n_group"}
+            stats = stats.rename(columns=old).assign(group=ends[0], reference=ends[2])
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise SessionError(
             f"{folder} should hold what `liex compare` writes, but: {error}; compare again"

@@ -34,7 +34,8 @@ BLUE = "#4477aa"
 GREEN = "#228833"
 PURPLE = "#aa3377"
 # Okabe and Ito's colours, which colour-blind people tell apart; every group has its own mark, too
-GROUP_COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#7f7f7f")
+# the first group is the reference, in grey
+GROUP_COLOURS = ("#7f7f7f", "#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
 GROUP_MARKS = ("o", "s", "D", "^", "P", "X", "*")
 _PAGE = {INK: "--ink", MUTED: "--muted", LINE: "--line", SOFT: "--soft", PAPER: "--paper"}
 _FACE = "'DejaVu Sans'"  # comes with matplotlib: the same figure on every machine

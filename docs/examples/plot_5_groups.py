@@ -11,7 +11,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
 
-from liex_lab.behaviour.cohort import compare
+from liex_lab.behaviour.cohort import compare, counted_units
 
 rng = np.random.default_rng(4)
 rows = []
@@ -37,7 +37,7 @@ table = pd.DataFrame(rows)
 found = compare(table, ["distance_m"]).iloc[0]
 print(f"{found.contrast}: {found.estimate:.2f} m [{found.ci_low:.2f}, {found.ci_high:.2f}]")
 print(
-    f"p {found.p:.2f}, {found.test}; {found.n_units_first} and {found.n_units_second} {found.unit}s"
+    f"p {found.p:.2f}, {found.test}; {counted_units(found)}"
 )
 
 # %%

@@ -9,18 +9,29 @@ compare` and the dashboard's page of groups show it.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import combinations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
 
-from liex_lab.behaviour.design import CAGE, NotComparable, Units, animal_means, find_units
+from liex_lab import __version__
+from liex_lab.behaviour.design import (
+    ANIMAL,
+    CAGE,
+    PAIRED,
+    NotComparable,
+    Units,
+    animal_means,
+    find_units,
+)
 from liex_lab.behaviour.multiplicity import false_discovery
 from liex_lab.behaviour.statistics import (
     FEWEST_FOR_MODEL,
+    MOST_EXACT,
     Estimate,
+    arrangements,
     check_reachable,
     estimate,
     mixed_model,
@@ -28,13 +39,20 @@ from liex_lab.behaviour.statistics import (
     smallest_p,
     spread_of_animals,
 )
+from liex_lab.plan.subject import alike, one_animal, references_first
 from liex_lab.tables.schema import Column, columns, to_pandas
+from liex_lab.tables.units import shown, titled
 
 if TYPE_CHECKING:
     from liex_lab.tables.session_tables import SessionTables
 
 WHO = ("subject_id", "group", "cage", "sex", "batch")
 ENGINES = ("auto", "permutation", "mixed")
+_SOFTWARE = (
+    f"Poses, actions and statistics: liex_lab {__version__}, after Xu et al., Lie-X: Depth Image "
+    "Based Articulated Object Pose Estimation, Tracking, and Action Recognition on Lie Groups, "
+    "International Journal of Computer Vision, 2017."
+)
 _USUAL = (
     "distance_m",
     "mean_speed_mm_s",
@@ -48,7 +66,11 @@ _USUAL = (
 STATS: tuple[Column, ...] = columns(
     "stats",
     ("measure", "string", "", "column of the summary that is compared"),
-    ("contrast", "string", "", "second group - first group"),
+    ("contrast", "string", "", "the difference that is estimated: group - reference"),
+    ("group", "string", "", "the group that the reference is subtracted from"),
+    ("n_group", "int64", "", "units of `group`; see unit"),
+    ("reference", "string", "", "the group that is subtracted"),
+    ("n_reference", "int64", "", "units of `reference`"),
     (
         "estimate",
         "float64",
@@ -81,11 +103,9 @@ STATS: tuple[Column, ...] = columns(
         "unit",
         "string",
         "",
-        "what was assigned to a group, and so what n counts: cage, animal, or an animal's own "
-        "difference",
+        "what was assigned to a group, and so what n_group and n_reference count: cage, animal, "
+        "or an animal's own difference",
     ),
-    ("n_units_first", "int64", "", "units in the first group"),
-    ("n_units_second", "int64", "", "units in the second group"),
     ("n_animals", "int64", "", "animals in both groups"),
     ("n_cages", "int64", "", "cages they live in; 0 when not stated"),
     ("n_sessions", "int64", "", "sessions with a value"),
@@ -180,7 +200,7 @@ def compare(
         and effect size are the model's, else those of `estimate`.
     """
     table = _prepared(table, blocks)
-    groups = sorted(set(table["group"]) - {""})
+    groups = references_first(set(table["group"]) - {""})
     if reference is None:
         pairs = list(combinations(groups, 2))
     else:
@@ -203,10 +223,33 @@ def compare(
 
 
 def _prepared(table: pd.DataFrame, blocks: Sequence[str]) -> pd.DataFrame:
-    """The table with every name as text, empty where it is not known."""
+    """The table with every name as text, empty where it is not known, and spelled in one way."""
     names = {*WHO, *blocks}
     texts = {name: table[name].fillna("").astype(str) if name in table else "" for name in names}
-    return table.assign(**texts)
+    return unified(table.assign(**texts))[0]
+
+
+def unified(table: pd.DataFrame) -> tuple[pd.DataFrame, list[str]]:
+    """The table with names that differ in capitals, spaces, _ or - alone spelled in one way.
+
+    Args:
+        table: one row per session, see `collect`; its columns of `WHO` are read.
+
+    Returns:
+        The table, and what to check: such names, and animals that may be one.
+    """
+    notes = []
+    for column in (name for name in WHO if name in table):
+        for kept, *others in alike(table[column].fillna("").astype(str)):
+            notes.append(f"{column} {', '.join(map(repr, others))} is taken for {kept!r}")
+            table = table.assign(**{column: table[column].replace(others, kept)})
+    known = table["subject_id"].fillna("").astype(str) if "subject_id" in table else []
+    notes += [
+        f"possible pseudo-replication: the animals {', '.join(ids)} may be one; if they are, give "
+        "all its sessions one subject_id"
+        for ids in one_animal(set(known) - {""})
+    ]
+    return table, notes
 
 
 def _values(table: pd.DataFrame, measure: str) -> pd.Series[Any]:
@@ -228,27 +271,18 @@ def _compare_one(
     own = table[table["group"].isin(groups)]
     rows = own[np.isfinite(own["value"])]
     cages = set(rows["cage"]) - {""}
+    animals = rows.groupby("group")["subject_id"].nunique()
     row: dict[str, Any] = {
+        **dict.fromkeys((column.name for column in STATS if column.dtype == "float64"), np.nan),
         "measure": measure,
         "contrast": f"{groups[1]} - {groups[0]}",
-        "unit": "",
+        "group": groups[1],
+        "n_group": int(animals.get(groups[1], 0)),
+        "reference": groups[0],
+        "n_reference": int(animals.get(groups[0], 0)),
+        "unit": ANIMAL,
         "test": "",
         "refused": "",
-        **dict.fromkeys(
-            (
-                "estimate",
-                "ci_low",
-                "ci_high",
-                "effect_size",
-                "effect_low",
-                "effect_high",
-                "p",
-                "smallest_p",
-            ),
-            np.nan,
-        ),
-        "n_units_first": 0,
-        "n_units_second": 0,
         "n_animals": int(rows["subject_id"].nunique()),
         "n_cages": len(cages),
         "n_sessions": len(rows),
@@ -259,10 +293,9 @@ def _compare_one(
     try:
         units = find_units(rows, groups, blocks)
         row |= _described(units)
-        found = estimate(units)
-        row |= _sized(found, rows, groups)
         if float(np.ptp(units.values)) == 0.0 and not (units.paired and units.values[0] != 0.0):
             raise NotComparable("every unit has the same value, so there is nothing to compare")
+        row |= _sized(estimate(units), rows, groups)
         row |= _tested(rows, units, groups, engine, alpha, rng)
     except NotComparable as reason:
         row["refused"] = str(reason)
@@ -276,8 +309,8 @@ def _described(units: Units) -> dict[str, Any]:
     )
     return {
         "unit": units.unit,
-        "n_units_first": first,
-        "n_units_second": second,
+        "n_group": second,
+        "n_reference": first,
         "smallest_p": smallest_p(units),
     }
 
@@ -319,43 +352,125 @@ def _tested(
                 "degrees of freedom"
             )
             return {"p": model.p, "test": name, **_sized(model.found, rows, groups)}
-    check_reachable(units, alpha)
+    check_reachable(units, alpha, groups)
     within = ""
     if len(np.unique(units.block)) > 1:
         within = " within blocks"
     of = "signs of the animals' own differences" if units.paired else f"{units.unit}s{within}"
-    return {"p": permutation(units, rng), "test": f"permutation of {of}"}
+    n_ways = arrangements(units)
+    exact = n_ways <= MOST_EXACT
+    how = f"exact, all {n_ways:,} arrangements"
+    how = how if exact else f"{MOST_EXACT:,} random arrangements of {n_ways:,}"
+    return {"p": permutation(units, rng), "test": f"permutation of {of} ({how})"}
 
 
-def methods(stats: pd.DataFrame, alpha: float = 0.05) -> str:
-    """Text for a methods section: units, tests, intervals, and how p was corrected.
+def counted_units(row: Mapping[str, Any]) -> str:
+    """How many units of each group, each number beside its group: 4 drug, 5 vehicle (animals).
+
+    Args:
+        row: a row of the table `stats`.
+    """
+    if str(row["unit"]) == PAIRED:
+        return f"{row['n_group']} animals, each in {row['group']} and in {row['reference']}"
+    each = f"{row['n_group']} {row['group']}, {row['n_reference']} {row['reference']}"
+    return f"{each} ({row['unit']}s)"
+
+
+def result(row: Mapping[str, Any], unit: str) -> str:
+    """One comparison as a sentence for a paper: difference, interval, effect size, test, n.
+
+    Args:
+        row: a row of the table `stats`.
+        unit: the measure's unit in the table; empty where it has none.
+    """
+    names = ("estimate", "ci_low", "ci_high")
+    difference, low, high = (_plain(shown(float(row[name]), unit)[0]) for name in names)
+    read = f" {shown(1.0, unit)[1]}" if unit else ""
+    sizes = [f"{float(row[name]):.2f}" for name in ("effect_size", "effect_low", "effect_high")]
+    n = f"n = {counted_units(row)}"
+    what = titled(str(row["measure"]), unit)
+    refused = f"No test of {what}, {row['contrast']}: {row['refused']}"
+    if not np.isfinite(row["estimate"]):
+        return f"{refused}; {n}."
+    way = "lower" if row["estimate"] < 0 else "higher"
+    text = f"{what[:1].upper()}{what[1:]} was {difference.lstrip('-')}{read} {way} in "
+    text += f"{row['group']} than in {row['reference']} ("
+    if np.isfinite(row["ci_low"]):
+        text += f"95 % CI of {row['contrast']}: {low} to {high}{read}; "
+    if np.isfinite(row["effect_size"]):
+        text += f"Hedges' g = {sizes[0]}, {sizes[1]} to {sizes[2]}; "
+    if not row["test"]:
+        return f"{text}{n}). {refused}."
+    corrected = f", corrected for {row['n_family']} tests {row['p_fdr']:.2g}"
+    return f"{text}p = {row['p']:.2g}{corrected * (row['n_family'] > 1)}; {row['test']}; {n})."
+
+
+def _plain(value: float) -> str:
+    """Three digits that count, without an exponent."""
+    return np.format_float_positional(float(f"{value:.3g}"), trim="-")
+
+
+def methods(
+    stats: pd.DataFrame,
+    table: pd.DataFrame | None = None,
+    said: Sequence[str] = (),
+    alpha: float = 0.05,
+) -> str:
+    """Text for a methods section: groups, units, tests, intervals, correction, software.
 
     Args:
         stats: the table `stats`, see `compare`.
+        table: the sessions that were compared, see `collect`; None leaves out how many there are.
+        said: sentences on the sessions, such as which are left out.
         alpha: the level of significance that the text names.
 
     Returns:
         One paragraph; empty for an empty table.
     """
-    done = stats[stats["test"] != ""]
-    refused = stats[stats["refused"] != ""]
     if len(stats) == 0:
         return ""
-    units = ", ".join(sorted(set(done["unit"])))
-    tests = "; ".join(sorted(set(done["test"])))
-    text = (
-        f"Sessions were averaged per animal; the unit of comparison is the {units}. "
-        if units
-        else ""
-    ) + (f"Tests: {tests}. " if tests else "")
-    text += (
-        "Differences are given with 95 % intervals, and as Hedges' g relative to the standard "
-        "deviation between animals. p values are two-sided and corrected by Benjamini and "
-        f"Hochberg's procedure over {len(done)} tests (family: {stats['family'].iloc[0]}); "
-        f"{alpha:g} was taken as the limit."
+    done = stats[stats["test"] != ""]
+    tests = list(dict.fromkeys(done["test"]))
+    units = sorted(set(done["unit"]))
+    parts = [] if table is None else [f"Groups: {'; '.join(_of_groups(table))}."]
+    parts += [one if one.endswith(".") else f"{one}." for one in said]
+    if units:
+        unit = ", ".join(units)
+        parts.append(f"Sessions were averaged per animal; the unit of comparison is the {unit}.")
+        parts.append(f"Tests: {'; '.join(tests)}.")
+    intervals = {
+        "Welch's t over the units": any(
+            unit != PAIRED and "model" not in test and "blocks" not in test
+            for unit, test in zip(stats["unit"], stats["test"], strict=True)
+        ),
+        "a paired t over the animals' own differences": PAIRED in set(stats["unit"]),
+        "least squares with a mean per block": any("blocks" in test for test in tests),
+        "t of the mixed model": any("model" in test for test in tests),
+    }
+    how = ", or ".join(name for name, used in intervals.items() if used)
+    parts.append(
+        f"Differences are given with 95 % intervals ({how}), and as Hedges' g relative to the "
+        "standard deviation between animals."
     )
-    if len(refused):
-        n = len(refused)
-        told = "comparison was" if n == 1 else "comparisons were"
-        text += f" {n} {told} not tested, as the design does not allow it."
-    return text
+    if len(done):
+        parts.append(
+            "p values are two-sided and corrected by Benjamini and Hochberg's procedure over "
+            f"{len(done)} test{'s' * (len(done) > 1)} (family: {stats['family'].iloc[0]}); "
+            f"{alpha:g} was taken as the limit."
+        )
+    if n := len(stats) - len(done):
+        were = "comparison was" if n == 1 else "comparisons were"
+        reasons = "; ".join(dict.fromkeys(stats.loc[stats["test"] == "", "refused"]))
+        parts.append(f"{n} {were} not tested: {reasons}.")
+    return " ".join([*parts, _SOFTWARE])
+
+
+def _of_groups(table: pd.DataFrame) -> list[str]:
+    """Animals, cages and sessions of each group."""
+    texts = []
+    for group, rows in table.groupby(table["group"].fillna("").astype(str)):
+        cages = set(rows["cage"].fillna("")) - {""} if "cage" in rows else set()
+        counts = {"animal": rows["subject_id"].nunique(), "cage": len(cages), "session": len(rows)}
+        each = [f"{n} {noun}{'s' * (n > 1)}" for noun, n in counts.items() if n]
+        texts.append(f"{group or 'without a group, not compared'}: {', '.join(each)}")
+    return texts

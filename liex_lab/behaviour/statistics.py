@@ -341,12 +341,13 @@ def _fit(values: Array, second: Array, clusters: NDArray[np.str_]) -> tuple[floa
     return float(result.fe_params[1]) * scale, error * scale
 
 
-def check_reachable(units: Units, alpha: float) -> None:
+def check_reachable(units: Units, alpha: float, groups: tuple[str, str]) -> None:
     """Refuse a permutation test that cannot come out significant, however large the difference is.
 
     Args:
         units: the units of the comparison.
         alpha: level of significance.
+        groups: names of the first and the second group.
 
     Raises:
         NotComparable: the smallest p that these units can give is above `alpha`; the text says how
@@ -362,7 +363,8 @@ def check_reachable(units: Units, alpha: float) -> None:
         what = f"{units.unit}s" + (
             " within their blocks" if len(np.unique(units.block)) > 1 else ""
         )
-        sizes = f"{int((~units.second).sum())} against {int(units.second.sum())} {what}"
+        first, second = int((~units.second).sum()), int(units.second.sum())
+        sizes = f"{second} {groups[1]} and {first} {groups[0]} {what}"
     raise NotComparable(
         f"{sizes} can be arranged in {n_ways} ways, so p cannot be below {least:.2g}; more "
         f"{units.unit.split(',')[0]}s are needed"

@@ -11,13 +11,14 @@ from typing import Annotated
 import typer
 
 from liex_lab.cli.options import say
+from liex_lab.errors import MisfitError, printable
 from liex_lab.runtime.progress import progress_bar
 
 
 def compare(
     places: Annotated[
         list[Path],
-        typer.Argument(metavar="FOLDER...", help="Sessions, or folders with sessions in."),
+        typer.Argument(metavar="PLACE...", help="Study files, sessions, or folders of sessions."),
     ],
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="The folder for the tables.")],
     measures: Annotated[
@@ -34,11 +35,15 @@ def compare(
         typer.Option("--animals", metavar="CSV", help="subject_id with group, cage, sex or batch."),
     ] = None,
     engine: Annotated[str, typer.Option("--engine", help="auto, permutation or mixed.")] = "auto",
+    only_trusted: Annotated[
+        bool, typer.Option("--only-trusted", help="Leave out sessions marked 'look at it'.")
+    ] = False,
 ) -> None:
     """Compare groups of animals: the test that the design allows, effect sizes, and n at every
     level.
     """
     from liex_lab.api import compare_groups
+    from liex_lab.behaviour.cohort import counted_units
     from liex_lab.dashboards.units import counted
 
     with progress_bar() as progress:
@@ -49,23 +54,31 @@ def compare(
             reference=reference,
             animals=animals,
             engine=engine,
+            only_trusted=only_trusted,
             progress=progress,
         )
     refused: dict[str, list[str]] = {}
     for row in found["stats"].to_dict("records"):
-        numbers = f"{row['estimate']:.4g} [{row['ci_low']:.3g}, {row['ci_high']:.3g}]"
+        numbers = f"{row['estimate']:.4g}"
+        if not isnan(row["ci_low"]):
+            numbers += f" [{row['ci_low']:.3g}, {row['ci_high']:.3g}]"
         if not isnan(row["effect_size"]):  # of values that are all the same there is none
             numbers += f", g {row['effect_size']:.2g}"
-        n = f"{row['n_units_first']} and {row['n_units_second']} units ({row['unit'] or 'none'})"
-        say(f"{row['measure']}, {row['contrast']}: {numbers}; {n}")
+        if not isnan(row["estimate"]):
+            say(f"{row['measure']}, {row['contrast']}: {numbers}; {counted_units(row)}")
         if row["test"]:
             say(f"    p {row['p']:.2g}, corrected {row['p_fdr']:.2g}: {row['test']}")
         else:
             refused.setdefault(row["refused"], []).append(row["measure"])
     for why, names in refused.items():  # said once, not once for each measure
         say(f"not tested: {', '.join(dict.fromkeys(names))}\n    {why}")
-    say(f"tables: {found['folder']}")
+    say(found["sessions"])
+    say(f"tables: {found['folder']}   (sentences to paste: results.txt, methods.txt)")
     say(f"figures: {counted(len(found['figures']), 'file')} in {found['folder'] / 'figures'}")
+    for one in found["check"]:
+        typer.secho(f"check this result: {printable(one)}", fg=typer.colors.YELLOW)
+    if found["check"]:
+        raise typer.Exit(MisfitError.exit_code)
 
 
 def report(

@@ -90,8 +90,7 @@ def cohort(
         only=only or (),
         dry_run=dry_run,
     )
-    failed = _tell_study(standings, dry_run)
-    if failed and not dry_run:
+    if _tell_study(standings, dry_run):
         say(f"to try what failed again: liex cohort {shlex.quote(study)} --retry")
         raise typer.Exit(SOME_FAILED)
 
@@ -163,21 +162,28 @@ def verify(
 
 def _tell_study(standings: list[SessionStatus], all_of_them: bool) -> int:
     """Every session that is not simply done, and how many are in each state; returns how many
-    failed.
+    failed or lack their recording.
     """
+    from liex_lab.pipelines.study.status import to_check
+
     counts: dict[str, int] = {}
     for one in standings:
         counts[one.in_words] = counts.get(one.in_words, 0) + 1
-        if one.state == "done" and one.reason:
+        if one.missing:
+            gone = (
+                f"there is no recording {one.session.recording}; correct its path, or copy it there"
+            )
+            say(f"{'missing':9}{one.session.id}  {gone}")
+        elif one.state == "done" and one.reason:
             say(f"{'done':9}{one.session.id}  {one.reason}")
         elif all_of_them or one.state not in ("done", "excluded"):
             remedy = f"; {one.failure['remedy']}" if one.failure and one.state == "failed" else ""
             say(f"{one.state:9}{one.session.id}  {one.reason}{remedy}".rstrip())
     remarks = [one.session.remark for one in standings if one.state not in ("failed", "excluded")]
-    for remark in dict.fromkeys(filter(None, remarks)):
+    for remark in dict.fromkeys(filter(None, [*remarks, *to_check(standings)])):
         say(remark)
     say(
         f"{len(standings)} session{'' if len(standings) == 1 else 's'}: "
         + ", ".join(f"{n} {state}" for state, n in sorted(counts.items()))
     )
-    return counts.get("failed", 0)
+    return counts.get("failed", 0) + counts.get("recording missing", 0)

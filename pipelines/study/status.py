@@ -9,13 +9,16 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, Literal
 
 from liex_lab.errors import LiexError
 from liex_lab.plan import Plan
 from liex_lab.plan.study import PlannedSession, Study
+from liex_lab.plan.subject import find_subject, same
 from liex_lab.sessions.corrections import DESCRIBED, START, read_log, with_description
 from liex_lab.sessions.failure import read_failure
+from liex_lab.sessions.listed import state_in_words
 from liex_lab.sessions.verdict import CAUTION, LOOK_AT_IT, verdict_in
 
 from .changes import what_changed
@@ -36,6 +39,7 @@ class SessionStatus:
         failure: of the last attempt, if it failed.
         described: what the study says otherwise of the animal than its results; then nothing else
             changed, and nothing is measured anew.
+        input: hash of the recording of one that is done; empty for others.
     """
 
     session: PlannedSession
@@ -43,13 +47,18 @@ class SessionStatus:
     reason: str = ""
     failure: dict[str, Any] | None = None
     described: dict[str, str] = field(default_factory=dict)
+    input: str = ""
 
     @property
     def in_words(self) -> str:
         """The state as a person is told it: of one that is done, whether all is well with it."""
-        if self.state != "done" or not self.reason:
-            return self.state
-        return f"done, {LOOK_AT_IT}" if self.reason.startswith(LOOK_AT_IT) else "done with cautions"
+        return "recording missing" if self.missing else state_in_words(self.state, self.reason)
+
+    @property
+    def missing(self) -> bool:
+        """Whether its recording is not there, although its results may be."""
+        said = self.state in ("failed", "excluded")
+        return not said and not self.session.recording_exists
 
     @property
     def to_do(self) -> bool:
@@ -129,20 +138,62 @@ def standing(session: PlannedSession, waits_for: str = "") -> SessionStatus:
             why = f"described anew: {told}; nothing is measured again"
         if why:
             return SessionStatus(session, "changed", why, described=said)
-        return SessionStatus(session, "done", to_look_at(verdict_in(document)))
+        input = str(document.get("input", {}).get("sha256", ""))
+        return SessionStatus(session, "done", to_look_at(verdict_in(document)), input=input)
     failure = read_failure(session.folder)
     if failure is not None:
         unsure = "input" not in failure or waits_for
         why = "" if unsure else what_changed(session, failure)
-        return SessionStatus(
-            session, "changed" if why else "failed", why or str(failure["reason"]), failure
-        )
+        reason = f"{why}; before, it failed: {failure['reason']}" if why else str(failure["reason"])
+        return SessionStatus(session, "changed" if why else "failed", reason, failure)
     begun = session.folder.with_name(f"{session.folder.name}.part").is_dir()
     return (
         SessionStatus(session, "begun", "it was interrupted and goes on")
         if begun
         else SessionStatus(session, "new", "new")
     )
+
+
+def to_check(found: Sequence[SessionStatus]) -> list[str]:
+    """What may be wrong with the animals of a study: two names of one, or a recording listed twice.
+
+    Args:
+        found: the status of its sessions.
+    """
+    import pandas as pd
+
+    from liex_lab.behaviour.cohort import unified
+
+    sessions = [one.session for one in found if one.state != "excluded"]
+    animals = {one.animal.id: one.animal.model_dump(exclude={"set"}) for one in sessions}
+    table = pd.DataFrame(animals.values()).rename(columns={"id": "subject_id"})
+    notes = [*misnamed(sessions), *unified(table)[1]]
+    known: dict[tuple[Any, ...], str] = {}
+    for one in (one for one in found if one.input):
+        region = one.session.plan.arena.region
+        first = known.setdefault((one.input, repr(region)), one.session.id)
+        if first != one.session.id:
+            notes.append(f"{one.session.id} is of the same recording as {first}")
+    return notes
+
+
+def misnamed(sessions: Sequence[PlannedSession]) -> list[str]:
+    """Sessions whose recordings are named after another animal of the study, in sentences.
+
+    Args:
+        sessions: those of the study; ones in one of several arenas are not judged.
+    """
+    known = {same(one.animal.id): one.animal.id for one in sessions}
+    notes = []
+    for one in sessions:
+        found = find_subject(Path(one.recording))
+        other = known.get(same(found.id), one.animal.id) if found.origin else one.animal.id
+        if other != one.animal.id and one.plan.arena.region is None:
+            notes.append(
+                f"{one.id}: the study names the animal {one.animal.id}, and the recording's "
+                f"{found.origin} {other}"
+            )
+    return notes
 
 
 def to_look_at(verdict: Mapping[str, Any]) -> str:

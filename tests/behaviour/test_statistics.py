@@ -11,7 +11,15 @@ import pytest
 from liex_lab.pipelines.evaluation.statistics import PLANS, StudyPlan, error_rates, power
 
 from liex_lab.behaviour import measure_session
-from liex_lab.behaviour.cohort import STATS, collect, compare, methods
+from liex_lab.behaviour.cohort import (
+    STATS,
+    collect,
+    compare,
+    counted_units,
+    methods,
+    result,
+    unified,
+)
 from liex_lab.behaviour.design import CAGE, PAIRED, NotComparable, Units, find_units
 from liex_lab.behaviour.statistics import (
     MOST_EXACT,
@@ -60,7 +68,7 @@ def test_the_permutation_is_the_count_a_reader_would_make():
     row = only(table)
     assert row["p"] == pytest.approx(slow)
     assert row["estimate"] == pytest.approx(y[5:].mean() - y[:5].mean())
-    assert (row["unit"], row["n_units_first"], row["n_animals"], row["n_sessions"]) == (
+    assert (row["unit"], row["n_group"], row["n_animals"], row["n_sessions"]) == (
         "animal",
         5,
         10,
@@ -120,10 +128,10 @@ def test_cages_of_one_group_are_the_unit_and_their_animals_are_not():
         "c8",
     ]
     row = only(study(8, cage=cage))
-    assert (row["unit"], row["n_units_first"], row["n_units_second"]) == (CAGE, 4, 4)
+    assert (row["unit"], row["n_group"], row["n_reference"]) == (CAGE, 4, 4)
     assert (row["n_animals"], row["n_cages"]) == (16, 8)
     assert row["smallest_p"] == pytest.approx(2 / 70)
-    assert row["test"] == "permutation of cages"
+    assert row["test"] == "permutation of cages (exact, all 70 arrangements)"
 
 
 def test_cages_with_both_groups_are_blocks():
@@ -164,14 +172,14 @@ def test_animals_that_were_in_both_groups_are_compared_with_themselves():
 @pytest.mark.parametrize(
     ("table", "reason"),
     [
-        (study(3), "3 against 3 animals can be arranged in 20 ways, so p cannot be below 0.1"),
+        (study(3), "3 b and 3 a animals can be arranged in 20 ways, so p cannot be below 0.1"),
         (study(1), "the group a has 1 animals with a value"),
         (study(5).assign(subject_id=""), "10 sessions do not say which animal"),
         (study(5, values=[1.0] * 10), "every unit has the same value"),
         (study(5, values=[np.nan] * 5 + [1.0] * 5), "the group a has 0 animals"),
         (study(5, cage=["c1"] * 4 + [""] * 6), "the cage of 6 of 10 animals is not stated"),
         (study(5, batch=["x"] * 5 + ["y"] * 5), "every batch has animals of one group only"),
-        (study(4, cage=["c1"] * 4 + ["c2"] * 4), "1 against 1 cages can be arranged in 2 ways"),
+        (study(4, cage=["c1"] * 4 + ["c2"] * 4), "1 b and 1 a cages can be arranged in 2 ways"),
         (
             pd.concat([study(4), study(4).head(1).assign(group="b")], ignore_index=True),
             "1 of 8 animals (m0) were in both groups",
@@ -190,7 +198,77 @@ def test_a_refused_comparison_still_shows_its_difference_and_its_numbers():
     assert row["estimate"] == pytest.approx(1.0)
     assert row["effect_size"] == pytest.approx(0.8)  # J of 4 degrees of freedom
     assert row["ci_low"] < 1.0 < row["ci_high"]
-    assert row["n_units_first"] == 3
+    assert row["n_group"] == 3
+    assert "1 higher in b than in a (95 % CI of b - a: " in result(row, "")
+    assert "No test of speed, b - a: 3 b and 3 a animals" in result(row, "")
+
+
+def test_each_number_of_units_stands_beside_its_own_group():
+    table = study(5).drop(index=9).replace({"a": "vehicle", "b": "drug"})
+    for reference, first, other in (
+        ("vehicle", "4 drug", "5 vehicle"),
+        ("drug", "5 vehicle", "4 drug"),
+    ):
+        row = only(table, reference=reference)
+        assert row["reference"] == reference
+        assert counted_units(row) == f"{first}, {other} (animals)"
+        assert (f"{row['n_group']} {row['group']}", f"{row['n_reference']} {reference}") == (
+            first,
+            other,
+        )
+        assert f"n = {first}, {other} (animals)" in result(row, "mm/s")
+        assert row["contrast"] == f"{row['group']} - {reference}"
+    assert only(table)["contrast"] == "drug - vehicle", "a control group is the reference"
+
+
+@pytest.mark.parametrize(
+    "values", [[1.0] * 10, [0.0] * 10, [np.nan] * 10, [0.0] * 5 + [np.nan] * 5]
+)
+def test_a_difference_of_nothing_is_no_result(values):
+    row = only(study(5, values=values))
+    assert np.isnan(row["estimate"])
+    assert np.isnan(row["ci_low"])
+    assert result(row, "").startswith("No test of speed, b - a: ")
+
+
+def test_names_that_differ_in_capitals_or_spaces_are_one_and_this_is_told():
+    table = study(5)
+    spelled = table.assign(group=["a", "A", "a ", "a", "a", "b-1", "b 1", "b_1", "B1", "b 1"])
+    row = only(spelled)
+    assert (row["group"], row["n_group"], row["reference"], row["n_reference"]) == (
+        "b 1",
+        5,
+        "a",
+        5,
+    )
+    assert row["p"] == only(table)["p"]
+    notes = unified(spelled)[1]
+    assert notes[0] == "group 'A', 'a ' is taken for 'a'"
+    assert unified(table)[1] == []
+    assert only(table.assign(group=["1-12"] * 5 + ["11-2"] * 5))["n_group"] == 5
+
+
+@pytest.mark.parametrize(
+    "ids",
+    [
+        ("m01day1", "m01day2"),
+        ("m01d1", "m01d2"),
+        ("m01_ses-1", "m01_ses-2"),
+        ("20260821", "20260822"),
+    ],
+)
+def test_ids_that_differ_by_a_day_are_told_as_possible_pseudo_replication(ids):
+    table = study(5)
+    table.loc[:1, "subject_id"] = ids
+    (note,) = unified(table)[1]
+    assert note.startswith("possible pseudo-replication: ")
+    assert all(id in note for id in ids)
+
+
+@pytest.mark.parametrize("scheme", ["m{}", "s{}", "A1{}", "c2m{}", "25031{}", "mouse{}", "AM{}"])
+def test_ids_of_animals_are_not_taken_for_days(scheme):
+    table = study(5).assign(subject_id=[scheme.format(k) for k in range(10)])
+    assert unified(table)[1] == []
 
 
 def test_the_interval_without_blocks_is_welch_s():
@@ -232,7 +310,13 @@ def test_the_false_discovery_rate_is_of_the_tests_that_were_made():
     assert list(stats.columns) == [column.name for column in STATS]
     text = methods(stats)
     assert "over 4 tests (family: four and one)" in text
-    assert "1 comparison was not tested" in text
+    assert "1 comparison was not tested: every unit has the same value" in text
+    assert "Welch's t over the units" in text
+    assert "exact, all 924 arrangements" in text
+    assert "liex_lab" in text
+    text = methods(stats[stats["test"] == ""], table)
+    assert "Groups: a: 6 animals, 6 sessions; b: 6 animals, 6 sessions." in text
+    assert "0 tests" not in text
 
 
 def test_three_groups_are_compared_in_pairs_or_with_the_one_named():

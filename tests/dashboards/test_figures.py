@@ -396,8 +396,10 @@ def test_a_comparison_draws_every_animal_and_the_interval_of_the_table(study, tm
     row = stats[stats["measure"] == "mean_speed_mm_s"].iloc[0]
     np.testing.assert_allclose(interval.get_xdata(), [0.1 * row["ci_low"], 0.1 * row["ci_high"]])
     said = text_of(figure)
-    assert "n = 6 animals, 6 sessions" in said
-    assert "n = 3 and 3 animals" in said
+    assert "mean speed, n = 3 drug, 3 control (animals)" in said
+    assert "drug - control | n = 3 drug, | 3 control (animals)" in said
+    assert "mean speed, cm/s" in said
+    assert "6 sessions in the study, 6 compared" in said
     assert f"g {row['effect_size']:.2f}" in said
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import shutil
 from pathlib import Path
 
 import pandas as pd
@@ -11,6 +13,8 @@ from typer.testing import CliRunner
 
 from liex_lab import cli
 from liex_lab.errors import SessionError
+from liex_lab.sessions.failure import write_failure
+from liex_lab.sessions.verdict import OTHER_ANIMAL
 from tests.sessions.walking_mouse import WalkingMouse, steady, write
 
 
@@ -67,7 +71,7 @@ def test_a_list_of_the_animals_overrules_the_sessions(study, tmp_path):
     ]
     assert row["contrast"] == "b - a"
     # every cage holds one of each, so only those two change places
-    assert "5 against 5 animals within their blocks can be arranged in 32 ways" in row["refused"]
+    assert "5 b and 5 a animals within their blocks can be arranged in 32 ways" in row["refused"]
 
 
 @pytest.mark.parametrize(
@@ -98,3 +102,130 @@ def test_what_cannot_be_compared_is_told(study, tmp_path):
         compare_sessions([study / "sub-m0"], tmp_path / "out")
     with pytest.raises(SessionError, match="the engine is one of"):
         compare_sessions([study], tmp_path / "out", engine="anova")
+
+
+def study_file(folder: Path, excluded: str = "m9") -> Path:
+    """A study file over the sessions of the fixture `study`, copied into its results."""
+    text = 'results = "results"\n'
+    for k in range(10):
+        text += f'[[animals]]\nid = "m{k}"\n[[sessions]]\nanimal = "m{k}"\nsession = "01"\n'
+        text += f'recording = "r{k}.mcap"\n'
+        text += 'exclude = "fell asleep"\n' if f"m{k}" == excluded else ""
+    (folder / "study.toml").write_text(text)
+    return folder / "study.toml"
+
+
+def with_verdict(folder: Path, **verdict: object) -> None:
+    file = folder / "session.json"
+    document = json.loads(file.read_text())
+    file.write_text(json.dumps(document | {"verdict": verdict}))
+
+
+@pytest.fixture
+def accounted(study, tmp_path) -> Path:
+    """The study with one session of each kind: excluded, failed, not measured, doubted."""
+    for k in range(10):
+        place = tmp_path / f"results/sub-m{k}/ses-01/behav"
+        if k != 8:
+            shutil.copytree(study / f"sub-m{k}" / f"s{k}.liex", place)
+    write_failure(tmp_path / "results/sub-m7/ses-01/behav", {"reason": "no animal was found"})
+    (tmp_path / "results/sub-m7/ses-01/behav/session.json").unlink()
+    with_verdict(tmp_path / "results/sub-m1/ses-01/behav", cautions=["12 poses are doubtful"])
+    with_verdict(
+        tmp_path / "results/sub-m2/ses-01/behav", look_at_it=True, reasons=["it is a fish"]
+    )
+    study_file(tmp_path)
+    return tmp_path
+
+
+@pytest.mark.parametrize("place", ["", "study.toml", "results"])
+def test_every_session_of_a_study_is_accounted_for(accounted, place):
+    found = compare_sessions([accounted / place], accounted / "out", ["distance_m"])
+    said = found["sessions"]
+    assert said == (
+        "10 sessions in the study, 7 compared: m1 has cautions; m2 look at it; m7 failed; "
+        "m8 not measured; m9 excluded"
+    )
+    assert "m2: it is a fish" in found["check"]
+    for name in ("methods.txt", "results.txt"):
+        assert said in (accounted / "out" / name).read_text()
+    assert "n = 2 fast, 5 control (animals)" in (accounted / "out/results.txt").read_text()
+
+
+def test_only_trusted_leaves_out_what_someone_has_to_look_at(accounted):
+    found = compare_sessions(
+        [accounted / "results"], accounted / "out", ["distance_m"], only_trusted=True
+    )
+    assert (
+        "10 sessions in the study, 6 compared: m1 has cautions; m2 left out, look at it; "
+        in (found["sessions"])
+    )
+    assert found["check"] == []
+    assert found["stats"]["n_reference"].tolist() == [4]
+
+
+def test_a_failed_session_in_a_folder_without_a_study_is_accounted_for(study, tmp_path):
+    for k in range(10):
+        shutil.copytree(study / f"sub-m{k}" / f"s{k}.liex", tmp_path / f"s{k}.liex")
+    write_failure(tmp_path / "s10.liex", {"reason": "no animal was found"})
+    shutil.copytree(tmp_path / "s1.liex", tmp_path / "s10.liex.outdated")
+    found = compare_sessions([tmp_path], tmp_path / "out", ["distance_m"])
+    assert found["sessions"] == "11 sessions in the study, 10 compared: s10 failed"
+
+
+@pytest.mark.parametrize("same_input", [True, False])
+def test_a_recording_that_is_there_twice_counts_once(study, tmp_path, same_input):
+    for k in range(10):
+        shutil.copytree(study / f"sub-m{k}" / f"s{k}.liex", tmp_path / f"s{k}.liex")
+    shutil.copytree(tmp_path / "s1.liex", tmp_path / "twin.liex")
+    if not same_input:  # as from another container: other bytes, the same depth
+        file = tmp_path / "twin.liex/session.json"
+        document = json.loads(file.read_text())
+        document["input"]["sha256"] = "1" * 64
+        file.write_text(json.dumps(document))
+    found = compare_sessions([tmp_path], tmp_path / "out", ["distance_m"])
+    assert found["sessions"].endswith("10 compared: twin same recording as s1")
+    assert found["check"] == ["twin is the same recording as s1, and is not counted"]
+    assert found["stats"]["n_sessions"].tolist() == [10]
+    other = write(
+        tmp_path / "z.liex",
+        WalkingMouse(steady(1.0), speed_mm_s=103.0),
+        name="s1",
+        subject={"subject_id": "m99", "group": "fast"},
+    )
+    with pytest.raises(SessionError, match="same recording, but of the animals m99 and m1"):
+        compare_sessions([tmp_path], tmp_path / "out", ["distance_m"])
+    assert other.name == "s1"
+
+
+def test_two_days_of_one_mouse_are_told_as_possible_pseudo_replication(study, tmp_path):
+    table = "subject_id,group\n" + "".join(f"m{k},{'ab'[k % 2]}\n" for k in range(10))
+    (tmp_path / "animals.csv").write_text(table)
+    for k in range(10):
+        mouse = WalkingMouse(steady(1.0), speed_mm_s=100.0 + 3 * k)
+        who = {"subject_id": f"m0{k // 2}day{k % 2}", "group": "ab"[k // 5]}
+        write(tmp_path / f"s{k}.liex", mouse, name=f"s{k}", subject=who)
+    ran = CliRunner().invoke(
+        cli.app, ["compare", str(tmp_path), "--out", str(tmp_path / "out"), "--measure=distance_m"]
+    )
+    assert ran.exit_code == 4, ran.output
+    for text in (ran.output, *((tmp_path / "out" / name).read_text() for name in TEXTS)):
+        assert "possible pseudo-replication: the animals m00day0, m00day1 may be one" in text
+
+
+TEXTS = ("methods.txt", "results.txt")
+
+
+def test_a_recording_of_another_animal_is_told(accounted):
+    with_verdict(
+        accounted / "results/sub-m3/ses-01/behav",
+        cautions=[f"{OTHER_ANIMAL}, m7 instead of m3"],
+    )
+    found = compare_sessions([accounted], accounted / "out", ["distance_m"])
+    assert f"m3: {OTHER_ANIMAL}, m7 instead of m3" in found["check"]
+    text = (accounted / "study.toml").read_text()
+    (accounted / "study.toml").write_text(text.replace("r3.mcap", "m4_day1.mcap"))
+    found = compare_sessions([accounted], accounted / "out", ["distance_m"])
+    assert any(
+        "the study names the animal m3, and the recording's" in one for one in found["check"]
+    )

@@ -145,7 +145,8 @@ def test_sessions_reports_corrections_and_comparisons_stay_in_theirs(name: str, 
         write_layout(session)
         word = BoutEdit("add", text or "x", int(MOUSE.times_ns[2]), int(MOUSE.times_ns[9]))
         correct_session(session.path, [word, Description("group", text)], author=text)
-        write(out / "other.liex", MOUSE, name="other", subject={"subject_id": "b", "group": "b"})
+        other = replace(MOUSE, speed_mm_s=150.0)
+        write(out / "other.liex", other, name="other", subject={"subject_id": "b", "group": "b"})
         try:
             compare_sessions([out], out / "compared", ["mean_speed_mm_s"])
         except SessionError:
@@ -176,7 +177,8 @@ def test_no_writer_follows_a_link_in_its_folder(measured: Session, root: Path) -
     out = root / "a" / "b" / "out"
     precious = root / "prec" / "precious"
     session = renamed(measured, out / "s.liex", individual="m")
-    other = write(out / "t.liex", MOUSE, subject={"subject_id": "m02", "group": "b"})
+    slower = replace(MOUSE, speed_mm_s=150.0)
+    other = write(out / "t.liex", slower, name="t", subject={"subject_id": "m02", "group": "b"})
     word = BoutEdit("add", "x", int(MOUSE.times_ns[2]), int(MOUSE.times_ns[9]))
     compared = out / "compared"
     compared.mkdir()

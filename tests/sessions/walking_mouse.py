@@ -4,6 +4,7 @@ rear once.
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -138,7 +139,7 @@ class WalkingMouse:
             "camera": self.camera,
             "T_arena_camera": self.T_arena_camera,
             "floor_distance_mm": FLOOR_MM,
-            "input_sha256": "0" * 64,
+            "input_sha256": hashlib.sha256(str(more.get("name")).encode()).hexdigest(),
             "plan_toml": 'animal = "mouse"\nseed = 7\n',
             "format": "synthetic",
             "n_frames": len(self.times_s),

@@ -253,7 +253,10 @@ def test_a_failed_session_is_left_alone_until_something_changed_or_it_is_asked_f
     assert standings(study, retry=True)[0].to_do
     recording = tmp_path / "rawdata" / "torn.mcap"
     recording.write_bytes(b"copied again")
-    assert why(file) == ("changed", "input changed: sizes or times of its files")
+    assert why(file) == (
+        "changed",
+        "input changed: sizes or times of its files; before, it failed: frame 33 cannot be read",
+    )
 
 
 def test_an_outdated_session_that_fails_is_kept_under_another_name(tmp_path: Path) -> None:
@@ -333,6 +336,39 @@ def test_dry_run_changes_nothing(tmp_path: Path) -> None:
         == "new      sub-good_ses-01  new\nnew      sub-bad_ses-01  new\n2 sessions: 2 new\n"
     )
     assert sorted(tmp_path.rglob("*")) == before
+
+
+@pytest.mark.parametrize("options", [["--dry-run"], []])
+def test_a_session_whose_recording_is_gone_is_not_done(tmp_path: Path, options: list[str]) -> None:
+    file = one_session(tmp_path)
+    (tmp_path / "rawdata" / "good.mcap").unlink()
+    result = CliRunner().invoke(cli.app, ["cohort", str(file), *options])
+    assert result.exit_code == 3, result.output
+    assert "missing  sub-good_ses-01  there is no recording " in result.output
+    assert "1 session: 1 recording missing" in result.output
+    assert (Study.load(file).sessions[0].folder / "session.json").is_file(), "its results stay"
+
+
+def test_a_recording_that_never_was_is_listed_by_a_dry_run(tmp_path: Path) -> None:
+    file = make_study(tmp_path, ["good", "missing", "missing2"])
+    result = CliRunner().invoke(cli.app, ["cohort", str(file), "--dry-run"])
+    assert result.exit_code == 3
+    assert "3 sessions: 1 new, 2 recording missing" in result.output
+
+
+def test_two_names_of_one_animal_and_one_recording_listed_twice_are_told(tmp_path: Path) -> None:
+    file = make_study(tmp_path, ["m01day1", "m01day2", "m02", "m03"])
+    text = file.read_text().replace('id = "m02"\ngroup = "@g"', 'id = "m02"\ngroup = "@G"')
+    file.write_text(text.replace("rawdata/m02.mcap", "rawdata/m03.mcap"))
+    for session in Study.load(file).sessions:
+        measure_one(session, pretended_run)
+    said = CliRunner().invoke(cli.app, ["cohort", str(file), "--dry-run"]).output
+    assert (
+        "sub-m02_ses-01: the study names the animal m02, and the recording's file name m03" in said
+    )
+    assert "group '@G' is taken for '@g'" in said
+    assert "possible pseudo-replication: the animals m01day1, m01day2 may be one" in said
+    assert "sub-m03_ses-01 is of the same recording as sub-m02_ses-01" in said
 
 
 def test_two_runs_of_a_study_at_once_are_refused(tmp_path: Path) -> None:
