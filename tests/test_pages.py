@@ -73,6 +73,8 @@ AFTER = {
     "docs/howto/spreadsheet.md": "README.md",
     "docs/tutorials/study.md": "docs/tutorials/mouse.md",
 }
+# a page with the same commands as another one
+SAME = {"docs/start.md": "README.md"}
 # what a reader changes on one page: moments of the sample, groups, and how long a recording is
 GROUPS = r"""
 awk '/^group/ {sub("\"\"", n++ % 2 ? "\"drug\"" : "\"vehicle\"")} 1' study/study.toml > edited
@@ -86,6 +88,10 @@ CHANGED = {
         "--at 31.5 --from 31.2 --to 33": "--at 4 --from 3.4 --to 4.6",
         "--action rear_supported --from 40 --to 41.5": "--action pause --from 0 --to 0.3",
         "CORRECTED.boris": "forms/mouse_walk.boris",
+    },
+    "docs/howto/figures.md": {
+        "A.liex B.liex": "study/derivatives/liex-lab/sub-m0[12]*/*/behav",
+        "--action rear_supported": "--action walk",
     },
     "docs/tutorials/study.md": {
         "for k in": "mkdir -p study/rawdata\nfor k in",
@@ -103,27 +109,38 @@ CHANGED = {
 }
 
 
+def typed(page: str) -> list[tuple[str, str]]:
+    """The blocks of a page as a reader types them: language and lines."""
+    text = PAGES[page]
+    for printed, own in CHANGED.get(page, {}).items():
+        assert printed in text, f"{page} does not have {printed!r} any more"
+        text = text.replace(printed, own)
+    for printed, own in NAMES.items():
+        text = text.replace(printed, own)
+    blocks = []
+    for language, block in BLOCK.findall(text):
+        kept = [line for line in block.splitlines() if not skipped(line)]
+        blocks.append((language, "\n".join(kept)))
+    return blocks
+
+
 @pytest.fixture(scope="module")
 def follow(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
     """Follow a page, once, after the pages before it; the folder that it leaves."""
 
     @cache
     def follow(page: str) -> Path:
+        if page in SAME:
+            assert set(typed(page)) <= set(typed(SAME[page])), "the pages differ: follow both"
+            return follow(SAME[page])
         folder = tmp_path_factory.mktemp("reader")
         if page in AFTER:
             shutil.copytree(follow(AFTER[page]), folder, symlinks=True, dirs_exist_ok=True)
         else:
             (folder / "datasets").symlink_to(REPOSITORY / "datasets")
             run_shell("liex convert 'synthetic:walk?seed=3&frames=60' --to recording.mcap", folder)
-        text = PAGES[page]
-        for printed, typed in CHANGED.get(page, {}).items():
-            assert printed in text, f"{page} does not have {printed!r} any more"
-            text = text.replace(printed, typed)
-        for printed, typed in NAMES.items():
-            text = text.replace(printed, typed)
-        for language, block in BLOCK.findall(text):
-            kept = [line for line in block.splitlines() if not skipped(line)]
-            {"sh": run_shell, "python": run_python}[language]("\n".join(kept), folder)
+        for language, block in typed(page):
+            {"sh": run_shell, "python": run_python}[language](block, folder)
         return folder
 
     return follow
@@ -168,3 +185,10 @@ def run_python(block: str, folder: Path) -> None:
 @pytest.mark.parametrize("page", WITH_BLOCKS)
 def test_a_page_can_be_followed_as_it_is_printed(page: str, follow: Callable[[str], Path]) -> None:
     follow(page)
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_a_block_says_whether_it_is_to_be_run(page: str) -> None:
+    fences = re.findall(r"^ *```(.*)$", PAGES[page], re.MULTILINE)
+    assert set(fences[::2]) <= {"sh", "python", "toml", "text"}
+    assert set(fences[1::2]) <= {""}

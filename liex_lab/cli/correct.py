@@ -110,9 +110,10 @@ def bout(
     new_word: NewWord = False,
     by: Author = "",
 ) -> None:
-    """Rename a bout (--at, --action), change its span (--at, --from, --to), delete it (--at,
-    --delete), add one (--action, --from, --to), or read the whole ethogram from a file (--labels).
-    Its present name confirms it.
+    """Edit bouts: rename one, change its span, delete it, add one, or read a whole ethogram.
+
+    Rename: --at, --action (the present name confirms it). New span: --at, --from, --to. Delete:
+    --at, --delete. Add: --action, --from, --to. Whole ethogram: --labels.
     """
     from liex_lab.sessions import correcting
 

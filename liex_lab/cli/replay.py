@@ -53,8 +53,8 @@ def show(
     replay = Session.open(session).path / "session.rrd"
     if at_s is None and not web and not has_screen():
         raise LiexError(
-            f"Rerun needs a screen and there is none here; open {replay} on a computer that has "
-            "one, or add --web"
+            f"Rerun needs a screen and there is none here; open {replay} on a computer with a "
+            "screen, or add --web"
         )
     with tempfile.TemporaryDirectory(prefix="liex-show-") as scratch:
         more = [] if depth == "kept" else _whole_depth(session, Path(scratch), recording)

@@ -70,7 +70,18 @@ def test_every_verb_explains_itself(words: list[str]) -> None:
 
 
 IMPERATIVES = {
-    *("Apply", "Check", "Compare", "Correct", "Draw", "Exchange", "List", "Make", "Measure"),
+    *(
+        "Apply",
+        "Check",
+        "Compare",
+        "Correct",
+        "Draw",
+        "Edit",
+        "Exchange",
+        "List",
+        "Make",
+        "Measure",
+    ),
     *("Move", "Open", "Pack", "Rename", "Report", "Score", "Set", "Show", "Take", "Train", "Turn"),
     *("Write",),
 }
@@ -461,6 +472,16 @@ def test_run_hands_the_topic_to_the_plan(monkeypatch: pytest.MonkeyPatch, tmp_pa
     assert plan is not None
     assert plan.recording.topic == "/left/depth"
     assert (unnamed, settings) == (None, ["recording.topic=/left/depth"])
+
+
+@pytest.mark.parametrize(("n", "counted"), [(1, "1 file"), (2, "2 files")])
+def test_files_are_counted_in_the_singular_and_plural(
+    n: int, counted: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drawn = {"files": ["a.svg"] * n, "empty": [], "folder": "there"}
+    monkeypatch.setattr(api, "draw_figures", lambda *_, **__: drawn)
+    result = CliRunner().invoke(cli.app, ["figures", "NAME.liex"])
+    assert result.output == f"figures: {counted} in there\n"
 
 
 def test_train_names_the_model_after_the_animal(monkeypatch: pytest.MonkeyPatch) -> None:
