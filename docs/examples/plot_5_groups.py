@@ -36,9 +36,7 @@ table = pd.DataFrame(rows)
 # ``liex compare`` does with the sessions of a folder:
 found = compare(table, ["distance_m"]).iloc[0]
 print(f"{found.contrast}: {found.estimate:.2f} m [{found.ci_low:.2f}, {found.ci_high:.2f}]")
-print(
-    f"p {found.p:.2f}, {found.test}; {counted_units(found)}"
-)
+print(f"p {found.p:.2f}, {found.test}; {counted_units(found)}")
 
 # %%
 # With two cages in each group no arrangement of cages can reach 5 per cent, and no test is made;
