@@ -31,8 +31,10 @@ if TYPE_CHECKING:
 
 DONE = ("done", "changed")  # states in which there is a session to look at
 NO_POSE = "no pose"
+NO_NAME = "no name"
 OTHER = "other actions"
-GREY = "#dcdcd7"
+NO_NAME_GREY = "#dcdcd7"
+GREY = "#9b9c97"
 VOID = "#ffffff"
 _READERS = 4  # threads; most of the time goes into opening files
 _HELD = 6  # sessions whose tables stay in memory

@@ -89,11 +89,16 @@ def session_page(
             [dcc.Link("Sessions", href="/"), " / ", entry.who.get("group") or "session"],
             className="kind",
         ),
-        html.H1(key),
-        html.P(
-            f"{who + ' · ' if who else ''}{frames['n_frames']:,} frames, "
-            f"{frames['duration_s']:.1f} s",
-            className="muted",
+        html.Div(
+            className="title",
+            children=[
+                html.H1(key),
+                html.P(
+                    f"{who + ' · ' if who else ''}{frames['n_frames']:,} frames, "
+                    f"{frames['duration_s']:.1f} s",
+                    className="muted",
+                ),
+            ],
         ),
         *(
             [

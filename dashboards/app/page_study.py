@@ -10,7 +10,17 @@ from dash import Dash, Input, Output, State, dcc, html, no_update
 from liex_lab.actions.colours import PALETTE
 
 from . import plots
-from .data import GREY, NO_POSE, OTHER, StudyData, colours_of, shown_words, vocabulary_of
+from .data import (
+    GREY,
+    NO_NAME,
+    NO_NAME_GREY,
+    NO_POSE,
+    OTHER,
+    StudyData,
+    colours_of,
+    shown_words,
+    vocabulary_of,
+)
 from .parts import download, graph
 from .tables import STATES, block, csv_address, session_address
 
@@ -37,7 +47,7 @@ def sessions_page(data: StudyData) -> list[Any]:
             children=[
                 html.Div([html.P("Study", className="kind"), html.H1(data.name)]),
                 html.Button(
-                    "Look again",
+                    "Refresh",
                     id="look-again",
                     n_clicks=0,
                     type="button",
@@ -47,7 +57,7 @@ def sessions_page(data: StudyData) -> list[Any]:
         ),
         html.Ul(chips, className="chips", id="state-counts"),
         html.P(
-            "A session's name opens it. Error is the joint error to be expected, median over its "
+            "Open a session by its name. Error is the expected joint error, the median over its "
             "frames; flips are stretches in which head and tail may have been exchanged.",
             className="muted",
         ),
@@ -171,6 +181,7 @@ def register(app: Dash, data: StudyData) -> None:
         marks = [
             *coloured.items(),
             *([(OTHER, GREY)] if len(words) > MOST_COLOURS else []),
+            (NO_NAME, NO_NAME_GREY),
             (NO_POSE, plots.NO_POSE_COLOUR),
         ]
         key = [
@@ -178,7 +189,9 @@ def register(app: Dash, data: StudyData) -> None:
             for word, colour in marks
         ]
         size = plots.time_unit(max((one.duration_s for one in ones.values()), default=0.0))[1]
-        return plots.ethograms(ones, coloured), plots.time_budgets(table, coloured), key, size
+        groups = [data.entries[one].who.get("group", "") for one in ones]
+        budgets = plots.time_budgets(table, coloured, groups)
+        return plots.ethograms(ones, coloured, groups), budgets, key, size
 
     @app.callback(
         Output("url", "href", allow_duplicate=True),
