@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from liex_lab.actions.colours import action_colours
 from liex_lab.errors import LiexError, SessionError
 from liex_lab.sessions import Session
+from liex_lab.sessions.correcting import disagreements
 from liex_lab.sessions.corrections import author_name, read_log
 
 from ..figures.seen import animals, joints_in_picture
@@ -88,6 +89,11 @@ class Desk:
     @cached_property
     def _relief(self) -> Relief:
         return Relief(self.session, scale_mm([self.session]))
+
+    @cached_property
+    def notes(self) -> list[str]:
+        """Sentences on exchanges of head and tail that contradict the frames around them."""
+        return disagreements(self.session)
 
     def row_at(self, at_s: float) -> int:
         """Row of the frame whose time is nearest.

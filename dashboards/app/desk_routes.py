@@ -10,11 +10,12 @@ import threading
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 from flask import Flask, Response, jsonify, request
 
 from liex_lab.errors import LiexError, SessionError
 from liex_lab.sessions import correcting
-from liex_lab.sessions.corrections import BoutEdit, Correction, FlipSpan, JointMove
+from liex_lab.sessions.corrections import BoutEdit, Correction, FlipSpan, JointMove, read_log
 
 from .desk import Desk, Desks
 from .saver import Saver, Ticket
@@ -40,9 +41,11 @@ class Clerk:
     def take(self, key: str, asked: dict[str, Any]) -> dict[str, Any]:
         """Check what the page asks for and queue it; returns its ticket and what it says.
 
+        A joint that is only tried, while it is dragged, is checked and not queued.
+
         Args:
             key: the session's name in the study.
-            asked: what (joint, action, flip, nothing, undo) with its numbers, and by.
+            asked: what (joint, action, flip, nothing, undo, redo) with its numbers, and by.
 
         Raises:
             LiexError: it cannot be done.
@@ -51,7 +54,11 @@ class Clerk:
         author = _text(asked, "by")
         if asked.get("what") == "undo":
             return self._undo(key, desk, asked, author)
+        if asked.get("what") == "redo":
+            return self._redo(key, desk, author)
         what = asked_correction(desk, asked)
+        if asked.get("try"):
+            return {"ticket": None, "said": str(what), **vars(what)}
         return self._kept(key, self._saver.add(desk.session.path, what, author))
 
     def state(self, key: str) -> dict[str, Any]:
@@ -75,6 +82,7 @@ class Clerk:
                 for n, one in ours.items()
             },
             "log": desk.log(),
+            "notes": desk.notes,
         }
 
     def _undo(self, key: str, desk: Desk, asked: dict[str, Any], author: str) -> dict[str, Any]:
@@ -86,13 +94,24 @@ class Clerk:
                 of, ticket = self._tickets.get(int(_number(asked, "ticket")), ("", None))
             if ticket is None or of != key:
                 raise SessionError("that correction is not known here; take it back from the list")
-            if self._saver.drop(ticket):
-                return {"ticket": None, "said": f"{ticket.what} is not made"}
             self._saver.wait(ticket)
             number = ticket.number
         if not isinstance(number, int) or isinstance(number, bool):
             raise SessionError(f"a correction is taken back by its number, got {number!r}")
         return self._kept(key, self._saver.take_back(folder, number, author))
+
+    def _redo(self, key: str, desk: Desk, author: str) -> dict[str, Any]:
+        """Make again what was taken back last, once what waits is saved; names its number."""
+        with self._lock:
+            ours = [ticket for of, ticket in self._tickets.values() if of == key]
+        if ours:
+            self._saver.wait(ours[-1])
+        log = read_log(desk.session.path)
+        if log.redoable is None:
+            raise SessionError("nothing was taken back since the last new correction")
+        number, what = log.redoable
+        kept = self._kept(key, self._saver.take_back(desk.session.path, number, author))
+        return {**kept, "said": f"made again: {what}", "number": log.undos[number]}
 
     def _kept(self, key: str, ticket: Ticket) -> dict[str, Any]:
         with self._lock:
@@ -179,13 +198,13 @@ def add_routes(server: Flask, desks: Desks, clerk: Clerk | None) -> None:
         clerk: takes corrections; None takes none.
     """
 
-    def told(make: Callable[[], Any]) -> Response:
-        """JSON of what `make` returns, or 400 with a sentence."""
+    def told(make: Callable[[], Any], refused: int = 400) -> Response:
+        """JSON of what `make` returns, or a sentence with the status `refused`."""
         try:
             return jsonify(make())
         except LiexError as error:
             answer = jsonify({"said": str(error)})
-            answer.status_code = 400
+            answer.status_code = refused
             return answer
 
     @server.before_request
@@ -196,16 +215,16 @@ def add_routes(server: Flask, desks: Desks, clerk: Clerk | None) -> None:
 
     @server.get("/desk/<path:key>/about")
     def desk_about(key: str) -> Response:
-        """What the page is told once of the session `key`."""
-        return told(lambda: {**desks.of(key).about(), "may_correct": clerk is not None})
+        """What the page is told once of the session `key`; of one without poses, why, and no n."""
+        return told(lambda: {**desks.of(key).about(), "may_correct": clerk is not None}, 200)
 
     @server.get("/desk/<path:key>/times")
     def desk_times(key: str) -> Response:
-        """The times of all frames of the session `key`, s: little-endian float64."""
+        """The times of all frames of the session `key`, s: little-endian float64; none without."""
         try:
             times = desks.of(key).time_s
-        except LiexError as error:
-            return Response(str(error), 400, mimetype="text/plain")
+        except LiexError:  # the page says why
+            times = np.zeros(0)
         return Response(times.astype("<f8").tobytes(), mimetype="application/octet-stream")
 
     @server.get("/desk/<path:key>/rows/<int:first>/<int:stop>")

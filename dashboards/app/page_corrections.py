@@ -136,9 +136,16 @@ def made(session: Session) -> html.Div:
     Args:
         session: the opened session.
     """
-    standing = read_log(session.path).standing
-    if not standing:
-        return html.Div(html.P("No corrections so far.", className="muted"))
+    log = read_log(session.path)
+    again = [
+        html.Button(
+            f"Redo: {what}", id={"part": "undo", "number": number}, n_clicks=0, type="button"
+        )
+        for number, what in [log.redoable or (0, None)]
+        if number
+    ]
+    if not log.standing:
+        return html.Div([html.P("No corrections so far.", className="muted"), *again])
     lines = [
         html.Li(
             [
@@ -151,9 +158,9 @@ def made(session: Session) -> html.Div:
                 ),
             ]
         )
-        for entry in standing
+        for entry in log.standing
     ]
-    return html.Div([html.H3("Corrections"), html.Ul(lines, className="made")])
+    return html.Div([html.H3("Corrections"), html.Ul(lines, className="made"), *again])
 
 
 def asked_for(session: Session, what: str, at_s: float, told: dict[str, Any]) -> Correction:

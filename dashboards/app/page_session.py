@@ -89,11 +89,16 @@ def session_page(
             [dcc.Link("Sessions", href="/"), " / ", entry.who.get("group") or "session"],
             className="kind",
         ),
-        html.H1(key),
-        html.P(
-            f"{who + ' · ' if who else ''}{frames['n_frames']:,} frames, "
-            f"{frames['duration_s']:.1f} s",
-            className="muted",
+        html.Div(
+            className="title",
+            children=[
+                html.H1(key),
+                html.P(
+                    f"{who + ' · ' if who else ''}{frames['n_frames']:,} frames, "
+                    f"{frames['duration_s']:.1f} s",
+                    className="muted",
+                ),
+            ],
         ),
         *(
             [
@@ -323,7 +328,7 @@ def facts(session: Session, row: int) -> list[Any]:
         ]
     bouts = session.bouts
     now = bouts[(bouts["start_s"] <= frame["time_s"]) & (frame["time_s"] < bouts["stop_s"])]
-    action = ", ".join(str(word).replace("_", " ") for word in now["action"]) or "no name"
+    action = ", ".join(str(word).replace("_", " ") for word in now["action"]) or "unlabelled"
     items: list[Any] = [html.Dt("action"), html.Dd(action)]
     for title, value, unit in known:
         told = f"{value:.3f}" if title == "time" else number(value)

@@ -10,7 +10,15 @@ from dash import Dash, Input, Output, State, dcc, html, no_update
 from liex_lab.actions.colours import PALETTE, UNLABELLED
 
 from . import plots
-from .data import GREY, NO_POSE, OTHER, StudyData, colours_of, shown_words, vocabulary_of
+from .data import (
+    GREY,
+    NO_POSE,
+    OTHER,
+    StudyData,
+    colours_of,
+    shown_words,
+    vocabulary_of,
+)
 from .parts import download, graph
 from .tables import STATES, block, csv_address, session_address
 
@@ -47,7 +55,7 @@ def sessions_page(data: StudyData) -> list[Any]:
         ),
         html.Ul(chips, className="chips", id="state-counts"),
         html.P(
-            "A session's name opens it. Error is the joint error to be expected, median over its "
+            "Open a session by its name. Error is the expected joint error, the median over its "
             "frames; flips are stretches in which head and tail may have been exchanged.",
             className="muted",
         ),
@@ -179,12 +187,9 @@ def register(app: Dash, data: StudyData) -> None:
             for word, colour in marks
         ]
         size = plots.time_unit(max((one.duration_s for one in ones.values()), default=0.0))[1]
-        return (
-            plots.ethograms(ones, coloured),
-            plots.time_budgets(table, coloured, words),
-            key,
-            size,
-        )
+        groups = [data.entries[one].who.get("group", "") for one in ones]
+        budgets = plots.time_budgets(table, coloured, words, groups)
+        return plots.ethograms(ones, coloured, groups), budgets, key, size
 
     @app.callback(
         Output("url", "href", allow_duplicate=True),

@@ -69,12 +69,15 @@ def empty(sentence: str, height: int = 160) -> dict[str, Any]:
     return {"data": [], "layout": _layout(height, annotations=[note], xaxis=hidden, yaxis=hidden)}
 
 
-def ethograms(ones: Mapping[str, Ethogram], coloured: Mapping[str, str]) -> dict[str, Any]:
+def ethograms(
+    ones: Mapping[str, Ethogram], coloured: Mapping[str, str], groups: Sequence[str] = ()
+) -> dict[str, Any]:
     """A row per session, coloured by what the animal did; actions without a colour share a grey.
 
     Args:
         ones: the key of each session and its ethogram, the first on top.
         coloured: word -> colour.
+        groups: the group of each session, named where its rows begin.
     """
     if not ones:
         return empty("No session is chosen, or none of those has an ethogram.")
@@ -83,14 +86,14 @@ def ethograms(ones: Mapping[str, Ethogram], coloured: Mapping[str, str]) -> dict
     words = list(coloured)
     every = [*words, *sorted({word for one in ones.values() for word in one.words} - set(words))]
     rows = np.stack([raster(one, every, 0.0, stop_s, n_columns) for one in ones.values()])
-    # as places of the colours: 0 no pose, 1 other actions, then the words
-    painted = np.where(rows == -2, 0.0, np.where(rows >= len(words), 1.0, rows + 2.0))
-    painted[rows == -1] = np.nan
     unit, size = time_unit(stop_s)
     time_s = (np.arange(n_columns) + 0.5) * stop_s / n_columns
-    named = np.array(["", NO_POSE, *every])  # of -1, -2 and the words
-    place = np.where(rows == -1, 0, np.where(rows == -2, 1, rows + 2))
-    colours = [NO_POSE_COLOUR, GREY, *coloured.values()]
+    # as places of the colours: 0 no pose, 1 unlabelled, 2 other actions, then the words
+    painted = np.where(rows >= len(words), 2.0, rows + np.where(rows < 0, 2.0, 3.0))
+    painted[time_s > np.array([[one.duration_s] for one in ones.values()])] = np.nan
+    named = np.array([NO_POSE, "unlabelled", *every])  # of -2, -1 and the words
+    place = rows + 2
+    colours = [NO_POSE_COLOUR, UNLABELLED, GREY, *coloured.values()]
     trace = {
         "type": "heatmap",
         "z": painted.astype(np.float32),
@@ -108,12 +111,17 @@ def ethograms(ones: Mapping[str, Ethogram], coloured: Mapping[str, str]) -> dict
     x = {"title": {"text": f"time, {unit}"}, "range": [0, stop_s / size], "showgrid": False}
     return {
         "data": [trace],
-        "layout": _layout(_rows_height(len(ones)), xaxis=x, yaxis=_session_axis(len(ones))),
+        "layout": _layout(
+            _rows_height(len(ones)), xaxis=x, yaxis=_session_axis(list(ones), groups)
+        ),
     }
 
 
 def time_budgets(
-    shares: pd.DataFrame, coloured: Mapping[str, str], words: Sequence[str]
+    shares: pd.DataFrame,
+    coloured: Mapping[str, str],
+    words: Sequence[str],
+    groups: Sequence[str] = (),
 ) -> dict[str, Any]:
     """A stacked bar per session: shares of the observed time in %, uncoloured actions in one grey.
 
@@ -122,6 +130,7 @@ def time_budgets(
             `unlabelled`.
         coloured: word -> colour.
         words: the actions.
+        groups: the group of each session, named where its rows begin.
     """
     if shares.empty:
         return empty("No session is chosen, or none of those has a summary.")
@@ -151,7 +160,7 @@ def time_budgets(
         "layout": _layout(
             _rows_height(len(keys)),
             xaxis=x,
-            yaxis=_session_axis(len(keys)),
+            yaxis=_session_axis(keys, groups),
             barmode="stack",
             bargap=0.25,
             showlegend=False,
@@ -488,14 +497,20 @@ def _rows_height(n: int) -> int:
     return 80 + n * (24 if n <= FEW else 12)
 
 
-def _session_axis(n: int) -> dict[str, Any]:
-    """A vertical axis with a session in each row, the first on top."""
+def _session_axis(keys: Sequence[str], groups: Sequence[str] = ()) -> dict[str, Any]:
+    """A vertical axis with a session in each row, the first on top; a group is named once."""
+    n = len(keys)
+    new = [k == 0 or groups[k] != groups[k - 1] for k in range(len(groups))]
+    named = zip(groups, new, strict=True)
+    heads = [f"<b>{text(group)}</b>  " if first else "" for group, first in named] or [""] * n
     return {
+        "tickmode": "array",
+        "tickvals": [text(key) for key in keys],
+        "ticktext": [head + text(key) for head, key in zip(heads, keys, strict=True)],
         "type": "category",
         "autorange": "reversed",
         "automargin": True,
         "showgrid": False,
-        "nticks": n,
         "tickfont": {"size": 12 if n <= FEW else 9},
     }
 

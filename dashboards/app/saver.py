@@ -93,21 +93,6 @@ class Saver:
         """
         return self._put(Ticket(folder, None, author, number, said=f"{number} is taken back"))
 
-    def drop(self, ticket: Ticket) -> bool:
-        """Forget a correction that still waits; whether it did.
-
-        Args:
-            ticket: what `add` returned.
-        """
-        with self._changed:
-            if ticket.state != WAITING:
-                return False
-            self._tickets.remove(ticket)
-            ticket.state = FAILED
-            ticket.said = "taken back before it was saved"
-            self._changed.notify_all()
-            return True
-
     def wait(self, ticket: Ticket) -> None:
         """Wait until a correction is saved.
 

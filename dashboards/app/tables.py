@@ -53,11 +53,11 @@ SESSIONS = {
     "session": "session",
     "group": "group",
     "state": "state",
-    "duration_min": "min",
+    "duration_min": "duration, min",
     "posed_share": "with a pose",
     "doubtful_share": "doubtful",
     "n_gaps": "gaps",
-    "n_missing": "not delivered",
+    "n_missing": "missing",
     "predicted_error_mm": "error, mm",
     "n_flips": "flips",
     "flips_s": "flips, s",
@@ -98,7 +98,7 @@ BOUTS = {
     "source": "by",
     "peak_speed_mm_s": "peak, cm/s",
     "contradicts": "contradicts its definition",
-    "path_mm": "way, mm",
+    "path_mm": "path, mm",
 }
 GAPS = {"start_s": "from, s", "stop_s": "to, s", "n_frames_missing": "frames", "reason": "reason"}
 FLIPS = {
@@ -257,6 +257,7 @@ def fill(name: str, table: Table, words: str, order: dict[str, Any]) -> dict[str
         }
         for column, title in table.shown.items()
     ]
+    places = {name: _places(table.rows[name]) for name in table.shown if name in table.rows}
     n = len(rows)
     total = len(table.rows)
     said = counted(n, "row") if n == total else f"{n:,} of {total:,} rows"
@@ -267,7 +268,7 @@ def fill(name: str, table: Table, words: str, order: dict[str, Any]) -> dict[str
         "heads": heads,
         "said": said,
         "rows": [
-            [_cell(table, row, column) for column in table.shown]
+            [_cell(table, row, column, places.get(column)) for column in table.shown]
             for row in records(rows.head(MOST_ROWS))
         ],
     }
@@ -343,12 +344,14 @@ def session_address(key: str, at_s: float | None = None) -> str:
     return f"/session/{quote(key, safe='')}" + ("" if at_s is None else f"?t={at_s:.3f}")
 
 
-def number(value: Any) -> str:
+def number(value: Any, places: int | None = None) -> str:
     """A number as a person would write it.
 
     Args:
         value: a bool is yes or no, a whole number has its thousands parted, another three digits
             (none after the point from 1000 on), and NaN is a dash; anything else is taken as text.
+        places: digits after the point of a number that is not whole by its type, as everywhere in
+            its column; None as above.
     """
     if isinstance(value, bool | np.bool_):
         return "yes" if value else "no"
@@ -360,6 +363,8 @@ def number(value: Any) -> str:
         shown = (
             0.0 if abs(float(value)) < 1e-12 else float(value)
         )  # what is left of a sum that is none
+        if places is not None:
+            return f"{shown:,.{places}f}"
         return f"{shown:,.0f}" if abs(shown) >= 1000 or shown == int(shown) else f"{shown:.3g}"
     return str(value)
 
@@ -373,8 +378,25 @@ def records(rows: pd.DataFrame) -> list[dict[str, Any]]:
     return [{str(name): value for name, value in row.items()} for row in rows.to_dict("records")]
 
 
-def _cell(table: Table, row: dict[str, Any], column: str) -> dict[str, Any]:
-    """A cell: its text and, where it is more than that, its kind and where it leads."""
+def _places(values: pd.Series[Any]) -> int | None:
+    """Digits after the point for a column: three digits of its middle value, at most four places.
+
+    None of a column of other things than numbers, or of p values and estimates of many measures.
+    """
+    if values.dtype.kind != "f" or values.name in STATS:
+        return None
+    size = values.abs()[values.abs() > 0]
+    whole = bool((size == size.round()).all())
+    return 0 if whole else int(np.clip(2 - np.floor(np.log10(size.median())), 0, 4))
+
+
+def _cell(
+    table: Table, row: dict[str, Any], column: str, places: int | None = None
+) -> dict[str, Any]:
+    """A cell: its text and, where it is more than that, its kind and where it leads.
+
+    Numbers have the `places` after the point of their column.
+    """
     value = row.get(column, "")
     about = str(row.get("measure", ""))
     if column == "measure":
@@ -393,7 +415,9 @@ def _cell(table: Table, row: dict[str, Any], column: str) -> dict[str, Any]:
     if column in _LONG:
         return {"kind": "said", "text": str(value)}
     known = (
-        f"{100 * value:.3g} %" if column.endswith("_share") and _finite(value) else number(value)
+        f"{100 * value:.1f} %"
+        if column.endswith("_share") and _finite(value)
+        else number(value, places)
     )
     if column == table.link and column == "start_s":
         return {"kind": "moment", "text": known, "to": round(float(value), 4)}

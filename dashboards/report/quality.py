@@ -76,7 +76,7 @@ def refusal_rows(session: Session) -> list[tuple[str, str, str, str, str]]:
             f"{one['start_s']:.2f}",
             f"{one['stop_s']:.2f}",
             str(one["action"]),
-            str(one["named"]) or "no name",
+            str(one["named"]) or "unlabelled",
             str(one["why"]),
         )
         for one in (session.metadata.get("refused_bouts") or {}).get("bouts", [])

@@ -73,21 +73,6 @@ def test_one_that_cannot_be_saved_takes_no_other_with_it(tmp_path: Path) -> None
         saver.wait(tickets[1])
 
 
-def test_one_that_waits_is_dropped_and_one_that_is_saved_is_not(tmp_path: Path) -> None:
-    disk = Disk()
-    saver = Saver(disk.correct)
-    disk.go.clear()
-    first = saver.add(tmp_path, joint(1), "me")
-    while first.state == "waiting":
-        pass
-    second = saver.add(tmp_path, joint(2), "me")
-    assert saver.drop(second)
-    assert not saver.drop(first)
-    disk.go.set()
-    saver.finish(tmp_path)
-    assert [entry.what for entry in read_log(tmp_path).standing] == [joint(1)]
-
-
 def test_authors_and_takings_back_keep_their_order(tmp_path: Path) -> None:
     disk = Disk()
     saver = Saver(disk.correct)

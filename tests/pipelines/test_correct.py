@@ -12,6 +12,8 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 from liex_lab.pipelines.correct import correct_session
 from liex_lab.pipelines.training.action_model import labelled_sessions
 from liex_lab.pipelines.verify import verify_session
@@ -23,10 +25,10 @@ from liex_lab.errors import LiexError, SessionError
 from liex_lab.exchange import export
 from liex_lab.plan import Plan
 from liex_lab.sessions import Session, correcting
-from liex_lab.sessions.corrections import Correction
+from liex_lab.sessions.corrections import Correction, Entry, Log, read_log
 from liex_lab.sessions.tracks import track_of
 from tests.golden.test_golden import golden  # noqa: F401
-from tests.sessions.walking_mouse import WalkingMouse, write
+from tests.sessions.walking_mouse import FLOOR_MM, WalkingMouse, write
 
 MOUSE = WalkingMouse(np.arange(180) / 30.0, rear_s=(2.0, 3.5), lost=(20, 21))
 
@@ -133,6 +135,102 @@ def test_a_joint_under_a_pixel_lies_as_deep_under_the_skin_as_it_usually_does(
     assert (
         np.linalg.norm(np.array([move.x_mm, move.y_mm, move.z_mm]) - where) < 6.0
     )  # the pixels are 7 mm wide
+
+
+@settings(max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.sampled_from([0, 60, 75, 90, 104]), st.integers(-8, 8), st.integers(-8, 8))
+def test_a_joint_put_off_the_animal_keeps_its_height_and_none_is_put_below_the_floor(
+    measured: Session, row: int, du: int, dv: int
+) -> None:
+    nose = measured.poses.iloc[5 * row + 4]
+    uv = np.round(nose[["u_px", "v_px"]].to_numpy(float)) + np.array([du, dv])
+    frame = int(nose["frame_index"])
+    move = correcting.joint_move_at_pixel(measured, frame, "nose", *uv)
+    seen = MOUSE.frame(row).depth[int(uv[1]), int(uv[0])]
+    if seen > FLOOR_MM - 3.0:  # the floor, whose height is 0
+        assert move.note == correcting.OFF_THE_ANIMAL
+    if move.note:
+        assert move.z_mm == pytest.approx(nose["z_mm"], abs=1e-3)
+        assert str(move).endswith("height kept: the pixel is not on the animal")
+    assert move.z_mm >= 0.0
+    place = np.array([move.x_mm, move.y_mm, move.z_mm])
+    under = measured.camera.project(measured.T_arena_camera.inverse() @ place)
+    np.testing.assert_allclose(under, uv, atol=1e-3)
+
+
+def test_beside_a_rearing_mouse_neither_the_joint_nor_its_neighbours_fall(session: Session) -> None:
+    row = 80
+    height = session.poses["z_mm"].to_numpy(float).reshape(-1, 5)[:, 4]
+    nose = session.poses.iloc[5 * row + 4]
+    move = correcting.joint_move_at_pixel(session, row, "nose", nose["u_px"] - 4, nose["v_px"] + 5)
+    assert move.note, "the floor is seen there"
+    now = corrected(session, move).poses["z_mm"].to_numpy(float).reshape(-1, 5)[:, 4]
+    np.testing.assert_allclose(now[row - 3 : row + 4], height[row - 3 : row + 4], atol=3.0)
+
+
+def test_a_wall_an_unread_pixel_and_a_frame_without_depth_say_nothing_of_a_height(
+    session: Session, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    row = 80
+    nose = session.poses.iloc[5 * row + 4]
+    real = correcting.depth_under
+    for pictures in (
+        lambda depth, u, v: real(np.minimum(depth, FLOOR_MM - 150.0), u, v),  # it stands there
+        lambda depth, u, v: float("nan"),
+    ):
+        monkeypatch.setattr(correcting, "depth_under", pictures)
+        move = correcting.joint_move_at_pixel(session, row, "nose", nose["u_px"], nose["v_px"])
+        assert move.note
+        assert move.z_mm == pytest.approx(nose["z_mm"], abs=1e-3)
+
+
+@pytest.mark.parametrize("height_mm", [2.0, 5.0])
+def test_frames_around_a_joint_that_is_put_on_the_floor_stay_above_it(
+    session: Session, height_mm: float
+) -> None:
+    for row in (61, 75, 103):  # the nose goes up, is up, and goes down
+        x, y = session.poses.iloc[5 * row + 4][["x_mm", "y_mm"]]
+        found = corrected(session, correcting.joint_move(session, row, "nose", (x, y, height_mm)))
+        z = found.poses["z_mm"].to_numpy(float).reshape(-1, 5)
+        assert np.nanmin(np.delete(z, row, axis=0)) >= 0.0
+        assert z[row].min() > -1.0  # bones keep their lengths
+        session = corrected(found, undo=[found.log.standing[0].number])
+    with pytest.raises(SessionError, match=r"below the floor; give a height z of 0 mm or more"):
+        correcting.joint_move(session, 75, "nose", (x, y, -2.0))
+
+
+@settings(max_examples=60)
+@given(st.lists(st.sampled_from(["new", "undo", "redo"]), max_size=14))
+def test_redo_makes_again_what_was_taken_back_until_something_new_is_done(steps: list[str]) -> None:
+    log, done, undone = Log("m"), [], []  # type: tuple[Log, list[object], list[object]]
+    for k, step in enumerate(steps):
+        if step == "new":
+            what = correcting.JointMove(k, "nose", 0.0, 0.0, 1.0)
+            log, undone = log.added([what]), []
+            done.append(what)
+        elif step == "undo" and done:
+            log = log.added([], [log.standing[-1].number])
+            undone.append(done.pop())
+        elif step == "redo":
+            assert (log.redoable is not None) == bool(undone)
+            if log.redoable is not None:
+                number, what = log.redoable
+                assert what == undone[-1]
+                log = log.added([], [number])
+                done.append(undone.pop())
+        assert [entry.what for entry in log.standing] == done
+    stated = json.loads(log.to_json())
+    assert [Entry.from_dict(entry) for entry in stated["entries"]] == list(log.entries)
+    redone = "redo" in steps and len(log.undos) < sum(e.what is None for e in log.entries)
+    assert stated["schema_version"] == (3 if redone else 2)
+
+
+def test_logs_of_earlier_versions_are_read(session: Session) -> None:
+    place = session.poses.iloc[4][["x_mm", "y_mm", "z_mm"]].to_numpy(float)
+    corrected(session, correcting.joint_move(session, 0, "nose", place + 2.0))
+    entry = read_log(session.path).entries[0].to_dict()
+    del entry["note"]
+    assert Entry.from_dict(entry) == read_log(session.path).entries[0]
 
 
 def test_taken_back_everything_reads_as_measured_and_the_log_says_who_and_when(
@@ -332,6 +430,8 @@ def test_the_command_line_corrects_lists_and_takes_back(session: Session) -> Non
     assert "ada" in listed
     assert listed.count("taken back") >= 3
     assert "run" in set(Session.open(place).bouts["action"])
+    assert "again:     stroll" in liex("redo", place)
+    assert ("stroll", 1.0, 2.0, "human") in spans(Session.open(place))
     liex("apply", place)
     assert "corrections were made by hand by ada" in (place / "report.html").read_text(
         encoding="utf-8"

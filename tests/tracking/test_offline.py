@@ -8,6 +8,8 @@ from dataclasses import fields, replace
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from liex_lab.body.pose import Pose
 from liex_lab.body.skeleton import Skeleton
@@ -18,7 +20,7 @@ from liex_lab.tracking.observations import Observations, joints_of, reversed_pos
 from liex_lab.tracking.offline import track_whole
 from liex_lab.tracking.online import OnlineTracker
 from liex_lab.tracking.smoother import Curve
-from liex_lab.tracking.track import Flip, Track
+from liex_lab.tracking.track import Flip, Track, ends_of
 from liex_lab.tracking.track_rows import covariance_of_root, single_frames
 from tests.tracking.stories import MOUSE, SUBJECT, joint_error, lose, noisy, told, walk
 
@@ -224,6 +226,37 @@ def test_a_human_turns_a_span_round_and_may_take_that_back(truth, measured):
     np.testing.assert_array_equal(
         undone.track.joints_mm, track_whole(SUBJECT, seen).track.joints_mm
     )
+
+
+@settings(max_examples=12)
+@given(st.lists(st.tuples(st.integers(0, 146), st.integers(1, 60)), min_size=1, max_size=3))
+def test_an_exchange_by_hand_turns_its_frames_and_no_others(measured, spans_):
+    seen = told(SECONDS, measured)
+    was = track_whole(SUBJECT, seen).track
+    ends = [(start, min(start + n, len(SECONDS))) for start, n in spans_]
+    net = np.zeros(len(SECONDS), bool)
+    for start, stop in ends:
+        net[start:stop] ^= True  # what is exchanged twice is as it was
+    tracked = track_whole(SUBJECT, seen, [Flip(*end, 1.0, True, "human") for end in ends])
+    along = [one.joints_mm[:, MOUSE.tip] - one.joints_mm[:, 0] for one in (was, tracked.track)]
+    cosine = np.prod([np.linalg.norm(one, axis=1) for one in along], axis=0)
+    cosine = np.sum(along[0] * along[1], axis=1) / cosine
+    assert (np.where(net, -cosine, cosine) > 0.9).all(), "no frame turns through other angles"
+    assert tracked.track.observed.all()
+    inner = [end for end in ends_of(ends) if 0 < end < len(SECONDS)]
+    assert list(tracked.cuts) == inner, "each end makes a half turn, and is cut"
+
+
+def test_an_exchange_that_takes_a_half_turn_away_is_smoothed_over_its_ends(truth, measured):
+    flipped = np.zeros(len(SECONDS), bool)
+    flipped[60:100] = True  # every frame says it the wrong way for so long that it is believed
+    seen = told(SECONDS, measured, flipped)
+    wrong = track_whole(SUBJECT, seen).track
+    assert joint_error(wrong.joints_mm, truth)[65:95].min() > 10.0
+    tracked = track_whole(SUBJECT, seen, [Flip(60, 100, 1.0, True, "human")])
+    assert tracked.cuts == ()
+    assert tracked.track.posed.all()
+    assert joint_error(tracked.track.joints_mm, truth).max() < 5.0
 
 
 def test_a_recording_without_any_animal_is_empty_rows():

@@ -16,12 +16,14 @@ const TOLD_MS = 160;  // the page's other figures follow when the moment has sto
 let open = null;
 
 export async function start(key, at) {  // the page of a session has been opened
+  const before = open;
   if (open) open.close();
   const place = document.getElementById("desk");
   if (!place) return;
   const desk = open = new Desk(place, key);
   try {
     await desk.begin(at);
+    if (before && before.said && before.key === key) desk.say(before.said.textContent);  // it is not to vanish
   } catch (error) {
     place.replaceChildren(make("p", { class: "problems", role: "alert" }, error.message));
   }
@@ -72,6 +74,7 @@ class Desk {
     this.player = new Player(this.source, this.stage);
     this.stage.onPlaceable = () => about.may_correct;
     this.stage.onPlace = (row, joint, to) => this.placeJoint(row, joint, to);
+    this.stage.onDrag = (dragged) => this.tryJoint(dragged);
     this.stage.onPick = (pixel) => ["u", "v"].forEach((name, k) => set(`correct-${name}`, { value: Math.round(pixel[k] * 100) / 100 }));
     this.player.shown = (row) => this.show(row);
     this.player.stopped = () => this.tell();
@@ -120,7 +123,8 @@ class Desk {
       button("No name", "0", () => this.unname(), { disabled: !may }),
       button("Head ⇄ tail", "F", () => this.flip(), { disabled: !may }),
       button("[ from", "[", () => this.mark(0)), button("to ]", "]", () => this.mark(1)),
-      button("Take back", "U", () => this.clerk.undo(), { disabled: !may }));
+      button("Take back", "U", () => this.clerk.undo(), { disabled: !may }),
+      button("Redo", "R", () => this.clerk.redo(), { disabled: !may }));
     const side = make("div", { class: "desk-side" }, this.now,
       make("h3", {}, "What it does"), this.names, deeds, this.said, this.clerk.told,
       ...this.doubts.parts, ...this.crossings.parts,
@@ -129,7 +133,7 @@ class Desk {
         make("dl", {}, ...KEYS.flatMap(([name, does]) => [make("dt", {}, make("kbd", {}, name)), make("dd", {}, does)]))));
     this.place.replaceChildren(make("div", { class: "desk-left" }, this.canvas, bar, ...bands), side);
     this.place.addEventListener("click", (event) => {  // after a click the keys are the page's again
-      if (event.detail && event.target.closest("button")) this.canvas.focus({ preventScroll: true });
+      if (event.detail && event.target.closest("button, summary")) this.canvas.focus({ preventScroll: true });
     });
   }
 
@@ -147,7 +151,7 @@ class Desk {
     if (Number(this.speed.value) !== this.player.speed) this.speed.value = String(this.player.speed);
     this.clock.textContent = `${time.toFixed(3)} s of ${this.about.duration_s.toFixed(1)} s`;
     const seen = this.source.at(row), bout = this.boutAt(time);
-    const facts = [bout ? bout.action.replaceAll("_", " ") : "no name"];
+    const facts = [bout ? bout.action.replaceAll("_", " ") : "unlabelled"];
     if (seen && seen.flag) facts.push(seen.flag.replaceAll("_", " "));
     if (seen && seen.error !== null) facts.push(`error ${seen.error.toFixed(1)} mm`);
     if (seen) facts.push(`frame ${seen.frame}`);
@@ -231,6 +235,26 @@ class Desk {
     const known = `${row}/${joint}`;
     this.stage.placed.set(known, to);
     return this.clerk.correct({ what: "joint", row, joint: this.about.joints[joint], u: to[0], v: to[1] }, known);
+  }
+
+  async tryJoint(dragged) {  // where the joint would be, height included: one question at a time
+    dragged.asked = dragged.to;
+    if (this.trying) return;
+    this.trying = true;
+    while (dragged.asked && this.stage.dragged === dragged) {
+      const [u, v] = dragged.asked;
+      dragged.asked = null;
+      try {
+        const told = await this.clerk.post({ what: "joint", try: true, row: dragged.row, joint: this.about.joints[dragged.joint], u, v });
+        dragged.said = `z ${told.z_mm.toFixed(1)} mm${told.note ? ", height kept" : ""}`;
+        if (this.stage.dragged === dragged) this.say(told.said);
+      } catch (error) {
+        dragged.said = "not here";
+        if (this.stage.dragged === dragged) this.say(error.message, true);
+      }
+      this.stage.changed();
+    }
+    this.trying = false;
   }
 
   async refresh() {

@@ -25,7 +25,7 @@ export class Clerk {
     try {
       const told = await this.post({ ...asked, by: by ? by.value : "" });
       this.tickets.push({ ticket: told.ticket, placed });
-      this.mine.push(told.ticket);
+      this.mine.push({ ticket: told.ticket });
       desk.say(told.said);
       desk.markSpan(null, null);
       desk.doubts.corrected(here, desk.time());
@@ -38,20 +38,32 @@ export class Clerk {
   }
 
   async undo() {
-    const { desk } = this, ticket = this.mine.pop();
-    if (ticket === undefined) {
+    const { desk } = this, last = this.mine.pop();
+    if (last === undefined) {
       desk.say("nothing of this visit is left to take back; the list of corrections below has those of before");
       return;
     }
-    desk.say("taking back …");
+    await this.change("taking back …", { what: "undo", ...last });
+  }
+
+  async redo() {  // what was taken back last, in this visit or before
+    const told = await this.change("making again …", { what: "redo" });
+    if (told) this.mine.push({ number: told.number });
+  }
+
+  async change(doing, asked) {
+    const { desk } = this, by = document.getElementById("correct-by");
+    let told = null;
+    desk.say(doing);
     try {
-      const told = await this.post({ what: "undo", ticket });
-      if (told.ticket !== null) this.tickets.push({ ticket: told.ticket });
+      told = await this.post({ ...asked, by: by ? by.value : "" });
+      this.tickets.push({ ticket: told.ticket });
       desk.say(told.said);
     } catch (error) {
       desk.say(error.message, true);
     }
     this.soon();
+    return told;
   }
 
   post(asked) {
@@ -73,8 +85,10 @@ export class Clerk {
     this.tickets = this.tickets.filter((one) => !done.includes(one));
     this.unsaved = state.unsaved;
     const n = state.log.length;
+    this.reported ||= state.report_old;
+    const report = state.report_old ? "; writing the report …" : this.reported ? "; the report is up to date" : "";
     this.told.textContent = state.unsaved ? `saving ${state.unsaved} …`
-      : `${n === 1 ? "1 correction stands" : `${n} corrections stand`}, all saved${state.report_old ? "; the report follows" : ""}`;
+      : `${n === 1 ? "1 correction stands" : `${n} corrections stand`}, all saved${report}`;
     const failed = done.map((one) => state.tickets[one.ticket]).find((one) => one && one.state === "failed" && !one.said.startsWith("taken back"));
     if (failed) desk.say(failed.said, true);
     if (done.length) {
@@ -83,6 +97,7 @@ export class Clerk {
       desk.player.wake();
       this.made = `${n}-${Date.now()}`;
       set("corrections-made", { data: this.made });
+      if (state.notes.length && !failed) desk.say(state.notes[state.notes.length - 1], true);
     }
     if (this.tickets.length || state.unsaved) this.soon();
     else if (state.report_old) this.asking = setTimeout(() => this.ask().catch(() => {}), REPORT_MS);

@@ -5,7 +5,7 @@ export const KEYS = [
   [", .", "slower, faster"], ["1 to 9", "name the bout here, or the marked span; with Shift from the tenth on"], ["0", "take the bout's name away"],
   ["[ ]", "mark a span from here, to here; Esc clears it"], ["F", "exchange head and tail in the span, or here"],
   ["N P", "next, previous place in doubt"], ["K", "it is right as it is: next"],
-  ["X", "next crossing: ends or animals taken for one another; with Shift the one before"], ["U", "take back"],
+  ["X", "next crossing: ends or animals taken for one another; with Shift the one before"], ["U R", "take back; make again what was taken back"],
   ["+ − Z", "zoom in, out; all of the picture"], ["S", "skeleton on, off"],
 ];
 
@@ -35,7 +35,7 @@ export function actOf(desk, event) {  // what a key does on the desk; undefined 
     ",": () => player.faster(-1), ".": () => player.faster(1),
     "[": () => desk.mark(0), "]": () => desk.mark(1),
     Escape: () => { stage.cancel(); desk.markSpan(null, null); desk.say(""); },
-    f: () => desk.flip(), u: () => desk.clerk.undo(),
+    f: () => desk.flip(), u: () => desk.clerk.undo(), r: () => desk.clerk.redo(),
     n: () => desk.doubts.next(1), p: () => desk.doubts.next(-1), k: () => desk.doubts.right(),
     x: () => desk.crossings.next(event.shiftKey ? -1 : 1),
     z: () => desk.view(), "+": () => stage.zoom(1.25), "=": () => stage.zoom(1.25), "-": () => stage.zoom(0.8),

@@ -37,6 +37,7 @@ export class Source {
       this.times = new Float64Array(times);
     });
     [this.about] = await Promise.all([json(`${this.base}/about`), this.timed]);
+    if (this.about.n === undefined) throw new Error(this.about.said);
     return this.about;
   }
 

@@ -21,6 +21,7 @@ export class Stage {
     this.skeleton = true;
     this.lit = false;
     this.onPlace = () => {};
+    this.onDrag = () => {};
     this.onPick = () => {};
     this.last = null;
     this.first = new Promise((seen) => {  // the first picture, or that there is none
@@ -187,7 +188,8 @@ export class Stage {
       context.lineWidth = 1.2 * dots;
       context.strokeStyle = "#222";
       context.stroke();
-      if (held || this.hover === j) this.label(about.joints[j], one, dots);
+      const where = held && this.dragged.said ? `, ${this.dragged.said}` : "";
+      if (held || this.hover === j) this.label(`${about.joints[j]}${where}`, one, dots);
     });
   }
 
@@ -242,6 +244,7 @@ export class Stage {
     const [u, v] = this.view ? this.pixel(event.clientX, event.clientY) : [0, 0];
     if (this.dragged) {
       this.dragged.to = [u + this.dragged.off[0], v + this.dragged.off[1]];
+      this.onDrag(this.dragged);
     } else if (this.panned) {
       const away = Math.hypot(event.clientX - this.panned.began[0], event.clientY - this.panned.began[1]);
       if (!this.panned.moved && away < 5) return;
