@@ -19,7 +19,13 @@ from liex_lab.errors import LiexError
 from liex_lab.optics.presets import unusual_lens
 from liex_lab.plan import Plan
 from liex_lab.plan.plan import arena_lines
-from liex_lab.recordings.timestamps import DROPPED, Gap, unwritable_times
+from liex_lab.recordings.timestamps import (
+    DROPPED,
+    Gap,
+    frames_apart,
+    median_step,
+    unwritable_times,
+)
 from liex_lab.runtime.progress import Progress, silent
 
 from .build import build_water
@@ -37,7 +43,7 @@ FINDINGS: Final = {  # key of the JSON: what it says; numbers that cannot be tol
     "format": "how the recording is stored",
     "n_frames": "frames that can be read",
     "duration_s": "from the first frame to the last",
-    "rate_hz": "one over the median step from frame to frame",
+    "rate_hz": "one over the usual step from frame to frame",
     "jitter_ms": "standard deviation of the steps, without those across a gap",
     "n_gaps": "places where the camera left out frames",
     "n_missing": "frames that it left out there",
@@ -79,6 +85,9 @@ FINDINGS: Final = {  # key of the JSON: what it says; numbers that cannot be tol
 # frames looked at, spread over the recording; as many as a run learns its scene from
 _N_SAMPLED = 96
 _N_RAW = 16
+# frames compared with the one before, and how many in a row of a recording that has more
+_N_COMPARED = 400
+_WINDOW = 8
 _PLAUSIBLE_MM = (
     100.0,
     10_000.0,
@@ -170,6 +179,7 @@ def examine(
                 *filter(None, [unwritable_times(opened.times_ns)]),
                 *filter(None, [unusual_lens(lens) if water is None and not missing else ""]),
                 *_time_problems(opened),
+                *_copies_told(opened, sample),
                 *depth.problems(),
                 *misplaced,
                 *scene.problems,
@@ -214,10 +224,33 @@ def _asked(plan: Plan, fps: float | None, topic: str | None) -> Plan:
     return plan.with_settings(settings)
 
 
+def _copies_told(recording: Recording, sample: NDArray[np.float32]) -> list[str]:
+    """Sentences on frames that repeat the depth image before them, of a long recording in windows
+    spread over it.
+    """
+    from liex_lab.foreground.background import has_noise, sampled
+    from liex_lab.recordings.frame import has_readings
+    from liex_lab.tracking.copies import copies_told
+
+    if recording.format == "synthetic":  # rendered when asked for
+        return []
+    n = len(recording)
+    starts = [0] if n <= _N_COMPARED else sampled(n - _WINDOW, _N_COMPARED // _WINDOW).tolist()
+    compared = [
+        (frame.time_ns, frame.repeats and has_readings(frame.depth))
+        for start in starts
+        for frame in recording.frames(start, start + _WINDOW if len(starts) > 1 else None)
+    ]
+    times_ns, repeats = (np.array(column) for column in zip(*compared, strict=True))
+    some = f", of {len(compared):,} frames compared" if len(compared) < n else ""
+    found = copies_told(times_ns, repeats, has_noise(sample))
+    return [f"{told}{some}" for part in found for told in part]
+
+
 def _time_facts(recording: Recording) -> dict[str, Any]:
     step = np.diff(recording.times_ns) / 1e6
     dropped = _dropped(recording)
-    usual = step[step < 1.5 * np.median(step)] if len(step) else step
+    usual = step[frames_apart(recording.times_ns, median_step(recording.times_ns)) == 1]
     return {
         "format": recording.format,
         "n_frames": len(recording),

@@ -19,6 +19,15 @@ from numpy.typing import NDArray
 Times = NDArray[np.int64]
 
 GAP_FACTOR = 1.5  # a step longer than this many median steps means that frames are missing
+# stamps count as rounded to a unit above this share of the usual step, or where this share of the
+# steps is off a multiple of it by this much
+_COARSE = 1e-3
+_OFTEN = 0.05
+_OFF = 0.1
+_STEADY = 0.05  # squared mean length of the phases of a clock's stamps: 1 where they are exact
+_TICKS_NS = (1_000_000, 15_625_000)  # of clocks that may be as coarse as a camera's step
+_RARELY = 2.25  # times the median: as long is a step across which a frame is missing, at most
+_FAR = 3  # steps; across more of them the clock's phase may be another
 CLOCK_JUMP_NS = (
     60 * 10**9
 )  # no camera drops frames for a minute: it was stopped, or its clock was set
@@ -88,7 +97,7 @@ class MonotoneTimes:
 
 
 def median_step(times_ns: Times) -> int:
-    """Median time between neighbouring frames.
+    """Usual time between neighbouring frames: their median, of rounded stamps the mean.
 
     Args:
         times_ns: (n,) int64 stamps, ns.
@@ -96,7 +105,102 @@ def median_step(times_ns: Times) -> int:
     Returns:
         The step, ns; 0 for fewer than two frames.
     """
-    return int(np.median(np.diff(times_ns))) if len(times_ns) > 1 else 0
+    if len(times_ns) < 2:
+        return 0
+    return rounded_step(times_ns) or int(np.median(np.diff(times_ns)))
+
+
+def rounded_step(times_ns: Times) -> int:
+    """Step of a steady clock whose stamps are rounded or jitter, such as 33, 33, 34 ms.
+
+    No single step is then the camera's. Theirs is the total time over the number of steps, with the
+    steps across a gap counted by `frames_apart`.
+
+    Args:
+        times_ns: (n,) int64 stamps, ns.
+
+    Returns:
+        The step, ns; 0 where the stamps are as exact as their median step, or none is found.
+    """
+    dt = np.diff(times_ns)
+    if not _are_rounded(dt):
+        return 0
+    usual = np.median(dt)
+    step = float(dt[dt <= _RARELY * usual].mean())
+    unit = np.gcd.reduce(dt)
+    for window in (2, 4, 8, 16) if _COARSE * usual < unit <= usual / 2 else (8, 16, 16, 16):
+        apart = _in_phase(times_ns, step, window)
+        near = apart <= _FAR
+        step = float(dt[near].sum() / apart[near].sum())
+    if not _is_steady(times_ns / step):
+        return 0
+    # at last a line through each stretch without a long gap, all of the same slope
+    stretch = np.append(0, np.cumsum(~near))
+    count, time = (
+        values - (np.bincount(stretch, values) / np.bincount(stretch))[stretch]
+        for values in (np.append(0, np.cumsum(apart)), times_ns - times_ns[0])
+    )
+    if count.any():
+        step = float((count * time).sum() / (count * count).sum())
+    return round(step)
+
+
+def _are_rounded(dt: Times) -> bool:
+    """Whether steps (n,) ns differ by what is no gap: all are multiples of a unit that is coarse
+    beside them, or many are no multiple of the median one.
+    """
+    usual = int(np.median(dt)) if len(dt) else 0
+    if usual <= 0:
+        return False
+    unit = int(np.gcd.reduce(dt))
+    if unit > _COARSE * usual:
+        # frames lost by a camera of exact stamps make multiples of its step, too
+        return unit <= usual / 2 or unit in _TICKS_NS
+    return bool(np.mean(np.abs(dt / usual - np.rint(dt / usual)) > _OFF) > _OFTEN)
+
+
+def _is_steady(phase: NDArray[np.float64]) -> bool:
+    """Whether stamps (n,), in steps of a clock, have its phase and are not spread over the step."""
+    total = np.append(0.0, np.cumsum(np.exp(2j * np.pi * phase)))
+    window = min(16, len(phase))
+    length = np.abs(total[window:] - total[:-window]) ** 2
+    return bool((length.mean() - window) / (window * (window - 1)) > _STEADY)
+
+
+def _in_phase(times_ns: Times, step_ns: float, window: int) -> Times:
+    """How many steps (n - 1,) of a steady clock lie between neighbouring stamps (n,) ns, at least 1.
+
+    A stamp is off by up to half of what it was rounded to. The clock's phase, the circular mean
+    over so many frames before a step and after it, is not, and tells what is due to rounding.
+    """
+    n = len(times_ns)
+    phase = (times_ns - times_ns[0]) / step_ns
+    total = np.append(0.0, np.cumsum(np.exp(2j * np.pi * phase)))
+    apart = np.diff(phase)
+    first = np.maximum.accumulate(np.append(0, np.where(apart > _FAR, np.arange(1, n), 0)))
+    last = np.append(first[1:] != first[:-1], True) * np.arange(1, n + 1)
+    stop = np.minimum.accumulate(np.where(last > 0, last, n)[::-1])[::-1]
+    row = np.arange(1, n)
+    before = total[row] - total[np.maximum(row - window, first[:-1])]
+    after = total[np.minimum(row + window, stop[1:])] - total[row]
+    off = [
+        np.angle(np.exp(2j * np.pi * at) * mean.conj()) / (2.0 * np.pi)
+        for at, mean in ((phase[:-1], before), (phase[1:], after))
+    ]
+    return np.maximum(1, np.rint(apart + off[0] - off[1])).astype(np.int64)
+
+
+def frames_apart(times_ns: Times, step_ns: int) -> Times:
+    """How many frames (n - 1,) each stamp lies after the one before: more than 1 across a gap.
+
+    Args:
+        times_ns: (n,) int64 stamps, ns, increasing.
+        step_ns: the usual step, ns, above 0.
+    """
+    dt = np.diff(times_ns)
+    if rounded_step(times_ns):
+        return _in_phase(times_ns, step_ns, 16)
+    return np.where(dt > GAP_FACTOR * step_ns, np.rint(dt / step_ns), 1).astype(np.int64)
 
 
 def clock_doubts(step_ns: int, faults: NDArray[np.uint8]) -> tuple[str, ...]:
@@ -141,8 +245,9 @@ def find_gaps(times_ns: Times, step_ns: int) -> list[Gap]:
     if step_ns <= 0:
         return []
     dt = np.diff(times_ns)
+    apart = frames_apart(times_ns, step_ns)
     found = []
-    for i in np.flatnonzero(dt > GAP_FACTOR * step_ns):
+    for i in np.flatnonzero(apart > 1):
         jumped = dt[i] > CLOCK_JUMP_NS
         found.append(
             Gap(
@@ -150,7 +255,7 @@ def find_gaps(times_ns: Times, step_ns: int) -> list[Gap]:
                 stop_frame=int(i) + 1,
                 start_ns=int(times_ns[i]) + step_ns,
                 stop_ns=int(times_ns[i + 1]),
-                n_frames_missing=1 if jumped else round(int(dt[i]) / step_ns) - 1,
+                n_frames_missing=1 if jumped else int(apart[i]) - 1,
                 reason=JUMPED if jumped else DROPPED,
             )
         )

@@ -19,6 +19,7 @@ from liex_lab.body.surface import Surface
 from liex_lab.errors import EstimationError
 from liex_lab.estimation.estimator import Estimates, PoseEstimator
 from liex_lab.estimation.session_shape import ShapePrior
+from liex_lab.foreground.background import has_noise
 from liex_lab.foreground.background_segmenter import BackgroundSubtraction
 from liex_lab.foreground.height_maps import HeightMaps
 from liex_lab.foreground.segmenter import Segmenter
@@ -26,7 +27,7 @@ from liex_lab.recordings.frame import DepthFrame, has_readings, stacked
 from liex_lab.runtime.memory import Allocator
 from liex_lab.runtime.threads import threads
 from liex_lab.tracking.motion_model import TrackingParameters
-from liex_lab.tracking.observations import Observations
+from liex_lab.tracking.observations import COLUMNS, Observations
 from liex_lab.tracking.occluders import behind_something
 from liex_lab.tracking.occlusion import OcclusionCorrection
 from liex_lab.tracking.offline import track_whole
@@ -63,6 +64,7 @@ class FrameTracker:
         sample_fit: how well the model explains the sampled frames; None of a tracker that was made
             without any.
         shape: the session's own shape; None where none was asked for.
+        noisy: whether the sensor has noise, so that a depth image which repeats is a copy.
     """
 
     estimator: PoseEstimator
@@ -77,6 +79,7 @@ class FrameTracker:
     free_ends: OcclusionCorrection | None = None
     sample_fit: SampleFit | None = None
     shape: OwnShape | None = None
+    noisy: bool = False
 
     @staticmethod
     def prepare(
@@ -109,6 +112,7 @@ class FrameTracker:
             EstimationError: no sampled frame shows an animal.
         """
         home = estimator.skeleton.length
+        noisy = has_noise(sample)
         size = spine_mm / home if spine_mm else estimator.find_size(sample, scene)
         estimates = estimator.estimate(sample, scene, size)
         whole = _whole(scene, sample, estimates)
@@ -161,7 +165,19 @@ class FrameTracker:
         )
         origin = "plan" if spine_mm else "recording"
         return FrameTracker(
-            estimator, scene, size, origin, body, limit, bridge_s, blur, spread, ends, fit, shape
+            estimator,
+            scene,
+            size,
+            origin,
+            body,
+            limit,
+            bridge_s,
+            blur,
+            spread,
+            ends,
+            fit,
+            shape,
+            noisy,
         )
 
     @property
@@ -196,16 +212,22 @@ class FrameTracker:
     def observe(self, frames: Sequence[DepthFrame]) -> Observations:
         """The pose hypotheses of consecutive frames, each by itself.
 
+        A depth image that a noisy sensor repeats bit for bit is a copy, which says nothing.
+
         Args:
             frames: at least one.
 
         Returns:
             Observations of n frames, arena frame.
         """
+        copies = np.array([self._is_copy(frame) for frame in frames])
+        if copies.any():
+            return self._observe_others(frames, copies)
         depths = stacked(frames)
         times = np.array([frame.time_ns for frame in frames], np.int64)
         seen = Observations.empty(self.estimator.skeleton, times)
         seen.has_depth[:] = [has_readings(depth) for depth in depths]
+        seen.repeats[:] = [frame.repeats for frame in frames] & seen.has_depth
         with threads(
             len(frames) > 1
         ):  # kernels share frames out: of one, the other cores would only wait
@@ -215,6 +237,24 @@ class FrameTracker:
                 self._put(seen, h, estimates, depths) for h, estimates in enumerate(hypotheses)
             ]
             self._put_agreement(seen, hypotheses, poses, cleared)
+        return seen
+
+    def _is_copy(self, frame: DepthFrame) -> bool:
+        return self.noisy and frame.repeats and has_readings(frame.depth)
+
+    def _observe_others(
+        self, frames: Sequence[DepthFrame], copies: NDArray[np.bool_]
+    ) -> Observations:
+        """Observations of n frames, of which those that are copies (n,) show nothing."""
+        times = np.array([frame.time_ns for frame in frames], np.int64)
+        seen = Observations.empty(self.estimator.skeleton, times)
+        seen.repeats[:] = copies
+        seen.has_depth[:] = ~copies
+        rows = np.flatnonzero(~copies)
+        if len(rows):
+            others = self.observe([frames[row] for row in rows])
+            for name in COLUMNS:
+                getattr(seen, name)[rows] = getattr(others, name)
         return seen
 
     def follow(self, frames: Sequence[DepthFrame]) -> Track:

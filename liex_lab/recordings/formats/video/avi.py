@@ -12,6 +12,7 @@ from typing import IO, NamedTuple
 
 from liex_lab.errors import RecordingError
 from liex_lab.recordings.formats.video.index import DepthTrack, even_times
+from liex_lab.recordings.infrared import is_infrared, refuse_infrared
 from liex_lab.runtime.progress import Progress
 
 _CHUNK = struct.Struct("<4sI")  # name, length of what follows
@@ -55,6 +56,7 @@ def index_avi(path: Path, progress: Progress) -> DepthTrack:
     kinds: list[bytes] = []  # of the streams, in order
     scale = rate = n_stated = 0
     number = b""
+    infrared = ""
     with path.open("rb", buffering=0) as file:
         if file.read(4) != b"RIFF":
             raise RecordingError(
@@ -71,6 +73,12 @@ def index_avi(path: Path, progress: Progress) -> DepthTrack:
                     n_stated = n
             elif chunk.name == b"strf" and kinds and number == b"%02d" % (len(kinds) - 1):
                 track.take_bitmap_header(_read(file, chunk))
+            elif chunk.name == b"strn" and kinds and number == b"%02d" % (len(kinds) - 1):
+                title = _read(file, chunk).decode("utf-8", "replace").rstrip("\0")
+                track.stated = title.upper() == "DEPTH"
+                if is_infrared(title):  # the next stream may be depth
+                    infrared = title
+                    number = b""
             elif number and chunk.name in (number + b"dc", number + b"db"):
                 if chunk.size:  # an empty chunk stands for a picture that was dropped
                     track.offsets.append(chunk.start)
@@ -78,6 +86,8 @@ def index_avi(path: Path, progress: Progress) -> DepthTrack:
                     slots.append(n_slots)
                 n_slots += 1
                 progress(chunk.start >> 20, (size >> 20) + 1, "looking through the video (MB)")
+    if infrared and not number:
+        refuse_infrared(path, infrared)
     if scale and rate:
         track.times_ns = even_times(slots, scale, rate)
     track.whole = track.whole and n_slots >= n_stated

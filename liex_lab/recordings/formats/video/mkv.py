@@ -18,8 +18,9 @@ from typing import IO, NamedTuple
 
 import numpy as np
 
-from liex_lab.errors import RecordingError
+from liex_lab.errors import RecordingError, printable
 from liex_lab.recordings.formats.video.index import FFV1, RAW, DepthTrack
+from liex_lab.recordings.infrared import is_infrared
 from liex_lab.recordings.timestamps import LIMIT_NS
 from liex_lab.runtime.progress import Progress
 
@@ -222,15 +223,32 @@ class _Walk:
             path: the file, for the sentence.
 
         Returns:
-            The track titled or tagged DEPTH, else the first of 16-bit grey pictures, else the first
-            video.
+            The track titled or tagged DEPTH, else the first of 16-bit grey pictures that is not
+            titled as infrared, else the first video.
+
+        Raises:
+            RecordingError: there is no video track, or only infrared holds 16-bit grey pictures.
         """
         videos = [track for track in self.tracks if track.is_video]
         tagged = {uid for uid, name in self.tags if name == "K4A_DEPTH_TRACK"}
         titled = [track for track in videos if track.name.upper() == "DEPTH" or track.uid in tagged]
         grey = [track for track in videos if track.depth.codec == FFV1 or track.depth.codec in RAW]
-        for some in (titled, grey, videos):
+        visible = [track for track in grey if not is_infrared(track.name)]
+        if grey and not titled and not visible:
+            raise RecordingError(
+                f"{path} has no DEPTH track: its track of 16-bit pictures is titled "
+                f"{printable(grey[0].name)}, which is infrared (k4arecorder's mode PASSIVE_IR "
+                "records no depth); give a recording with depth"
+            )
+        for some in (titled, visible, videos):
             if some:
+                depth = some[0].depth
+                depth.stated = bool(titled)
+                if some is visible and len(some) > 1:
+                    depth.doubts.append(
+                        f"{len(some)} tracks hold 16-bit pictures and none is titled DEPTH, so the "
+                        "first was taken; check that it is the depth"
+                    )
                 return some[0]
         raise RecordingError(
             f"{path} holds no video track, or is cut short before it is named; give a recording "
