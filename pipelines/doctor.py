@@ -9,6 +9,7 @@ where asked at which plan fits, which alone needs models.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -28,7 +29,7 @@ from liex_lab.recordings.timestamps import (
 )
 from liex_lab.runtime.progress import Progress, silent
 
-from .build import build_water
+from .build import animal_of, build_water
 from .choice import Proposal, propose_plan
 from .doctor_files import next_command, open_anyhow
 from .doctor_scene import SceneLook
@@ -102,6 +103,7 @@ def examine(
     topic: str | None = None,
     propose: bool = False,
     named: bool = True,
+    typed: tuple[str | None, Sequence[str]] = (None, ()),
     progress: Progress = silent,
 ) -> dict[str, Any]:
     """The findings of a recording: the keys of `FINDINGS`, in types that JSON can hold.
@@ -117,6 +119,8 @@ def examine(
         propose: hold the bundled plans against the recording, which takes their models: the given
             or the usual one first, and others only where it does not fit.
         named: whether someone named the plan, who is told then if it does not fit.
+        typed: the plan as it was typed, None where none was, and further options that a run is to
+            have, too.
         progress: told while an archive is unpacked or an index made.
 
     Raises:
@@ -138,7 +142,7 @@ def examine(
         except LiexError as error:
             misplaced.append(str(error))
             plan = plan.with_settings(["arena.region="])
-        stride = stride_for(seen, plan.animal.spine_min_mm)
+        stride = stride_for(seen, animal_of(plan).spine_min_mm)
         sample = sample_frames(seen, _N_SAMPLED, stride)
         depth = _Depths(sample if seen is opened else sample_frames(opened, _N_RAW))
         scene = SceneLook(seen, plan, water, sample, stride)
@@ -185,7 +189,9 @@ def examine(
                 *scene.problems,
                 *proposal.problems,
             ],
-            "next": next_command(path, proposal, missing, len(arenas) if asked is None else 0),
+            "next": next_command(
+                path, proposal, missing, len(arenas) if asked is None else 0, *typed
+            ),
         }
     return {key: found[key] for key in FINDINGS}
 
@@ -229,7 +235,6 @@ def _copies_told(recording: Recording, sample: NDArray[np.float32]) -> list[str]
     spread over it.
     """
     from liex_lab.foreground.background import has_noise, sampled
-    from liex_lab.recordings.frame import has_readings
     from liex_lab.tracking.copies import copies_told
 
     if recording.format == "synthetic":  # rendered when asked for
@@ -237,7 +242,7 @@ def _copies_told(recording: Recording, sample: NDArray[np.float32]) -> list[str]
     n = len(recording)
     starts = [0] if n <= _N_COMPARED else sampled(n - _WINDOW, _N_COMPARED // _WINDOW).tolist()
     compared = [
-        (frame.time_ns, frame.repeats and has_readings(frame.depth))
+        (frame.time_ns, frame.repeats)
         for start in starts
         for frame in recording.frames(start, start + _WINDOW if len(starts) > 1 else None)
     ]

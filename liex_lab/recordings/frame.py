@@ -30,8 +30,8 @@ class DepthFrame:
         index: its row in the recording that it was read from.
         time_ns: its time on the recording's own clock, ns.
         depth: (H, W) float32 mm along the optical axis; 0 = unread; finite, never negative.
-        repeats: whether its depth is, bit for bit, that of the frame before it; known of frames
-            that are read in order, see `marked`.
+        repeats: whether its depth is, bit for bit, that of the frame before it, and holds readings;
+            known of frames that are read in order, see `marked`.
     """
 
     index: int
@@ -53,6 +53,7 @@ def marked(frames: Iterable[DepthFrame], before: Depth | None = None) -> Iterato
             before is not None
             and np.array_equal(frame.depth[::_ROWS], before[::_ROWS])
             and np.array_equal(frame.depth, before)
+            and has_readings(frame.depth)
         )
         before = frame.depth
         yield replace(frame, repeats=repeats)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from liex_lab.errors import RecordingError
+from liex_lab.errors import RecordingError, printable
 
 _WORD = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+")
 _INFRARED = {"ir", "infra", "passiveir"}
@@ -25,7 +25,7 @@ def is_infrared(name: str) -> bool:
 
 
 def refuse_infrared(path: Path, name: str) -> None:
-    """Refuse a file or folder whose name is that of infrared images.
+    """Refuse a file or folder whose name, or the title of its track, is that of infrared images.
 
     Args:
         path: the file or folder, for the sentence.
@@ -36,6 +36,7 @@ def refuse_infrared(path: Path, name: str) -> None:
     """
     if is_infrared(name):
         raise RecordingError(
-            f"{path} is infrared by its name, and depth was expected; give the recording of the "
-            "depth, or rename it if it holds depth"
+            f"{path} holds infrared, by the name {printable(name)}, and depth was expected; give "
+            "the recording of the depth (a Matroska track titled DEPTH), or change the name if "
+            "this is depth"
         )

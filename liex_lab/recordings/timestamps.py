@@ -24,7 +24,7 @@ GAP_FACTOR = 1.5  # a step longer than this many median steps means that frames 
 _COARSE = 1e-3
 _OFTEN = 0.05
 _OFF = 0.1
-_STEADY = 0.05  # squared mean length of the phases of a clock's stamps: 1 where they are exact
+_LEAST = 0.8  # of the mean of its steps is a clock's own; less comes of stamps without one
 _TICKS_NS = (1_000_000, 15_625_000)  # of clocks that may be as coarse as a camera's step
 _RARELY = 2.25  # times the median: as long is a step across which a frame is missing, at most
 _FAR = 3  # steps; across more of them the clock's phase may be another
@@ -123,64 +123,44 @@ def rounded_step(times_ns: Times) -> int:
         The step, ns; 0 where the stamps are as exact as their median step, or none is found.
     """
     dt = np.diff(times_ns)
-    if not _are_rounded(dt):
+    usual = int(np.median(dt)) if len(dt) else 0
+    if usual <= 0:
         return 0
-    usual = np.median(dt)
-    step = float(dt[dt <= _RARELY * usual].mean())
-    unit = np.gcd.reduce(dt)
-    for window in (2, 4, 8, 16) if _COARSE * usual < unit <= usual / 2 else (8, 16, 16, 16):
+    unit = int(np.gcd.reduce(dt))
+    if unit > _COARSE * usual:
+        # frames lost by a camera of exact stamps make multiples of its step, too
+        rounded = unit <= usual / 2 or unit in _TICKS_NS
+    else:
+        rounded = np.mean(np.abs(dt / usual - np.rint(dt / usual)) > _OFF) > _OFTEN
+    if not rounded:
+        return 0
+    step = first = float(dt[dt <= _RARELY * usual].mean())
+    for window in (2, 4, 8, 16):
         apart = _in_phase(times_ns, step, window)
         near = apart <= _FAR
         step = float(dt[near].sum() / apart[near].sum())
-    if not _is_steady(times_ns / step):
-        return 0
     # at last a line through each stretch without a long gap, all of the same slope
     stretch = np.append(0, np.cumsum(~near))
     count, time = (
         values - (np.bincount(stretch, values) / np.bincount(stretch))[stretch]
         for values in (np.append(0, np.cumsum(apart)), times_ns - times_ns[0])
     )
-    if count.any():
-        step = float((count * time).sum() / (count * count).sum())
-    return round(step)
-
-
-def _are_rounded(dt: Times) -> bool:
-    """Whether steps (n,) ns differ by what is no gap: all are multiples of a unit that is coarse
-    beside them, or many are no multiple of the median one.
-    """
-    usual = int(np.median(dt)) if len(dt) else 0
-    if usual <= 0:
-        return False
-    unit = int(np.gcd.reduce(dt))
-    if unit > _COARSE * usual:
-        # frames lost by a camera of exact stamps make multiples of its step, too
-        return unit <= usual / 2 or unit in _TICKS_NS
-    return bool(np.mean(np.abs(dt / usual - np.rint(dt / usual)) > _OFF) > _OFTEN)
-
-
-def _is_steady(phase: NDArray[np.float64]) -> bool:
-    """Whether stamps (n,), in steps of a clock, have its phase and are not spread over the step."""
-    total = np.append(0.0, np.cumsum(np.exp(2j * np.pi * phase)))
-    window = min(16, len(phase))
-    length = np.abs(total[window:] - total[:-window]) ** 2
-    return bool((length.mean() - window) / (window * (window - 1)) > _STEADY)
+    step = float((count * time).sum() / max((count * count).sum(), 1e-9))
+    return round(step) if step > _LEAST * first else 0
 
 
 def _in_phase(times_ns: Times, step_ns: float, window: int) -> Times:
-    """How many steps (n - 1,) of a steady clock lie between neighbouring stamps (n,) ns, at least 1.
+    """How many steps (n - 1,) of a steady clock lie between neighbouring stamps (n,) ns; 1 or more.
 
     A stamp is off by up to half of what it was rounded to. The clock's phase, the circular mean
     over so many frames before a step and after it, is not, and tells what is due to rounding.
     """
-    n = len(times_ns)
     phase = (times_ns - times_ns[0]) / step_ns
-    total = np.append(0.0, np.cumsum(np.exp(2j * np.pi * phase)))
     apart = np.diff(phase)
-    first = np.maximum.accumulate(np.append(0, np.where(apart > _FAR, np.arange(1, n), 0)))
-    last = np.append(first[1:] != first[:-1], True) * np.arange(1, n + 1)
-    stop = np.minimum.accumulate(np.where(last > 0, last, n)[::-1])[::-1]
-    row = np.arange(1, n)
+    stretch = np.append(0, np.cumsum(apart > _FAR))
+    first, stop = (np.searchsorted(stretch, stretch, side) for side in ("left", "right"))
+    total = np.append(0.0, np.cumsum(np.exp(2j * np.pi * phase)))
+    row = np.arange(1, len(phase))
     before = total[row] - total[np.maximum(row - window, first[:-1])]
     after = total[np.minimum(row + window, stop[1:])] - total[row]
     off = [

@@ -17,9 +17,7 @@ Mask = NDArray[np.bool_]
 
 _MUCH = 0.1  # of the frames; a stream that froze for longer is one to look at
 _FEW = 5  # frames that may repeat in a recording without noise
-_NEARLY = 0.02  # by which the ratio of both rates may differ from a whole number
 _SOON = 0.9  # of a step: sooner than the camera could have made another image
-_TIMES = {2: "twice", 3: "three times", 4: "four times"}
 
 
 def asked_too_often(times_ns: NDArray[np.int64], copies: Mask, known: Mask) -> Mask:
@@ -32,7 +30,7 @@ def asked_too_often(times_ns: NDArray[np.int64], copies: Mask, known: Mask) -> M
     """
     if not copies.any():
         return copies
-    seconds = (times_ns - times_ns[:1]) * 1e-9
+    seconds = (times_ns - times_ns[:1]).astype(np.float64) * 1e-9
     step_s = median_step(times_ns[~copies]) * 1e-9
     between = whole_gaps(seconds, known, GAP_FACTOR * step_s)
     last = np.flatnonzero(known)[-1:]  # no image follows it, and its copies end with the recording
@@ -57,31 +55,27 @@ def copies_told(
     cautions: list[str] = []
     if often.any():
         true_hz, hz = (1e9 / median_step(times) for times in (times_ns[~repeats], times_ns))
-        whole = round(hz / true_hz)
-        times = _TIMES.get(whole) if abs(hz / true_hz - whole) < _NEARLY * whole else None
+        times = f"{hz / true_hz:.1f} times".replace("2.0 times", "twice").replace(".0 ", " ")
         cautions.append(
-            f"{'each depth image is' if times else 'depth images are'} there "
-            f"{times or 'more than once'}: the camera made {true_hz:.2f} frames/s, not {hz:.2f}; "
-            "each image counts once"
+            f"each depth image is there {times}: the camera made {true_hz:.2f} frames/s, not "
+            f"{hz:.2f}; each image counts once"
         )
-    n = int(still.sum())
-    if n >= (1 if noisy else _FEW):
+    if (n := int(still.sum())) >= (1 if noisy else _FEW):
         stops = np.append(times_ns[1:], times_ns[-1] + median_step(times_ns))
-        lasted = [((stops[b - 1] - times_ns[a]) * 1e-9, a) for a, b in spans(still)]
+        lasted = [(1e-9 * (stops[b - 1] - times_ns[a]), a) for a, b in spans(still)]
         longest_s, at = max(lasted)
-        places = (
-            f"in {len(lasted):,} places, {sum(one for one, _ in lasted):.2f} s in all, the longest "
-            if len(lasted) > 1
-            else ""
+        told = (
+            f"the depth image of the frame before repeats in {n:,} of {len(still):,} frames, "
+            f"{sum(one for one, _ in lasted):.2f} s in all, the longest time for {longest_s:.2f} s "
+            f"from {1e-9 * (times_ns[at] - times_ns[0]):.2f} s on"
         )
-        span = f"{places}for {longest_s:.2f} s from {(times_ns[at] - times_ns[0]) * 1e-9:.2f} s on"
-        same = f"{n:,} {'frame repeats' if n == 1 else 'frames repeat'} the depth image before"
-        if noisy:
-            told = f"the stream froze {span}: {same}, and nothing is measured there"
-        else:
-            told = (
-                f"{same} bit for bit, {span}; the background has no noise, so a stream that froze "
-                "looks like an animal that keeps still: watch that part of the replay"
+        if not noisy:
+            cautions.append(
+                f"{told}; the background has no noise, so a stream that froze looks like an animal "
+                "that keeps still: watch that part of the replay"
             )
-        (reasons if noisy and n > _MUCH * len(still) else cautions).append(told)
+        else:
+            (reasons if n > _MUCH * len(still) else cautions).append(
+                f"the stream froze: {told}; nothing is measured there"
+            )
     return reasons, cautions

@@ -159,6 +159,13 @@ class Observations:
         """(n, H) True where there is a hypothesis."""
         return np.isfinite(self.score)
 
+    def forget(self, copies: NDArray[np.bool_]) -> None:
+        """Take out, in place, what was found in frames (n,) whose depth image is a copy."""
+        nothing = Observations.empty(self.skeleton, self.times_ns)
+        for name in {*COLUMNS} - {"times_ns", "repeats"}:
+            getattr(self, name)[copies] = getattr(nothing, name)[copies]
+        self.has_depth[copies] = False
+
     @property
     def copies(self) -> NDArray[np.bool_]:
         """(n,) True where the depth image is a copy of the one before it, and so shows nothing."""

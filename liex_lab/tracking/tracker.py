@@ -27,7 +27,7 @@ from liex_lab.recordings.frame import DepthFrame, has_readings, stacked
 from liex_lab.runtime.memory import Allocator
 from liex_lab.runtime.threads import threads
 from liex_lab.tracking.motion_model import TrackingParameters
-from liex_lab.tracking.observations import COLUMNS, Observations
+from liex_lab.tracking.observations import Observations
 from liex_lab.tracking.occluders import behind_something
 from liex_lab.tracking.occlusion import OcclusionCorrection
 from liex_lab.tracking.offline import track_whole
@@ -112,7 +112,6 @@ class FrameTracker:
             EstimationError: no sampled frame shows an animal.
         """
         home = estimator.skeleton.length
-        noisy = has_noise(sample)
         size = spine_mm / home if spine_mm else estimator.find_size(sample, scene)
         estimates = estimator.estimate(sample, scene, size)
         whole = _whole(scene, sample, estimates)
@@ -177,7 +176,7 @@ class FrameTracker:
             ends,
             fit,
             shape,
-            noisy,
+            has_noise(sample),
         )
 
     @property
@@ -220,14 +219,11 @@ class FrameTracker:
         Returns:
             Observations of n frames, arena frame.
         """
-        copies = np.array([self._is_copy(frame) for frame in frames])
-        if copies.any():
-            return self._observe_others(frames, copies)
         depths = stacked(frames)
         times = np.array([frame.time_ns for frame in frames], np.int64)
         seen = Observations.empty(self.estimator.skeleton, times)
         seen.has_depth[:] = [has_readings(depth) for depth in depths]
-        seen.repeats[:] = [frame.repeats for frame in frames] & seen.has_depth
+        seen.repeats[:] = [frame.repeats for frame in frames]
         with threads(
             len(frames) > 1
         ):  # kernels share frames out: of one, the other cores would only wait
@@ -237,24 +233,8 @@ class FrameTracker:
                 self._put(seen, h, estimates, depths) for h, estimates in enumerate(hypotheses)
             ]
             self._put_agreement(seen, hypotheses, poses, cleared)
-        return seen
-
-    def _is_copy(self, frame: DepthFrame) -> bool:
-        return self.noisy and frame.repeats and has_readings(frame.depth)
-
-    def _observe_others(
-        self, frames: Sequence[DepthFrame], copies: NDArray[np.bool_]
-    ) -> Observations:
-        """Observations of n frames, of which those that are copies (n,) show nothing."""
-        times = np.array([frame.time_ns for frame in frames], np.int64)
-        seen = Observations.empty(self.estimator.skeleton, times)
-        seen.repeats[:] = copies
-        seen.has_depth[:] = ~copies
-        rows = np.flatnonzero(~copies)
-        if len(rows):
-            others = self.observe([frames[row] for row in rows])
-            for name in COLUMNS:
-                getattr(seen, name)[rows] = getattr(others, name)
+        if self.noisy:
+            seen.forget(seen.repeats)
         return seen
 
     def follow(self, frames: Sequence[DepthFrame]) -> Track:

@@ -49,7 +49,10 @@ def test_frozen_frames_have_no_pose_and_are_a_gap_that_is_reported(session: Sess
     assert gap[["start_frame", "stop_frame"]].to_numpy().tolist() == [[FROZEN.start, FROZEN.stop]]
     verdict = session.metadata["verdict"]
     assert verdict["look_at_it"]
-    assert "the stream froze for 0.30 s from 0.13 s on: 9 frames repeat" in verdict["sentence"]
+    assert (
+        "the stream froze: the depth image of the frame before repeats in 9 of 40"
+        in verdict["sentence"]
+    )
 
 
 def test_it_ends_without_a_leap(session: Session, mouse: Any) -> None:  # noqa: F811
@@ -91,8 +94,8 @@ def test_a_live_recording_that_freezes_is_flagged_alike(frozen: Path, session: S
 def test_doctor_reports_when_it_froze_and_for_how_long(frozen: Path) -> None:
     told = [one for one in examine(frozen)["problems"] if "froze" in one]
     assert told == [
-        "the stream froze for 0.30 s from 0.13 s on: 9 frames repeat the depth image before, and "
-        "nothing is measured there"
+        "the stream froze: the depth image of the frame before repeats in 9 of 40 frames, 0.30 s "
+        "in all, the longest time for 0.30 s from 0.13 s on; nothing is measured there"
     ]
 
 

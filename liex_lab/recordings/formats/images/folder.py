@@ -363,11 +363,11 @@ def _say_cut(stack: Stack) -> list[str]:
 def _refuse_negative(
     stack: Stack, decode: Callable[[Stored], Depth], camera_file: CameraFile
 ) -> None:
-    """Float pictures may count away from the camera with a minus sign; nothing would be left of
-    them unread.
+    """Floats and signed integers may count away from the camera with a minus sign; all of them
+    would be unread.
     """
     stored = stack.read(stack.whole.index(True))
-    if stored is None or stored.dtype.kind != "f" or decode(stored).any():
+    if stored is None or stored.dtype.kind not in "fi" or decode(stored).any():
         return
     read = stored[np.isfinite(stored) & (stored != 0)] * camera_file.unit_mm
     if read.size and np.median(read) < 0:

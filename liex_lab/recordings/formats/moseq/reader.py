@@ -288,7 +288,6 @@ class _Session:
             self.problems.append(
                 f"{self.depth.name} is cut or damaged; its {len(video)} whole frames can be read"
             )
-        self.problems += video.problems
         return video, video.track
 
     def _open_raw(self, once: bool) -> RawFrames:

@@ -12,7 +12,7 @@ from typing import IO, NamedTuple
 
 from liex_lab.errors import RecordingError
 from liex_lab.recordings.formats.video.index import DepthTrack, even_times
-from liex_lab.recordings.infrared import is_infrared, refuse_infrared
+from liex_lab.recordings.infrared import is_infrared
 from liex_lab.runtime.progress import Progress
 
 _CHUNK = struct.Struct("<4sI")  # name, length of what follows
@@ -56,7 +56,6 @@ def index_avi(path: Path, progress: Progress) -> DepthTrack:
     kinds: list[bytes] = []  # of the streams, in order
     scale = rate = n_stated = 0
     number = b""
-    infrared = ""
     with path.open("rb", buffering=0) as file:
         if file.read(4) != b"RIFF":
             raise RecordingError(
@@ -67,6 +66,7 @@ def index_avi(path: Path, progress: Progress) -> DepthTrack:
                 kind, *_, a, b, _, n = _STREAM.unpack(_read(file, chunk)[: _STREAM.size])
                 kinds.append(kind)
                 if kind == b"vids" and not number:
+                    track.title = ""
                     number = b"%02d" % (len(kinds) - 1)
                     scale = a
                     rate = b
@@ -74,10 +74,8 @@ def index_avi(path: Path, progress: Progress) -> DepthTrack:
             elif chunk.name == b"strf" and kinds and number == b"%02d" % (len(kinds) - 1):
                 track.take_bitmap_header(_read(file, chunk))
             elif chunk.name == b"strn" and kinds and number == b"%02d" % (len(kinds) - 1):
-                title = _read(file, chunk).decode("utf-8", "replace").rstrip("\0")
-                track.stated = title.upper() == "DEPTH"
-                if is_infrared(title):  # the next stream may be depth
-                    infrared = title
+                track.title = _read(file, chunk).decode("utf-8", "replace").rstrip("\0")
+                if is_infrared(track.title):  # the next stream may be depth
                     number = b""
             elif number and chunk.name in (number + b"dc", number + b"db"):
                 if chunk.size:  # an empty chunk stands for a picture that was dropped
@@ -86,8 +84,6 @@ def index_avi(path: Path, progress: Progress) -> DepthTrack:
                     slots.append(n_slots)
                 n_slots += 1
                 progress(chunk.start >> 20, (size >> 20) + 1, "looking through the video (MB)")
-    if infrared and not number:
-        refuse_infrared(path, infrared)
     if scale and rate:
         track.times_ns = even_times(slots, scale, rate)
     track.whole = track.whole and n_slots >= n_stated

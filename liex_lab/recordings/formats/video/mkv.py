@@ -18,7 +18,7 @@ from typing import IO, NamedTuple
 
 import numpy as np
 
-from liex_lab.errors import RecordingError, printable
+from liex_lab.errors import RecordingError
 from liex_lab.recordings.formats.video.index import FFV1, RAW, DepthTrack
 from liex_lab.recordings.infrared import is_infrared
 from liex_lab.recordings.timestamps import LIMIT_NS
@@ -224,31 +224,19 @@ class _Walk:
 
         Returns:
             The track titled or tagged DEPTH, else the first of 16-bit grey pictures that is not
-            titled as infrared, else the first video.
+            titled as infrared, else the first of them or the first video.
 
         Raises:
-            RecordingError: there is no video track, or only infrared holds 16-bit grey pictures.
+            RecordingError: there is no video track.
         """
         videos = [track for track in self.tracks if track.is_video]
         tagged = {uid for uid, name in self.tags if name == "K4A_DEPTH_TRACK"}
         titled = [track for track in videos if track.name.upper() == "DEPTH" or track.uid in tagged]
         grey = [track for track in videos if track.depth.codec == FFV1 or track.depth.codec in RAW]
         visible = [track for track in grey if not is_infrared(track.name)]
-        if grey and not titled and not visible:
-            raise RecordingError(
-                f"{path} has no DEPTH track: its track of 16-bit pictures is titled "
-                f"{printable(grey[0].name)}, which is infrared (k4arecorder's mode PASSIVE_IR "
-                "records no depth); give a recording with depth"
-            )
-        for some in (titled, visible, videos):
+        for some in (titled, visible, grey, videos):
             if some:
-                depth = some[0].depth
-                depth.stated = bool(titled)
-                if some is visible and len(some) > 1:
-                    depth.doubts.append(
-                        f"{len(some)} tracks hold 16-bit pictures and none is titled DEPTH, so the "
-                        "first was taken; check that it is the depth"
-                    )
+                some[0].depth.title = "DEPTH" if titled else some[0].name
                 return some[0]
         raise RecordingError(
             f"{path} holds no video track, or is cut short before it is named; give a recording "

@@ -48,7 +48,7 @@ class DepthVideo:
         self.track = track
         self.width = track.width
         self.height = track.height
-        self.problems = [*track.doubts]
+        self.problems: list[str] = []
         self._path = path
         self._file = path.open("rb", buffering=0)
         self._lock = Lock()
@@ -160,8 +160,7 @@ def open_video(path: Path, progress: Progress) -> DepthVideo:
         from liex_lab.recordings.formats.video.avi import index_avi
 
         track = index_avi(path, progress)
-    if not track.stated:
-        refuse_infrared(path, path.stem)
+    refuse_infrared(path, track.title or path.stem)
     if track.codec != FFV1 and track.codec not in RAW:
         named = f"is packed with {track.codec!r}" if track.codec else "has no video in it"
         raise RecordingError(
