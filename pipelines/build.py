@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from liex_lab.foreground.segmenter import Segmenter
     from liex_lab.optics.camera import Camera, Distortion, Lens
     from liex_lab.optics.refraction import Water
-    from liex_lab.plan.sections import SharedShape
+    from liex_lab.plan.sections import Animal, SharedShape
     from liex_lab.recordings.recording import Recording
     from liex_lab.tracking.own_shape import StatedShape
     from liex_lab.tracking.tracker import FrameTracker
@@ -148,8 +148,7 @@ def _overruled(camera: Camera, plan: Plan) -> Camera:
 def plan_of(animal: str) -> Plan:
     """The bundled plan of an animal, or one for the animal of a skeleton's TOML.
 
-    The latter expects a spine of 0.6 to 1.8 times the skeleton's own length, and a model `NAME.npz`
-    named as the skeleton's file.
+    The latter expects a model `NAME.npz` named as the skeleton's file.
 
     Args:
         animal: name of a bundled plan, or the path of a skeleton's TOML.
@@ -158,19 +157,38 @@ def plan_of(animal: str) -> Plan:
 
     if animal in known_plans():
         return Plan.load(animal)
-    skeleton = Skeleton.load(animal)
-    low, high = (round(factor * skeleton.length, 3) for factor in _SPANS)
-    return Plan.from_table(
+    plan = Plan.from_table(
         {
-            "animal": {
-                "name": skeleton.name,
-                "skeleton": animal,
-                "spine_min_mm": low,
-                "spine_max_mm": high,
-            },
-            "foreground": {"min_height_mm": skeleton.view.min_height_mm},
+            "animal": {"skeleton": animal},
+            "foreground": {"min_height_mm": Skeleton.load(animal).view.min_height_mm},
             "estimation": {"model": f"{Path(animal).stem}.npz"},
         }
+    )
+    return plan.model_copy(update={"animal": animal_of(plan)})
+
+
+def animal_of(plan: Plan) -> Animal:
+    """The plan's animal; of one of the user's own, its skeleton states what the plan does not.
+
+    Its name is the skeleton's then, and its spine 0.6 to 1.8 times the skeleton's own length.
+
+    Args:
+        plan: its section `animal`.
+
+    Raises:
+        LiexError: the skeleton's file cannot be read.
+    """
+    from liex_lab.body.skeleton import Skeleton
+
+    animal = plan.animal
+    if not animal.skeleton.endswith(".toml"):
+        return animal
+    skeleton = Skeleton.load(animal.skeleton)
+    low, high = (round(factor * skeleton.length, 3) for factor in _SPANS)
+    own = {"name": skeleton.name, "spine_min_mm": low, "spine_max_mm": high}
+    usual = type(animal).model_fields  # a plan that was written out states its defaults
+    return animal.model_copy(
+        update={k: v for k, v in own.items() if getattr(animal, k) == usual[k].default}
     )
 
 
@@ -322,7 +340,7 @@ def build_scene(
     from liex_lab.foreground.background_segmenter import BackgroundSubtraction
     from liex_lab.foreground.hand_segmenter import HandSegmenter
 
-    animal = plan.animal
+    animal = animal_of(plan)
     foreground = plan.foreground
     region = region_of(recording, plan)
     floor = stated_floor(recording.camera, plan)

@@ -17,7 +17,7 @@ from liex_lab.errors import EstimationError, LiexError, MisfitError
 from liex_lab.plan import Plan, known_plans
 from liex_lab.runtime.progress import Progress, silent
 
-from .build import build_tracker
+from .build import animal_of, build_tracker
 
 if TYPE_CHECKING:
     from liex_lab.estimation.estimator import PoseEstimator
@@ -77,12 +77,14 @@ class Proposal:
         says: how it fits, or what contradicts each plan.
         n_animals: things of the animal's size in view at once; None where no plan fits.
         problems: sentences about several animals, and about a given plan that does not fit.
+        is_given: whether the plan that fits is the one that was given.
     """
 
     plan: str | None
     says: str
     n_animals: int | None = None
     problems: tuple[str, ...] = ()
+    is_given: bool = False
 
 
 def propose_plan(recording: Recording, plan: Plan | None = None) -> Proposal:
@@ -117,7 +119,8 @@ def propose_plan(recording: Recording, plan: Plan | None = None) -> Proposal:
             f"{fit.n_animals} animals are in view at once and a run follows one of them; record "
             "them one at a time"
         )
-    return Proposal(found.name, says, fit.n_animals, tuple(problems))
+    given_fits = plan is not None and found is first
+    return Proposal(found.name, says, fit.n_animals, tuple(problems), given_fits)
 
 
 def _other_hand(recording: Recording, found: Look, plan: Plan | None) -> tuple[str, ...]:
@@ -214,7 +217,7 @@ def look(recording: Recording, plan: Plan | str) -> Look:
         recording: an open recording.
         plan: the plan, or the name of a bundled one.
     """
-    name = plan if isinstance(plan, str) else plan.animal.name
+    name = plan if isinstance(plan, str) else animal_of(plan).name
     chosen = Plan.load(plan) if isinstance(plan, str) else plan
     plan = chosen.with_settings([_HANDFUL])
     try:
@@ -243,7 +246,7 @@ def misfits_of(fit: SampleFit | None, plan: Plan) -> tuple[str, ...]:
     """
     if fit is None:
         return ()
-    animal = plan.animal
+    animal = animal_of(plan)
     stated = animal.spine_mm is not None
     return tuple(fit.misfits(animal.spine_min_mm, animal.spine_max_mm, stated))
 
@@ -258,9 +261,8 @@ def _is(plan: Plan, name: str) -> bool:
 
 
 def _refusal(plan: Plan, misfits: Sequence[str], fitting: Look | None) -> str:
-    what = (
-        f"the recording does not fit the plan of the {plan.animal.name}: {', and '.join(misfits)}"
-    )
+    name = animal_of(plan).name
+    what = f"the recording does not fit the plan of the {name}: {', and '.join(misfits)}"
     if fitting is None or fitting.fit is None:
         return (
             f"{what}; no other bundled plan fits either: check the camera's numbers and the depth "
@@ -285,7 +287,8 @@ def _right_way_round(found: Fitted, progress: Progress) -> Fitted:
     is_hand = isinstance(found.tracker.scene, HandSegmenter)
     if not is_hand or plan.recording.mirrored is not None or fit is None:
         return found
-    if not fit.has_length(plan.animal.spine_min_mm, plan.animal.spine_max_mm):
+    animal = animal_of(plan)
+    if not fit.has_length(animal.spine_min_mm, animal.spine_max_mm):
         return found  # it is no hand at all
     progress(0, None, "looking which hand it is")
     handful = plan.with_settings([_HANDFUL])

@@ -9,6 +9,7 @@ where asked at which plan fits, which alone needs models.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -19,10 +20,16 @@ from liex_lab.errors import LiexError
 from liex_lab.optics.presets import unusual_lens
 from liex_lab.plan import Plan
 from liex_lab.plan.plan import arena_lines
-from liex_lab.recordings.timestamps import DROPPED, Gap, unwritable_times
+from liex_lab.recordings.timestamps import (
+    DROPPED,
+    Gap,
+    frames_apart,
+    median_step,
+    unwritable_times,
+)
 from liex_lab.runtime.progress import Progress, silent
 
-from .build import build_water
+from .build import animal_of, build_water
 from .choice import Proposal, propose_plan
 from .doctor_files import next_command, open_anyhow
 from .doctor_scene import SceneLook
@@ -37,7 +44,7 @@ FINDINGS: Final = {  # key of the JSON: what it says; numbers that cannot be tol
     "format": "how the recording is stored",
     "n_frames": "frames that can be read",
     "duration_s": "from the first frame to the last",
-    "rate_hz": "one over the median step from frame to frame",
+    "rate_hz": "one over the usual step from frame to frame",
     "jitter_ms": "standard deviation of the steps, without those across a gap",
     "n_gaps": "places where the camera left out frames",
     "n_missing": "frames that it left out there",
@@ -79,6 +86,9 @@ FINDINGS: Final = {  # key of the JSON: what it says; numbers that cannot be tol
 # frames looked at, spread over the recording; as many as a run learns its scene from
 _N_SAMPLED = 96
 _N_RAW = 16
+# frames compared with the one before, and how many in a row of a recording that has more
+_N_COMPARED = 400
+_WINDOW = 8
 _PLAUSIBLE_MM = (
     100.0,
     10_000.0,
@@ -93,6 +103,7 @@ def examine(
     topic: str | None = None,
     propose: bool = False,
     named: bool = True,
+    typed: tuple[str | None, Sequence[str]] = (None, ()),
     progress: Progress = silent,
 ) -> dict[str, Any]:
     """The findings of a recording: the keys of `FINDINGS`, in types that JSON can hold.
@@ -108,6 +119,8 @@ def examine(
         propose: hold the bundled plans against the recording, which takes their models: the given
             or the usual one first, and others only where it does not fit.
         named: whether someone named the plan, who is told then if it does not fit.
+        typed: the plan as it was typed, None where none was, and further options that a run is to
+            have, too.
         progress: told while an archive is unpacked or an index made.
 
     Raises:
@@ -129,7 +142,7 @@ def examine(
         except LiexError as error:
             misplaced.append(str(error))
             plan = plan.with_settings(["arena.region="])
-        stride = stride_for(seen, plan.animal.spine_min_mm)
+        stride = stride_for(seen, animal_of(plan).spine_min_mm)
         sample = sample_frames(seen, _N_SAMPLED, stride)
         depth = _Depths(sample if seen is opened else sample_frames(opened, _N_RAW))
         scene = SceneLook(seen, plan, water, sample, stride)
@@ -170,12 +183,15 @@ def examine(
                 *filter(None, [unwritable_times(opened.times_ns)]),
                 *filter(None, [unusual_lens(lens) if water is None and not missing else ""]),
                 *_time_problems(opened),
+                *_copies_told(opened, sample),
                 *depth.problems(),
                 *misplaced,
                 *scene.problems,
                 *proposal.problems,
             ],
-            "next": next_command(path, proposal, missing, len(arenas) if asked is None else 0),
+            "next": next_command(
+                path, proposal, missing, len(arenas) if asked is None else 0, *typed
+            ),
         }
     return {key: found[key] for key in FINDINGS}
 
@@ -214,10 +230,32 @@ def _asked(plan: Plan, fps: float | None, topic: str | None) -> Plan:
     return plan.with_settings(settings)
 
 
+def _copies_told(recording: Recording, sample: NDArray[np.float32]) -> list[str]:
+    """Sentences on frames that repeat the depth image before them, of a long recording in windows
+    spread over it.
+    """
+    from liex_lab.foreground.background import has_noise, sampled
+    from liex_lab.tracking.copies import copies_told
+
+    if recording.format == "synthetic":  # rendered when asked for
+        return []
+    n = len(recording)
+    starts = [0] if n <= _N_COMPARED else sampled(n - _WINDOW, _N_COMPARED // _WINDOW).tolist()
+    compared = [
+        (frame.time_ns, frame.repeats)
+        for start in starts
+        for frame in recording.frames(start, start + _WINDOW if len(starts) > 1 else None)
+    ]
+    times_ns, repeats = (np.array(column) for column in zip(*compared, strict=True))
+    some = f", of {len(compared):,} frames compared" if len(compared) < n else ""
+    found = copies_told(times_ns, repeats, has_noise(sample))
+    return [f"{told}{some}" for part in found for told in part]
+
+
 def _time_facts(recording: Recording) -> dict[str, Any]:
     step = np.diff(recording.times_ns) / 1e6
     dropped = _dropped(recording)
-    usual = step[step < 1.5 * np.median(step)] if len(step) else step
+    usual = step[frames_apart(recording.times_ns, median_step(recording.times_ns)) == 1]
     return {
         "format": recording.format,
         "n_frames": len(recording),

@@ -7,6 +7,7 @@ run refuses them; a diagnosis goes on with what is likely and says so.
 from __future__ import annotations
 
 import shlex
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -99,7 +100,12 @@ def _guess_camera(recording: Recording) -> str:
 
 
 def next_command(
-    path: str | Path, proposal: Proposal, missing: list[str], n_arenas: int = 0
+    path: str | Path,
+    proposal: Proposal,
+    missing: list[str],
+    n_arenas: int = 0,
+    plan: str | None = None,
+    options: Sequence[str] = (),
 ) -> str:
     """What to type next; empty where no plan was looked for.
 
@@ -108,14 +114,19 @@ def next_command(
         proposal: which plan fits.
         missing: what the files leave out, to be written first.
         n_arenas: arenas that were seen in the picture, of which each is to be a session.
+        plan: the plan that was given, as it was typed; None where none was.
+        options: further options that were given and that a run takes, too.
     """
     if not proposal.says:
         return ""
     where = shlex.quote(str(path))
-    if missing:
-        return f"write what is missing, then liex doctor {where}"
-    if proposal.plan is None:
-        return f"liex doctor {where} again, once what is said above is put right"
-    named = "" if proposal.plan == USUAL else f" --plan {shlex.quote(proposal.plan)}"
-    several = " --set arenas=auto" if n_arenas > 1 else ""
-    return f"liex run {where}{named}{several}"
+    if missing or proposal.plan is None:
+        given = shlex.join([*(["--plan", plan] if plan else []), *options])
+        again = f"liex doctor {where} {given}".rstrip()
+        if missing:
+            return f"write what is missing, then {again}"
+        return f"{again} again, once what is said above is corrected"
+    named = plan if plan and proposal.is_given else proposal.plan
+    chosen = ["--plan", named] if plan or named != USUAL else []
+    several = ["--set", "arenas=auto"] if n_arenas > 1 else []
+    return shlex.join(["liex", "run", str(path), *chosen, *several, *options])

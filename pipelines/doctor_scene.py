@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from liex_lab.errors import EstimationError, PlanError
 from liex_lab.plan import Plan
 
+from .build import animal_of
 from .origin import build_zones
 from .regions import region_of, stated_floor
 
@@ -92,7 +93,7 @@ class SceneLook:
             self.sample = self.sample * self._region
         self._floor = stated
         background, spread, _ = learn_background(self.sample)
-        animal = self.plan.animal
+        animal = animal_of(self.plan)
         try:
             scene = SampledScene(
                 self.sample,
@@ -185,7 +186,7 @@ class SceneLook:
         from liex_lab.foreground.background_segmenter import BackgroundSubtraction
         from liex_lab.recordings.recording import Recording
 
-        animal = self.plan.animal
+        animal = animal_of(self.plan)
         foreground = self.plan.foreground
         memory = Recording(
             name=self.seen.name,

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
+from itertools import chain, tee
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,6 +17,7 @@ import numpy as np
 
 from liex_lab.errors import RecordingError
 from liex_lab.plan import Plan
+from liex_lab.recordings.frame import marked
 from liex_lab.runtime.progress import Progress, silent
 
 from .build import build_recording, build_tracker
@@ -133,8 +135,10 @@ def _first(frames: Iterator[Arrival], n: int) -> list[Arrival]:
 
 
 def _chained(held: list[Arrival], frames: Iterator[Arrival]) -> Iterator[Arrival]:
-    yield from held
-    yield from frames
+    """All arrivals, their frames marked where they repeat the one before."""
+    arrivals, again = tee(chain(held, frames))
+    for frame, arrival in zip(marked(one.frame for one in again), arrivals, strict=True):
+        yield arrival._replace(frame=frame)
 
 
 def _together(arrivals: Iterator[Arrival]) -> Iterator[list[Arrival]]:

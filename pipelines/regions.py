@@ -122,7 +122,9 @@ def _sampled(recording: Recording, plan: Plan) -> tuple[SampledScene, int]:
     from liex_lab.foreground.background import learn_background, sample_frames, stride_for
     from liex_lab.foreground.standing import SampledScene
 
-    animal = plan.animal
+    from .build import animal_of  # which cuts regions out, and so imports this module
+
+    animal = animal_of(plan)
     stride = stride_for(recording, animal.spine_min_mm)
     sample = sample_frames(recording, _N_SAMPLED, stride)
     background, spread, _ = learn_background(sample)

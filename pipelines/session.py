@@ -322,7 +322,7 @@ def read_ahead(opened: Recording, first: int) -> Generator[list[DepthFrame], Non
         yield from opened.chunks(CHUNK, first)
         return
     rooms = FrameRooms()
-    frames = (opened.frame(row) for row in range(first, len(opened)))
+    frames = opened.frames(first)
     yield from prefetch(iter(lambda: rooms.filled(frames, CHUNK), []))
 
 
@@ -338,6 +338,7 @@ def make_track(writer: SessionWriter, fitted: Fitted) -> Verdict:
     """
     from liex_lab.optics.presets import unusual_lens
     from liex_lab.sessions.verdict import Verdict
+    from liex_lab.tracking.copies import copies_told
     from liex_lab.tracking.observations import Observations
     from liex_lab.tracking.pace import why_too_fast
 
@@ -347,6 +348,7 @@ def make_track(writer: SessionWriter, fitted: Fitted) -> Verdict:
     subject = tracker.subject
     files = fitted.recording.files
     fast = why_too_fast(tracked.track, subject.length_mm)
+    frozen, copied = copies_told(whole.times_ns, whole.repeats, tracker.noisy)
     water = build_water(fitted.plan)
     # water makes an ideal camera with a focal length of its own
     lens = unusual_lens(fitted.recording.camera) if water is None else ""
@@ -361,11 +363,13 @@ def make_track(writer: SessionWriter, fitted: Fitted) -> Verdict:
             *fitted.recording.doubts,
             *fitted.recording.clock_doubts,
             *filter(None, [fast]),
+            *frozen,
             *files.rewritten(),
         ),
         n_animals=subject.n_animals,
         cautions=(
             *fitted.notes,
+            *copied,
             *tracker.scene.remarks,
             *files.grown(),
             *filter(None, [lens]),

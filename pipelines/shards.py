@@ -77,7 +77,7 @@ def measure_shard(shard: Shard) -> Shard:
     opened = _opened(shard.recording, shard.plan.to_toml(), shard.origin.input_sha256)
     first_ns = int(opened.times_ns[0]) if shard.start else None
     rooms = FrameRooms()
-    coming = (opened.frame(row) for row in range(shard.start, shard.stop))
+    coming = opened.frames(shard.start, shard.stop)
     with ShardWriter(shard.folder, shard.origin, first_ns) as writer:
         while frames := rooms.filled(coming, CHUNK):
             writer.add(frames, shard.tracker.observe(frames))

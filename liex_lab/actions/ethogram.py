@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.errors import LiexError
+from liex_lab.recordings.timestamps import frames_apart, median_step
 
 UNLABELLED = ""  # the word of a frame that no action names
 LONGEST_GAP_S = 0.4  # that the recogniser bridges; nobody knows what happened in a longer one
@@ -154,7 +155,7 @@ class Ethogram:
 def frame_stops(times_ns: NDArray[np.int64]) -> NDArray[np.int64]:
     """When each frame's validity ends.
 
-    At the next frame; before a gap (1.5 median steps) or at the end, one median step later.
+    At the next frame; before a gap (1.5 usual steps) or at the end, one usual step later.
 
     Args:
         times_ns: (n,) time stamps, increasing.
@@ -164,6 +165,6 @@ def frame_stops(times_ns: NDArray[np.int64]) -> NDArray[np.int64]:
     """
     if len(times_ns) < 2:
         return times_ns + 1
-    step = np.diff(times_ns)
-    usual = int(np.median(step))
-    return times_ns + np.append(np.where(step > 1.5 * usual, usual, step), usual)
+    usual = median_step(times_ns)
+    whole = frames_apart(times_ns, usual) == 1
+    return times_ns + np.append(np.where(whole, np.diff(times_ns), usual), usual)

@@ -30,6 +30,7 @@ from liex_lab.actions.vocabulary import FASTEST
 from liex_lab.actions.window_features import window_features
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.mlp import Network
+from liex_lab.recordings.timestamps import median_step
 from liex_lab.runtime.memory import Allocator, blocks
 from liex_lab.tracking.track import Track
 
@@ -270,7 +271,7 @@ class TimelineModel:
         """
         if len(times_ns) < 2:
             return {}
-        rate = 1e9 / float(np.median(np.diff(times_ns)))
+        rate = 1e9 / median_step(times_ns)
         fastest = FASTEST.get(self.skeleton, {})
         found = {}
         for word, shortest in zip(self.words, self.chain.shortest_s, strict=True):

@@ -200,6 +200,9 @@ def doctor(
 
     asked = [*(settings or []), *region_setting(region)]
     chosen = Plan.load(plan or "mouse").with_settings(asked)
+    stated = [*asked, *([] if fps is None else [f"recording.fps={fps}"])]
+    options = [] if topic is None else ["--topic", topic]
+    options += [word for setting in stated for word in ("--set", setting)]
     from liex_lab.pipelines.doctor import examine
     from liex_lab.pipelines.doctor_text import print_report
 
@@ -211,6 +214,7 @@ def doctor(
             topic=topic,
             propose=True,
             named=plan is not None,
+            typed=(plan, options),
             progress=progress,
         )
     if as_json:

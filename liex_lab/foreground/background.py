@@ -9,6 +9,8 @@ half of its 16 to 84 % range the standard deviation. The kernel is `far_modes`.
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -24,6 +26,11 @@ _NEAR_SHARE = 0.05  # of a pixel's readings may be nearer than its nearest usual
 _LENGTH_PX = 64.0
 _MAX_STRIDE = 4
 _ROWS = 32  # of pixels whose readings are sorted at once
+# noise changes something in this share of an image's cells, so many to a row and to a column, in
+# the median of so many pairs; a moving animal changes the few cells in which it is
+_EVERYWHERE = 0.8
+_CELLS = 8
+_PAIRS = 32
 
 
 def sampled(n: int, most: int) -> NDArray[np.int64]:
@@ -59,6 +66,26 @@ def sample_frames(recording: Recording, n_frames: int, stride: int = 1) -> NDArr
     for k, index in enumerate(chosen):
         sample[k] = recording.frame(int(index)).depth[::stride, ::stride]
     return sample
+
+
+def has_noise(sample: NDArray[np.float32]) -> bool:
+    """Whether the sensor has noise: two depth images differ nearly everywhere, not at the animal.
+
+    Where it has none, as in a rendered recording, an image of a still scene may repeat bit for bit.
+
+    Args:
+        sample: (n, H, W) float32 mm, 0 where unread, frames spread over the recording.
+    """
+    shares = []
+    cells = [np.unique(np.arange(_CELLS) * n // _CELLS) for n in sample.shape[1:]]
+    for before, after in pairwise(sample[:: max(1, len(sample) // _PAIRS)]):
+        changed, read = (
+            np.maximum.reduceat(np.maximum.reduceat(where, cells[0]), cells[1], axis=1)
+            for where in (before != after, (before > 0) | (after > 0))
+        )
+        if changed.any():
+            shares.append(float(changed.sum() / read.sum()))
+    return len(shares) > 0 and float(np.median(shares)) > _EVERYWHERE
 
 
 def usual_depth(pictures: NDArray[np.uint16]) -> NDArray[np.uint16]:

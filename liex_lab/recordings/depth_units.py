@@ -24,6 +24,7 @@ Stored = NDArray[Any]
 COLOUR = "nyu-hand"  # the one encoding of 8-bit colour pictures
 LARGEST_STEP = 0xFFFF
 _NO_DISPARITY = 2047  # of 11 bits
+_FARTHEST_MM = 10_000.0
 
 
 def _rotated(stored: Stored) -> Stored:
@@ -77,12 +78,17 @@ def decode(
         encoding: one of `ENCODINGS`.
         unit_mm: mm per step of what `encoding` gives.
         unread: *stored* values that mean "no reading" (of what the encoding gives for colour
-            pictures), besides those that it has by itself.
+            pictures), besides those that it has by itself: the largest of a type of integers where
+            it would lie farther than any animal is watched, as cameras and programs write it.
 
     Returns:
         (H, W) float32 mm, 0 = unread.
     """
     values = _MILLIMETRES[encoding][1](stored)
+    if values is stored and stored.dtype.kind in "iu":
+        largest = float(np.iinfo(stored.dtype).max)
+        if largest * abs(unit_mm) > _FARTHEST_MM:
+            unread = (*unread, largest)
     if values is stored or stored.ndim == 3:
         return depth_mm(values, unit_mm, unread)
     depth = depth_mm(values, unit_mm)

@@ -7,8 +7,8 @@ along the ray); 0 means that there is no reading.
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from itertools import islice
 from typing import Any
 
@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 Depth = NDArray[np.float32]
 
 _FEW = 16  # one row and column of so many
+_ROWS = 64
 _MOST_ROOMS = 6  # that are kept: being filled, waiting, looked at (two at once), written
 
 
@@ -29,11 +30,33 @@ class DepthFrame:
         index: its row in the recording that it was read from.
         time_ns: its time on the recording's own clock, ns.
         depth: (H, W) float32 mm along the optical axis; 0 = unread; finite, never negative.
+        repeats: whether its depth is, bit for bit, that of the frame before it, and holds readings;
+            known of frames that are read in order, see `marked`.
     """
 
     index: int
     time_ns: int
     depth: Depth
+    repeats: bool = False
+
+
+def marked(frames: Iterable[DepthFrame], before: Depth | None = None) -> Iterator[DepthFrame]:
+    """Consecutive frames, each marked where it repeats the depth image of the frame before it.
+
+    Args:
+        frames: in order; the depth of the last one is held until the next one has come.
+        before: depth (H, W) mm of the frame before the first; None where there is none.
+    """
+    for frame in frames:
+        # a few rows tell nearly all images apart
+        repeats = (
+            before is not None
+            and np.array_equal(frame.depth[::_ROWS], before[::_ROWS])
+            and np.array_equal(frame.depth, before)
+            and has_readings(frame.depth)
+        )
+        before = frame.depth
+        yield replace(frame, repeats=repeats)
 
 
 class FrameRooms:
@@ -62,7 +85,7 @@ class FrameRooms:
                 room = self._free((n_frames, *frame.depth.shape))
             depth = room[len(taken)]
             depth[...] = frame.depth
-            taken.append(DepthFrame(frame.index, frame.time_ns, depth))
+            taken.append(replace(frame, depth=depth))
         return taken
 
     def _free(self, shape: tuple[int, ...]) -> Depth:

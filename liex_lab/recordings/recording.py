@@ -11,6 +11,7 @@ import hashlib
 import weakref
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from itertools import islice
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -20,7 +21,7 @@ from numpy.typing import NDArray
 
 from liex_lab.errors import RecordingError
 from liex_lab.optics.camera import Camera
-from liex_lab.recordings.frame import Depth, DepthFrame
+from liex_lab.recordings.frame import Depth, DepthFrame, marked
 from liex_lab.recordings.source_files import SourceFiles
 from liex_lab.recordings.timestamps import (
     FAULTS,
@@ -177,7 +178,7 @@ class Recording:
     def rate_hz(self) -> float:
         """Frames per second while none is missing; NaN for a single frame.
 
-        One over the median step between neighbouring frames.
+        One over the usual step between neighbouring frames, see `median_step`.
         """
         return 1e9 / self._step_ns if self._step_ns else float("nan")
 
@@ -251,8 +252,18 @@ class Recording:
             ) from error
         return DepthFrame(row, int(self.times_ns[row]), depth)
 
+    def frames(self, first: int = 0, stop: int | None = None) -> Iterator[DepthFrame]:
+        """Consecutive frames, decoded one by one, each marked where it repeats the one before it.
+
+        Args:
+            first: row of the first frame.
+            stop: row after the last one; None for all that follow.
+        """
+        before = self.frame(first - 1).depth if 0 < first < len(self) else None
+        return marked((self.frame(i) for i in range(len(self))[first:stop]), before)
+
     def __iter__(self) -> Iterator[DepthFrame]:
-        return (self.frame(i) for i in range(len(self)))
+        return self.frames()
 
     def chunks(self, n_frames: int, first: int = 0) -> Iterator[list[DepthFrame]]:
         """Consecutive frames in lists of equal length, of which one is in memory at a time.
@@ -269,8 +280,8 @@ class Recording:
         """
         if n_frames < 1:
             raise ValueError(f"a chunk has at least one frame, got {n_frames}")
-        for start in range(first, len(self), n_frames):
-            yield [self.frame(i) for i in range(start, min(start + n_frames, len(self)))]
+        frames = self.frames(first)
+        yield from iter(lambda: list(islice(frames, n_frames)), [])
 
     def __getitem__(self, part: slice) -> Recording:
         """Some of the frames as a recording of its own, with rows counted anew.

@@ -19,6 +19,16 @@ from numpy.typing import NDArray
 Times = NDArray[np.int64]
 
 GAP_FACTOR = 1.5  # a step longer than this many median steps means that frames are missing
+# stamps count as rounded to a unit above this share of the usual step, or where this share of the
+# steps is off a multiple of it by this much
+_COARSE = 1e-3
+_OFTEN = 0.05
+_OFF = 0.1
+_LEAST = 0.8  # of the mean of its steps is a clock's own; less comes of stamps without one
+_TICKS_NS = (1_000_000, 15_625_000)  # of clocks that may be as coarse as a camera's step
+_RARELY = 2.25  # times the median: as long is a step across which a frame is missing, at most
+_LONGER = (3, 16, 64, 256)  # frames missing in gaps, short ones first, as they tell the step
+_FAR = 3  # steps; across more of them the clock's phase may be another
 CLOCK_JUMP_NS = (
     60 * 10**9
 )  # no camera drops frames for a minute: it was stopped, or its clock was set
@@ -92,7 +102,7 @@ class MonotoneTimes:
 
 
 def median_step(times_ns: Times) -> int:
-    """Median time between neighbouring frames.
+    """Usual time between neighbouring frames: their median, of rounded stamps the mean.
 
     Args:
         times_ns: (n,) int64 stamps, ns.
@@ -100,7 +110,101 @@ def median_step(times_ns: Times) -> int:
     Returns:
         The step, ns; 0 for fewer than two frames.
     """
-    return int(np.median(np.diff(times_ns))) if len(times_ns) > 1 else 0
+    if len(times_ns) < 2:
+        return 0
+    return rounded_step(times_ns) or int(np.median(np.diff(times_ns)))
+
+
+def rounded_step(times_ns: Times) -> int:
+    """Step of a steady clock whose stamps are rounded or jitter, such as 33, 33, 34 ms.
+
+    No single step is then the camera's. Theirs is the total time over the number of steps, with the
+    steps across a gap counted by `frames_apart`.
+
+    Args:
+        times_ns: (n,) int64 stamps, ns.
+
+    Returns:
+        The step, ns; 0 where the stamps are as exact as their median step, or none is found.
+    """
+    dt = np.diff(times_ns)
+    usual = int(np.median(dt)) if len(dt) else 0
+    if usual <= 0:
+        return 0
+    unit = int(np.gcd.reduce(dt))
+    if unit > _COARSE * usual:
+        # frames lost by a camera of exact stamps make multiples of its step, too
+        rounded = unit <= usual / 2 or unit in _TICKS_NS
+    else:
+        rounded = np.mean(np.abs(dt / usual - np.rint(dt / usual)) > _OFF) > _OFTEN
+    if not rounded:
+        return 0
+    step = first = float(dt[dt <= _RARELY * usual].mean())
+    for window in (2, 4, 8, 16):
+        apart = _in_phase(times_ns, step, window)
+        near = apart <= _FAR
+        step = float(dt[near].sum() / apart[near].sum())
+    for longest in _LONGER:
+        step = _slope(dt, _in_phase(times_ns, step, 16), longest, step)
+    return round(step) if step > _LEAST * first else 0
+
+
+def _slope(dt: Times, apart: Times, longest: int, otherwise: float) -> float:
+    """Time per frame, ns: the slope of lines through the stretches without a longer gap.
+
+    Args:
+        dt: (n,) steps, ns.
+        apart: (n,) how many frames each of them takes.
+        longest: more frames than these begin a stretch of its own.
+        otherwise: the result where the slope is far from it, as without two frames in a stretch.
+    """
+    stretch = np.append(0, np.cumsum(apart > longest))
+    count, time = (
+        values - (np.bincount(stretch, values) / np.bincount(stretch))[stretch]
+        for values in (np.cumsum(np.append(0.0, apart)), np.cumsum(np.append(0.0, dt)))
+    )
+    found = float(count @ time) / max(float(count @ count), 1e-9)
+    return found if abs(found - otherwise) < 0.1 * otherwise else otherwise
+
+
+def _in_phase(times_ns: Times, step_ns: float, window: int) -> Times:
+    """How many steps (n - 1,) of a steady clock lie between neighbouring stamps (n,) ns; 1 or more.
+
+    A stamp is off by up to half of what it was rounded to. The clock's phase, the circular mean
+    over so many frames before a step and after it, is not, and tells what is due to rounding.
+    """
+    phase = (times_ns - times_ns[0]) / step_ns
+    apart = np.diff(phase)
+    stretch = np.append(0, np.cumsum(apart > _FAR))
+    first, stop = (np.searchsorted(stretch, stretch, side) for side in ("left", "right"))
+    total = np.append(0.0, np.cumsum(np.exp(2j * np.pi * phase)))
+    row = np.arange(1, len(phase))
+    before = total[row] - total[np.maximum(row - window, first[:-1])]
+    after = total[np.minimum(row + window, stop[1:])] - total[row]
+    off = [
+        np.angle(np.exp(2j * np.pi * at) * mean.conj()) / (2.0 * np.pi)
+        for at, mean in ((phase[:-1], before), (phase[1:], after))
+    ]
+    return np.maximum(1, np.rint(apart + off[0] - off[1])).astype(np.int64)
+
+
+def frames_apart(times_ns: Times, step_ns: int) -> Times:
+    """How many frames (n - 1,) each stamp lies after the one before: more than 1 across a gap.
+
+    Args:
+        times_ns: (n,) int64 stamps, ns, increasing.
+        step_ns: the usual step, ns, above 0.
+    """
+    dt = np.diff(times_ns)
+    if rounded_step(times_ns):
+        return _in_phase(times_ns, step_ns, 16)
+    # the median of jittering steps is off by a hundredth, which longer and longer gaps show
+    period = float(step_ns)
+    for longest in (1, *_LONGER):
+        missing = np.maximum(2, np.rint(dt / period))
+        apart = np.where(dt > GAP_FACTOR * step_ns, missing, 1).astype(np.int64)
+        period = _slope(dt, apart, longest, period)
+    return apart
 
 
 def clock_doubts(step_ns: int, faults: NDArray[np.uint8]) -> tuple[str, ...]:
@@ -145,10 +249,9 @@ def find_gaps(times_ns: Times, step_ns: int) -> list[Gap]:
     if step_ns <= 0:
         return []
     dt = np.diff(times_ns)
-    after = np.flatnonzero(dt > GAP_FACTOR * step_ns)
-    period_ns = _period_ns(dt, step_ns) if len(after) else 0.0
+    apart = frames_apart(times_ns, step_ns)
     found = []
-    for i in after:
+    for i in np.flatnonzero(apart > 1):
         jumped = dt[i] > CLOCK_JUMP_NS
         found.append(
             Gap(
@@ -156,30 +259,11 @@ def find_gaps(times_ns: Times, step_ns: int) -> list[Gap]:
                 stop_frame=int(i) + 1,
                 start_ns=int(times_ns[i]) + step_ns,
                 stop_ns=int(times_ns[i + 1]),
-                n_frames_missing=1 if jumped else max(1, round(int(dt[i]) / period_ns) - 1),
+                n_frames_missing=1 if jumped else int(apart[i]) - 1,
                 reason=JUMPED if jumped else DROPPED,
             )
         )
     return found
-
-
-def _period_ns(dt: Times, step_ns: int) -> float:
-    """Mean frame interval of steps `dt` (n,), ns: least squares over stretches without long gaps.
-
-    Longer and longer gaps count as their number of frames becomes certain. A median step is not
-    enough: that of whole milliseconds or of a jittering clock is off by a hundredth.
-    """
-    period = float(step_ns)
-    for longest in (GAP_FACTOR, 4.0, 16.0, 64.0):
-        stretch = np.cumsum(np.append(False, dt > longest * period))
-        pulse = np.cumsum(np.append(0.0, np.maximum(np.rint(dt / period), 1.0)))
-        x, t = (
-            values - (np.bincount(stretch, values) / np.bincount(stretch))[stretch]
-            for values in (pulse, np.cumsum(np.append(0.0, dt)))
-        )
-        found = float(x @ t) / max(float(x @ x), 1e-9)
-        period = found if abs(found - step_ns) < 0.1 * step_ns else period
-    return period
 
 
 def find_faults(times_ns: Times, step_ns: int, faults: NDArray[np.uint8]) -> list[Gap]:

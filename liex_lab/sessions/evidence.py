@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 FILE = "observations.npz"
 # columns that sessions of earlier versions do not hold
-_LATER = ("covered", "beside", "behind", "part_mm")
+_LATER = ("covered", "beside", "behind", "part_mm", "repeats")
 _BYTES_PER_JOINT = 1 << 10  # of a frame; several times what there are
 _SPARE_BYTES = 1 << 26  # for the skeleton and its mesh
 _BLOCK = 16_384  # frames that are in memory at a time

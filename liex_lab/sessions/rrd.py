@@ -62,6 +62,7 @@ _FLAG_COLOURS = {
     "not_found": int(colours.NO_POSE[1:], 16),
     "hidden": 0xAA3377,
     "no_depth": 0xBBBBBB,
+    "repeated": 0x66CCEE,
     "corrected": 0x4477AA,
 }
 _WALL = 0x9AA0A6

@@ -20,6 +20,8 @@ from liex_lab.actions.ethogram import Ethogram, runs_of
 from liex_lab.arena.outline import UNKNOWN, Arena
 from liex_lab.arena.zones import Zone, zone_names
 from liex_lab.geometry import so3
+from liex_lab.recordings.timestamps import frames_apart, rounded_step
+from liex_lab.recordings.timestamps import median_step as recorded_step
 from liex_lab.runtime.memory import blocks
 from liex_lab.tables.schema import FRAMES, ROOT_COVARIANCES, ROWS_PER_GROUP, Block, Words, to_pandas
 from liex_lab.tracking.track import Flip, Track
@@ -31,15 +33,13 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-# median steps; a longer one means that frames are missing (as in recordings.timestamps)
-GAP_FACTOR = 1.5
 _Found = tuple[
     float, float, int, int, int, str, float, float
 ]  # start_s, stop_s, start_frame, stop_frame, frames missing, reason, x mm, y mm
 _SPAN_NAMES = ("start_s", "stop_s", "start_frame", "stop_frame")
 _NOWHERE = (float("nan"), float("nan"))
 HIDDEN = "hidden"
-LOST = ("no_depth", HIDDEN, "tracker_lost")  # reasons of gaps that are not the camera's
+LOST = ("no_depth", "repeated", HIDDEN, "tracker_lost")  # reasons of gaps that are not the camera's
 _NEAR = 0.1  # of the spine: how near a joint must be to count in its score
 
 
@@ -352,13 +352,19 @@ def median_step(time_s: Array) -> float:
         time_s: (n,) s, increasing.
 
     Returns:
-        Median of the steps, s.
+        Median of the steps, s; of rounded stamps their mean, see `timestamps.rounded_step`.
     """
-    return float(np.median(np.diff(time_s))) if len(time_s) > 1 else 0.0
+    if len(time_s) < 2:
+        return 0.0
+    return rounded_step(_in_ns(time_s)) * 1e-9 or float(np.median(np.diff(time_s)))
+
+
+def _in_ns(time_s: Array) -> NDArray[np.int64]:
+    return np.rint(np.asarray(time_s) * 1e9).astype(np.int64)
 
 
 def gap_follows(time_s: Array) -> NDArray[np.bool_]:
-    """After which frames others are missing: the step is longer than 1.5 median ones.
+    """After which frames others are missing: the step is longer than 1.5 usual ones.
 
     Args:
         time_s: (n,) s, increasing.
@@ -366,8 +372,9 @@ def gap_follows(time_s: Array) -> NDArray[np.bool_]:
     Returns:
         (n,) bool, True also at the last frame.
     """
-    step = np.diff(time_s)
-    return np.append(step > GAP_FACTOR * median_step(time_s), True)[: len(time_s)]
+    times_ns = _in_ns(time_s)
+    apart = frames_apart(times_ns, recorded_step(times_ns))
+    return np.append(apart > 1, True)[: len(time_s)]
 
 
 def stop_times(time_s: Array) -> Array:

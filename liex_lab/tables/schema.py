@@ -262,7 +262,9 @@ FRAMES = columns(
         "empty when the pose is trusted; doubtful: its predicted error is large, or the picture "
         "contradicts it; corrected: a person placed joints of it; hidden, not_found or no_depth: "
         "nothing was measured, and there is no pose where it is not bridged; hidden: the animal is "
-        "behind or under something, whole or so much of it that nobody knows how it lies",
+        "behind or under something, whole or so much of it that nobody knows how it lies; "
+        "repeated: the depth image is a copy of the one before, with no pose where the stream "
+        "froze, and a pose between its neighbours where each image was written more than once",
         "",
         "tracker",
     ),
@@ -442,7 +444,8 @@ GAPS = columns(
         "camera_dropped: never recorded, start_frame = stop_frame = the next frame; "
         "clock_jumped: the camera was stopped, or its clock set, before the frame; "
         "stamp_repeated, stamp_out_of_order: this frame's own time stamp could not be true and "
-        "was moved; no_depth: recorded without any depth; hidden: the animal went behind or under "
+        "was moved; no_depth: recorded without any depth; repeated: the stream froze, and the "
+        "depth image before it was written again; hidden: the animal went behind or under "
         "something; tracker_lost: nothing in the frame looks like the animal",
     ),
     (

@@ -46,11 +46,12 @@ class Observations:
         n_px: (n, H) int32 pixels of the component that it is a pose of, 0 where there is none.
         centroid_mm: (n, H, 3) centre of that component, arena frame, mm.
         centroid_px: (n, H, 2) its projection, px of the depth image.
-        has_depth: (n,) True where anything was read.
+        has_depth: (n,) True where anything was read, and not copied from the frame before.
         covered: (n, H) share of the silhouette that the rendered body covers.
         beside: (n, H) share of the rendered body that lies beside the silhouette.
         behind: (n, H) share of the component's outline that ends at something nearer.
         part_mm: (n, H) that distance in the part of the body where it is largest, mm.
+        repeats: (n,) True where the depth image is, bit for bit, the one before it.
     """
 
     skeleton: Skeleton
@@ -70,6 +71,7 @@ class Observations:
     beside: Small
     behind: Small
     part_mm: Small
+    repeats: NDArray[np.bool_]
 
     @staticmethod
     def empty(skeleton: Skeleton, times_ns: NDArray[np.int64]) -> Observations:
@@ -108,6 +110,7 @@ class Observations:
             nothing(),
             nothing(),
             nothing(),
+            np.zeros(n, np.bool_),
         )
 
     def put_pose(self, h: int, pose: Pose) -> None:
@@ -155,6 +158,23 @@ class Observations:
     def known(self) -> NDArray[np.bool_]:
         """(n, H) True where there is a hypothesis."""
         return np.isfinite(self.score)
+
+    def forget(self, copies: NDArray[np.bool_]) -> None:
+        """Take out, in place, what was found in frames (n,) whose depth image is a copy."""
+        nothing = Observations.empty(self.skeleton, self.times_ns)
+        for name in {*COLUMNS} - {"times_ns", "repeats"}:
+            getattr(self, name)[copies] = getattr(nothing, name)[copies]
+        self.has_depth[copies] = False
+
+    @property
+    def copies(self) -> NDArray[np.bool_]:
+        """(n,) True where the depth image is a copy of the one before it, and so shows nothing."""
+        return self.repeats & ~self.has_depth
+
+    @property
+    def shown(self) -> NDArray[np.int64]:
+        """(n,) row of the frame whose depth image each frame shows: its own, but of copies."""
+        return np.maximum.accumulate(np.where(self.copies, 0, np.arange(len(self))))
 
     def pose(self, path: NDArray[np.int64]) -> Pose:
         """The poses (n) that a path takes, arena frame.

@@ -30,6 +30,7 @@ from liex_lab.body.pose import Pose
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.runtime.memory import Allocator, blocks
 from liex_lab.tracking.association import NONE, HypothesisAssociation
+from liex_lab.tracking.copies import asked_too_often
 from liex_lab.tracking.gaps import short_gaps, spans, whole_gaps
 from liex_lab.tracking.larger_animal import cost_of_the_other
 from liex_lab.tracking.motion_model import TrackingParameters
@@ -37,7 +38,13 @@ from liex_lab.tracking.observations import Observations, joints_of, reversed_pos
 from liex_lab.tracking.smoother import smooth
 from liex_lab.tracking.subject import Subject
 from liex_lab.tracking.track import Flip, Track, Tracked, ends_of
-from liex_lab.tracking.track_rows import doubted, hide, mask_and_flag, write_curve
+from liex_lab.tracking.track_rows import (
+    add_sight_of_copies,
+    doubted,
+    hide,
+    mask_and_flag,
+    write_curve,
+)
 from liex_lab.tracking.trust import (
     elsewhere,
     gone_behind,
@@ -150,7 +157,8 @@ def track_whole(
             if taken[max(0, rows.start - MARGIN) : rows.stop + MARGIN].any():
                 draw(rows)
     measured = used & (path >= 0)
-    bridged = short_gaps(seconds, measured, subject.bridge_s)
+    bridged = short_gaps(seconds, measured, subject.bridge_s) & ~seen.copies
+    copies = asked_too_often(seen.times_ns, seen.copies, measured)
     strayed = np.zeros(len(seen), np.bool_)
     for rows in blocks(len(seen), _BLOCK):
         strayed[rows] = elsewhere(
@@ -174,11 +182,12 @@ def track_whole(
             seen[rows],
             path[rows],
             doubt[rows],
-            measured[rows],
+            (measured | copies)[rows],
             bridged[rows],
             strayed[rows],
         )
         hide(track[rows], hidden[rows])
+    add_sight_of_copies(track, seen, copies)
     flips = _flips(seen, track)
     return Tracked(
         track,
@@ -289,6 +298,7 @@ def _flips(seen: Observations, track: Track) -> list[Flip]:
         ends = seen[rows].joints_as(0, [0, tip])
         along = track.joints_mm[rows, tip] - track.joints_mm[rows, 0]
         exchanged[rows] = np.einsum("nd,nd->n", along, ends[:, 1] - ends[:, 0]) < 0
+    exchanged = exchanged[seen.shown]
     found = [Flip(a, b, float(1.0 - track.p_flip[a:b].mean()), True) for a, b in spans(exchanged)]
     unsure = ~exchanged & (track.p_flip > _TOLD)
     return found + [Flip(a, b, float(track.p_flip[a:b].mean()), False) for a, b in spans(unsure)]

@@ -37,6 +37,10 @@ FLAGS = {
     ),
     "corrected": "a person placed joints of this pose; the others follow as the bones allow",
     "no_depth": "the frame holds no depth at all; the row is NaN, or bridged",
+    "repeated": (
+        "the depth image is a copy of the one before; the row is NaN where the stream froze, and "
+        "lies between its neighbours where each image was written more than once"
+    ),
 }
 
 

@@ -203,6 +203,7 @@ def mask_and_flag(
     doubtful = strayed | (track.predicted_error_mm > limit)
     track.flag[measured] = np.where(doubtful, "doubtful", "")[measured]
     track.flag[~measured & ~seen.has_depth] = "no_depth"
+    track.flag[seen.copies] = "repeated"
 
 
 def covariance_of_root(curve: Curve) -> Array:
@@ -242,6 +243,19 @@ def stretch_of(stretch_sd: float, joints: Array) -> Array:
         (n, J) mm along one axis: stretch_sd times the distance from the base over sqrt(3).
     """
     return np.asarray(stretch_sd * np.linalg.norm(joints - joints[:, :1], axis=-1) / np.sqrt(3.0))
+
+
+def add_sight_of_copies(track: Track, seen: Observations, copies: NDArray[np.bool_]) -> None:
+    """Write into copies what was seen of the animal in the images that they repeat, in place.
+
+    Args:
+        track: n rows.
+        seen: hypotheses (n, H) of these frames.
+        copies: (n,) bool, frames whose depth image is that of a frame before.
+    """
+    shown = seen.shown[copies]
+    for column in (track.n_foreground_px, track.centroid_mm, track.centroid_px, track.residual_mm):
+        column[copies] = column[shown]
 
 
 def _add_sight(

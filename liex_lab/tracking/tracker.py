@@ -19,6 +19,7 @@ from liex_lab.body.surface import Surface
 from liex_lab.errors import EstimationError
 from liex_lab.estimation.estimator import Estimates, PoseEstimator
 from liex_lab.estimation.session_shape import ShapePrior
+from liex_lab.foreground.background import has_noise
 from liex_lab.foreground.background_segmenter import BackgroundSubtraction
 from liex_lab.foreground.height_maps import HeightMaps
 from liex_lab.foreground.segmenter import Segmenter
@@ -63,6 +64,7 @@ class FrameTracker:
         sample_fit: how well the model explains the sampled frames; None of a tracker that was made
             without any.
         shape: the session's own shape; None where none was asked for.
+        noisy: whether the sensor has noise, so that a depth image which repeats is a copy.
     """
 
     estimator: PoseEstimator
@@ -77,6 +79,7 @@ class FrameTracker:
     free_ends: OcclusionCorrection | None = None
     sample_fit: SampleFit | None = None
     shape: OwnShape | None = None
+    noisy: bool = False
 
     @staticmethod
     def prepare(
@@ -161,7 +164,19 @@ class FrameTracker:
         )
         origin = "plan" if spine_mm else "recording"
         return FrameTracker(
-            estimator, scene, size, origin, body, limit, bridge_s, blur, spread, ends, fit, shape
+            estimator,
+            scene,
+            size,
+            origin,
+            body,
+            limit,
+            bridge_s,
+            blur,
+            spread,
+            ends,
+            fit,
+            shape,
+            has_noise(sample),
         )
 
     @property
@@ -196,6 +211,8 @@ class FrameTracker:
     def observe(self, frames: Sequence[DepthFrame]) -> Observations:
         """The pose hypotheses of consecutive frames, each by itself.
 
+        A depth image that a noisy sensor repeats bit for bit is a copy, which says nothing.
+
         Args:
             frames: at least one.
 
@@ -206,6 +223,7 @@ class FrameTracker:
         times = np.array([frame.time_ns for frame in frames], np.int64)
         seen = Observations.empty(self.estimator.skeleton, times)
         seen.has_depth[:] = [has_readings(depth) for depth in depths]
+        seen.repeats[:] = [frame.repeats for frame in frames]
         with threads(
             len(frames) > 1
         ):  # kernels share frames out: of one, the other cores would only wait
@@ -215,6 +233,8 @@ class FrameTracker:
                 self._put(seen, h, estimates, depths) for h, estimates in enumerate(hypotheses)
             ]
             self._put_agreement(seen, hypotheses, poses, cleared)
+        if self.noisy:
+            seen.forget(seen.repeats)
         return seen
 
     def follow(self, frames: Sequence[DepthFrame]) -> Track:

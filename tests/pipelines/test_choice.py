@@ -6,12 +6,14 @@ from __future__ import annotations
 
 import gc
 from dataclasses import dataclass, replace
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 from liex_lab.pipelines import choice
+from liex_lab.pipelines.build import animal_of
 from liex_lab.pipelines.choice import Look, best, fit_plan, misfits_of
 
 from liex_lab.errors import EstimationError, MisfitError
@@ -222,3 +224,34 @@ def test_a_slim_mouse_beside_a_stout_one_of_its_length_is_counted() -> None:
     fit = choice.look(recording, "mouse").fit
     assert fit is not None
     assert fit.n_animals == 2
+
+
+@pytest.mark.parametrize(("name", "length_mm"), [("rat", 170.0), ("gecko", 62.0), ("pup", 24.0)])
+def test_an_own_animal_has_its_name_and_its_limits_from_its_skeleton(
+    name: str, length_mm: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    toml = tmp_path / f"{name}.toml"
+    toml.write_text(
+        f'name = "{name}"\n[[joints]]\nname = "rump"\n[[joints]]\nname = "nose"\nparent = "rump"\n'
+        f"offset_mm = [{length_mm}, 0.0, 0.0]\n"
+    )
+    plan = Plan.from_table({"animal": {"skeleton": str(toml)}})
+    for same in (plan, plan.with_settings(["seed=3"]), Plan.from_toml(plan.to_toml())):
+        animal = animal_of(same)
+        assert animal.name == name
+        limits = (animal.spine_min_mm, animal.spine_max_mm)
+        assert limits == pytest.approx((0.6 * length_mm, 1.8 * length_mm))
+    stated = plan.with_settings(["animal.spine_max_mm=500", "animal.name=Rex"])
+    assert (animal_of(stated).spine_max_mm, animal_of(stated).name) == (500.0, "Rex")
+    assert not misfits_of(replace(GOOD, spine_mm=0.9 * length_mm), plan)
+    far = replace(GOOD, spine_mm=3.0 * length_mm)
+    assert misfits_of(far, plan)
+    monkeypatch.setattr(choice, "look", lambda _, one: Look(str(one), None, ("no",)))
+    monkeypatch.setattr(choice, "build_tracker", lambda *_: Pretended(far, None))
+    with pytest.raises(MisfitError, match=f"does not fit the plan of the {name}"):
+        fit_plan(RECORDING, plan)
+
+
+@pytest.mark.parametrize("name", ["mouse", "fish", "hand"])
+def test_the_animal_of_a_bundled_plan_is_what_the_plan_says(name: str) -> None:
+    assert animal_of(Plan.load(name)) == Plan.load(name).animal

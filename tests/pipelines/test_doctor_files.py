@@ -134,6 +134,32 @@ def test_doctor_proposes_the_plan_and_says_what_to_run_next(
     assert next_command("a.mcap", Proposal(None, ""), []) == ""
 
 
+def test_the_next_command_keeps_the_plan_and_the_options_that_were_given(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    fits = {"mouse": Look("mouse", GOOD), "fish": Look("fish", None, ("no fish",))}
+    fits["hand"] = Look("hand", None, ("no hand",))
+    monkeypatch.setattr(
+        choice, "look", lambda _, plan: fits[plan if isinstance(plan, str) else plan.animal.name]
+    )
+    typed = ("my plans/plan.toml", ["--topic", "/depth", "--set", "recording.fps=30.0"])
+    right = propose_plan(RECORDING, Plan.load("mouse"))
+    assert next_command("a.mcap", right, [], 0, *typed) == (
+        "liex run a.mcap --plan 'my plans/plan.toml' --topic /depth --set recording.fps=30.0"
+    )
+    assert next_command("a.mcap", right, [], 0, "mouse") == "liex run a.mcap --plan mouse"
+    assert next_command("a.mcap", right, ["x"], 0, *typed) == (
+        "write what is missing, then liex doctor a.mcap --plan 'my plans/plan.toml' --topic /depth "
+        "--set recording.fps=30.0"
+    )
+    wrong = propose_plan(RECORDING, Plan.load("fish"))
+    assert "say --plan mouse" in wrong.problems[0]
+    assert next_command("a.mcap", wrong, [], 0, "fish") == "liex run a.mcap --plan mouse"
+    fits["mouse"] = Look("mouse", None, ("no mouse",))
+    none = propose_plan(RECORDING, Plan.load("fish"))
+    assert next_command("a.mcap", none, [], 0, "fish").startswith("liex doctor a.mcap --plan fish")
+
+
 DEPTH = (
     "hand_kinect2",
     "depth_files/primesense_pcl",

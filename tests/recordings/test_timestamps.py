@@ -26,6 +26,7 @@ from liex_lab.recordings.timestamps import (
     start_of_clock,
     start_of_day,
 )
+from liex_lab.tables import rows
 from tests.recordings.writers import depth_frames, write_png_folder
 
 stamps = st.lists(st.integers(-20, 20), min_size=1, max_size=9)
@@ -355,3 +356,50 @@ def test_a_clock_that_often_stands_still_is_doubted() -> None:
     assert "20 of 40 time stamps are repeated" in clock_doubts(33_000_000, moved.faults)[0]
     few = make_monotone(np.r_[0:30, 29].astype(np.int64) * 33_000_000)
     assert clock_doubts(33_000_000, few.faults) == ()
+
+
+UNITS = {1_000_000: (10.0, 700.0), 10_000_000: (10.0, 45.0), 15_625_000: (10.0, 35.0)}
+
+
+@given(st.data())
+def test_rounded_stamps_give_the_true_rate_and_every_gap(data: st.DataObject) -> None:
+    """Whole milliseconds, ticks of 10 ms and of Windows' clock; gaps of 1 to 100 frames."""
+    unit, (low, high) = data.draw(st.sampled_from([*UNITS.items()]))
+    hz = data.draw(st.floats(low, high) | st.sampled_from([30.0, 15.0, 29.97]))
+    n = data.draw(st.integers(300, 600))
+    gaps = data.draw(
+        st.dictionaries(st.integers(1, (n - 5) // 25), st.integers(1, 100), max_size=5)
+    )
+    lost = np.zeros(n, np.int64)
+    for k, n_lost in gaps.items():
+        lost[25 * k :] += n_lost
+    true_ns = (np.arange(n) + lost) * 1e9 / hz + data.draw(st.integers(0, 10**9))
+    times = np.round(true_ns / unit).astype(np.int64) * unit
+    step = median_step(times)
+    assert 1e9 / step == pytest.approx(hz, rel=1e-3)
+    found = {gap.start_frame // 25: gap.n_frames_missing for gap in find_gaps(times, step)}
+    assert found == gaps
+    seconds = (times - times[0]) * 1e-9
+    assert rows.median_step(seconds) == pytest.approx(step * 1e-9)
+    assert np.flatnonzero(rows.gap_follows(seconds)[:-1]).tolist() == [
+        25 * k - 1 for k in sorted(gaps)
+    ]
+
+
+@given(
+    st.sampled_from([33_333_333, 40_000_000, 16_666_667, 10_000_000, 20_000_000, 100_000_000]),
+    st.lists(st.integers(1, 9), min_size=3, max_size=60),
+)
+def test_the_step_of_exact_stamps_is_their_median_as_before(step: int, apart: list[int]) -> None:
+    times = np.append(0, np.cumsum(apart)) * step
+    if np.median(apart) == 1:
+        assert median_step(times) == step
+        missing = [gap.n_frames_missing for gap in find_gaps(times, step)]
+        assert missing == [one - 1 for one in apart if one > 1]
+
+
+def test_stamps_of_a_clock_that_cannot_be_told_keep_their_median_step() -> None:
+    bursts = np.cumsum(np.tile([100_000, 100_000, 100_000, 133_033_333], 30))
+    assert median_step(bursts) == 100_000, "which is doubted"
+    wild = np.cumsum(np.random.default_rng(3).integers(1, 10**8, 400))
+    assert median_step(wild) == int(np.median(np.diff(wild)))

@@ -68,12 +68,9 @@ def test_its_accuracy_is_measured_on_rendered_snakes(model, monkeypatch):
     assert result["median_joint_error_mm"] < 30.0  # of 240; a model from 1,024 pictures
 
 
-def test_a_plan_of_three_lines_turns_a_recording_into_a_session(model, tmp_path):
+def test_the_plan_of_the_tutorial_turns_a_recording_into_a_session(model, tmp_path):
     plan = tmp_path / "plan.toml"
-    plan.write_text(
-        f'[animal]\nname = "snake"\nskeleton = "{SNAKE}"\nspine_min_mm = 150.0\nspine_max_mm = '
-        f'400.0\n[estimation]\nmodel = "{model}"\n'
-    )
+    plan.write_text(f'[animal]\nskeleton = "{SNAKE}"\n\n[estimation]\nmodel = "{model}"\n')
     recording = open_recording(f"synthetic:move?animal={SNAKE}&seed=2&frames=40&spine_mm=250")
     session = Session.open(run_session(recording, Plan.load(plan), tmp_path))
     joints = session.poses.pivot(index="frame_index", columns="joint", values="x_mm")

@@ -20,6 +20,7 @@ from liex_lab.recordings.camera_file import CAMERA_FILE, WHAT_TO_WRITE, CameraFi
 from liex_lab.recordings.depth_units import COLOUR, Stored
 from liex_lab.recordings.formats.images.stack import Stack
 from liex_lab.recordings.frame import Depth
+from liex_lab.recordings.infrared import is_infrared, refuse_infrared
 from liex_lab.recordings.recording import Recording
 from liex_lab.recordings.timestamp_files import name_times, read_csv_times
 from liex_lab.recordings.timestamps import (
@@ -101,6 +102,8 @@ def list_pictures(folder: Path, pattern: str = "*") -> tuple[str, list[Path]]:
         if fnmatch(path.name, pattern) and not path.name.endswith(_COLOUR_PCLZF)
     ]
     kinds = {kind: [p for p in chosen if p.suffix.lower() in ends] for kind, ends in KINDS.items()}
+    for kind, files in kinds.items():
+        kinds[kind] = [path for path in files if not is_infrared(path.stem)] or files
     found = [kind for kind, files in kinds.items() if files]
     if len(found) > 1:
         one = f"*{kinds[found[0]][0].suffix}"
@@ -167,6 +170,7 @@ def open_images(
         if path.is_dir()
         else (_kind(path), [path])
     )
+    refuse_infrared(path, f"{path.name if path.is_dir() else ''}/{files[0].stem}")
     if kind == "PCLZF":
         camera_toml = _with_xml(camera_toml, files[0])
     stack = open_stack(kind, files, camera_toml, progress)
@@ -359,11 +363,11 @@ def _say_cut(stack: Stack) -> list[str]:
 def _refuse_negative(
     stack: Stack, decode: Callable[[Stored], Depth], camera_file: CameraFile
 ) -> None:
-    """Float pictures may count away from the camera with a minus sign; nothing would be left of
-    them unread.
+    """Floats and signed integers may count away from the camera with a minus sign; all of them
+    would be unread.
     """
     stored = stack.read(stack.whole.index(True))
-    if stored is None or stored.dtype.kind != "f" or decode(stored).any():
+    if stored is None or stored.dtype.kind not in "fi" or decode(stored).any():
         return
     read = stored[np.isfinite(stored) & (stored != 0)] * camera_file.unit_mm
     if read.size and np.median(read) < 0:

@@ -1,4 +1,4 @@
-"""TIFF pictures, 16-bit or float32 grey, one to a file or many, BigTIFF and ImageJ stacks included.
+"""TIFF pictures, 16-bit or float32 grey, one to a file or many, BigTIFF and ImageJ included.
 
 Uncompressed pixels in one piece are read straight from their offset; other pages go through
 tifffile, and codecs that it leaves to another package (LZW) through OpenCV. A stack ends at its
@@ -38,6 +38,8 @@ _UNPACKERS = (8, 32946, 50013, *_LZMA)  # codes of compression: DEFLATE, LZMA
 logging.getLogger("tifffile").addHandler(logging.NullHandler())
 
 _LEAST_DIRECTORY = 30  # bytes: one that describes a picture has more
+_DEPTHS = ("u2", "i2", "f4")  # of pixels that hold depth
+_KINDS = {"u": "unsigned integer ", "i": "signed integer ", "f": "floating-point "}
 _SIGNATURES = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 
 
@@ -98,7 +100,7 @@ class TiffStack:
             index: number of the picture.
 
         Returns:
-            (H, W) uint16 or float32; None where the picture is cut or damaged.
+            (H, W) uint16, int16 or float32; None where the picture is cut or damaged.
         """
         page = self.pages[index]
         if not page.whole:
@@ -302,11 +304,13 @@ def _describe(path: Path, index: int, page: Any, size_bytes: int) -> _Page:
     dtype = np.dtype(page.dtype or "V1")
     if (
         page.samplesperpixel != 1
-        or dtype.kind + str(dtype.itemsize) not in ("u2", "f4")
+        or dtype.kind + str(dtype.itemsize) not in _DEPTHS
         or not (width and height)
     ):
         colour = "grey" if page.samplesperpixel == 1 else "colour"
-        raise not_depth_error(str(path), f"{page.bitspersample}-bit {colour}", width, height)
+        kind = "" if dtype == np.uint8 else _KINDS.get(dtype.kind, "")
+        found = f"{page.bitspersample}-bit {kind}{colour}"
+        raise not_depth_error(str(path), found, width, height)
     ends = [
         offset + count for offset, count in zip(page.dataoffsets, page.databytecounts, strict=True)
     ]

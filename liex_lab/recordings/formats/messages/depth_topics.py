@@ -9,7 +9,6 @@ pictures have none.
 from __future__ import annotations
 
 import math
-import re
 import struct
 from array import array
 from collections.abc import Sequence
@@ -45,12 +44,12 @@ from liex_lab.recordings.formats.messages.messages import (
 from liex_lab.recordings.formats.messages.pack_facts import PackFacts
 from liex_lab.recordings.formats.messages.parsers import parser_of, plain_schema
 from liex_lab.recordings.frame import Depth
+from liex_lab.recordings.infrared import is_infrared
 from liex_lab.recordings.recording import Recording
 from liex_lab.recordings.timestamps import make_monotone, start_of_clock
 from liex_lab.runtime.progress import Progress
 
 # 16-bit pictures too, but of brightness: not chosen unless asked for
-_INFRARED = re.compile(r"(^|[/_])(ir|infra\d*|infrared\w*)([/_]|$)", re.IGNORECASE)
 _EXPECTED = (
     "expected foxglove.RawImage or CompressedImage, or sensor_msgs Image or CompressedImage, with "
     "the encoding 16UC1, mono16 or 32FC1 or as 16-bit PNG, or a point cloud"
@@ -380,7 +379,7 @@ def _choose(file: MessageFile, found: _Found, topic: str | None) -> _Topic:
         offer = f"the depth topics are {names}" if names else "there is no depth topic in it"
         raise RecordingError(f"{path} has no depth pictures on the topic {topic!r}; {offer}")
     pictures = [depth for depth in depths if plain_schema(depth.channel) not in CLOUD_SCHEMAS]
-    visible = [depth for depth in pictures if not _INFRARED.search(depth.name)]
+    visible = [depth for depth in pictures if not is_infrared(depth.name)]
     for some in (visible, pictures, depths):
         if len(some) == 1:
             return some[0]

@@ -34,6 +34,7 @@ from liex_lab.recordings.formats.moseq.metadata import (
     read_stamps,
 )
 from liex_lab.recordings.formats.video.index import DepthTrack
+from liex_lab.recordings.infrared import refuse_infrared
 from liex_lab.recordings.recording import Recording
 from liex_lab.recordings.timestamps import (
     Times,
@@ -169,6 +170,8 @@ def open_moseq(
         RecordingError: there is no whole frame, or the camera is not known.
     """
     names = (*STAMPS, METADATA, CAMERA_FILE)
+    if path.suffix.lower() == ".dat":
+        refuse_infrared(path, path.stem)
     if path.is_dir() or path.suffix.lower() in (".dat", ".avi", ".mkv"):
         folder = path if path.is_dir() else path.parent
         depth = (

@@ -12,6 +12,7 @@ from typing import IO, NamedTuple
 
 from liex_lab.errors import RecordingError
 from liex_lab.recordings.formats.video.index import DepthTrack, even_times
+from liex_lab.recordings.infrared import is_infrared
 from liex_lab.runtime.progress import Progress
 
 _CHUNK = struct.Struct("<4sI")  # name, length of what follows
@@ -65,12 +66,17 @@ def index_avi(path: Path, progress: Progress) -> DepthTrack:
                 kind, *_, a, b, _, n = _STREAM.unpack(_read(file, chunk)[: _STREAM.size])
                 kinds.append(kind)
                 if kind == b"vids" and not number:
+                    track.title = ""
                     number = b"%02d" % (len(kinds) - 1)
                     scale = a
                     rate = b
                     n_stated = n
             elif chunk.name == b"strf" and kinds and number == b"%02d" % (len(kinds) - 1):
                 track.take_bitmap_header(_read(file, chunk))
+            elif chunk.name == b"strn" and kinds and number == b"%02d" % (len(kinds) - 1):
+                track.title = _read(file, chunk).decode("utf-8", "replace").rstrip("\0")
+                if is_infrared(track.title):  # the next stream may be depth
+                    number = b""
             elif number and chunk.name in (number + b"dc", number + b"db"):
                 if chunk.size:  # an empty chunk stands for a picture that was dropped
                     track.offsets.append(chunk.start)

@@ -34,6 +34,7 @@ class DepthTrack:
         times_ns: (n,) their times, ns.
         even: True where the times are steps of a constant rate, for the container knows no others.
         whole: True where the file ends where it should and holds as many pictures as it says.
+        title: title of the track.
         tags: tags of the whole file and of the track.
         attachments: bytes of attached files by name.
         session_start: ISO 8601 where the file states it.
@@ -48,6 +49,7 @@ class DepthTrack:
     times_ns: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
     even: bool = False
     whole: bool = True
+    title: str = ""
     tags: dict[str, str] = field(default_factory=dict)
     attachments: dict[str, bytes] = field(default_factory=dict)
     session_start: str | None = None

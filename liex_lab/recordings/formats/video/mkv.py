@@ -20,6 +20,7 @@ import numpy as np
 
 from liex_lab.errors import RecordingError
 from liex_lab.recordings.formats.video.index import FFV1, RAW, DepthTrack
+from liex_lab.recordings.infrared import is_infrared
 from liex_lab.recordings.timestamps import LIMIT_NS
 from liex_lab.runtime.progress import Progress
 
@@ -222,15 +223,20 @@ class _Walk:
             path: the file, for the sentence.
 
         Returns:
-            The track titled or tagged DEPTH, else the first of 16-bit grey pictures, else the first
-            video.
+            The track titled or tagged DEPTH, else the first of 16-bit grey pictures that is not
+            titled as infrared, else the first of them or the first video.
+
+        Raises:
+            RecordingError: there is no video track.
         """
         videos = [track for track in self.tracks if track.is_video]
         tagged = {uid for uid, name in self.tags if name == "K4A_DEPTH_TRACK"}
         titled = [track for track in videos if track.name.upper() == "DEPTH" or track.uid in tagged]
         grey = [track for track in videos if track.depth.codec == FFV1 or track.depth.codec in RAW]
-        for some in (titled, grey, videos):
+        visible = [track for track in grey if not is_infrared(track.name)]
+        for some in (titled, visible, grey, videos):
             if some:
+                some[0].depth.title = "DEPTH" if titled else some[0].name
                 return some[0]
         raise RecordingError(
             f"{path} holds no video track, or is cut short before it is named; give a recording "

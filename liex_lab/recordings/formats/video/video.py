@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from liex_lab.errors import RecordingError
 from liex_lab.recordings.formats.images.stack import too_large
 from liex_lab.recordings.formats.video.index import FFV1, RAW, DepthTrack
+from liex_lab.recordings.infrared import refuse_infrared
 from liex_lab.runtime.progress import Progress
 
 if TYPE_CHECKING:
@@ -159,6 +160,7 @@ def open_video(path: Path, progress: Progress) -> DepthVideo:
         from liex_lab.recordings.formats.video.avi import index_avi
 
         track = index_avi(path, progress)
+    refuse_infrared(path, track.title or path.stem)
     if track.codec != FFV1 and track.codec not in RAW:
         named = f"is packed with {track.codec!r}" if track.codec else "has no video in it"
         raise RecordingError(

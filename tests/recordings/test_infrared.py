@@ -1,0 +1,155 @@
+"""Infrared looks like depth to a reader of 16-bit images: no container lets it pass for depth."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from fractions import Fraction
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+
+from liex_lab.recordings import open_recording
+from liex_lab.recordings.infrared import is_infrared
+from tests.recordings.asking import refusal
+from tests.recordings.video_writers import write_avi, write_mkv
+from tests.recordings.writers import SMALL, depth_frames, even_times, write_png_folder
+
+STORED = depth_frames(6)
+
+
+def write_titled_avi(path: Path, titles: tuple[str, ...]) -> Path:
+    """AVI with a stream for each title; all but the one called DEPTH hold half its values."""
+    with av.open(str(path), "w") as container:
+        streams = [container.add_stream("ffv1", rate=30) for _ in titles]
+        for title, stream in zip(titles, streams, strict=True):
+            stream.width, stream.height = STORED.shape[2], STORED.shape[1]
+            stream.pix_fmt, stream.time_base = "gray16le", Fraction(1, 30)
+            stream.metadata["title"] = title
+        for k, stored in enumerate(STORED):
+            for title, stream in zip(titles, streams, strict=True):
+                values = stored if title == "DEPTH" else stored // 2
+                frame = av.VideoFrame.from_ndarray(values, format="gray16le")
+                frame.pts = k
+                container.mux(stream.encode(frame))
+        for stream in streams:
+            container.mux(stream.encode())
+    return path
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "ir",
+        "IR",
+        "Infrared",
+        "PASSIVE_IR",
+        "mouse_ir",
+        "ir-2",
+        "infra1",
+        "/camera/ir/image_raw",
+        "IRImage",
+        "m07.InfraRed",
+        "/device_0/sensor_0/Infrared_1/image/data",
+        "passiveIR",
+    ],
+)
+def test_a_word_for_infrared_is_recognised_in_a_name(name: str) -> None:
+    assert is_infrared(name)
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "circle",
+        "mirror",
+        "first",
+        "birdie",
+        "Irene",
+        "iris",
+        "air",
+        "mouse_third",
+        "infrastructure",
+        "depth",
+        "depth_to_ir/image_raw",
+        "/camera/depth/image_rect_raw",
+        "ir_depth",
+        "",
+    ],
+)
+def test_letters_that_are_no_word_for_infrared_do_not_count(name: str) -> None:
+    assert not is_infrared(name)
+
+
+def untitled_mkv(path: Path, stored: np.ndarray) -> Path:
+    return write_mkv(path, 2 * stored, titles=("",))  # the writer halves what is not DEPTH
+
+
+@pytest.mark.parametrize("write", [write_avi, untitled_mkv])
+@pytest.mark.parametrize("name", ["ir", "infrared", "mouse_IR"])
+def test_a_video_called_infrared_is_refused_also_alone_in_a_folder(
+    tmp_path: Path, name: str, write: Callable[..., Path]
+) -> None:
+    suffix = ".avi" if write is write_avi else ".mkv"
+    path = write(tmp_path / "session" / f"{name}{suffix}", STORED)
+    for given in (path, path.parent):
+        assert "holds infrared" in refusal(given, camera=SMALL)
+    for other in ("circle", "first", "birdie"):
+        path = path.rename(path.with_stem(other))
+        with open_recording(path, camera=SMALL) as recording:
+            np.testing.assert_array_equal(recording.frame(2).depth, STORED[2])
+
+
+@pytest.mark.parametrize("title", ["IR", "INFRARED", "PASSIVE_IR", "Infrared 1"])
+def test_a_track_titled_infrared_is_no_depth(tmp_path: Path, title: str) -> None:
+    for path in (
+        write_mkv(tmp_path / "a.mkv", STORED, titles=(title,)),
+        write_titled_avi(tmp_path / "a.avi", (title,)),
+    ):
+        assert "infrared" in refusal(path, camera=SMALL)
+
+
+@pytest.mark.parametrize("titles", [("IR", "DEPTH"), ("DEPTH", "IR"), ("INFRARED", "DEPTH")])
+def test_depth_is_taken_wherever_it_stands(tmp_path: Path, titles: tuple[str, ...]) -> None:
+    for path in (
+        write_mkv(tmp_path / "mouse_ir.mkv", STORED, titles=titles),
+        write_titled_avi(tmp_path / "mouse.avi", titles),
+    ):
+        with open_recording(path, camera=SMALL) as recording:
+            np.testing.assert_array_equal(recording.frame(2).depth, STORED[2])
+
+
+def test_of_untitled_tracks_the_first_is_taken_as_the_azure_recorder_writes_them(
+    tmp_path: Path,
+) -> None:
+    path = write_mkv(tmp_path / "a.mkv", 2 * STORED, titles=("", ""))
+    with open_recording(path, camera=SMALL) as recording:
+        np.testing.assert_array_equal(recording.frame(2).depth, STORED[2])
+
+
+def test_a_folder_of_infrared_images_is_refused_and_depth_beside_infrared_is_read(
+    tmp_path: Path,
+) -> None:
+    times = even_times(len(STORED))
+    for name in ("ir", "Infrared", "m07_IR"):
+        folder = write_png_folder(tmp_path / name, STORED, SMALL, times)
+        assert "holds infrared" in refusal(folder)
+    for name in ("circle", "mirror"):
+        with open_recording(write_png_folder(tmp_path / name, STORED, SMALL, times)) as recording:
+            assert len(recording) == len(STORED)
+    both = write_png_folder(tmp_path / "both", STORED, SMALL, times)
+    for k, picture in enumerate(sorted(both.glob("*.png"))):
+        picture.with_name(f"ir_{k:04d}.png").write_bytes(picture.read_bytes())
+    with open_recording(both) as recording:
+        assert len(recording) == len(STORED)
+    for picture in both.glob("*.png"):
+        if not picture.name.startswith("ir"):
+            picture.unlink()
+    assert "holds infrared" in refusal(both)
+
+
+def test_a_raw_file_called_infrared_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "ir.dat"
+    path.write_bytes(STORED.astype("<u2").tobytes())
+    assert "holds infrared" in refusal(path, camera=SMALL)
