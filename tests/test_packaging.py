@@ -119,6 +119,7 @@ def python_in_the_clone(*arguments: str, clone: Path = REPOSITORY) -> str:
     return ran.stdout
 
 
+@pytest.mark.slow
 def test_the_readmes_snippet_runs_in_the_folder_of_the_clone(tmp_path: Path) -> None:
     text = (REPOSITORY / "README.md").read_text(encoding="utf-8")
     (snippet,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)

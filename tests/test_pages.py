@@ -182,6 +182,7 @@ def run_python(block: str, folder: Path) -> None:
     assert names <= set(liex_lab.__all__)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("page", WITH_BLOCKS)
 def test_a_page_can_be_followed_as_it_is_printed(page: str, follow: Callable[[str], Path]) -> None:
     follow(page)
