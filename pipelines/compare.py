@@ -119,6 +119,8 @@ def compare_sessions(
             "folder"
         )
     groups = sorted({str(group) for group in table["group"].fillna("")} - {""})
+    if reference is not None:  # however it is spelled
+        reference = next((group for group in groups if same(group) == same(reference)), reference)
     if len(groups) < 2 or (reference is not None and reference not in groups):
         raise SessionError(
             f"a comparison needs two groups{f', one of them {reference!r}' if reference else ''}, "
@@ -133,8 +135,8 @@ def compare_sessions(
     for name, written in (("stats", stats), ("sessions", table)):
         with replacing(target / f"{name}.csv") as part:
             write_csv(written, part)
-    entries = [entry for entry in dictionary(STATS) if entry["table"] == "stats"]
-    write_whole(target / "columns.json", json.dumps(entries, indent=1, ensure_ascii=False) + "\n")
+    columns = [entry for entry in dictionary(STATS) if entry["table"] == "stats"]
+    write_whole(target / "columns.json", json.dumps(columns, indent=1, ensure_ascii=False) + "\n")
     places_of = [_seen_from(target, session.path) for session in sessions.values()]
     document = {"sessions": places_of, "reference": reference, "accounted": told, "check": check}
     write_whole(target / "comparison.json", json.dumps(document, indent=1) + "\n")
@@ -177,13 +179,15 @@ def account(places: Sequence[str | Path]) -> tuple[list[Entry], list[str]]:
         place = study.results if study and place.is_file() else place
         folders += find_sessions([place])
         here = place.resolve()
-        check += misnamed(study.sessions) if study else []
-        for one in study.sessions if study else ():
+        planned = study.sessions if study else ()
+        check += misnamed(planned)
+        for one in planned:
             folder = one.folder.resolve()
             if here in (folder, *folder.parents):
-                several = sum(other.animal.id == one.animal.id for other in study.sessions) > 1
+                several = sum(other.animal.id == one.animal.id for other in planned) > 1
                 found[folder] = _state_of(folder, one.id if several else one.animal.id, one.exclude)
-        folders += [file.parent.resolve() for file in place.rglob(FAILED_FILE)]
+        failed = [file for file in place.rglob(FAILED_FILE) if not _SET_ASIDE.search(str(file))]
+        folders += [file.parent.resolve() for file in failed]
     for folder in folders:
         if folder not in found:
             short = folder.stem if folder.suffix == ".liex" else "/".join(folder.parts[-3:])

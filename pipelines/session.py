@@ -121,8 +121,9 @@ def measure_session(
         folder = folder or inside(Path(out), first.session.name or opened.name, ".liex")
         if told := unwritable_times(opened.times_ns):
             raise RecordingError(f"of {opened.name} {told}")
-        read = isinstance(recording, str | Path) and opened.sources
-        whose = _check_subject(opened, Path(recording), first) if read else []
+        whose: list[str] = []
+        if isinstance(recording, str | Path) and opened.sources:
+            whose = _check_subject(opened, Path(recording), first)
         check_unused(folder, overwrite)
         unnamed = None if plan else settings
         with hashed_ahead(opened, part_folder(folder), progress) as hashed:

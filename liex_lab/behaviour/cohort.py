@@ -364,7 +364,7 @@ def _tested(
     return {"p": permutation(units, rng), "test": f"permutation of {of} ({how})"}
 
 
-def counted_units(row: Mapping[str, Any]) -> str:
+def counted_units(row: Mapping[Any, Any]) -> str:
     """How many units of each group, each number beside its group: 4 drug, 5 vehicle (animals).
 
     Args:
@@ -376,7 +376,7 @@ def counted_units(row: Mapping[str, Any]) -> str:
     return f"{each} ({row['unit']}s)"
 
 
-def result(row: Mapping[str, Any], unit: str) -> str:
+def result(row: Mapping[Any, Any], unit: str) -> str:
     """One comparison as a sentence for a paper: difference, interval, effect size, test, n.
 
     Args:

@@ -30,7 +30,7 @@ _MONTHS = "(?:jan|feb|mar|apr|may|jun|jul|aug|sept?|oct|nov|dec)[a-z]{0,6}"
 _MD = r"(?:0[1-9]|1[0-2])(?:0[1-9]|[12]\d|3[01])"
 _TIME = (
     r"(?:[T_ -]?(?:[01]\d|2[0-3])[-_:.h]?[0-5]\d(?:[-_:.m]?[0-5]\d(?:[.,_]?\d{1,9})?s?)?"
-    r"(?:Z|[+-]\d\d:?\d\d)?)?"
+    r"(?:Z|[+-]\d\d:?\d\d)?(?!-\d\d(?!\d)))?"
 )
 _START, _END = r"(?<![^\W_])", r"(?![^\W_])"  # of a word of letters and digits
 _AFTER = r"(?<=[^\W_][-_. ])"  # another word stands before it

@@ -88,7 +88,7 @@ def test_one_page_of_groups_has_one_unit_for_a_speed() -> None:
     assert (trace["x"][0], trace["error_x"]["array"][0]) == (-4.0, 2.0)
     assert "cm/s" in figure["layout"]["xaxis"]["title"]["text"]
     said = str(verdict(stats.iloc[0].to_dict(), "mm/s"))
-    assert "-4 cm/s, 95 % interval -6 to -2" in said
+    assert "Mean speed was 4 cm/s lower in 1 than in 1 (95 % CI of y - x: -6 to -2 cm/s" in said
     shown_table = tables.Table(stats, tables.STATS, units={"mean_speed_mm_s": "mm/s"})
     heads = list(tables.STATS)
     cells = tables.fill("stats", shown_table, "", {"column": "", "down": False})["rows"][0]

@@ -1,0 +1,55 @@
+"""The animal of a recording is found whatever day, session or date stands beside it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from liex_lab.plan.subject import alike, find_subject, letters, one_animal, references_first, same
+
+ANIMALS = st.sampled_from(["m1", "m01", "mouse3", "A12", "rat7", "c2m3", "F0412", "m250"])
+DAYS = ["day1", "d2", "s1", "ses-01", "ses01", "session2", "rec3", "trial4", "wk2", "test", "t1"]
+DAYS += ["habituation", "baseline", "run2", "visit3", "post", "24h", "openfield", "recording 5"]
+DATES = ["20260821", "2026-08-21", "20260821T101500", "260821", "21.08.2026", "21Aug2026"]
+
+
+@settings(max_examples=200, deadline=None)
+@given(
+    animal=ANIMALS,
+    endings=st.tuples(st.sampled_from(["", *DATES]), st.sampled_from(["", *DAYS])),
+    apart=st.sampled_from("_- "),
+    upper=st.booleans(),
+    depth=st.booleans(),
+)
+def test_an_ending_of_any_kind_in_any_case_leaves_the_animal(animal, endings, apart, upper, depth):
+    name = apart.join([animal, *filter(None, endings), *["depth"] * depth])
+    found = find_subject(
+        Path("/raw") / f"{name.upper() if upper else name}.mcap", root=Path("/raw")
+    )
+    assert found.id.lower() == animal.lower()
+    assert find_subject(Path("/elsewhere") / f"{name}.mcap").id == animal
+
+
+@settings(max_examples=200, deadline=None)
+@given(names=st.lists(st.text(min_size=1, max_size=80), min_size=2, max_size=2))
+def test_letters_and_digits_are_all_that_an_id_holds(names):
+    for name in names:
+        assert letters(name).isascii()
+        assert letters(name).isalnum()
+        assert len(letters(name)) <= 64
+        assert same(same(name)) == same(name)
+
+
+def test_ids_of_different_animals_stay_apart():
+    ids = ["101-2", "10-12", "小白", "小黑", "cre+1", "cre1", "a" * 70, "a" * 70 + "b"]
+    assert len({letters(one) for one in ids}) == len(ids)
+    assert one_animal(["m1", "m01", "m10", "c2m3", "c2m4", "A12", "A12b"]) == []
+    assert alike(["+/+", "+/-", "-/-", "1-12", "11-2"]) == []
+
+
+def test_a_group_named_like_a_control_comes_first():
+    assert references_first(["drug", "vehicle", "high"]) == ["vehicle", "drug", "high"]
+    assert references_first(["ko", "WT"]) == ["WT", "ko"]
+    assert references_first(["b", "a"]) == ["a", "b"]
