@@ -136,7 +136,8 @@ def rounded_step(times_ns: Times) -> int:
         # frames lost by a camera of exact stamps make multiples of its step, too
         rounded = unit <= usual / 2 or unit in _TICKS_NS
     else:
-        rounded = np.mean(np.abs(dt / usual - np.rint(dt / usual)) > _OFF) > _OFTEN
+        off = np.abs(dt / usual - np.rint(dt / usual)) > _OFF
+        rounded = bool(off.mean() > _OFTEN)
     if not rounded:
         return 0
     step = first = float(dt[dt <= _RARELY * usual].mean())

@@ -106,9 +106,11 @@ def test_images_written_twice_count_once_and_nothing_else_changes(
 ) -> None:
     depths = np.delete(pictures, 28, axis=0)[:30]
     times = START_NS + FRAME_NS * np.arange(len(depths))
-    once = write_png_folder(tmp_path / "once", depths, mouse.camera, times)
+    once = write_png_folder(tmp_path / "once", depths, mouse.camera, times.tolist())
     polled = np.sort(np.concatenate([times, times + FRAME_NS // 2]))
-    twice = write_png_folder(tmp_path / "twice", np.repeat(depths, 2, 0), mouse.camera, polled)
+    twice = write_png_folder(
+        tmp_path / "twice", np.repeat(depths, 2, 0), mouse.camera, polled.tolist()
+    )
     right, found = (
         Session.open(run_session(one, Plan.load("mouse"), tmp_path)) for one in (once, twice)
     )
