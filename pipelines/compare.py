@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 from liex_lab.errors import SessionError
 from liex_lab.runtime.durable import replacing, write_whole
 from liex_lab.runtime.progress import Progress, silent
+from liex_lab.runtime.spreadsheets import read_texts
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -139,11 +140,9 @@ def find_sessions(places: Sequence[str | Path]) -> list[Path]:
 
 def _overruled(table: pd.DataFrame, path: Path) -> pd.DataFrame:
     """The table with group, cage, sex and batch as a CSV of the animals states them."""
-    import pandas as pd
-
     try:
-        stated = pd.read_csv(path, dtype=str, keep_default_na=False)
-    except (OSError, UnicodeDecodeError, pd.errors.ParserError, pd.errors.EmptyDataError) as error:
+        stated = read_texts(path)
+    except (OSError, ValueError) as error:
         raise SessionError(
             f"{path} should be a CSV with the column subject_id, but: {error}; correct it"
         ) from None
