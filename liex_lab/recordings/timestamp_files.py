@@ -9,12 +9,13 @@ digits of ms, µs or ns since 1970.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from decimal import Decimal
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,82 +56,76 @@ _CLOCKS = (  # nanoseconds in a step, the step of 1970, and what that is called
     (100, 621_355_968 * 10**9, "steps of 100 ns since the year 1, as .NET counts"),
 )
 _HOUR_NS = 3600 * 10**9
-_BLANK = re.compile(r"(\d{4}-\d\d-\d\d) +(?=\d\d:)")  # between date and time
-_WHOLE_PART = re.compile(r"[-+]?\d+|.*\d\d:\d\d:\d\d")
-_FRACTION = re.compile(r"(\d+)(Z|[+-]\d\d:?\d\d)?")
-_GROUPED = re.compile(r"([-+]?[1-9]\d{0,2})[.,](\d{3})")  # a number, or thousands
+_BLANK = re.compile(r"(?<=\d{4}-\d\d-\d\d) +(?=\d\d:)")  # between date and time
+_TIME_OF_DAY = re.compile(r"(\d\d:\d\d:\d\d),(?=\d{3})")  # whose comma is a decimal sign
+_GROUPED = re.compile(r"^([-+]?[1-9]\d{0,2})[.,](\d{3})$")  # a number, or thousands
 
 
 @dataclass(frozen=True)
 class Stamps:
-    """A table of time stamps.
+    """A table of time stamps: the column that was chosen for the times, and its other columns.
 
     Attributes:
         path: the file.
-        times_ns: (n,) int64 stamps, ns, in file order; None where the table states no time.
-        counts: (n,) frames behind the first, where the column chosen for the times counts frames.
-        columns: cells of the other columns, (n,) each.
-        zoned: False where stamps are dates without a time zone.
+        k: number of the column, from 0.
+        cells: line and text of its stamps.
+        read: what reads such a text.
+        values: (n,) plain numbers, or nanoseconds of dates and of hh:mm:ss.
+        counts: (n,) frames behind the first, where the numbers rise by one as a counter does.
+        rows: line and cells of the rows.
+        ns_per_unit: nanoseconds in the unit of plain numbers.
+        named: whether the table or camera.toml states that these are times.
     """
 
     path: Path
-    times_ns: Times | None
+    k: int
+    cells: list[tuple[int, str]]
+    read: Callable[[str], Decimal]
+    values: list[Decimal]
     counts: Times | None
-    columns: tuple[list[str], ...] = ()
-    zoned: bool = True
+    rows: list[tuple[int, list[str]]]
+    ns_per_unit: int = 1
+    named: bool = False
+
+    @staticmethod
+    def of(path: Path, rows: list[tuple[int, list[str]]], k: int) -> Stamps:
+        """The column k of a table.
+
+        Args:
+            path: the file.
+            rows: lines and cells.
+            k: number of the column, from 0.
+
+        Raises:
+            RecordingError: a cell is no stamp of the first one's kind.
+        """
+        cells = [(line, row[k] if k < len(row) else "") for line, row in rows]
+        read = (_reader(cells[0][1]) if cells else None) or number
+        try:
+            values = [read(text) for _, text in cells]
+        except ValueError:
+            raise _no_stamp(
+                path, *next(cell for cell in cells if not _reads(read, cell[1]))
+            ) from None
+        whole = read is number and all(abs(v) < LIMIT_NS and v == int(v) for v in values)
+        counts = frame_counts(np.array([int(v) for v in values], np.int64), 1) if whole else None
+        return Stamps(path, k, cells, read, values, counts, rows)
 
     def __len__(self) -> int:
         """The number of rows."""
-        known = self.counts if self.times_ns is None else self.times_ns
-        return 0 if known is None else len(known)
+        return len(self.values)
 
-    def rows_of(
-        self,
-        folder: str,
-        names: Sequence[str],
-        numbers: Times | None,
-        problems: list[str],
-        doubts: list[str],
-    ) -> NDArray[np.int64]:
-        """The row of each depth image: by the name beside the stamp, or by its number, or in order.
+    @property
+    def zoned(self) -> bool:
+        """Whether the stamps are moments, as far as they are dates."""
+        return self.read is not _moment_ns or all(
+            read_moment(text)[0].tzinfo is not None for _, text in self.cells
+        )
 
-        Args:
-            folder: name of the images' folder, for sentences.
-            names: of the images' files, in order.
-            numbers: (m,) the number of each image; None where they are not numbered.
-            problems: sentences, appended to.
-            doubts: reasons not to rely on the rows, appended to.
-
-        Returns:
-            (m,) rows; -1 for an image without one.
-        """
-        n = len(numbers) if numbers is not None else len(names)
-        stems = [_stem(name) for name in names]
-        found, sure, best = np.where(np.arange(n) < len(self), np.arange(n), -1), False, -1
-        for cells in self.columns:
-            rows = _places(stems, [_stem(cell) for cell in cells])
-            if (hits := int((rows >= 0).sum())) > max(best, len(rows) // 2):
-                found, sure, best = rows, True, hits
-            counts = name_numbers(cells)
-            if numbers is None or counts is None or frame_counts(counts) is None:
-                continue
-            rows = _places(numbers.tolist(), counts.tolist())
-            if (rows < 0).any():  # one of the two may begin at 1
-                moved = _places((numbers - numbers[0] + counts[0]).tolist(), counts.tolist())
-                rows = rows if (moved < 0).any() else moved
-            hits = int((rows >= 0).sum())
-            renumbered = n == len(self) and numbers[-1] - numbers[0] == n - 1
-            if hits > best and (hits == n or not renumbered):
-                found, sure, best = rows, hits in (n, len(self)), hits
-        if best < 0 and n != len(self):
-            problems.append(match_counts(n, np.arange(len(self)), folder, self.path.name)[1] or "")
-            doubts.append(unpaired(folder, self.path.name))
-        elif best >= 0 and best < max(n, len(self)):
-            (problems if sure else doubts).append(
-                f"{n - best} of {n} depth images have no row in {self.path.name} and are left out, "
-                f"and {len(self) - best} of its {len(self)} rows have no image"
-            )
-        return found
+    @property
+    def steps(self) -> NDArray[np.float64]:
+        """(n - 1,) from each value to the next."""
+        return np.diff(np.array(self.values, np.float64))
 
     def times(
         self, hz: float | None, problems: list[str], doubts: list[str], usual_hz: float | None
@@ -143,27 +138,124 @@ class Stamps:
             doubts: reasons not to rely on the times, appended to.
             usual_hz: what to assume for frame numbers without a rate, Hz; None refuses them.
 
+        Returns:
+            (n,) int64 ns, in file order.
+
         Raises:
             UnknownTimesError: there are only frame numbers, and no rate is known.
+            RecordingError: a number is no time.
         """
-        if self.counts is None:
-            return np.array([], np.int64) if self.times_ns is None else self.times_ns
-        counter = f"a column of {self.path.name} counts by one: a frame counter, not times"
-        advice = "state fps = 30.0 (your rate) in camera.toml, or name the column of times with"
-        if hz is not None:
-            problems.append(f"{counter}; it was taken to count frames at {hz:g} frames/s")
-        elif self.times_ns is None and usual_hz is None:
-            raise UnknownTimesError(f"{counter}; {advice} time_column and time_unit")
-        else:
-            doubts.append(f"{counter}; {advice} time_column and time_unit")
-        if hz is None and self.times_ns is not None:
-            return self.times_ns
-        return from_rate(self.counts, hz or usual_hz or 1.0)
+        if self.counts is not None:
+            counter = f"a column of {self.path.name} counts by one: a frame counter, not times"
+            advice = (
+                f"{counter}; state fps = 30.0 (your rate) in camera.toml, or name the column of "
+                "times with time_column and time_unit"
+            )
+            if hz is None and usual_hz is None and not self.named:
+                raise UnknownTimesError(advice)
+            (problems if hz else doubts).append(
+                f"{counter}; frames were placed by it at {hz:g} frames/s" if hz else advice
+            )
+            if hz or not self.named:
+                return from_rate(self.counts, hz or usual_hz or 1.0)
+        if self.read is number:
+            return self._numbers(problems)
+        times = np.array([int(value) for value in self.values], np.int64)
+        if self.read is _clock_ns:  # goes on after midnight
+            back = np.diff(times, prepend=times[:1]) < -12 * _HOUR_NS
+            return times + 24 * _HOUR_NS * np.cumsum(back)
+        hours = np.abs(np.abs(np.diff(times)) - _HOUR_NS) < _HOUR_NS // 60
+        if not self.zoned:
+            without = f"the dates in {self.path.name} have no time zone"
+            problems.append(f"{without}, so the start of the recording is not known from them")
+            if hours.any():
+                doubts.append(
+                    f"{without} and jump by an hour at line "
+                    f"{self.cells[int(hours.argmax()) + 1][0]}, as where summer time begins or "
+                    "ends; write them with their zone"
+                )
+        return times
+
+    def _numbers(self, problems: list[str]) -> Times:
+        """Numbers as ns; a unit that is only usual gives way to another that alone is possible."""
+        grouped = [cell for cell in self.cells if _GROUPED.match(cell[1])]
+        if grouped and (self.steps < 0).any():  # as numbers they fall, as thousands they may rise
+            flat = [number(_GROUPED.sub(r"\1\2", text)) for _, text in self.cells]
+            if flat == sorted(flat):
+                raise _no_stamp(self.path, *grouped[0])
+        step = float(np.median(self.steps)) if len(self.steps) else 0.0
+        clock = (self.ns_per_unit, 0, "")
+        if not self.named and step > 0 and not _is_rate(step * self.ns_per_unit):
+            possible = (
+                clock
+                for clock in _CLOCKS
+                if _is_rate(step * clock[0])
+                and _PLAUSIBLE_NS[0] <= (self.values[0] - clock[1]) * clock[0] < _PLAUSIBLE_NS[1]
+            )
+            clock = next(possible, clock)
+            hz = 1e9 / (step * clock[0])
+            problems.append(
+                f"the numbers in {self.path.name} were taken as {clock[2]}, which alone gives a "
+                f"date of our time and the rate of a camera ({hz:.4g} frames/s)"
+                if clock[2]
+                else f"the numbers in {self.path.name} were taken as "
+                f"{'milli' if self.ns_per_unit == UNITS['ms'] else ''}seconds, as MoSeq writes "
+                f"them, which makes {hz:.3g} frames/s; if they have another unit, write "
+                f'time_column = {self.k} and time_unit = "us" (or "s", "ns") into camera.toml'
+            )
+        found = [int(((v - clock[1]) * clock[0]).to_integral_value()) for v in self.values]
+        beyond = [cell for cell, t in zip(self.cells, found, strict=True) if abs(t) >= LIMIT_NS]
+        if beyond:
+            raise _no_stamp(self.path, *beyond[0])
+        return np.array(found, np.int64)
+
+    def rows_of(
+        self,
+        folder: str,
+        names: Sequence[str],
+        numbers: Times,
+        problems: list[str],
+        doubts: list[str],
+    ) -> NDArray[np.int64]:
+        """The row of each depth image: by the name beside the stamp, or by its number, or in order.
+
+        Args:
+            folder: name of the images' folder, for sentences.
+            names: of the images' files, in order.
+            numbers: (m,) the number of each image; all the same where they are not numbered.
+            problems: sentences, appended to.
+            doubts: reasons not to rely on the rows, appended to.
+
+        Returns:
+            (m,) rows; -1 for an image without one.
+        """
+        n = len(numbers)
+        in_order = n == len(self) and numbers[-1] - numbers[0] == n - 1  # perhaps renumbered
+        found, best, sure = np.where(np.arange(n) < len(self), np.arange(n), -1), 0, False
+        for cells in zip(*(row for _, row in self.rows), strict=False):
+            tries = [(_places([_stem(name) for name in names], [_stem(c) for c in cells]), n // 2)]
+            counts = name_numbers(cells)
+            if counts is not None and frame_counts(counts) is not None:
+                moved = numbers - numbers[0] + counts[0]  # one of the two may begin at 1
+                tries.append((_places(numbers, counts), n - 1 if in_order else 0))
+                tries.append((_places(moved, counts), min(n, len(self)) - 1))
+            for rows, least in tries:
+                hits = int((rows >= 0).sum())
+                if hits > max(best, least):
+                    found, best, sure = rows, hits, least > 0 or hits in (n, len(self))
+        if not best and n != len(self):
+            problems.append(match_counts(n, np.arange(len(self)), folder, self.path.name)[1] or "")
+            doubts.append(unpaired(folder, self.path.name))
+        elif best and best < max(n, len(self)):
+            (problems if sure else doubts).append(
+                f"of {n} depth images and {len(self)} rows of {self.path.name}, {best} belong "
+                "together by name or number; the others are left out"
+            )
+        return found
 
 
 def read_stamps(
     path: Path,
-    problems: list[str],
     doubts: list[str],
     column: str | int | None = None,
     unit: str | None = None,
@@ -172,11 +264,10 @@ def read_stamps(
     """Read a table of stamps, with or without a header.
 
     Lines that begin with # are passed over, but for one that names the columns. Stamps are numbers,
-    or dates (ISO 8601), or hh:mm:ss, which continue past midnight.
+    or dates (ISO 8601), or hh:mm:ss.
 
     Args:
         path: the table.
-        problems: sentences, appended to.
         doubts: reasons not to rely on the times, appended to.
         column: name of the column of times, or its number from 0 in a table that may have no
             header; None for one of time_ns, time_us, time_ms and time_s, or else the first column
@@ -189,7 +280,7 @@ def read_stamps(
         RecordingError: there is no such column, its unit is not known, or a cell is no stamp.
     """
     try:
-        separator, lines = split_lines(_BLANK.sub(r"\1T", read_text(path)))
+        separator, lines = split_lines(_TIME_OF_DAY.sub(r"\1.", _BLANK.sub("T", read_text(path))))
         cells = split_cells(lines, separator)
     except ValueError as error:
         raise RecordingError(
@@ -206,141 +297,42 @@ def read_stamps(
         at = -1 if any(map(_reader, probe)) else plain[0]
     header = named[at] if at >= 0 else []
     data = [rows[k] for k in plain if k > at]
-    if separator == ",":
-        data = _with_decimals(path, data, len(header), doubts)
+    if separator == "," and len(header) < 2 and _are_decimals(data):
+        data = [(line, [",".join(row)]) for line, row in data]
     name = next((name for name in wanted if name in header), None)
-    if isinstance(column, int) or (usual_ns and not data):
-        chosen = _Column.of(path, data, column if isinstance(column, int) else 0)
-    elif name is not None:
-        chosen = _Column.of(path, data, header.index(name))
-    elif column is None and (found := _can_be_times(path, data, usual_ns is not None)):
-        chosen = found
+    if isinstance(column, int) or name in header:
+        at = column if isinstance(column, int) else header.index(str(name))
+        found: Stamps | None = Stamps.of(path, data, at)
     else:
+        found = None if column else _can_be_times(path, data, usual_ns is not None)
+    if found is None:
         raise RecordingError(
             f"{path} should begin with a line that names a column {column or 'time_ns or time_s'}, "
             f"but its first line is {_shorten(lines[0]) if lines else 'missing'!r}; "
             + ("correct time_column in camera.toml" if column else "add that header line")
         )
-    others = tuple(
-        [row[k] if k < len(row) else "" for _, row in data]
-        for k in range(len(data[0][1]) if data else 0)
-        if k != chosen.k or chosen.counts is not None
-    )
-    if chosen.read is not number:
-        times, zoned = chosen.moments(path, problems, doubts)
-        return Stamps(path, times, None, others, zoned)
-    if name is None and column is None and chosen.counts is not None:
-        return Stamps(path, None, chosen.counts, others)
+    wide = [row for _, row in data if not header or len(row) > len(header)]
+    for k in range(max(found.k - 1, 0), found.k + 1):
+        behind = [row[k + 1] for row in wide if len(row) > k + 1 and _are_digits(row[k : k + 2])]
+        if separator == "," and len(behind) == len(data) > 0 and not _is_column(behind, header):
+            doubts.append(
+                f"line {data[0][0]} of {path.name} holds {','.join(data[0][1])!r}, where a comma "
+                "may be a decimal sign; it was taken to separate columns: write a decimal point, "
+                "or semicolons between columns"
+            )
+            break
     usual = usual_ns or (1 if isinstance(column, int) else None)
     ns_per_unit = UNITS[unit] if unit else CSV_COLUMNS.get(str(name), usual)
-    if ns_per_unit is None:
+    stated = name is not None or column is not None
+    if ns_per_unit is None and found.read is number and stated:
         raise RecordingError(
             f'the unit of the column {name!r} in {path} is not known; write time_unit = "s", "ms", '
             '"us" or "ns" beside time_column in camera.toml'
         )
-    unnamed = name is None and column is None
-    return Stamps(path, chosen.times(path, ns_per_unit, unnamed, problems), chosen.counts, others)
+    return replace(found, ns_per_unit=ns_per_unit or 1, named=stated)
 
 
-@dataclass(frozen=True)
-class _Column:
-    """A column of stamps of one kind: its place, lines and cells, and what they say.
-
-    Values are plain numbers, or nanoseconds of dates and of hh:mm:ss; counts as in `Stamps`.
-    """
-
-    k: int
-    read: Callable[[str], Decimal]
-    cells: list[tuple[int, str]]
-    values: list[Decimal]
-    counts: Times | None
-
-    @staticmethod
-    def of(path: Path, rows: list[tuple[int, list[str]]], k: int) -> _Column:
-        """The column k of a table, if every cell of it is of the first one's kind."""
-        cells = [(line, row[k] if k < len(row) else "") for line, row in rows]
-        read = (_reader(cells[0][1]) if cells else None) or number
-        values = []
-        for line, text in cells:
-            try:
-                values.append(read(text))
-            except ValueError:
-                raise _no_stamp(path, line, text) from None
-        whole = read is number and all(abs(v) < LIMIT_NS and v == int(v) for v in values)
-        counts = frame_counts(np.array([int(v) for v in values], np.int64), 1) if whole else None
-        return _Column(k, read, cells, values, counts)
-
-    @property
-    def steps(self) -> NDArray[np.float64]:
-        """(n - 1,) from each value to the next."""
-        return np.diff(np.array(self.values, np.float64))
-
-    def times(self, path: Path, ns_per_unit: int, usual: bool, problems: list[str]) -> Times:
-        """Numbers as ns.
-
-        A unit that is only the usual one gives way to another that alone is possible.
-        """
-        flat = [number(_GROUPED.sub(r"\1\2", text)) for _, text in self.cells]
-        if (self.steps < 0).any() and not (np.diff(np.array(flat, np.float64)) < 0).any():
-            raise _no_stamp(path, *next(c for c in self.cells if _GROUPED.match(c[1])))
-        step = float(np.median(self.steps)) if len(self.steps) else 0.0
-        origin = 0
-        if usual and step > 0 and not _is_rate(step * ns_per_unit):
-            first = self.values[0]
-            possible = (
-                clock
-                for clock in _CLOCKS
-                if _is_rate(step * clock[0])
-                and _PLAUSIBLE_NS[0] <= (first - clock[1]) * clock[0] < _PLAUSIBLE_NS[1]
-            )
-            clock = next(possible, None)
-            if clock is None:
-                problems.append(
-                    f"the numbers in {path.name} were taken as "
-                    f"{'milli' if ns_per_unit == UNITS['ms'] else ''}seconds, as MoSeq writes "
-                    f"them, which makes {1e9 / (step * ns_per_unit):.3g} frames/s; if they have "
-                    f'another unit, write time_column = {self.k} and time_unit = "us" (or "s", '
-                    '"ns") into camera.toml'
-                )
-            else:
-                ns_per_unit, origin, words = clock
-                problems.append(
-                    f"the numbers in {path.name} were taken as {words}, which alone gives a date "
-                    f"of today and a camera's rate ({1e9 / (step * ns_per_unit):.4g} frames/s)"
-                )
-        found = [int(((v - origin) * ns_per_unit).to_integral_value()) for v in self.values]
-        for (line, text), t in zip(self.cells, found, strict=True):
-            if abs(t) >= LIMIT_NS:
-                raise _no_stamp(path, line, text)
-        return np.array(found, np.int64)
-
-    def moments(self, path: Path, problems: list[str], doubts: list[str]) -> tuple[Times, bool]:
-        """Dates and times of day as ns, and whether they have a zone; a time of day continues past
-        midnight.
-        """
-        times = np.array([int(v) for v in self.values], np.int64)
-        if self.read is _clock_ns:
-            back = np.diff(times, prepend=times[:1]) < -12 * _HOUR_NS
-            return times + 24 * _HOUR_NS * np.cumsum(back), False
-        zoned = [read_moment(text)[0].tzinfo is not None for _, text in self.cells]
-        if any(zoned) and not all(zoned):
-            raise _no_stamp(path, *self.cells[zoned.index(not zoned[0])])
-        if not any(zoned):
-            problems.append(
-                f"the dates in {path.name} have no time zone, so the start of the recording is "
-                "not known from them"
-            )
-            hours = np.abs(np.abs(np.diff(times)) - _HOUR_NS) < _HOUR_NS // 60
-            if hours.any():
-                doubts.append(
-                    f"the dates in {path.name} have no time zone and jump by an hour at line "
-                    f"{self.cells[int(hours.argmax()) + 1][0]}, as where summer time begins or "
-                    "ends; write them with their zone"
-                )
-        return times, all(zoned)
-
-
-def _can_be_times(path: Path, rows: list[tuple[int, list[str]]], numbers: bool) -> _Column | None:
+def _can_be_times(path: Path, rows: list[tuple[int, list[str]]], numbers: bool) -> Stamps | None:
     """The first column that rises and does not count frames; or else one that counts; or else the
     first of stamps.
 
@@ -349,12 +341,12 @@ def _can_be_times(path: Path, rows: list[tuple[int, list[str]]], numbers: bool) 
         rows: lines and cells.
         numbers: whether numbers whose column has no name can be times.
     """
-    found: list[_Column] = []
+    found: list[Stamps] = []
     for k, cell in enumerate(rows[0][1] if rows else []):
         read = _reader(cell)
         timely = read is not None and (numbers or read is not number)
         try:
-            column = _Column.of(path, rows, k)
+            column = Stamps.of(path, rows, k)
         except RecordingError:
             if timely and not found:
                 raise
@@ -364,16 +356,20 @@ def _can_be_times(path: Path, rows: list[tuple[int, list[str]]], numbers: bool) 
             return column
         if timely or column.counts is not None:
             found.append(column)
-    return next((column for column in found if column.counts is not None), next(iter(found), None))
+    first = Stamps.of(path, rows, 0) if numbers and not found else next(iter(found), None)
+    return next((column for column in found if column.counts is not None), first)
 
 
 def _reader(text: str) -> Callable[[str], Decimal] | None:
     """What reads a stamp that is written like this one; None where it is no stamp."""
-    for read in (number, _moment_ns, _clock_ns):
-        with suppress(ValueError):
-            read(text)
-            return read
-    return None
+    return next((read for read in (number, _moment_ns, _clock_ns) if _reads(read, text)), None)
+
+
+def _reads(read: Callable[[str], Decimal], text: str) -> bool:
+    with suppress(ValueError):
+        read(text)
+        return True
+    return False
 
 
 def _moment_ns(text: str) -> Decimal:
@@ -396,49 +392,29 @@ def _no_stamp(path: Path, line: int, text: str) -> RecordingError:
     )
 
 
-def _with_decimals(
-    path: Path, rows: list[tuple[int, list[str]]], n_named: int, doubts: list[str]
-) -> list[tuple[int, list[str]]]:
-    """Rows split at commas, with those commas undone that are decimal signs.
+def _are_decimals(rows: list[tuple[int, list[str]]]) -> bool:
+    """Whether the only comma in each line is a decimal sign."""
+    behind = [row[1] for _, row in rows if len(row) == 2]
+    digits = behind and all(len(row) <= 2 and _are_digits(row) for _, row in rows)
+    even = len({len(text) for text in behind}) == 1 < len(behind[0]) if behind else False
+    return bool(digits and (even or len(behind) < len(rows)) and not _is_column(behind))
 
-    A comma is one where the digits behind it do not rise as a column would, and are equally many or
-    more than the header names. Where that is not certain, `doubts` says so.
+
+def _are_digits(texts: list[str]) -> bool:
+    return all(text.isascii() and text.isdigit() for text in texts)
+
+
+def _is_column(digits: list[str], header: Sequence[str] = ()) -> bool:
+    """Whether digits behind commas rise, or are the same, or 0 and 1: a column of their own.
+
+    Args:
+        digits: one text a line.
+        header: of a table that has more columns than it names.
     """
-    k = 0
-    while rows and k + 1 < (width := max(len(row) for _, row in rows)):
-        ends = [_FRACTION.fullmatch(row[k + 1] if k + 1 < len(row) else "0") for _, row in rows]
-        digits = [end[1] for end in ends if end is not None]
-        k += 1
-        if (
-            0 < n_named >= width
-            or len(digits) < len(rows)
-            or not all(_WHOLE_PART.fullmatch(row[k - 1]) for _, row in rows)
-        ):
-            continue
-        values = np.array([int(end[-18:]) for end in digits], np.int64)
-        is_column = (
-            bool(np.all(np.diff(values) >= 0))
-            or values.max() < 2
-            or frame_counts(values, 1) is not None
-        )
-        is_fraction = (
-            0 < n_named < width
-            or any(len(row) <= k for _, row in rows)
-            or any(end[0] == "0" < end for end in digits)
-            or (len({len(end) for end in digits}) == 1 < len(digits[0]) and not is_column)
-        )
-        if is_fraction and not is_column:
-            rows = [
-                (line, [*row[: k - 1], ".".join(row[k - 1 : k + 1]), *row[k + 1 :]])
-                for line, row in rows
-            ]
-        elif values.any() and (is_fraction or not is_column):
-            doubts.append(
-                f"line {rows[0][0]} of {path.name} holds {','.join(rows[0][1][k - 1 : k + 1])!r}, "
-                "and the comma may be a decimal sign; it was taken to separate columns: write a "
-                "decimal point, or semicolons between columns"
-            )
-    return rows
+    values = np.array([int(text[-18:]) for text in digits], np.int64)
+    padded = bool(header) or any(text[0] == "0" < text for text in digits)
+    rises = np.all(np.diff(values) >= 0)
+    return bool(not padded and (rises or values.max() < 2 or frame_counts(values, 1) is not None))
 
 
 def name_numbers(names: Sequence[str]) -> Times | None:
@@ -467,8 +443,9 @@ def name_numbers(names: Sequence[str]) -> Times | None:
     return next(iter([*rising, *differ[::-1]]), None)
 
 
-def _places(wanted: Sequence[str | int], keys: Sequence[str | int]) -> NDArray[np.int64]:
+def _places(wanted: Iterable[Any], keys: Iterable[Any]) -> NDArray[np.int64]:
     """Where each of some keys is; -1 where it is not, and everywhere if keys are not unique."""
+    wanted, keys = list(wanted), list(keys)
     places = {key: k for k, key in enumerate(keys)}
     unique = len(places) == len(keys) and len(set(wanted)) == len(wanted)
     return np.array([places.get(key, -1) if unique else -1 for key in wanted], np.int64)

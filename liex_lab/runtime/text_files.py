@@ -10,7 +10,6 @@ import csv
 import re
 import tomllib
 from collections.abc import Sequence
-from contextlib import suppress
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
 from typing import Any
@@ -21,6 +20,7 @@ _SAMPLE = 50  # lines that a separator is chosen by
 _STATED = re.compile(r'"?sep=(.)"?\s*', re.IGNORECASE)  # a first line that Excel writes and reads
 _BLANKS = re.compile(  # in a line of numbers that blanks separate, whatever its commas are
     r"^\s*[-+]?\d[\d.eE+-]*\s+[-+]?\d|[^,\s]\s+[-+]?\d+,\d+(\s|$)|^\s*[-+]?\d+,\d+\s+[^,\s]"
+    r"|^[-+]?\d{1,3}(,\d{3}){2,}(\.\d+)?$"  # or in a number, which is refused
 )
 _DECIMAL_COMMA = re.compile(r"^([-+]?\d+),(\d+(?:[eE][-+]?\d+)?)$")
 _CLOCK = re.compile(r"(?:(\d+):([0-5]?\d):([0-5]\d(?:[.,]\d+)?)|(\d+):([0-5]\d[.,]\d+))")
@@ -144,11 +144,13 @@ def number(text: str) -> Decimal:
     Raises:
         ValueError: it is no finite number.
     """
-    with suppress(InvalidOperation):
-        found = Decimal(_DECIMAL_COMMA.sub(r"\1.\2", text))
-        if found.is_finite():
-            return found
-    raise ValueError(f"{text!r} is no number")
+    try:
+        found = Decimal(_DECIMAL_COMMA.sub(r"\1.\2", text) if "," in text else text)
+    except InvalidOperation:
+        found = Decimal("nan")
+    if not found.is_finite():
+        raise ValueError(f"{text!r} is no number")
+    return found
 
 
 def clock_s(text: str) -> Decimal:

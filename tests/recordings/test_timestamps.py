@@ -242,7 +242,7 @@ def times_of(path: Path, content: str | bytes, **how: Any) -> list[int]:
     """Stamps of a table that are read without a doubt."""
     path.write_bytes(content.encode() if isinstance(content, str) else content)
     doubts: list[str] = []
-    times = read_stamps(path, [], doubts, **how).times(None, [], doubts, None)
+    times = read_stamps(path, doubts, **how).times(None, [], doubts, None)
     assert doubts == []
     return times.tolist()
 
@@ -299,7 +299,7 @@ def test_a_wrong_csv_is_told_in_a_sentence(tmp_path: Path, content: bytes, says:
     path = tmp_path / "timestamps.csv"
     path.write_bytes(content)
     with pytest.raises(RecordingError, match=r"timestamps\.csv") as error:
-        read_stamps(path, [], [])
+        read_stamps(path, []).times(None, [], [], None)
     assert says in str(error.value)
     assert len(str(error.value)) < 400 + len(str(tmp_path))
 

@@ -261,10 +261,11 @@ class Folder:
         kept = np.arange(n)
         names = [file.name for file in self.files]
         numbers = name_numbers(names) if len(names) == n else kept
+        numbers = np.zeros(n, np.int64) if numbers is None else numbers
         hz = rate(fps, "the call") or self.camera_toml.fps
         if path.is_file():
             stated = (self.camera_toml.time_column, self.camera_toml.time_unit)
-            stamps = read_stamps(path, problems, doubts, *stated)
+            stamps = read_stamps(path, doubts, *stated)
             times = stamps.times(hz, problems, doubts, None)
             rows = stamps.rows_of(self.folder.name, names, numbers, problems, doubts)
             kept = np.flatnonzero(rows >= 0)
@@ -280,7 +281,7 @@ class Folder:
             if hz is None:
                 raise self._no_times()
             problems.append(f"there are no time stamps, so a constant {hz:g} frames/s was assumed")
-            counts = None if numbers is None else frame_counts(numbers)
+            counts = frame_counts(numbers)
             times, moment = from_rate(n if counts is None else counts, hz), False
             if counts is not None and (left_out := int(counts[-1]) + 1 - n) > 0:
                 problems.append(

@@ -187,7 +187,7 @@ def read_session_stamps(
         text = path.read_bytes()
         path.write_bytes(text[: text.rfind(b"\n") + 1])
     stated = (camera_file.time_column, camera_file.time_unit, STAMPS[name])
-    stamps = read_stamps(path, problems, doubts, *stated)
+    stamps = read_stamps(path, doubts, *stated)
     if not len(stamps):
         problems.append(f"{name} holds no time stamp")
         return None

@@ -431,9 +431,8 @@ class _Session:
         n = len(stack)
         own = None if track is None or not len(track.times_ns) else track
         hz = rate(self.fps, "the call") or self.camera_file.fps
-        if self.stamps is not None and (
-            self.stamps.times_ns is not None or own is None or own.even
-        ):
+        counted = self.stamps is not None and self.stamps.counts is not None
+        if self.stamps is not None and (own is None or own.even or not counted):
             name = self.stamps.path.name
             known = None if own is None else 1e9 / max(median_step(own.times_ns), 1)
             stamps = self.stamps.times(hz or known, self.problems, self.doubts, _NOMINAL_HZ)
