@@ -57,6 +57,7 @@ class Recording:
             with zone).
         optics: what was undone on reading (distortion, water, mirroring), empty where nothing was;
             see `rectify`.
+        doubts: reasons not to rely on its times that the format knows, in sentences.
         unpacked: folder with what an archive was unpacked to, which opens as the same recording
             while this one is open; None where nothing was.
         region_px: (u, v) corners, pixels, of the polygon outside of which every picture was made
@@ -128,7 +129,7 @@ class Recording:
         self._stored = np.arange(len(self.times_ns)) if stored is None else stored
         self._whole_frames = np.ones(len(self.times_ns), np.bool_) if whole is None else whole
         self._faults = np.zeros(len(self.times_ns), np.uint8) if faults is None else faults
-        self._doubts = tuple(doubts)
+        self.doubts = tuple(doubts)
         self._step_ns = median_step(self.times_ns) if step_ns is None else step_ns
         self._whole: Recording | None = None
         self._grow = grow
@@ -180,7 +181,7 @@ class Recording:
     @property
     def clock_doubts(self) -> tuple[str, ...]:
         """Why its times are not to be relied on, in sentences; usually none."""
-        return (*self._doubts, *clock_doubts(self._step_ns, self._faults))
+        return (*self.doubts, *clock_doubts(self._step_ns, self._faults))
 
     @property
     def duration_s(self) -> float:
@@ -308,7 +309,7 @@ class Recording:
             step_ns=self._step_ns * step,
             stored=self._stored[rows],
             faults=self._faults[rows],
-            doubts=self._doubts,
+            doubts=self.doubts,
         )
         cut._whole = self._whole or self
         cut.optics = self.optics
@@ -417,7 +418,7 @@ class Recording:
             stored=self._stored,
             close=None if lent else self.close,
             faults=self._faults,
-            doubts=self._doubts,
+            doubts=self.doubts,
             unpacked=self.unpacked,
             grow=lambda: (more := self.grown()) and more.seen_by(camera, change, optics),
         )

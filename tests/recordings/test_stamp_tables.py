@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from datetime import UTC, datetime, timedelta
 from decimal import Decimal
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -123,7 +124,7 @@ NS = [round(1000 * ms) * 1000 for ms in MS]
 FRAMES = depth_frames(N)
 
 
-def moseq(folder: Path, lines: list[str] | bytes, **camera: object) -> Recording:
+def moseq(folder: Path, lines: list[str] | bytes, **camera: Any) -> Recording:
     """A session whose depth_ts.txt has these lines."""
     shutil.rmtree(folder, ignore_errors=True)
     write_camera(write_moseq_folder(folder, FRAMES), **camera)
@@ -137,7 +138,7 @@ def images(
     table: list[str],
     dropped: Sequence[int] = (),
     name: str = "depth_{:06d}",
-    **camera: object,
+    **camera: Any,
 ) -> Recording:
     """Depth images with a table of time stamps; some of the images are not there."""
     shutil.rmtree(folder, ignore_errors=True)
@@ -249,7 +250,7 @@ def stamp(k: int, form: str) -> str:
     ],
 )
 def test_dates_with_a_zone_are_instants_across_the_end_of_summer_time(
-    tmp_path: Path, form: str, head: str, line: str, how: dict[str, object]
+    tmp_path: Path, form: str, head: str, line: str, how: dict[str, Any]
 ) -> None:
     table = [head] * bool(head) + [line.format(t=stamp(k, form), k=k) for k in range(N)]
     with images(tmp_path / "r", table, **how) as recording:

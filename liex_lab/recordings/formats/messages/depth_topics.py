@@ -300,6 +300,7 @@ def _open(
         metadata=metadata | packed.metadata,
         close=file.close,
         faults=packed.faults(monotone.faults),
+        doubts=packed.doubts,
         grow=grow,
     )
 
