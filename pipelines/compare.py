@@ -20,6 +20,7 @@ from liex_lab.plan.study import Study
 from liex_lab.plan.subject import same
 from liex_lab.runtime.durable import replacing, write_whole
 from liex_lab.runtime.progress import Progress, silent
+from liex_lab.runtime.spreadsheets import read_texts
 from liex_lab.sessions.failure import FAILED_FILE, read_failure
 from liex_lab.sessions.listed import Entry
 from liex_lab.sessions.verdict import LOOK_AT_IT, OTHER_ANIMAL, read_verdict
@@ -294,11 +295,9 @@ def find_sessions(places: Sequence[str | Path]) -> list[Path]:
 
 def _overruled(table: pd.DataFrame, path: Path) -> pd.DataFrame:
     """The table with group, cage, sex and batch as a CSV of the animals states them."""
-    import pandas as pd
-
     try:
-        stated = pd.read_csv(path, dtype=str, keep_default_na=False)
-    except (OSError, UnicodeDecodeError, pd.errors.ParserError, pd.errors.EmptyDataError) as error:
+        stated = read_texts(path)
+    except (OSError, ValueError) as error:
         raise SessionError(
             f"{path} should be a CSV with the column subject_id, but: {error}; correct it"
         ) from None

@@ -311,6 +311,7 @@ def _write(
         source={"name": opened.name, "format": opened.format, "sha256": opened.digest(progress)},
         region_px=[list(corner) for corner in corners],
         n_px=0 if mask is None else int(mask.sum()),
+        doubts=list(opened.doubts),
     )
     whole = _Hash(step_mm)
     metadata = {**opened.metadata, **facts.to_notes()}

@@ -12,7 +12,6 @@ import math
 import shlex
 import shutil
 import threading
-import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,6 +23,7 @@ from liex_lab.errors import LiexError, PlanError, StudyError, one_line
 from liex_lab.plan import Plan, known_plans
 from liex_lab.plan.editing import with_value
 from liex_lab.plan.study import STUDY_FILE, PlannedSession, Study
+from liex_lab.runtime.text_files import decoded, parse_toml, read_toml
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -199,8 +199,8 @@ class StatedRegions:
             stated = _at(_table(file), _REGION)
         else:
             try:
-                stated = _at(tomllib.loads(session.plan), _REGION)
-            except (tomllib.TOMLDecodeError, RecursionError):
+                stated = _at(parse_toml(session.plan), _REGION)
+            except ValueError:
                 stated = None
         return [Place("beside", "this recording, in a plan beside it", file, _REGION, stated)]
 
@@ -241,18 +241,18 @@ class StatedRegions:
 
     def _text(self, place: Place, session: Session | None) -> str:
         try:
-            return place.file.read_bytes().decode("utf-8")
+            return decoded(place.file.read_bytes())
         except FileNotFoundError:
             if session is not None and place.name == "beside":
                 return session.plan
             raise PlanError(f"{place.file} is gone; load the page again") from None
-        except (OSError, UnicodeDecodeError) as error:
+        except (OSError, ValueError) as error:
             raise PlanError(f"{place.file} cannot be read ({one_line(error)})") from None
 
     def _check(self, place: Place, text: str) -> None:
         """Whether the file says what a run can take, for every recording that it is of."""
         if self._study is not None and place.path != _REGION:
-            _ = Study.from_table(tomllib.loads(text), place.file).sessions  # every plan resolved
+            _ = Study.from_table(parse_toml(text), place.file).sessions  # every plan resolved
         else:
             Plan.from_toml(text, place.file.name)
 
@@ -332,8 +332,8 @@ def _at(table: Any, path: Sequence[str]) -> Any:
 
 def _table(file: Path) -> dict[str, Any]:
     try:
-        return tomllib.loads(file.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError, RecursionError) as error:
+        return read_toml(file)
+    except (OSError, ValueError) as error:
         raise PlanError(f"{file.name} cannot be read as a plan ({one_line(error)})") from None
 
 

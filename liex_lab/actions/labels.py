@@ -6,7 +6,9 @@ from and are judged by.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 
@@ -16,22 +18,23 @@ from numpy.typing import NDArray
 
 from liex_lab.actions.ethogram import UNLABELLED
 from liex_lab.errors import LiexError, one_line
-from liex_lab.runtime.spreadsheets import read_named
+from liex_lab.runtime.spreadsheets import read_texts
+from liex_lab.runtime.text_files import clock_s, number
 from liex_lab.tracking.track import Track
 
 Array = NDArray[np.float64]
 
 HUMAN = "human"
 _NEEDED = ("action", "start_s", "stop_s")
-_TEXTS = ("session_id", "individual", "action")  # names: 007 and NA are names, too
+_THOUSANDS = re.compile(r"[1-9]\d{0,2},\d{3}")  # beside 950, 1,034 is no decimal number
 
 
 def read_labels(path: str | Path) -> pd.DataFrame:
     """Bouts from a table, checked and in order of time.
 
     Args:
-        path: our bouts.parquet, or a CSV with the columns action, start_s, stop_s and, where it
-            tells of several recordings, session_id.
+        path: our bouts.parquet, or a table as CSV or as a spreadsheet saves it with the columns
+            action, start_s, stop_s and, where it is of several recordings, session_id.
 
     Returns:
         The table, with the column source set to human.
@@ -42,9 +45,7 @@ def read_labels(path: str | Path) -> pd.DataFrame:
     """
     source = Path(path)
     try:
-        table = (
-            pd.read_parquet(source) if source.suffix == ".parquet" else read_named(source, _TEXTS)
-        )
+        table = pd.read_parquet(source) if source.suffix == ".parquet" else read_texts(source)
     except (OSError, ValueError) as error:
         raise LiexError(
             f"{source} should be a table of bouts, as CSV or parquet, but: {one_line(error)}"
@@ -77,8 +78,9 @@ def checked(table: pd.DataFrame, origin: str) -> pd.DataFrame:
     if len(wrong):
         row = {name: " ".join(str(table[name].iloc[wrong[0]]).split())[:80] for name in _NEEDED}
         raise LiexError(
-            f"{origin}: each bout starts before it stops, in seconds; the one of {row['action']} "
-            f"in row {wrong[0] + 1} has start_s={row['start_s']} and stop_s={row['stop_s']}"
+            f"{origin}: each bout starts before it stops, in seconds or as hh:mm:ss, without "
+            f"separators of thousands; the one of {row['action']} in row {wrong[0] + 1} has "
+            f"start_s={row['start_s']} and stop_s={row['stop_s']}"
         )
     out = table.reset_index(drop=True).assign(
         action=table["action"].to_numpy().astype(str), **times
@@ -87,11 +89,20 @@ def checked(table: pd.DataFrame, origin: str) -> pd.DataFrame:
 
 
 def _numbers(column: pd.Series) -> NDArray[np.float64]:
-    """A column (n,) as numbers, NaN where there is none."""
-    plain = column.dtype.kind in "iuf"
-    return np.asarray(
-        pd.to_numeric(column if plain else column.astype(str), errors="coerce").to_numpy(np.float64)
-    )
+    """A column (n,) of seconds or times as hh:mm:ss as numbers, NaN where there is none."""
+    if column.dtype.kind in "iuf":
+        return column.to_numpy(np.float64)
+    texts = [str(cell) for cell in column]
+    commas = [text for text in texts if "," in text]
+    thousands = len(commas) < len(texts) and all(map(_THOUSANDS.fullmatch, commas))
+    return np.array([np.nan if thousands and "," in text else _seconds(text) for text in texts])
+
+
+def _seconds(text: str) -> float:
+    """Seconds, or a time as hh:mm:ss in seconds; NaN where it is neither."""
+    with suppress(ValueError):
+        return float(clock_s(text) if ":" in text else number(text))
+    return float("nan")
 
 
 def sessions_named(table: pd.DataFrame) -> set[str]:

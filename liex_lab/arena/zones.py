@@ -10,7 +10,6 @@ from __future__ import annotations
 import difflib
 import math
 import re
-import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,6 +23,7 @@ from liex_lab.arena.outline import Arena, circle_points
 from liex_lab.arena.polygon import crossing_sides
 from liex_lab.errors import PlanError
 from liex_lab.optics.camera import Camera
+from liex_lab.runtime.text_files import read_toml
 
 Array = NDArray[np.float64]
 
@@ -199,17 +199,12 @@ def read_zones(path: str | Path) -> tuple[DrawnZone, ...]:
     """
     file = Path(path)
     try:
-        table = tomllib.loads(file.read_text(encoding="utf-8-sig"))
+        table = read_toml(file)
     except FileNotFoundError:
         raise PlanError(
             f"there is no file {file} with zones; check the spelling of arena.zones"
         ) from None
-    except (
-        tomllib.TOMLDecodeError,
-        UnicodeDecodeError,
-        IsADirectoryError,
-        RecursionError,
-    ) as error:
+    except (ValueError, IsADirectoryError) as error:
         raise PlanError(
             f"{file} should be a TOML file with zones, but it is not ({error}); correct it"
         ) from None

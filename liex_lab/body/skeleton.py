@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import difflib
 import math
-import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -23,6 +22,7 @@ from numpy.typing import NDArray
 
 from liex_lab.errors import LiexError
 from liex_lab.geometry import so3
+from liex_lab.runtime.text_files import read_toml
 
 Array = NDArray[np.float64]
 
@@ -183,8 +183,8 @@ class Skeleton:
             )
             raise LiexError(f"there is no skeleton '{animal}': {hint}")
         try:
-            table = tomllib.loads(path.read_text(encoding="utf-8"))
-        except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
+            table = read_toml(path)
+        except ValueError as error:
             raise LiexError(f"the skeleton {path} is not a TOML file: {error}") from None
         return Skeleton.from_table(_with_mesh(table, path), str(path))
 

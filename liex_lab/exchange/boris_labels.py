@@ -18,7 +18,8 @@ import pandas as pd
 
 from liex_lab.actions.labels import HUMAN, checked
 from liex_lab.errors import LiexError, one_line
-from liex_lab.runtime.spreadsheets import read_named
+from liex_lab.runtime.spreadsheets import read_texts
+from liex_lab.runtime.text_files import decoded, read_text, split_lines
 
 _STATE = "State event"
 _MOST_BYTES = 1 << 28  # unpacked
@@ -36,7 +37,7 @@ def read_boris_project(path: str | Path) -> dict[str, Any]:
     source = Path(path)
     try:
         raw = source.read_bytes()
-        document = json.loads(_unpacked(raw) if raw[:2] == b"\x1f\x8b" else raw)
+        document = json.loads(decoded(_unpacked(raw) if raw[:2] == b"\x1f\x8b" else raw))
     except (OSError, EOFError, ValueError, RecursionError, zlib.error) as error:
         raise LiexError(
             f"{source} should be a BORIS project (JSON), but: {one_line(error)}"
@@ -88,15 +89,14 @@ def boris_export_labels(path: str | Path) -> pd.DataFrame:
     """Labels of BORIS's export 'aggregated events'; see `boris_labels`.
 
     Args:
-        path: a TSV file, by its ending .tsv, else a CSV file.
+        path: a TSV or CSV file.
 
     Raises:
         LiexError: the file is no such export.
     """
     source = Path(path)
     try:
-        names = ("Observation id", "Subject", "Behavior")
-        table = read_named(source, names, "\t" if source.suffix == ".tsv" else ",")
+        table = read_texts(source)
     except (OSError, ValueError) as error:
         raise LiexError(f"{source} should be an export of BORIS, but: {one_line(error)}") from None
     wanted = {
@@ -123,8 +123,11 @@ def is_boris_export(path: str | Path) -> bool:
     Args:
         path: a text file.
     """
-    with Path(path).open(encoding="utf-8", errors="replace") as file:
-        return file.readline().lstrip("\ufeff").startswith(("Observation id", '"Observation id"'))
+    try:
+        lines = split_lines(read_text(Path(path)))[1]
+    except ValueError:
+        return False
+    return "".join(lines[:2]).startswith(("Observation id", '"Observation id"'))
 
 
 def _unpacked(raw: bytes) -> bytes:

@@ -10,7 +10,6 @@ from __future__ import annotations
 import difflib
 import json
 import textwrap
-import tomllib
 from collections.abc import Iterable
 from datetime import datetime
 from pathlib import Path
@@ -36,6 +35,7 @@ from liex_lab.plan.sections import (
     Tracking,
     WaterSurface,
 )
+from liex_lab.runtime.text_files import parse_toml, read_text
 
 _HERE = Path(__file__).resolve().parents[1]
 _MOST_ARENAS = 8  # in one picture
@@ -165,8 +165,8 @@ class Plan(Table):
             PlanError: the text is not TOML, or a setting cannot be used.
         """
         try:
-            table = tomllib.loads(text)
-        except (tomllib.TOMLDecodeError, RecursionError) as error:
+            table = parse_toml(text)
+        except ValueError as error:
             raise PlanError(
                 f"{origin} should be a TOML file, but: {error}; compare it with `liex info --plan`"
             ) from None
@@ -263,11 +263,9 @@ def known_plans() -> list[str]:
 
 def _read(path: Path) -> str:
     try:
-        return path.read_text(encoding="utf-8")
-    except UnicodeDecodeError:
-        raise PlanError(
-            f"the plan {path} should be a TOML text in UTF-8, but it is not a text file"
-        ) from None
+        return read_text(path)
+    except ValueError as error:
+        raise PlanError(f"the plan {path} should be a TOML file, but: {error}") from None
 
 
 def _settings() -> dict[str, Any]:
@@ -285,8 +283,8 @@ def _settings() -> dict[str, Any]:
 def _value(dotted: str, text: str) -> Any:
     """The value that a person typed after --set: as TOML, or as the plain word it is."""
     try:
-        value = tomllib.loads(f"value = {text}")["value"]
-    except (tomllib.TOMLDecodeError, RecursionError):
+        value = parse_toml(f"value = {text}")["value"]
+    except ValueError:
         return text
     annotation = _settings().get(dotted)
     takes_text = str in (get_args(annotation) or (annotation,))

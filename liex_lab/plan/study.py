@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import difflib
 import json
-import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -23,6 +22,7 @@ from liex_lab.errors import PlanError, StudyError
 from liex_lab.plan import Plan, known_plans
 from liex_lab.plan.sections import ArenaName, Region
 from liex_lab.runtime.places import named_beside
+from liex_lab.runtime.text_files import read_toml
 
 # as in NeuroBlueprint: letters and digits alone, so that no name is a path, a formula or markup
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9]{1,64}$")]
@@ -245,8 +245,8 @@ class Study:
         if not file.is_file():
             raise StudyError(f"there is no study file {file}; `liex cohort init FOLDER` begins one")
         try:
-            table = tomllib.loads(file.read_text(encoding="utf-8"))
-        except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
+            table = read_toml(file)
+        except ValueError as error:
             raise StudyError(f"{file} should be a TOML file, but: {error}; correct it") from None
         return Study.from_table(table, file)
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import difflib
 import math
-import tomllib
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -20,6 +19,7 @@ from liex_lab.recordings.frame import Depth
 from liex_lab.recordings.timestamp_files import UNITS
 from liex_lab.recordings.timestamps import start_of_day
 from liex_lab.runtime.places import named_beside
+from liex_lab.runtime.text_files import read_toml
 
 CAMERA_FILE = "camera.toml"
 WHAT_TO_WRITE = (
@@ -98,8 +98,8 @@ class CameraFile:
         if not path.is_file():
             return CameraFile(path)
         try:
-            document = tomllib.loads(path.read_text(encoding="utf-8-sig"))
-        except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
+            document = read_toml(path)
+        except ValueError as error:
             raise RecordingError(
                 f"{path} should be a TOML file, but it does not parse ({error}); correct it"
             ) from None

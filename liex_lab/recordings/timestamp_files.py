@@ -1,23 +1,37 @@
-"""Text formats of time stamps: tables (CSV, blank separated) and stamps in the names of pictures.
+"""Text formats of time stamps: tables, and stamps or numbers in the names of depth images.
 
 A stamp is read as a decimal number and becomes integer nanoseconds exactly; a float64 of seconds
-since 1970 is good to 200 ns only. Names hold a date and time, seconds since 1970 with a fraction
-(as in the TUM RGB-D data sets), or 13, 16 or 19 digits of ms, µs or ns since 1970.
+since 1970 is good to 200 ns only. Stamps may also be dates (ISO 8601) or hh:mm:ss. Names hold a
+date and time, seconds since 1970 with a fraction (as in the TUM RGB-D data sets), or 13, 16 or 19
+digits of ms, µs or ns since 1970.
 """
 
 from __future__ import annotations
 
-import csv
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
-from decimal import Decimal, InvalidOperation
+from decimal import Decimal
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from liex_lab.errors import RecordingError
-from liex_lab.recordings.timestamps import LIMIT_NS, Times
+from liex_lab.errors import RecordingError, UnknownTimesError
+from liex_lab.recordings.timestamps import (
+    LIMIT_NS,
+    PLAUSIBLE_HZ,
+    Times,
+    frame_counts,
+    from_rate,
+    match_counts,
+    read_moment,
+    unpaired,
+)
+from liex_lab.runtime.text_files import clock_s, number, read_text, split_cells, split_lines
 
 UNITS = {"ns": 1, "us": 10**3, "ms": 10**6, "s": 10**9}  # nanoseconds in each
 CSV_COLUMNS = {f"time_{unit}": ns for unit, ns in UNITS.items()}  # columns that name their unit
@@ -32,97 +46,414 @@ _WHOLE = re.compile(
     r"(?<!\d)(\d{13}|\d{16}|\d{19})(?!\d)"
 )  # ms, us or ns since 1970, told apart by their length
 _PLAUSIBLE_NS = (946_684_800 * 10**9, 4_102_444_800 * 10**9)  # the years 2000 to 2100
+_CLOCKS = (  # nanoseconds in a step, the step of 1970, and what that is called
+    (10**9, 0, "seconds since 1970"),
+    (10**6, 0, "milliseconds since 1970"),
+    (10**3, 0, "microseconds since 1970"),
+    (100, 0, "steps of 100 ns since 1970"),
+    (1, 0, "nanoseconds since 1970"),
+    (100, 116_444_736 * 10**9, "steps of 100 ns since 1601, as Windows counts"),
+    (100, 621_355_968 * 10**9, "steps of 100 ns since the year 1, as .NET counts"),
+)
+_HOUR_NS = 3600 * 10**9
+_BLANK = re.compile(r"(?<=\d{4}-\d\d-\d\d) +(?=\d\d:)")  # between date and time
+_TIME_OF_DAY = re.compile(r"(\d\d:\d\d:\d\d),(?=\d{3})")  # whose comma is a decimal sign
+_GROUPED = re.compile(r"^([-+]?[1-9]\d{0,2})[.,](\d{3})$")  # a number, or thousands
 
 
-def to_ns(text: str, ns_per_unit: int) -> int:
-    """A decimal number as integer nanoseconds, exactly.
+@dataclass(frozen=True)
+class Stamps:
+    """A table of time stamps: the column that was chosen for the times, and its other columns.
 
-    A float64 of seconds since 1970 is good to 200 ns only.
-
-    Args:
-        text: the number as it is written.
-        ns_per_unit: nanoseconds in its unit.
-
-    Returns:
-        The time, ns, rounded to a whole one.
-
-    Raises:
-        InvalidOperation: the text is no finite number, or is beyond the year 2116.
+    Attributes:
+        path: the file.
+        k: number of the column, from 0.
+        cells: line and text of its stamps.
+        read: what reads such a text.
+        values: (n,) plain numbers, or nanoseconds of dates and of hh:mm:ss.
+        counts: (n,) frames behind the first, where the numbers rise by one as a counter does.
+        rows: line and cells of the rows.
+        ns_per_unit: nanoseconds in the unit of plain numbers.
+        named: whether the table or camera.toml states that these are times.
     """
-    value = Decimal(text.strip()) * ns_per_unit
-    if not value.is_finite() or abs(value) >= LIMIT_NS:
-        raise InvalidOperation(f"{text} is not a time")
-    return int(value.to_integral_value())
+
+    path: Path
+    k: int
+    cells: list[tuple[int, str]]
+    read: Callable[[str], Decimal]
+    values: list[Decimal]
+    counts: Times | None
+    rows: list[tuple[int, list[str]]]
+    ns_per_unit: int = 1
+    named: bool = False
+
+    @staticmethod
+    def of(path: Path, rows: list[tuple[int, list[str]]], k: int) -> Stamps:
+        """The column k of a table.
+
+        Args:
+            path: the file.
+            rows: lines and cells.
+            k: number of the column, from 0.
+
+        Raises:
+            RecordingError: a cell is no stamp of the first one's kind.
+        """
+        cells = [(line, row[k] if k < len(row) else "") for line, row in rows]
+        read = (_reader(cells[0][1]) if cells else None) or number
+        try:
+            values = [read(text) for _, text in cells]
+        except ValueError:
+            raise _no_stamp(
+                path, *next(cell for cell in cells if not _reads(read, cell[1]))
+            ) from None
+        whole = read is number and all(abs(v) < LIMIT_NS and v == int(v) for v in values)
+        counts = frame_counts(np.array([int(v) for v in values], np.int64), 1) if whole else None
+        return Stamps(path, k, cells, read, values, counts, rows)
+
+    def __len__(self) -> int:
+        """The number of rows."""
+        return len(self.values)
+
+    @property
+    def zoned(self) -> bool:
+        """Whether the stamps are moments, as far as they are dates."""
+        return self.read is not _moment_ns or all(
+            read_moment(text)[0].tzinfo is not None for _, text in self.cells
+        )
+
+    @property
+    def steps(self) -> NDArray[np.float64]:
+        """(n - 1,) from each value to the next."""
+        return np.diff(np.array(self.values, np.float64))
+
+    def times(
+        self, hz: float | None, problems: list[str], doubts: list[str], usual_hz: float | None
+    ) -> Times:
+        """The stamps, or the times of the frame numbers that stand in their place.
+
+        Args:
+            hz: a rate that is known, Hz.
+            problems: sentences, appended to.
+            doubts: reasons not to rely on the times, appended to.
+            usual_hz: what to assume for frame numbers without a rate, Hz; None refuses them.
+
+        Returns:
+            (n,) int64 ns, in file order.
+
+        Raises:
+            UnknownTimesError: there are only frame numbers, and no rate is known.
+            RecordingError: a number is no time.
+        """
+        if self.counts is not None:
+            counter = f"a column of {self.path.name} counts by one: a frame counter, not times"
+            advice = (
+                f"{counter}; state fps = 30.0 (your rate) in camera.toml, or name the column of "
+                "times with time_column and time_unit"
+            )
+            if hz is None and usual_hz is None and not self.named:
+                raise UnknownTimesError(advice)
+            (problems if hz else doubts).append(
+                f"{counter}; frames were placed by it at {hz:g} frames/s" if hz else advice
+            )
+            if hz or not self.named:
+                return from_rate(self.counts, hz or usual_hz or 1.0)
+        if self.read is number:
+            return self._numbers(problems)
+        times = np.array([int(value) for value in self.values], np.int64)
+        if self.read is _clock_ns:  # goes on after midnight
+            back = np.diff(times, prepend=times[:1]) < -12 * _HOUR_NS
+            return times + 24 * _HOUR_NS * np.cumsum(back)
+        hours = np.abs(np.abs(np.diff(times)) - _HOUR_NS) < _HOUR_NS // 60
+        if not self.zoned:
+            without = f"the dates in {self.path.name} have no time zone"
+            problems.append(f"{without}, so the start of the recording is not known from them")
+            if hours.any():
+                doubts.append(
+                    f"{without} and jump by an hour at line "
+                    f"{self.cells[int(hours.argmax()) + 1][0]}, as where summer time begins or "
+                    "ends; write them with their zone"
+                )
+        return times
+
+    def _numbers(self, problems: list[str]) -> Times:
+        """Numbers as ns; a unit that is only usual gives way to another that alone is possible."""
+        grouped = [cell for cell in self.cells if _GROUPED.match(cell[1])]
+        if grouped and (self.steps < 0).any():  # as numbers they fall, as thousands they may rise
+            flat = [number(_GROUPED.sub(r"\1\2", text)) for _, text in self.cells]
+            if flat == sorted(flat):
+                raise _no_stamp(self.path, *grouped[0])
+        step = float(np.median(self.steps)) if len(self.steps) else 0.0
+        clock = (self.ns_per_unit, 0, "")
+        if not self.named and step > 0 and not _is_rate(step * self.ns_per_unit):
+            possible = (
+                clock
+                for clock in _CLOCKS
+                if _is_rate(step * clock[0])
+                and _PLAUSIBLE_NS[0] <= (self.values[0] - clock[1]) * clock[0] < _PLAUSIBLE_NS[1]
+            )
+            clock = next(possible, clock)
+            hz = 1e9 / (step * clock[0])
+            problems.append(
+                f"the numbers in {self.path.name} were taken as {clock[2]}, which alone gives a "
+                f"date of our time and the rate of a camera ({hz:.4g} frames/s)"
+                if clock[2]
+                else f"the numbers in {self.path.name} were taken as "
+                f"{'milli' if self.ns_per_unit == UNITS['ms'] else ''}seconds, as MoSeq writes "
+                f"them, which makes {hz:.3g} frames/s; if they have another unit, write "
+                f'time_column = {self.k} and time_unit = "us" (or "s", "ns") into camera.toml'
+            )
+        found = [int(((v - clock[1]) * clock[0]).to_integral_value()) for v in self.values]
+        beyond = [cell for cell, t in zip(self.cells, found, strict=True) if abs(t) >= LIMIT_NS]
+        if beyond:
+            raise _no_stamp(self.path, *beyond[0])
+        return np.array(found, np.int64)
+
+    def rows_of(
+        self,
+        folder: str,
+        names: Sequence[str],
+        numbers: Times,
+        problems: list[str],
+        doubts: list[str],
+    ) -> NDArray[np.int64]:
+        """The row of each depth image: by the name beside the stamp, or by its number, or in order.
+
+        Args:
+            folder: name of the images' folder, for sentences.
+            names: of the images' files, in order.
+            numbers: (m,) the number of each image; all the same where they are not numbered.
+            problems: sentences, appended to.
+            doubts: reasons not to rely on the rows, appended to.
+
+        Returns:
+            (m,) rows; -1 for an image without one.
+        """
+        n = len(numbers)
+        in_order = n == len(self) and numbers[-1] - numbers[0] == n - 1  # perhaps renumbered
+        found, best, sure = np.where(np.arange(n) < len(self), np.arange(n), -1), 0, False
+        for cells in zip(*(row for _, row in self.rows), strict=False):
+            tries = [(_places([_stem(name) for name in names], [_stem(c) for c in cells]), n // 2)]
+            counts = name_numbers(cells)
+            if counts is not None and frame_counts(counts) is not None:
+                moved = numbers - numbers[0] + counts[0]  # one of the two may begin at 1
+                tries.append((_places(numbers, counts), n - 1 if in_order else 0))
+                tries.append((_places(moved, counts), min(n, len(self)) - 1))
+            for rows, least in tries:
+                hits = int((rows >= 0).sum())
+                if hits > max(best, least):
+                    found, best, sure = rows, hits, least > 0 or hits in (n, len(self))
+        if not best and n != len(self):
+            problems.append(match_counts(n, np.arange(len(self)), folder, self.path.name)[1] or "")
+            doubts.append(unpaired(folder, self.path.name))
+        elif best and best < max(n, len(self)):
+            (problems if sure else doubts).append(
+                f"of {n} depth images and {len(self)} rows of {self.path.name}, {best} belong "
+                "together by name or number; the others are left out"
+            )
+        return found
 
 
-def read_csv_times(path: Path, column: str | int | None = None, unit: str | None = None) -> Times:
-    """Stamps of a table with a header, separated by commas, semicolons, tabs or blanks.
+def read_stamps(
+    path: Path,
+    doubts: list[str],
+    column: str | int | None = None,
+    unit: str | None = None,
+    usual_ns: int | None = None,
+) -> Stamps:
+    """Read a table of stamps, with or without a header.
 
-    Lines that begin with # are passed over, but for one that names the columns.
+    Lines that begin with # are passed over, but for one that names the columns. Stamps are numbers,
+    or dates (ISO 8601), or hh:mm:ss.
 
     Args:
         path: the table.
+        doubts: reasons not to rely on the times, appended to.
         column: name of the column of times, or its number from 0 in a table that may have no
-            header; None for the first of time_ns, time_us, time_ms and time_s.
+            header; None for one of time_ns, time_us, time_ms and time_s, or else the first column
+            of dates or, where usual_ns is given, the first that can be times.
         unit: ns, us, ms or s, where the column's name does not end in it.
-
-    Returns:
-        (n,) int64 stamps, ns, in file order.
+        usual_ns: nanoseconds in the unit of numbers whose column has no name; None where numbers
+            need one.
 
     Raises:
-        RecordingError: there is no such column, its unit is not known, or a cell is no number.
+        RecordingError: there is no such column, its unit is not known, or a cell is no stamp.
     """
-    lines = _lines(path)
-    rows = [(number, row) for number, row in enumerate(_split(lines), start=1) if row]
-    if isinstance(column, int):
-        rows = (
-            rows[1:]
-            if rows and column < len(rows[0][1]) and not _is_number(rows[0][1][column])
-            else rows
-        )
-        return _parse(path, rows, column, UNITS[unit or "ns"])
-    named = [(number, [cell.lstrip("# ") for cell in row if cell != "#"]) for number, row in rows]
-    wanted = (column,) if column else tuple(CSV_COLUMNS)
-    at, header = next(
-        ((at, row) for at, (_, row) in enumerate(named) if set(wanted) & set(row)), (-1, [])
-    )
-    if at < 0:
+    try:
+        separator, lines = split_lines(_TIME_OF_DAY.sub(r"\1.", _BLANK.sub("T", read_text(path))))
+        cells = split_cells(lines, separator)
+    except ValueError as error:
+        raise RecordingError(
+            f"{path} should be a text file with one time stamp per line, but {error}"
+        ) from None
+    rows = [(line, row) for line, row in enumerate(cells, start=1) if any(row)]
+    wanted = tuple(CSV_COLUMNS) if column is None else (column,)
+    named = [[cell.lstrip("# ") for cell in row if cell != "#"] for _, row in rows]
+    plain = [at for at, (_, row) in enumerate(rows) if not row[0].startswith("#")]
+    at = next((at for at, row in enumerate(named) if set(wanted) & set(row)), -1)
+    if at < 0 and plain:
+        first = rows[plain[0]][1]
+        probe = first[column : column + 1] if isinstance(column, int) else first
+        at = -1 if any(map(_reader, probe)) else plain[0]
+    header = named[at] if at >= 0 else []
+    data = [rows[k] for k in plain if k > at]
+    if separator == "," and len(header) < 2 and _are_decimals(data):
+        data = [(line, [",".join(row)]) for line, row in data]
+    name = next((name for name in wanted if name in header), None)
+    if isinstance(column, int) or name in header:
+        at = column if isinstance(column, int) else header.index(str(name))
+        found: Stamps | None = Stamps.of(path, data, at)
+    else:
+        found = None if column else _can_be_times(path, data, usual_ns is not None)
+    if found is None:
         raise RecordingError(
             f"{path} should begin with a line that names a column {column or 'time_ns or time_s'}, "
             f"but its first line is {_shorten(lines[0]) if lines else 'missing'!r}; "
             + ("correct time_column in camera.toml" if column else "add that header line")
         )
-    name = next(name for name in wanted if name in header)
-    ns_per_unit = UNITS[unit] if unit else CSV_COLUMNS.get(name)
-    if ns_per_unit is None:
+    wide = [row for _, row in data if not header or len(row) > len(header)]
+    for k in range(max(found.k - 1, 0), found.k + 1):
+        behind = [row[k + 1] for row in wide if len(row) > k + 1 and _are_digits(row[k : k + 2])]
+        if separator == "," and len(behind) == len(data) > 0 and not _is_column(behind, header):
+            doubts.append(
+                f"line {data[0][0]} of {path.name} holds {','.join(data[0][1])!r}, where a comma "
+                "may be a decimal sign; it was taken to separate columns: write a decimal point, "
+                "or semicolons between columns"
+            )
+            break
+    usual = usual_ns or (1 if isinstance(column, int) else None)
+    ns_per_unit = UNITS[unit] if unit else CSV_COLUMNS.get(str(name), usual)
+    stated = name is not None or column is not None
+    if ns_per_unit is None and found.read is number and stated:
         raise RecordingError(
             f'the unit of the column {name!r} in {path} is not known; write time_unit = "s", "ms", '
             '"us" or "ns" beside time_column in camera.toml'
         )
-    return _parse(path, rows[at + 1 :], header.index(name), ns_per_unit)
+    return replace(found, ns_per_unit=ns_per_unit or 1, named=stated)
 
 
-def read_column_times(path: Path, ns_per_unit: int) -> Times:
-    """Stamps in the first column of a file of numbers; a header line is passed over.
+def _can_be_times(path: Path, rows: list[tuple[int, list[str]]], numbers: bool) -> Stamps | None:
+    """The first column that rises and does not count frames; or else one that counts; or else the
+    first of stamps.
 
     Args:
-        path: the file, its columns separated by blanks or commas.
-        ns_per_unit: nanoseconds in the unit of column 0.
+        path: the file.
+        rows: lines and cells.
+        numbers: whether numbers whose column has no name can be times.
+    """
+    found: list[Stamps] = []
+    for k, cell in enumerate(rows[0][1] if rows else []):
+        read = _reader(cell)
+        timely = read is not None and (numbers or read is not number)
+        try:
+            column = Stamps.of(path, rows, k)
+        except RecordingError:
+            if timely and not found:
+                raise
+            continue
+        rises = 4 * int((column.steps > 0).sum()) >= 3 * len(column.steps)
+        if timely and rises and column.counts is None:
+            return column
+        if timely or column.counts is not None:
+            found.append(column)
+    first = Stamps.of(path, rows, 0) if numbers and not found else next(iter(found), None)
+    return next((column for column in found if column.counts is not None), first)
+
+
+def _reader(text: str) -> Callable[[str], Decimal] | None:
+    """What reads a stamp that is written like this one; None where it is no stamp."""
+    return next((read for read in (number, _moment_ns, _clock_ns) if _reads(read, text)), None)
+
+
+def _reads(read: Callable[[str], Decimal], text: str) -> bool:
+    with suppress(ValueError):
+        read(text)
+        return True
+    return False
+
+
+def _moment_ns(text: str) -> Decimal:
+    return Decimal(read_moment(text)[1])
+
+
+def _clock_ns(text: str) -> Decimal:
+    return clock_s(text) * UNITS["s"]
+
+
+def _is_rate(step_ns: float) -> bool:
+    return PLAUSIBLE_HZ[0] <= 1e9 / step_ns <= PLAUSIBLE_HZ[1]
+
+
+def _no_stamp(path: Path, line: int, text: str) -> RecordingError:
+    return RecordingError(
+        f"{path} holds {_shorten(text)!r} on line {line} where a time stamp was expected, such as "
+        "1234.5 (without separators of thousands), 2024-05-01T10:00:00.5Z or 10:00:00.5; correct "
+        "or remove that line"
+    )
+
+
+def _are_decimals(rows: list[tuple[int, list[str]]]) -> bool:
+    """Whether the only comma in each line is a decimal sign."""
+    behind = [row[1] for _, row in rows if len(row) == 2]
+    digits = behind and all(len(row) <= 2 and _are_digits(row) for _, row in rows)
+    even = len({len(text) for text in behind}) == 1 < len(behind[0]) if behind else False
+    return bool(digits and (even or len(behind) < len(rows)) and not _is_column(behind))
+
+
+def _are_digits(texts: list[str]) -> bool:
+    return all(text.isascii() and text.isdigit() for text in texts)
+
+
+def _is_column(digits: list[str], header: Sequence[str] = ()) -> bool:
+    """Whether digits behind commas rise, or are the same, or 0 and 1: a column of their own.
+
+    Args:
+        digits: one text a line.
+        header: of a table that has more columns than it names.
+    """
+    values = np.array([int(text[-18:]) for text in digits], np.int64)
+    padded = bool(header) or any(text[0] == "0" < text for text in digits)
+    rises = np.all(np.diff(values) >= 0)
+    return bool(not padded and (rises or values.max() < 2 or frame_counts(values, 1) is not None))
+
+
+def name_numbers(names: Sequence[str]) -> Times | None:
+    """The number that counts in each name; None where the names differ in more than numbers.
+
+    Of several numbers it is the first that rises with every name and counts, or else the last that
+    differs.
+
+    Args:
+        names: names of files, in order; folders and endings do not matter.
 
     Returns:
-        (n,) int64 stamps, ns, in file order.
-
-    Raises:
-        RecordingError: the file is no text, or a line has no number there.
+        (n,) int64.
     """
-    rows = [
-        (number, line.replace(",", " ").split())
-        for number, line in enumerate(_lines(path), start=1)
+    parts = [re.split(r"(\d+)", _stem(name)) for name in names]
+    if len({tuple(part[::2]) for part in parts}) != 1:
+        return None
+    groups = [
+        np.array([int(digits[-18:]) for digits in group], np.int64)
+        for group in list(zip(*parts, strict=True))[1::2]
     ]
-    rows = [(number, row) for number, row in rows if row]
-    if rows and not _is_number(rows[0][1][0]):
-        rows = rows[1:]
-    return _parse(path, rows, 0, ns_per_unit)
+    differ = [group for group in groups if (group != group[0]).any()]
+    rising = [
+        group for group in differ if np.all(np.diff(group) > 0) and frame_counts(group) is not None
+    ]
+    return next(iter([*rising, *differ[::-1]]), None)
+
+
+def _places(wanted: Iterable[Any], keys: Iterable[Any]) -> NDArray[np.int64]:
+    """Where each of some keys is; -1 where it is not, and everywhere if keys are not unique."""
+    wanted, keys = list(wanted), list(keys)
+    places = {key: k for k, key in enumerate(keys)}
+    unique = len(places) == len(keys) and len(set(wanted)) == len(wanted)
+    return np.array([places.get(key, -1) if unique else -1 for key in wanted], np.int64)
+
+
+def _stem(name: str) -> str:
+    """A name without folders and ending, in small letters."""
+    return re.sub(r"\.[a-z]+$", "", re.split(r"[/\\]", name)[-1].casefold())
 
 
 def name_times(names: Sequence[str]) -> tuple[Times, bool] | None:
@@ -162,50 +493,6 @@ def _seconds_ns(parts: tuple[str, str]) -> int:
 
 def _whole_ns(digits: str) -> int:
     return int(digits) * 10 ** (19 - len(digits))
-
-
-def _split(lines: list[str]) -> list[list[str]]:
-    """Cells of every line, none for a line that is a comment without names or blank."""
-    first = next((line for line in lines if line.strip()), "")
-    delimiter = next((d for d in ",;\t" if d in first), None)
-    rows = (
-        [line.split() for line in lines]
-        if delimiter is None
-        else list(csv.reader(lines, delimiter=delimiter))
-    )
-    return [[cell.strip().strip('"') for cell in row] for row in rows]
-
-
-def _lines(path: Path) -> list[str]:
-    try:
-        return path.read_text(encoding="utf-8-sig").splitlines()
-    except UnicodeDecodeError:
-        raise RecordingError(
-            f"{path} should be a text file with one time stamp per line, but it is not text"
-        ) from None
-
-
-def _is_number(text: str) -> bool:
-    try:
-        return Decimal(text).is_finite()
-    except InvalidOperation:
-        return False
-
-
-def _parse(path: Path, rows: list[tuple[int, list[str]]], column: int, ns_per_unit: int) -> Times:
-    times = []
-    for number, row in rows:
-        if row[0].startswith("#"):
-            continue
-        text = row[column] if column < len(row) else ""
-        try:
-            times.append(to_ns(text, ns_per_unit))
-        except InvalidOperation:
-            raise RecordingError(
-                f"{path} holds {_shorten(text)!r} on line {number} where a time stamp was "
-                "expected; correct or remove that line"
-            ) from None
-    return np.array(times, np.int64)
 
 
 def _shorten(text: str) -> str:

@@ -9,6 +9,7 @@ a step of more than 1.5 median steps. What was moved is reported, never hidden.
 
 from __future__ import annotations
 
+import re
 from bisect import bisect_right
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
@@ -42,6 +43,11 @@ _PLAUSIBLE_START_NS = (
 )  # the year 2000: earlier stamps count from something else than 1970
 
 
+_COUNTING = 0.75  # of the steps of a counter are the same
+_MOMENT = re.compile(
+    r"(\d{4}-?\d\d-?\d\d\D\d\d:?\d\d(?::?\d\d)?)(?:[.,](\d+))? ?(z|[+-]\d\d(?::?\d\d)?)?",
+    re.IGNORECASE,
+)
 DROPPED = "camera_dropped"
 JUMPED = "clock_jumped"
 PULSES_UNKNOWN = (
@@ -285,17 +291,47 @@ def find_faults(times_ns: Times, step_ns: int, faults: NDArray[np.uint8]) -> lis
     ]
 
 
-def from_rate(n_frames: int, fps: float) -> Times:
+def from_rate(n_frames: int | Times, fps: float) -> Times:
     """Evenly spaced stamps from 0: the last resort, where a file holds no clock.
 
     Args:
-        n_frames: how many stamps.
+        n_frames: how many stamps, or (n,) the place of each frame among those that the camera
+            took, see `frame_counts`.
         fps: frame rate, Hz.
 
     Returns:
-        (n_frames,) int64 ns.
+        (n,) int64 ns.
     """
-    return np.round(np.arange(n_frames) * (1e9 / fps)).astype(np.int64)
+    places = np.arange(n_frames) if isinstance(n_frames, int) else n_frames
+    return np.round(places * (1e9 / fps)).astype(np.int64)
+
+
+def frame_counts(numbers: Times, step: int | None = None) -> Times | None:
+    """How many frames each number is behind the first, if the numbers count frames.
+
+    They count where almost all steps are the same and the others are multiples of it. A counter of
+    8, 16 or 32 bits may wrap around; one that starts again otherwise lost nobody knows how many
+    frames, and none is counted.
+
+    Args:
+        numbers: (n,) int64.
+        step: the step that is asked for; None for any.
+
+    Returns:
+        (n,) int64 from 0; None where they do not count.
+    """
+    steps = np.diff(numbers)
+    sizes, often = np.unique(steps, return_counts=True)
+    if len(steps) < 2 or often.max() < _COUNTING * len(steps):
+        return None
+    usual = int(sizes[often.argmax()])
+    if usual <= 0 or step not in (None, usual):
+        return None
+    wrap = next(size for size in (1 << 8, 1 << 16, 1 << 32, 1 << 62) if numbers.max() < size)
+    wrapped = (steps < 0) & (steps + wrap <= max(wrap >> 5, usual))
+    lost = (steps < 0) | (steps > usual << 24)
+    steps = np.where(wrapped, steps + wrap, np.where(lost, usual, steps))
+    return None if (steps % usual).any() else np.append(0, np.cumsum(steps // usual))
 
 
 def make_monotone(times_ns: Times) -> MonotoneTimes:
@@ -473,6 +509,19 @@ def match_counts(
     )
 
 
+def unpaired(frames_from: str, times_from: str) -> str:
+    """The doubt about frames and stamps that were paired in order although one of them lacks some.
+
+    Args:
+        frames_from: name of the file or folder of the depth images.
+        times_from: name of the file of the stamps.
+    """
+    return (
+        f"{frames_from} and {times_from} do not hold equally many frames and nothing says which "
+        "are missing: times may be wrong by these"
+    )
+
+
 def start_of_day(stated: str | datetime | None) -> str | None:
     """A stated start of the recording as ISO 8601 with zone.
 
@@ -484,12 +533,35 @@ def start_of_day(stated: str | datetime | None) -> str | None:
     """
     if isinstance(stated, str):
         try:
-            stated = datetime.fromisoformat(stated)
+            stated = read_moment(stated)[0]
         except ValueError:
             return None
     return (
         stated.isoformat() if isinstance(stated, datetime) and stated.tzinfo is not None else None
     )
+
+
+def read_moment(text: str) -> tuple[datetime, int]:
+    """A date and time of day in the forms of ISO 8601, with or without a zone.
+
+    Args:
+        text: such as 2024-10-27T02:59:59.1234567+02:00.
+
+    Returns:
+        The moment, to the microsecond, and exactly as ns since 1970; one without a zone as if in
+        UTC.
+
+    Raises:
+        ValueError: it is none.
+    """
+    found = _MOMENT.fullmatch(text.strip())
+    if found is None:
+        raise ValueError(f"{text!r} is no date and time")
+    moment = datetime.fromisoformat(found[1] + (found[3] or "").upper())
+    ns = int((found[2] or "0")[:9].ljust(9, "0"))
+    since_1970 = moment.replace(tzinfo=moment.tzinfo or UTC) - datetime(1970, 1, 1, tzinfo=UTC)
+    whole_s = since_1970 // timedelta(seconds=1)
+    return moment + timedelta(microseconds=ns // 1000), whole_s * 10**9 + ns
 
 
 def start_of_clock(first_ns: int) -> str | None:

@@ -13,6 +13,8 @@ import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from liex_lab.runtime.text_files import read_text, split_cells, split_lines
+
 if TYPE_CHECKING:
     import pandas as pd
 
@@ -80,26 +82,31 @@ def write_csv(table: pd.DataFrame, path: Path, *, index: bool = False) -> None:
     harmless_table(table).to_csv(path, index=index, lineterminator="\n")
 
 
-def read_named(path: Path, texts: tuple[str, ...], separator: str = ",") -> pd.DataFrame:
-    """Read a CSV file some columns of which are names: '', 007 and NA are names like any other.
+def read_texts(path: Path) -> pd.DataFrame:
+    """Read a table that a person made, every cell as it is written: 007 and NA are names, too.
 
     Args:
-        path: the file.
-        texts: columns that are text whatever they look like; those that are there.
-        separator: what stands between cells.
+        path: the file, as CSV or as a spreadsheet separates its cells.
 
     Raises:
         OSError: the file cannot be read.
-        ValueError: it is no such table.
+        ValueError: it is no table with a name for every column.
     """
     import pandas as pd
 
-    table = pd.read_csv(path, sep=separator)
-    names = [name for name in texts if name in table]
-    if names:
-        said = pd.read_csv(path, sep=separator, usecols=names, dtype="str", keep_default_na=False)
-        table = table.assign(**{name: said[name] for name in names})
-    return table
+    separator, lines = split_lines(read_text(path))
+    rows = [(k, row) for k, row in enumerate(split_cells(lines, separator), start=1) if any(row)]
+    names = rows[0][1] if rows else []
+    for line, row in rows:
+        if any(row[len(names) :]):
+            raise ValueError(
+                f"line {line} has {len(row)} cells and the first line names {len(names)} columns; "
+                "where a comma is the decimal sign, separate cells by semicolons"
+            )
+    n = len(names)
+    table = pd.DataFrame([[*row, *[""] * n][:n] for _, row in rows[1:]], columns=range(n))
+    table.columns = pd.Index(names, dtype=str)
+    return table.loc[:, ~table.columns.duplicated()]
 
 
 def read_harmless(path: Path, texts: tuple[str, ...] = ()) -> pd.DataFrame:
@@ -111,7 +118,11 @@ def read_harmless(path: Path, texts: tuple[str, ...] = ()) -> pd.DataFrame:
     """
     import pandas as pd
 
-    table = read_named(path, texts)
+    table = pd.read_csv(path)
+    names = [name for name in texts if name in table]
+    if names:
+        said = pd.read_csv(path, usecols=names, dtype="str", keep_default_na=False)
+        table = table.assign(**{name: said[name] for name in names})
     table.columns = pd.Index([as_it_was(name) for name in table.columns])
     return table.map(as_it_was)
 

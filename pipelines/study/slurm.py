@@ -5,14 +5,14 @@ Each text becomes one line of a job script, so line breaks are refused.
 
 from __future__ import annotations
 
-import tomllib
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from liex_lab.errors import StudyError
 from liex_lab.plan import plans_folder
+from liex_lab.runtime.text_files import read_toml
 
 # one line of a job script each: nothing in the file may begin another line
 Line = Annotated[str, Field(pattern=r"^[^\r\n\x00]*$", max_length=1000)]
@@ -68,13 +68,12 @@ class SlurmTable(BaseModel):
                 f"there is no file {file}; copy {plans_folder() / 'slurm.toml'} and change the copy"
             )
         try:
-            table: dict[str, Any] = tomllib.loads(file.read_text(encoding="utf-8"))
-            return SlurmTable.model_validate(table)
-        except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
-            raise StudyError(f"{file} should be a TOML file, but: {error}; correct it") from None
-        except ValidationError as error:
+            return SlurmTable.model_validate(read_toml(file))
+        except ValidationError as error:  # which is a ValueError, too
             first = error.errors(include_url=False)[0]
             where = ".".join(str(part) for part in first["loc"])
             raise StudyError(
                 f"{file}: {where}: {first['msg']}; compare it with the bundled slurm.toml"
             ) from None
+        except ValueError as error:
+            raise StudyError(f"{file} should be a TOML file, but: {error}; correct it") from None

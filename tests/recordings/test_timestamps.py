@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from itertools import combinations, pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from hypothesis import strategies as st
 
 from liex_lab.errors import RecordingError
 from liex_lab.recordings import open_recording
-from liex_lab.recordings.timestamp_files import name_times, read_column_times, read_csv_times, to_ns
+from liex_lab.recordings.timestamp_files import name_times, read_stamps
 from liex_lab.recordings.timestamps import (
     FAULTS,
     Gap,
@@ -260,17 +261,26 @@ def test_a_rate_gives_stamps_that_do_not_drift() -> None:
     assert np.diff(times).max() - np.diff(times).min() <= 1
 
 
+def times_of(path: Path, content: str | bytes, **how: Any) -> list[int]:
+    """Stamps of a table that are read without a doubt."""
+    path.write_bytes(content.encode() if isinstance(content, str) else content)
+    doubts: list[str] = []
+    times = read_stamps(path, doubts, **how).times(None, [], doubts, None)
+    assert doubts == []
+    return times.tolist()
+
+
 @pytest.mark.parametrize(
     ("text", "unit", "ns"),
     [
-        ("666649624.5888", 10**6, 666649624588800),
-        ("1760000000.123456789", 10**9, 1760000000123456789),
-        ("-1.5", 10**9, -1_500_000_000),
-        ("1.76e9", 10**9, 1_760_000_000 * 10**9),
+        ("666649624.5888", "ms", 666649624588800),
+        ("1760000000.123456789", "s", 1760000000123456789),
+        ("-1.5", "s", -1_500_000_000),
+        ("1.76e9", "s", 1_760_000_000 * 10**9),
     ],
 )
-def test_decimal_times_are_exact(text: str, unit: int, ns: int) -> None:
-    assert to_ns(text, unit) == ns
+def test_decimal_times_are_exact(tmp_path: Path, text: str, unit: str, ns: int) -> None:
+    assert times_of(tmp_path / "a.csv", f"time_{unit}\n{text}\n") == [ns]
 
 
 @pytest.mark.parametrize(
@@ -285,34 +295,34 @@ def test_decimal_times_are_exact(text: str, unit: int, ns: int) -> None:
 )
 def test_a_csv_is_read_whatever_program_wrote_it(tmp_path: Path, content: str) -> None:
     path = tmp_path / "timestamps.csv"
-    path.write_text(content, encoding="utf-8")
-    np.testing.assert_array_equal(read_csv_times(path), [5, 7])
+    assert times_of(path, content) == [5, 7]
 
 
 def test_moseq_stamps_may_have_a_header_and_commas(tmp_path: Path) -> None:
     path = tmp_path / "depth_ts.txt"
-    path.write_text("time,other\n1.5, 0\n2.5, 0\n")
-    np.testing.assert_array_equal(read_column_times(path, 10**6), [1_500_000, 2_500_000])
+    found = times_of(path, "time,other\n1.5, 0\n2.5, 0\n", usual_ns=10**6)
+    assert found == [1_500_000, 2_500_000]
 
 
 @pytest.mark.parametrize(
     ("content", "says"),
     [
         (b"", "missing"),
-        (b"1\n2\n3\n", "time_ns or time_s"),
+        (b"1\n2\n", "time_ns or time_s"),
         (b"time_ns\n1\nnan\n", "'nan' on line 3"),
         (b"time_s\n1\n1e30\n", "'1e30' on line 3"),
         (b"time_s\n1\ninf\n", "'inf' on line 3"),
         (b"time_s\n" + b"x" * 500, "..."),
         (b"frame,time_ns\n1\n", "'' on line 2"),
-        (b"\xff\xfe\x00\x01\x02\x80", "not text"),
+        (b"\xff\xfe\x00\x01\x02", "utf-16"),
+        (b"time_s\n1\n\xe4\x80\n", "not text in UTF-8 or UTF-16 (line 3"),
     ],
 )
 def test_a_wrong_csv_is_told_in_a_sentence(tmp_path: Path, content: bytes, says: str) -> None:
     path = tmp_path / "timestamps.csv"
     path.write_bytes(content)
     with pytest.raises(RecordingError, match=r"timestamps\.csv") as error:
-        read_csv_times(path)
+        read_stamps(path, []).times(None, [], [], None)
     assert says in str(error.value)
     assert len(str(error.value)) < 400 + len(str(tmp_path))
 

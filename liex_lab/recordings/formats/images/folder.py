@@ -13,6 +13,7 @@ from fnmatch import fnmatch
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from liex_lab.errors import RecordingError, SeveralKindsError, UnknownTimesError
 from liex_lab.optics.camera import Lens
@@ -22,12 +23,12 @@ from liex_lab.recordings.formats.images.stack import Stack
 from liex_lab.recordings.frame import Depth
 from liex_lab.recordings.infrared import is_infrared, refuse_infrared
 from liex_lab.recordings.recording import Recording
-from liex_lab.recordings.timestamp_files import name_times, read_csv_times
+from liex_lab.recordings.timestamp_files import name_numbers, name_times, read_stamps
 from liex_lab.recordings.timestamps import (
     MonotoneTimes,
+    frame_counts,
     from_rate,
     make_monotone,
-    match_counts,
     start_of_clock,
 )
 from liex_lab.runtime.progress import Progress, silent
@@ -225,7 +226,8 @@ class Folder:
         camera_toml = self.camera_toml
         the_camera = camera_toml.camera(stack.width, stack.height, camera)
         problems = [*camera_toml.problems, *stack.problems, *_say_cut(stack)]
-        monotone, start = self._times(fps, problems)
+        doubts: list[str] = []
+        kept, monotone, start = self._times(fps, problems, doubts)
         _refuse_negative(stack, self.decode, camera_toml)
         stated_in = [self.folder / CAMERA_FILE, self.folder / camera_toml.timestamps, *self.beside]
         return Recording(
@@ -237,10 +239,12 @@ class Folder:
             sources=[*self.files, *(file for file in stated_in if file.is_file())],
             problems=problems,
             truncated=stack.truncated,
-            whole=np.array(stack.whole[: len(monotone.times_ns)], np.bool_),
+            whole=np.array(stack.whole, np.bool_)[kept],
+            stored=kept,
             metadata=({"session_start_time": start} if start else {}) | camera_toml.metadata,
             close=stack.close,
             faults=monotone.faults,
+            doubts=doubts,
         )
 
     @property
@@ -248,39 +252,49 @@ class Folder:
         """Where the pictures lie."""
         return self.path if self.path.is_dir() else self.path.parent
 
-    def _times(self, fps: float | None, problems: list[str]) -> tuple[MonotoneTimes, str | None]:
-        """Stamps for the frames that have one, and the moment of the first, ISO 8601, where they
-        tell it.
+    def _times(
+        self, fps: float | None, problems: list[str], doubts: list[str]
+    ) -> tuple[NDArray[np.int64], MonotoneTimes, str | None]:
+        """The images that have a stamp, their stamps, and the moment of the first, ISO 8601, where
+        they state it.
 
-        From the stamp file, or else from the names of the pictures, or else from a stated rate.
+        From the stamp file, or else from the names of the images, or else from a stated rate.
         """
         path = self.folder / self.camera_toml.timestamps
         n = len(self.stack)
+        kept = np.arange(n)
+        names = [file.name for file in self.files]
+        numbers = name_numbers(names) if len(names) == n else kept
+        numbers = np.zeros(n, np.int64) if numbers is None else numbers
+        hz = rate(fps, "the call") or self.camera_toml.fps
         if path.is_file():
-            times = read_csv_times(path, self.camera_toml.time_column, self.camera_toml.time_unit)
-            n, counts = match_counts(n, times, self.folder.name, path.name)
-            if not n:
+            stated = (self.camera_toml.time_column, self.camera_toml.time_unit)
+            stamps = read_stamps(path, doubts, *stated)
+            times = stamps.times(hz, problems, doubts, None)
+            rows = stamps.rows_of(self.folder.name, names, numbers, problems, doubts)
+            kept = np.flatnonzero(rows >= 0)
+            if not len(kept):
                 raise RecordingError(
                     f"{path} holds no time stamp; write one per picture, or remove it and state "
                     "fps in camera.toml"
                 )
-            problems += [counts] if counts else []
-            moment = True
-        elif (
-            len(self.files) == n
-            and (named := name_times([file.name for file in self.files])) is not None
-        ):
+            times, moment = times[rows[kept]], stamps.zoned
+        elif len(names) == n and (named := name_times(names)) is not None:
             times, moment = named
         else:
-            hz = rate(fps, "the call") or self.camera_toml.fps
             if hz is None:
                 raise self._no_times()
             problems.append(f"there are no time stamps, so a constant {hz:g} frames/s was assumed")
-            times = from_rate(n, hz)
-            moment = False
-        monotone = make_monotone(times[:n])
+            counts = frame_counts(numbers)
+            times, moment = from_rate(n if counts is None else counts, hz), False
+            if counts is not None and (left_out := int(counts[-1]) + 1 - n) > 0:
+                problems.append(
+                    f"the numbers in the names leave out {left_out} of {n + left_out}; these were "
+                    "taken for frames that are missing"
+                )
+        monotone = make_monotone(times)
         problems += [monotone.problem] if monotone.problem else []
-        return monotone, start_of_clock(int(monotone.times_ns[0])) if moment else None
+        return kept, monotone, start_of_clock(int(monotone.times_ns[0])) if moment else None
 
     def _no_times(self) -> RecordingError:
         return UnknownTimesError(

@@ -8,7 +8,6 @@ b f / (b - f) in front of it. `raw` values are 1 - 1 / v.
 from __future__ import annotations
 
 import difflib
-import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -18,6 +17,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from liex_lab.errors import RecordingError
 from liex_lab.recordings.frame import Depth
+from liex_lab.runtime.text_files import read_toml
 
 PROFILE_FILE = "raytrix.toml"
 _SHIPPED = Path(__file__).with_name("raytrix_profiles.toml")
@@ -169,7 +169,7 @@ class Profile(BaseModel):
 
 def shipped_profiles() -> dict[str, dict[str, Any]]:
     """The profiles that come with the package, by name."""
-    return tomllib.loads(_SHIPPED.read_text(encoding="utf-8"))
+    return read_toml(_SHIPPED)
 
 
 def read_profile(path: Path) -> Profile:
@@ -186,8 +186,8 @@ def read_profile(path: Path) -> Profile:
             be.
     """
     try:
-        table = tomllib.loads(path.read_text(encoding="utf-8-sig"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
+        table = read_toml(path)
+    except ValueError as error:
         raise RecordingError(
             f"{path} should be a TOML file, but it does not parse ({error}); correct it"
         ) from None

@@ -299,6 +299,7 @@ def _open(
         metadata=metadata | packed.metadata,
         close=file.close,
         faults=packed.faults(monotone.faults),
+        doubts=packed.doubts,
         grow=grow,
     )
 

@@ -29,6 +29,7 @@ class PackFacts:
     Attributes:
         step_mm: mm of a stored step.
         problems: sentences about the recording.
+        doubts: reasons not to rely on its times.
         moved: frames whose stamps were moved, and why: index into `FAULTS` by row.
         source: name, format and SHA-256 of the recording.
         region_px: (u, v) corners of the polygon that the pixels kept lie in; empty for the whole
@@ -47,6 +48,7 @@ class PackFacts:
     n_px: int = 0
     depth_sha256: str = ""
     packed: bool = False
+    doubts: list[str] = field(default_factory=list)
 
     @staticmethod
     def of(notes: Mapping[str, str]) -> PackFacts:
@@ -72,6 +74,7 @@ class PackFacts:
                 int(told["n_px"]),
                 notes.get(_HASH, ""),
                 True,
+                [str(doubt) for doubt in told.get("doubts", ())],
             )
             sound = 0.0 < facts.step_mm < 1000.0 and all(
                 0 < why < len(FAULTS) for why in moved.values()
@@ -94,6 +97,7 @@ class PackFacts:
             "source": self.source,
             "region_px": self.region_px,
             "n_px": self.n_px,
+            "doubts": self.doubts,
         }
         return {_FACTS: json.dumps(told)}
 

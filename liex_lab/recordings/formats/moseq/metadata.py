@@ -12,8 +12,10 @@ from pathlib import Path
 from typing import Any
 
 from liex_lab.errors import RecordingError
-from liex_lab.recordings.timestamp_files import CSV_COLUMNS, read_column_times, read_csv_times
-from liex_lab.recordings.timestamps import PLAUSIBLE_HZ, Times, median_step, start_of_day
+from liex_lab.recordings.camera_file import CameraFile
+from liex_lab.recordings.timestamp_files import Stamps, read_stamps
+from liex_lab.recordings.timestamps import start_of_day
+from liex_lab.runtime.text_files import read_text
 
 STAMPS = {"depth_ts.txt": 10**6, "timestamps.csv": 10**9}  # file: nanoseconds in its unit
 METADATA = "metadata.json"
@@ -82,7 +84,7 @@ def read_metadata(path: Path | None, cut: bool) -> Metadata:
     if path is None:
         return _NOTHING
     try:
-        document = json.loads(path.read_text(encoding="utf-8-sig"))
+        document = json.loads(read_text(path))
         if not isinstance(document, dict):
             raise ValueError("it is not an object in braces")
     except (
@@ -99,9 +101,8 @@ def read_metadata(path: Path | None, cut: bool) -> Metadata:
     facts = {}
     problems = []
     for key, ours in (("SubjectName", "subject_id"), ("SessionName", "session_name")):
-        stated = document.get(key)
-        if isinstance(stated, str | int) and not isinstance(stated, bool) and str(stated).strip():
-            facts[ours] = str(stated).strip()
+        if type(document.get(key)) in (str, int) and str(document[key]).strip():
+            facts[ours] = str(document[key]).strip()
     if (stated := document.get("StartTime")) is not None:
         if (start := start_of_day(stated if isinstance(stated, str) else None)) is not None:
             facts["session_start_time"] = start
@@ -151,23 +152,31 @@ def _stated_camera(document: dict[str, Any]) -> tuple[str | None, str]:
     ), name.strip()
 
 
-def read_stamps(files: dict[str, Path], cut: bool, problems: list[str]) -> tuple[str, Times] | None:
+def read_session_stamps(
+    files: dict[str, Path],
+    cut: bool,
+    camera_file: CameraFile,
+    problems: list[str],
+    doubts: list[str],
+) -> Stamps | None:
     """Read the file of time stamps beside the depth.
 
     depth_ts.txt counts milliseconds and timestamps.csv seconds, unless their first line names a
-    column in another unit. Of a cut archive, half a number at the end is dropped, from the file
-    too.
+    column in another unit, or camera.toml does. Of a cut archive, half a number at the end is
+    dropped, from the file too.
 
     Args:
         files: the session's files by name.
         cut: True where their archive is cut.
+        camera_file: may state the column of times and its unit.
         problems: sentences, appended to where the stamps are missing or give an unlikely rate.
+        doubts: reasons not to rely on the times, appended to.
 
     Returns:
-        Name of the file and its (n,) int64 stamps, ns; None where there are none.
+        The stamps; None where there are none.
 
     Raises:
-        RecordingError: a line has no number where a stamp was expected.
+        RecordingError: a line has no stamp where one was expected.
     """
     name = next((name for name in STAMPS if name in files), None)
     if name is None:
@@ -177,19 +186,9 @@ def read_stamps(files: dict[str, Path], cut: bool, problems: list[str]) -> tuple
         # the archive broke off inside this file: half a number is a wrong number
         text = path.read_bytes()
         path.write_bytes(text[: text.rfind(b"\n") + 1])
-    with path.open("rb") as file:
-        first = file.readline(4096).decode("utf-8", "replace")
-    named = any(column in first for column in CSV_COLUMNS)
-    times = read_csv_times(path) if named else read_column_times(path, STAMPS[name])
-    if not len(times):
+    stated = (camera_file.time_column, camera_file.time_unit, STAMPS[name])
+    stamps = read_stamps(path, doubts, *stated)
+    if not len(stamps):
         problems.append(f"{name} holds no time stamp")
         return None
-    step = median_step(times)
-    if not named and step > 0 and not PLAUSIBLE_HZ[0] <= 1e9 / step <= PLAUSIBLE_HZ[1]:
-        problems.append(
-            f"the stamps in {name} were taken as "
-            f"{'milli' if name == 'depth_ts.txt' else ''}seconds, as MoSeq writes them, which "
-            f"makes {1e9 / step:.3g} frames/s; if they have another unit, say so in a first line "
-            "such as time_ns or time_s"
-        )
-    return name, times
+    return stamps

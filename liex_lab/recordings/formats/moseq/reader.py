@@ -31,7 +31,7 @@ from liex_lab.recordings.formats.moseq.metadata import (
     STAMPS,
     Metadata,
     read_metadata,
-    read_stamps,
+    read_session_stamps,
 )
 from liex_lab.recordings.formats.video.index import DepthTrack
 from liex_lab.recordings.infrared import refuse_infrared
@@ -42,6 +42,7 @@ from liex_lab.recordings.timestamps import (
     make_monotone,
     match_counts,
     median_step,
+    unpaired,
 )
 from liex_lab.runtime.disk import STRETCH, let_go
 from liex_lab.runtime.progress import Progress, silent
@@ -51,6 +52,7 @@ DEPTH = "depth.dat"
 VIDEOS = ("depth.avi", "depth.mkv")
 DEPTHS = (DEPTH, *VIDEOS)
 _NOMINAL_HZ = 30.0  # what every camera that MoSeq records from delivers when nothing is lost
+_SURPLUS = 0.05  # of the stamps: recorders write those of frames whose infrared was lost
 _KINECT_V2_SIZE = (512, 424)
 _OTHER_SIZES = (
     (640, 480),
@@ -245,7 +247,10 @@ class _Session:
         self.camera_file = CameraFile.read(found.files.get(CAMERA_FILE, path.parent / CAMERA_FILE))
         self.metadata: Metadata = read_metadata(found.files.get(METADATA), found.cut)
         self.problems = [*self.camera_file.problems, *self.metadata.problems]
-        self.stamps = read_stamps(found.files, found.cut, self.problems)
+        self.doubts: list[str] = []
+        self.stamps = read_session_stamps(
+            found.files, found.cut, self.camera_file, self.problems, self.doubts
+        )
 
     def open(self, name: str, sources: list[Path], scratch: Scratch | None = None) -> Recording:
         """The recording.
@@ -328,7 +333,7 @@ class _Session:
         """That of a Kinect v2, unless the stamps say that another camera's size fits and this one
         does not.
         """
-        n = 0 if self.stamps is None else len(self.stamps[1])
+        n = 0 if self.stamps is None else len(self.stamps)
         kinect_bytes = 2 * _KINECT_V2_SIZE[0] * _KINECT_V2_SIZE[1]
         other = next(((w, h) for w, h in _OTHER_SIZES if n and n_bytes == 2 * w * h * n), None)
         if other is not None and n_bytes % kinect_bytes:
@@ -351,7 +356,7 @@ class _Session:
         unpacked: Path | None,
     ) -> Recording:
         camera = self._camera(stack, track)
-        times = self._times(len(stack), track)
+        times = self._times(stack, track)
         monotone = make_monotone(times)
         self.problems += [monotone.problem] if monotone.problem else []
         start = (
@@ -370,6 +375,7 @@ class _Session:
             truncated=stack.truncated or self.cut,
             close=close,
             faults=monotone.faults,
+            doubts=self.doubts,
             metadata={**start, **self.metadata.facts, **self.camera_file.metadata},
             unpacked=unpacked,
         )
@@ -423,22 +429,29 @@ class _Session:
             "camera's own in a camera.toml beside the recording"
         )
 
-    def _times(self, n: int, track: DepthTrack | None) -> Times:
+    def _times(self, stack: Stack, track: DepthTrack | None) -> Times:
         """The stamps beside the depth, or else its own, or else a constant rate."""
+        n = len(stack)
         own = None if track is None or not len(track.times_ns) else track
-        if self.stamps is not None:
-            name, stamps = self.stamps
+        hz = rate(self.fps, "the call") or self.camera_file.fps
+        counted = self.stamps is not None and self.stamps.counts is not None
+        if self.stamps is not None and (own is None or own.even or not counted):
+            name = self.stamps.path.name
+            known = None if own is None else 1e9 / max(median_step(own.times_ns), 1)
+            stamps = self.stamps.times(hz or known, self.problems, self.doubts, _NOMINAL_HZ)
             if self.cut and 1 < len(stamps) < n:
                 stamps = self._continue(stamps, n)
             if len(stamps) == n or own is None or own.even:
+                extra = len(stamps) - n
                 n, counts = match_counts(n, stamps, self.depth.name, name)
                 self.problems += [counts] if counts else []
+                if not 0 <= extra <= (len(stamps) if stack.truncated else max(3, _SURPLUS * n)):
+                    self.doubts.append(unpaired(self.depth.name, name))
                 return stamps[:n]
             self.problems.append(
                 f"{self.depth.name} holds {n} frames but {name} holds {len(stamps)} time stamps; "
                 "those of the video itself are used"
             )
-        hz = rate(self.fps, "the call")
         if own is not None and not (own.even and hz):
             if own.even:
                 self.problems.append(
