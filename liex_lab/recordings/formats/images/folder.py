@@ -25,7 +25,7 @@ from liex_lab.recordings.timestamp_files import name_times, read_csv_times
 from liex_lab.recordings.timestamps import (
     MonotoneTimes,
     from_rate,
-    make_monotone,
+    in_order_of_sensor,
     match_counts,
     start_of_clock,
 )
@@ -233,7 +233,8 @@ class Folder:
             sources=[*self.files, *(file for file in stated_in if file.is_file())],
             problems=problems,
             truncated=stack.truncated,
-            whole=np.array(stack.whole[: len(monotone.times_ns)], np.bool_),
+            whole=np.array(stack.whole, np.bool_)[monotone.order],
+            stored=monotone.order,
             metadata=({"session_start_time": start} if start else {}) | camera_toml.metadata,
             close=stack.close,
             faults=monotone.faults,
@@ -274,7 +275,7 @@ class Folder:
             problems.append(f"there are no time stamps, so a constant {hz:g} frames/s was assumed")
             times = from_rate(n, hz)
             moment = False
-        monotone = make_monotone(times[:n])
+        monotone = in_order_of_sensor(times[:n])
         problems += [monotone.problem] if monotone.problem else []
         return monotone, start_of_clock(int(monotone.times_ns[0])) if moment else None
 
