@@ -16,9 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.errors import LiexError
-from liex_lab.optics.presets import unusual_lens
+from liex_lab.optics.presets import unusual_centre, unusual_lens
 from liex_lab.plan import Plan
 from liex_lab.plan.plan import arena_lines
+from liex_lab.recordings.depth_units import PLAUSIBLE_MM
 from liex_lab.recordings.timestamps import DROPPED, Gap, unwritable_times
 from liex_lab.runtime.progress import Progress, silent
 
@@ -79,10 +80,6 @@ FINDINGS: Final = {  # key of the JSON: what it says; numbers that cannot be tol
 # frames looked at, spread over the recording; as many as a run learns its scene from
 _N_SAMPLED = 96
 _N_RAW = 16
-_PLAUSIBLE_MM = (
-    100.0,
-    10_000.0,
-)  # median depth: nearer than any camera reads, farther than any animal is watched
 
 
 def examine(
@@ -169,6 +166,7 @@ def examine(
                 *seen.problems,
                 *filter(None, [unwritable_times(opened.times_ns)]),
                 *filter(None, [unusual_lens(lens) if water is None and not missing else ""]),
+                *filter(None, [unusual_centre(lens)[0] if not missing else ""]),
                 *_time_problems(opened),
                 *depth.problems(),
                 *misplaced,
@@ -306,7 +304,7 @@ class _Depths:
                 f"{self.n_empty} of the {self.n_frames} frames looked at hold no depth at all; "
                 "check the camera's cable and what covers its lens"
             )
-        if not _PLAUSIBLE_MM[0] <= self.median_mm <= _PLAUSIBLE_MM[1]:
+        if not PLAUSIBLE_MM[0] <= self.median_mm <= PLAUSIBLE_MM[1]:
             found.append(
                 f"the median depth is {self.median_mm:.4g} mm, which no animal is watched from; "
                 "the depths are probably not in mm, so state the true unit_mm (millimetres per "

@@ -311,7 +311,7 @@ def make_track(writer: SessionWriter, fitted: Fitted) -> Verdict:
     Returns:
         How it went.
     """
-    from liex_lab.optics.presets import unusual_lens
+    from liex_lab.optics.presets import unusual_centre, unusual_lens
     from liex_lab.sessions.verdict import Verdict
     from liex_lab.tracking.observations import Observations
     from liex_lab.tracking.pace import why_too_fast
@@ -325,6 +325,7 @@ def make_track(writer: SessionWriter, fitted: Fitted) -> Verdict:
     water = build_water(fitted.plan)
     # water makes an ideal camera with a focal length of its own
     lens = unusual_lens(fitted.recording.camera) if water is None else ""
+    centre, at_edge = unusual_centre(fitted.recording.camera)
     place = tracker.scene.floor.unusual(None if water is None else water.lift_mm)
     verdict = Verdict.of(
         tracked.track,
@@ -334,7 +335,7 @@ def make_track(writer: SessionWriter, fitted: Fitted) -> Verdict:
             *tracker.scene.doubts,
             *fitted.recording.doubts,
             *fitted.recording.clock_doubts,
-            *filter(None, [fast]),
+            *filter(None, [fast, centre if at_edge else ""]),
             *files.rewritten(),
         ),
         n_animals=subject.n_animals,
@@ -342,7 +343,7 @@ def make_track(writer: SessionWriter, fitted: Fitted) -> Verdict:
             *fitted.notes,
             *tracker.scene.remarks,
             *files.grown(),
-            *filter(None, [lens]),
+            *filter(None, [lens, "" if at_edge else centre]),
             *place,
         ),
         accepted=fitted.plan.estimation.accept_misfit,
