@@ -69,7 +69,12 @@ _EIGHT_BIT = (
     "the depth itself"
 )
 _NOT_YET = "is in a format that is not read yet; export it as 16-bit PNG pictures, one to a frame"
+_PACKED = (
+    "is packed as a whole, as rosbag2's compression mode `file` does; unpack it with `zstd -d` and "
+    "give the result"
+)
 _NOT_READ = {
+    **dict.fromkeys((".zstd", ".zst"), _PACKED),
     **dict.fromkeys((".ray", ".rays"), _RAYTRIX),
     **dict.fromkeys((".ply", ".xyz"), _CLOUD),
     **dict.fromkeys(
@@ -218,6 +223,7 @@ def _open_folder(folder: Path, how: _How) -> Recording:
     if any(Path(name).suffix.lower() in (*_PICTURES, ".jpg", ".jpeg", ".bmp") for name in inside):
         return how.open("images.folder.open_images", folder)
     files = [name for name in inside if _reader(name, _ALONE)]
+    files = files or [name for name in inside if _NOT_READ.get(Path(name).suffix) is _PACKED]
     if len(files) == 1:
         return _open(folder / files[0], how)
     offer = files or [f"{name}/" for name in inside if (folder / name).is_dir()]
