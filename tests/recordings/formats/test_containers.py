@@ -424,13 +424,19 @@ def to_second_version(data: bytes, kind: int = 7) -> bytes:
 
 
 def test_the_second_version_of_cdr_is_read(tmp_path: Path) -> None:
-    path = write_ros_mcap(
-        tmp_path / "r.mcap", STORED, camera=QVGA, calibrated=False, pack_message=to_second_version
-    )
-    write_camera(tmp_path, QVGA)
-    with open_recording(path) as recording:
-        is_exact(recording)
-        assert (recording.truncated, recording.problems) == (False, [])
+    """Also from a writer that states it and aligns the numbers of its CameraInfo as before."""
+    for topic in ("/camera/depth/image_raw", "/d/image", "/de/image", "/dep/image", "/dept/image"):
+        path = write_ros_mcap(
+            tmp_path / "r.mcap",
+            STORED,
+            camera=QVGA,
+            topics=(topic,),
+            pack_message=to_second_version,
+        )
+        with open_recording(path) as recording:
+            is_exact(recording)
+            assert numbers(recording.camera) == numbers(QVGA)
+            assert (recording.truncated, recording.problems) == (False, [])
 
 
 def test_numbers_of_the_second_version_are_aligned_to_four_bytes(tmp_path: Path) -> None:

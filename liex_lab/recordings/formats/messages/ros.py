@@ -205,7 +205,18 @@ def parser(schema: str, encoding: str) -> Parser | None:
     read = _PARSERS[schema]
     if encoding == "ros1":
         return lambda data: read(layout(data))
-    return lambda data: read(layout(unpacked_message(data)))
+    return lambda data: _read_cdr(read, unpacked_message(data))
+
+
+def _read_cdr(read: Callable[[_Fields], Message], data: memoryview) -> Message:
+    """A message in CDR; one that begins as of the second version may be laid out as the first."""
+    fields = _CdrFields(data)
+    message = read(fields)
+    if fields.largest_step == _SECOND_VERSION <= len(data) - fields.at:
+        fields = _CdrFields(data)
+        fields.largest_step = 8
+        message = read(fields)
+    return message
 
 
 def stamp_reader(encoding: str) -> Callable[[memoryview], int | None] | None:
