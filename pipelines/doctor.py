@@ -17,9 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.errors import LiexError
-from liex_lab.optics.presets import unusual_lens
+from liex_lab.optics.presets import unusual_centre, unusual_lens
 from liex_lab.plan import Plan
 from liex_lab.plan.plan import arena_lines
+from liex_lab.recordings.depth_units import PLAUSIBLE_MM
 from liex_lab.recordings.timestamps import (
     DROPPED,
     Gap,
@@ -89,10 +90,6 @@ _N_RAW = 16
 # frames compared with the one before, and how many in a row of a recording that has more
 _N_COMPARED = 400
 _WINDOW = 8
-_PLAUSIBLE_MM = (
-    100.0,
-    10_000.0,
-)  # median depth: nearer than any camera reads, farther than any animal is watched
 
 
 def examine(
@@ -182,6 +179,7 @@ def examine(
                 *seen.problems,
                 *filter(None, [unwritable_times(opened.times_ns)]),
                 *filter(None, [unusual_lens(lens) if water is None and not missing else ""]),
+                *filter(None, [unusual_centre(lens)[0] if not missing else ""]),
                 *_time_problems(opened),
                 *_copies_told(opened, sample),
                 *depth.problems(),
@@ -344,7 +342,7 @@ class _Depths:
                 f"{self.n_empty} of the {self.n_frames} frames looked at hold no depth at all; "
                 "check the camera's cable and what covers its lens"
             )
-        if not _PLAUSIBLE_MM[0] <= self.median_mm <= _PLAUSIBLE_MM[1]:
+        if not PLAUSIBLE_MM[0] <= self.median_mm <= PLAUSIBLE_MM[1]:
             found.append(
                 f"the median depth is {self.median_mm:.4g} mm, which no animal is watched from; "
                 "the depths are probably not in mm, so state the true unit_mm (millimetres per "

@@ -337,7 +337,7 @@ def make_track(writer: SessionWriter, fitted: Fitted) -> Verdict:
     Returns:
         How it went.
     """
-    from liex_lab.optics.presets import unusual_lens
+    from liex_lab.optics.presets import unusual_centre, unusual_lens
     from liex_lab.sessions.verdict import Verdict
     from liex_lab.tracking.copies import copies_told
     from liex_lab.tracking.observations import Observations
@@ -354,6 +354,7 @@ def make_track(writer: SessionWriter, fitted: Fitted) -> Verdict:
     # water makes an ideal camera with a focal length of its own
     lens = unusual_lens(fitted.recording.camera) if water is None else ""
     jumps = [gap.start_frame for gap in fitted.recording.gaps if gap.reason == JUMPED]
+    centre, at_edge = unusual_centre(fitted.recording.camera)
     place = tracker.scene.floor.unusual(None if water is None else water.lift_mm)
     verdict = Verdict.of(
         tracked.track,
@@ -363,7 +364,7 @@ def make_track(writer: SessionWriter, fitted: Fitted) -> Verdict:
             *tracker.scene.doubts,
             *fitted.recording.doubts,
             *fitted.recording.clock_doubts,
-            *filter(None, [fast]),
+            *filter(None, [fast, centre if at_edge else ""]),
             *frozen,
             *files.rewritten(),
         ),
@@ -373,7 +374,7 @@ def make_track(writer: SessionWriter, fitted: Fitted) -> Verdict:
             *copied,
             *tracker.scene.remarks,
             *files.grown(),
-            *filter(None, [lens]),
+            *filter(None, [lens, "" if at_edge else centre]),
             *place,
             *(f"{PULSES_UNKNOWN}, first before frame {k}" for k in jumps[:1]),
         ),

@@ -130,3 +130,37 @@ def unusual_lens(camera: Camera) -> str:
         f"of {camera.width} x {camera.height} px ({usual}); where it is wrong, every length is: "
         "put something of known length on the floor"
     )
+
+
+def is_central(cx: float, cy: float, width: int, height: int, share: float = 0.4) -> bool:
+    """Whether a principal point lies in the middle of a picture.
+
+    Args:
+        cx: its column, px.
+        cy: its row, px.
+        width: columns of the picture, px.
+        height: rows of the picture, px.
+        share: how much of the width and height the middle is.
+    """
+    off = max(abs((cx + 0.5) / width - 0.5), abs((cy + 0.5) / height - 0.5))
+    return off <= share / 2
+
+
+def unusual_centre(camera: Camera) -> tuple[str, bool]:
+    """That a principal point lies far from the middle of the picture, and whether at its edge.
+
+    Args:
+        camera: as the recording or the plan states it.
+
+    Returns:
+        A sentence, "" where it lies in the middle 40 %; True outside of the middle 80 %.
+    """
+    where = (camera.cx, camera.cy, camera.width, camera.height)
+    if is_central(*where):
+        return "", False
+    return (
+        f"the principal point ({camera.cx:.1f}, {camera.cy:.1f}) lies far from the middle of the "
+        f"picture of {camera.width} x {camera.height} px, as if cx and cy belonged to another "
+        "picture size or to a larger picture: lengths and the tilt are wrong if they do",
+        not is_central(*where, 0.8),
+    )

@@ -49,6 +49,7 @@ class CameraFile:
         width: columns of the pictures, px.
         height: rows of the pictures, px.
         unit_mm: mm per stored step.
+        states_unit: whether the file states unit_mm.
         unread: stored values that mean "no reading".
         encoding: how stored values mean depth, one of `ENCODINGS`.
         byte_order: of PGM pictures, "big" or "little".
@@ -69,6 +70,7 @@ class CameraFile:
     width: int | None = None
     height: int | None = None
     unit_mm: float = 1.0
+    states_unit: bool = False
     unread: tuple[float, ...] = (0.0,)
     encoding: str = "linear"
     byte_order: str | None = None
@@ -259,6 +261,7 @@ def _from_table(path: Path, table: dict[str, Any], problems: tuple[str, ...]) ->
         width=int(numbers["width"]) if "width" in numbers else None,
         height=int(numbers["height"]) if "height" in numbers else None,
         unit_mm=numbers.get("unit_mm", own_unit_mm(table.get("encoding", "linear"))),
+        states_unit="unit_mm" in numbers,
         unread=tuple(_number(path, "unread", value, finite=False) for value in unread),
         encoding=table.get("encoding", "linear"),
         byte_order=table.get("byte_order"),

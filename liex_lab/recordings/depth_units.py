@@ -21,6 +21,8 @@ from liex_lab.recordings.frame import Depth, depth_mm
 
 Stored = NDArray[Any]
 
+# median depth: nearer than any camera reads, farther than any animal is watched
+PLAUSIBLE_MM = (100.0, 10_000.0)
 COLOUR = "nyu-hand"  # the one encoding of 8-bit colour pictures
 LARGEST_STEP = 0xFFFF
 _NO_DISPARITY = 2047  # of 11 bits

@@ -70,19 +70,20 @@ _EIGHT_BIT = (
     "the depth itself"
 )
 _NOT_YET = "is in a format that is not read yet; export it as 16-bit PNG pictures, one to a frame"
-_PACKED = "is packed, and only .tar.gz is read as it is; unpack it and give what comes out"
+_PACKED = "is packed, and only .tar.gz is read as it is; unpack it{} and give the result"
 _TRACKS = (
     "is a database, such as Live Mouse Tracker's, with tracks but without depth images; give the "
     "depth recording itself"
 )
 _NOT_READ = {
+    **dict.fromkeys((".zstd", ".zst"), _PACKED.format(" with `zstd -d`")),
     **dict.fromkeys((".ray", ".rays"), _RAYTRIX),
     **dict.fromkeys((".ply", ".xyz"), _CLOUD),
     **dict.fromkeys(
         (".jpg", ".jpeg", ".bmp", ".gif", ".webp", ".mp4", ".mov", ".webm"), _EIGHT_BIT
     ),
     **dict.fromkeys((".h5", ".npy", ".npz", ".rrd", ".xef", ".svo", ".svo2"), _NOT_YET),
-    **dict.fromkeys((".zip", ".gz", ".xz", ".bz2", ".7z", ".rar"), _PACKED),
+    **dict.fromkeys((".zip", ".gz", ".xz", ".bz2", ".7z", ".rar"), _PACKED.format("")),
     **dict.fromkeys((".sqlite", ".sqlite3", ".db"), _TRACKS),
 }
 
@@ -259,6 +260,7 @@ def _open_folder(folder: Path, how: _How) -> Recording:
     if any(Path(name).suffix.lower() in (*_PICTURES, ".jpg", ".jpeg", ".bmp") for name in inside):
         return how.open("images.folder.open_images", folder)
     files = [name for name in inside if _reader(name, _ALONE)]
+    files = files or [name for name in inside if _NOT_READ.get(Path(name).suffix) is _PACKED]
     if len(files) == 1:
         return _open(folder / files[0], how)
     offer = files or [f"{name}/" for name in inside if (folder / name).is_dir()]

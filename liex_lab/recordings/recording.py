@@ -60,7 +60,6 @@ class Recording:
             with zone).
         optics: what was undone on reading (distortion, water, mirroring), empty where nothing was;
             see `rectify`.
-        doubts: reasons not to rely on its times that the format knows, in sentences.
         unpacked: folder with what an archive was unpacked to, which opens as the same recording
             while this one is open; None where nothing was.
         region_px: (u, v) corners, pixels, of the polygon outside of which every picture was made
@@ -84,7 +83,6 @@ class Recording:
         step_ns: int | None = None,
         stored: NDArray[np.int64] | None = None,
         faults: NDArray[np.uint8] | None = None,
-        doubts: Sequence[str] = (),
         grow: Callable[[], Recording | None] | None = None,
         unpacked: Path | None = None,
         doubts: list[str] | None = None,
@@ -109,7 +107,6 @@ class Recording:
                 0 ... n - 1.
             faults: (n,) uint8, which stamps were moved and why, an index into `FAULTS`; None for
                 none.
-            doubts: reasons not to rely on the times that the format knows, in sentences.
             grow: opens what was appended to the files since, see `grown`; None where the format
                 cannot.
             unpacked: folder with what an archive was unpacked to, if it opens as the same
@@ -137,7 +134,6 @@ class Recording:
         self._stored = np.arange(len(self.times_ns)) if stored is None else stored
         self._whole_frames = np.ones(len(self.times_ns), np.bool_) if whole is None else whole
         self._faults = np.zeros(len(self.times_ns), np.uint8) if faults is None else faults
-        self.doubts = tuple(doubts)
         self._step_ns = median_step(self.times_ns) if step_ns is None else step_ns
         self._whole: Recording | None = None
         self._grow = grow
@@ -189,7 +185,7 @@ class Recording:
     @property
     def clock_doubts(self) -> tuple[str, ...]:
         """Why its times are not to be relied on, in sentences; usually none."""
-        return (*self.doubts, *clock_doubts(self._step_ns, self._faults))
+        return clock_doubts(self._step_ns, self._faults)
 
     @property
     def duration_s(self) -> float:
@@ -436,7 +432,6 @@ class Recording:
             stored=self._stored,
             close=None if lent else self.close,
             faults=self._faults,
-            doubts=self.doubts,
             unpacked=self.unpacked,
             grow=lambda: (more := self.grown()) and more.seen_by(camera, change, optics),
             doubts=self.doubts,

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import re
 from bisect import bisect_right
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, timedelta
 
 import numpy as np
@@ -48,6 +48,10 @@ _MOMENT = re.compile(
     r"(\d{4}-?\d\d-?\d\d\D\d\d:?\d\d(?::?\d\d)?)(?:[.,](\d+))? ?(z|[+-]\d\d(?::?\d\d)?)?",
     re.IGNORECASE,
 )
+_NEAR = 8  # frames among which one in the wrong place is sorted
+_CLOSEST = 0.6  # steps between two of them
+_MOST_LOST = 8
+
 DROPPED = "camera_dropped"
 JUMPED = "clock_jumped"
 PULSES_UNKNOWN = (
@@ -100,11 +104,13 @@ class MonotoneTimes:
         faults: (n,) uint8 index into `FAULTS`: why this frame's stamp was moved, 0 for one that
             stayed.
         problem: a sentence about what was moved; None where nothing was.
+        order: (n,) number, in file order, of the frame of each row; empty for 0 ... n - 1.
     """
 
     times_ns: Times
     faults: NDArray[np.uint8]
     problem: str | None
+    order: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
 
 
 def median_step(times_ns: Times) -> int:
@@ -332,6 +338,44 @@ def frame_counts(numbers: Times, step: int | None = None) -> Times | None:
     lost = (steps < 0) | (steps > usual << 24)
     steps = np.where(wrapped, steps + wrap, np.where(lost, usual, steps))
     return None if (steps % usual).any() else np.append(0, np.cumsum(steps // usual))
+
+
+def in_order_of_sensor(times_ns: Times, settled: NDArray[np.int64] | None = None) -> MonotoneTimes:
+    """Stamps made strictly increasing, after frames recorded in the wrong order were sorted.
+
+    Frames change places where that is sound: a few neighbours whose stamps, sorted, follow each
+    other as a camera's do, no two closer than `_CLOSEST` steps and none farther than `_MOST_LOST`.
+    Repeated and wild stamps stay where they are, and so do those behind a clock that was set back;
+    `make_monotone` deals with them.
+
+    Args:
+        times_ns: (n,) int64 stamps, ns, in file order.
+        settled: (m,) order of the first frames, which somebody has read already; None for none.
+
+    Returns:
+        The stamps in the order of the rows, that order, and a sentence about what was sorted.
+    """
+    joined, _ = _join_clocks(times_ns)
+    rows = np.arange(len(times_ns))
+    order = rows.copy() if settled is None else np.r_[settled, rows[len(settled) :]]
+    n_settled = 0 if settled is None else len(settled)
+    step = median_step(np.sort(joined))
+    for at in (n_settled + np.flatnonzero(np.diff(joined[n_settled:]) < 0)).tolist():
+        low, high = max(n_settled, at - _NEAR), min(len(rows), at + _NEAR + 2)
+        new = order[low:high][np.argsort(joined[order[low:high]], kind="stable")]
+        steps = np.diff(joined[new])
+        inside = low == n_settled or new[0] == order[low]
+        inside &= high == len(rows) or new[-1] == order[high - 1]
+        if inside and _CLOSEST * step <= steps.min() and steps.max() <= _MOST_LOST * step:
+            order[low:high] = new
+    found = make_monotone(times_ns[order])
+    if not (n := int((order != rows).sum())):
+        return replace(found, order=order)
+    n_pairs = int(((order[:-1] == rows[1:]) & (order[1:] == rows[:-1])).sum())
+    said = f"{n_pairs} pair{'s' * (n > 2)}" if n == 2 * n_pairs else f"{n} frames"
+    said += " were recorded in the wrong order, and were sorted by the sensor's time stamps"
+    problem = said if found.problem is None else f"{said}; {found.problem}"
+    return replace(found, order=order, problem=problem)
 
 
 def make_monotone(times_ns: Times) -> MonotoneTimes:

@@ -21,6 +21,7 @@ from liex_lab.plan import Plan
 from tests.oracles.plate import Plate, bent_down
 from tests.oracles.refraction import seen
 from tests.recordings.oni_files import depth_builder
+from tests.recordings.ros_writers import write_bag
 from tests.recordings.writers import (
     Frames,
     cut,
@@ -400,3 +401,29 @@ def test_a_real_session(reference_data: Path) -> None:
     assert findings["arena"]["kind"] == "round"
     assert 40 < findings["animal_length_mm"] < 110
     assert (findings["animal_share"], findings["animal_sits_still"]) == (1.0, False)
+
+
+@pytest.mark.parametrize("write", ["folder", "foxglove", "ros"])
+def test_a_principal_point_at_the_edge_is_reported_from_every_source(
+    tmp_path: Path, write: str
+) -> None:
+    edge = replace(CAMERA, cx=159.5, cy=119.5)
+    path = {
+        "folder": lambda: write_png_folder(tmp_path / "r", frames(), edge),
+        "foxglove": lambda: write_mcap(tmp_path / "r.mcap", frames(), edge),
+        "ros": lambda: write_bag(tmp_path / "r.bag", frames(), camera=edge),
+    }[write]()
+    problems = examined(path)["problems"]
+    assert any("the principal point (159.5, 119.5) lies far" in problem for problem in problems)
+
+
+@pytest.mark.parametrize("kind", ["16UC1", "32FC1"])
+def test_the_unit_that_doctor_asks_for_is_used(tmp_path: Path, kind: str) -> None:
+    """Depth in tenths of a millimetre, or floats in millimetres."""
+    stored, unit_mm = (frames() * 25, 0.04) if kind == "16UC1" else (frames().astype("f4"), 1.0)
+    path = write_bag(tmp_path / "r.bag", stored, camera=CAMERA, kind=kind)
+    assert any("state the true unit_mm" in problem for problem in examined(path)["problems"])
+    (tmp_path / "camera.toml").write_text(f"[camera]\nunit_mm = {unit_mm}\n")
+    found = examined(path)
+    assert not any("unit_mm" in problem for problem in found["problems"])
+    assert found["depth_max_mm"] == pytest.approx(701.0, abs=0.01)

@@ -18,7 +18,7 @@ from liex_lab.pipelines.doctor_files import next_command, open_anyhow
 
 from liex_lab.errors import LiexError, RecordingError
 from liex_lab.optics.camera import Camera
-from liex_lab.optics.presets import PRESETS, of_size, preset, unusual_lens
+from liex_lab.optics.presets import PRESETS, of_size, preset, unusual_centre, unusual_lens
 from liex_lab.plan import Plan
 from liex_lab.plan.sections import CameraName
 from tests.pipelines.test_choice import FISH, GOOD, RECORDING
@@ -101,6 +101,7 @@ def test_a_focal_length_that_no_known_camera_has_is_told(tmp_path: Path, factor:
             wrong = replace(camera, fx=factor * camera.fx, fy=factor * camera.fy)
             assert f"{name} {camera.fx:.0f}" in unusual_lens(wrong)
     assert not unusual_lens(Camera(2000.0, 2000.0, 700.0, 500.0, 1400, 1000)), "not known at all"
+
     lens = {"fx": 365.0 * factor, "fy": 365.0 * factor, "cx": 255.5, "cy": 211.5}
     stated = [*(f"camera.{name}={value!r}" for name, value in lens.items()), "recording.fps=30.0"]
     found = examine(pictures(tmp_path / "p"), Plan().with_settings(stated))
@@ -184,3 +185,28 @@ def test_every_genuine_file_that_holds_depth_gets_a_diagnosis(
     assert found["n_frames"] >= 1
     assert found["depth_max_mm"] is not None
     assert all("write" in sentence or "choose" in sentence for sentence in found["missing"])
+
+
+@pytest.mark.parametrize(
+    ("cx", "cy", "said", "at_edge"),
+    [
+        (159.5, 119.5, False, False),
+        (97.0, 165.0, False, False),
+        (95.0, 119.5, True, False),
+        (159.5, 170.0, True, False),
+        (319.5, 119.5, True, True),
+        (159.5, -0.5, True, True),
+        (600.0, 400.0, True, True),
+    ],
+)
+def test_a_principal_point_far_from_the_middle_is_reported(
+    cx: float, cy: float, said: bool, at_edge: bool
+) -> None:
+    sentence, edge = unusual_centre(Camera(287.9, 287.9, cx, cy, 320, 240))
+    assert (f"({cx:.1f}, {cy:.1f})" in sentence, edge) == (said, at_edge)
+
+
+def test_every_known_camera_looks_through_its_middle() -> None:
+    for cameras in PRESETS.values():
+        for camera in cameras:
+            assert unusual_centre(camera) == ("", False)

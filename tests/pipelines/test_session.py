@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import os
 import shutil
+from dataclasses import replace
 from itertools import count
 
 import numpy as np
@@ -26,6 +27,7 @@ from liex_lab.simulation.recording import FRAME_NS, SyntheticSession
 from liex_lab.simulation.sensors import PRIMESENSE_QVGA_SENSOR
 from liex_lab.tracking.observations import Observations
 from liex_lab.tracking.tracker import FrameTracker
+from tests.recordings.ros_writers import Info, write_bag
 from tests.recordings.writers import START_NS, write_png_folder
 
 SPINE_MM, N_RENDERED = 65.0, 43
@@ -272,6 +274,32 @@ def test_the_shape_of_the_arena_is_found(session, mouse):
     if arena.kind != "open":
         assert arena.edge == "wall"
         assert session.frames["wall_distance_mm"].dropna().between(-5.0, 1000.0).all()
+
+
+def test_a_calibration_of_another_lens_is_a_reason_until_the_right_one_is_stated(
+    mouse, pictures, times_ns, tmp_path
+):
+    right = mouse.camera
+    wrong = Info(replace(right, fx=309.0, fy=309.0, cx=85.0), "/camera/color/camera_info", "colour")
+    path = write_bag(
+        tmp_path / "walk.bag",
+        pictures,
+        camera=right,
+        times_ns=times_ns,
+        frame_id="depth",
+        infos=[wrong],
+    )
+    plan = Plan.load("mouse").with_settings(["replay.depth=none"])
+    made = run_session(path, plan, tmp_path / "wrong.liex")
+    found = Session.open(made).metadata
+    (reason,) = found["verdict"]["reasons"]
+    assert reason.startswith("the calibration is that of another lens (frame colour")
+    assert reason in found["problems"]
+    assert "the principal point (85.0, 119.5)" in found["verdict"]["cautions"][0]
+    numbers = [f"camera.{name}={getattr(right, name)}" for name in ("fx", "fy", "cx", "cy")]
+    made = run_session(path, plan.with_settings(numbers), tmp_path / "right.liex")
+    verdict = Session.open(made).metadata["verdict"]
+    assert (verdict["reasons"], verdict["cautions"]) == ([], [])
 
 
 def test_a_picture_that_is_written_to_during_the_run_is_a_reason_to_look_at_it(folder, tmp_path):

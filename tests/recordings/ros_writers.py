@@ -5,7 +5,7 @@ our readers.
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -21,7 +21,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from liex_lab.optics.camera import Camera
 from liex_lab.recordings.rvl import pack_rvl
-from tests.recordings.writers import SMALL, even_times
+from tests.recordings.writers import SMALL, STEP_NS, even_times
 
 INVERSE_A, INVERSE_B = 10100.0, 1.0 - 10100.0 / 10.0  # ROS's own values for depths up to 10 m
 
@@ -44,6 +44,25 @@ class How:
     log_delay_ns: int = 0
     stamped: bool = True
     times_ns: Sequence[int] | None = None
+    frame_id: str | None = None  # of the pictures; None: their topic
+    log_ns: Sequence[int] | None = None  # times of logging in place of the delayed ones
+    infos: Sequence[Info] | None = None  # calibrations in place of that of the camera
+
+
+@dataclass(frozen=True)
+class Info:
+    """A CameraInfo; `camera` is what it states, and None zeroes.
+
+    at: before which picture it is logged.
+    """
+
+    camera: Camera | None
+    topic: str = "/camera/depth/camera_info"
+    frame_id: str = "/camera/depth/image_raw"
+    at: int = 0
+    binning: tuple[int, int] = (0, 0)
+    roi: tuple[int, int, int, int] = (0, 0, 0, 0)  # x, y, width, height
+    size: tuple[int, int] | None = None
 
 
 @cache
@@ -55,14 +74,19 @@ def store(ros: int) -> Any:
 def ros_messages(ros: int, frames: NDArray[Any], how: How) -> Iterator[tuple[str, int, Any]]:
     """Topic, time of logging and message, in order of time."""
     times = even_times(len(frames)) if how.times_ns is None else how.times_ns
+    logged = [t + how.log_delay_ns for t in times] if how.log_ns is None else how.log_ns
     for topic in how.topics:
-        if how.calibrated:
-            info = topic.rpartition("/")[0] + "/camera_info"
-            yield info, times[0] + how.log_delay_ns, _camera_info(ros, topic, times[0], how)
-    for time_ns, frame in zip(times, frames, strict=True):
+        if how.calibrated and how.infos is None:
+            where = topic.rpartition("/")[0] + "/camera_info"
+            yield where, times[0] + how.log_delay_ns, _camera_info(ros, topic, times[0], how)
+    for n, (time_ns, log_ns, frame) in enumerate(zip(times, logged, frames, strict=True)):
+        for info in how.infos or ():
+            if info.at == n:
+                yield info.topic, log_ns, info_message(ros, time_ns, info, how)
         for topic in how.topics:
             stamp = time_ns if how.stamped else 0
-            yield topic, time_ns + how.log_delay_ns, depth_message(ros, frame, stamp, topic, how)
+            frame_id = topic if how.frame_id is None else how.frame_id
+            yield topic, log_ns, depth_message(ros, frame, stamp, frame_id, how)
 
 
 def depth_message(ros: int, frame: NDArray[Any], time_ns: int, frame_id: str, how: How) -> Any:
@@ -147,21 +171,27 @@ def _header(ros: int, time_ns: int, frame_id: str) -> Any:
 
 
 def _camera_info(ros: int, frame_id: str, time_ns: int, how: How) -> Any:
-    types, camera = store(ros).types, how.camera
-    k = camera.matrix
+    return info_message(ros, time_ns, Info(how.camera, frame_id=frame_id), how)
+
+
+def info_message(ros: int, time_ns: int, info: Info, how: How) -> Any:
+    """A CameraInfo."""
+    types, camera = store(ros).types, info.camera
+    width, height = info.size or ((camera.width, camera.height) if camera else (0, 0))
+    k = camera.matrix if camera else np.zeros((3, 3))
     p = np.hstack([k, np.zeros((3, 1))])
-    region = types["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, False)
+    x, y, across, down = info.roi
+    region = types["sensor_msgs/msg/RegionOfInterest"](x, y, down, across, bool(across))
     return types["sensor_msgs/msg/CameraInfo"](
-        _header(ros, time_ns, frame_id),
-        camera.height,
-        camera.width,
+        _header(ros, time_ns, info.frame_id),
+        height,
+        width,
         how.model,
         np.array(how.distortion, float),
         k.ravel(),
         np.eye(3).ravel(),
         p.ravel(),
-        0,
-        0,
+        *info.binning,
         region,
     )
 
@@ -175,9 +205,15 @@ def write_ros_mcap(
     compression: CompressionType = CompressionType.ZSTD,
     chunk_size: int = 16 * 1024,
     use_chunking: bool = True,
+    sent_ns: Sequence[int] | None = None,
+    pack_message: Callable[[bytes], bytes] = bytes,
     **changes: Any,
 ) -> Path:
-    """ROS's messages in an MCAP file; `changes` are further facts of `How`."""
+    """ROS's messages in an MCAP file; `changes` are further facts of `How`.
+
+    sent_ns: times of sending of the pictures; None: those of logging.
+    """
+    sent = None if sent_ns is None else iter(sent_ns)
     with path.open("wb") as file:
         writer = McapWriter(
             file, chunk_size=chunk_size, compression=compression, use_chunking=use_chunking
@@ -194,7 +230,9 @@ def write_ros_mcap(
                     topic, "ros1" if ros == 1 else "cdr", schema
                 )
             pack = store(ros).serialize_ros1 if ros == 1 else store(ros).serialize_cdr
-            writer.add_message(channels[topic], log_ns, bytes(pack(message, kind)), log_ns)
+            published = next(sent) if sent is not None and "Info" not in kind else log_ns
+            data = pack_message(bytes(pack(message, kind)))
+            writer.add_message(channels[topic], log_ns, data, published)
         writer.finish()
     return path
 
@@ -232,11 +270,67 @@ def write_bag(
     return path
 
 
-def write_db3(folder: Path, frames: NDArray[Any], how: How | None = None, **changes: Any) -> Path:
-    """A ROS 2 bag: a folder with metadata.yaml and a .db3 file."""
-    with rosbag2.Writer(folder, version=8, storage_plugin=rosbag2.StoragePlugin.SQLITE3) as writer:
+Messages = Iterator[tuple[str, int, Any]]
+
+
+def realsense_messages(
+    frames: NDArray[Any],
+    camera: Camera,
+    sensor_ns: Sequence[int],
+    *,
+    option_m: str | None = "0.000500",
+    metadata_m: str | None = "0.000500",
+    arrival_ns: Sequence[int] | None = None,
+    without_metadata: Sequence[int] = (),
+    began_ms: str = "1760000000123.456",
+    kind: str = "mono16",
+) -> Messages:
+    """What the RealSense programs of 2026 record: camera, unit and metadata as text, stamps of
+    arrival.
+    """
+    text = store(2).types["std_msgs/msg/String"]
+    stream = "/device_0/sensor_0/Depth_0"
+    yield "/file_version", 0, store(2).types["std_msgs/msg/UInt32"](4)
+    yield f"{stream}/info", 0, text("encoding=Z16;fps=30")
+    lens = f"fx={camera.fx};ppx={camera.cx};fy={camera.fy};ppy={camera.cy}"
+    size = f"width={camera.width};height={camera.height}"
+    bent = "model=Brown Conrady;coeffs=0.000000,0.000000,0.000000,0.000000,0.000000"
+    yield f"{stream}/camera_info", 0, text(f"{size};{lens};{bent}")
+    if option_m is not None:
+        yield "/device_0/sensor_0/option/Depth_Units/value", 0, text(option_m)
+        yield "/device_0/sensor_0/option/Depth_Units/description", 0, text("Metres of a step")
+    arrived = [(k + 1) * STEP_NS for k in range(len(frames))] if arrival_ns is None else arrival_ns
+    for n, (frame, now_ns, true_ns) in enumerate(zip(frames, arrived, sensor_ns, strict=True)):
+        image = depth_message(2, frame, now_ns, "Depth_0", How(kind=kind))
+        data = "data" if kind == "mono16" else "data/compressedDepth"
+        yield f"{stream}/image/{data}", now_ns, image
+        unit = "" if metadata_m is None else f"depth_units={metadata_m};"
+        milliseconds = f"{true_ns // 10**6}.{true_ns % 10**6:06d}"
+        facts = (
+            f"Frame number={100 + n};timestamp_domain=Global Time;system_time={began_ms};"
+            f"timestamp={milliseconds};{unit}Actual Exposure=8500;"
+        )
+        if n not in without_metadata:
+            yield f"{stream}/image/metadata", now_ns, text(facts)
+
+
+def write_db3(
+    folder: Path,
+    frames: NDArray[Any],
+    how: How | None = None,
+    *,
+    messages: Messages | None = None,
+    packed: bool = False,
+    **changes: Any,
+) -> Path:
+    """A ROS 2 bag: a folder with metadata.yaml and a .db3 file; packed: every message by itself."""
+    writer = rosbag2.Writer(folder, version=8, storage_plugin=rosbag2.StoragePlugin.SQLITE3)
+    if packed:
+        writer.set_compression(rosbag2.CompressionMode.MESSAGE, rosbag2.CompressionFormat.ZSTD)
+    with writer:
         connections: dict[str, Any] = {}
-        for topic, log_ns, message in ros_messages(2, frames, replace(how or How(), **changes)):
+        written = messages or ros_messages(2, frames, replace(how or How(), **changes))
+        for topic, log_ns, message in written:
             kind = message.__msgtype__
             if topic not in connections:
                 connections[topic] = writer.add_connection(topic, kind, typestore=store(2))

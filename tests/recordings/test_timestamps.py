@@ -21,6 +21,7 @@ from liex_lab.recordings.timestamps import (
     find_faults,
     find_gaps,
     from_rate,
+    in_order_of_sensor,
     make_monotone,
     match_counts,
     median_step,
@@ -148,6 +149,59 @@ def test_gaps_count_every_missing_pulse_whatever_the_jitter(
     for gap in find_gaps(stamps, median_step(stamps)):
         before[gap.start_frame] = gap.n_frames_missing
     np.testing.assert_array_equal(np.arange(n) + np.cumsum(before), pulse)
+
+
+STEP = 33_333_333
+
+
+@given(
+    st.sets(st.integers(0, 18), max_size=8),
+    st.integers(0, 2**60),
+    st.sets(st.integers(1, 58), max_size=4),
+    st.integers(0, 2**32),
+)
+def test_neighbours_recorded_in_the_wrong_order_get_their_own_stamps_again(
+    swapped: set[int], start: int, lost: set[int], seed: int
+) -> None:
+    """Also beside lost frames, and with stamps that jitter."""
+    jitter = np.random.default_rng(seed).integers(-STEP // 6, STEP // 6, 60)
+    right = np.delete(start + np.arange(60) * STEP + jitter, sorted(lost))
+    order = np.arange(len(right))
+    for k in swapped:
+        order[[3 * k, 3 * k + 1]] = order[[3 * k + 1, 3 * k]]
+    order = order[order < len(right)]
+    found = in_order_of_sensor(right[order])
+    np.testing.assert_array_equal(found.times_ns, right)
+    np.testing.assert_array_equal(order[found.order], np.arange(len(right)))
+    assert not found.faults.any()
+    n = len(swapped)
+    assert found.problem is None if not n else f"{n} pair" in str(found.problem)
+
+
+@pytest.mark.parametrize("move", [(20, 22), (20, 24), (3, 10)])
+def test_a_late_frame_goes_where_its_stamp_belongs(move: tuple[int, int]) -> None:
+    right = np.arange(60, dtype=np.int64) * STEP
+    stated = np.insert(np.delete(right, move[0]), move[1], right[move[0]])
+    found = in_order_of_sensor(stated)
+    np.testing.assert_array_equal(found.times_ns, right)
+    assert "were recorded in the wrong order" in str(found.problem)
+
+
+@given(st.integers(8, 50), st.floats(0.1, 1000.0), st.sampled_from(["back", "wild", "repeated"]))
+def test_clocks_that_are_not_sound_are_treated_as_before(at: int, steps: float, how: str) -> None:
+    stated = np.arange(60, dtype=np.int64) * STEP
+    if how == "back":  # for good
+        stated[at:] -= int(steps * STEP)
+    elif how == "wild":
+        stated[at] += int((9 + steps) * STEP) * (-1) ** at
+    else:
+        stated[at] = stated[at - 1]
+    found = in_order_of_sensor(stated)
+    before = make_monotone(stated)
+    np.testing.assert_array_equal(found.order, np.arange(60))
+    np.testing.assert_array_equal(found.times_ns, before.times_ns)
+    np.testing.assert_array_equal(found.faults, before.faults)
+    assert found.problem == before.problem
 
 
 def test_clocks_in_noise_stay_within_what_an_integer_holds() -> None:

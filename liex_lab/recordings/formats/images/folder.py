@@ -28,7 +28,7 @@ from liex_lab.recordings.timestamps import (
     MonotoneTimes,
     frame_counts,
     from_rate,
-    make_monotone,
+    in_order_of_sensor,
     start_of_clock,
 )
 from liex_lab.runtime.progress import Progress, silent
@@ -239,8 +239,8 @@ class Folder:
             sources=[*self.files, *(file for file in stated_in if file.is_file())],
             problems=problems,
             truncated=stack.truncated,
-            whole=np.array(stack.whole, np.bool_)[kept],
-            stored=kept,
+            whole=np.array(stack.whole, np.bool_)[kept[monotone.order]],
+            stored=kept[monotone.order],
             metadata=({"session_start_time": start} if start else {}) | camera_toml.metadata,
             close=stack.close,
             faults=monotone.faults,
@@ -292,7 +292,7 @@ class Folder:
                     f"the numbers in the names leave out {left_out} of {n + left_out}; these were "
                     "taken for frames that are missing"
                 )
-        monotone = make_monotone(times)
+        monotone = in_order_of_sensor(times)
         problems += [monotone.problem] if monotone.problem else []
         return kept, monotone, start_of_clock(int(monotone.times_ns[0])) if moment else None
 

@@ -68,6 +68,22 @@ def picture_size(message: DepthMessage) -> tuple[int, int] | None:
     return found if found is not None and min(found) > 0 and _fits(found) else None
 
 
+def said_kind(message: DepthMessage) -> str:
+    """What a message says that it holds, for a sentence.
+
+    Args:
+        message: a picture or a point cloud.
+    """
+    if isinstance(message, PointCloud):
+        return f"points of {', '.join(message.columns) or 'nothing'}"
+    if isinstance(message, RawPicture):
+        return (
+            f"{message.encoding}, {message.width} x {message.height} pixels in rows of "
+            f"{message.step} bytes, {len(message.data)} bytes in all"
+        )
+    return message.packing.strip()
+
+
 def _fits(size: tuple[int, int]) -> bool:
     return size[0] * size[1] <= LARGEST_PICTURE
 
@@ -133,6 +149,8 @@ def _raw_pixels(message: RawPicture) -> NDArray[Any] | None:
     width = message.width
     height = message.height
     step = message.step or width * dtype.itemsize
+    if step == width and len(message.data) == height * width * dtype.itemsize:
+        step = width * dtype.itemsize  # pixels of a row instead of its bytes, as some writers state
     # some writers leave out the padding of the last row
     if step < width * dtype.itemsize or step * (height - 1) + width * dtype.itemsize > len(
         message.data

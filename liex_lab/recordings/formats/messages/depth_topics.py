@@ -1,17 +1,19 @@
 """Selection of the depth topic in an MCAP file or ROS bag, with its calibration and its clock.
 
-One walk over the file finds the topics whose first message is depth, and the first calibration of
-every topic that has one. The calibration of the same frame_id is taken, nearest by topic name; a
-rectified topic takes P instead of K. Stamps are the sensor's, or the times of logging where
-pictures have none.
+One walk over the file finds the topics whose first message is depth, the calibrations, and what a
+known program states besides (`realsense`). The calibration of the same frame_id is taken, nearest
+by topic name, and mapped onto the picture by its binning and region of interest; a rectified topic
+takes P instead of K. Stamps are the sensor's, or the times of sending or logging where pictures
+have none.
 """
 
 from __future__ import annotations
 
-import math
+import re
 import struct
 from array import array
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from threading import Lock
@@ -21,10 +23,17 @@ from numpy.typing import NDArray
 
 from liex_lab.errors import LiexError, RecordingError, UnknownCameraError
 from liex_lab.optics.camera import Camera, Distortion, Lens
+from liex_lab.optics.presets import is_central
 from liex_lab.recordings.camera_file import CAMERA_FILE, CameraFile, fitting
-from liex_lab.recordings.formats.messages.depth_images import decode, picture_size
+from liex_lab.recordings.depth_units import PLAUSIBLE_MM
+from liex_lab.recordings.formats.messages.depth_images import (
+    decode,
+    picture_size,
+    said_kind,
+)
 from liex_lab.recordings.formats.messages.message_file import (
     Channel,
+    DamagedChunk,
     Envelope,
     Listed,
     MessageFile,
@@ -32,21 +41,23 @@ from liex_lab.recordings.formats.messages.message_file import (
     printable,
 )
 from liex_lab.recordings.formats.messages.messages import (
-    CALIBRATION_SCHEMAS,
     CLOUD_SCHEMAS,
-    UNIT_TOPIC,
     Calibration,
     DamagedMessage,
     DepthMessage,
-    DepthUnit,
     Parser,
+    Statement,
 )
 from liex_lab.recordings.formats.messages.pack_facts import PackFacts
-from liex_lab.recordings.formats.messages.parsers import parser_of, plain_schema
+from liex_lab.recordings.formats.messages.parsers import (
+    parser_of,
+    plain_schema,
+)
+from liex_lab.recordings.formats.messages.realsense import Statements, calibration_in
 from liex_lab.recordings.frame import Depth
 from liex_lab.recordings.infrared import is_infrared
 from liex_lab.recordings.recording import Recording
-from liex_lab.recordings.timestamps import make_monotone, start_of_clock
+from liex_lab.recordings.timestamps import in_order_of_sensor, start_of_clock
 from liex_lab.runtime.progress import Progress
 
 # 16-bit pictures too, but of brightness: not chosen unless asked for
@@ -55,8 +66,17 @@ _EXPECTED = (
     "the encoding 16UC1, mono16 or 32FC1 or as 16-bit PNG, or a point cloud"
 )
 _LIMIT_NS = 2**62  # the year 2116
-_DAMAGE = (ValueError, TypeError, KeyError, OverflowError, struct.error)
+_DAMAGE = (ValueError, TypeError, KeyError, OverflowError, struct.error, DamagedChunk)
 _FACTS = ("subject_id", "session_start_time")
+# calibrations of a topic that are compared: of all that differ, and of those that an index lists
+_N_COMPARED = 12
+_SAME_CAMERA = 0.005  # of the focal length or the picture: what a driver's rounding changes
+_STATE_IT = (
+    "state the depth camera's numbers with --set camera.fx=... --set camera.fy=... --set "
+    "camera.cx=... --set camera.cy=..."
+)
+
+_Numbers = tuple[float, float, float, float]
 
 
 @dataclass
@@ -68,8 +88,11 @@ class _Topic:
         parse: turns the bytes of a message into depth.
         frame_id: name of the camera's frame.
         size: width and height, px; (0, 0) for loose points.
+        metric: whether it holds metres by convention.
+        order: (m,) numbers of messages that a recording was given already, by row.
         log_ns: (n,) times of logging, ns.
         stamp_ns: (n,) stamps of the sensor, ns.
+        publish_ns: (n,) times of sending, ns; 0 where they are not stated.
         places: (3 n,) chunk, offset and length of each message.
     """
 
@@ -77,7 +100,10 @@ class _Topic:
     parse: Parser
     frame_id: str
     size: tuple[int, int]
+    metric: bool = False
+    order: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
     log_ns: array[int] = field(default_factory=lambda: array("q"))
+    publish_ns: array[int] = field(default_factory=lambda: array("q"))
     stamp_ns: array[int] = field(default_factory=lambda: array("q"))
     places: array[int] = field(default_factory=lambda: array("q"))  # three to a message
 
@@ -99,6 +125,7 @@ class _Topic:
         if max(message.log_time_ns, abs(stamp_ns)) >= _LIMIT_NS:
             raise DamagedMessage("a message's time cannot be")
         self.log_ns.append(message.log_time_ns)
+        self.publish_ns.append(min(message.publish_time_ns, _LIMIT_NS))
         self.stamp_ns.append(stamp_ns)
         self.places.extend(message.place)
 
@@ -114,7 +141,9 @@ class _Topic:
         good = listed.log_time_ns < _LIMIT_NS
         stamps = listed.log_time_ns if listed.stamp_ns is None else listed.stamp_ns
         good &= (stamps < _LIMIT_NS) & (stamps > -_LIMIT_NS)
+        published = listed.log_time_ns if listed.publish_time_ns is None else listed.publish_time_ns
         self.log_ns.frombytes(listed.log_time_ns[good].astype(np.int64).tobytes())
+        self.publish_ns.frombytes(np.minimum(published, _LIMIT_NS)[good].astype(np.int64).tobytes())
         self.stamp_ns.frombytes(stamps[good].astype(np.int64).tobytes())
         self.places.frombytes(np.ascontiguousarray(listed.places[good], np.int64).tobytes())
         if not good.all():
@@ -127,7 +156,7 @@ class _Topic:
             chunk: number of the chunk; these messages are at the end.
         """
         while self.places and self.places[-3] >= chunk:
-            del self.places[-3:], self.log_ns[-1], self.stamp_ns[-1]
+            del self.places[-3:], self.log_ns[-1], self.publish_ns[-1], self.stamp_ns[-1]
 
 
 @dataclass
@@ -137,14 +166,28 @@ class _Found:
     Attributes:
         parsers: by channel; None of channels that are of no use.
         depths: the depth topics by channel.
-        calibrations: the first calibration by topic.
-        units: the unit of depth by topic.
+        calibrations: the different calibrations by topic, each with the time of logging, ns, of
+            the first message that has it.
+        listed: calibrations that were not read yet, by channel.
+        stated: what a known program states about its recording.
+        read: the channels of which a message could be read.
+        failed: why a message of a channel could not be read.
+        kinds: what the pictures of a channel hold instead of depth.
     """
 
     parsers: dict[Channel, Parser | None] = field(default_factory=dict)
     depths: dict[Channel, _Topic] = field(default_factory=dict)
-    calibrations: dict[str, Calibration] = field(default_factory=dict)
-    units: dict[str, DepthUnit] = field(default_factory=dict)
+    calibrations: dict[str, list[tuple[int, Calibration]]] = field(default_factory=dict)
+    listed: dict[Channel, list[Listed]] = field(default_factory=dict)
+    stated: Statements = field(default_factory=Statements)
+    read: set[Channel] = field(default_factory=set)
+    failed: dict[Channel, str] = field(default_factory=dict)
+    kinds: dict[Channel, str] = field(default_factory=dict)
+
+    def unreadable(self) -> list[str]:
+        """Sentences about channels of which no message could be read."""
+        whys = {c.topic: why for c, why in self.failed.items() if c not in self.read}
+        return [f"{printable(topic)}: {printable(why, 200)}" for topic, why in whys.items()]
 
 
 class _Frames:
@@ -165,7 +208,7 @@ class _Frames:
         self._camera = camera
         self._step_mm = step_mm
         self._places = np.array(topic.places, np.int64).reshape(-1, 3)[order]
-        self._scale = camera_file.unit_mm
+        self.scale = 1.0
         self._unread = camera_file.unread
         self._problems = problems
         self._bad = set[int]()
@@ -182,7 +225,7 @@ class _Frames:
         """
         with self._lock:
             data = self._file.read(Place(*self._places[number].tolist()))
-        depth = self._decode(data)
+        depth, why = self._decode(data)
         if depth is not None:
             return depth
         camera = self._camera
@@ -190,25 +233,42 @@ class _Frames:
             self._bad.add(number)
             self._problems.append(
                 f"frame {number} of {printable(self._topic.name)} is damaged or not of "
-                f"{camera.width} x {camera.height} pixels, and was taken as wholly unread"
+                f"{camera.width} x {camera.height} pixels ({printable(why)}), and was taken as "
+                "wholly unread"
             )
         return np.zeros((camera.height, camera.width), np.float32)
 
-    def _decode(self, data: memoryview) -> Depth | None:
+    def _decode(self, data: memoryview) -> tuple[Depth | None, str]:
+        """Depth of a message, or why there is none."""
         try:
             message = self._topic.parse(data)
         except _DAMAGE as error:
             if self._file.parsed:
-                return None
+                return None, str(error)
             raise RecordingError(
                 f"{self._file.path} is damaged ({error}); copy it again, or go on with what is "
                 "whole by adding --set recording.accept_truncated=true"
             ) from None
         assert isinstance(message, DepthMessage)
         try:
-            return decode(message, self._camera, self._step_mm, self._scale, self._unread)
+            depth = decode(message, self._camera, self._step_mm, self.scale, self._unread)
         except _DAMAGE:
-            return None
+            depth = None
+        return depth, said_kind(message)
+
+    def scale_by(self, factors: Sequence[float]) -> None:
+        """Multiply all depth by the first factor that gives depths of a camera above an animal.
+
+        Args:
+            factors: in order; the last is taken where none gives such depths, and the first where
+                nothing tells.
+        """
+        seen = (
+            self.read(n) for n in ((0, len(self._places) // 2) if len(set(factors)) > 1 else ())
+        )
+        median_mm = next((float(np.median(one[one > 0])) for one in seen if one.any()), 0.0)
+        plausible = [f for f in factors if PLAUSIBLE_MM[0] <= f * median_mm <= PLAUSIBLE_MM[1]]
+        self.scale = [*plausible, factors[-1 if median_mm else 0]][0]
 
 
 def open_topic(
@@ -260,33 +320,37 @@ def _open(
 
     chosen = _choose(file, found, topic)
     camera_file = CameraFile.read(path.parent / CAMERA_FILE)
-    problems: list[str] = list(camera_file.problems)
+    problems: list[str] = [*camera_file.problems, *found.unreadable()]
+    doubts: list[str] = []
     if not file.whole:
         problems.append(
             f"{path.name} is cut or damaged; {len(chosen.log_ns)} whole depth pictures can be read "
             "from it"
         )
-    the_camera = _camera(
-        path, chosen, found.calibrations, camera_file, camera, file.notes, problems
-    )
+    the_camera = _camera(path, chosen, found, camera_file, camera, file.notes, problems, doubts)
     # A writer may flush its topics out of turn; the order of logging is the file's own order.
     order = np.argsort(np.array(chosen.log_ns, np.int64), kind="stable")
-    monotone = make_monotone(_stamps(chosen, order, problems))
+    monotone = in_order_of_sensor(_stamps(chosen, order, found.stated, problems), chosen.order)
+    chosen.order = monotone.order
     problems += [monotone.problem] if monotone.problem else []
     packed = PackFacts.of(file.notes)
     problems += packed.problems
-    start = start_of_clock(int(monotone.times_ns[0]))
+    start = start_of_clock(int(monotone.times_ns[0])) or found.stated.start(chosen.name)
     stated = {name: file.notes[name] for name in _FACTS if name in file.notes}
     metadata = ({"session_start_time": start} if start else {}) | stated | camera_file.metadata
+    stated_mm = found.stated.step_mm(chosen.name, camera_file.states_unit, problems, doubts)
+    step_mm = (stated_mm or 1.0) * packed.step_mm
     frames = _Frames(
-        file,
-        chosen,
-        order,
-        the_camera,
-        _step_mm(chosen, found.units) * packed.step_mm,
-        camera_file,
-        problems,
+        file, chosen, order[monotone.order], the_camera, step_mm, camera_file, problems
     )
+    unit_mm = camera_file.unit_mm
+    literal = unit_mm / (1000.0 if chosen.metric else step_mm)
+    known = camera_file.states_unit and bool(file.notes or stated_mm)
+    frames.scale_by([1.0 if known else unit_mm, literal] if camera_file.states_unit else [unit_mm])
+    if known and frames.scale != literal:
+        problems.append(
+            f"unit_mm = {unit_mm:g} in camera.toml is not used, for the recording states its unit"
+        )
     return Recording(
         name=packed.name(path.resolve().stem),
         format=kind,
@@ -299,69 +363,95 @@ def _open(
         metadata=metadata | packed.metadata,
         close=file.close,
         faults=packed.faults(monotone.faults),
-        doubts=packed.doubts,
         grow=grow,
+        doubts=[*packed.doubts, *doubts],
     )
 
 
-def _stamps(topic: _Topic, order: NDArray[np.int64], problems: list[str]) -> NDArray[np.int64]:
-    """The sensor's stamps; the times of logging instead when pictures have none (zero), for two
-    clocks do not mix.
+def _stamps(
+    topic: _Topic, order: NDArray[np.int64], stated: Statements, problems: list[str]
+) -> NDArray[np.int64]:
+    """The sensor's stamps; the times of sending or logging instead when pictures have none (zero),
+    for two clocks do not mix.
     """
     stamps = np.array(topic.stamp_ns, np.int64)[order]
     logged = np.array(topic.log_ns, np.int64)[order]
+    published = np.array(topic.publish_ns, np.int64)[order]
+    stamps = stated.sensor_times(topic.name, logged, stamps, problems)
     unstamped = int(((stamps == 0) & (logged != 0)).sum())
     if unstamped == 1 and len(stamps) > 1 and np.all(np.diff(stamps) > 0):
         unstamped = 0  # a clock that begins at zero with the first picture
-    if unstamped:
-        problems.append(
-            f"{unstamped} of {len(stamps)} pictures have no stamp of the sensor, so the times of "
-            "logging are used"
-        )
-    return logged if unstamped else stamps
+    if not unstamped:
+        return stamps
+    steps, sent_steps = np.diff(logged), np.diff(published)
+    sent = len(steps) > 1 and sent_steps.min() > 0 and 2.0 * sent_steps.std() < steps.std()
+    problems.append(
+        f"{unstamped} of {len(stamps)} pictures have no stamp of the sensor, so the times of "
+        f"{'sending' if sent else 'logging'} are used"
+    )
+    return published if sent else logged
 
 
 def _walk(file: MessageFile, found: _Found, progress: Progress) -> None:
-    """Find the depth topics, and the first calibration of every topic that has one."""
+    """Find the depth topics, the calibrations, and what a known program states besides."""
     parsers = found.parsers
 
     def wanted(channel: Channel) -> bool:
         if channel not in parsers:
             parsers[channel] = parser_of(channel)
-        calibrated = (
-            plain_schema(channel) in CALIBRATION_SCHEMAS and channel.topic in found.calibrations
-        )
-        return parsers[channel] is not None and not calibrated
+        return parsers[channel] is not None
 
-    for message in file.walk(wanted, progress):
+    def take(message: Envelope | Listed) -> None:
         parse = parsers[message.channel]
         assert parse is not None
         try:
             if not _note(found, message, parse):
-                parsers[message.channel] = None  # its first picture is not depth
-        except _DAMAGE:
-            file.whole = False
+                parsers[message.channel] = None  # nothing more of it is wanted
+            found.read.add(message.channel)
+        except _DAMAGE as error:
+            found.failed.setdefault(message.channel, f"its messages cannot be read: {error}")
+
+    for message in file.walk(wanted, progress):
+        take(message)
+    for channel, parts in found.listed.items():  # some, spread over the recording up to the last
+        places = np.concatenate(
+            [np.c_[part.log_time_ns.astype(np.int64), part.places] for part in parts]
+        )
+        some = np.linspace(0, len(places) - 1, _N_COMPARED).astype(int)
+        for log_ns, *place in places[some].tolist():
+            with suppress(RecordingError):  # a damaged chunk: who reads its pictures is told
+                take(Envelope(channel, log_ns, Place(*place), file.read(Place(*place))))
+    file.whole = file.whole and not found.failed.keys() & found.read
 
 
 def _note(found: _Found, envelope: Envelope | Listed, parse: Parser) -> bool:
-    """Take note of a message; False where it is the first picture of a topic and not depth."""
+    """Take note of a message; False where it is the first picture of a topic and not depth, or
+    where others on its topic add nothing.
+    """
     channel = envelope.channel
     if isinstance(envelope, Listed):
         if channel in found.depths:
             found.depths[channel].add_all(envelope)
+        elif channel.topic in found.calibrations and len(envelope.places):
+            found.listed.setdefault(channel, []).append(envelope)
         return True
     message = parse(envelope.data)
+    if isinstance(message, Statement):
+        message = calibration_in(message) or message
+    if isinstance(message, Statement):
+        return found.stated.add(envelope, message)
     if isinstance(message, Calibration):
-        found.calibrations[channel.topic] = message
-        return True
-    if isinstance(message, DepthUnit):
-        found.units[channel.topic] = message
+        known = found.calibrations.setdefault(channel.topic, [])
+        if len(known) < _N_COMPARED and all(message != other for _, other in known):
+            known.append((envelope.log_time_ns, message))
         return True
     if channel not in found.depths:
         size = picture_size(message)
         if size is None:
+            found.kinds[channel] = said_kind(message)
             return False
-        found.depths[channel] = _Topic(channel, parse, message.frame_id, size)
+        metric = said_kind(message).startswith(("32FC1", "points"))
+        found.depths[channel] = _Topic(channel, parse, message.frame_id, size, metric)
     found.depths[channel].add(envelope, message.stamp_ns)
     return True
 
@@ -391,52 +481,43 @@ def _choose(file: MessageFile, found: _Found, topic: str | None) -> _Topic:
                 f"one with --topic {choice[0]} (in Python topic=), or in a plan with "
                 "recording.topic"
             )
-    raise _no_depth(file)
+    raise _no_depth(file, found)
 
 
-def _no_depth(file: MessageFile) -> RecordingError:
+def _no_depth(file: MessageFile, found: _Found) -> RecordingError:
+    said = {c: f": {printable(why, 200)}" for c, why in (found.failed | found.kinds).items()}
     described = {
-        f"{printable(c.topic)} ({printable(c.schema)}, {printable(c.encoding)})"
+        f"{printable(c.topic)} ({printable(c.schema)}, {printable(c.encoding)}){said.get(c, '')}"
         for c in file.channels
     }
     listed = ", ".join(sorted(described)[:8]) + (", ..." if len(described) > 8 else "")
     cut = "the file is cut or damaged, and " if not file.whole else ""
+    jpeg = any("jp" in kind.lower() for kind in found.kinds.values())
+    lossy = "; JPEG does not keep depth, so record the raw or the compressedDepth topic"
     return RecordingError(
         f"{file.path} holds no depth pictures: {cut}its topics are {listed or 'none'}; {_EXPECTED}"
+        + (lossy if jpeg else "")
     )
-
-
-def _step_mm(topic: _Topic, units: dict[str, DepthUnit]) -> float:
-    """Millimetres in a step of 16-bit depth: 1, unless a RealSense recording says otherwise."""
-    sensors = [name for name in units if topic.name.startswith(name.removesuffix(UNIT_TOPIC) + "/")]
-    metres = units[sensors[0]].metres if sensors else 0.0
-    # a float32 was written, and 0.001 was meant
-    return float(f"{metres:.6g}") * 1000.0 if math.isfinite(metres) and metres > 0 else 1.0
 
 
 def _camera(
     path: Path,
     topic: _Topic,
-    calibrations: dict[str, Calibration],
+    found: _Found,
     camera_file: CameraFile,
     stated: Lens | None,
     notes: dict[str, str],
     problems: list[str],
+    doubts: list[str],
 ) -> Camera:
     """Stated by the caller, or else calibrated in the file, or else in a camera.toml beside it."""
-    found = _calibration_of(topic, calibrations)
-    if stated is None and found is not None:
-        return _calibrated(topic, *found, notes, problems)
+    chosen = _calibrations_of(topic, found.calibrations)
+    if stated is None and chosen is not None:
+        return _calibrated(topic, *chosen, notes, problems, doubts)
     if stated is None and not camera_file.intrinsics:
-        several = (
-            f", which has {len(calibrations)} calibrations, none of them for"
-            if calibrations
-            else " for"
-        )
         raise UnknownCameraError(
-            f"{path} holds no CameraCalibration or CameraInfo{several} {printable(topic.name)}; "
-            "write a camera.toml beside it with [camera], fx = ..., fy = ..., cx = ... and cy = "
-            "... in pixels"
+            f"{path} {_why_unknown(topic, found)}; write a camera.toml beside it with [camera], fx "
+            "= ..., fy = ..., cx = ... and cy = ... in pixels"
         )
     known = (
         (stated.width, stated.height)
@@ -453,40 +534,111 @@ def _camera(
     return camera_file.camera(*size, stated)
 
 
+def _why_unknown(topic: _Topic, found: _Found) -> str:
+    """Why a file has no calibration for a topic."""
+    names = ", ".join(sorted(map(printable, found.calibrations))[:4])
+    if not names:
+        none = f"holds no CameraCalibration or CameraInfo for {printable(topic.name)}"
+        return "; ".join([none, *found.unreadable()])
+    usable = any(_is_usable(one) for many in found.calibrations.values() for _, one in many)
+    return f"holds calibrations on {names}, " + (
+        f"and neither frames nor names tell which is that of {printable(topic.name)}"
+        if usable
+        else "which are empty (uncalibrated: K is zero)"
+    )
+
+
 def _calibrated(
-    topic: _Topic, where: str, calibration: Calibration, notes: dict[str, str], problems: list[str]
+    topic: _Topic,
+    where: str,
+    calibrations: list[tuple[int, Calibration]],
+    notes: dict[str, str],
+    problems: list[str],
+    doubts: list[str],
 ) -> Camera:
-    """The camera of a calibration; without distortion where the picture was straightened, and for
-    points.
+    """The camera of a topic's calibrations; without distortion where the picture was straightened,
+    and for points.
     """
-    is_cloud = plain_schema(topic.channel) in CLOUD_SCHEMAS
-    straight = "rect" in topic.name.rpartition("/")[2] or is_cloud
-    p = calibration.p
-    k = (*p[0:3], *p[4:7]) if straight and len(p) == 12 and p[0] > 0 else calibration.k[:6]
+    fits = [one for one in calibrations if _mapped(topic, one[1])[1] == topic.size]
+    (first_ns, calibration), *others = fits or calibrations
+    kind = "CameraInfo" if topic.channel.encoding in ("ros1", "cdr") else "CameraCalibration"
+    here = f"the {kind} on {printable(where)}"
+    # a converted file keeps where the numbers came from
+    source = notes.get("camera_source", f"{kind} on {where}")
+    numbers, size = _mapped(topic, calibration)
     bent = None
     try:
-        bent = None if straight else Distortion.of(calibration.model, calibration.d)
+        bent = None if _is_straight(topic) else Distortion.of(calibration.model, calibration.d)
     except LiexError:
         problems.append(
             f"{printable(where)} states a lens distortion ({printable(calibration.model)}) that is "
             "not known and so not undone"
         )
-    kind = "CameraInfo" if topic.channel.encoding in ("ros1", "cdr") else "CameraCalibration"
-    source = notes.get(
-        "camera_source", f"{kind} on {where}"
-    )  # a converted file keeps where the numbers came from
-    size = _size(topic, (calibration.width, calibration.height))
-    camera = Camera(
-        fx=k[0],
-        fy=k[4],
-        cx=k[2],
-        cy=k[5],
-        width=calibration.width or size[0],
-        height=calibration.height or size[1],
-        source=printable(source),
-        distortion=bent,
-    )
-    return fitting(camera, *size, f"the {kind} on {printable(where)}")
+    camera = Camera(*numbers, *size, printable(source), distortion=bent)
+    camera = fitting(camera, *_size(topic, size), here)
+    if _is_of_another_lens(topic, where, calibration):
+        frame = (
+            f"frame {printable(calibration.frame_id)}" if calibration.frame_id else "by its name"
+        )
+        doubts.append(
+            f"the calibration is that of another lens ({frame}, on {printable(where)}) than the "
+            f"depth on {printable(topic.name)}, so lengths may be wrong: {_STATE_IT}"
+        )
+    for later_ns, other in others:
+        later, _ = _mapped(topic, other)
+        scales = (*numbers[:2], *size)
+        by = max(abs(a - b) / scale for a, b, scale in zip(later, numbers, scales, strict=True))
+        if by > 0.0:
+            (doubts if by > _SAME_CAMERA else problems).append(
+                f"{here} changes {(later_ns - first_ns) * 1e-9:.2f} s after its first: fx, fy, cx, "
+                f"cy from {', '.join(f'{n:g}' for n in numbers)} to "
+                f"{', '.join(f'{n:g}' for n in later)}; the first is used, and lengths are wrong "
+                f"where another one is true: {_STATE_IT}"
+            )
+            break
+    return camera
+
+
+def _is_straight(topic: _Topic) -> bool:
+    """Whether pictures have no distortion any more: rectified ones, and points."""
+    is_cloud = plain_schema(topic.channel) in CLOUD_SCHEMAS
+    return "rect" in topic.name.rpartition("/")[2] or is_cloud
+
+
+def _mapped(topic: _Topic, calibration: Calibration) -> tuple[_Numbers, tuple[int, int]]:
+    """(fx, fy, cx, cy) and size, px, of the pictures on a topic, by binning and region of interest.
+
+    A calibration is of the full picture, of which the topic may show a part or every second pixel.
+    Drivers also state these of intrinsics that are mapped already, or beside the size of the part:
+    then the principal point, which lies near the middle of most pictures, decides.
+    """
+    p = calibration.p
+    straight = _is_straight(topic) and len(p) == 12 and p[0] > 0 and p[5] > 0
+    k = (*p[0:3], *p[4:7]) if straight else calibration.k
+    x, y, width, height = calibration.roi
+    across, down = (max(1, n) for n in calibration.binning)
+    full = (calibration.width or topic.size[0], calibration.height or topic.size[1])
+    part = ((width or full[0]) // across, (height or full[1]) // down)
+    plain = (k[0], k[4], k[2], k[5])
+    cx, cy = ((k[2] - x + 0.5) / across - 0.5, (k[5] - y + 0.5) / down - 0.5)
+    mapped = (k[0] / across, k[4] / down, cx, cy)
+    wanted = _size(topic, full)
+    if wanted not in (full, part):
+        return plain, full
+    both = [mapped, plain] if part == wanted else [plain, mapped]
+    central = [one for one in both if is_central(*one[2:], *wanted)]
+    return [*central, *both][0], wanted
+
+
+def _is_of_another_lens(topic: _Topic, where: str, calibration: Calibration) -> bool:
+    """Whether a calibration belongs to another frame than the depth.
+
+    Where a frame has no name, the topics tell: /camera/color/camera_info is not of
+    /camera/depth/image, while /camera/camera_info may be.
+    """
+    frames = {topic.frame_id.strip("/"), calibration.frame_id.strip("/")}
+    branch = re.sub(r"(/info)?/[^/]*$", "", f"/{where.strip('/')}")
+    return len(frames) > 1 if all(frames) else not topic.name.startswith(f"{branch}/")
 
 
 def _size(topic: _Topic, of_camera: tuple[int, int]) -> tuple[int, int]:
@@ -494,20 +646,20 @@ def _size(topic: _Topic, of_camera: tuple[int, int]) -> tuple[int, int]:
     return topic.size if min(topic.size) else of_camera
 
 
-def _calibration_of(
-    topic: _Topic, calibrations: dict[str, Calibration]
-) -> tuple[str, Calibration] | None:
-    """The calibration of the same camera: of the same frame, and among those on the topic nearest
+def _calibrations_of(
+    topic: _Topic, calibrations: dict[str, list[tuple[int, Calibration]]]
+) -> tuple[str, list[tuple[int, Calibration]]] | None:
+    """The calibrations of the same camera: of the same frame, and among those on the topic nearest
     by its name.
     """
-    # K[0] = 0 means "not calibrated" in these messages
-    usable = {
-        name: c
-        for name, c in calibrations.items()
-        if len(c.k) == 9 and np.isfinite(c.k).all() and c.k[0] > 0
+    good = {
+        name: [one for one in many if _is_usable(one[1])] for name, many in calibrations.items()
     }
+    usable = {name: many for name, many in good.items() if many}
     same_frame = {
-        name: c for name, c in usable.items() if topic.frame_id and c.frame_id == topic.frame_id
+        name: many
+        for name, many in usable.items()
+        if topic.frame_id and many[0][1].frame_id == topic.frame_id
     }
     for some in (same_frame, usable):
         near = {name: _shared(topic.name, name) for name in some}
@@ -515,10 +667,16 @@ def _calibration_of(
         if (
             nearest
             and (len(some) == 1 or near[nearest[0]] > 0)
-            and _alike([some[name] for name in nearest])
+            and _alike([some[name][0][1] for name in nearest])
         ):
             return nearest[0], some[nearest[0]]
     return None
+
+
+def _is_usable(calibration: Calibration) -> bool:
+    """K[0] = 0 means "not calibrated" in these messages."""
+    k = calibration.k
+    return len(k) == 9 and bool(np.isfinite(k).all()) and k[0] > 0 and k[4] > 0
 
 
 def _shared(one: str, other: str) -> int:

@@ -81,6 +81,9 @@ def _cloud(message: Any) -> PointCloud:
 
 def _stamp(message: Any) -> int:
     stamp = message.timestamp
+    if isinstance(stamp, str):  # RFC 3339, as protobuf's MessageToJson writes it
+        stamp = Timestamp()
+        stamp.FromJsonString(message.timestamp)
     return int(stamp.seconds) * _SECOND + int(stamp.nanos)
 
 
@@ -106,9 +109,9 @@ class _Json:
         value = self._content.get(_JSON_NAMES.get(name, name))
         if name == "data":
             return base64.b64decode(value or b"", validate=True)
-        if name in self._OBJECTS:
+        if name in self._OBJECTS and not isinstance(value, str):
             return _Json(value or {})
-        if name in self._TEXTS:
+        if name in (*self._TEXTS, *self._OBJECTS):
             return str(value or "")
         if name == "fields":
             return [_Json(item) for item in value or []]

@@ -309,12 +309,12 @@ class McapFile(MessageFile):
     ) -> Iterator[Envelope]:
         try:
             if opcode == Opcode.MESSAGE:
-                number, _, log_time_ns, _ = MESSAGE.unpack_from(payload)
+                number, _, log_time_ns, sent_ns = MESSAGE.unpack_from(payload)
                 channel = self._by_id[number]
                 if wanted(channel):
                     head = MESSAGE.size
                     inner = Place(place.chunk, place.offset + head, place.length - head)
-                    yield Envelope(channel, log_time_ns, inner, payload[head:])
+                    yield Envelope(channel, log_time_ns, inner, payload[head:], sent_ns)
             elif opcode in FACTS:
                 self._learn(opcode, ReadDataStream(BytesIO(payload)))
         except DAMAGE:

@@ -44,7 +44,8 @@ from liex_lab.recordings.formats.messages.message_file import (
     Place,
     first_bytes,
 )
-from liex_lab.recordings.formats.messages.parsers import stamp_reader
+from liex_lab.recordings.formats.messages.messages import CALIBRATION_SCHEMAS
+from liex_lab.recordings.formats.messages.parsers import plain_schema, stamp_reader
 from liex_lab.recordings.recording import Recording
 from liex_lab.runtime.progress import Progress, silent
 
@@ -178,11 +179,14 @@ class _Skimmed(IndexedMcap):
             channel = listed.channel
             if not wanted(channel):
                 continue
+            if channel in met and plain_schema(channel) in CALIBRATION_SCHEMAS:
+                yield listed
+                continue
             stamps = None
             if channel in met:
                 stamps = self._stamps(listed, channel_id, part.heads.get(channel_id))
             if stamps is not None:
-                yield Listed(channel, listed.log_time_ns, listed.places, stamps)
+                yield Listed(channel, listed.log_time_ns, listed.places, *stamps)
                 continue
             for time_ns, numbers in zip(
                 listed.log_time_ns.tolist(), listed.places.tolist(), strict=True
@@ -190,28 +194,34 @@ class _Skimmed(IndexedMcap):
                 if wanted(channel):
                     met.add(channel)
                     place = Place(*numbers)
-                    yield Envelope(channel, time_ns, place, self._message(place))
+                    data = self._message(place)
+                    record = self.unpack(place.chunk)[place.offset + RECORD.size :]
+                    yield Envelope(channel, time_ns, place, data, MESSAGE.unpack_from(record)[3])
 
     def _stamps(
         self, listed: Listed, channel_id: int, heads: list[bytes] | None
-    ) -> NDArray[np.int64] | None:
-        """Stamps (n,) of messages of one chunk, ns; None where their beginnings do not tell."""
+    ) -> tuple[NDArray[np.int64], NDArray[np.uint64]] | None:
+        """Stamps (n,) and times of sending (n,) of messages of one chunk, ns; None where their
+        beginnings do not tell.
+        """
         read = stamp_reader(listed.channel)
         if read is None:
             return None
         found = []
+        published = []
         if heads is None:
             heads = self._heads(self.file, listed)
         for time_ns, head in zip(listed.log_time_ns.tolist(), heads, strict=True):
             opcode, length = RECORD.unpack_from(head)
-            whose, _, logged_ns, _ = MESSAGE.unpack_from(head, RECORD.size)
+            whose, _, logged_ns, published_ns = MESSAGE.unpack_from(head, RECORD.size)
             if opcode != Opcode.MESSAGE or (whose, logged_ns) != (channel_id, time_ns):
                 raise DamagedChunk("there is another message than its index says")
             stamp_ns = read(memoryview(head)[RECORD.size + MESSAGE.size : RECORD.size + length])
             if stamp_ns is None:
                 return None
             found.append(stamp_ns)
-        return np.array(found, np.int64)
+            published.append(published_ns)
+        return np.array(found, np.int64), np.array(published, np.uint64)
 
     def _heads(self, file: IO[bytes], listed: Listed) -> list[bytes]:
         """The first bytes of the records of messages of one chunk."""

@@ -10,6 +10,7 @@ import bz2
 from abc import ABC, abstractmethod
 from bisect import bisect_right
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, NamedTuple
 
@@ -24,6 +25,7 @@ from liex_lab.runtime.progress import Progress
 # A chunk is some megabytes. A damaged one may state any size, and a few bytes unpack to as many
 # zeros as one likes.
 _LARGEST_CHUNK = 1 << 27
+_PACKINGS = {b"\x28\xb5\x2f\xfd": "zstd", b"\x04\x22\x4d\x18": "lz4"}  # by their first bytes
 _PIECE = 1 << 15  # bytes of a packed chunk that are read at once where its beginning is wanted
 
 
@@ -63,12 +65,14 @@ class Envelope(NamedTuple):
         log_time_ns: time of logging, ns.
         place: where its data lies, to fetch it again.
         data: its bytes.
+        publish_time_ns: when it was sent, ns; 0 where the file does not state it.
     """
 
     channel: Channel
     log_time_ns: int
     place: Place
     data: memoryview
+    publish_time_ns: int = 0
 
 
 class Listed(NamedTuple):
@@ -79,12 +83,14 @@ class Listed(NamedTuple):
         log_time_ns: (n,) uint64 times of logging, ns.
         places: (n, 3) int64 chunk, offset and length of each, as a `Place`.
         stamp_ns: (n,) int64 stamps of the sensor, ns; None takes the times of logging.
+        publish_time_ns: (n,) when each was sent, ns; None where that was not read.
     """
 
     channel: Channel
     log_time_ns: NDArray[np.uint64]
     places: NDArray[np.int64]
     stamp_ns: NDArray[np.int64] | None = None
+    publish_time_ns: NDArray[np.uint64] | None = None
 
 
 class Chunk(NamedTuple):
@@ -256,14 +262,8 @@ def unpacked(packed: bytes, chunk: Chunk) -> bytes:
     Raises:
         DamagedChunk: it does not unpack to what was packed, or its compression is not known.
     """
-    try:
+    with _telling():
         data = _inflate(packed, chunk.packing, chunk.size)
-    except DamagedChunk:
-        raise
-    except Exception as error:  # the codecs are foreign and have exceptions of their own
-        if why_short(error):  # which says nothing about the file
-            raise MemoryError(str(error)) from None
-        raise DamagedChunk(str(error)) from None
     if chunk.cut:
         return data
     if len(data) != chunk.size:
@@ -271,6 +271,22 @@ def unpacked(packed: bytes, chunk: Chunk) -> bytes:
     if chunk.crc and isal_zlib.crc32(data) != chunk.crc:
         raise DamagedChunk("its checksum is wrong")
     return data
+
+
+def unpacked_message(data: memoryview) -> memoryview:
+    """The bytes of a message, unpacked where a recorder packs every message by itself.
+
+    Args:
+        data: the message; it begins otherwise than a packed one does if it is not packed.
+
+    Raises:
+        DamagedChunk: it does not unpack.
+    """
+    packing = _PACKINGS.get(bytes(data[:4]))
+    if packing is None:
+        return data
+    whole = Chunk(0, len(data), packing, _LARGEST_CHUNK, 0, cut=True)  # it does not state its size
+    return memoryview(unpacked(bytes(data), whole))
 
 
 def first_bytes(file: IO[bytes], chunk: Chunk, size: int) -> bytes:
@@ -288,7 +304,7 @@ def first_bytes(file: IO[bytes], chunk: Chunk, size: int) -> bytes:
         DamagedChunk: there are fewer, or it does not unpack.
     """
     file.seek(chunk.offset)
-    try:
+    with _telling():
         if chunk.packing == "zstd":
             import zstandard
 
@@ -297,15 +313,22 @@ def first_bytes(file: IO[bytes], chunk: Chunk, size: int) -> bytes:
                 data = reader.read(size)
         else:
             data = _inflate(file.read(chunk.length), chunk.packing, size)
-    except DamagedChunk:
-        raise
-    except Exception as error:
-        if why_short(error):
-            raise MemoryError(str(error)) from None
-        raise DamagedChunk(str(error)) from None
     if len(data) < size:
         raise DamagedChunk(f"{len(data)} bytes came out of it and {size} were expected")
     return data
+
+
+@contextmanager
+def _telling() -> Iterator[None]:
+    """Turn the exceptions of the codecs, which are foreign, into ours."""
+    try:
+        yield
+    except DamagedChunk:
+        raise
+    except Exception as error:
+        if why_short(error):  # which says nothing about the file
+            raise MemoryError(str(error)) from None
+        raise DamagedChunk(str(error)) from None
 
 
 def _inflate(packed: bytes, packing: str, size: int) -> bytes:

@@ -1,7 +1,8 @@
 """Common form of the messages that hold depth or describe it, whatever they were packed as.
 
 Schemas: foxglove.RawImage, CompressedImage, PointCloud and CameraCalibration; sensor_msgs/Image,
-CompressedImage, PointCloud2 and CameraInfo; std_msgs/Float32 for RealSense's depth unit.
+CompressedImage, PointCloud2 and CameraInfo; std_msgs/String, std_msgs/Float32 and
+diagnostic_msgs/KeyValue for what the RealSense programs state (see `realsense`).
 """
 
 from __future__ import annotations
@@ -17,9 +18,7 @@ PICTURE_SCHEMAS = (
 )
 CLOUD_SCHEMAS = ("foxglove.PointCloud", "sensor_msgs/PointCloud2")
 CALIBRATION_SCHEMAS = ("foxglove.CameraCalibration", "sensor_msgs/CameraInfo")
-# where the RealSense program writes the metres of a stored step
-UNIT_TOPIC = "/option/Depth Units/value"
-UNIT_SCHEMA = "std_msgs/Float32"
+STATEMENT_SCHEMAS = ("std_msgs/String", "std_msgs/Float32", "diagnostic_msgs/KeyValue")
 
 
 class DamagedMessage(ValueError):
@@ -108,6 +107,9 @@ class Calibration:
         d: distortion coefficients.
         k: (9,) camera matrix 3 x 3, row by row.
         p: (12,) projection matrix 3 x 4 of the rectified picture, row by row; or empty.
+        binning: pixels of the full picture, along columns and rows, that make one of these; 0 is 1.
+        roi: column and row offset, width and height of the part of the full picture, px; width or
+            height 0 for the whole.
     """
 
     frame_id: str
@@ -117,19 +119,21 @@ class Calibration:
     d: tuple[float, ...]
     k: tuple[float, ...]
     p: tuple[float, ...]
+    binning: tuple[int, int] = (1, 1)
+    roi: tuple[int, int, int, int] = (0, 0, 0, 0)
 
 
 @dataclass(frozen=True, slots=True)
-class DepthUnit:
-    """Unit of stored depth, as the RealSense program writes it.
+class Statement:
+    """Facts that a program states as text.
 
     Attributes:
-        metres: m in one stored step of the depth pictures.
+        facts: text by name; a bare value has the name "value".
     """
 
-    metres: float
+    facts: dict[str, str]
 
 
 DepthMessage = RawPicture | PackedPicture | PointCloud
-Message = DepthMessage | Calibration | DepthUnit
+Message = DepthMessage | Calibration | Statement
 Parser = Callable[[memoryview], Message]

@@ -12,10 +12,10 @@ from liex_lab.recordings.formats.messages.messages import (
     CALIBRATION_SCHEMAS,
     CLOUD_SCHEMAS,
     PICTURE_SCHEMAS,
-    UNIT_SCHEMA,
-    UNIT_TOPIC,
+    STATEMENT_SCHEMAS,
     Parser,
 )
+from liex_lab.recordings.formats.messages.realsense import STATES
 
 
 def plain_schema(channel: Channel) -> str:
@@ -40,9 +40,14 @@ def parser_of(channel: Channel) -> Parser | None:
         The parser; None for messages that say nothing about depth.
     """
     schema = plain_schema(channel)
-    if schema == UNIT_SCHEMA and not channel.topic.endswith(UNIT_TOPIC):
+    if schema in STATEMENT_SCHEMAS and not STATES.search(channel.topic):
         return None
-    if schema not in (*PICTURE_SCHEMAS, *CLOUD_SCHEMAS, *CALIBRATION_SCHEMAS, UNIT_SCHEMA):
+    if schema not in (
+        *PICTURE_SCHEMAS,
+        *CLOUD_SCHEMAS,
+        *CALIBRATION_SCHEMAS,
+        *STATEMENT_SCHEMAS,
+    ):
         return None
     if schema.startswith("foxglove."):
         from liex_lab.recordings.formats.messages import foxglove

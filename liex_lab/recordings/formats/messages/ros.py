@@ -10,20 +10,23 @@ from __future__ import annotations
 import struct
 from collections.abc import Callable
 
+from liex_lab.recordings.formats.messages.message_file import unpacked_message
 from liex_lab.recordings.formats.messages.messages import (
     Calibration,
     DamagedMessage,
-    DepthUnit,
     Message,
     PackedPicture,
     Parser,
     PointCloud,
     RawPicture,
+    Statement,
 )
 
 # sensor_msgs/PointField: number of a type, and NumPy's name of it without the byte order
 _FIELD_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 _MOST_FIELDS = 256
+_SECOND_VERSION = 4  # bytes to which its numbers are aligned at most
+_PLAIN_CDR = (b"\0\0", b"\0\1", b"\0\6", b"\0\7")  # big and little endian, version 1 and 2
 
 
 class _Fields:
@@ -31,7 +34,7 @@ class _Fields:
 
     order = "<"
     origin = 0
-    aligned = False
+    largest_step = 1  # bytes to which numbers are aligned at most
     end_of_text = 0
 
     def __init__(self, data: memoryview) -> None:
@@ -41,8 +44,7 @@ class _Fields:
     def numbers(self, kind: str, n: int = 1) -> tuple[float, ...]:
         """`n` numbers of a type, as `struct` names it."""
         size = struct.calcsize(f"<{kind}")
-        if self.aligned:
-            self.at += (self.origin - self.at) % size
+        self.at += (self.origin - self.at) % min(size, self.largest_step)
         begin = self.at
         self.at = self.at + n * size
         if self.at > len(self.data):
@@ -83,18 +85,23 @@ class _Fields:
 class _CdrFields(_Fields):
     """The same in ROS 2 (CDR): byte order in the first four bytes, numbers aligned to their size.
 
-    Strings end in a zero, and headers have no counter.
+    Strings end in a zero, and headers have no counter. The second version (XCDR2) aligns to four
+    bytes at most.
     """
 
     origin = 4
-    aligned = True
     end_of_text = 1
 
     def __init__(self, data: memoryview) -> None:
         super().__init__(data)
-        if len(data) < 4 or data[0] != 0 or data[1] > 1:
-            raise DamagedMessage("a message is not in plain CDR")
-        self.order = "<" if data[1] else ">"
+        kind = bytes(data[:2])
+        if len(data) < 4 or kind not in _PLAIN_CDR:
+            raise DamagedMessage(
+                f"a message begins with {kind.hex(' ')}, which is no plain CDR (00 00, 00 01, 00 "
+                "06 or 00 07)"
+            )
+        self.order = "<" if data[1] & 1 else ">"
+        self.largest_step = _SECOND_VERSION if data[1] > 1 else 8
 
     def header(self) -> tuple[int, str]:
         """The stamp, ns, and the frame's name of a std_msgs/Header without the counter."""
@@ -127,13 +134,17 @@ def _camera_info(fields: _Fields) -> Calibration:
     k = fields.numbers("d", 9)
     _ = fields.numbers("d", 9)
     p = fields.numbers("d", 12)
-    return Calibration(frame_id, width, height, model, d, k, p)
+    binning = (fields.whole(), fields.whole())
+    x, y, rows, columns = (fields.whole() for _ in range(4))
+    return Calibration(frame_id, width, height, model, d, k, p, binning, (x, y, columns, rows))
 
 
 def _cloud(fields: _Fields) -> PointCloud:
     stamp_ns, frame_id = fields.header()
     height = fields.whole()
     width = fields.whole()
+    if fields.largest_step == _SECOND_VERSION:  # the list's length in bytes
+        fields.whole()
     n_fields = fields.whole()
     if n_fields > _MOST_FIELDS:
         raise DamagedMessage(f"a cloud's points have {n_fields} fields")
@@ -151,8 +162,19 @@ def _cloud(fields: _Fields) -> PointCloud:
     return PointCloud(stamp_ns, frame_id, width, height, columns, point_step, row_step, data)
 
 
-def _unit(fields: _Fields) -> DepthUnit:
-    return DepthUnit(fields.numbers("f")[0])
+def _value(fields: _Fields) -> Statement:
+    return Statement({"value": f"{fields.numbers('f')[0]:.6g}"})  # 0.001 was meant, not its float32
+
+
+def _text(fields: _Fields) -> Statement:
+    """Facts as in "fx=287.9;fy=287.9", or one bare value."""
+    text = fields.text()
+    pairs = dict(part.split("=", 1) for part in text.split(";") if "=" in part)
+    return Statement(pairs or {"value": text})
+
+
+def _key_value(fields: _Fields) -> Statement:
+    return Statement({fields.text(): fields.text()})
 
 
 _PARSERS: dict[str, Callable[[_Fields], Message]] = {
@@ -160,7 +182,9 @@ _PARSERS: dict[str, Callable[[_Fields], Message]] = {
     "sensor_msgs/CompressedImage": _packed_image,
     "sensor_msgs/CameraInfo": _camera_info,
     "sensor_msgs/PointCloud2": _cloud,
-    "std_msgs/Float32": _unit,
+    "std_msgs/Float32": _value,
+    "std_msgs/String": _text,
+    "diagnostic_msgs/KeyValue": _key_value,
 }
 _LAYOUTS: dict[str, type[_Fields]] = {"ros1": _Fields, "cdr": _CdrFields}
 
@@ -179,7 +203,20 @@ def parser(schema: str, encoding: str) -> Parser | None:
     if layout is None or schema not in _PARSERS:
         return None
     read = _PARSERS[schema]
-    return lambda data: read(layout(data))
+    if encoding == "ros1":
+        return lambda data: read(layout(data))
+    return lambda data: _read_cdr(read, unpacked_message(data))
+
+
+def _read_cdr(read: Callable[[_Fields], Message], data: memoryview) -> Message:
+    """A message in CDR; one that begins as of the second version may be laid out as the first."""
+    fields = _CdrFields(data)
+    message = read(fields)
+    if fields.largest_step == _SECOND_VERSION <= len(data) - fields.at:
+        fields = _CdrFields(data)
+        fields.largest_step = 8
+        message = read(fields)
+    return message
 
 
 def stamp_reader(encoding: str) -> Callable[[memoryview], int | None] | None:

@@ -39,7 +39,7 @@ from liex_lab.recordings.recording import Recording
 from liex_lab.recordings.timestamps import (
     Times,
     from_rate,
-    make_monotone,
+    in_order_of_sensor,
     match_counts,
     median_step,
     unpaired,
@@ -357,7 +357,7 @@ class _Session:
     ) -> Recording:
         camera = self._camera(stack, track)
         times = self._times(stack, track)
-        monotone = make_monotone(times)
+        monotone = in_order_of_sensor(times)
         self.problems += [monotone.problem] if monotone.problem else []
         start = (
             {"session_start_time": track.session_start}
@@ -376,6 +376,7 @@ class _Session:
             close=close,
             faults=monotone.faults,
             doubts=self.doubts,
+            stored=monotone.order,
             metadata={**start, **self.metadata.facts, **self.camera_file.metadata},
             unpacked=unpacked,
         )

@@ -31,7 +31,12 @@ from liex_lab.recordings.formats.oni.index import (
 from liex_lab.recordings.formats.oni.records import OniFile
 from liex_lab.recordings.frame import Depth, depth_mm
 from liex_lab.recordings.recording import Recording
-from liex_lab.recordings.timestamps import MonotoneTimes, from_rate, make_monotone, start_of_clock
+from liex_lab.recordings.timestamps import (
+    MonotoneTimes,
+    from_rate,
+    in_order_of_sensor,
+    start_of_clock,
+)
 from liex_lab.runtime.progress import Progress, silent
 
 RAW = b"NONE"
@@ -216,6 +221,7 @@ def _open(
         truncated=not whole,
         close=file.close,
         faults=monotone.faults,
+        stored=monotone.order,
         metadata=({"session_start_time": start} if start else {}) | camera_file.metadata,
     )
 
@@ -311,7 +317,7 @@ def _times(node: DepthNode, look: Look, fps: float | None, problems: list[str]) 
             f"all frames have the same time stamp, so a constant {hz:g} frames/s was assumed, "
             f"{origin}"
         )
-        return make_monotone(from_rate(n, hz))
+        return in_order_of_sensor(from_rate(n, hz))
     order = np.arange(n)
     sane = np.maximum.accumulate(np.where(stamps <= _LATEST_US, order, 0))
     if n_wild := int((sane != order).sum()):
@@ -320,7 +326,7 @@ def _times(node: DepthNode, look: Look, fps: float | None, problems: list[str]) 
             "frames were taken to follow the one before at once"
         )
     times_us = np.minimum(stamps[sane], np.uint64(_LATEST_US)).astype(np.int64)
-    monotone = make_monotone(times_us * 1000 + (order - sane))
+    monotone = in_order_of_sensor(times_us * 1000 + (order - sane))
     problems += [monotone.problem] if monotone.problem else []
     return monotone
 

@@ -1,0 +1,178 @@
+"""Statements of the RealSense programs about their recordings: depth unit, camera, sensor times.
+
+A `.bag` (until 2025) holds them in numbers, KeyValues and a CameraInfo; a `.db3` (since 2026) holds
+all of them in strings such as "fx=287.9;ppx=159.5". Both use the same topics, of a sensor or of one
+of its streams, and converters keep these. In a `.db3` a depth image's header has the time of
+arrival, counted from the beginning of the recording; the sensor's is in the metadata of its frame.
+"""
+
+from __future__ import annotations
+
+import re
+from collections import Counter, defaultdict
+from dataclasses import dataclass, field
+from decimal import InvalidOperation
+
+import numpy as np
+from numpy.typing import NDArray
+
+from liex_lab.recordings.formats.messages.message_file import Envelope, Place
+from liex_lab.recordings.formats.messages.messages import Calibration, Statement
+from liex_lab.recordings.timestamp_files import UNITS, to_ns
+from liex_lab.recordings.timestamps import start_of_clock
+
+STATES = re.compile(r"(/option/Depth[ _]Units/value|/image/metadata|/camera_info)$")
+_OF_PROGRAM = re.compile(r"^/device_\d+/sensor_\d+/")
+_ROUNDING_MM = 1e-3  # units are written with six decimals of a metre
+_LENS = ("width", "height", "fx", "ppx", "fy", "ppy")
+
+
+def calibration_in(statement: Statement) -> Calibration | None:
+    """The intrinsics of a stream that are stated as text; None where it states something else.
+
+    Args:
+        statement: what the program states.
+
+    Raises:
+        ValueError: one of them is no number.
+    """
+    if not set(_LENS) <= set(statement.facts):
+        return None
+    width, height, fx, cx, fy, cy = (float(statement.facts[name]) for name in _LENS)
+    bent = tuple(float(c) for c in statement.facts.get("coeffs", "").split(",") if c)
+    k = (fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0)
+    return Calibration("", int(width), int(height), statement.facts.get("model", ""), bent, k, ())
+
+
+@dataclass
+class Statements:
+    """What a file states about its sensors and streams, each named by the beginning of its topics.
+
+    Attributes:
+        units_mm: mm of a stored step, as a sensor's option or in the metadata of a stream's frames:
+            how often each was stated.
+        times_ns: by message of a stream: time of logging and time of the sensor, ns.
+        began_ns: the computer's clock at the first frame of a stream, ns.
+    """
+
+    units_mm: defaultdict[str, Counter[float]] = field(default_factory=lambda: defaultdict(Counter))
+    times_ns: defaultdict[str, dict[Place, tuple[int, int]]] = field(
+        default_factory=lambda: defaultdict(dict)
+    )
+    began_ns: dict[str, int] = field(default_factory=dict)
+
+    def add(self, message: Envelope, statement: Statement) -> bool:
+        """Take note of a statement.
+
+        Args:
+            message: the message that it came in.
+            statement: what it states.
+
+        Returns:
+            False where further messages of the channel add nothing.
+
+        Raises:
+            ValueError: a number in it is none.
+        """
+        topic, facts = message.channel.topic, statement.facts
+        of = STATES.sub("/", topic)
+        unit_mm = (
+            float(facts.get("value" if topic.endswith("/value") else "depth_units", 0)) * 1000.0
+        )
+        if 0.0 < unit_mm < np.inf:
+            self.units_mm[of][float(f"{unit_mm:.9g}")] += 1
+        try:
+            if "system_time" in facts:
+                self.began_ns.setdefault(of, to_ns(facts["system_time"], UNITS["ms"]))
+            if "timestamp" in facts:
+                sensor_ns = to_ns(facts["timestamp"], UNITS["ms"])
+                self.times_ns[of][message.place] = (message.log_time_ns, sensor_ns)
+        except InvalidOperation as error:
+            raise ValueError(f"a time in the metadata is none ({error})") from None
+        # a .bag has one message for every fact of every frame, and its headers have the times
+        return message.channel.schema.endswith("String") or of not in self.began_ns
+
+    def step_mm(
+        self, topic: str, settled: bool, problems: list[str], doubts: list[str]
+    ) -> float | None:
+        """Millimetres of a stored step on a topic.
+
+        What the frames themselves state comes before the sensor's option.
+
+        Args:
+            topic: name of the depth topic.
+            settled: whether a camera.toml states the unit.
+            problems: is told where a recording of the programs states none.
+            doubts: is told where it states several.
+
+        Returns:
+            mm; None where the file does not state it, or states several and it is settled.
+        """
+        stated = {of: units for of, units in self.units_mm.items() if topic.startswith(of)}
+        if not stated and _OF_PROGRAM.search(topic) and not settled:
+            problems.append(
+                "the recording states no depth unit, so 1 mm was assumed; state the true unit_mm "
+                "in camera.toml if it differs"
+            )
+        every = sorted({unit for units in stated.values() for unit in units})
+        differ = bool(every) and every[-1] - every[0] > _ROUNDING_MM
+        if not every or (differ and settled):
+            return None
+        step_mm, _ = stated[max(stated, key=len)].most_common(1)[0]
+        if differ:
+            listed = " and ".join(f"{unit:g}" for unit in every[:4])
+            doubts.append(
+                f"the recording states depth units of {listed} mm; {step_mm:g} mm was used, and "
+                "lengths are wrong by the ratio where another one is true: state unit_mm in "
+                "camera.toml"
+            )
+        return step_mm
+
+    def start(self, topic: str) -> str | None:
+        """The moment of the first frame of a topic, ISO 8601, by the computer's clock.
+
+        Args:
+            topic: name of the depth topic.
+
+        Returns:
+            The moment; None where it is not stated.
+        """
+        began = [start_of_clock(ns) for of, ns in self.began_ns.items() if topic.startswith(of)]
+        return began[0] if began else None
+
+    def sensor_times(
+        self,
+        topic: str,
+        logged_ns: NDArray[np.int64],
+        arrived_ns: NDArray[np.int64],
+        problems: list[str],
+    ) -> NDArray[np.int64]:
+        """The sensor's times of the depth images on a topic, from the metadata of their frames.
+
+        An image and its metadata have the same time of logging, or else the same number.
+
+        Args:
+            topic: name of the depth topic.
+            logged_ns: (n,) times of logging, ns, in order.
+            arrived_ns: (n,) stamps in their headers, ns.
+            problems: is told where images have no metadata.
+
+        Returns:
+            (n,) ns; the stamps of the headers where the file has no metadata.
+        """
+        times = next((t for of, t in self.times_ns.items() if topic.startswith(of)), {})
+        if not times:
+            return arrived_ns
+        by_log = dict(times.values())
+        found = [by_log.get(ns) for ns in logged_ns.tolist()]
+        if None in found and len(times) == len(found):
+            found = [ns for _, ns in times.values()]
+        if None in found:
+            problems.append(
+                f"{found.count(None)} of {len(found)} depth images have no metadata with the "
+                "sensor's time; their times of arrival are used"
+            )
+        known = np.array([ns is not None for ns in found])
+        sensor_ns = np.array([ns or 0 for ns in found])
+        delay = int(np.median((sensor_ns - arrived_ns)[known])) if known.any() else 0
+        return np.where(known, sensor_ns, arrived_ns + delay)
