@@ -52,22 +52,25 @@ def picture(
         left: column of the frame at which the picture begins, px.
         top: row of the frame at which the picture begins, px.
         marks: what stands still, as far as it is in the picture.
-        unit: radius of a joint, px; None takes that of a picture around the animal.
+        unit: radius of a joint, px; None takes that of a picture around the animal, smaller where
+            joints are close to each other.
         lettered: whether is written what a mark says.
     """
     h, w = rgb.shape[:2]
     points = (
         uv - [left, top] + 0.5
     )  # the paper counts from the corner of the picture, we from a pixel's centre
-    r = w / 70.0 if unit is None else unit
+    bone_px = np.median([np.hypot(*(points[a] - points[b])) for a, b in bones] or [w])
+    r = float(np.clip(0.4 * bone_px, w / 200.0, w / 70.0)) if unit is None else unit
     parts = [f'<image href="{png_uri(_small(rgb))}" width="{w}" height="{h}"/>']
     parts.append(svg_marks(marks, left, top, w, h, 0.9 * r, lettered))
-    for a, b in bones:
-        (x0, y0), (x1, y1) = points[a], points[b]
-        parts.append(
-            f'<line x1="{x0:.1f}" y1="{y0:.1f}" x2="{x1:.1f}" y2="{y1:.1f}" stroke="#fff" '
-            f'stroke-width="{0.8 * r:.2f}"/>'
-        )
+    for colour, width in (("#222", 1.3 * r), ("#fff", 0.8 * r)):  # seen on light and dark surfaces
+        for a, b in bones:
+            (x0, y0), (x1, y1) = points[a], points[b]
+            parts.append(
+                f'<line x1="{x0:.1f}" y1="{y0:.1f}" x2="{x1:.1f}" y2="{y1:.1f}" stroke="{colour}" '
+                f'stroke-width="{width:.2f}"/>'
+            )
     for k, (x, y) in enumerate(points):
         fill = "#fff" if k < len(points) - 1 else "#EE6677"
         parts.append(

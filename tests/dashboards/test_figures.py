@@ -107,7 +107,8 @@ def test_the_shares_of_the_budget_are_those_of_the_summary(session, seen):
     assert figure is not None
     drawn = [bar.get_width() for bar in figure.axes[0].patches]
     row = session.summary.iloc[0]
-    np.testing.assert_allclose(drawn, [100.0 * row[f"{word}_share"] for word in seen.words])
+    words = [*seen.words, "unlabelled"]
+    np.testing.assert_allclose(drawn, [100.0 * row[f"{word}_share"] for word in words])
 
 
 def test_an_action_has_its_colour_in_every_figure(session, seen):
