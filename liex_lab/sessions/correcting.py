@@ -87,7 +87,9 @@ def disagreements(session: Session) -> list[str]:
     Returns:
         One sentence for each exchange that stands and disagrees, with the commands to change it.
     """
-    exchanges = [one for one in session.log.standing if isinstance(one.what, FlipSpan)]
+    exchanges = [
+        (one.number, one.what) for one in session.log.standing if isinstance(one.what, FlipSpan)
+    ]
     if not exchanges:
         return []
     index, time_s = (session.frames[name].to_numpy() for name in ("frame_index", "time_s"))
@@ -97,9 +99,8 @@ def disagreements(session: Session) -> list[str]:
     ends_s = np.append(time_s, stop_times(time_s)[-1:])
     path = shlex.quote(str(session.path))
     found = []
-    for one in exchanges:
-        assert isinstance(one.what, FlipSpan)
-        ends = np.searchsorted(index, (one.what.start_frame, one.what.stop_frame))
+    for number, one in exchanges:
+        ends = np.searchsorted(index, (one.start_frame, one.stop_frame))
         before = ahead.copy()
         before[slice(*ends)] *= -1.0
         now, then = ((way[1:] * way[:-1]).sum(axis=1) for way in (ahead[rows], before[rows]))
@@ -114,8 +115,8 @@ def disagreements(session: Session) -> list[str]:
             f"{np.degrees(np.arccos(now[k])):.0f} degrees at frame {index[rows[k + 1]]}" for k in at
         )
         found.append(
-            f"{one.what}: this disagrees with the frames around it (a turn of "
-            f"{' and '.join(turns)}). Take it back with `liex correct undo {path} {one.number}`; "
+            f"{one}: this disagrees with the frames around it (a turn of "
+            f"{' and '.join(turns)}). Take it back with `liex correct undo {path} {number}`; "
             "the nearest span that agrees is then exchanged by `liex correct flip "
             f"{path} --from {ends_s[start]:.3f} --to {ends_s[stop]:.3f}`"
         )

@@ -20,7 +20,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from liex_lab.dashboards.app import plots, tables
-from liex_lab.dashboards.app.data import GREY, Ethogram, StudyData, colours_of, raster
+from liex_lab.dashboards.app.data import GREY, NO_NAME_GREY, Ethogram, StudyData, colours_of, raster
 from liex_lab.dashboards.app.guard import MOST_BYTES
 from liex_lab.dashboards.app.listener import MOST, Handler, Listener
 from liex_lab.dashboards.app.page_session import moved_to
@@ -110,6 +110,43 @@ def test_each_part_of_the_time_has_the_colour_of_what_fills_most_of_it(
             assert max(seconds.values()) < 1e-9
         else:
             assert seconds[place] >= max(seconds.values()) - 1e-9
+
+
+def test_rows_of_ethograms_and_budgets_name_their_group_once_and_every_grey_has_a_meaning() -> None:
+    ones = {
+        key: Ethogram(np.array([[0.0, 2.0]]), ["walk"], np.array([[3.0, 4.0]]), end_s, ("walk",))
+        for key, end_s in (("a", 4.0), ("b", 5.0), ("c", 4.0))
+    }
+    groups = ["drug", "drug", "vehicle"]
+    drawn = plots.ethograms(ones, {"walk": "#4477aa"}, groups)
+    shares = pd.DataFrame(
+        {"key": list(ones), "walk_share": 0.5, "walk_s": 2.0}
+        | {"unlabelled_share": 0.3, "unlabelled_s": 1.0, "sit_share": 0.2, "sit_s": 1.0}
+    )
+    budget = plots.time_budgets(shares, {"walk": "#4477aa"}, groups)
+    for figure in (drawn, budget):
+        assert figure["layout"]["yaxis"]["ticktext"] == ["<b>drug</b>  a", "b", "<b>vehicle</b>  c"]
+    parts = {part["name"]: part["marker"]["color"] for part in budget["data"]}
+    assert parts == {"walk": "#4477aa", "other actions": GREY, "no name": NO_NAME_GREY}
+    (rows,) = drawn["data"]
+    painted = {text: set(rows["z"][np.array(rows["text"]) == text]) for text in ("walk", "no pose")}
+    assert painted == {"walk": {3.0}, "no pose": {0.0}}
+    assert np.isnan(rows["z"][0][-100:]).all(), "nothing is painted after a session's end"
+
+
+@pytest.mark.parametrize(
+    ("values", "shown"),
+    [
+        ([0.0333, 1.7, 2.41], ["0.03", "1.70", "2.41"]),
+        ([0.1, 0.1], ["0.100", "0.100"]),
+        ([1.0, float("nan"), 12.0], ["1", "–", "12"]),
+        ([1234.5, 2345.6], ["1,234", "2,346"]),
+    ],
+)
+def test_numbers_of_a_column_have_the_same_digits(values: list[float], shown: list[str]) -> None:
+    table = tables.Table(pd.DataFrame({"a": values}), {"a": "a"})
+    filled = tables.fill("bouts", table, "", {"column": "", "down": False})
+    assert [row[0]["text"] for row in filled["rows"]] == shown
 
 
 def test_no_two_actions_share_a_colour_but_the_grey_ones() -> None:

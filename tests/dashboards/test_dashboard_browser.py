@@ -60,6 +60,15 @@ def test_two_hundred_sessions_open_in_seconds_are_sorted_filtered_and_had_as_csv
     watched.nothing_went_wrong()
 
 
+def test_a_session_that_failed_is_shown_without_a_complaint_of_the_browser(
+    served: Served, watched: Watched
+) -> None:
+    watched.page.goto(f"{served.address}/session/sub-m000_ses-02")
+    expect(watched.page.locator("main")).to_contain_text("frame 33 cannot be read; copy it again")
+    watched.page.wait_for_load_state("networkidle")
+    watched.nothing_went_wrong()
+
+
 def test_the_page_that_open_writes_leads_into_a_dashboard_with_a_token(
     tmp_path: Path, watched: Watched
 ) -> None:

@@ -214,8 +214,8 @@ def test_redo_makes_again_what_was_taken_back_until_something_new_is_done(steps:
         elif step == "redo":
             assert (log.redoable is not None) == bool(undone)
             if log.redoable is not None:
-                number, what = log.redoable
-                assert what == undone[-1]
+                number, again = log.redoable
+                assert again == undone[-1]
                 log = log.added([], [number])
                 done.append(undone.pop())
         assert [entry.what for entry in log.standing] == done

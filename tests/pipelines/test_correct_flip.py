@@ -113,7 +113,7 @@ def test_a_joint_placed_before_its_frame_was_exchanged_is_of_the_other_end(track
     nose = track_of(tracked, skeleton).joints_mm[row, -1] + np.array([2.0, -2.0, 1.0])
     move = JointMove(row, "nose", *nose.tolist())
     flip = FlipSpan(SPAN.start, SPAN.stop)
-    entries = [Entry(k + 1, "", "", what) for k, what in enumerate((move, flip))]
+    entries = [Entry(1, "", "", move), Entry(2, "", "", flip)]
     found = corrected_track(tracked, Log("", tuple(entries)), skeleton).track
     assert np.linalg.norm(found.joints_mm[row, 0] - nose) < 1.5, "its rump is there now"
     later = corrected_track(tracked, Log("", tuple(entries[::-1])), skeleton)
