@@ -16,7 +16,7 @@ from liex_lab.errors import PlanError
 from liex_lab.plan import Plan, known_plans
 from liex_lab.runtime.progress import Progress, silent
 
-from .origin import build_zones
+from .origin import animal_of, build_zones
 from .regions import cut_out, region_of, stated_floor
 
 if TYPE_CHECKING:
@@ -30,17 +30,13 @@ if TYPE_CHECKING:
     from liex_lab.foreground.segmenter import Segmenter
     from liex_lab.optics.camera import Camera, Distortion, Lens
     from liex_lab.optics.refraction import Water
-    from liex_lab.plan.sections import Animal, SharedShape
+    from liex_lab.plan.sections import SharedShape
     from liex_lab.recordings.recording import Recording
     from liex_lab.tracking.own_shape import StatedShape
     from liex_lab.tracking.tracker import FrameTracker
 
 
 _RULED = "mouse"  # the animal that the rules were made for
-_SPANS = (
-    0.6,
-    1.8,
-)  # of the home length: how small and how large an animal of the user's own may be
 
 
 def build_recording(
@@ -165,31 +161,6 @@ def plan_of(animal: str) -> Plan:
         }
     )
     return plan.model_copy(update={"animal": animal_of(plan)})
-
-
-def animal_of(plan: Plan) -> Animal:
-    """The plan's animal; of one of the user's own, its skeleton states what the plan does not.
-
-    Its name is the skeleton's then, and its spine 0.6 to 1.8 times the skeleton's own length.
-
-    Args:
-        plan: its section `animal`.
-
-    Raises:
-        LiexError: the skeleton's file cannot be read.
-    """
-    from liex_lab.body.skeleton import Skeleton
-
-    animal = plan.animal
-    if not animal.skeleton.endswith(".toml"):
-        return animal
-    skeleton = Skeleton.load(animal.skeleton)
-    low, high = (round(factor * skeleton.length, 3) for factor in _SPANS)
-    own = {"name": skeleton.name, "spine_min_mm": low, "spine_max_mm": high}
-    usual = type(animal).model_fields  # a plan that was written out states its defaults
-    return animal.model_copy(
-        update={k: v for k, v in own.items() if getattr(animal, k) == usual[k].default}
-    )
 
 
 def build_estimator(plan: Plan) -> PoseEstimator:

@@ -17,7 +17,8 @@ from liex_lab.errors import EstimationError, LiexError, MisfitError
 from liex_lab.plan import Plan, known_plans
 from liex_lab.runtime.progress import Progress, silent
 
-from .build import animal_of, build_tracker
+from .build import build_tracker
+from .origin import animal_of
 
 if TYPE_CHECKING:
     from liex_lab.estimation.estimator import PoseEstimator

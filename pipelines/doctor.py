@@ -30,11 +30,11 @@ from liex_lab.recordings.timestamps import (
 )
 from liex_lab.runtime.progress import Progress, silent
 
-from .build import animal_of, build_water
+from .build import build_water
 from .choice import Proposal, propose_plan
 from .doctor_files import next_command, open_anyhow
 from .doctor_scene import SceneLook
-from .origin import session_bytes
+from .origin import animal_of, session_bytes
 from .regions import arenas_of, cut_out, propose_arenas, stated_corners
 
 if TYPE_CHECKING:

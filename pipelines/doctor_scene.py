@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 from liex_lab.errors import EstimationError, PlanError
 from liex_lab.plan import Plan
 
-from .build import animal_of
-from .origin import build_zones
+from .origin import animal_of, build_zones
 from .regions import region_of, stated_floor
 
 if TYPE_CHECKING:

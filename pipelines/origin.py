@@ -17,9 +17,39 @@ if TYPE_CHECKING:
     from liex_lab.behaviour.places import Surroundings
     from liex_lab.foreground.segmenter import Segmenter
     from liex_lab.plan import Plan
+    from liex_lab.plan.sections import Animal
     from liex_lab.recordings.recording import Recording
     from liex_lab.sessions import Provenance
     from liex_lab.tracking.tracker import FrameTracker
+
+
+# of the home length: how small and how large an animal of the user's own may be
+_SPANS = (0.6, 1.8)
+
+
+def animal_of(plan: Plan) -> Animal:
+    """The plan's animal; of one of the user's own, its skeleton states what the plan does not.
+
+    Its name is the skeleton's then, and its spine 0.6 to 1.8 times the skeleton's own length.
+
+    Args:
+        plan: its section `animal`.
+
+    Raises:
+        LiexError: the skeleton's file cannot be read.
+    """
+    from liex_lab.body.skeleton import Skeleton
+
+    animal = plan.animal
+    if not animal.skeleton.endswith(".toml"):
+        return animal
+    skeleton = Skeleton.load(animal.skeleton)
+    low, high = (round(factor * skeleton.length, 3) for factor in _SPANS)
+    own = {"name": skeleton.name, "spine_min_mm": low, "spine_max_mm": high}
+    usual = type(animal).model_fields  # a plan that was written out states its defaults
+    return animal.model_copy(
+        update={k: v for k, v in own.items() if getattr(animal, k) == usual[k].default}
+    )
 
 
 def build_provenance(

@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING
 from liex_lab.errors import PlanError
 from liex_lab.plan import Plan
 
+from .origin import animal_of
+
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
@@ -121,8 +123,6 @@ def _sampled(recording: Recording, plan: Plan) -> tuple[SampledScene, int]:
     from liex_lab.body.skeleton import Skeleton
     from liex_lab.foreground.background import learn_background, sample_frames, stride_for
     from liex_lab.foreground.standing import SampledScene
-
-    from .build import animal_of  # which cuts regions out, and so imports this module
 
     animal = animal_of(plan)
     stride = stride_for(recording, animal.spine_min_mm)

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 import pytest
 from liex_lab.pipelines import choice
-from liex_lab.pipelines.build import animal_of
 from liex_lab.pipelines.choice import Look, best, fit_plan, misfits_of
+from liex_lab.pipelines.origin import animal_of
 
 from liex_lab.errors import EstimationError, MisfitError
 from liex_lab.foreground.hand_segmenter import HandSegmenter
@@ -247,7 +247,9 @@ def test_an_own_animal_has_its_name_and_its_limits_from_its_skeleton(
     far = replace(GOOD, spine_mm=3.0 * length_mm)
     assert misfits_of(far, plan)
     monkeypatch.setattr(choice, "look", lambda _, one: Look(str(one), None, ("no",)))
-    monkeypatch.setattr(choice, "build_tracker", lambda *_: Pretended(far, None))
+    monkeypatch.setattr(
+        choice, "build_tracker", lambda *_: Pretended(far, SimpleNamespace(doubts=()))
+    )
     with pytest.raises(MisfitError, match=f"does not fit the plan of the {name}"):
         fit_plan(RECORDING, plan)
 
