@@ -243,7 +243,7 @@ def unified(table: pd.DataFrame) -> tuple[pd.DataFrame, list[str]]:
         for kept, *others in alike(table[column].fillna("").astype(str)):
             notes.append(f"{column} {', '.join(map(repr, others))} is taken for {kept!r}")
             table = table.assign(**{column: table[column].replace(others, kept)})
-    known = table["subject_id"].fillna("").astype(str) if "subject_id" in table else []
+    known = list(table["subject_id"].fillna("").astype(str)) if "subject_id" in table else []
     notes += [
         f"possible pseudo-replication: the animals {', '.join(ids)} may be one; if they are, give "
         "all its sessions one subject_id"

@@ -31,7 +31,7 @@ def test_tiff_of_every_kind_gives_the_same_depth(kind: str, compression: str | N
     """Unread is 0, what is negative, and the largest value that the integers have."""
     depth = depth_frames(2).astype(np.float32)
     stored = depth.astype(kind)
-    unread = {
+    unread: list[float] = {
         "u": [0, 65535],
         "i": [0, -1, -32768, 32767],
         "f": [0, -1, np.nan, np.inf, -np.inf],
@@ -40,7 +40,7 @@ def test_tiff_of_every_kind_gives_the_same_depth(kind: str, compression: str | N
     depth[:, 0, : len(unread)] = 0
     with TemporaryDirectory() as folder:
         path = write_tiff_stack(Path(folder) / "r" / "stack.tif", depth)  # and what lies beside it
-        with tifffile.TiffWriter(path, byteorder=kind[0]) as tif:
+        with tifffile.TiffWriter(path, byteorder=kind[0])  # type: ignore[arg-type] as tif:
             for page in stored:
                 tif.write(page, photometric="minisblack", compression=compression)
         with open_recording(path) as recording:

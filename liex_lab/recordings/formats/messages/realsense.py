@@ -11,15 +11,14 @@ from __future__ import annotations
 import re
 from collections import Counter, defaultdict
 from dataclasses import dataclass, field
-from decimal import InvalidOperation
+from decimal import Decimal, InvalidOperation
 
 import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.recordings.formats.messages.message_file import Envelope, Place
 from liex_lab.recordings.formats.messages.messages import Calibration, Statement
-from liex_lab.recordings.timestamp_files import UNITS, to_ns
-from liex_lab.recordings.timestamps import start_of_clock
+from liex_lab.recordings.timestamps import LIMIT_NS, start_of_clock
 
 STATES = re.compile(r"(/option/Depth[ _]Units/value|/image/metadata|/camera_info)$")
 _OF_PROGRAM = re.compile(r"^/device_\d+/sensor_\d+/")
@@ -83,9 +82,9 @@ class Statements:
             self.units_mm[of][float(f"{unit_mm:.9g}")] += 1
         try:
             if "system_time" in facts:
-                self.began_ns.setdefault(of, to_ns(facts["system_time"], UNITS["ms"]))
+                self.began_ns.setdefault(of, _ms_as_ns(facts["system_time"]))
             if "timestamp" in facts:
-                sensor_ns = to_ns(facts["timestamp"], UNITS["ms"])
+                sensor_ns = _ms_as_ns(facts["timestamp"])
                 self.times_ns[of][message.place] = (message.log_time_ns, sensor_ns)
         except InvalidOperation as error:
             raise ValueError(f"a time in the metadata is none ({error})") from None
@@ -176,3 +175,11 @@ class Statements:
         sensor_ns = np.array([ns or 0 for ns in found])
         delay = int(np.median((sensor_ns - arrived_ns)[known])) if known.any() else 0
         return np.where(known, sensor_ns, arrived_ns + delay)
+
+
+def _ms_as_ns(text: str) -> int:
+    """Milliseconds as they are written, in ns; a float64 of them would be good to 200 ns only."""
+    value = Decimal(text.strip()) * 1_000_000
+    if not value.is_finite() or abs(value) >= LIMIT_NS:
+        raise InvalidOperation(f"{text} is not a time")
+    return int(value.to_integral_value())
