@@ -94,7 +94,6 @@ CHANGED = {
         "--action rear_supported": "--action walk",
     },
     "docs/tutorials/study.md": {
-        "for k in": "mkdir -p study/rawdata\nfor k in",
         "frames=90": "frames=40",
         "liex cohort study/study.toml --dry-run": f"{GROUPS}liex cohort study/study.toml --dry-run",
     },

@@ -40,7 +40,7 @@ def test_tiff_of_every_kind_gives_the_same_depth(kind: str, compression: str | N
     depth[:, 0, : len(unread)] = 0
     with TemporaryDirectory() as folder:
         path = write_tiff_stack(Path(folder) / "r" / "stack.tif", depth)  # and what lies beside it
-        with tifffile.TiffWriter(path, byteorder=kind[0])  # type: ignore[arg-type] as tif:
+        with tifffile.TiffWriter(path, byteorder=kind[0]) as tif:  # type: ignore[arg-type]
             for page in stored:
                 tif.write(page, photometric="minisblack", compression=compression)
         with open_recording(path) as recording:
