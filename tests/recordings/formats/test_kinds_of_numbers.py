@@ -31,11 +31,12 @@ def test_tiff_of_every_kind_gives_the_same_depth(kind: str, compression: str | N
     """Unread is 0, what is negative, and the largest value that the integers have."""
     depth = depth_frames(2).astype(np.float32)
     stored = depth.astype(kind)
-    unread: list[float] = {
+    kinds: dict[str, list[float]] = {
         "u": [0, 65535],
         "i": [0, -1, -32768, 32767],
         "f": [0, -1, np.nan, np.inf, -np.inf],
-    }[stored.dtype.kind]
+    }
+    unread = kinds[stored.dtype.kind]
     stored[:, 0, : len(unread)] = unread
     depth[:, 0, : len(unread)] = 0
     with TemporaryDirectory() as folder:
