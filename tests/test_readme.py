@@ -126,7 +126,7 @@ def test_the_zones_can_be_read(tmp_path: Path) -> None:
 
 
 def test_the_animal_of_ones_own_can_be_read(tmp_path: Path) -> None:
-    (example,) = blocks("toml", PAGES["tutorials/own-animal.md"])
+    example, _ = blocks("toml", PAGES["tutorials/own-animal.md"])  # a skeleton, and a plan
     (tmp_path / "gerbil.toml").write_text(example, encoding="utf-8")
     gerbil = Skeleton.load(tmp_path / "gerbil.toml")
     assert (gerbil.name, gerbil.n_joints, gerbil.dof) == ("gerbil", 3, 8)

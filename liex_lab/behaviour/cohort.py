@@ -10,13 +10,13 @@ compare` and the dashboard's page of groups show it.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from importlib.metadata import version
 from itertools import combinations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
 
-from liex_lab import __version__
 from liex_lab.behaviour.design import (
     ANIMAL,
     CAGE,
@@ -49,7 +49,7 @@ if TYPE_CHECKING:
 WHO = ("subject_id", "group", "cage", "sex", "batch")
 ENGINES = ("auto", "permutation", "mixed")
 _SOFTWARE = (
-    f"Poses, actions and statistics: liex_lab {__version__}, after Xu et al., Lie-X: Depth Image "
+    f"Poses, actions and statistics: liex_lab {version('liex_lab')}, after Xu et al., Lie-X: Depth Image "
     "Based Articulated Object Pose Estimation, Tracking, and Action Recognition on Lie Groups, "
     "International Journal of Computer Vision, 2017."
 )

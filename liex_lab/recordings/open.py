@@ -260,7 +260,7 @@ def _open_folder(folder: Path, how: _How) -> Recording:
     if any(Path(name).suffix.lower() in (*_PICTURES, ".jpg", ".jpeg", ".bmp") for name in inside):
         return how.open("images.folder.open_images", folder)
     files = [name for name in inside if _reader(name, _ALONE)]
-    files = files or [name for name in inside if _NOT_READ.get(Path(name).suffix) is _PACKED]
+    files = files or [name for name in inside if Path(name).suffix in (".zstd", ".zst")]
     if len(files) == 1:
         return _open(folder / files[0], how)
     offer = files or [f"{name}/" for name in inside if (folder / name).is_dir()]

@@ -79,7 +79,7 @@ def test_a_list_of_the_animals_overrules_the_sessions(study, tmp_path):
     [
         ("subject_id,group\nm0,a\n", "does not list the animal 'm1'"),
         ("name,group\nm0,a\n", "should have a column subject_id"),
-        ("", "should be a CSV"),
+        ("", "should have a column subject_id"),
     ],
 )
 def test_a_list_that_does_not_fit_is_told(study, tmp_path, text, sentence):

@@ -211,7 +211,7 @@ def test_a_clock_whose_date_leaves_one_unit_is_read_in_it(
 def test_a_unit_that_is_not_known_is_doubted_until_it_is_stated(tmp_path: Path) -> None:
     lines = [str(ns // 1000) for ns in NS]
     with moseq(tmp_path / "s", lines) as recording:
-        assert "another unit" in recording.doubts[0]
+        assert "another unit" in (*recording.doubts, *recording.clock_doubts)[0]
         assert any('time_column = 0 and time_unit = "us"' in said for said in recording.problems)
     with moseq(tmp_path / "s", lines, time_column=0, time_unit="us") as recording:
         assert (recording.times_ns.tolist(), recording.doubts) == (NS, [])

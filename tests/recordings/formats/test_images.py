@@ -191,7 +191,9 @@ def test_pictures_for_people_are_refused(
         cv2.imwrite(str(path), picture)
     else:
         tifffile.imwrite(path, picture, photometric="minisblack" if picture.ndim == 2 else "rgb")
-        kind = kind.replace(" with transparency", "")
+        kind = kind.replace(" with transparency", "").replace(
+            "a 16-bit", "a 16-bit unsigned integer"
+        )
     for given in (write_camera_folder, path):
         sentence = refusal(given)
         assert f"expected 16-bit depth, got {kind}" in sentence
