@@ -50,8 +50,8 @@ WHO = ("subject_id", "group", "cage", "sex", "batch")
 ENGINES = ("auto", "permutation", "mixed")
 _SOFTWARE = (
     f"Poses, actions and statistics: liex_lab {version('liex_lab')}, after Xu et al., Lie-X: Depth "
-    "Image Based Articulated Object Pose Estimation, Tracking, and Action Recognition on Lie Groups, "
-    "International Journal of Computer Vision, 2017."
+    "Image Based Articulated Object Pose Estimation, Tracking, and Action Recognition on Lie "
+    "Groups, International Journal of Computer Vision, 2017."
 )
 _USUAL = (
     "distance_m",
