@@ -61,9 +61,10 @@ def picture(
         uv - [left, top] + 0.5
     )  # the paper counts from the corner of the picture, we from a pixel's centre
     bone_px = np.median([np.hypot(*(points[a] - points[b])) for a, b in bones] or [w])
-    r = float(np.clip(0.4 * bone_px, w / 200.0, w / 70.0)) if unit is None else unit
+    usual = w / 70.0
+    r = float(np.clip(0.4 * bone_px, w / 200.0, usual)) if unit is None else unit
     parts = [f'<image href="{png_uri(_small(rgb))}" width="{w}" height="{h}"/>']
-    parts.append(svg_marks(marks, left, top, w, h, 0.9 * r, lettered))
+    parts.append(svg_marks(marks, left, top, w, h, 0.9 * (unit or usual), lettered))
     for colour, width in (("#222", 1.3 * r), ("#fff", 0.8 * r)):  # seen on light and dark surfaces
         for a, b in bones:
             (x0, y0), (x1, y1) = points[a], points[b]

@@ -20,7 +20,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from liex_lab.dashboards.app import plots, tables
-from liex_lab.dashboards.app.data import GREY, NO_NAME_GREY, Ethogram, StudyData, colours_of, raster
+from liex_lab.dashboards.app.data import GREY, Ethogram, StudyData, colours_of, raster
 from liex_lab.dashboards.app.guard import MOST_BYTES
 from liex_lab.dashboards.app.listener import MOST, Handler, Listener
 from liex_lab.dashboards.app.page_session import moved_to
@@ -29,7 +29,7 @@ from liex_lab.pipelines.study.listing import list_sessions
 from typer.testing import CliRunner
 
 from liex_lab import api, cli
-from liex_lab.actions.colours import PALETTE, action_colours
+from liex_lab.actions.colours import PALETTE, UNLABELLED, action_colours
 from liex_lab.errors import LiexError, SessionError
 from liex_lab.sessions import Session
 from liex_lab.sessions.listed import Entry
@@ -127,7 +127,7 @@ def test_rows_of_ethograms_and_budgets_name_their_group_once_and_every_grey_has_
     for figure in (drawn, budget):
         assert figure["layout"]["yaxis"]["ticktext"] == ["<b>drug</b>  a", "b", "<b>vehicle</b>  c"]
     parts = {part["name"]: part["marker"]["color"] for part in budget["data"]}
-    assert parts == {"walk": "#4477aa", "other actions": GREY, "no name": NO_NAME_GREY}
+    assert parts == {"walk": "#4477aa", "other actions": GREY, "unlabelled": UNLABELLED}
     (rows,) = drawn["data"]
     painted = {text: set(rows["z"][np.array(rows["text"]) == text]) for text in ("walk", "no pose")}
     assert painted == {"walk": {3.0}, "no pose": {0.0}}

@@ -246,7 +246,7 @@ def test_a_measure_is_chosen_and_its_groups_compared_with_names_as_text(
     verdict = page.locator(".verdict").inner_text()
     assert "Hedges' g" in verdict
     assert "100 animals" in verdict
-    assert "control - <b>drug</b> %{y}" in verdict
+    assert "<b>drug</b> %{y} - control" in verdict
     assert page.locator(".js-plotly-plot b, .js-plotly-plot tspan[style*='bold']").count() == 0
     watched.nothing_went_wrong()
 

@@ -386,7 +386,9 @@ def test_a_comparison_draws_every_animal_and_the_interval_of_the_table(study, tm
     table, stats, sessions = sets.read_comparison(tmp_path / "cmp")
     assert len(sessions) == 6
     with drawing():
-        figure = groups.comparison(table, stats, "mean_speed_mm_s", "mm/s")
+        figure = groups.comparison(
+            table, stats, "mean_speed_mm_s", "mm/s", table.attrs["accounted"]
+        )
     assert figure is not None
     left, right = figure.axes
     for group in ("control", "drug"):

@@ -313,7 +313,7 @@ def test_a_joint_cannot_be_put_where_the_still_scene_is_shown(session: Session) 
     assert boxes is not None
     left, top, right, bottom = boxes[3, 0]
     u, v = (0, 0) if left > 0 or top > 0 else (right, bottom)
-    with pytest.raises(SessionError, match="outside of the cut-out that the session keeps"):
+    with pytest.raises(SessionError, match="for the animal is 90 mm long"):
         correcting.joint_move_at_pixel(session, 3, "neck", float(u), float(v))
     uv = MOUSE.track().uv_px[3, 1]
     moved = correcting.joint_move_at_pixel(session, 3, MOUSE.skeleton.names[1], *uv)
