@@ -478,6 +478,7 @@ def register(app: Dash, data: StudyData, show_replay: ShowReplay | None) -> None
         ClientsideFunction("liex", "cursor"),
         Output("whole", "figure"),
         Input("moment", "value"),
+        Input("session-figures", "children"),  # the moment may have changed before they came
         State("session-unit-s", "data"),
         State("whole", "figure"),
     )

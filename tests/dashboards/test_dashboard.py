@@ -123,7 +123,7 @@ def test_rows_of_ethograms_and_budgets_name_their_group_once_and_every_grey_has_
         {"key": list(ones), "walk_share": 0.5, "walk_s": 2.0}
         | {"unlabelled_share": 0.3, "unlabelled_s": 1.0, "sit_share": 0.2, "sit_s": 1.0}
     )
-    budget = plots.time_budgets(shares, {"walk": "#4477aa"}, groups)
+    budget = plots.time_budgets(shares, {"walk": "#4477aa"}, ["walk", "sit"], groups)
     for figure in (drawn, budget):
         assert figure["layout"]["yaxis"]["ticktext"] == ["<b>drug</b>  a", "b", "<b>vehicle</b>  c"]
     parts = {part["name"]: part["marker"]["color"] for part in budget["data"]}

@@ -84,7 +84,7 @@
     return window.dash_clientside.no_update;
   }
 
-  function cursor(at, unit, figure) {  // the line through the curves of the whole session
+  function cursor(at, came, unit, figure) {  // the line through the curves of the whole session
     const [line] = figure.layout.shapes, place = (Number(at) || 0) / unit;
     if (line.x0 === place) return window.dash_clientside.no_update;
     return { ...figure, layout: { ...figure.layout, shapes: [{ ...line, x0: place, x1: place }] } };
