@@ -20,9 +20,6 @@ from liex_lab.runtime.kernel_cache import keep_kernels
 
 __version__ = "0.1.0"
 
-if not os.path.isdir(os.path.join(__path__[0], "pipelines")):
-    # in a clone, where `pipelines`, `dashboards` and `datasets` stand beside this folder
-    __path__.append(os.path.dirname(__path__[0]))
 keep_old_paths()
 # kernels' threads that have nothing to do sleep; OpenMP's usual ones spin, on cores on which
 # recordings are read and logs are written meanwhile (libgomp reads this when it is loaded)

@@ -12,6 +12,8 @@ import warnings
 from collections.abc import Sequence
 from importlib import import_module
 from importlib.machinery import ModuleSpec
+from importlib.util import spec_from_file_location
+from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING
 
@@ -105,6 +107,11 @@ MOVED = {
 }
 
 
+# they stand in the library where it is installed, and beside it in a clone
+BESIDE = ("liex_lab.pipelines", "liex_lab.dashboards")
+_LIBRARY = Path(__file__).resolve().parent
+
+
 class _Forward(Loader):
     """Loads the module at the new path in place of the old one."""
 
@@ -133,18 +140,21 @@ class _Forward(Loader):
 
 
 class _MovedModules:
-    """Finds the old paths of `MOVED`, after every other finder has failed to."""
+    """Finds `BESIDE` in a clone and the old paths of `MOVED`, after every other finder."""
 
     def find_spec(
         self, name: str, path: Sequence[str] | None = None, target: ModuleType | None = None
     ) -> ModuleSpec | None:
-        """Forwarding spec of an old path; None for every other name.
+        """Spec of a package beside the library, or forwarding spec of an old path; else None.
 
         Args:
             name: the dotted path that is imported.
             path: not used.
             target: not used.
         """
+        package = _LIBRARY.parent / name.removeprefix("liex_lab.") / "__init__.py"
+        if name in BESIDE and package.is_file():
+            return spec_from_file_location(name, package)
         return ModuleSpec(name, _Forward()) if name in MOVED else None
 
 
