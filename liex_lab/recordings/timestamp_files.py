@@ -315,18 +315,17 @@ def read_stamps(
     wide = [row for _, row in data if not header or len(row) > len(header)]
     for k in range(max(found.k - 1, 0), found.k + 1):
         behind = [row[k + 1] for row in wide if len(row) > k + 1 and _are_digits(row[k : k + 2])]
-        sure = len(data) >= _SURE and _is_column(behind, header)
-        if separator == "," and len(behind) == len(data) > 0 and not sure:
+        may_be = separator == "," and len(behind) == len(data) > 0
+        if may_be and (len(data) < _SURE or not _is_column(behind, header)):
             doubts.append(
                 f"line {data[0][0]} of {path.name} holds {','.join(data[0][1])!r}, where a comma "
                 "may be a decimal sign; it was taken to separate columns: write a decimal point, "
                 "or semicolons between columns"
             )
             break
-    usual = usual_ns or (1 if isinstance(column, int) else None)
-    ns_per_unit = UNITS[unit] if unit else CSV_COLUMNS.get(str(name), usual)
     stated = name is not None or column is not None
-    if ns_per_unit is None and found.read is number and stated:
+    ns_per_unit = UNITS[unit] if unit else CSV_COLUMNS.get(str(name), usual_ns)
+    if not ns_per_unit and found.read is number and stated and not isinstance(column, int):
         raise RecordingError(
             f'the unit of the column {name!r} in {path} is not known; write time_unit = "s", "ms", '
             '"us" or "ns" beside time_column in camera.toml'

@@ -96,9 +96,8 @@ def read_texts(path: Path) -> pd.DataFrame:
                 f"line {line} has {len(row)} cells and the first line names {len(names)} columns; "
                 "where a comma is the decimal sign, separate cells by semicolons"
             )
-    n = len(names)
-    table = pd.DataFrame([[*row, *[""] * n][:n] for _, row in rows[1:]], columns=range(n))
-    table.columns = pd.Index(names, dtype=str)
+    filled = [[*row, *[""] * len(names)][: len(names)] for _, row in rows[1:]]
+    table = pd.DataFrame(filled, columns=pd.Index(names, dtype=str))
     return table.loc[:, ~table.columns.duplicated()]
 
 

@@ -302,12 +302,12 @@ class _Session:
                 f"DepthResolution in {METADATA}"
             )
         if left_over or self.cut:
-            where = (
-                f"ends in the middle of frame {n}"
+            self.problems.append(
+                f"{DEPTH} ends in the middle of frame {n}; its {n} whole frames can be read"
                 if left_over
-                else f"holds {n} frames, but its archive is cut or damaged"
+                else f"{DEPTH} holds {n} frames, but its archive is cut or damaged; its {n} whole "
+                "frames can be read"
             )
-            self.problems.append(f"{DEPTH} {where}; its {n} whole frames can be read")
         return RawFrames(
             self.depth,
             width,
@@ -319,10 +319,8 @@ class _Session:
         )
 
     def _size_of_camera(self) -> tuple[int, int] | None:
-        if isinstance(self.stated_camera, Camera):
-            return self.stated_camera.width, self.stated_camera.height
-        width, height = self.camera_file.width, self.camera_file.height
-        return (width, height) if width and height else None
+        stated = self.stated_camera if isinstance(self.stated_camera, Camera) else self.camera_file
+        return (stated.width, stated.height) if stated.width and stated.height else None
 
     def _guess_size(self, n_bytes: int) -> tuple[int, int]:
         """That of a Kinect v2, unless the stamps say that another camera's size fits and this one
