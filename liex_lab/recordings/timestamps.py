@@ -566,6 +566,8 @@ def read_moment(text: str) -> tuple[datetime, int]:
     Raises:
         ValueError: it is none.
     """
+    if len(text.strip()) <= len("2024-10-27"):
+        raise ValueError(f"{text!r} has no time of day")
     moment = datetime.fromisoformat(re.sub(" (?=[z+-])", "", text.strip(), flags=re.I).upper())
     fraction = re.search(r"[.,](\d+)", text)  # of which datetime keeps six digits
     ns = int(fraction[1][:9].ljust(9, "0")) if fraction else 0
