@@ -90,8 +90,6 @@ def checked(table: pd.DataFrame, origin: str) -> pd.DataFrame:
 
 def _numbers(column: pd.Series) -> NDArray[np.float64]:
     """A column (n,) of seconds or times as hh:mm:ss as numbers, NaN where there is none."""
-    if column.dtype.kind in "iuf":
-        return column.to_numpy(np.float64)
     texts = [str(cell) for cell in column]
     commas = [text for text in texts if "," in text]
     thousands = len(commas) < len(texts) and all(map(_THOUSANDS.fullmatch, commas))

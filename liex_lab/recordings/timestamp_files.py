@@ -24,6 +24,7 @@ from liex_lab.errors import RecordingError, UnknownTimesError
 from liex_lab.recordings.timestamps import (
     LIMIT_NS,
     PLAUSIBLE_HZ,
+    PLAUSIBLE_NS,
     Times,
     frame_counts,
     from_rate,
@@ -42,10 +43,7 @@ _DATE = re.compile(
 _SECONDS = re.compile(
     r"(?<!\d)(\d{9,10})\.(\d{3,9})(?!\d)"
 )  # since 1970, as the TUM data sets name their pictures
-_WHOLE = re.compile(
-    r"(?<!\d)(\d{13}|\d{16}|\d{19})(?!\d)"
-)  # ms, us or ns since 1970, told apart by their length
-_PLAUSIBLE_NS = (946_684_800 * 10**9, 4_102_444_800 * 10**9)  # the years 2000 to 2100
+_WHOLE = re.compile(r"(?<!\d)(\d{10})(\d{3}|\d{6}|\d{9})(?!\d)")  # the same in ms, us or ns
 _CLOCKS = (  # nanoseconds in a step, the step of 1970, and what that is called
     (10**9, 0, "seconds since 1970"),
     (10**6, 0, "milliseconds since 1970"),
@@ -58,6 +56,7 @@ _CLOCKS = (  # nanoseconds in a step, the step of 1970, and what that is called
 _HOUR_NS = 3600 * 10**9
 _BLANK = re.compile(r"(?<=\d{4}-\d\d-\d\d) +(?=\d\d:)")  # between date and time
 _TIME_OF_DAY = re.compile(r"(\d\d:\d\d:\d\d),(?=\d{3})")  # whose comma is a decimal sign
+_SURE = 12  # rows: digits behind commas that rise in fewer may be fractions that do so by chance
 _GROUPED = re.compile(r"^([-+]?[1-9]\d{0,2})[.,](\d{3})$")  # a number, or thousands
 
 
@@ -190,7 +189,7 @@ class Stamps:
                 clock
                 for clock in _CLOCKS
                 if _is_rate(step * clock[0])
-                and _PLAUSIBLE_NS[0] <= (self.values[0] - clock[1]) * clock[0] < _PLAUSIBLE_NS[1]
+                and PLAUSIBLE_NS[0] <= (self.values[0] - clock[1]) * clock[0] < PLAUSIBLE_NS[1]
             )
             clock = next(possible, clock)
             hz = 1e9 / (step * clock[0])
@@ -244,7 +243,7 @@ class Stamps:
                 if hits > max(best, least):
                     found, best, sure = rows, hits, least > 0 or hits in (n, len(self))
         if not best and n != len(self):
-            problems.append(match_counts(n, np.arange(len(self)), folder, self.path.name)[1] or "")
+            problems += match_counts(n, len(self), folder, self.path.name)
             doubts.append(unpaired(folder, self.path.name))
         elif best and best < max(n, len(self)):
             (problems if sure else doubts).append(
@@ -286,17 +285,19 @@ def read_stamps(
         raise RecordingError(
             f"{path} should be a text file with one time stamp per line, but {error}"
         ) from None
-    rows = [(line, row) for line, row in enumerate(cells, start=1) if any(row)]
     wanted = tuple(CSV_COLUMNS) if column is None else (column,)
-    named = [[cell.lstrip("# ") for cell in row if cell != "#"] for _, row in rows]
-    plain = [at for at, (_, row) in enumerate(rows) if not row[0].startswith("#")]
-    at = next((at for at, row in enumerate(named) if set(wanted) & set(row)), -1)
-    if at < 0 and plain:
-        first = rows[plain[0]][1]
+    names = [[cell.lstrip("# ") for cell in row if cell != "#"] for row in cells]
+    at = next((at for at, row in enumerate(names) if set(wanted) & set(row)), -1)
+    header = names[at] if at >= 0 else []
+    data = [
+        (line, row)
+        for line, row in enumerate(cells, start=1)
+        if line > at + 1 and any(row) and not row[0].startswith("#")
+    ]
+    if at < 0 and data:
+        first = data[0][1]
         probe = first[column : column + 1] if isinstance(column, int) else first
-        at = -1 if any(map(_reader, probe)) else plain[0]
-    header = named[at] if at >= 0 else []
-    data = [rows[k] for k in plain if k > at]
+        header = [] if any(map(_reader, probe)) else data.pop(0)[1]
     if separator == "," and len(header) < 2 and _are_decimals(data):
         data = [(line, [",".join(row)]) for line, row in data]
     name = next((name for name in wanted if name in header), None)
@@ -314,17 +315,17 @@ def read_stamps(
     wide = [row for _, row in data if not header or len(row) > len(header)]
     for k in range(max(found.k - 1, 0), found.k + 1):
         behind = [row[k + 1] for row in wide if len(row) > k + 1 and _are_digits(row[k : k + 2])]
-        if separator == "," and len(behind) == len(data) > 0 and not _is_column(behind, header):
+        may_be = separator == "," and len(behind) == len(data) > 0
+        if may_be and (len(data) < _SURE or not _is_column(behind, header)):
             doubts.append(
                 f"line {data[0][0]} of {path.name} holds {','.join(data[0][1])!r}, where a comma "
                 "may be a decimal sign; it was taken to separate columns: write a decimal point, "
                 "or semicolons between columns"
             )
             break
-    usual = usual_ns or (1 if isinstance(column, int) else None)
-    ns_per_unit = UNITS[unit] if unit else CSV_COLUMNS.get(str(name), usual)
     stated = name is not None or column is not None
-    if ns_per_unit is None and found.read is number and stated:
+    ns_per_unit = UNITS[unit] if unit else CSV_COLUMNS.get(str(name), usual_ns)
+    if not ns_per_unit and found.read is number and stated and not isinstance(column, int):
         raise RecordingError(
             f'the unit of the column {name!r} in {path} is not known; write time_unit = "s", "ms", '
             '"us" or "ns" beside time_column in camera.toml'
@@ -437,10 +438,10 @@ def name_numbers(names: Sequence[str]) -> Times | None:
         for group in list(zip(*parts, strict=True))[1::2]
     ]
     differ = [group for group in groups if (group != group[0]).any()]
-    rising = [
+    rising = (
         group for group in differ if np.all(np.diff(group) > 0) and frame_counts(group) is not None
-    ]
-    return next(iter([*rising, *differ[::-1]]), None)
+    )
+    return next(rising, differ[-1] if differ else None)
 
 
 def _places(wanted: Iterable[Any], keys: Iterable[Any]) -> NDArray[np.int64]:
@@ -470,29 +471,23 @@ def name_times(names: Sequence[str]) -> tuple[Times, bool] | None:
     Returns:
         (n,) int64 stamps, ns, and True where they tell a moment; None where the names hold none.
     """
-    for form, read in ((_DATE, _date_ns), (_SECONDS, _seconds_ns), (_WHOLE, _whole_ns)):
+    for form in (_DATE, _SECONDS, _WHOLE):
         found = [form.findall(name) for name in names]
         if names and all(len(matches) == 1 for matches in found):
-            times = [read(matches[0]) for matches in found]
-            if all(t is not None and _PLAUSIBLE_NS[0] <= t < _PLAUSIBLE_NS[1] for t in times):
-                return np.array(times, np.int64), form is not _DATE
+            with suppress(ValueError):
+                times = [_name_ns(*parts) for (parts,) in found]
+                if all(PLAUSIBLE_NS[0] <= t < PLAUSIBLE_NS[1] for t in times):
+                    return np.array(times, np.int64), form is not _DATE
     return None
 
 
-def _date_ns(parts: tuple[str, ...]) -> int | None:
-    try:
-        moment = datetime.strptime("".join(parts[:6]), "%Y%m%d%H%M%S").replace(tzinfo=UTC)
-    except ValueError:
-        return None
-    return int(moment.timestamp()) * 10**9 + int(parts[6].ljust(9, "0"))
-
-
-def _seconds_ns(parts: tuple[str, str]) -> int:
-    return int(parts[0]) * 10**9 + int(parts[1].ljust(9, "0"))
-
-
-def _whole_ns(digits: str) -> int:
-    return int(digits) * 10 ** (19 - len(digits))
+def _name_ns(*parts: str) -> int:
+    """The date and time, or else the seconds since 1970, and their fraction, as ns since 1970."""
+    *since_1970, fraction = parts
+    if len(since_1970) > 1:
+        moment = datetime.strptime("".join(since_1970), "%Y%m%d%H%M%S").replace(tzinfo=UTC)
+        since_1970 = [f"{moment.timestamp():.0f}"]
+    return int(since_1970[0]) * 10**9 + int(fraction.ljust(9, "0"))
 
 
 def _shorten(text: str) -> str:

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import re
 from bisect import bisect_right
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, timedelta
 
@@ -38,16 +39,9 @@ _SURE = 5
 _LONGEST_STEP_NS = 10**9
 LATEST_NS = 2**32 * 10**9  # the year 2106: what the replays' messages can state
 LIMIT_NS = 2**62  # the year 2116 on the usual clock; leaves room for sums in int64
-_PLAUSIBLE_START_NS = (
-    946_684_800 * 10**9
-)  # the year 2000: earlier stamps count from something else than 1970
-
-
+# the years 2000 to 2100: other stamps count from something else than 1970
+PLAUSIBLE_NS = (946_684_800 * 10**9, 4_102_444_800 * 10**9)
 _COUNTING = 0.75  # of the steps of a counter are the same
-_MOMENT = re.compile(
-    r"(\d{4}-?\d\d-?\d\d\D\d\d:?\d\d(?::?\d\d)?)(?:[.,](\d+))? ?(z|[+-]\d\d(?::?\d\d)?)?",
-    re.IGNORECASE,
-)
 _NEAR = 8  # frames among which one in the wrong place is sorted
 _CLOSEST = 0.6  # steps between two of them
 _MOST_LOST = 8
@@ -90,9 +84,7 @@ PLAUSIBLE_HZ = (0.5, 2000.0)  # of a depth camera that watches an animal
 _MOST_MOVED = 0.25  # of the stamps may be repeated or out of order, as of a busy computer
 FAULTS = ("", "stamp_repeated", "stamp_out_of_order", JUMPED)  # what `MonotoneTimes.faults` counts
 # their places in it
-_REPEATED = 1
-_OUT_OF_ORDER = 2
-_JUMPED = 3
+_REPEATED, _OUT_OF_ORDER, _JUMPED = range(1, len(FAULTS))
 
 
 @dataclass(frozen=True)
@@ -261,22 +253,19 @@ def find_gaps(times_ns: Times, step_ns: int) -> list[Gap]:
     """
     if step_ns <= 0:
         return []
-    dt = np.diff(times_ns)
     apart = frames_apart(times_ns, step_ns)
-    found = []
-    for i in np.flatnonzero(apart > 1):
-        jumped = dt[i] > CLOCK_JUMP_NS
-        found.append(
-            Gap(
-                start_frame=int(i) + 1,
-                stop_frame=int(i) + 1,
-                start_ns=int(times_ns[i]) + step_ns,
-                stop_ns=int(times_ns[i + 1]),
-                n_frames_missing=1 if jumped else int(apart[i]) - 1,
-                reason=JUMPED if jumped else DROPPED,
-            )
+    jumped = np.diff(times_ns) > CLOCK_JUMP_NS
+    return [
+        Gap(
+            start_frame=i + 1,
+            stop_frame=i + 1,
+            start_ns=int(times_ns[i]) + step_ns,
+            stop_ns=int(times_ns[i + 1]),
+            n_frames_missing=1 if jumped[i] else int(apart[i]) - 1,
+            reason=JUMPED if jumped[i] else DROPPED,
         )
-    return found
+        for i in np.flatnonzero(apart > 1).tolist()
+    ]
 
 
 def find_faults(times_ns: Times, step_ns: int, faults: NDArray[np.uint8]) -> list[Gap]:
@@ -401,10 +390,8 @@ def make_monotone(times_ns: Times) -> MonotoneTimes:
     faults = np.where(
         moved, np.where(np.abs(times - joined) > CLOCK_JUMP_NS, _JUMPED, _OUT_OF_ORDER), 0
     )
-    repeated = np.zeros(len(times), bool)
-    repeated[1:] = times_ns[1:] == times_ns[:-1]
-    repeated[:-1] |= repeated[1:]
-    faults[moved & repeated] = _REPEATED
+    same = times_ns[1:] == times_ns[:-1]
+    faults[moved & (np.append(same, False) | np.append(False, same))] = _REPEATED
     faults[jumps] = _JUMPED
     sentences = []
     if len(jumps):
@@ -487,22 +474,19 @@ def _fewest_moved(times_ns: Times) -> Times:
     monotone[: keep[0]] = int(kept[0]) - step * np.arange(int(keep[0]), 0, -1)
     monotone[keep[-1] + 1 :] = int(kept[-1]) + step * np.arange(1, len(times_ns) - int(keep[-1]))
     for n in np.flatnonzero(np.diff(keep) > 1):
-        i = int(keep[n])
-        j = int(keep[n + 1])
-        start = int(kept[n])
-        stop = int(kept[n + 1])
-        monotone[i + 1 : j] = [start + (stop - start) * k // (j - i) for k in range(1, j - i)]
+        i, j = keep[n : n + 2].tolist()
+        start, stop = kept[n : n + 2].tolist()
+        monotone[i:j] = [start + (stop - start) * k // (j - i) for k in range(j - i)]
     return monotone
 
 
 def _first_of_equal(times_ns: Times, slack: Times, keep: NDArray[np.int64]) -> NDArray[np.int64]:
     """Keep the first of equal stamps in place of a later one: what repeats is stale."""
     chosen = keep.copy()
+    starts = np.append(True, np.diff(times_ns) != 0)
+    run = np.maximum.accumulate(np.where(starts, np.arange(len(times_ns)), 0))
     for n, k in enumerate(keep.tolist()):
-        first = k
-        after = int(chosen[n - 1]) + 1 if n else 0
-        while first > after and times_ns[first - 1] == times_ns[k]:
-            first -= 1
+        first = max(run[k], chosen[n - 1] + 1 if n else 0)
         if n + 1 == len(keep) or slack[keep[n + 1]] >= slack[first]:
             chosen[n] = first
     return chosen
@@ -512,45 +496,33 @@ def _longest_nondecreasing(values: list[int]) -> NDArray[np.int64]:
     """Indices of a longest non-decreasing subsequence, by patience sorting."""
     tops: list[int] = []
     top_index: list[int] = []
-    before = np.full(len(values), -1, np.int64)
+    before = []
     for i, value in enumerate(values):
         pile = bisect_right(tops, value)
-        before[i] = top_index[pile - 1] if pile else -1
-        if pile == len(tops):
-            tops.append(value)
-            top_index.append(i)
-        else:
-            tops[pile] = value
-            top_index[pile] = i
-    chain = []
-    i = top_index[-1]
-    while i >= 0:
-        chain.append(i)
-        i = int(before[i])
+        before.append(top_index[pile - 1] if pile else -1)
+        tops[pile : pile + 1] = [value]  # a new top, or a new pile behind the last
+        top_index[pile : pile + 1] = [i]
+    chain = top_index[-1:]
+    while before[chain[-1]] >= 0:
+        chain.append(before[chain[-1]])
     return np.array(chain[::-1], np.int64)
 
 
-def match_counts(
-    n_frames: int, times_ns: Times, frames_from: str, times_from: str
-) -> tuple[int, str | None]:
-    """How many frames have both a picture and a stamp.
+def match_counts(n_frames: int, n_stamps: int, frames_from: str, times_from: str) -> list[str]:
+    """The sentence on frames and stamps that are not equally many; none where they are.
 
     Args:
         n_frames: number of pictures.
-        times_ns: (m,) int64 stamps, ns.
-        frames_from: name of the file or folder of the pictures, for the sentence.
-        times_from: name of the file of the stamps, for the sentence.
-
-    Returns:
-        The smaller of both numbers, and a sentence with both when they differ, else None.
+        n_stamps: number of stamps.
+        frames_from: name of the file or folder of the pictures.
+        times_from: name of the file of the stamps.
     """
-    if n_frames == len(times_ns):
-        return n_frames, None
-    n = min(n_frames, len(times_ns))
-    return n, (
-        f"{frames_from} holds {n_frames} frames but {times_from} holds {len(times_ns)} time "
-        f"stamps; the first {n} of both are used"
-    )
+    if n_frames == n_stamps:
+        return []
+    return [
+        f"{frames_from} holds {n_frames} frames but {times_from} holds {n_stamps} time "
+        f"stamps; the first {min(n_frames, n_stamps)} of both are used"
+    ]
 
 
 def unpaired(frames_from: str, times_from: str) -> str:
@@ -566,23 +538,19 @@ def unpaired(frames_from: str, times_from: str) -> str:
     )
 
 
-def start_of_day(stated: str | datetime | None) -> str | None:
+def start_of_day(stated: object) -> str | None:
     """A stated start of the recording as ISO 8601 with zone.
 
     Args:
-        stated: ISO 8601 text or a datetime, as a file states it; None where it does not.
+        stated: ISO 8601 text or a datetime, as a file states it; anything else states none.
 
     Returns:
         The moment; None where there is none, or it has no zone and so says no moment.
     """
-    if isinstance(stated, str):
-        try:
-            stated = read_moment(stated)[0]
-        except ValueError:
-            return None
-    return (
-        stated.isoformat() if isinstance(stated, datetime) and stated.tzinfo is not None else None
-    )
+    with suppress(ValueError):
+        moment = stated if isinstance(stated, datetime) else read_moment(str(stated))[0]
+        return moment.isoformat() if moment.tzinfo is not None else None
+    return None
 
 
 def read_moment(text: str) -> tuple[datetime, int]:
@@ -598,14 +566,13 @@ def read_moment(text: str) -> tuple[datetime, int]:
     Raises:
         ValueError: it is none.
     """
-    found = _MOMENT.fullmatch(text.strip())
-    if found is None:
-        raise ValueError(f"{text!r} is no date and time")
-    moment = datetime.fromisoformat(found[1] + (found[3] or "").upper())
-    ns = int((found[2] or "0")[:9].ljust(9, "0"))
+    if len(text.strip()) <= len("2024-10-27"):
+        raise ValueError(f"{text!r} has no time of day")
+    moment = datetime.fromisoformat(re.sub(" (?=[z+-])", "", text.strip(), flags=re.I).upper())
+    fraction = re.search(r"[.,](\d+)", text)  # of which datetime keeps six digits
+    ns = int(fraction[1][:9].ljust(9, "0")) if fraction else 0
     since_1970 = moment.replace(tzinfo=moment.tzinfo or UTC) - datetime(1970, 1, 1, tzinfo=UTC)
-    whole_s = since_1970 // timedelta(seconds=1)
-    return moment + timedelta(microseconds=ns // 1000), whole_s * 10**9 + ns
+    return moment, since_1970 // timedelta(seconds=1) * 10**9 + ns
 
 
 def start_of_clock(first_ns: int) -> str | None:
@@ -618,7 +585,7 @@ def start_of_clock(first_ns: int) -> str | None:
         The moment, to the microsecond; None where the stamp is before 2000 and so plainly counts
         from something else.
     """
-    if first_ns < _PLAUSIBLE_START_NS:
+    if first_ns < PLAUSIBLE_NS[0]:
         return None
     return (
         datetime.fromtimestamp(first_ns // 10**9, UTC)

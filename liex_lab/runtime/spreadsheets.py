@@ -57,18 +57,11 @@ def harmless_table(table: pd.DataFrame) -> pd.DataFrame:
     Returns:
         A copy where text was changed.
     """
-    import pandas as pd
-
     found = table.copy(deep=False)
     for k, kind in enumerate(table.dtypes):
         if kind.kind == "O":  # text, whatever holds it
             found.isetitem(k, table.iloc[:, k].map(harmless).array)
-    if isinstance(found.columns, pd.MultiIndex):
-        names = [tuple(map(harmless, name)) for name in found.columns]
-        found.columns = pd.MultiIndex.from_tuples(names, names=found.columns.names)
-    else:
-        found.columns = pd.Index([harmless(name) for name in found.columns])
-    return found
+    return found.rename(columns=harmless)
 
 
 def write_csv(table: pd.DataFrame, path: Path, *, index: bool = False) -> None:
@@ -103,9 +96,8 @@ def read_texts(path: Path) -> pd.DataFrame:
                 f"line {line} has {len(row)} cells and the first line names {len(names)} columns; "
                 "where a comma is the decimal sign, separate cells by semicolons"
             )
-    n = len(names)
-    table = pd.DataFrame([[*row, *[""] * n][:n] for _, row in rows[1:]], columns=range(n))
-    table.columns = pd.Index(names, dtype=str)
+    filled = [[*row, *[""] * len(names)][: len(names)] for _, row in rows[1:]]
+    table = pd.DataFrame(filled, columns=pd.Index(names, dtype=str))
     return table.loc[:, ~table.columns.duplicated()]
 
 
@@ -123,8 +115,7 @@ def read_harmless(path: Path, texts: tuple[str, ...] = ()) -> pd.DataFrame:
     if names:
         said = pd.read_csv(path, usecols=names, dtype="str", keep_default_na=False)
         table = table.assign(**{name: said[name] for name in names})
-    table.columns = pd.Index([as_it_was(name) for name in table.columns])
-    return table.map(as_it_was)
+    return table.rename(columns=as_it_was).map(as_it_was)
 
 
 def copy_harmless(source: Path, target: Path) -> None:

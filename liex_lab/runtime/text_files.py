@@ -10,6 +10,7 @@ import csv
 import re
 import tomllib
 from collections.abc import Sequence
+from contextlib import suppress
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
 from typing import Any
@@ -106,11 +107,10 @@ def split_lines(text: str) -> tuple[str, list[str]]:
     stated = _STATED.fullmatch(lines[0]) if lines else None
     if stated is not None:
         return stated[1], ["", *lines[1:]]
-    sample = [line for line in lines if line.strip() and line[0] != "#"][:_SAMPLE]
-    sample = sample or [line for line in lines if line.strip()][:1]
+    filled = [line for line in lines if line.strip()]
+    sample = [line for line in filled if line[0] != "#"][:_SAMPLE] or filled[:1]
     rows = {separator: split_cells(sample, separator) for separator in _SEPARATORS}
-    blanks = bool(sample and _BLANKS.search(sample[-1]))
-    possible = _SEPARATORS[:2] if blanks else _SEPARATORS
+    possible = _SEPARATORS[:2] if sample and _BLANKS.search(sample[-1]) else _SEPARATORS
     for first in (0, 1):  # a first line may name fewer columns
         for separator in possible:
             widths = {len(row) for row in rows[separator][first:]}
@@ -144,13 +144,11 @@ def number(text: str) -> Decimal:
     Raises:
         ValueError: it is no finite number.
     """
-    try:
+    with suppress(InvalidOperation):
         found = Decimal(_DECIMAL_COMMA.sub(r"\1.\2", text) if "," in text else text)
-    except InvalidOperation:
-        found = Decimal("nan")
-    if not found.is_finite():
-        raise ValueError(f"{text!r} is no number")
-    return found
+        if found.is_finite():
+            return found
+    raise ValueError(f"{text!r} is no number")
 
 
 def clock_s(text: str) -> Decimal:

@@ -217,6 +217,14 @@ def test_a_unit_that_is_not_known_is_doubted_until_it_is_stated(tmp_path: Path) 
         assert (recording.times_ns.tolist(), recording.doubts) == (NS, [])
 
 
+@pytest.mark.parametrize("n", [2, 3, 5, 11])
+@pytest.mark.parametrize("line", ["{},{}", "{},33{}", "{},0"])
+def test_fractions_that_rise_by_chance_in_a_few_rows_are_doubted(n: int, line: str) -> None:
+    lines = [line.format(1000 + 33 * k, k + 1) for k in range(n)]
+    found, _, doubts = read("\n".join(lines).encode(), usual_ns=10**6)
+    assert found is None or any("a comma may be a decimal sign" in doubt for doubt in doubts)
+
+
 @pytest.mark.parametrize("line", ['"{:,.3f}"', "{:,.3f}", "{:,.0f}\t0", "0;{:,.0f}"])
 def test_separators_of_thousands_are_refused(tmp_path: Path, line: str) -> None:
     lines = [line.format(900 + 1000 * k) for k in range(N)]

@@ -382,10 +382,9 @@ def test_a_wrong_csv_is_told_in_a_sentence(tmp_path: Path, content: bytes, says:
 
 
 def test_two_counts_give_the_smaller_and_a_sentence_with_both() -> None:
-    assert match_counts(5, np.arange(5), "a", "b") == (5, None)
-    n, sentence = match_counts(5, np.arange(7), "depth.dat", "depth_ts.txt")
-    assert n == 5
-    assert sentence is not None
+    assert match_counts(5, 5, "a", "b") == []
+    (sentence,) = match_counts(5, 7, "depth.dat", "depth_ts.txt")
+    assert "the first 5 of both" in sentence
     assert "depth.dat holds 5" in sentence
     assert "depth_ts.txt holds 7" in sentence
 

@@ -103,13 +103,16 @@ def list_pictures(folder: Path, pattern: str = "*") -> tuple[str, list[Path]]:
         if fnmatch(path.name, pattern) and not path.name.endswith(_COLOUR_PCLZF)
     ]
     kinds = {kind: [p for p in chosen if p.suffix.lower() in ends] for kind, ends in KINDS.items()}
-    for kind, files in kinds.items():
-        kinds[kind] = [path for path in files if not is_infrared(path.stem)] or files
-    found = [kind for kind, files in kinds.items() if files]
+    found = [
+        (kind, [path for path in files if not is_infrared(path.stem)] or files)
+        for kind, files in kinds.items()
+        if files
+    ]
     if len(found) > 1:
-        one = f"*{kinds[found[0]][0].suffix}"
+        (first, files), (second, _) = found[:2]
+        one = f"*{files[0].suffix}"
         raise SeveralKindsError(
-            f"{folder} holds both {found[0]} and {found[1]} pictures, and a recording has one "
+            f"{folder} holds both {first} and {second} pictures, and a recording has one "
             f'kind; choose with a line such as pattern = "{one}" under [camera] in camera.toml',
             one,
         )
@@ -123,7 +126,8 @@ def list_pictures(folder: Path, pattern: str = "*") -> tuple[str, list[Path]]:
         raise RecordingError(
             f"no picture in {folder} fits pattern = {pattern!r}; correct it in camera.toml"
         )
-    return found[0], sorted(kinds[found[0]], key=lambda path: natural_key(path.name))
+    kind, files = found[0]
+    return kind, sorted(files, key=lambda path: natural_key(path.name))
 
 
 def natural_key(name: str) -> list[tuple[int, int, str]]:
@@ -221,17 +225,16 @@ class Folder:
             raise
 
     def _recording(self, format: str, camera: Lens | None, fps: float | None) -> Recording:
-        path = self.path
-        stack = self.stack
-        camera_toml = self.camera_toml
+        stack, camera_toml = self.stack, self.camera_toml
         the_camera = camera_toml.camera(stack.width, stack.height, camera)
         problems = [*camera_toml.problems, *stack.problems, *_say_cut(stack)]
         doubts: list[str] = []
         kept, monotone, start = self._times(fps, problems, doubts)
         _refuse_negative(stack, self.decode, camera_toml)
+        at = self.path.resolve()
         stated_in = [self.folder / CAMERA_FILE, self.folder / camera_toml.timestamps, *self.beside]
         return Recording(
-            name=path.resolve().stem if path.is_file() else path.resolve().name,
+            name=at.stem if at.is_file() else at.name,
             format=format,
             camera=the_camera,
             times_ns=monotone.times_ns,
@@ -281,9 +284,9 @@ class Folder:
             times, moment = times[rows[kept]], stamps.zoned
         elif len(names) == n and (named := name_times(names)) is not None:
             times, moment = named
+        elif hz is None:
+            raise self._no_times()
         else:
-            if hz is None:
-                raise self._no_times()
             problems.append(f"there are no time stamps, so a constant {hz:g} frames/s was assumed")
             counts = frame_counts(numbers)
             times, moment = from_rate(n if counts is None else counts, hz), False
@@ -317,11 +320,10 @@ def _with_xml(camera_file: CameraFile, picture: Path) -> CameraFile:
     if camera_file.intrinsics or found is None:
         return camera_file
     unit_mm = found.pop("unit_mm")
-    stated = camera_file.path.is_file()
     return replace(
         camera_file,
         intrinsics=found,
-        unit_mm=camera_file.unit_mm if stated else unit_mm,
+        unit_mm=camera_file.unit_mm if camera_file.path.is_file() else unit_mm,
         source="the XML files beside the pictures",
     )
 
@@ -366,11 +368,10 @@ def open_stack(kind: str, files: list[Path], camera_file: CameraFile, progress: 
 
 def _say_cut(stack: Stack) -> list[str]:
     cut = [i for i, whole in enumerate(stack.whole) if not whole]
-    if not cut:
-        return []
     return [
         f"{len(cut)} of {len(stack)} pictures are cut short or damaged and were taken as wholly "
-        f"unread, the first is frame {cut[0]} ({stack.label(cut[0])})"
+        f"unread, the first is frame {first} ({stack.label(first)})"
+        for first in cut[:1]
     ]
 
 

@@ -7,7 +7,7 @@ from any of several keys, for programs that record for MoSeq have no common one.
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -65,9 +65,6 @@ class Metadata:
     problems: list[str]
 
 
-_NOTHING = Metadata(None, "<u2", None, "", {}, [])
-
-
 def read_metadata(path: Path | None, cut: bool) -> Metadata:
     """Parse metadata.json, which is often missing.
 
@@ -81,8 +78,9 @@ def read_metadata(path: Path | None, cut: bool) -> Metadata:
     Raises:
         RecordingError: the file is no JSON object, or its DepthResolution cannot be.
     """
+    nothing = Metadata(None, "<u2", None, "", {}, [])
     if path is None:
-        return _NOTHING
+        return nothing
     try:
         document = json.loads(read_text(path))
         if not isinstance(document, dict):
@@ -92,24 +90,23 @@ def read_metadata(path: Path | None, cut: bool) -> Metadata:
         RecursionError,
     ) as error:  # broken JSON and broken UTF-8 are both ValueErrors
         if cut:
-            return Metadata(
-                None, "<u2", None, "", {}, [f"{METADATA} is cut short and was not used"]
-            )
+            return replace(nothing, problems=[f"{METADATA} is cut short and was not used"])
         raise RecordingError(
             f"{METADATA} of the session is not JSON ({error}); correct or remove it"
         ) from None
-    facts = {}
+    named = {
+        "subject_id": document.get("SubjectName"),
+        "session_name": document.get("SessionName"),
+    }
+    facts = {key: str(said).strip() for key, said in named.items() if type(said) in (str, int)}
+    stated = document.get("StartTime")
+    facts |= {"session_start_time": start_of_day(stated) or ""}
+    facts = {key: said for key, said in facts.items() if said}
     problems = []
-    for key, ours in (("SubjectName", "subject_id"), ("SessionName", "session_name")):
-        if type(document.get(key)) in (str, int) and str(document[key]).strip():
-            facts[ours] = str(document[key]).strip()
-    if (stated := document.get("StartTime")) is not None:
-        if (start := start_of_day(stated if isinstance(stated, str) else None)) is not None:
-            facts["session_start_time"] = start
-        else:
-            problems.append(
-                f"StartTime {stated!r} in {METADATA} is not a time with a zone, so it was not used"
-            )
+    if stated is not None and "session_start_time" not in facts:
+        problems.append(
+            f"StartTime {stated!r} in {METADATA} is not a time with a zone, so it was not used"
+        )
     little = document.get("IsLittleEndian", True) is not False
     size = _stated_size(document.get("DepthResolution"))
     return Metadata(size, "<u2" if little else ">u2", *_stated_camera(document), facts, problems)
@@ -136,20 +133,11 @@ def _stated_camera(document: dict[str, Any]) -> tuple[str | None, str]:
     entries = {
         key.lower().replace("_", "").replace(" ", ""): value for key, value in document.items()
     }
-    name = next(
-        (
-            entries[key]
-            for key in _CAMERA_KEYS
-            if isinstance(entries.get(key), str) and entries[key].strip()
-        ),
-        None,
-    )
-    if name is None:
-        return None, ""
+    stated = (entries[key].strip() for key in _CAMERA_KEYS if isinstance(entries.get(key), str))
+    name = next(filter(None, stated), "")
     plain = "".join(letter for letter in name.lower() if letter.isalnum())
-    return next(
-        (camera for word, camera in _CAMERA_WORDS.items() if word in plain), OTHER
-    ), name.strip()
+    known = (camera for word, camera in _CAMERA_WORDS.items() if word in plain)
+    return next(known, OTHER if name else None), name
 
 
 def read_session_stamps(
@@ -182,8 +170,7 @@ def read_session_stamps(
     if name is None:
         return None
     path = files[name]
-    if cut and not path.read_bytes().endswith(b"\n"):
-        # the archive broke off inside this file: half a number is a wrong number
+    if cut:  # the archive may have broken off inside this file: half a number is a wrong number
         text = path.read_bytes()
         path.write_bytes(text[: text.rfind(b"\n") + 1])
     stated = (camera_file.time_column, camera_file.time_unit, STAMPS[name])

@@ -7,8 +7,9 @@ an Azure Kinect; stamps lie beside the depth, or are the video's own, or follow 
 
 from __future__ import annotations
 
+import re
 import shutil
-from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
 from threading import Lock
@@ -121,20 +122,16 @@ class RawFrames:
         with self._lock:
             self._file.seek(index * n_bytes)
             raw = self._file.read(n_bytes)
-            if self.once:
-                self._go_by((index + 1) * n_bytes)
+            end = self._file.tell()
+            # no more than a stretch of what was read stays in the system's memory
+            if self.once and not 0 <= end - self._kept_from < STRETCH:
+                let_go(self._file, min(self._kept_from, end), end)
+                self._kept_from = end
         if len(raw) < n_bytes:
             raise RecordingError(
                 f"{self.path} became shorter while it was read; frame {index} is no longer there"
             )
         return np.frombuffer(raw, self.dtype).reshape(self.height, self.width)
-
-    def _go_by(self, end: int) -> None:
-        """Keep no more than a stretch of what was read up to there in the system's memory."""
-        if 0 <= end - self._kept_from < STRETCH:
-            return
-        let_go(self._file, min(self._kept_from, end), end)
-        self._kept_from = end
 
     def label(self, index: int) -> str:
         """Name of a frame, for a sentence.
@@ -174,54 +171,41 @@ def open_moseq(
     names = (*STAMPS, METADATA, CAMERA_FILE)
     if path.suffix.lower() == ".dat":
         refuse_infrared(path, path.stem)
-    if path.is_dir() or path.suffix.lower() in (".dat", ".avi", ".mkv"):
-        folder = path if path.is_dir() else path.parent
-        depth = (
-            next((folder / name for name in DEPTHS if (folder / name).is_file()), path)
-            if path.is_dir()
-            else path
-        )
-        files = {depth.name: depth} | {
-            name: folder / name for name in names if (folder / name).is_file()
-        }
-        found = Unpacked(files, frozenset(), False)
-        name = folder.resolve().name if depth.name in DEPTHS else depth.stem
-        return _Session(path, depth, found, camera, fps, progress).open(name, list(files.values()))
-    # gzip has no random access, so the session is streamed once into a folder that lives as long as
-    # the recording
-    scratch = Scratch()
+    opened = ExitStack()
     try:
+        if path.is_dir() or path.suffix.lower() in (".dat", ".avi", ".mkv"):
+            folder = path if path.is_dir() else path.parent
+            depths = [folder / name for name in DEPTHS if (folder / name).is_file()]
+            depth = next(iter(depths), path) if path.is_dir() else path
+            files = {depth.name: depth} | {
+                name: folder / name for name in names if (folder / name).is_file()
+            }
+            found = Unpacked(files, frozenset(), False)
+            name = folder.resolve().name if depth.name in DEPTHS else depth.stem
+            session = _Session(path, depth, found, camera, fps, progress)
+            return session.open(name, list(files.values()), opened)
+        # gzip has no random access, so the session is streamed once into a folder that lives as
+        # long as the recording
+        scratch = Scratch()
+        opened.callback(scratch.close)
         found = unpack(path, (*DEPTHS, *names), scratch.folder, progress)
         beside = path.parent / CAMERA_FILE
         if CAMERA_FILE not in found.files and beside.is_file():  # others may open what came out
             shutil.copy(beside, scratch.folder)
         inside = next((found.files[name] for name in DEPTHS if name in found.files), None)
         if inside is None:
-            raise _no_depth(path, found)
-        return _Session(path, inside, found, camera, fps, progress).open(
-            _archive_name(path), [path], scratch
-        )
+            raise RecordingError(
+                f"{path} is cut short before its {DEPTH}, so no frame can be read; copy it again"
+                if found.cut
+                else f"{path} should hold a MoSeq session, but there is no {DEPTH} in it; give "
+                "another archive"
+            )
+        session = _Session(path, inside, found, camera, fps, progress)
+        name = re.sub(r"\.(tar\.gz|[^.]+)$", "", path.name, flags=re.IGNORECASE)
+        return session.open(name, [path], opened, scratch.folder)
     except BaseException:
-        scratch.close()
+        opened.close()
         raise
-
-
-def _no_depth(path: Path, found: Unpacked) -> RecordingError:
-    if found.cut:
-        return RecordingError(
-            f"{path} is cut short before its {DEPTH}, so no frame can be read; copy it again"
-        )
-    return RecordingError(
-        f"{path} should hold a MoSeq session, but there is no {DEPTH} in it; give another archive"
-    )
-
-
-def _archive_name(path: Path) -> str:
-    name = path.name
-    for suffix in (".tar.gz", ".tgz", ".tar"):
-        if name.lower().endswith(suffix):
-            return name[: -len(suffix)]
-    return path.stem
 
 
 class _Session:
@@ -252,31 +236,43 @@ class _Session:
             found.files, found.cut, self.camera_file, self.problems, self.doubts
         )
 
-    def open(self, name: str, sources: list[Path], scratch: Scratch | None = None) -> Recording:
+    def open(
+        self, name: str, sources: list[Path], opened: ExitStack, unpacked: Path | None = None
+    ) -> Recording:
         """The recording.
 
         Args:
             name: its name.
             sources: the input's files.
-            scratch: folder of unpacked files, removed on closing; None where nothing was
-                unpacked.
+            opened: what closing the recording closes, added to.
+            unpacked: folder of unpacked files; None where nothing was unpacked.
 
         Returns:
             The recording.
         """
-        stack, track = self._open_depth(once=scratch is not None)
-
-        def close() -> None:
-            stack.close()
-            if scratch is not None:
-                scratch.close()
-
-        try:
-            unpacked = None if scratch is None or self.cut else scratch.folder
-            return self._recording(name, sources, stack, track, close, unpacked)
-        except BaseException:
-            stack.close()
-            raise
+        stack, track = self._open_depth(once=unpacked is not None)
+        opened.callback(stack.close)
+        camera = self._camera(stack, track)
+        monotone = in_order_of_sensor(self._times(stack, track))
+        self.problems += [monotone.problem] if monotone.problem else []
+        began = "" if track is None else track.session_start
+        start = {"session_start_time": began} if began else {}
+        return Recording(
+            name=name,
+            format="moseq",
+            camera=camera,
+            times_ns=monotone.times_ns,
+            read=Pictures(stack, self.camera_file.decode, self.problems).read,
+            sources=sources,
+            problems=self.problems,
+            truncated=stack.truncated or self.cut,
+            close=opened.close,
+            faults=monotone.faults,
+            doubts=self.doubts,
+            stored=monotone.order,
+            metadata={**start, **self.metadata.facts, **self.camera_file.metadata},
+            unpacked=None if self.cut else unpacked,
+        )
 
     def _open_depth(self, once: bool) -> tuple[Stack, DepthTrack | None]:
         if self.depth.suffix.lower() == ".dat":
@@ -306,12 +302,12 @@ class _Session:
                 f"DepthResolution in {METADATA}"
             )
         if left_over or self.cut:
-            where = (
-                f"ends in the middle of frame {n}"
+            self.problems.append(
+                f"{DEPTH} ends in the middle of frame {n}; its {n} whole frames can be read"
                 if left_over
-                else f"holds {n} frames, but its archive is cut or damaged"
+                else f"{DEPTH} holds {n} frames, but its archive is cut or damaged; its {n} whole "
+                "frames can be read"
             )
-            self.problems.append(f"{DEPTH} {where}; its {n} whole frames can be read")
         return RawFrames(
             self.depth,
             width,
@@ -323,11 +319,8 @@ class _Session:
         )
 
     def _size_of_camera(self) -> tuple[int, int] | None:
-        if isinstance(self.stated_camera, Camera):
-            return self.stated_camera.width, self.stated_camera.height
-        width = self.camera_file.width
-        height = self.camera_file.height
-        return (width, height) if width and height else None
+        stated = self.stated_camera if isinstance(self.stated_camera, Camera) else self.camera_file
+        return (stated.width, stated.height) if stated.width and stated.height else None
 
     def _guess_size(self, n_bytes: int) -> tuple[int, int]:
         """That of a Kinect v2, unless the stamps say that another camera's size fits and this one
@@ -346,88 +339,44 @@ class _Session:
             )
         return _KINECT_V2_SIZE
 
-    def _recording(
-        self,
-        name: str,
-        sources: list[Path],
-        stack: Stack,
-        track: DepthTrack | None,
-        close: Callable[[], None],
-        unpacked: Path | None,
-    ) -> Recording:
-        camera = self._camera(stack, track)
-        times = self._times(stack, track)
-        monotone = in_order_of_sensor(times)
-        self.problems += [monotone.problem] if monotone.problem else []
-        start = (
-            {"session_start_time": track.session_start}
-            if track is not None and track.session_start
-            else {}
-        )
-        return Recording(
-            name=name,
-            format="moseq",
-            camera=camera,
-            times_ns=monotone.times_ns,
-            read=Pictures(stack, self.camera_file.decode, self.problems).read,
-            sources=sources,
-            problems=self.problems,
-            truncated=stack.truncated or self.cut,
-            close=close,
-            faults=monotone.faults,
-            doubts=self.doubts,
-            stored=monotone.order,
-            metadata={**start, **self.metadata.facts, **self.camera_file.metadata},
-            unpacked=unpacked,
-        )
-
     def _camera(self, stack: Stack, track: DepthTrack | None) -> Camera:
         """Stated, or else from the factory's calibration in the file, or else typical of the camera
         that recorded.
         """
-        width = stack.width
-        height = stack.height
+        width, height = stack.width, stack.height
         if self.stated_camera is not None or self.camera_file.intrinsics:
             return self.camera_file.camera(width, height, self.stated_camera)
         mode = mode_of(width, height)
-        lenses = (
-            [read_calibration(data) for data in track.attachments.values()]
-            if track is not None
-            else []
-        )
-        lens = next((lens for lens in lenses if lens is not None), None)
+        attached = track.attachments.values() if track is not None else ()
+        lens = next(filter(None, map(read_calibration, attached)), None)
         if mode is not None and lens is not None:
             return azure_camera(mode, lens)
-        kind = self._which_camera(track)
+        # where the files do not name the camera, only a Kinect v2 has pictures of its size
+        kind = self.metadata.camera or KINECT
+        if track is not None and any(name.startswith("K4A_") for name in track.tags):
+            kind = AZURE
         if kind == KINECT and (width, height) == _KINECT_V2_SIZE:
-            self._say_typical("Kinect v2")
-            return KINECT_V2
-        if kind == AZURE and mode is not None:
-            self._say_typical(f"Azure Kinect in the mode {mode.name}")
-            return azure_camera(mode, None)
+            typical, name = KINECT_V2, "Kinect v2"
+        elif kind == AZURE and mode is not None:
+            typical, name = azure_camera(mode, None), f"Azure Kinect in the mode {mode.name}"
+        else:
+            raise self._unknown_camera(width, height)
+        self.problems.append(
+            f"the files hold no intrinsics, so those of a typical {name} were taken; state your "
+            "camera's own in a camera.toml beside the recording"
+        )
+        return typical
+
+    def _unknown_camera(self, width: int, height: int) -> RecordingError:
         whose = (
             f"the camera {self.metadata.camera_name!r}"
             if self.metadata.camera_name
             else "a camera that is not known"
         )
-        raise RecordingError(
+        return RecordingError(
             f"{self.path} holds pictures of {width} x {height} pixels from {whose}; write a "
             "camera.toml beside it with [camera], fx = ..., fy = ..., cx = ... and cy = ... in "
             "pixels"
-        )
-
-    def _which_camera(self, track: DepthTrack | None) -> str | None:
-        """The camera as the files name it; where they do not, only a Kinect v2 has pictures of its
-        size.
-        """
-        if track is not None and any(name.startswith("K4A_") for name in track.tags):
-            return AZURE
-        return self.metadata.camera or KINECT
-
-    def _say_typical(self, camera: str) -> None:
-        self.problems.append(
-            f"the files hold no intrinsics, so those of a typical {camera} were taken; state your "
-            "camera's own in a camera.toml beside the recording"
         )
 
     def _times(self, stack: Stack, track: DepthTrack | None) -> Times:
@@ -444,8 +393,7 @@ class _Session:
                 stamps = self._continue(stamps, n)
             if len(stamps) == n or own is None or own.even:
                 extra = len(stamps) - n
-                n, counts = match_counts(n, stamps, self.depth.name, name)
-                self.problems += [counts] if counts else []
+                self.problems += match_counts(n, len(stamps), self.depth.name, name)
                 if not 0 <= extra <= (len(stamps) if stack.truncated else max(3, _SURPLUS * n)):
                     self.doubts.append(unpaired(self.depth.name, name))
                 return stamps[:n]
@@ -473,9 +421,8 @@ class _Session:
         time.
         """
         step = max(1, median_step(stamps))
-        n_lost = n - len(stamps)
         self.problems.append(
-            f"the time stamps of the last {n_lost} frames are cut off, so these frames were taken "
-            f"to follow every {step / 1e6:.4g} ms, the median step of those before"
+            f"the time stamps of the last {n - len(stamps)} frames are cut off, so these frames "
+            f"were taken to follow every {step / 1e6:.4g} ms, the median step of those before"
         )
-        return np.concatenate([stamps, stamps[-1] + step * np.arange(1, n_lost + 1)])
+        return np.concatenate([stamps, stamps[-1] + step * np.arange(1, n - len(stamps) + 1)])
