@@ -88,19 +88,17 @@ def compare_sessions(
     left = {one.key: one.state for one in entries if one.folder is None}  # and why
     if only_trusted:
         left |= {one.key: "left out, look at it" for one in entries if one.state == LOOK_AT_IT}
-    kept = sorted((one.folder, one.key) for one in entries if one.folder and one.key not in left)
     sessions: dict[str, Session] = {}
-    for k, (folder, key) in enumerate(kept):
-        progress(k, len(kept), "reading sessions")
+    kept = sorted((one.folder, one.key) for one in entries if one.folder and one.key not in left)
+    for folder, key in kept:
+        progress(len(sessions), len(kept), "reading sessions")
         sessions[key] = Session.open(folder)
     for key, other in find_copies(sessions).items():
         left[key] = f"same recording as {other}"
         check.append(f"{key} is the {left[key]}, and is not counted")
         del sessions[key]
     table = collect(sessions.values())
-    if animals is not None:
-        table = _overruled(table, Path(animals))
-    table, notes = unified(table)
+    table, notes = unified(table if animals is None else _overruled(table, Path(animals)))
     check += [*notes, *_counted_otherwise(sessions)]
     check += [f"{one.key}: {one.reason}" for one in entries if one.key in sessions and one.reason]
     grouped = set(table.loc[table["group"].fillna("") != "", "session_id"])
@@ -162,7 +160,7 @@ def _counted_otherwise(sessions: Mapping[str, Session]) -> list[str]:
 def _in_words(entries: Sequence[Entry], left: Mapping[str, str]) -> str:
     """How many sessions there are, how many are compared, and the state of each other one."""
     n = len(entries)
-    states = [f"{one.key} {left.get(one.key, one.state)}" for one in entries]
+    states = (f"{one.key} {left.get(one.key, one.state)}" for one in entries)
     said = "; ".join(state for state in states if not state.endswith(" done"))
     counts = f"{n} session{'s' * (n != 1)} in the study, {n - len(left)} compared"
     return f"{counts}: {said}" if said else counts
@@ -239,14 +237,14 @@ def find_copies(sessions: Mapping[str, Session]) -> dict[str, str]:
     Raises:
         SessionError: two sessions of one recording are of two animals.
     """
-    known: dict[tuple[str, str], str] = {}
+    known: dict[str, str] = {}
     whose: dict[str, str] = {}
     copies: dict[str, str] = {}
     for key, session in sessions.items():
         whose[key] = ", ".join(session.table("sessions")["subject_id"].astype(str))
         region = session.metadata.get("plan", {}).get("arena", {}).get("region")
         numbers = session.summary.select_dtypes("number").to_numpy().tolist()
-        marks = ((session.metadata["input"]["sha256"], repr(region)), ("measured", repr(numbers)))
+        marks = (f"{session.metadata['input']['sha256']} {region}", str(numbers))
         twin = next((known[mark] for mark in marks if mark in known), key)
         if same(whose[twin]) != same(whose[key]):
             raise SessionError(
@@ -254,7 +252,8 @@ def find_copies(sessions: Mapping[str, Session]) -> dict[str, str]:
                 f"{whose[twin]}; remove one of them, or correct the animal of one with `liex "
                 "describe SESSION subject_id=NAME`"
             )
-        copies |= {key: twin} if twin != key else {}
+        if twin != key:
+            copies[key] = twin
         known |= dict.fromkeys(marks, twin)
     return copies
 

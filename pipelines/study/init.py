@@ -231,10 +231,8 @@ def _pairs(text: str) -> str:
     """A session's name: as it is where it is made of key-value pairs, otherwise its letters and
     digits.
     """
-    first, *pairs = text.split("_")
-    whole = re.fullmatch(r"[A-Za-z0-9]{1,32}", first) and len(pairs) <= 5
-    kept = all(re.fullmatch(r"[A-Za-z0-9]{1,32}-[A-Za-z0-9]{1,64}", pair) for pair in pairs)
-    return text if whole and kept else letters(text)[:32]
+    kept = re.fullmatch(r"[A-Za-z0-9]{1,32}(?:_[A-Za-z0-9]{1,32}-[A-Za-z0-9]{1,64}){0,5}", text)
+    return text if kept else letters(text)[:32]
 
 
 def _text(root: Path, named: Sequence[Named], notes: Sequence[str]) -> str:

@@ -175,10 +175,10 @@ def misnamed(sessions: Sequence[PlannedSession]) -> list[str]:
     """
     known = {same(one.animal.id): one.animal.id for one in sessions}
     notes = []
-    for one in sessions:
+    for one in (one for one in sessions if one.plan.arena.region is None):
         found = find_subject(Path(one.recording))
-        other = known.get(same(found.id), one.animal.id) if found.origin else one.animal.id
-        if other != one.animal.id and one.plan.arena.region is None:
+        other = known.get(same(found.id)) if found.origin else None
+        if other not in (None, one.animal.id):
             notes.append(
                 f"{one.id}: the study names the animal {one.animal.id}, and the recording's "
                 f"{found.origin} {other}"
