@@ -8,33 +8,43 @@ Every session of a study is accounted for: compared, or why it is not.
 from __future__ import annotations
 
 import json
-import os
 import re
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import pandas as pd
+
+from liex_lab.behaviour.cohort import (
+    ENGINES,
+    STATS,
+    WHO,
+    collect,
+    compare,
+    methods,
+    result,
+    unified,
+    usual_measures,
+)
 from liex_lab.errors import LiexError, SessionError
 from liex_lab.plan.study import Study
 from liex_lab.plan.subject import same
 from liex_lab.runtime.durable import replacing, write_whole
 from liex_lab.runtime.progress import Progress, silent
-from liex_lab.runtime.spreadsheets import read_texts
+from liex_lab.runtime.spreadsheets import read_texts, write_csv
+from liex_lab.sessions import Session
 from liex_lab.sessions.failure import FAILED_FILE, read_failure
 from liex_lab.sessions.listed import Entry
+from liex_lab.sessions.source import link_to
 from liex_lab.sessions.verdict import LOOK_AT_IT, OTHER_ANIMAL, read_verdict
+from liex_lab.tables.schema import dictionary, from_pandas, write_table
 
 from .study.status import misnamed
 
-if TYPE_CHECKING:
-    import pandas as pd
-
-    from liex_lab.sessions import Session
-
 # copies of a session that another one has taken the place of, or will take
 _SET_ASIDE = re.compile(r"\.(?:outdated(?:-\d+)?|old|part)[/\\]")
-_WHO = ("group", "cage", "sex", "batch")
+_OBSERVED_SHARES = 8  # from this schema on, shares are of the observed frames
 
 
 def compare_sessions(
@@ -72,57 +82,38 @@ def compare_sessions(
         SessionError: there are no two groups, one recording counts for two animals, or a folder,
             column, engine or CSV cannot be used.
     """
-    from liex_lab.behaviour.cohort import (
-        ENGINES,
-        STATS,
-        collect,
-        compare,
-        methods,
-        result,
-        unified,
-        usual_measures,
-    )
-    from liex_lab.runtime.spreadsheets import write_csv
-    from liex_lab.sessions import Session
-    from liex_lab.tables.schema import dictionary, from_pandas, write_table
-
     if engine not in ENGINES:
         raise SessionError(f"the engine is one of {', '.join(ENGINES)}, got '{engine}'")
     entries, check = account(places)
     left = {one.key: one.state for one in entries if one.folder is None}  # and why
     if only_trusted:
         left |= {one.key: "left out, look at it" for one in entries if one.state == LOOK_AT_IT}
-    kept = sorted((one.folder, one.key) for one in entries if one.folder and one.key not in left)
     sessions: dict[str, Session] = {}
-    for k, (folder, key) in enumerate(kept):
-        progress(k, len(kept), "reading sessions")
+    kept = sorted((one.folder, one.key) for one in entries if one.folder and one.key not in left)
+    for folder, key in kept:
+        progress(len(sessions), len(kept), "reading sessions")
         sessions[key] = Session.open(folder)
-    copies = find_copies(sessions)
-    left |= {one: f"same recording as {other}" for one, other in copies.items()}
-    check += [f"{one} is the {left[one]}, and is not counted" for one in copies]
-    sessions = {key: session for key, session in sessions.items() if key not in copies}
+    for key, other in find_copies(sessions).items():
+        left[key] = f"same recording as {other}"
+        check.append(f"{key} is the {left[key]}, and is not counted")
+        del sessions[key]
     table = collect(sessions.values())
-    if animals is not None:
-        table = _overruled(table, Path(animals))
-    table, notes = unified(table)
-    check += [
-        *notes,
-        *(f"{one.key}: {one.reason}" for one in entries if one.key in sessions and one.reason),
-    ]
+    table, notes = unified(table if animals is None else _overruled(table, Path(animals)))
+    check += [*notes, *_counted_otherwise(sessions)]
+    check += [f"{one.key}: {one.reason}" for one in entries if one.key in sessions and one.reason]
     grouped = set(table.loc[table["group"].fillna("") != "", "session_id"])
     left |= {key: "has no group" for key, one in sessions.items() if one.name not in grouped}
     told = _in_words(entries, left)
     wanted = list(measures) or usual_measures(table)
-    absent = [name for name in wanted if name not in table]
-    if absent:
+    if absent := [name for name in wanted if name not in table]:
         raise SessionError(
             f"no session's summary has the column '{absent[0]}'; see columns.json in a session's "
             "folder"
         )
     groups = sorted({str(group) for group in table["group"].fillna("")} - {""})
-    if reference is not None:  # however it is spelled
-        reference = next((group for group in groups if same(group) == same(reference)), reference)
-    if len(groups) < 2 or (reference is not None and reference not in groups):
+    spelled = {same(group): group for group in groups}
+    reference = None if reference is None else spelled.get(same(reference), reference)
+    if len(groups) < 2 or reference not in (None, *groups):
         raise SessionError(
             f"a comparison needs two groups{f', one of them {reference!r}' if reference else ''}, "
             f"and these {len(table)} sessions have {', '.join(groups) or 'none'}; state "
@@ -137,23 +128,39 @@ def compare_sessions(
         with replacing(target / f"{name}.csv") as part:
             write_csv(written, part)
     columns = [entry for entry in dictionary(STATS) if entry["table"] == "stats"]
-    write_whole(target / "columns.json", json.dumps(columns, indent=1, ensure_ascii=False) + "\n")
-    places_of = [_seen_from(target, session.path) for session in sessions.values()]
+    places_of = [link_to(session.path, target)["path"] for session in sessions.values()]
     document = {"sessions": places_of, "reference": reference, "accounted": told, "check": check}
-    write_whole(target / "comparison.json", json.dumps(document, indent=1) + "\n")
     first = next(iter(sessions.values())).columns
     units = dict(zip(first["name"], first["unit"].fillna(""), strict=True))
-    texts = [result(row, units.get(row["measure"], "")) for row in stats.to_dict("records")]
+    results = [result(row, units.get(row["measure"], "")) for row in stats.to_dict("records")]
     warned = [f"Check this result: {one}." for one in check]
-    write_whole(target / "results.txt", "\n".join([*texts, "", told, *warned]) + "\n")
-    write_whole(target / "methods.txt", methods(stats, table, [told, *warned]) + "\n")
+    texts = {
+        "columns.json": json.dumps(columns, indent=1, ensure_ascii=False),
+        "comparison.json": json.dumps(document, indent=1),
+        "results.txt": "\n".join([*results, "", told, *warned]),
+        "methods.txt": methods(stats, table, [told, *warned]),
+    }
+    for name, text in texts.items():
+        write_whole(target / name, f"{text}\n")
     return {"stats": stats, "folder": target, "sessions": told, "check": check}
+
+
+def _counted_otherwise(sessions: Mapping[str, Session]) -> list[str]:
+    """That some sessions count shares in another way than the others, as a sentence."""
+    old = [k for k, one in sessions.items() if one.metadata["schema_version"] < _OBSERVED_SHARES]
+    if len(old) in (0, len(sessions)):
+        return []
+    return [
+        f"{', '.join(old)} are of an earlier version of liex_lab, which counted lost frames in the "
+        "time of bouts: their shares of actions can be too high beside those of the others, so "
+        "run `liex run` on their recordings again"
+    ]
 
 
 def _in_words(entries: Sequence[Entry], left: Mapping[str, str]) -> str:
     """How many sessions there are, how many are compared, and the state of each other one."""
     n = len(entries)
-    states = [f"{one.key} {left.get(one.key, one.state)}" for one in entries]
+    states = (f"{one.key} {left.get(one.key, one.state)}" for one in entries)
     said = "; ".join(state for state in states if not state.endswith(" done"))
     counts = f"{n} session{'s' * (n != 1)} in the study, {n - len(left)} compared"
     return f"{counts}: {said}" if said else counts
@@ -174,26 +181,23 @@ def account(places: Sequence[str | Path]) -> tuple[list[Entry], list[str]]:
     """
     found: dict[Path, Entry] = {}
     check: list[str] = []
-    folders = []
     for place in map(Path, places):
         study = _study_of(place)
-        place = study.results if study and place.is_file() else place
-        folders += find_sessions([place])
-        here = place.resolve()
         planned = study.sessions if study else ()
         check += misnamed(planned)
+        place = study.results if study and place.is_file() else place
+        here = place.resolve()
         for one in planned:
             folder = one.folder.resolve()
             if here in (folder, *folder.parents):
                 several = sum(other.animal.id == one.animal.id for other in planned) > 1
                 found[folder] = _state_of(folder, one.id if several else one.animal.id, one.exclude)
         failed = [file for file in place.rglob(FAILED_FILE) if not _SET_ASIDE.search(str(file))]
-        folders += [file.parent.resolve() for file in failed]
-    for folder in folders:
-        if folder not in found:
+        for folder in [*find_sessions([place]), *(file.parent.resolve() for file in failed)]:
             short = folder.stem if folder.suffix == ".liex" else "/".join(folder.parts[-3:])
-            taken = {one.key for one in found.values()}
-            found[folder] = _state_of(folder, str(folder) if short in taken else short)
+            taken = short in (one.key for one in found.values())
+            if folder not in found:
+                found[folder] = _state_of(folder, str(folder) if taken else short)
     return list(found.values()), check
 
 
@@ -205,9 +209,8 @@ def _state_of(folder: Path, key: str, exclude: str = "") -> Entry:
     verdict = read_verdict(folder)
     doubts = [one for one in verdict["cautions"] if str(one).startswith(OTHER_ANIMAL)]
     doubts += [] if verdict["accepted"] else verdict["reasons"]
-    state = (
-        LOOK_AT_IT if verdict["look_at_it"] else "has cautions" if verdict["cautions"] else "done"
-    )
+    state = "has cautions" if verdict["cautions"] else "done"
+    state = LOOK_AT_IT if verdict["look_at_it"] else state
     return Entry(key, state, "; ".join(map(str, doubts)), folder=folder)
 
 
@@ -234,14 +237,14 @@ def find_copies(sessions: Mapping[str, Session]) -> dict[str, str]:
     Raises:
         SessionError: two sessions of one recording are of two animals.
     """
-    known: dict[tuple[str, str], str] = {}
+    known: dict[str, str] = {}
     whose: dict[str, str] = {}
     copies: dict[str, str] = {}
     for key, session in sessions.items():
         whose[key] = ", ".join(session.table("sessions")["subject_id"].astype(str))
         region = session.metadata.get("plan", {}).get("arena", {}).get("region")
         numbers = session.summary.select_dtypes("number").to_numpy().tolist()
-        marks = ((session.metadata["input"]["sha256"], repr(region)), ("measured", repr(numbers)))
+        marks = (f"{session.metadata['input']['sha256']} {region}", str(numbers))
         twin = next((known[mark] for mark in marks if mark in known), key)
         if same(whose[twin]) != same(whose[key]):
             raise SessionError(
@@ -249,17 +252,10 @@ def find_copies(sessions: Mapping[str, Session]) -> dict[str, str]:
                 f"{whose[twin]}; remove one of them, or correct the animal of one with `liex "
                 "describe SESSION subject_id=NAME`"
             )
-        copies |= {key: twin} if twin != key else {}
+        if twin != key:
+            copies[key] = twin
         known |= dict.fromkeys(marks, twin)
     return copies
-
-
-def _seen_from(target: Path, folder: Path) -> str:
-    """The path of a session as seen from the comparison's folder, so that both can be moved."""
-    try:
-        return Path(os.path.relpath(folder, target.resolve())).as_posix()
-    except ValueError:  # on another drive
-        return str(folder)
 
 
 def find_sessions(places: Sequence[str | Path]) -> list[Path]:
@@ -279,17 +275,11 @@ def find_sessions(places: Sequence[str | Path]) -> list[Path]:
             raise SessionError(
                 f"{place} is not a folder; name session folders, or folders with sessions in them"
             )
-        inside = (
-            {place}
-            if (place / "session.json").is_file()
-            else {p.parent for p in place.rglob("session.json") if not _SET_ASIDE.search(str(p))}
-        )
-        inside = {
-            folder for folder in inside if not inside & set(folder.parents)
-        }  # not a session's older tables
+        files = (p for p in place.rglob("session.json") if not _SET_ASIDE.search(str(p)))
+        inside = {place} if (place / "session.json").is_file() else {p.parent for p in files}
         if not inside:
             raise SessionError(f"there is no session in {place}; `liex run` makes them")
-        found |= {folder.resolve() for folder in inside}
+        found |= {one.resolve() for one in inside if not inside & set(one.parents)}
     return sorted(found)
 
 
@@ -303,19 +293,18 @@ def _overruled(table: pd.DataFrame, path: Path) -> pd.DataFrame:
         ) from None
     if (
         "subject_id" not in stated
-        or not set(stated.columns) & set(_WHO)
+        or not set(stated.columns) & set(WHO[1:])
         or stated["subject_id"].duplicated().any()
     ):
         raise SessionError(
             f"{path} should have a column subject_id, each animal once, and any of "
-            f"{', '.join(_WHO)}; it has {', '.join(map(str, stated.columns))}"
+            f"{', '.join(WHO[1:])}; it has {', '.join(map(str, stated.columns))}"
         )
     known = stated.set_index("subject_id")
-    unknown = sorted(set(table["subject_id"].astype(str)) - set(known.index))
-    if unknown:
+    if unknown := sorted(set(table["subject_id"].astype(str)) - set(known.index)):
         raise SessionError(
             f"{path} does not list the animal '{unknown[0]}' of the sessions; add a row for it"
         )
     return table.assign(
-        **{name: table["subject_id"].map(known[name]) for name in _WHO if name in known}
+        **{name: table["subject_id"].map(known[name]) for name in WHO[1:] if name in known}
     )

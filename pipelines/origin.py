@@ -119,8 +119,9 @@ def build_background(
 
     if plan.replay.depth not in (ANIMAL, ARENA):
         return None
-    known = segmenter if isinstance(segmenter, BackgroundSubtraction) else None
-    return still_scene(recording, known)
+    return still_scene(
+        recording, segmenter if isinstance(segmenter, BackgroundSubtraction) else None
+    )
 
 
 def build_described_scene(segmenter: Segmenter, arena: Arena) -> Scene | None:

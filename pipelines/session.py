@@ -160,10 +160,10 @@ def _check_subject(opened: Recording, path: Path, plan: Plan) -> list[str]:
         named = animal_part(told) if in_metadata else found.id if found.origin else ""
         opened.metadata["subject_id"] = named
         return []
+    differ = in_metadata and same(found.id) != same(letters(animal_part(stated)))
     # of several arenas the metadata name one animal at most
-    whose = in_metadata and plan.arena.region is None
-    differ = same(found.id) != same(letters(animal_part(stated)))
-    return [f"{OTHER_ANIMAL}, {told} instead of {stated}"] if whose and differ else []
+    alone = plan.arena.region is None
+    return [f"{OTHER_ANIMAL}, {told} instead of {stated}"] if differ and alone else []
 
 
 def check_unused(folder: Path, overwrite: bool) -> None:
@@ -347,14 +347,14 @@ def make_track(writer: SessionWriter, fitted: Fitted) -> Verdict:
     whole = writer.seen(Observations)
     tracked = tracker.track(whole, allocate=writer.allocate)
     subject = tracker.subject
-    files = fitted.recording.files
+    recording = fitted.recording
     fast = why_too_fast(tracked.track, subject.length_mm)
     frozen, copied = copies_told(whole.times_ns, whole.repeats, tracker.noisy)
     water = build_water(fitted.plan)
     # water makes an ideal camera with a focal length of its own
-    lens = unusual_lens(fitted.recording.camera) if water is None else ""
-    jumps = [gap.start_frame for gap in fitted.recording.gaps if gap.reason == JUMPED]
-    centre, at_edge = unusual_centre(fitted.recording.camera)
+    lens = unusual_lens(recording.camera) if water is None else ""
+    jumps = [gap.start_frame for gap in recording.gaps if gap.reason == JUMPED]
+    centre, at_edge = unusual_centre(recording.camera)
     place = tracker.scene.floor.unusual(None if water is None else water.lift_mm)
     verdict = Verdict.of(
         tracked.track,
@@ -362,18 +362,18 @@ def make_track(writer: SessionWriter, fitted: Fitted) -> Verdict:
         misfits=fitted.misfits,
         doubts=(
             *tracker.scene.doubts,
-            *fitted.recording.doubts,
-            *fitted.recording.clock_doubts,
+            *recording.doubts,
+            *recording.clock_doubts,
             *filter(None, [fast, centre if at_edge else ""]),
             *frozen,
-            *files.rewritten(),
+            *recording.files.rewritten(),
         ),
         n_animals=subject.n_animals,
         cautions=(
             *fitted.notes,
             *copied,
             *tracker.scene.remarks,
-            *files.grown(),
+            *recording.files.grown(),
             *filter(None, [lens, "" if at_edge else centre]),
             *place,
             *(f"{PULSES_UNKNOWN}, first before frame {k}" for k in jumps[:1]),
@@ -421,14 +421,13 @@ def measure_behaviour(
     rules = build_rules(plan)
     around = replace(build_surroundings(origin), seams=seams)
     moved = moving_rows(rows, rules, around, allocate)
+    named: dict[str, Any] = {}
+    notes: dict[str, Any] = {}
     if recogniser is not None:
         named, notes = name_actions(recogniser, rows, moved, allocate)
     elif nameless := why_nameless(plan, origin.skeleton):
         named = {"bouts": empty_table(BOUTS), "actions": {}}
         notes = {"no_actions": nameless}
-    else:
-        named = {}
-        notes = {}
     rest()
     return measure_rows(rows, rules, around, moved=moved, allocate=allocate, **named), notes
 

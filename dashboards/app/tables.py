@@ -8,10 +8,11 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 from urllib.parse import quote
 
 import numpy as np
+import pandas as pd
 from dash import dcc, html
 
 from liex_lab.errors import SessionError
@@ -22,9 +23,6 @@ from ..units import counted, read_as
 from ..units import shown as as_read
 from .data import DONE, StudyData
 from .parts import aria, download
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 MOST_ROWS = 400  # on a page; the file has them all
 _BATCH = 20_000  # rows of a long table that are in memory at once
@@ -162,14 +160,10 @@ def arranged(table: Table, words: str, column: str, down: bool) -> pd.DataFrame:
     """
     rows = table.rows
     wanted = words.lower().split()
-    if wanted and len(rows):
-        texts = [rows[name].map(_searched) for name in table.shown if name in rows]
-        lines = texts[0]
-        for more in texts[1:]:
-            lines = lines + "\n" + more
-        rows = rows[
-            np.logical_and.reduce([lines.str.contains(word, regex=False) for word in wanted])
-        ]
+    cells = [rows[name].map(_searched) for name in table.shown if wanted and name in rows]
+    if cells:
+        lines = ("\n".join(line) for line in zip(*cells, strict=True))
+        rows = rows[np.array([all(word in line for word in wanted) for line in lines], bool)]
     if column in rows:
         rows = rows.sort_values(column, ascending=not down, kind="stable", na_position="last")
     return rows
@@ -188,26 +182,18 @@ def block(name: str, caption: str, *, searched: bool = True) -> html.Div:
         caption: what it holds, for a screen reader.
         searched: whether there is a field to filter by.
     """
-    tools: list[Any] = []
-    if searched:
-        tools.append(
-            html.Label(
-                [
-                    html.Span("Filter "),
-                    dcc.Input(
-                        id={"part": "filter", "table": name},
-                        type="text",
-                        value="",
-                        debounce=0.25,
-                        placeholder="any word",
-                        className="filter",
-                    ),
-                ]
-            )
-        )
-    else:
-        tools.append(dcc.Input(id={"part": "filter", "table": name}, type="hidden", value=""))
-    tools.append(download("Download CSV", csv_address(name)))
+    words = dcc.Input(
+        id={"part": "filter", "table": name},
+        type="text" if searched else "hidden",
+        value="",
+        debounce=0.25,
+        placeholder="any word",
+        className="filter",
+    )
+    tools = [
+        html.Label([html.Span("Filter "), words]) if searched else words,
+        download("Download CSV", csv_address(name)),
+    ]
     return html.Div(
         className="table-block",
         children=[
@@ -253,13 +239,12 @@ def fill(name: str, table: Table, words: str, order: dict[str, Any]) -> dict[str
             "column": column,
             "title": title,
             "sort": _sorted(column, order),
-            "numeric": _numeric(table.rows, column),
+            "numeric": column in table.rows and table.rows[column].dtype.kind in "iuf",
         }
         for column, title in table.shown.items()
     ]
     places = {name: _places(table.rows[name]) for name in table.shown if name in table.rows}
-    n = len(rows)
-    total = len(table.rows)
+    n, total = len(rows), len(table.rows)
     said = counted(n, "row") if n == total else f"{n:,} of {total:,} rows"
     said += f"; the first {MOST_ROWS} are shown, the CSV has all" if n > MOST_ROWS else ""
     return {
@@ -316,9 +301,9 @@ def session_table(data: StudyData, key: str, name: str) -> pd.DataFrame:
     Raises:
         SessionError: there is no such session or table.
     """
-    session = data.session(key)
     if name not in session_tables(data, key):
         raise SessionError(f"the session '{key}' has no table '{name}'")
+    session = data.session(key)
     return session.summary if name == "summary" else session.table(name)
 
 
@@ -416,7 +401,7 @@ def _cell(
         return {"kind": "said", "text": str(value)}
     known = (
         f"{100 * value:.1f} %"
-        if column.endswith("_share") and _finite(value)
+        if column.endswith("_share") and isinstance(value, int | float) and np.isfinite(value)
         else number(value, places)
     )
     if column == table.link and column == "start_s":
@@ -424,14 +409,6 @@ def _cell(
     if column == table.link and row.get("state", "done") in DONE:
         return {"kind": "link", "text": known, "to": session_address(str(value))}
     return {"text": known}
-
-
-def _finite(value: Any) -> bool:
-    return isinstance(value, int | float | np.number) and bool(np.isfinite(float(value)))
-
-
-def _numeric(rows: pd.DataFrame, column: str) -> bool:
-    return column in rows and rows[column].dtype.kind in "iuf"
 
 
 def _sorted(column: str, order: dict[str, Any]) -> str:
@@ -444,13 +421,8 @@ def columns_of(data: StudyData) -> Sequence[str]:
     Args:
         data: the study.
     """
-    rows = data.collected()
-    left_out = {"n_frames", "n_frames_observed", "fps_median", "n_bouts", "n_frames_summary"}
+    left_out = {"n_frames", "n_frames_observed", "fps_median", "n_bouts"}
+    known = data.collected().select_dtypes("number").dropna(axis="columns", how="all")
     return [
-        str(name)
-        for name in rows
-        if rows[name].dtype.kind in "iuf"
-        and str(name) not in left_out
-        and rows[name].notna().any()
-        and not str(name).endswith("_summary")
+        name for name in map(str, known) if name not in left_out and not name.endswith("_summary")
     ]

@@ -8,6 +8,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
+import pandas as pd
 
 from liex_lab.actions.colours import action_colours
 from liex_lab.behaviour.cohort import counted_units
@@ -39,9 +40,10 @@ from .style import (
 from .times import joined, walked
 
 if TYPE_CHECKING:
-    import pandas as pd
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
+    from liex_lab.sessions import Session
 
 NO_GROUP = "no group"
 
@@ -81,17 +83,17 @@ def ethograms(all_seen: Sequence[Seen]) -> Figure | None:
         for sessions in subjects.values()
         for seen in sessions
     ]
-    words = list(dict.fromkeys(word for _, seen in rows for word in seen.words))
-    if not any(len(seen.bouts) for _, seen in rows):
+    n = sum(len(seen.bouts) for seen in all_seen)
+    if not n:
         return None
-    duration = max(seen.duration_s for _, seen in rows)
+    words = list(dict.fromkeys(word for _, seen in rows for word in seen.words))
+    duration = max(seen.duration_s for seen in all_seen)
     unit, size = time_unit(duration)
     height = max(3.4 * len(rows), 8.0)
-    keys = key_rows(words)
-    figure = sheet(TWO_COLUMNS_MM, height + 17.0 + 4.0 * keys)
+    bottom = 8.0 + 4.0 * key_rows(words)
+    figure = sheet(TWO_COLUMNS_MM, height + bottom + 9.0)
     width = TWO_COLUMNS_MM - LEFT_MM - RIGHT_MM - 8.0
-    axes = panel(figure, LEFT_MM + 8.0, 8.0 + 4.0 * keys, width, height)
-    n = sum(len(seen.bouts) for _, seen in rows)
+    axes = panel(figure, LEFT_MM + 8.0, bottom, width, height)
     axes.set_title(f"Ethograms, n = {counted(len(rows), 'session')}, {counted(n, 'bout')}")
     colours = action_colours(words)
     least = 0.05 * duration / width
@@ -132,13 +134,12 @@ def occupancy_by_subject(all_seen: Sequence[Seen]) -> Figure | None:
         all_seen: the animals.
     """
     panels = []
-    for group, subjects in by_group(all_seen).items():
-        for who, sessions in subjects.items():
-            found = _added([_framed(seen, all_seen) for seen in sessions])
+    for group, subjects in _occupancies(all_seen).items():
+        for who, (session, found) in subjects.items():
             text = f"{who} ({group}), {found.observed_s:.1f} s\nn = {counted(found.n, 'frame')}"
-            panels.append((text, sessions[0].session, found))
-    n = len(panels)
-    return occupancy_panels(f"Occupancy by subject, n = {counted(n, 'subject')}", panels)
+            panels.append((text, session, found))
+    title = f"Occupancy by subject, n = {counted(len(panels), 'subject')}"
+    return occupancy_panels(title, panels)
 
 
 def occupancy_by_group(all_seen: Sequence[Seen]) -> Figure | None:
@@ -148,16 +149,15 @@ def occupancy_by_group(all_seen: Sequence[Seen]) -> Figure | None:
         all_seen: the animals.
     """
     panels = []
-    for group, subjects in by_group(all_seen).items():
-        own = [_added([_framed(seen, all_seen) for seen in some]) for some in subjects.values()]
-        own = [found for found in own if found.n]
-        if not own:
-            continue
-        mean = replace(_added(own), time_s=np.mean([found.time_s for found in own], axis=0))
-        text = f"{group}, n = {counted(len(own), 'subject')}\nmean of {mean.observed_s:.1f} s each"
-        panels.append((text, next(iter(subjects.values()))[0].session, mean))
-    n = len(panels)
-    return occupancy_panels(f"Occupancy by group, n = {counted(n, 'group')}", panels)
+    for group, subjects in _occupancies(all_seen).items():
+        own = [found for _, found in subjects.values() if found.n]
+        if own:
+            mean = replace(_added(own), time_s=np.mean([found.time_s for found in own], axis=0))
+            counts = f"n = {counted(len(own), 'subject')}\nmean of {mean.observed_s:.1f} s each"
+            session = next(iter(subjects.values()))[0]
+            panels.append((f"{group}, {counts}", session, mean))
+    title = f"Occupancy by group, n = {counted(len(panels), 'group')}"
+    return occupancy_panels(title, panels)
 
 
 def budgets_by_group(all_seen: Sequence[Seen]) -> Figure | None:
@@ -174,22 +174,20 @@ def budgets_by_group(all_seen: Sequence[Seen]) -> Figure | None:
     }
     if not words or not any(np.isfinite(values).any() for values in shares.values()):
         return None
-    step = 2.0 + 3.2 * len(groups)
-    figure = sheet(ONE_COLUMN_MM, step * len(words) + 16.0 + 4.0 * len(groups))
-    axes = panel(figure, LEFT_MM, 9.0, ONE_COLUMN_MM - LEFT_MM - RIGHT_MM, step * len(words))
+    height = (2.0 + 3.2 * len(groups)) * len(words)
+    figure = sheet(ONE_COLUMN_MM, height + 16.0 + 4.0 * len(groups))
+    axes = panel(figure, LEFT_MM, 9.0, ONE_COLUMN_MM - LEFT_MM - RIGHT_MM, height)
     n = sum(len(values) for values in shares.values())
     heading(figure, f"Time budget: every subject, and the mean, n = {counted(n, 'subject')}")
     apart = 0.8 / len(groups)
     for g, (group, values) in enumerate(shares.items()):
         colour = group_colour(group, list(groups))
         at = np.arange(len(words)) + (g - (len(groups) - 1) / 2) * apart
-        known = np.isfinite(values).any(axis=0)
-        mean = np.full(len(words), np.nan)
-        mean[known] = 100.0 * np.nanmean(values[:, known], axis=0)
+        mean = 100.0 * np.nan_to_num(pd.DataFrame(values).mean())
         label = f"{group}, n = {counted(len(values), 'subject')}"
-        axes.barh(at, np.nan_to_num(mean), 0.9 * apart, color=colour, alpha=0.35, label=label)
+        axes.barh(at, mean, 0.9 * apart, color=colour, alpha=0.35, label=label)
+        mark = GROUP_MARKS[g % len(GROUP_MARKS)]
         for one in values:
-            mark = GROUP_MARKS[g % len(GROUP_MARKS)]
             axes.plot(100.0 * one, at, mark, color=colour, markersize=2.2, gid=f"subjects {group}")
     axes.set_yticks(range(len(words)), [word.replace("_", " ") for word in words])
     axes.set_ylim(len(words) - 0.5, -0.5)
@@ -231,11 +229,9 @@ def distance_by_group(all_seen: Sequence[Seen]) -> Figure | None:
         for time_s, metres, _ in some:
             rows = np.unique(np.linspace(0, len(time_s) - 1, min(len(time_s), 400)).astype(int))
             axes.plot(time_s[rows] / size, metres[rows], color=colour, linewidth=0.5, alpha=0.5)
-        known = [one for one in some if one[2]]
-        if known:
+        if known := [one for one in some if one[2]]:
             # the mean ends with the shortest session, or it would fall where one drops out
-            shortest = min(float(time_s[-1]) for time_s, _, _ in known)
-            grid = np.linspace(0.0, shortest, 400)
+            grid = np.linspace(0.0, min(float(time_s[-1]) for time_s, _, _ in known), 400)
             mean = np.mean([np.interp(grid, time_s, metres) for time_s, metres, _ in known], axis=0)
             axes.plot(grid / size, mean, color=colour, linewidth=1.5, label=group)
     axes.set_xlim(0.0, duration / size)
@@ -265,34 +261,30 @@ def comparison(
     """
     if measure not in table:
         return None
-    known = table[np.isfinite(table[measure].astype(float))].copy()
-    known["group"] = known["group"].fillna("").astype(str)
-    known = known[known["group"] != ""]
+    known = table.assign(group=table["group"].fillna("").astype(str))
+    known = known[np.isfinite(known[measure].astype(float)) & (known["group"] != "")]
     if known.empty:
         return None
     own = stats[stats["measure"] == measure]
-    first = list(own["reference"])[:1]
-    names = list(dict.fromkeys([*first, *references_first(set(known["group"]))]))
+    names = list(dict.fromkeys([*own["reference"].head(1), *references_first(known["group"])]))
     factor, read = shown(1.0, unit)
     height = max(42.0, 13.0 * len(own))
     lines = textwrap.wrap(accounted, 150)
-    figure = sheet(TWO_COLUMNS_MM, height + 22.0 + 2.6 * len(lines))
     bottom = 13.0 + 2.6 * len(lines)
+    figure = sheet(TWO_COLUMNS_MM, height + bottom + 9.0)
     left = panel(figure, 16.0, bottom, 72.0, height)
+    counts = []
+    n_animals = []
     for k, name in enumerate(names):
         rows = known[known["group"] == name]
+        n = rows["subject_id"].nunique()
         _strip(left, k, rows, factor * rows[measure].to_numpy(float), name, names)
-    counts = [
-        f"{name}\n{counted(known.loc[known['group'] == name, 'subject_id'].nunique(), 'animal')}, "
-        f"{counted(int((known['group'] == name).sum()), 'session')}"
-        for name in names
-    ]
+        n_animals.append(f"{n} {name}")
+        counts.append(f"{name}\n{counted(n, 'animal')}, {counted(len(rows), 'session')}")
     left.set_xticks(range(len(names)), counts)
     left.set_xlim(-0.6, len(names) - 0.4)
     left.set_ylabel(read_as(measure, unit))
-    n_animals = known.groupby("group")["subject_id"].nunique()
-    each = ", ".join(f"{n_animals.get(name, 0)} {name}" for name in names[::-1])
-    left.set_title(f"{titled(measure, unit)}, n = {each} (animals)")
+    left.set_title(f"{titled(measure, unit)}, n = {', '.join(n_animals[::-1])} (animals)")
     left.grid(axis="y", color=LINE, linewidth=0.4)
     edge = figure.get_size_inches()[1] * 25.4
     figure.text(
@@ -335,13 +327,10 @@ def _strip(
     axes: Axes, k: int, rows: pd.DataFrame, values: Array, name: str, names: Sequence[str]
 ) -> None:
     """One group: a small mark per session, a large one per animal, a line for the animals' mean."""
-    import pandas as pd
-
     animal, animals = pd.factorize(rows["subject_id"].astype(str))
     means = animal_means(values, animal)
     beside = np.linspace(-0.2, 0.2, len(animals)) if len(animals) > 1 else np.zeros(1)
-    colour = group_colour(name, names)
-    mark = GROUP_MARKS[k % len(GROUP_MARKS)]
+    colour, mark = group_colour(name, names), GROUP_MARKS[k % len(GROUP_MARKS)]
     if len(values) > len(animals):  # else the sessions are the animals
         axes.plot(k + beside[animal] + 0.03, values, mark, color=colour, markersize=2.0, alpha=0.5)
     axes.plot(
@@ -364,14 +353,12 @@ def _differences(axes: Axes, own: pd.DataFrame, factor: float, unit: str) -> Non
         axes.text(0.0, 0.5, "no difference can be given", transform=axes.transAxes)
         return
     _intervals(axes, known, "estimate", "ci_low", "ci_high", factor)
-    texts = []
-    for row in known.to_dict("records"):
+    rows = known.to_dict("records")
+    for k, row in enumerate(rows):
         g = f"g {row['effect_size']:.2f}" if np.isfinite(row["effect_size"]) else "no g"
         p = f"p {row['p']:.2g}\ncorrected {row['p_fdr']:.2g}" if row["test"] else "no test"
-        texts.append(f"{g}\n{p}")
-    for k, text in enumerate(texts):
         axes.annotate(
-            text,
+            f"{g}\n{p}",
             (1.02, k),
             xycoords=("axes fraction", "data"),
             va="center",
@@ -380,10 +367,7 @@ def _differences(axes: Axes, own: pd.DataFrame, factor: float, unit: str) -> Non
         )
     axes.set_yticks(
         range(len(known)),
-        [
-            f"{row['contrast']}\nn = {counted_units(row)}".replace(", ", ",\n")
-            for row in known.to_dict("records")
-        ],
+        [f"{row['contrast']}\nn = {counted_units(row)}".replace(", ", ",\n") for row in rows],
         size=5.5,
     )
     axes.set_ylim(len(known) - 0.4, -0.6)
@@ -394,10 +378,8 @@ def _intervals(
     axes: Axes, known: pd.DataFrame, middle: str, low: str, high: str, factor: float
 ) -> None:
     """Marks with their intervals, one row below the other; hollow where there is no test."""
-    at = factor * known[middle].to_numpy(float)
-    for k, (value, a, b, test) in enumerate(
-        zip(at, factor * known[low], factor * known[high], known["test"].astype(str), strict=True)
-    ):
+    spans = factor * known[[middle, low, high]].to_numpy(float)
+    for k, ((value, a, b), test) in enumerate(zip(spans, known["test"].astype(str), strict=True)):
         if np.isfinite([a, b]).all():
             axes.plot([a, b], [k, k], color=INK, linewidth=1.0, gid=f"interval {k}")
         fill = INK if test and test != "nan" else "none"
@@ -407,12 +389,22 @@ def _intervals(
     axes.tick_params(axis="y", length=0)
 
 
-def _framed(seen: Seen, all_seen: Sequence[Seen]) -> Occupancy:
-    """The occupancy of a session on the grid that all sessions share."""
+def _occupancies(all_seen: Sequence[Seen]) -> dict[str, dict[str, tuple[Session, Occupancy]]]:
+    """Each subject's first session and its occupancy, on a grid that all share, by group."""
     corners = [extent_mm(one.session, one.xy_mm, centred=True) for one in all_seen]
     low = np.min([corner[0] for corner in corners], axis=0)
     high = np.max([corner[1] for corner in corners], axis=0)
-    return occupancy(aligned(seen.session, seen.xy_mm), seen.hold_s, low, high)
+
+    def framed(seen: Seen) -> Occupancy:
+        return occupancy(aligned(seen.session, seen.xy_mm), seen.hold_s, low, high)
+
+    return {
+        group: {
+            who: (sessions[0].session, _added([framed(seen) for seen in sessions]))
+            for who, sessions in subjects.items()
+        }
+        for group, subjects in by_group(all_seen).items()
+    }
 
 
 def _added(some: Sequence[Occupancy]) -> Occupancy:
@@ -421,19 +413,7 @@ def _added(some: Sequence[Occupancy]) -> Occupancy:
     return replace(some[0], time_s=total, n=sum(found.n for found in some))
 
 
-def _budget(sessions: Sequence[Seen], words: Sequence[str]) -> list[float]:
+def _budget(sessions: Sequence[Seen], words: Sequence[str]) -> pd.Series[float]:
     """Share of a subject's time in each action: the mean of its sessions; NaN where unknown."""
-    rows = [
-        [
-            float(seen.summary[f"{word}_share"])
-            if seen.summary is not None and f"{word}_share" in seen.summary
-            else np.nan
-            for word in words
-        ]
-        for seen in sessions
-    ]
-    values = np.array(rows)
-    out = np.full(len(words), np.nan)
-    known = np.isfinite(values).any(axis=0)
-    out[known] = np.nanmean(values[:, known], axis=0)
-    return [float(value) for value in out]
+    known = [{} if seen.summary is None else dict(seen.summary) for seen in sessions]
+    return pd.DataFrame(known, columns=[f"{word}_share" for word in words], dtype=float).mean()

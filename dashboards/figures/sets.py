@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import io
 import json
 from collections import Counter
@@ -9,9 +10,10 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 
 from liex_lab.behaviour.cohort import WHO
@@ -30,7 +32,6 @@ from .seen import Seen, animals
 from .style import FORMATS, drawing, image_bytes, on_page
 
 if TYPE_CHECKING:
-    import pandas as pd
     from matplotlib.backends.backend_pdf import PdfPages
     from matplotlib.figure import Figure
 
@@ -119,15 +120,14 @@ def comparison_figures(
         only: names of `OF_STUDY`, 'effects', or measures of `stats`; () takes all.
     """
     units = _units(sessions)
-    measures = list(dict.fromkeys(stats["measure"].astype(str)))
-    if not only or "effects" in only:
+    said = str(table.attrs.get("accounted", ""))
+    only = only or ("effects", *stats["measure"].astype(str), *OF_STUDY)
+    if "effects" in only:
         yield Drawn("effects", "effect sizes with their intervals", groups.effects(stats, units))
-    for measure in measures:
-        if not only or measure in only:
-            unit, said = units.get(measure, ""), str(table.attrs.get("accounted", ""))
-            drawn = groups.comparison(table, stats, measure, unit, said)
-            yield Drawn(safe_name(f"compare_{measure}"), "every animal, and the difference", drawn)
-    wanted = [name for name in OF_STUDY if not only or name in only]
+    for measure in (one for one in dict.fromkeys(stats["measure"].astype(str)) if one in only):
+        drawn = groups.comparison(table, stats, measure, units.get(measure, ""), said)
+        yield Drawn(safe_name(f"compare_{measure}"), "every animal, and the difference", drawn)
+    wanted = [name for name in OF_STUDY if name in only]
     if sessions and wanted:
         yield from _of_many(_grouped(sessions, table), wanted, list(stats["reference"])[:1])
 
@@ -166,8 +166,8 @@ def write_figures(
                 empty.append(one.name)
                 continue
             for kind in alone:
-                content = image_bytes(one.figure, kind)
-                files.append(put_figure(folder, f"{one.name}.{kind}", content))
+                name = f"{one.name}.{kind}"
+                files.append(put_figure(folder, name, image_bytes(one.figure, kind)))
             if pages is not None:
                 pages.savefig(one.figure)
     if PAGES in kinds and (folder / _PAGES_FILE).is_file():
@@ -225,8 +225,6 @@ def read_comparison(folder: Path) -> tuple[pd.DataFrame, pd.DataFrame, list[Sess
     Raises:
         SessionError: its files are missing or damaged.
     """
-    import pandas as pd
-
     try:
         table = read_harmless(folder / "sessions.csv", ("session_id", "individual", *WHO))
         stats = pd.read_parquet(folder / "stats.parquet")
@@ -254,15 +252,10 @@ def check_names(only: Sequence[str], known: Sequence[str]) -> None:
     Raises:
         SessionError: one is not known.
     """
-    import difflib
-
-    for name in only:
-        if name not in known:
-            near = difflib.get_close_matches(name, known, 1)
-            hint = f"did you mean '{near[0]}'? " if near else ""
-            raise SessionError(
-                f"there is no figure '{name}' here: {hint}known are {', '.join(known)}"
-            )
+    for name in (one for one in only if one not in known):
+        near = difflib.get_close_matches(name, known, 1)
+        hint = f"did you mean '{near[0]}'? " if near else ""
+        raise SessionError(f"there is no figure '{name}' here: {hint}known are {', '.join(known)}")
 
 
 def check_kinds(kinds: Sequence[str]) -> None:
@@ -274,11 +267,10 @@ def check_kinds(kinds: Sequence[str]) -> None:
     Raises:
         SessionError: one is not known.
     """
-    for kind in kinds:
-        if kind not in KINDS:
-            raise SessionError(
-                f"figures are written as {', '.join(KINDS)}, got '{kind}'; name one of these"
-            )
+    if unknown := [kind for kind in kinds if kind not in KINDS]:
+        raise SessionError(
+            f"figures are written as {', '.join(KINDS)}, got '{unknown[0]}'; name one of these"
+        )
 
 
 def for_the_page(session: Session, folder: Path | None) -> dict[str, str]:
@@ -293,7 +285,8 @@ def for_the_page(session: Session, folder: Path | None) -> dict[str, str]:
     """
     made: dict[str, str] = {}
     there = set() if folder is None else {path.name for path in _files(folder)}
-    asked = _asked(session)
+    report = session.metadata.get("plan", {}).get("report", {})  # older plans have none
+    asked = {str(kind) for kind in report.get("figures", ())}
     paged = PAGES in asked or _PAGES_FILE in there
     with uncollected(), drawing(), _one_pdf(folder if paged else None) as pages:
         for one in session_figures(session):
@@ -317,12 +310,6 @@ def for_the_page(session: Session, folder: Path | None) -> dict[str, str]:
     return made
 
 
-def _asked(session: Session) -> set[str]:
-    """The formats that a session's plan asks for; plans of earlier versions ask for none."""
-    report = session.metadata.get("plan", {}).get("report", {})
-    return {str(kind) for kind in report.get("figures", ())}
-
-
 def _files(folder: Path) -> list[Path]:
     """The files of figures in a folder, in the order of their names."""
     return sorted(path for kind in FORMATS for path in folder.glob(f"*.{kind}"))
@@ -340,9 +327,9 @@ def _arena(session: Session) -> Figure | None:
 
 def _grouped(sessions: Sequence[Session], table: pd.DataFrame) -> list[Seen]:
     """The animals with the groups that a comparison puts them in; those in none are left out."""
-    stated: dict[tuple[str, str], list[Any]] = {}
-    for row in table.to_dict("records"):
-        stated.setdefault((str(row["session_id"]), str(row["individual"])), []).append(row["group"])
+    who = ["session_id", "individual"]
+    named = table.astype(dict.fromkeys(who, str)).groupby(who)["group"]
+    stated = {key: list(groups_of) for key, groups_of in named}
     every = [seen for session in sessions for seen in animals(session)]
     there = Counter((seen.session.name, seen.individual) for seen in every)
     found = []
@@ -361,9 +348,7 @@ def _grouped(sessions: Sequence[Session], table: pd.DataFrame) -> list[Seen]:
 
 def _units(sessions: Sequence[Session]) -> dict[str, str]:
     """The unit of every column of the summaries."""
-    units: dict[str, str] = {}
-    for session in sessions:
-        own = session.columns[session.columns["table"] == "summary"]
-        for name, unit in zip(own["name"], own["unit"], strict=True):
-            units.setdefault(str(name), unit if isinstance(unit, str) else "")
-    return units
+    tables = [session.columns for session in sessions]
+    known = pd.concat([pd.DataFrame(columns=["table", "name", "unit"]), *tables])
+    known = known[known["table"] == "summary"].drop_duplicates("name")
+    return dict(zip(known["name"].astype(str), known["unit"].fillna("").astype(str), strict=True))

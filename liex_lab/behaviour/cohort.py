@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from importlib.metadata import version
-from itertools import combinations
+from itertools import combinations, product
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -53,6 +53,8 @@ _SOFTWARE = (
     "Image Based Articulated Object Pose Estimation, Tracking, and Action Recognition on Lie "
     "Groups, International Journal of Computer Vision, 2017."
 )
+_ESTIMATES = ("estimate", "ci_low", "ci_high")
+_EFFECTS = ("effect_size", "effect_low", "effect_high")
 _USUAL = (
     "distance_m",
     "mean_speed_mm_s",
@@ -139,16 +141,13 @@ def collect(sessions: Iterable[SessionTables]) -> pd.DataFrame:
         Columns of the tables `sessions` and `summary`, and n_bouts; columns that both have carry
         `_summary` in the second.
     """
-    rows = []
-    for session in sessions:
-        who = session.table("sessions")
-        table = who.merge(
-            session.summary, on=["session_id", "individual"], suffixes=("", "_summary")
-        )
-        rows.append(table.assign(n_bouts=len(session.table("bouts", ["action"]))))
-    return (
-        pd.concat(rows, ignore_index=True) if rows else pd.DataFrame(columns=["session_id", *WHO])
-    )
+    rows = [
+        session.table("sessions")
+        .merge(session.summary, on=["session_id", "individual"], suffixes=("", "_summary"))
+        .assign(n_bouts=len(session.table("bouts", ["action"])))
+        for session in sessions
+    ]
+    return pd.concat(rows or [pd.DataFrame(columns=["session_id", *WHO])], ignore_index=True)
 
 
 def usual_measures(table: pd.DataFrame) -> list[str]:
@@ -199,34 +198,24 @@ def compare(
         of the table (Benjamini-Hochberg). Where a mixed model was fitted, estimate, interval
         and effect size are the model's, else those of `estimate`.
     """
-    table = _prepared(table, blocks)
+    texts = {
+        name: table[name].fillna("").astype(str) if name in table else ""
+        for name in (*WHO, *blocks)
+    }
+    table = unified(table.assign(**texts))[0]
     groups = references_first(set(table["group"]) - {""})
-    if reference is None:
-        pairs = list(combinations(groups, 2))
-    else:
-        pairs = [
-            (reference, other) for other in groups if other != reference and reference in groups
-        ]
-    rows = []
-    for k, (measure, pair) in enumerate((measure, pair) for measure in measures for pair in pairs):
-        own = table.assign(value=_values(table, measure))
-        rows.append(
-            _compare_one(
-                own, measure, pair, engine, blocks, alpha, np.random.default_rng([seed, k])
-            )
-        )
+    pairs: Iterable[tuple[str, str]] = combinations(groups, 2)
+    if reference is not None:
+        pairs = ((reference, one) for one in groups if one != reference and reference in groups)
+    rows = [
+        _compare_one(table, *asked, engine, blocks, alpha, np.random.default_rng([seed, k]))
+        for k, asked in enumerate(product(measures, pairs))
+    ]
     corrected = false_discovery([row["p"] for row in rows])
     n_family = int(np.isfinite(corrected).sum())
     for row, p in zip(rows, corrected, strict=True):
         row |= {"p_fdr": p, "family": family, "n_family": n_family}
     return to_pandas(STATS, {column.name: [row[column.name] for row in rows] for column in STATS})
-
-
-def _prepared(table: pd.DataFrame, blocks: Sequence[str]) -> pd.DataFrame:
-    """The table with every name as text, empty where it is not known, and spelled in one way."""
-    names = {*WHO, *blocks}
-    texts = {name: table[name].fillna("").astype(str) if name in table else "" for name in names}
-    return unified(table.assign(**texts))[0]
 
 
 def unified(table: pd.DataFrame) -> tuple[pd.DataFrame, list[str]]:
@@ -252,12 +241,6 @@ def unified(table: pd.DataFrame) -> tuple[pd.DataFrame, list[str]]:
     return table, notes
 
 
-def _values(table: pd.DataFrame, measure: str) -> pd.Series[Any]:
-    return (
-        table[measure].astype(float) if measure in table else pd.Series(np.nan, index=table.index)
-    )
-
-
 def _compare_one(
     table: pd.DataFrame,
     measure: str,
@@ -269,6 +252,7 @@ def _compare_one(
 ) -> dict[str, Any]:
     """One row of the table `stats`."""
     own = table[table["group"].isin(groups)]
+    own = own.assign(value=own[measure].astype(float) if measure in own else np.nan)
     rows = own[np.isfinite(own["value"])]
     cages = set(rows["cage"]) - {""}
     animals = rows.groupby("group")["subject_id"].nunique()
@@ -292,7 +276,8 @@ def _compare_one(
     }
     try:
         units = find_units(rows, groups, blocks)
-        row |= _described(units)
+        row |= {"unit": units.unit, "smallest_p": smallest_p(units)}
+        row["n_reference"], row["n_group"] = _counts(units)
         if float(np.ptp(units.values)) == 0.0 and not (units.paired and units.values[0] != 0.0):
             raise NotComparable("every unit has the same value, so there is nothing to compare")
         row |= _sized(estimate(units), rows, groups)
@@ -302,17 +287,11 @@ def _compare_one(
     return row
 
 
-def _described(units: Units) -> dict[str, Any]:
+def _counts(units: Units) -> tuple[int, int]:
+    """Units of the reference and of the group; of pairs each is in both."""
+    n_second = int(units.second.sum())
     n = len(units.values)
-    first, second = (
-        (n, n) if units.paired else (int((~units.second).sum()), int(units.second.sum()))
-    )
-    return {
-        "unit": units.unit,
-        "n_group": second,
-        "n_reference": first,
-        "smallest_p": smallest_p(units),
-    }
+    return (n, n) if units.paired else (n - n_second, n_second)
 
 
 def _sized(found: Estimate, rows: pd.DataFrame, groups: tuple[str, str]) -> dict[str, float]:
@@ -325,12 +304,9 @@ def _sized(found: Estimate, rows: pd.DataFrame, groups: tuple[str, str]) -> dict
     sd, correction = spread_of_animals(
         animal_means(rows["value"].to_numpy(float), number), places % 2 == 1
     )
-    known = {"estimate": found.difference, "ci_low": found.low, "ci_high": found.high}
-    effect = {"effect_size": found.difference, "effect_low": found.low, "effect_high": found.high}
-    return {
-        **known,
-        **{name: correction * value / sd if sd > 0 else np.nan for name, value in effect.items()},
-    }
+    values = (found.difference, found.low, found.high)
+    effects = (correction * value / sd if sd > 0 else np.nan for value in values)
+    return dict(zip((*_ESTIMATES, *_EFFECTS), (*values, *effects), strict=True))
 
 
 def _tested(
@@ -353,14 +329,12 @@ def _tested(
             )
             return {"p": model.p, "test": name, **_sized(model.found, rows, groups)}
     check_reachable(units, alpha, groups)
-    within = ""
-    if len(np.unique(units.block)) > 1:
-        within = " within blocks"
+    within = " within blocks" if len(np.unique(units.block)) > 1 else ""
     of = "signs of the animals' own differences" if units.paired else f"{units.unit}s{within}"
     n_ways = arrangements(units)
-    exact = n_ways <= MOST_EXACT
     how = f"exact, all {n_ways:,} arrangements"
-    how = how if exact else f"{MOST_EXACT:,} random arrangements of {n_ways:,}"
+    if n_ways > MOST_EXACT:
+        how = f"{MOST_EXACT:,} random arrangements of {n_ways:,}"
     return {"p": permutation(units, rng), "test": f"permutation of {of} ({how})"}
 
 
@@ -383,26 +357,29 @@ def result(row: Mapping[Any, Any], unit: str) -> str:
         row: a row of the table `stats`.
         unit: the measure's unit in the table; empty where it has none.
     """
-    names = ("estimate", "ci_low", "ci_high")
-    difference, low, high = (_plain(shown(float(row[name]), unit)[0]) for name in names)
+    difference, low, high = (_plain(shown(float(row[name]), unit)[0]) for name in _ESTIMATES)
+    g, g_low, g_high = (f"{float(row[name]):.2f}" for name in _EFFECTS)
     read = f" {shown(1.0, unit)[1]}" if unit else ""
-    sizes = [f"{float(row[name]):.2f}" for name in ("effect_size", "effect_low", "effect_high")]
     n = f"n = {counted_units(row)}"
     what = titled(str(row["measure"]), unit)
     refused = f"No test of {what}, {row['contrast']}: {row['refused']}"
     if not np.isfinite(row["estimate"]):
         return f"{refused}; {n}."
     way = "lower" if row["estimate"] < 0 else "higher"
-    text = f"{what[:1].upper()}{what[1:]} was {difference.lstrip('-')}{read} {way} in "
-    text += f"{row['group']} than in {row['reference']} ("
+    found = (
+        f"{what[:1].upper()}{what[1:]} was {difference.lstrip('-')}{read} {way} in "
+        f"{row['group']} than in {row['reference']}"
+    )
+    details = []
     if np.isfinite(row["ci_low"]):
-        text += f"95 % CI of {row['contrast']}: {low} to {high}{read}; "
+        details.append(f"95 % CI of {row['contrast']}: {low} to {high}{read}")
     if np.isfinite(row["effect_size"]):
-        text += f"Hedges' g = {sizes[0]}, {sizes[1]} to {sizes[2]}; "
+        details.append(f"Hedges' g = {g}, {g_low} to {g_high}")
     if not row["test"]:
-        return f"{text}{n}). {refused}."
+        return f"{found} ({'; '.join([*details, n])}). {refused}."
     corrected = f", corrected for {row['n_family']} tests {row['p_fdr']:.2g}"
-    return f"{text}p = {row['p']:.2g}{corrected * (row['n_family'] > 1)}; {row['test']}; {n})."
+    p = f"p = {row['p']:.2g}{corrected * (row['n_family'] > 1)}"
+    return f"{found} ({'; '.join([*details, p, row['test'], n])})."
 
 
 def _plain(value: float) -> str:
@@ -431,13 +408,14 @@ def methods(
         return ""
     done = stats[stats["test"] != ""]
     tests = list(dict.fromkeys(done["test"]))
-    units = sorted(set(done["unit"]))
     parts = [] if table is None else [f"Groups: {'; '.join(_of_groups(table))}."]
     parts += [one if one.endswith(".") else f"{one}." for one in said]
-    if units:
-        unit = ", ".join(units)
-        parts.append(f"Sessions were averaged per animal; the unit of comparison is the {unit}.")
-        parts.append(f"Tests: {'; '.join(tests)}.")
+    if tests:
+        unit = ", ".join(sorted(set(done["unit"])))
+        parts += [
+            f"Sessions were averaged per animal; the unit of comparison is the {unit}.",
+            f"Tests: {'; '.join(tests)}.",
+        ]
     intervals = {
         "Welch's t over the units": any(
             unit != PAIRED and "model" not in test and "blocks" not in test

@@ -14,6 +14,7 @@ import unicodedata
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from itertools import groupby
 from pathlib import Path
 
 from liex_lab.plan.study import RAW, STUDY_FILE
@@ -27,7 +28,8 @@ _WORDS = (
 )
 _GLUED = "days?|sessions?|sess?|recording|rec|trial|week|wk|test|visit|run"  # as in m01day1
 _MONTHS = "(?:jan|feb|mar|apr|may|jun|jul|aug|sept?|oct|nov|dec)[a-z]{0,6}"
-_MD = r"(?:0[1-9]|1[0-2])(?:0[1-9]|[12]\d|3[01])"
+_MONTH, _DAY = "(?:0[1-9]|1[0-2])", r"(?:0[1-9]|[12]\d|3[01])"
+_MD = _MONTH + _DAY
 _TIME = (
     r"(?:[T_ -]?(?:[01]\d|2[0-3])[-_:.h]?[0-5]\d(?:[-_:.m]?[0-5]\d(?:[.,_]?\d{1,9})?s?)?"
     r"(?:Z|[+-]\d\d:?\d\d)?(?!-\d\d(?!\d)))?"
@@ -69,6 +71,9 @@ _ANIMAL = re.compile(
     re.IGNORECASE,
 )
 _FIRST = re.compile(rf"([dstwv]\d{{1,3}})[-_. ](?={_ANIMAL.pattern})", re.IGNORECASE)
+_DATED = re.compile(  # as in m01_012517 or m01_250117: the digits alone may be an animal's number
+    rf"(.*[^\W\d_].*[^\W_])[-_. ]((?:{_MD}|{_DAY}{_MONTH})[1-3]\d)", re.IGNORECASE
+)
 _TAG = re.compile(r"[a-z]{0,3}[-_ ]?\d{1,4}[a-z]{0,2}", re.IGNORECASE)
 _CAGE = re.compile(r"(?:home[-_ ]?)?(?:cage|litter)[-_ ]?(?:\d{1,4}|[a-z])", re.IGNORECASE)
 CONTAINER = re.compile(r"\.(?:tar\.gz|tgz|tar|mcap|bag|db3|oni|avi|mkv|dat)$", re.IGNORECASE)
@@ -104,7 +109,8 @@ def find_subject(path: Path, stated: str = "", root: Path | None = None) -> Subj
             and where there is neither, those that look like an animal's tag, such as m01.
     """
     whole = path.absolute()
-    known = root.absolute() if root else _root_of(whole)
+    studies = (one for one in whole.parents if one.name == RAW or (one / STUDY_FILE).is_file())
+    known = root.absolute() if root else next(studies, None)
     above = list(whole.relative_to(known).parts[:-1]) if known else _tags_above(whole)
     names = [*above, whole.name if path.is_dir() else CONTAINER.sub("", whole.name)]
     kept = [animal_part(name) for name in names]
@@ -136,12 +142,6 @@ def _session(names: Sequence[str], animal: str) -> str:
     return "".join(letters(plain) for one in named if (plain := re.sub(r"\W|_", "", one)))
 
 
-def _root_of(whole: Path) -> Path | None:
-    """The folder from which on a study's folders name animals; None outside of studies."""
-    here = (one for one in whole.parents if one.name == RAW or (one / STUDY_FILE).is_file())
-    return next(here, None)
-
-
 def _tags_above(whole: Path) -> list[str]:
     """Names of the folders above a recording, up to one that looks like an animal's tag."""
     names = [folder.name for folder in whole.parents]
@@ -168,6 +168,8 @@ def _split(name: str) -> tuple[str, list[str]]:
     kept = _OCCASION.sub("_", text).strip("-_., ()[]")
     if (first := _FIRST.match(kept)) is not None:
         occasions, kept = [first[1], *occasions], kept[first.end() :]
+    if (last := _DATED.fullmatch(kept)) is not None:
+        occasions, kept = [*occasions, last[2]], last[1]
     return kept, occasions
 
 
@@ -222,11 +224,10 @@ def alike(names: Iterable[str]) -> list[list[str]]:
     Args:
         names: each as often as it occurs.
     """
-    counts = Counter(sorted(names))
-    spelled: dict[str, list[str]] = {}
-    for name, _ in counts.most_common():
-        spelled.setdefault(same(name), []).append(name)
-    return [found for found in spelled.values() if len(found) > 1]
+    counts = Counter(names)
+    ordered = sorted(counts, key=lambda name: (same(name), -counts[name], name))
+    spelled = (list(some) for _, some in groupby(ordered, same))
+    return [some for some in spelled if len(some) > 1]
 
 
 def one_animal(ids: Iterable[str]) -> list[list[str]]:
@@ -235,10 +236,14 @@ def one_animal(ids: Iterable[str]) -> list[list[str]]:
     Args:
         ids: of animals that are taken for different ones.
     """
-    found: dict[str, list[str]] = {}
-    for id in sorted(set(ids)):
-        found.setdefault(same(_SHORT_GLUED.sub("", animal_part(id))), []).append(id)
-    return [some for some in found.values() if len({same(id) for id in some}) > 1]
+
+    def bare(id: str) -> str:
+        return same(_SHORT_GLUED.sub("", animal_part(id)))
+
+    found = (
+        list(some) for _, some in groupby(sorted(set(ids), key=lambda id: (bare(id), id)), bare)
+    )
+    return [some for some in found if len({same(id) for id in some}) > 1]
 
 
 def references_first(groups: Iterable[str]) -> list[str]:

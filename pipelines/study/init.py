@@ -11,7 +11,8 @@ import hashlib
 import json
 import os
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from itertools import count
 from pathlib import Path
 
 from liex_lab.errors import StudyError
@@ -35,6 +36,24 @@ _HEADER = """\
 # Paths count from this file's folder and stay in it. Nothing is ever written into {raw}.
 # [set], and `set` of an animal or a session, change values of the plan: set = {{ animal.spine_mm = 65 }}
 """  # noqa: E501
+_SETTINGS = f"""\
+plan = "mouse"                 # a bundled plan (see `liex info`), or a .toml file in this folder
+results = "{DERIVED}"
+shared = "off"                 # "subject": an animal has one size and shape
+
+[set]
+"""
+_ANIMAL = """\
+[[animals]]
+id = {id}  # named by: {origins}
+group = ""                     # cage, sex, batch too
+"""
+_SESSION = """\
+[[sessions]]
+animal = {}
+session = {}
+recording = {}
+"""
 
 
 def begin_study(
@@ -75,13 +94,12 @@ def begin_study(
         raise StudyError(
             f"no recording was found below {raw}; a study needs at least one, see `liex run --help`"
         )
-    stated = []
-    for k, path in enumerate(found):
-        progress(k, len(found), "reading who the animals are")
-        stated.append(stated_subject(path, progress))
     twins = find_twins(found)
-    kept = [(path, told) for path, told in zip(found, stated, strict=True) if path not in twins]
-    named, notes = name_sessions([path for path, _ in kept], raw, [told for _, told in kept])
+    stated: dict[Path, str] = {}
+    for path in (one for one in found if one not in twins):
+        progress(len(stated), len(found) - len(twins), "reading who the animals are")
+        stated[path] = stated_subject(path, progress)
+    named, notes = name_sessions(stated, raw)
     notes += [
         f"{one.relative_to(root).as_posix()} is the same recording as "
         f"{other.relative_to(root).as_posix()}, and is left out"
@@ -96,14 +114,13 @@ def begin_study(
 
 def _listed(named: Sequence[Named]) -> list[str]:
     """The animals with their sessions, for a person to check."""
-    sessions: dict[str, list[str]] = {}
-    for animal, session, _, _ in named:
-        sessions.setdefault(animal, []).append(session)
-    counts = f"{len(named)} recording{'s' * (len(named) != 1)}, {len(sessions)} animal"
-    lines = [f"{counts}{'s' * (len(sessions) != 1)}: is that so?"]
-    for animal, own in sessions.items():
+    animals = list(dict.fromkeys(animal for animal, *_ in named))
+    counts = f"{len(named)} recording{'s' * (len(named) != 1)}, {len(animals)} animal"
+    lines = [f"{counts}{'s' * (len(animals) != 1)}: is that so?"]
+    for one in animals:
+        own = [session for animal, session, *_ in named if animal == one]
         more = f" and {len(own) - _MOST_LISTED} more" if len(own) > _MOST_LISTED else ""
-        lines.append(f"    {animal}: {', '.join(own[:_MOST_LISTED])}{more}")
+        lines.append(f"    {one}: {', '.join(own[:_MOST_LISTED])}{more}")
     return lines
 
 
@@ -123,25 +140,23 @@ def find_twins(recordings: Sequence[Path]) -> dict[Path, Path]:
     ranks = {path: (path.suffix.lower() in packed, len(path.name), path) for path in recordings}
     for path in sorted(recordings, key=ranks.__getitem__):  # copies have longer names
         keys = ((path.parent, CONTAINER.sub("", path.name).lower()), _content(path))
-        twin = next((kept[key] for key in keys if key in kept), None)
-        if twin is not None:
-            twins[path] = twin
-        kept |= {key: twin or path for key in keys if key}
+        twin = next((kept[key] for key in keys if key in kept), path)
+        twins |= {path: twin} if twin != path else {}
+        kept |= {key: twin for key in keys if key}
     return twins
 
 
 def _content(path: Path) -> tuple[object, ...]:
     """Size, beginning and end of a recording's largest file, () of an empty one."""
     files = [path] if path.is_file() else [file for file in path.rglob("*") if file.is_file()]
-    sizes = {file: (file.name in _DEPTHS, file.stat().st_size) for file in files}
-    largest = max(sizes, key=sizes.__getitem__, default=path)
-    size = largest.stat().st_size if largest.is_file() else 0
+    sizes = [(file.name in _DEPTHS, file.stat().st_size, file) for file in files]
+    _, size, largest = max(sizes, default=(False, 0, path))
     if not size:
         return ()
-    with largest.open("rb") as file:
-        ends = file.read(_COMPARED_BYTES)
-        file.seek(max(size - _COMPARED_BYTES, 0))
-        return size, hashlib.sha256(ends + file.read()).hexdigest()
+    with largest.open("rb") as opened:
+        ends = opened.read(_COMPARED_BYTES)
+        opened.seek(max(size - _COMPARED_BYTES, 0))
+        return size, hashlib.sha256(ends + opened.read()).hexdigest()
 
 
 def find_recordings(folder: Path) -> list[Path]:
@@ -153,35 +168,30 @@ def find_recordings(folder: Path) -> list[Path]:
     found = []
     for inside, folders, names in os.walk(folder):
         here = Path(inside)
+        files = [name for name in sorted(names) if name.lower().endswith(_FILES)]
+        noted = not set(names).isdisjoint(_NOTES) and not files
+        one_recording = here != folder and (noted or not set(names).isdisjoint(_DEPTHS))
+        found += [here] if one_recording else [here / name for name in files if name[0] != "."]
         folders[:] = sorted(
             name
             for name in folders
-            if name[0] != "."
+            if not one_recording
+            and name[0] != "."
             and name not in _SKIPPED
             and not name.endswith((".liex", ".part"))
             and not (here / name / "session.json").exists()
         )
-        files = [name for name in sorted(names) if name.lower().endswith(_FILES)]
-        noted = any(name in names for name in _NOTES) and not files
-        if here != folder and (noted or any(name in names for name in _DEPTHS)):
-            found.append(here)
-            folders.clear()
-            continue
-        found += [here / name for name in files if name[0] != "."]
     return found
 
 
-def name_sessions(
-    recordings: Sequence[Path], raw: Path, stated: Sequence[str] = ()
-) -> tuple[list[Named], list[str]]:
+def name_sessions(stated: Mapping[Path, str], raw: Path) -> tuple[list[Named], list[str]]:
     """Animal and session of each recording, no pair of names twice, and what to check.
 
     Names that differ in capitals, spaces, _ or - alone are one animal.
 
     Args:
-        recordings: paths below `raw`.
+        stated: recordings below `raw`, and the animal's name in the metadata of each; may be empty.
         raw: the folder that the names count from.
-        stated: the animal's name in each recording's metadata; () where none was read.
 
     Returns:
         Animal, session, recording and what names the animal (metadata, folder or file name; '' for
@@ -191,7 +201,7 @@ def name_sessions(
     taken = set()
     spelled: dict[str, str] = {}
     notes = []
-    for path, told in zip(recordings, stated or [""] * len(recordings), strict=True):
+    for path, told in stated.items():
         found = find_subject(path, told, raw)
         by_name = find_subject(path, "", raw)
         if by_name.origin and same(by_name.id) != same(found.id):
@@ -202,12 +212,10 @@ def name_sessions(
         animal = spelled.setdefault(found.id.lower(), found.id)
         if animal != found.id:
             notes.append(f"{animal} and {found.id} are taken for one animal, {animal}")
-        session = base = _pairs(found.session or "01")
-        k = 1
-        while (animal.lower(), session.lower()) in taken:
-            k += 1
-            session = f"{base}_rec-{k}"
-        taken.add((animal.lower(), session.lower()))
+        base = _pairs(found.session or "01")
+        tries = (f"{base}_rec-{k}" if k > 1 else base for k in count(1))
+        session = next(one for one in tries if (animal, one.lower()) not in taken)
+        taken.add((animal, session.lower()))
         named.append((animal, session, path, found.origin))
     if unknown := [animal for animal, _, _, origin in named if not origin]:
         notes.append(
@@ -223,47 +231,30 @@ def _pairs(text: str) -> str:
     """A session's name: as it is where it is made of key-value pairs, otherwise its letters and
     digits.
     """
-    first, *pairs = text.split("_")
-    whole = re.fullmatch(r"[A-Za-z0-9]{1,32}", first) and len(pairs) <= 5
-    kept = all(re.fullmatch(r"[A-Za-z0-9]{1,32}-[A-Za-z0-9]{1,64}", pair) for pair in pairs)
-    return text if whole and kept else letters(text)[:32]
+    kept = re.fullmatch(r"[A-Za-z0-9]{1,32}(?:_[A-Za-z0-9]{1,32}-[A-Za-z0-9]{1,64}){0,5}", text)
+    return text if kept else letters(text)[:32]
 
 
 def _text(root: Path, named: Sequence[Named], notes: Sequence[str]) -> str:
     """The study file."""
-    lines = [
-        _HEADER.format(file=STUDY_FILE, raw=RAW),
-        *(f"# note: {note}" for note in notes),
-        f"name = {_quoted(root.resolve().name or 'study')}",
+    blocks = [
+        "\n".join(
+            [
+                _HEADER.format(file=STUDY_FILE, raw=RAW),
+                *(f"# note: {note}" for note in notes),
+                f"name = {_quoted(root.resolve().name or 'study')}",
+                _SETTINGS,
+            ]
+        )
     ]
-    lines += [
-        'plan = "mouse"                 # a bundled plan (see `liex info`), or a .toml file in '
-        "this folder",
-        f'results = "{DERIVED}"',
-        'shared = "off"                 # "subject": an animal has one size and shape',
-        "",
-        "[set]",
-        "",
-    ]
-    origins: dict[str, dict[str, None]] = {}
-    for animal, _, _, origin in named:
-        origins.setdefault(animal, {})[origin or "nothing, so check it"] = None
-    for animal, own in origins.items():
-        lines += [
-            "[[animals]]",
-            f"id = {_quoted(animal)}  # named by: {', '.join(own)}",
-            'group = ""                     # cage, sex, batch too',
-            "",
-        ]
+    for one in dict.fromkeys(animal for animal, *_ in named):
+        origins = dict.fromkeys(o or "nothing, so check it" for a, _, _, o in named if a == one)
+        blocks.append(_ANIMAL.format(id=_quoted(one), origins=", ".join(origins)))
     for animal, session, path, _ in named:
-        lines += [
-            "[[sessions]]",
-            f"animal = {_quoted(animal)}",
-            f"session = {_quoted(session)}",
-            f"recording = {_quoted(path.relative_to(root).as_posix())}",
-            "",
-        ]
-    return "\n".join(lines).rstrip() + "\n"
+        recording = path.relative_to(root).as_posix()
+        texts = (_quoted(text) for text in (animal, session, recording))
+        blocks.append(_SESSION.format(*texts))
+    return "\n".join(blocks)
 
 
 def _quoted(text: str) -> str:

@@ -57,8 +57,7 @@ class SessionStatus:
     @property
     def missing(self) -> bool:
         """Whether its recording is not there, although its results may be."""
-        said = self.state in ("failed", "excluded")
-        return not said and not self.session.recording_exists
+        return self.state not in ("failed", "excluded") and not self.session.recording_exists
 
     @property
     def to_do(self) -> bool:
@@ -81,12 +80,11 @@ def standings(
         LiexError: an id in `only` is none of the study's.
     """
     known = [session.id for session in study.sessions]
-    for id in only:
-        if id not in known:
-            raise LiexError(
-                f"the study {study.name} has no session {id}; it has "
-                f"{', '.join(known[:8]) or 'none'}"
-            )
+    if absent := [id for id in only if id not in known]:
+        raise LiexError(
+            f"the study {study.name} has no session {absent[0]}; it has "
+            f"{', '.join(known[:8]) or 'none'}"
+        )
     found = [
         standing(one.session, one.waits_for)
         for one in shared_sessions(study)
@@ -112,46 +110,39 @@ def standing(session: PlannedSession, waits_for: str = "") -> SessionStatus:
     """
     if session.exclude:
         return SessionStatus(session, "excluded", session.exclude)
-    if waits_for and (session.folder / "session.json").is_file():
+    file = session.folder / "session.json"
+    if waits_for and file.is_file():
         why = f"it shares size and shape with {waits_for}, which is to be looked at first"
         return SessionStatus(session, "changed", why)
-    if (session.folder / "session.json").is_file():
-        said: dict[str, str] = {}
-        try:
-            document = json.loads((session.folder / "session.json").read_text(encoding="utf-8"))
-            why = what_changed(session, document)
-            if not why:
-                said = _described_anew(session, document)
-        except (
-            OSError,
-            ValueError,
-            LiexError,
-            AttributeError,
-            TypeError,
-            KeyError,
-            RecursionError,
-        ):
-            document = {}
-            why = "its session.json cannot be read"
-        if said:
-            told = ", ".join(f"{key} = {value or 'unknown'}" for key, value in said.items())
-            why = f"described anew: {told}; nothing is measured again"
-        if why:
-            return SessionStatus(session, "changed", why, described=said)
-        input = str(document.get("input", {}).get("sha256", ""))
-        return SessionStatus(session, "done", to_look_at(verdict_in(document)), input=input)
+    if file.is_file():
+        return _measured(session, file)
     failure = read_failure(session.folder)
     if failure is not None:
         unsure = "input" not in failure or waits_for
         why = "" if unsure else what_changed(session, failure)
         reason = f"{why}; before, it failed: {failure['reason']}" if why else str(failure["reason"])
         return SessionStatus(session, "changed" if why else "failed", reason, failure)
-    begun = session.folder.with_name(f"{session.folder.name}.part").is_dir()
-    return (
-        SessionStatus(session, "begun", "it was interrupted and goes on")
-        if begun
-        else SessionStatus(session, "new", "new")
-    )
+    if session.folder.with_name(f"{session.folder.name}.part").is_dir():
+        return SessionStatus(session, "begun", "it was interrupted and goes on")
+    return SessionStatus(session, "new", "new")
+
+
+def _measured(session: PlannedSession, file: Path) -> SessionStatus:
+    """The status of a session that has results: whether they are those of today's study."""
+    said: dict[str, str] = {}
+    try:
+        document = json.loads(file.read_text(encoding="utf-8"))
+        why = what_changed(session, document)
+        said = {} if why else _described_anew(session, document)
+    except (OSError, ValueError, LiexError, AttributeError, TypeError, KeyError, RecursionError):
+        why = "its session.json cannot be read"
+    if said:
+        told = ", ".join(f"{key} = {value or 'unknown'}" for key, value in said.items())
+        why = f"described anew: {told}; nothing is measured again"
+    if why:
+        return SessionStatus(session, "changed", why, described=said)
+    input = str(document.get("input", {}).get("sha256", ""))
+    return SessionStatus(session, "done", to_look_at(verdict_in(document)), input=input)
 
 
 def to_check(found: Sequence[SessionStatus]) -> list[str]:
@@ -168,10 +159,9 @@ def to_check(found: Sequence[SessionStatus]) -> list[str]:
     animals = {one.animal.id: one.animal.model_dump(exclude={"set"}) for one in sessions}
     table = pd.DataFrame(animals.values()).rename(columns={"id": "subject_id"})
     notes = [*misnamed(sessions), *unified(table)[1]]
-    known: dict[tuple[Any, ...], str] = {}
+    known: dict[str, str] = {}
     for one in (one for one in found if one.input):
-        region = one.session.plan.arena.region
-        first = known.setdefault((one.input, repr(region)), one.session.id)
+        first = known.setdefault(f"{one.input} {one.session.plan.arena.region}", one.session.id)
         if first != one.session.id:
             notes.append(f"{one.session.id} is of the same recording as {first}")
     return notes
@@ -185,10 +175,10 @@ def misnamed(sessions: Sequence[PlannedSession]) -> list[str]:
     """
     known = {same(one.animal.id): one.animal.id for one in sessions}
     notes = []
-    for one in sessions:
+    for one in (one for one in sessions if one.plan.arena.region is None):
         found = find_subject(Path(one.recording))
-        other = known.get(same(found.id), one.animal.id) if found.origin else one.animal.id
-        if other != one.animal.id and one.plan.arena.region is None:
+        other = known.get(same(found.id)) if found.origin else None
+        if other not in (None, one.animal.id):
             notes.append(
                 f"{one.id}: the study names the animal {one.animal.id}, and the recording's "
                 f"{found.origin} {other}"

@@ -198,6 +198,21 @@ def test_a_recording_that_is_there_twice_counts_once(study, tmp_path, same_input
     assert other.name == "s1"
 
 
+def test_sessions_that_count_shares_otherwise_are_told(study, tmp_path):
+    for k in range(10):
+        shutil.copytree(study / f"sub-m{k}" / f"s{k}.liex", tmp_path / f"s{k}.liex")
+    old = [tmp_path / f"s{k}.liex/session.json" for k in range(10)]
+    for file in old[:2]:
+        file.write_text(json.dumps(json.loads(file.read_text()) | {"schema_version": 7}))
+    (said,) = compare_sessions([tmp_path], tmp_path / "out", ["walk_share"])["check"]
+    assert said.startswith(
+        "s0, s1 are of an earlier version of liex_lab, which counted lost frames"
+    )
+    for file in old:
+        file.write_text(json.dumps(json.loads(file.read_text()) | {"schema_version": 7}))
+    assert compare_sessions([tmp_path], tmp_path / "out", ["walk_share"])["check"] == []
+
+
 def test_two_days_of_one_mouse_are_told_as_possible_pseudo_replication(study, tmp_path):
     table = "subject_id,group\n" + "".join(f"m{k},{'ab'[k % 2]}\n" for k in range(10))
     (tmp_path / "animals.csv").write_text(table)
