@@ -11,7 +11,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from flask import Flask, Response, jsonify, request
+from flask import Flask, Response, jsonify, make_response, request
 
 from liex_lab.errors import LiexError, SessionError
 from liex_lab.sessions import correcting
@@ -203,9 +203,7 @@ def add_routes(server: Flask, desks: Desks, clerk: Clerk | None) -> None:
         try:
             return jsonify(make())
         except LiexError as error:
-            answer = jsonify({"said": str(error)})
-            answer.status_code = refused
-            return answer
+            return make_response({"said": str(error)}, refused)
 
     @server.before_request
     def ahead() -> None:
@@ -275,9 +273,8 @@ def add_routes(server: Flask, desks: Desks, clerk: Clerk | None) -> None:
         """Take a correction of the session `key`, JSON as of `Clerk.take`."""
         asked = request.get_json(silent=True)  # another site's form cannot send JSON
         if clerk is None or not isinstance(asked, dict):
-            answer = jsonify({"said": "no correction is taken here"})
-            answer.status_code = 403 if clerk is None else 400
-            return answer
+            said = {"said": "no correction is taken here"}
+            return make_response(said, 403 if clerk is None else 400)
         return told(lambda: clerk.take(key, asked))
 
 

@@ -9,7 +9,8 @@ joints their limits. Bout edits cut and replace half-open intervals.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, fields, replace
+from copy import deepcopy
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -29,7 +30,7 @@ from liex_lab.tables.schema import BOUTS
 from liex_lab.tracking.following import let_follow
 from liex_lab.tracking.observations import reversed_pose
 from liex_lab.tracking.offline import MARGIN, track_whole
-from liex_lab.tracking.track import CORRECTED, Flip, Track, ends_of
+from liex_lab.tracking.track import COLUMNS, CORRECTED, Flip, Track, ends_of
 
 if TYPE_CHECKING:
     from liex_lab.body.skeleton import Skeleton
@@ -89,8 +90,7 @@ def corrected_track(session: Session, log: Log, skeleton: Skeleton) -> Corrected
     if spans:
         track, flips, turned = _turned_round(session, track, index, spans)
     moves = _moves_of(log, skeleton)
-    root = SE3(track.root_rotation.copy(), track.root_mm.copy())
-    was = Pose(root, track.angles_rad.copy(), track.scale)
+    was = deepcopy(track.pose)
     moved = place_joints(track, index, moves, session.camera, session.T_arena_camera)
     if len(moved):
         followed = let_follow(track, was, moved)
@@ -127,7 +127,8 @@ def _turned_round(
     No row loses its pose or its trust.
     """
     seen, subject = read_evidence(session)
-    wanted = [Flip(*_rows_of(index, span), 1.0, True, HUMAN) for span in spans]
+    rows_of_spans = (np.searchsorted(index, (one.start_frame, one.stop_frame)) for one in spans)
+    wanted = [Flip(int(start), int(stop), 1.0, True, HUMAN) for start, stop in rows_of_spans]
     earlier = [
         flip for flip in read_flips(session) if flip.source == HUMAN
     ]  # of versions that wrote into the table
@@ -148,24 +149,18 @@ def _turned_round(
         | (exchanged & (np.einsum("nd,nd->n", was, now) > 0.0))  # passed by, and bridged as it was
     )
     trusted = near & (track.flag == "")
-    for column in fields(Track):
-        if column.name not in ("skeleton", "times_ns"):
-            getattr(track, column.name)[near & ~lost] = getattr(again.track, column.name)[
-                near & ~lost
-            ]
+    for name in {*COLUMNS} - {"times_ns"}:
+        getattr(track, name)[near & ~lost] = getattr(again.track, name)[near & ~lost]
     track.flag[trusted] = ""
     rows = np.flatnonzero(lost & exchanged)
-    turned = reversed_pose(track.skeleton, Pose(track.root, track.angles_rad, track.scale)[rows])
+    turned = reversed_pose(track.skeleton, track.pose[rows])
     _put(track, rows, turned, session.camera, session.T_arena_camera)
     return track, again.flips, np.flatnonzero(near)
 
 
 def _put(track: Track, rows: Rows, pose: Pose, camera: Camera, T_arena_camera: SE3) -> None:
     """Write poses into some rows of a track, in place."""
-    track.root_rotation[rows] = pose.root.rotation
-    track.root_mm[rows] = pose.root.translation
-    track.angles_rad[rows] = pose.angles
-    track.joints_mm[rows] = pose.joints(track.skeleton)
+    track.put_pose(rows, pose)
     track.uv_px[rows] = camera.project(T_arena_camera.inverse() @ track.joints_mm[rows])
 
 
@@ -221,13 +216,6 @@ def place_joints(
     track.bridged[rows] = False
     track.flag[rows] = CORRECTED
     return rows
-
-
-def _rows_of(index: Rows, span: FlipSpan) -> tuple[int, int]:
-    """First row of a span of frames, and the first row after it."""
-    return int(np.searchsorted(index, span.start_frame)), int(
-        np.searchsorted(index, span.stop_frame)
-    )
 
 
 def edited_bouts(

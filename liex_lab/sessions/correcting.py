@@ -95,24 +95,26 @@ def disagreements(session: Session) -> list[str]:
     index, time_s = (session.frames[name].to_numpy() for name in ("frame_index", "time_s"))
     ahead = _ahead(session)
     rows = np.flatnonzero(np.isfinite(ahead).all(axis=1))
-    apart = np.diff(time_s[rows]) > _APART_S
+    cosine = np.zeros(len(index))  # of the turn from the frame with a pose before each
+    cosine[rows[1:]] = (ahead[rows[1:]] * ahead[rows[:-1]]).sum(axis=1)
+    apart = set(rows[1:][np.diff(time_s[rows]) > _APART_S].tolist())
+    half_turns = set(np.flatnonzero(cosine < 0.0).tolist()) - apart
     ends_s = np.append(time_s, stop_times(time_s)[-1:])
     path = shlex.quote(str(session.path))
     found = []
     for number, one in exchanges:
-        ends = np.searchsorted(index, (one.start_frame, one.stop_frame))
-        before = ahead.copy()
-        before[slice(*ends)] *= -1.0
-        now, then = ((way[1:] * way[:-1]).sum(axis=1) for way in (ahead[rows], before[rows]))
-        half_turns = np.flatnonzero(~apart & (now < 0.0))
-        at = [k for k in np.searchsorted(rows, ends) - 1 if k in half_turns]
+        # the first row with a pose from each end on
+        ends = np.searchsorted(rows, np.searchsorted(index, (one.start_frame, one.stop_frame)))
+        ends = np.append(rows, len(index))[ends]
+        at = [row for row in ends.tolist() if row in half_turns]
         if not at:
             continue
-        free = np.array([0, *rows[1:][apart | (then < 0.0)], len(index)])
+        # an exchange makes half turns of its ends, and unmakes those that are there
+        free = np.array(sorted({0, len(index)} | apart | (half_turns ^ set(ends.tolist()))))
         start = free[np.abs(free[:-1] - ends[0]).argmin()]
         stop = free[free > start][np.abs(free[free > start] - ends[1]).argmin()]
         turns = (
-            f"{np.degrees(np.arccos(now[k])):.0f} degrees at frame {index[rows[k + 1]]}" for k in at
+            f"{np.degrees(np.arccos(cosine[row])):.0f} degrees at frame {index[row]}" for row in at
         )
         found.append(
             f"{one}: this disagrees with the frames around it (a turn of "
@@ -285,12 +287,11 @@ def _inset_mm(session: Session, recording: Recording, kept: Kept, joint: str) ->
         poses[names].to_numpy(float) for names in (["u_px", "v_px"], ["x_mm", "y_mm", "z_mm"])
     )
     into = session.T_arena_camera.inverse()
-    found = []
-    for row in chosen:
-        if not kept.holds(int(row), *uv[row]):
-            continue  # what is seen there is the still scene
-        seen = depth_under(recording.frame(int(row)).depth, *uv[row])
-        found.append((into @ places[row])[2] - seen)
+    found = [
+        (into @ places[row])[2] - depth_under(recording.frame(row).depth, *uv[row])
+        for row in chosen.tolist()
+        if kept.holds(row, *uv[row])  # else the still scene is seen there
+    ]
     known = np.array(found)[np.isfinite(found)]
     return max(0.0, float(np.median(known))) if len(known) else 0.0
 
@@ -424,9 +425,8 @@ def labelled_bouts(session: Session, labels: Any) -> list[BoutEdit]:
             f"none of these labels lies within the session {session.name}; check their times and "
             "names"
         )
-    first = int(time_ns[0])
-    last = _end_ns(session)
-    edges = [first, *(t for bout in bouts for t in (bout.start_ns, bout.stop_ns)), last]
+    ends = (t for bout in bouts for t in (bout.start_ns, bout.stop_ns))
+    edges = [int(time_ns[0]), *ends, _end_ns(session)]
     free = [
         BoutEdit("delete", "", a, b, "any")
         for a, b in zip(edges[::2], edges[1::2], strict=True)
@@ -518,11 +518,7 @@ def _joint_row(session: Session, frame: int, joint: str) -> tuple[int, Array]:
         raise SessionError(
             f"there is no frame {frame}; the recording has {index[0]} to {index[-1]}"
         )
-    place = (
-        session.poses[["x_mm", "y_mm", "z_mm"]]
-        .iloc[row * len(joints) + joints.index(joint)]
-        .to_numpy(float)
-    )
+    place = _joints(session)[row, joints.index(joint)]
     if not np.isfinite(place).all():
         raise SessionError(
             f"frame {frame} has no pose, so no joint of it can be moved; joints are moved where "

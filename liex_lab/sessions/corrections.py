@@ -304,11 +304,9 @@ class Log:
                 )
         who = author or author_name()
         now = datetime.now(UTC).isoformat(timespec="seconds")
-        number = max((entry.number for entry in self.entries), default=0)
-        new: list[Entry] = []
-        for undone, one in [*((n, None) for n in dict.fromkeys(undo)), *((0, w) for w in what)]:
-            number += 1
-            new.append(Entry(number, who, now, one, undone))
+        first = 1 + max((entry.number for entry in self.entries), default=0)
+        wanted = [*((None, number) for number in dict.fromkeys(undo)), *((one, 0) for one in what)]
+        new = [Entry(number, who, now, *one) for number, one in enumerate(wanted, first)]
         return Log(self.made_of, (*self.entries, *new), self.files, self.facts)
 
     def to_json(self) -> str:

@@ -74,7 +74,6 @@ def _follow(track: Track, was: Pose, rows: Rows, placed: NDArray[np.bool_]) -> R
     seconds = (track.times_ns[rows] - track.times_ns[rows[0]]) * 1e-9
     weight = np.ones(len(rows))
     nu = motion.degrees_of_freedom
-    pose = was[rows]
     for _ in range(_PASSES):
         moved = _smoothed(seconds, off, error / np.sqrt(weight), length, motion)
         pose = _moved(track, was, rows, moved)
@@ -89,15 +88,10 @@ def _follow(track: Track, was: Pose, rows: Rows, placed: NDArray[np.bool_]) -> R
         low, high = np.where(above, share, low), np.where(above, high, share)
         share = 0.5 * (low + high)
     pose = _moved(track, was, rows, low * moved)
-    joints = pose.joints(skeleton)
-    far = np.linalg.norm(joints - joints_were, axis=-1).max(axis=1) > _LEAST_MM
+    far = np.linalg.norm(pose.joints(skeleton) - joints_were, axis=-1).max(axis=1) > _LEAST_MM
     chosen = np.flatnonzero(far & ~placed)
-    into = rows[chosen]
-    track.root_rotation[into] = pose.root.rotation[chosen]
-    track.root_mm[into] = pose.root.translation[chosen]
-    track.angles_rad[into] = pose.angles[chosen]
-    track.joints_mm[into] = joints[chosen]
-    return into
+    track.put_pose(rows[chosen], pose[chosen])
+    return rows[chosen]
 
 
 def _departures(track: Track, was: Pose, rows: Rows, joints_were: Array) -> Array:

@@ -205,16 +205,11 @@ def _turn_round(
     itself is to be turned round elsewhere.
     """
     turned = np.zeros(len(seen), np.int64)
-    for span in corrections:
-        if span.undone_at:
-            continue
-        for t in range(span.start, min(span.stop, len(seen))):
-            if path[t] == NONE:
-                continue
-            if seen.known[t, path[t] ^ 1]:
-                path[t] ^= 1
-            else:
-                turned[t] += 1
+    for span in (one for one in corrections if not one.undone_at):
+        rows = span.start + np.flatnonzero(path[span.start : span.stop] != NONE)
+        has_other = seen.known[rows, path[rows] ^ 1]
+        path[rows[has_other]] ^= 1
+        turned[rows[~has_other]] += 1
         doubt[span.start : span.stop] = 0.0
     return turned
 

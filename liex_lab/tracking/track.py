@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from liex_lab.body.pose import Pose
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.geometry import SE3
 from liex_lab.runtime.memory import Allocator, blocks
@@ -172,12 +173,24 @@ class Track:
         Returns:
             All their rows.
         """
-        columns = (np.concatenate([getattr(part, name) for part in parts]) for name in _columns())
+        columns = (np.concatenate([getattr(part, name) for part in parts]) for name in COLUMNS)
         return Track(parts[0].skeleton, *columns)
+
+    def put_pose(self, rows: NDArray[np.int64], pose: Pose) -> None:
+        """Write poses into some rows, in place, but for `uv_px`, which belongs to the camera.
+
+        Args:
+            rows: (k,) the rows.
+            pose: (k) poses, arena frame.
+        """
+        self.root_rotation[rows] = pose.root.rotation
+        self.root_mm[rows] = pose.root.translation
+        self.angles_rad[rows] = pose.angles
+        self.joints_mm[rows] = pose.joints(self.skeleton)
 
     def __getitem__(self, rows: slice) -> Track:
         """Some consecutive frames; what is written into them is written into the whole."""
-        return Track(self.skeleton, *(getattr(self, name)[rows] for name in _columns()))
+        return Track(self.skeleton, *(getattr(self, name)[rows] for name in COLUMNS))
 
     @property
     def n_frames(self) -> int:
@@ -203,6 +216,11 @@ class Track:
         return SE3(self.root_rotation, self.root_mm)
 
     @property
+    def pose(self) -> Pose:
+        """The poses (n), arena frame; NaN where there is none."""
+        return Pose(self.root, self.angles_rad, self.scale)
+
+    @property
     def sd_root(self) -> Array:
         """(n, 6) standard deviations of the root's turn, rad, and shift, mm, on its own axes."""
         return np.asarray(np.sqrt(np.diagonal(self.cov_root, axis1=1, axis2=2)))
@@ -218,8 +236,7 @@ class Track:
         return self.scale * self.skeleton.length
 
 
-def _columns() -> list[str]:
-    return [f.name for f in fields(Track) if f.name != "skeleton"]
+COLUMNS = tuple(field.name for field in fields(Track) if field.name != "skeleton")
 
 
 @dataclass(frozen=True)

@@ -17,6 +17,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from threading import Lock
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -90,10 +91,8 @@ class _Topic:
         size: width and height, px; (0, 0) for loose points.
         metric: whether it holds metres by convention.
         order: (m,) numbers of messages that a recording was given already, by row.
-        log_ns: (n,) times of logging, ns.
-        stamp_ns: (n,) stamps of the sensor, ns.
-        publish_ns: (n,) times of sending, ns; 0 where they are not stated.
-        places: (3 n,) chunk, offset and length of each message.
+        rows: (6 n,) of each message the times of logging and of sending (0 where it is not stated)
+            and the stamp of the sensor, ns; chunk, offset and length.
     """
 
     channel: Channel
@@ -102,10 +101,7 @@ class _Topic:
     size: tuple[int, int]
     metric: bool = False
     order: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
-    log_ns: array[int] = field(default_factory=lambda: array("q"))
-    publish_ns: array[int] = field(default_factory=lambda: array("q"))
-    stamp_ns: array[int] = field(default_factory=lambda: array("q"))
-    places: array[int] = field(default_factory=lambda: array("q"))  # three to a message
+    rows: array[int] = field(default_factory=lambda: array("q"))
 
     @property
     def name(self) -> str:
@@ -124,10 +120,8 @@ class _Topic:
         """
         if max(message.log_time_ns, abs(stamp_ns)) >= _LIMIT_NS:
             raise DamagedMessage("a message's time cannot be")
-        self.log_ns.append(message.log_time_ns)
-        self.publish_ns.append(min(message.publish_time_ns, _LIMIT_NS))
-        self.stamp_ns.append(stamp_ns)
-        self.places.extend(message.place)
+        sent_ns = min(message.publish_time_ns, _LIMIT_NS)
+        self.rows.extend((message.log_time_ns, sent_ns, stamp_ns, *message.place))
 
     def add_all(self, listed: Listed) -> None:
         """Note messages that an index lists.
@@ -138,14 +132,12 @@ class _Topic:
         Raises:
             DamagedMessage: a time is beyond the year 2116; the others are noted.
         """
-        good = listed.log_time_ns < _LIMIT_NS
-        stamps = listed.log_time_ns if listed.stamp_ns is None else listed.stamp_ns
-        good &= (stamps < _LIMIT_NS) & (stamps > -_LIMIT_NS)
-        published = listed.log_time_ns if listed.publish_time_ns is None else listed.publish_time_ns
-        self.log_ns.frombytes(listed.log_time_ns[good].astype(np.int64).tobytes())
-        self.publish_ns.frombytes(np.minimum(published, _LIMIT_NS)[good].astype(np.int64).tobytes())
-        self.stamp_ns.frombytes(stamps[good].astype(np.int64).tobytes())
-        self.places.frombytes(np.ascontiguousarray(listed.places[good], np.int64).tobytes())
+        logged = listed.log_time_ns
+        sent = logged if listed.publish_time_ns is None else listed.publish_time_ns
+        stamps = logged if listed.stamp_ns is None else listed.stamp_ns
+        good = (logged < _LIMIT_NS) & (stamps < _LIMIT_NS) & (stamps > -_LIMIT_NS)
+        times = [one.astype(np.int64) for one in (logged, np.minimum(sent, _LIMIT_NS), stamps)]
+        self.rows.frombytes(np.column_stack([*times, listed.places])[good].tobytes())
         if not good.all():
             raise DamagedMessage("a message's time cannot be")
 
@@ -155,8 +147,8 @@ class _Topic:
         Args:
             chunk: number of the chunk; these messages are at the end.
         """
-        while self.places and self.places[-3] >= chunk:
-            del self.places[-3:], self.log_ns[-1], self.publish_ns[-1], self.stamp_ns[-1]
+        while self.rows and self.rows[-3] >= chunk:
+            del self.rows[-6:]
 
 
 @dataclass
@@ -168,7 +160,7 @@ class _Found:
         depths: the depth topics by channel.
         calibrations: the different calibrations by topic, each with the time of logging, ns, of
             the first message that has it.
-        listed: calibrations that were not read yet, by channel.
+        listed: time of logging, ns, and place of calibrations that were not read yet, by channel.
         stated: what a known program states about its recording.
         read: the channels of which a message could be read.
         failed: why a message of a channel could not be read.
@@ -178,7 +170,7 @@ class _Found:
     parsers: dict[Channel, Parser | None] = field(default_factory=dict)
     depths: dict[Channel, _Topic] = field(default_factory=dict)
     calibrations: dict[str, list[tuple[int, Calibration]]] = field(default_factory=dict)
-    listed: dict[Channel, list[Listed]] = field(default_factory=dict)
+    listed: dict[Channel, list[tuple[int, Place]]] = field(default_factory=dict)
     stated: Statements = field(default_factory=Statements)
     read: set[Channel] = field(default_factory=set)
     failed: dict[Channel, str] = field(default_factory=dict)
@@ -190,29 +182,33 @@ class _Found:
         return [f"{printable(topic)}: {printable(why, 200)}" for topic, why in whys.items()]
 
 
+@dataclass
 class _Frames:
-    """Pictures of one topic, fetched from the file one at a time."""
+    """Pictures of one topic, fetched from the file one at a time.
 
-    def __init__(
-        self,
-        file: MessageFile,
-        topic: _Topic,
-        order: NDArray[np.int64],
-        camera: Camera,
-        step_mm: float,
-        camera_file: CameraFile,
-        problems: list[str],
-    ) -> None:
-        self._file = file
-        self._topic = topic
-        self._camera = camera
-        self._step_mm = step_mm
-        self._places = np.array(topic.places, np.int64).reshape(-1, 3)[order]
-        self.scale = 1.0
-        self._unread = camera_file.unread
-        self._problems = problems
-        self._bad = set[int]()
-        self._lock = Lock()
+    Attributes:
+        file: the open file.
+        topic: the topic.
+        places: (n, 3) chunk, offset and length of each picture's message.
+        camera: the camera of the recording.
+        step_mm: mm in a step of 16-bit depth.
+        unread: what a camera.toml calls unread.
+        problems: is told of pictures that cannot be read.
+        scale: what all depth is multiplied by.
+        bad: pictures of which it was told.
+        lock: held while the file is read.
+    """
+
+    file: MessageFile
+    topic: _Topic
+    places: NDArray[np.int64]
+    camera: Camera
+    step_mm: float
+    unread: Sequence[float]
+    problems: list[str]
+    scale: float = 1.0
+    bad: set[int] = field(default_factory=set)
+    lock: Any = field(default_factory=Lock)
 
     def read(self, number: int) -> Depth:
         """Depth of one picture; one that is damaged or of another size is wholly unread.
@@ -223,16 +219,16 @@ class _Frames:
         Returns:
             (H, W) float32 mm, 0 where unread.
         """
-        with self._lock:
-            data = self._file.read(Place(*self._places[number].tolist()))
+        with self.lock:
+            data = self.file.read(Place(*self.places[number].tolist()))
         depth, why = self._decode(data)
         if depth is not None:
             return depth
-        camera = self._camera
-        if number not in self._bad:
-            self._bad.add(number)
-            self._problems.append(
-                f"frame {number} of {printable(self._topic.name)} is damaged or not of "
+        camera = self.camera
+        if number not in self.bad:
+            self.bad.add(number)
+            self.problems.append(
+                f"frame {number} of {printable(self.topic.name)} is damaged or not of "
                 f"{camera.width} x {camera.height} pixels ({printable(why)}), and was taken as "
                 "wholly unread"
             )
@@ -241,20 +237,19 @@ class _Frames:
     def _decode(self, data: memoryview) -> tuple[Depth | None, str]:
         """Depth of a message, or why there is none."""
         try:
-            message = self._topic.parse(data)
+            message = self.topic.parse(data)
         except _DAMAGE as error:
-            if self._file.parsed:
+            if self.file.parsed:
                 return None, str(error)
             raise RecordingError(
-                f"{self._file.path} is damaged ({error}); copy it again, or go on with what is "
+                f"{self.file.path} is damaged ({error}); copy it again, or go on with what is "
                 "whole by adding --set recording.accept_truncated=true"
             ) from None
         assert isinstance(message, DepthMessage)
-        try:
-            depth = decode(message, self._camera, self._step_mm, self.scale, self._unread)
-        except _DAMAGE:
-            depth = None
-        return depth, said_kind(message)
+        with suppress(*_DAMAGE):
+            depth = decode(message, self.camera, self.step_mm, self.scale, self.unread)
+            return depth, said_kind(message)
+        return None, said_kind(message)
 
     def scale_by(self, factors: Sequence[float]) -> None:
         """Multiply all depth by the first factor that gives depths of a camera above an animal.
@@ -263,9 +258,7 @@ class _Frames:
             factors: in order; the last is taken where none gives such depths, and the first where
                 nothing tells.
         """
-        seen = (
-            self.read(n) for n in ((0, len(self._places) // 2) if len(set(factors)) > 1 else ())
-        )
+        seen = (self.read(n) for n in ((0, len(self.places) // 2) if len(set(factors)) > 1 else ()))
         median_mm = next((float(np.median(one[one > 0])) for one in seen if one.any()), 0.0)
         plausible = [f for f in factors if PLAUSIBLE_MM[0] <= f * median_mm <= PLAUSIBLE_MM[1]]
         self.scale = [*plausible, factors[-1 if median_mm else 0]][0]
@@ -324,13 +317,15 @@ def _open(
     doubts: list[str] = []
     if not file.whole:
         problems.append(
-            f"{path.name} is cut or damaged; {len(chosen.log_ns)} whole depth pictures can be read "
-            "from it"
+            f"{path.name} is cut or damaged; {len(chosen.rows) // 6} whole depth pictures can be "
+            "read from it"
         )
     the_camera = _camera(path, chosen, found, camera_file, camera, file.notes, problems, doubts)
     # A writer may flush its topics out of turn; the order of logging is the file's own order.
-    order = np.argsort(np.array(chosen.log_ns, np.int64), kind="stable")
-    monotone = in_order_of_sensor(_stamps(chosen, order, found.stated, problems), chosen.order)
+    rows = np.array(chosen.rows, np.int64).reshape(-1, 6)
+    rows = rows[np.argsort(rows[:, 0], kind="stable")]
+    stamps = _stamps(chosen.name, rows, found.stated, problems)
+    monotone = in_order_of_sensor(stamps, chosen.order)
     chosen.order = monotone.order
     problems += [monotone.problem] if monotone.problem else []
     packed = PackFacts.of(file.notes)
@@ -340,9 +335,8 @@ def _open(
     metadata = ({"session_start_time": start} if start else {}) | stated | camera_file.metadata
     stated_mm = found.stated.step_mm(chosen.name, camera_file.states_unit, problems, doubts)
     step_mm = (stated_mm or 1.0) * packed.step_mm
-    frames = _Frames(
-        file, chosen, order[monotone.order], the_camera, step_mm, camera_file, problems
-    )
+    places = rows[monotone.order, 3:]
+    frames = _Frames(file, chosen, places, the_camera, step_mm, camera_file.unread, problems)
     unit_mm = camera_file.unit_mm
     literal = unit_mm / (1000.0 if chosen.metric else step_mm)
     known = camera_file.states_unit and bool(file.notes or stated_mm)
@@ -369,27 +363,24 @@ def _open(
 
 
 def _stamps(
-    topic: _Topic, order: NDArray[np.int64], stated: Statements, problems: list[str]
+    topic: str, rows: NDArray[np.int64], stated: Statements, problems: list[str]
 ) -> NDArray[np.int64]:
     """The sensor's stamps; the times of sending or logging instead when pictures have none (zero),
     for two clocks do not mix.
     """
-    stamps = np.array(topic.stamp_ns, np.int64)[order]
-    logged = np.array(topic.log_ns, np.int64)[order]
-    published = np.array(topic.publish_ns, np.int64)[order]
-    stamps = stated.sensor_times(topic.name, logged, stamps, problems)
+    logged, sent, in_headers = rows[:, :3].T
+    stamps = stated.sensor_times(topic, logged, in_headers, problems)
     unstamped = int(((stamps == 0) & (logged != 0)).sum())
-    if unstamped == 1 and len(stamps) > 1 and np.all(np.diff(stamps) > 0):
-        unstamped = 0  # a clock that begins at zero with the first picture
-    if not unstamped:
+    rises = len(stamps) > 1 and np.all(np.diff(stamps) > 0)
+    if not unstamped or (unstamped == 1 and rises):  # a clock that begins at zero is one
         return stamps
-    steps, sent_steps = np.diff(logged), np.diff(published)
-    sent = len(steps) > 1 and sent_steps.min() > 0 and 2.0 * sent_steps.std() < steps.std()
+    steps, sent_steps = np.diff(logged), np.diff(sent)
+    is_even = len(steps) > 1 and sent_steps.min() > 0 and 2.0 * sent_steps.std() < steps.std()
     problems.append(
         f"{unstamped} of {len(stamps)} pictures have no stamp of the sensor, so the times of "
-        f"{'sending' if sent else 'logging'} are used"
+        f"{'sending' if is_even else 'logging'} are used"
     )
-    return published if sent else logged
+    return sent if is_even else logged
 
 
 def _walk(file: MessageFile, found: _Found, progress: Progress) -> None:
@@ -413,14 +404,11 @@ def _walk(file: MessageFile, found: _Found, progress: Progress) -> None:
 
     for message in file.walk(wanted, progress):
         take(message)
-    for channel, parts in found.listed.items():  # some, spread over the recording up to the last
-        places = np.concatenate(
-            [np.c_[part.log_time_ns.astype(np.int64), part.places] for part in parts]
-        )
-        some = np.linspace(0, len(places) - 1, _N_COMPARED).astype(int)
-        for log_ns, *place in places[some].tolist():
+    for channel, listed in found.listed.items():  # some, spread over the recording up to the last
+        for k in np.linspace(0, len(listed) - 1, _N_COMPARED).astype(int).tolist():
+            log_ns, place = listed[k]
             with suppress(RecordingError):  # a damaged chunk: who reads its pictures is told
-                take(Envelope(channel, log_ns, Place(*place), file.read(Place(*place))))
+                take(Envelope(channel, log_ns, place, file.read(place)))
     file.whole = file.whole and not found.failed.keys() & found.read
 
 
@@ -433,7 +421,9 @@ def _note(found: _Found, envelope: Envelope | Listed, parse: Parser) -> bool:
         if channel in found.depths:
             found.depths[channel].add_all(envelope)
         elif channel.topic in found.calibrations and len(envelope.places):
-            found.listed.setdefault(channel, []).append(envelope)
+            places = map(Place._make, envelope.places.tolist())
+            known_at = found.listed.setdefault(channel, [])
+            known_at.extend(zip(envelope.log_time_ns.tolist(), places, strict=True))
         return True
     message = parse(envelope.data)
     if isinstance(message, Statement):
@@ -577,12 +567,10 @@ def _calibrated(
     camera = Camera(*numbers, *size, printable(source), distortion=bent)
     camera = fitting(camera, *_size(topic, size), here)
     if _is_of_another_lens(topic, where, calibration):
-        frame = (
-            f"frame {printable(calibration.frame_id)}" if calibration.frame_id else "by its name"
-        )
+        frame = f"frame {calibration.frame_id}" if calibration.frame_id else "by its name"
         doubts.append(
-            f"the calibration is that of another lens ({frame}, on {printable(where)}) than the "
-            f"depth on {printable(topic.name)}, so lengths may be wrong: {_STATE_IT}"
+            f"the calibration is that of another lens ({printable(frame)}, on {printable(where)}) "
+            f"than the depth on {printable(topic.name)}, so lengths may be wrong: {_STATE_IT}"
         )
     for later_ns, other in others:
         later, _ = _mapped(topic, other)
@@ -620,8 +608,12 @@ def _mapped(topic: _Topic, calibration: Calibration) -> tuple[_Numbers, tuple[in
     full = (calibration.width or topic.size[0], calibration.height or topic.size[1])
     part = ((width or full[0]) // across, (height or full[1]) // down)
     plain = (k[0], k[4], k[2], k[5])
-    cx, cy = ((k[2] - x + 0.5) / across - 0.5, (k[5] - y + 0.5) / down - 0.5)
-    mapped = (k[0] / across, k[4] / down, cx, cy)
+    mapped = (
+        k[0] / across,
+        k[4] / down,
+        (k[2] - x + 0.5) / across - 0.5,
+        (k[5] - y + 0.5) / down - 0.5,
+    )
     wanted = _size(topic, full)
     if wanted not in (full, part):
         return plain, full
@@ -652,24 +644,23 @@ def _calibrations_of(
     """The calibrations of the same camera: of the same frame, and among those on the topic nearest
     by its name.
     """
-    good = {
-        name: [one for one in many if _is_usable(one[1])] for name, many in calibrations.items()
+    usable = {
+        name: good
+        for name, many in calibrations.items()
+        if (good := [one for one in many if _is_usable(one[1])])
     }
-    usable = {name: many for name, many in good.items() if many}
-    same_frame = {
-        name: many
-        for name, many in usable.items()
-        if topic.frame_id and many[0][1].frame_id == topic.frame_id
-    }
-    for some in (same_frame, usable):
-        near = {name: _shared(topic.name, name) for name in some}
+    firsts = {name: good[0][1] for name, good in usable.items()}
+    same_frame = [
+        name
+        for name, first in firsts.items()
+        if topic.frame_id and first.frame_id == topic.frame_id
+    ]
+    for some in (same_frame, list(usable)):
+        near = {name: _n_shared(topic.name, name) for name in some}
         nearest = [name for name in some if near[name] == max(near.values())]
-        if (
-            nearest
-            and (len(some) == 1 or near[nearest[0]] > 0)
-            and _alike([some[name][0][1] for name in nearest])
-        ):
-            return nearest[0], some[nearest[0]]
+        numbers = {(c.k, c.d, c.width, c.height) for c in map(firsts.get, nearest) if c}
+        if len(numbers) == 1 and (len(some) == 1 or near[nearest[0]] > 0):
+            return nearest[0], usable[nearest[0]]
     return None
 
 
@@ -679,17 +670,8 @@ def _is_usable(calibration: Calibration) -> bool:
     return len(k) == 9 and bool(np.isfinite(k).all()) and k[0] > 0 and k[4] > 0
 
 
-def _shared(one: str, other: str) -> int:
+def _n_shared(one: str, other: str) -> int:
     """How many words of two topics are the same from the beginning on."""
-    pairs = list(
-        zip(one.strip("/").split("/")[:-1], other.strip("/").split("/")[:-1], strict=False)
-    )
+    words = (topic.strip("/").split("/")[:-1] for topic in (one, other))
+    pairs = list(zip(*words, strict=False))
     return next((n for n, (a, b) in enumerate(pairs) if a != b), len(pairs))
-
-
-def _alike(calibrations: Sequence[Calibration]) -> bool:
-    first = calibrations[0]
-    return all(
-        (c.k, c.d, c.width, c.height) == (first.k, first.d, first.width, first.height)
-        for c in calibrations
-    )

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable
+from typing import Any
 
 from liex_lab.recordings.formats.messages.message_file import unpacked_message
 from liex_lab.recordings.formats.messages.messages import (
@@ -41,15 +42,19 @@ class _Fields:
         self.data = data
         self.at = self.origin
 
-    def numbers(self, kind: str, n: int = 1) -> tuple[float, ...]:
+    def _next(self, n_bytes: int) -> memoryview:
+        """The next bytes."""
+        begin = self.at
+        self.at = begin + n_bytes
+        if self.at > len(self.data):
+            raise DamagedMessage("a message ends too early")
+        return self.data[begin : self.at]
+
+    def numbers(self, kind: str, n: int = 1) -> tuple[Any, ...]:
         """`n` numbers of a type, as `struct` names it."""
         size = struct.calcsize(f"<{kind}")
         self.at += (self.origin - self.at) % min(size, self.largest_step)
-        begin = self.at
-        self.at = self.at + n * size
-        if self.at > len(self.data):
-            raise DamagedMessage("a message ends too early")
-        return struct.unpack_from(f"{self.order}{n}{kind}", self.data, begin)
+        return struct.unpack(f"{self.order}{n}{kind}", self._next(n * size))
 
     def whole(self, kind: str = "I") -> int:
         """One integer."""
@@ -64,12 +69,7 @@ class _Fields:
 
     def blob(self) -> memoryview:
         """Bytes with their number before them."""
-        n = self.whole()
-        begin = self.at
-        self.at = self.at + n
-        if self.at > len(self.data):
-            raise DamagedMessage("a message ends too early")
-        return self.data[begin : self.at]
+        return self._next(self.whole())
 
     def text(self) -> str:
         """A string."""
@@ -110,14 +110,11 @@ class _CdrFields(_Fields):
 
 def _image(fields: _Fields) -> RawPicture:
     stamp_ns, frame_id = fields.header()
-    height = fields.whole()
-    width = fields.whole()
+    height, width = fields.numbers("I", 2)
     encoding = fields.text()
-    big_endian = fields.whole("B")
+    big_endian = bool(fields.whole("B"))
     step = fields.whole()
-    return RawPicture(
-        stamp_ns, frame_id, width, height, encoding, step, bool(big_endian), fields.blob()
-    )
+    return RawPicture(stamp_ns, frame_id, width, height, encoding, step, big_endian, fields.blob())
 
 
 def _packed_image(fields: _Fields) -> PackedPicture:
@@ -127,22 +124,19 @@ def _packed_image(fields: _Fields) -> PackedPicture:
 
 def _camera_info(fields: _Fields) -> Calibration:
     _, frame_id = fields.header()
-    height = fields.whole()
-    width = fields.whole()
+    height, width = fields.numbers("I", 2)
     model = fields.text()
     d = fields.floats()
-    k = fields.numbers("d", 9)
-    _ = fields.numbers("d", 9)
+    kr = fields.numbers("d", 18)  # camera matrix, rotation
     p = fields.numbers("d", 12)
-    binning = (fields.whole(), fields.whole())
-    x, y, rows, columns = (fields.whole() for _ in range(4))
-    return Calibration(frame_id, width, height, model, d, k, p, binning, (x, y, columns, rows))
+    across, down, x, y, rows, columns = fields.numbers("I", 6)
+    part = (x, y, columns, rows)
+    return Calibration(frame_id, width, height, model, d, kr[:9], p, (across, down), part)
 
 
 def _cloud(fields: _Fields) -> PointCloud:
     stamp_ns, frame_id = fields.header()
-    height = fields.whole()
-    width = fields.whole()
+    height, width = fields.numbers("I", 2)
     if fields.largest_step == _SECOND_VERSION:  # the list's length in bytes
         fields.whole()
     n_fields = fields.whole()
@@ -156,8 +150,7 @@ def _cloud(fields: _Fields) -> PointCloud:
     columns = {
         name: (at, order + _FIELD_TYPES[kind]) for name, at, kind in found if kind in _FIELD_TYPES
     }
-    point_step = fields.whole()
-    row_step = fields.whole()
+    point_step, row_step = fields.numbers("I", 2)
     data = fields.blob()
     return PointCloud(stamp_ns, frame_id, width, height, columns, point_step, row_step, data)
 
