@@ -71,6 +71,7 @@ AFTER = {
     "docs/howto/movement.md": "README.md",
     "docs/howto/nwb.md": "README.md",
     "docs/howto/spreadsheet.md": "README.md",
+    "docs/reference/session-folder.md": "README.md",
     "docs/tutorials/study.md": "docs/tutorials/mouse.md",
 }
 # a page with the same commands as another one
