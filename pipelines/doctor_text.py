@@ -14,12 +14,16 @@ from liex_lab.errors import printable
 from liex_lab.optics.sensor_card import SensorCard
 from liex_lab.sessions.room import megabytes
 
+# lines that decide whether a run makes sense
+_FIRST = ("frames", "rate", "gaps", "intrinsics from", "floor", "arena", "animal", "plan")
 
-def print_report(findings: dict[str, Any]) -> None:
+
+def print_report(findings: dict[str, Any], verbose: bool = True) -> None:
     """Print the findings on one screen, and the problems below.
 
     Args:
         findings: what `examine` returns.
+        verbose: print every line, not only those that decide whether a run makes sense.
     """
     from rich.console import Console
     from rich.table import Table
@@ -27,7 +31,8 @@ def print_report(findings: dict[str, Any]) -> None:
 
     table = Table(show_header=False, box=None, pad_edge=False)
     for name, value in lines(findings):
-        table.add_row(name, Text(printable(value)))
+        if verbose or name in _FIRST:
+            table.add_row(name, Text(printable(value)))
     console = Console()
     console.print(table)
     if not findings["problems"] and not findings["missing"]:

@@ -217,7 +217,10 @@ def _region(
             return None, [f"whole pictures are kept, for no arena was found: {error}"]
         region = _found_region(learned, seen.width, seen.height)
         if region is None:
-            return None, ["whole pictures are kept, for no region of the arena stands out"]
+            return None, [
+                "whole images are kept, for the measurement uses all of them, not only the arena; "
+                "name the region to be kept with --region"
+            ]
         if learned.scene.standing.n_together > 1:  # type: ignore[attr-defined]
             return None, [
                 "whole pictures are kept, for more than one thing moves in them; name what is to "

@@ -194,6 +194,9 @@ def doctor(
     ] = None,
     plan: WhichPlan = None,
     settings: Settings = None,
+    verbose: Annotated[
+        bool, typer.Option("--verbose", help="Print lens, sensor and scene as well.")
+    ] = False,
 ) -> None:
     """Report what a recording contains, what is wrong with it, and which plan fits."""
     from liex_lab.plan import Plan
@@ -220,7 +223,7 @@ def doctor(
     if as_json:
         say(to_json(findings))
     else:
-        print_report(findings)
+        print_report(findings, verbose)
 
 
 app.command(rich_help_panel=RECORDINGS)(convert)

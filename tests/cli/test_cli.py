@@ -271,11 +271,12 @@ def test_doctor_prints_json_that_holds_no_nan(monkeypatch: pytest.MonkeyPatch) -
         "problems": ["a"],
     }
     job(monkeypatch, "doctor", examine=lambda path, **options: findings)
-    job(monkeypatch, "doctor_text", print_report=lambda findings: print("fine"))
+    job(monkeypatch, "doctor_text", print_report=lambda findings, verbose: print(verbose))
     result = CliRunner().invoke(cli.app, ["doctor", "m01.mcap", "--json"])
     expected = {"format": "mcap", "n_frames": 3, "fx": 365.0, "floor_mm": None, "problems": ["a"]}
     assert json.loads(result.output) == expected
-    assert CliRunner().invoke(cli.app, ["doctor", "m01.mcap"]).output == "fine\n"
+    assert CliRunner().invoke(cli.app, ["doctor", "m01.mcap"]).output == "False\n"
+    assert CliRunner().invoke(cli.app, ["doctor", "m01.mcap", "--verbose"]).output == "True\n"
 
 
 def test_evaluate_pose_writes_its_numbers(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
