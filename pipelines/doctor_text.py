@@ -128,7 +128,7 @@ def _floor(f: dict[str, Any]) -> list[tuple[str, str]]:
             if degrees is None
             else f"{_text(f['floor_mm'], 'mm')} from the lens, tilted by {degrees} degrees",
         ),
-        ("arena", _arena_text(f["arena"])),
+        ("arena", _arena_text(f["arena"], f["scene"])),
         ("scene", _scene_text(f["scene"])),
         *_sensor_lines(f["scene"]),
     ]
@@ -156,12 +156,13 @@ def _animal(f: dict[str, Any]) -> list[tuple[str, str]]:
     ]
 
 
-def _arena_text(arena: dict[str, Any] | None) -> str:
-    """The shape of the floor, and what it ends at."""
+def _arena_text(arena: dict[str, Any] | None, scene: dict[str, Any] | None) -> str:
+    """The shape of the floor, what it ends at, and whether a region is stated."""
+    region = "; only a region is looked at" if scene and scene["region_px"] else ""
     if arena is None:
-        return "unknown"
+        return f"unknown{region}"
     edge = {"wall": ", with walls", "drop": ", ends in the air"}.get(arena.get("edge", ""), "")
-    return f"{Arena.from_dict(arena)}{edge}"
+    return f"{Arena.from_dict(arena)}{edge}{region}"
 
 
 def _scene_text(scene: dict[str, Any] | None) -> str:
@@ -180,7 +181,6 @@ def _scene_text(scene: dict[str, Any] | None) -> str:
             f"rough to {_text(floor['roughness_mm'], 'mm', 1)}",
             f"{len(fixtures)} thing{'' if len(fixtures) == 1 else 's'} on it{times}",
             f"at most {scene['n_animals']} moving together",
-            *(["only a region is looked at"] if scene["region_px"] else []),
         ]
     )
 
