@@ -10,7 +10,6 @@ another object where its centroid is farther from the middle of the true joints 
 
 from __future__ import annotations
 
-import hashlib
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -30,7 +29,6 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 _OTHER = 0.8  # of the spine: the centroid of what is farther off is that of another object
-_FINGERPRINT = 16  # hexadecimal digits
 
 
 @dataclass(frozen=True)
@@ -42,14 +40,12 @@ class CommonView:
         second: (n,) bool, the second of two components is measured.
         wrong: (n,) bool, the component that is measured is another object.
         wrong_alone: (n,) bool, so would be that of the choice by area and volume.
-        fingerprint: hash of pictures, components, choice and size.
     """
 
     size: float
     second: NDArray[np.bool_]
     wrong: NDArray[np.bool_]
     wrong_alone: NDArray[np.bool_]
-    fingerprint: str
 
 
 def common_view(
@@ -71,17 +67,10 @@ def common_view(
     size = chooser.find_size(frames, scene)
     second = chooser.second_is_animal(frames, scene, size)
     crops, crop_cameras = chosen(frames, scene, 1.0, second, True)
-    told = hashlib.sha256(frames.tobytes())
-    for part in (crops.heights, crops.n_px.astype(np.int64), second, np.round([size], 6)):
-        told.update(part.tobytes())
     wrong = is_other(crops, crop_cameras, recording)
     alone = second_is_likelier(frames, scene)
     wrong_alone = is_other(*chosen(frames, scene, 1.0, alone, True), recording)
-    return (
-        scene,
-        frames,
-        CommonView(size, second, wrong, wrong_alone, told.hexdigest()[:_FINGERPRINT]),
-    )
+    return scene, frames, CommonView(size, second, wrong, wrong_alone)
 
 
 def is_other(crops: HeightMaps, crop_cameras: Array, recording: TrueRecording) -> NDArray[np.bool_]:

@@ -5,12 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
-ELSEWHERE = (
-    "other_processor"  # of a kept row: the processor, where the row is of another's pictures
-)
-SAME_AS = "same_as"  # of how a kept row was made: hashes of earlier code that learns the same
-OTHER_MODEL = "other_model"  # of a kept row: what another file of its model says of it, if any
-
 
 @dataclass
 class Results:

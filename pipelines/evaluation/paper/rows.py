@@ -24,9 +24,6 @@ from liex_lab.runtime.progress import Progress, silent
 from ...build import plan_of
 from .common_view import CommonView, common_view, measured
 from .examples import examples_in, failures_in
-from .fingerprints import fingerprint_of
-from .given import Given
-from .trained_by import baseline_of_today, paper_of_today
 
 if TYPE_CHECKING:
     from liex_lab.baselines.baseline import Baseline
@@ -50,7 +47,7 @@ _QUANTILES = 101
 def runs_of(animal: str, variant: str, progress: Progress = silent) -> list[Subject]:
     """The runs of a row: its models, each with its draws of the initial poses.
 
-    A cached model that other code trained, or nobody knows which, is trained again.
+    Models come from the cache where this version of the program trained them, else are trained now.
 
     Args:
         animal: a bundled animal's name, or the path of a skeleton's TOML.
@@ -60,15 +57,13 @@ def runs_of(animal: str, variant: str, progress: Progress = silent) -> list[Subj
     Raises:
         MissingPackageError: the CNN is asked for and torch is not installed.
     """
-    from ...training.baselines import BASELINES
-    from ..pose import estimator_of
+    from ..pose import estimator_of, subject_of
 
-    if variant in BASELINES:
-        return [baseline_of_today(animal, variant, progress)]
     if variant not in TRAINING_DRAWS:
-        return [estimator_of(animal, variant, progress)]
-    n = TRAINING_DRAWS[variant]
-    return runs_of_models(variant, [paper_of_today(animal, draw, progress) for draw in range(n)])
+        return [subject_of(animal, variant, progress)]
+    draws = range(TRAINING_DRAWS[variant])
+    models = [estimator_of(animal, "paper", progress, draw=draw) for draw in draws]
+    return runs_of_models(variant, models)
 
 
 def runs_of_models(variant: str, models: Sequence[PoseEstimator]) -> list[Subject]:
@@ -103,8 +98,8 @@ def measured_rows(
     chooser: PoseEstimator,
     tests: Mapping[str, Sequence[TrueRecording]],
     progress: Progress,
-) -> tuple[dict[str, dict[str, Any]], dict[str, list[CommonView]], dict[str, Given]]:
-    """What is measured of each row, and what each was given.
+) -> dict[str, dict[str, Any]]:
+    """What is measured of each row.
 
     Every recording is rendered and its scene learned once.
 
@@ -116,45 +111,40 @@ def measured_rows(
         progress: told recording by recording.
 
     Returns:
-        By row `splits` and `rate`, `examples` and `failures`; and by split the view of each of its
-        recordings, and what was given in them in numbers.
+        By row `splits` and `rate`, `examples` and, of those that Fig. 17 draws, `failures`.
     """
     rows: dict[str, dict[str, Any]] = {
         name: {"splits": {}, "examples": [], "failures": []} for name in runs
     }
-    views: dict[str, list[CommonView]] = {}
-    given: dict[str, Given] = {}
     for split, sessions in tests.items():
         measured_ones = []
         for k, recording in enumerate(sessions):
             progress(k, len(sessions), f"measuring {recording.name}")
             measured_ones.append(_measure(recording, animal, runs, chooser))
-        views[split] = [one.view for one in measured_ones]
-        given[split] = Given.join([one.given for one in measured_ones])
+        views = [one.view for one in measured_ones]
         for name in runs:
             errors = [
                 PoseErrors.join(list(of_run))
                 for of_run in zip(*(one.errors[name] for one in measured_ones), strict=True)
             ]
             first = [one.first[name] for one in measured_ones]
-            numbers = numbers_of(errors, views[split])
-            rows[name]["splits"][split] = {**numbers, "given": given[split].to_dict()}
+            rows[name]["splits"][split] = numbers_of(errors, views)
             rows[name]["examples"] += examples_in(split, first, sessions)
-            rows[name]["failures"] += failures_in(split, first, sessions)
+            if name in SWEPT:
+                rows[name]["failures"] += failures_in(split, first, sessions)
     progress(0, None, "timing")
     timed = {name: some[0] for name, some in runs.items()}
     for name, rate in rates_of(animal, timed, next(iter(tests.values()))).items():
         rows[name]["rate"] = rate
-    return rows, views, given
+    return rows
 
 
 class _Measured(NamedTuple):
-    """One recording: what every row is given, as it is and in numbers; by row the errors of its
-    runs, and the joints (n, J, 3) mm that the first of them finds.
+    """One recording: what every row is given; by row the errors of its runs, and the joints
+    (n, J, 3) mm that the first of them finds.
     """
 
     view: CommonView
-    given: Given
     errors: dict[str, list[PoseErrors]]
     first: dict[str, Array]
 
@@ -166,7 +156,7 @@ def _measure(
     chooser: PoseEstimator,
 ) -> _Measured:
     scene, frames, view = common_view(recording, plan_of(animal), chooser)
-    out = _Measured(view, Given.of(frames, view), {name: [] for name in runs}, {})
+    out = _Measured(view, {name: [] for name in runs}, {})
     cut: dict[Any, Any] = {}
     tip = chooser.skeleton.tip
     for name, subjects in runs.items():
@@ -189,7 +179,7 @@ def numbers_of(runs: Sequence[PoseErrors], views: Sequence[CommonView]) -> dict[
     Returns:
         `median_mm`, `mean_mm`, `interval95` (of the median) and `mean_interval95`, `run_median_mm`,
         `wrong_object`, `wrong_object_alone`, `n_frames`, `n_recordings`, the figures of
-        `PoseErrors.summary` over all runs, error of each joint, quantiles, and the fingerprint.
+        `PoseErrors.summary` over all runs, error of each joint, and quantiles.
     """
     errors = PoseErrors.join(list(runs))
     recording = np.concatenate([np.full(len(one.wrong), k) for k, one in enumerate(views)])
@@ -214,7 +204,6 @@ def numbers_of(runs: Sequence[PoseErrors], views: Sequence[CommonView]) -> dict[
         "error_quantiles_mm": [round(float(x), 3) for x in np.quantile(found, spread)]
         if len(found)
         else [],
-        "fingerprint": fingerprint_of(views),
     }
 
 

@@ -5,25 +5,22 @@ default, the paper's variant of Lie-X, its ablations without multiple initial po
 learned metric, and the baselines RF and CNN. All see the same frames and, in each, the same object
 with the same size (`common_view`). Numbers: those of `rows`, 101 quantiles of the error (Fig 8),
 frames/s on at most two cores, sensitivity to five parameters (Fig 7), candidates and convergence of
-one image (Fig 13 to 16). Rows whose models take long to train come from kept results where these
-are of today's code, training and test pictures, to the last digit or, of another processor's, in
-numbers (`given`); a row of which they are not is left out, and the command that measures it anew
-stands in its place.
+one image (Fig 13 to 16). Rows and curves whose models take long to train come from kept results
+(`kept`) unless they are asked for.
 """
 
 from __future__ import annotations
 
 import shlex
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
-from liex_lab.errors import MissingPackageError
-from liex_lab.evaluation.pose import plain
+from liex_lab.errors import MissingPackageError, PlanError
 from liex_lab.runtime.progress import Progress, silent
 
-from .budget import CURVES, Budget
-from .results import ELSEWHERE, OTHER_MODEL, Results
+from .results import Results
 from .rows import ROWS, SWEPT, TRAINING_DRAWS
 
 if TYPE_CHECKING:
@@ -31,13 +28,69 @@ if TYPE_CHECKING:
     from liex_lab.estimation.estimator import PoseEstimator
     from liex_lab.simulation.recording import TrueRecording
 
-    from .common_view import CommonView
     from .drawers import Drawers
     from .further import Further
-    from .given import Given
     from .rows import Subject
 
+CURVES = "fig7"  # stands for the curves among the names of rows
 _N_SESSIONS = 40
+_QUICK_FRAMES = 100
+_ILLUSTRATED = 128  # images behind the figures of candidates and convergence
+_QUICK_ILLUSTRATED = 16
+
+
+@dataclass(frozen=True)
+class Budget:
+    """How much is measured, and of what.
+
+    Attributes:
+        n_frames: frames of each split, rounded up to whole recordings; None takes all.
+        fresh: rows that are trained and measured now.
+        curves: those of Fig. 7 are, too.
+        kept: the others come from datasets/kept_results; else they are missing.
+        quick: every row is trained on next to nothing, to see that everything runs.
+        sealed: the sealed split is measured instead of the others.
+    """
+
+    n_frames: int | None
+    fresh: tuple[str, ...]
+    curves: bool
+    kept: bool
+    quick: bool
+    sealed: bool
+
+    @staticmethod
+    def of(
+        n_frames: int | None, quick: bool, fresh: bool, rows: Sequence[str], sealed: bool
+    ) -> Budget:
+        """What the options of the command line ask for.
+
+        Args:
+            n_frames: frames of each split; with any, nothing kept is used.
+            quick: every row is trained on next to nothing.
+            fresh: all rows and curves are trained and measured now.
+            rows: names of rows that are, and `CURVES`; () names none.
+            sealed: the sealed split; with it, nothing kept is used.
+
+        Raises:
+            PlanError: there is no such row.
+        """
+        known = (*ROWS, CURVES)
+        if unknown := [row for row in rows if row not in known]:
+            raise PlanError(f"there is no row '{unknown[0]}'; known are {', '.join(known)}")
+        wanted = tuple(row for row in ROWS if not rows or row in rows or row == "default")
+        if quick:
+            return Budget(n_frames or _QUICK_FRAMES, wanted, True, False, True, sealed)
+        whole = n_frames is None and not sealed
+        everything = fresh and not rows
+        return Budget(
+            n_frames,
+            fresh=wanted if fresh or rows or not whole else ("default",),
+            curves=whole and (everything or CURVES in rows),
+            kept=whole and not everything,
+            quick=False,
+            sealed=sealed,
+        )
 
 
 def make_tables(
@@ -77,9 +130,10 @@ def make_tables(
 
     Raises:
         PlanError: there is no such row, or part.
+        LiexError: kept results are damaged.
     """
-    from .cached_results import keep_results
     from .further import check_parts, measure_further
+    from .kept import keep_results
     from .table_text import write_tables
 
     check_parts(without)
@@ -90,8 +144,8 @@ def make_tables(
     all_results = [results_of(animal, budget, command, progress) for animal in animals]
     written = write_tables(folder, all_results, quick)
     for results in all_results:
-        kept = _unmarked(results.rows), _unmarked(results.sensitivity)
-        written.append(keep_results(folder / "kept", results.animal, *kept))
+        parts = [_without_origin(part) for part in (results.rows, results.sensitivity)]
+        written.append(keep_results(folder / "kept", results.animal, *parts))
     if drawers is None:
         return written
     further = measure_further(
@@ -143,14 +197,11 @@ def _command(
     return shlex.join([*words, *(f"--row={row}" for row in rows)])
 
 
-def _unmarked(rows: Mapping[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
+def _without_origin(entries: Mapping[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
+    """Rows or curves without what is true of this run alone."""
     return {
-        name: {
-            key: value
-            for key, value in row.items()
-            if key not in ("origin", ELSEWHERE, OTHER_MODEL)
-        }
-        for name, row in rows.items()
+        name: {key: value for key, value in entry.items() if key != "origin"}
+        for name, entry in entries.items()
     }
 
 
@@ -167,40 +218,37 @@ def results_of(animal: str, budget: Budget, command: str, progress: Progress) ->
     from liex_lab.simulation.simulator import world_of
 
     from ...training.pose_model import shared_pictures
-    from .fingerprints import made_by
     from .illustrations import illustrate
+    from .kept import kept_results
     from .rows import measured_rows
 
     skeleton = Skeleton.load(animal)
+    kept = kept_results(skeleton.name) if budget.kept else {"rows": {}, "sensitivity": {}}
     tests = _tests(skeleton, budget)
     results = Results(skeleton.name, list(skeleton.names), list(tests), sealed=budget.sealed)
     results.test_postures = world_of(skeleton).test_postures
-    default = _subjects(animal, ["default"], budget, results, progress)
-    chooser = cast("PoseEstimator", default["default"][0])
-    wanted = [name for name in budget.fresh if name != "default"]
     with shared_pictures():
-        runs = default | _subjects(animal, wanted, budget, results, progress)
-    rows, views, given = measured_rows(animal, runs, chooser, tests, progress)
-    kept = _kept(skeleton, budget, tests, views, given, results)
-    for name, row in rows.items():
-        made = {"quick": True} if budget.quick else made_from(name, skeleton)
-        known = {} if budget.quick else hashes_of(animal, name)
-        n_models = 1 if budget.quick else TRAINING_DRAWS.get(name, 1)
-        results.rows[name] = {
-            "origin": "measured",
-            "made": {
-                "from": made,
-                "command": command,
-                "seeds": list(range(n_models)),
-                **known,
-                **made_by(),
-            },
-            **row,
-        }
-    results.rows = {name: results.rows[name] for name in ROWS if name in results.rows}
-    results.sensitivity = _sensitivities(skeleton, kept, budget, command, results, progress)
+        runs = _runs(animal, budget, results, progress)
+    chooser = cast("PoseEstimator", runs["default"][0])
+    measured = measured_rows(animal, runs, chooser, tests, progress)
+    for name in ROWS:
+        if name in measured:
+            made = _made(name, skeleton, budget, command, results.test_postures)
+            results.rows[name] = {"origin": "measured", "made": made, **measured[name]}
+        elif name in kept["rows"]:
+            results.rows[name] = {**kept["rows"][name], "origin": "kept"}
+        elif name not in results.missing:
+            results.missing[name] = (
+                f"no row is kept; {_anew(skeleton.name, name)} measures it"
+                if budget.kept
+                else "it was not asked for"
+            )
+    results.sensitivity = _sensitivities(
+        skeleton, kept["sensitivity"], budget, command, results, progress
+    )
     progress(0, None, f"{skeleton.name}: candidates and convergence")
-    results.illustration = illustrate(chooser.model, budget.n_illustrated)
+    n_images = _QUICK_ILLUSTRATED if budget.quick else _ILLUSTRATED
+    results.illustration = illustrate(chooser.model, n_images)
     results.examples, results.failures = _poses(results, tests)
     return results
 
@@ -211,7 +259,7 @@ def _poses(
     """The poses that are drawn: of all rows in the examples, and where two rows err most."""
     from .examples import shown_poses
 
-    examples = {name: row["examples"] for name, row in results.rows.items() if "examples" in row}
+    examples = {name: row["examples"] for name, row in results.rows.items()}
     failures = {
         name: shown_poses(some, {name: some}, tests)
         for name in SWEPT[::-1]
@@ -233,112 +281,45 @@ def _tests(skeleton: Skeleton, budget: Budget) -> dict[str, Sequence[TrueRecordi
     return {split: world.test_split(split, n_sessions=n_sessions) for split in splits}
 
 
-def _kept(
-    skeleton: Skeleton,
-    budget: Budget,
-    tests: Mapping[str, Sequence[TrueRecording]],
-    views: Mapping[str, Sequence[CommonView]],
-    given: Mapping[str, Given],
-    results: Results,
-) -> Mapping[str, Any]:
-    """Kept rows that fit go into the results, why another does not into `missing`; the curves."""
-    from .cached_results import kept_results, taken, why_refused
-    from .kept_examples import examples_of_kept, other_model
-
-    if not budget.kept:
-        for name in ROWS:
-            if name not in budget.fresh:
-                results.missing[name] = "it was not asked for"
-        return {}
-    kept = kept_results(skeleton.name)
-    for name in ROWS:
-        if name in budget.fresh:
-            continue
-        row = kept["rows"].get(name)
-        why = "no row is kept"
-        if row is not None:
-            made, hashes = made_from(name, skeleton), hashes_of(skeleton.name, name)
-            why = why_refused(row, made, hashes, views, given)
-            if not why:
-                other = other_model(skeleton.name, name, row, hashes["models"], tests, views)
-                why = other.refused
-        if row is None or why:
-            results.missing[name] = f"{why}; {_anew(skeleton.name, name)} measures it"
-        else:
-            results.rows[name] = {**taken(row, hashes, views, given), "origin": "kept"}
-            if other.told:
-                results.rows[name][OTHER_MODEL] = other.told
-            if found := examples_of_kept(skeleton.name, name, row, tests, views):
-                results.rows[name]["examples"] = found
-    return cast("Mapping[str, Any]", kept["sensitivity"])
-
-
 def _anew(animal: str, row: str) -> str:
     """The command that measures one row anew."""
     return f"`{_command([animal], None, False, True, [row])} --out DIR`"
 
 
-def _subjects(
-    animal: str, names: Sequence[str], budget: Budget, results: Results, progress: Progress
+def _runs(
+    animal: str, budget: Budget, results: Results, progress: Progress
 ) -> dict[str, list[Subject]]:
     """What has to be measured; why a row cannot be goes into `results.missing`."""
     from .quick import quick_runs
     from .rows import runs_of
 
-    subjects = {}
-    for name in names:
+    runs = {}
+    for name in budget.fresh:
         try:
-            subjects[name] = (quick_runs if budget.quick else runs_of)(animal, name, progress)
+            runs[name] = (quick_runs if budget.quick else runs_of)(animal, name, progress)
         except MissingPackageError as error:
             results.missing[name] = str(error)
-    return subjects
+    return runs
 
 
-def made_from(variant: str, skeleton: Skeleton) -> dict[str, Any]:
-    """What decides a row's numbers: how its model is trained, and what is done with it.
-
-    Args:
-        variant: a name of `ROWS`.
-        skeleton: the animal's skeleton.
-
-    Returns:
-        Plain values: recipe and method, or the training of a baseline.
-    """
-    from liex_lab.estimation.method import method_of
-
+def _made(
+    variant: str, skeleton: Skeleton, budget: Budget, command: str, test_postures: str
+) -> dict[str, Any]:
+    """How a row is made now."""
     from ...training.baselines import BASELINES, training_of
     from ...training.pose_model import recipe_of
+    from .kept import made_by
 
     if variant in BASELINES:
-        return training_of(variant, skeleton).to_dict()
-    base = "default" if variant == "default" else "paper"
+        recipe = training_of(variant, skeleton).recipe
+    else:
+        recipe = recipe_of("default" if variant == "default" else "paper", skeleton)
     return {
-        "recipe": plain(vars(recipe_of(base, skeleton))),
-        "method": plain(method_of(base, skeleton).to_dict()),
-    }
-
-
-def hashes_of(animal: str, variant: str) -> dict[str, Any]:
-    """What a row was made with today: hashes, see `fingerprints`, its pictures in numbers, and
-    where test postures come from.
-
-    Args:
-        animal: the animal's name.
-        variant: a name of `ROWS`.
-    """
-    from liex_lab.body.skeleton import Skeleton
-    from liex_lab.simulation.simulator import world_of
-
-    from .fingerprints import learning_code, training_given, training_pictures
-    from .trained_by import model_digests
-
-    postures = world_of(Skeleton.load(animal)).test_postures
-    return {
-        **({"test_postures": postures} if postures else {}),
-        "learning_code": learning_code(variant),
-        "training_pictures": training_pictures(variant, animal),
-        "training_given": training_given(variant, animal),
-        "models": model_digests(animal, variant, TRAINING_DRAWS.get(variant, 1), of_today=True),
+        **made_by(command),
+        "seed": recipe.seed,
+        "seeds": list(range(1 if budget.quick else TRAINING_DRAWS.get(variant, 1))),
+        "training_images": None if budget.quick else recipe.n_images,
+        "test_postures": test_postures,
     }
 
 
@@ -350,40 +331,21 @@ def _sensitivities(
     results: Results,
     progress: Progress,
 ) -> dict[str, Any]:
-    """Fig. 7 of the paper's variant and of ours, kept or measured now.
-
-    A curve is measured where it is asked for and none is kept that fits; a kept one that is of
-    another method, training or code is left out.
-    """
-    from liex_lab.estimation.method import method_of
-
-    from .fingerprints import learning_code, made_by
+    """Fig. 7 of the paper's variant and of ours, measured now where it is asked for, or kept."""
+    from .kept import made_by
     from .quick import QUICK_SWEEP
-    from .sensitivity import Sweep, sensitivity, without_void
+    from .sensitivity import Sweep, sensitivity
 
     curves = {}
     for variant in SWEPT[: 1 if budget.quick else None]:
-        sweep = QUICK_SWEEP if budget.quick else Sweep()
-        made = {**made_from(variant, skeleton), "sweep": plain(vars(sweep))}
-        made["method"].pop("tells_facing", None)  # no model of a sweep does
-        code = learning_code(variant)
-        known = kept.get(variant)
-        if known is not None and (
-            known["made"]["from"] == made and known["made"].get("learning_code") == code
-        ):
-            kept_curve = without_void(known, method_of(variant, skeleton))
-            curves[variant] = {**kept_curve, "origin": "kept"}
-            continue
-        if not budget.curves:
+        if budget.curves:
+            sweep = QUICK_SWEEP if budget.quick else Sweep()
+            curve = sensitivity(skeleton, variant, sweep, progress)
+            curves[variant] = {**curve, "made": made_by(command), "origin": "measured"}
+        elif variant in kept:
+            curves[variant] = {**kept[variant], "origin": "kept"}
+        else:
             results.missing[f"Fig. 7, {variant}"] = (
-                f"no curve is kept of today's method and code; {_anew(skeleton.name, CURVES)} "
-                "measures it"
+                f"no curve is kept; {_anew(skeleton.name, CURVES)} measures it"
             )
-            continue
-        curve = sensitivity(skeleton, variant, sweep, progress)
-        curves[variant] = {
-            **curve,
-            "made": {"from": made, "command": command, "learning_code": code, **made_by()},
-            "origin": "measured",
-        }
     return curves

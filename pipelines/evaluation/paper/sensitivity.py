@@ -9,7 +9,6 @@ of its own, on 2,048 images, so errors are larger than in the tables; only the c
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -115,23 +114,6 @@ def left_out(method: Method) -> dict[str, str]:
         method: the variant.
     """
     return {} if method.proposals is None else {INITIAL_POSES: _PROPOSED}
-
-
-def without_void(curves: Mapping[str, Any], method: Method) -> dict[str, Any]:
-    """Curves as `sensitivity` returns them, without those of numbers that the method does not vary.
-
-    Results that were kept before these were left out hold such curves.
-
-    Args:
-        curves: what `sensitivity` returned, or what was kept of it.
-        method: the variant.
-    """
-    void = left_out(method)
-    parts = {
-        name: {number: value for number, value in curves[name].items() if number not in void}
-        for name in ("curves", "chosen")
-    }
-    return {**curves, **parts, "left_out": void}
 
 
 def sensitivity(

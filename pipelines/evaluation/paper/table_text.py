@@ -17,11 +17,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from liex_lab.evaluation.pose import POSE_PROTOCOL, plain
+from liex_lab.sessions.provenance import package_version
 
 from .deviations import DEVIATIONS, HAND
-from .given import elsewhere
+from .kept import processor
 from .published import OTHERS_FPS, OTHERS_MM, PUBLISHED_FPS, PUBLISHED_MM, TITLES
-from .results import ELSEWHERE, OTHER_MODEL, SAME_AS
 
 if TYPE_CHECKING:
     from .results import Results
@@ -52,7 +52,7 @@ _COLUMNS = (
     "published_frames_per_s",
     "origin",
     "processor",
-    ELSEWHERE,
+    "other_processor",
     "seed",
     "version",
     "command",
@@ -88,10 +88,9 @@ HOW = (
     "all of them. Published numbers are means on real recordings, other cameras and other "
     "animals: they show the order of the methods, and are not to be compared with ours in "
     "millimetres. A row is *measured* in this run, or *kept*: measured earlier, with the command, "
-    "seeds and version below; kept rows are of the same test pictures, foreground, training and "
-    "code, by their hashes, and are left out where these differ. Of a row of *another "
-    "processor*, whose pictures differ in the last digit of a number, code and recipe are the "
-    "same, and what it was given agrees in numbers. Frames/s count the foreground too, on frames "
+    "seeds and version below; the notes name each one of another version of the program. A row of "
+    "*another processor* was measured on another machine than this run's, where pictures and "
+    "models can differ in the last digit of a number. Frames/s count the foreground too, on frames "
     "in memory; those of a kept row are of another run, so compare its ratio to "
     "the default, which was timed beside it."
 )
@@ -175,11 +174,11 @@ def _by_split(results: Results) -> dict[str, dict[str, dict[str, Any]]]:
         split: {
             variant: {
                 **{name: row["splits"][split].get(name) for name in _FLAT},
-                "training_images": _training_images(row),
-                "seeds": row["made"].get("seeds"),
+                "training_images": row["made"]["training_images"],
+                "seeds": row["made"]["seeds"],
                 "origin": row["origin"],
                 "processor": row["made"].get("processor"),
-                ELSEWHERE: row.get(ELSEWHERE),
+                "other_processor": _other_processor(row),
             }
             for variant, row in results.rows.items()
         }
@@ -187,10 +186,10 @@ def _by_split(results: Results) -> dict[str, dict[str, dict[str, Any]]]:
     }
 
 
-def _training_images(row: dict[str, Any]) -> int | None:
-    """Images that the regressors of a row learned from."""
-    images = row["made"]["from"].get("recipe", {}).get("n_images")
-    return None if images is None else int(images)
+def _other_processor(row: dict[str, Any]) -> str | None:
+    """The processor of a row that was measured on another one than this run's."""
+    known = row["made"].get("processor")
+    return None if known == processor() else known
 
 
 def _rows(results: Results, only_rates: bool) -> Iterator[dict[str, Any]]:
@@ -202,18 +201,13 @@ def _rows(results: Results, only_rates: bool) -> Iterator[dict[str, Any]]:
             "method": TITLES[variant],
             "variant": variant,
             "origin": row["origin"],
-            "processor": row["made"].get("processor"),
-            ELSEWHERE: row.get(ELSEWHERE),
+            "other_processor": _other_processor(row),
+            **row["made"],
             **row["rate"],
             "published_mean_joint_error_mm": published.get(variant),
             "published_frames_per_s": PUBLISHED_FPS.get(results.animal)
             if variant == "paper"
             else None,
-            "seed": row["made"]["from"].get("recipe", {}).get("seed"),
-            "seeds": row["made"].get("seeds"),
-            "training_images": _training_images(row),
-            "version": row["made"]["version"],
-            "command": row["made"]["command"],
         }
         if only_rates:
             yield fixed
@@ -291,7 +285,7 @@ def mean_table(results: Results) -> tuple[list[str], list[list[str]]]:
 
 def _origin(row: dict[str, Any]) -> str:
     """Measured in this run, or kept, and then on what other processor."""
-    return f"{row['origin']}{', another processor' if row.get(ELSEWHERE) else ''}"
+    return f"{row['origin']}{', another processor' if _other_processor(row) else ''}"
 
 
 def _median(numbers: dict[str, Any]) -> str:
@@ -312,8 +306,8 @@ def _flips(numbers: dict[str, Any]) -> str:
 
 
 def words(results: Results, quick: bool) -> list[str]:
-    """Which rows are missing, of another processor or of earlier code, and where the order is not
-    the paper's.
+    """Which rows are missing, which were kept by another version or of other postures, and where
+    the order is not the paper's.
 
     Of a quick run nothing is said of the order.
 
@@ -329,20 +323,10 @@ def words(results: Results, quick: bool) -> list[str]:
         f"{TITLES.get(variant, variant)} was not measured: {why}."
         for variant, why in results.missing.items()
     ]
-    sentences += [
-        told for name, row in results.rows.items() if (told := elsewhere(TITLES[name], row))
-    ]
-    sentences += [
-        f"{TITLES[name]} was measured with earlier code ({', '.join(before)}), which learns from "
-        "2,048 pictures the same as today's to the last bit."
-        for name, row in results.rows.items()
-        if (before := row.get("made", {}).get(SAME_AS))
-    ]
-    sentences += [
-        f"{TITLES[name]}: {row[OTHER_MODEL]}."
-        for name, row in results.rows.items()
-        if row.get(OTHER_MODEL)
-    ]
+    for name, row in results.rows.items():
+        sentences += _notes(TITLES[name], row, results.test_postures)
+    for name, curve in results.sensitivity.items():
+        sentences += _notes(f"Fig. 7, {name},", curve, "")
     if quick:
         return sentences
     for variant in results.rows:
@@ -355,6 +339,18 @@ def words(results: Results, quick: bool) -> list[str]:
             "No two methods come out in another order than the paper's with intervals apart."
         )
     return sentences + turned
+
+
+def _notes(title: str, entry: dict[str, Any], test_postures: str) -> Iterator[str]:
+    """What a reader has to know of a kept row or curve."""
+    if entry.get("origin") != "kept":
+        return
+    made = entry["made"]
+    postures = made.get("test_postures")
+    if made["version"] != package_version("liex_lab"):
+        yield f"{title} was measured by version {made['version']} with `{made['command']}`."
+    if postures and postures != test_postures:
+        yield f"{title} was measured with test postures {postures}."
 
 
 def _where_ahead(results: Results, a: str, b: str) -> str:
@@ -430,18 +426,17 @@ def origin_table(results: Sequence[Results]) -> tuple[list[str], list[list[str]]
     for r in results:
         for variant, row in r.rows.items():
             made = row["made"]
-            recipe = made["from"].get("recipe", {})
             rows.append(
                 [
                     r.animal,
                     TITLES[variant],
                     _origin(row),
-                    str(recipe.get("n_images", "")),
-                    f"{recipe.get('seed', '')} ({len(made.get('seeds') or [0])})",
-                    f"{made['version']} ({made['code']})",
+                    str(made["training_images"] or ""),
+                    f"{made['seed']} ({len(made['seeds'])})",
+                    f"{made['version']}, {made['date']}",
                     ", ".join(filter(None, (made["machine"], made.get("processor")))),
                     f"`{made['command']}`",
                 ]
             )
-    head = ["animal", "method", "row", "training images", "seed (trainings)", "version (code)"]
+    head = ["animal", "method", "row", "training images", "seed (trainings)", "version, date"]
     return [*head, "machine", "command"], rows

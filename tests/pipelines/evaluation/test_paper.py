@@ -4,11 +4,10 @@ follow numbers.
 
 from __future__ import annotations
 
-import copy
 import csv
-import hashlib
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -24,18 +23,15 @@ from liex_lab.dashboards.paper.tracking import draw_tracking
 from liex_lab.pipelines.build import plan_of
 from liex_lab.pipelines.evaluation import pose
 from liex_lab.pipelines.evaluation.paper import (
-    cached_results,
     common_view,
     examples,
     exhibits,
-    fingerprints,
-    given,
-    kept_examples,
+    illustrations,
+    kept,
     quick,
     rows,
     run,
     table_text,
-    trained_by,
 )
 from liex_lab.pipelines.evaluation.paper.deviations import DEVIATIONS
 from liex_lab.pipelines.evaluation.paper.drawers import Drawers
@@ -45,10 +41,9 @@ from liex_lab.pipelines.evaluation.paper.sensitivity import (
     Sweep,
     chosen_values,
     with_value,
-    without_void,
 )
-from liex_lab.pipelines.training import pose_model
 from liex_lab.pipelines.training.baselines import training_of
+from liex_lab.pipelines.training.pose_model import recipe_of
 
 from liex_lab.baselines.cnn import CnnPlan
 from liex_lab.baselines.forest import ForestPlan, train_forests
@@ -59,6 +54,7 @@ from liex_lab.estimation.estimator import PoseEstimator
 from liex_lab.estimation.method import METHODS, method_of
 from liex_lab.forests.grow import GrowthPlan
 from liex_lab.runtime.progress import silent
+from liex_lab.sessions.provenance import package_version
 from liex_lab.simulation import simulator
 from liex_lab.simulation.recording import SyntheticSession
 from liex_lab.simulation.sensors import PRIMESENSE_QVGA_SENSOR
@@ -207,8 +203,8 @@ def test_the_page_holds_every_table_and_figure_with_a_sentence_and_asks_no_other
 
 @pytest.mark.slow
 def test_kept_rows_keep_their_poses_in_the_examples(made):
-    kept = json.loads((made / "kept" / "mouse.json").read_text())["rows"]
-    assert kept
+    kept_rows = kept.kept_results("mouse", made / "kept")["rows"]
+    assert kept_rows
     recordings = {split: SmallWorld().test_split(split) for split in ("clean", "hard")}
     places = [
         {"split": split, "recording": k, "frame": i}
@@ -216,92 +212,16 @@ def test_kept_rows_keep_their_poses_in_the_examples(made):
         for k, i in examples.example_frames(some)
     ]
     assert len(places) == 4
-    for name, row in kept.items():
+    for name, row in kept_rows.items():
         assert [{key: one[key] for key in places[0]} for one in row["examples"]] == places
-        again = kept_examples.examples_of_kept("mouse", name, row, recordings, {})
-        assert again == row["examples"]
-        shown = examples.shown_poses(places, {name: again}, recordings)
+        shown = examples.shown_poses(places, {name: row["examples"]}, recordings)
         for one in shown:
             recording = recordings[one["split"]][one["recording"]]
             np.testing.assert_array_equal(one["truth"], recording.joints_camera[one["frame"]])
             uv = one["camera"].project(one["truth"]).round().astype(int)
             assert (one["depth"][uv[:, 1], uv[:, 0]] > 0).mean() > 0.5
-    worst = kept["paper"]["failures"][0]
-    assert worst["error_mm"] >= max(0.0, kept["paper"]["splits"]["clean"]["median_mm"])
-
-
-def test_a_kept_row_without_poses_gets_them_only_from_the_very_model_it_was_measured_with(
-    monkeypatch,
-):
-    recordings = {"hard": SmallWorld().test_split("hard")[:1]}
-    chooser = PoseEstimator.load("mouse")
-    view = common_view.common_view(recordings["hard"][0], plan_of("mouse"), chooser)[2]
-    views = {"hard": [view]}
-    monkeypatch.setattr(trained_by, "model_digests", lambda *_: ["a"])
-    monkeypatch.setattr(pose, "subject_of", lambda *_: chooser)
-    found, refused = (
-        kept_examples.examples_of_kept(
-            "mouse", "rf", {"made": {"models": [digest]}}, recordings, views
-        )
-        for digest in ("a", "b")
-    )
-    assert refused == []
-    ((k, i),) = examples.example_frames(recordings["hard"])
-    (one,) = found
-    assert (one["recording"], one["frame"]) == (k, i)
-    off = np.array(one["joints_mm"]) - recordings["hard"][0].joints_camera[i]
-    assert np.linalg.norm(off, axis=-1).mean() < 15
-
-
-def test_another_model_file_is_compared_by_the_poses_in_the_row_s_examples(monkeypatch):
-    """Another calibration makes another file, and no other pose."""
-    recordings = {"hard": SmallWorld().test_split("hard")[:1]}
-    own = PoseEstimator.load("mouse")
-    view = common_view.common_view(recordings["hard"][0], plan_of("mouse"), own)[2]
-    views = {"hard": [view]}
-    monkeypatch.setattr(pose, "subject_of", lambda *_: own)
-    told = kept_examples._poses_of_model("mouse", "rf", recordings, views)
-    row = {"made": {"models": ["a"]}, "examples": told}
-
-    def of(row: Any, models: list[str | None]) -> kept_examples.OtherModel:
-        return kept_examples.other_model("mouse", "rf", row, models, recordings, views)
-
-    nothing = kept_examples.OtherModel()
-    for models in (["a"], [None]):
-        assert of(row, list(models)) == nothing
-    assert of({"made": row["made"]}, ["b"]) == nothing  # there is nothing to compare
-    same = of(row, ["b"])
-    assert same.refused == ""
-    assert "file of its model is a, and training gives b here" in same.told
-    assert "1 example frames are the same within 0.03 mm" in same.told
-    moved = copy.deepcopy(row)
-    moved["examples"][0]["joints_mm"][2][1] += 0.5
-    other = of(moved, ["b"])
-    assert other.told == ""
-    assert "its file is a, and training gives b here" in other.refused
-    assert "up to 0.50 mm apart" in other.refused
-    moved["examples"][0]["joints_mm"] = None
-    assert "inf mm apart" in of(moved, ["b"]).refused
-    results = run.Results("mouse", [], [], rows={"paper": {"other_model": same.told}})
-    assert table_text.words(results, quick=True) == [f"Lie-X, the paper's variant: {same.told}."]
-
-
-@pytest.mark.parametrize("note", [None, "other code", "today"])
-def test_only_a_model_that_today_s_code_is_known_to_have_trained_is_set_against_a_row(
-    note, monkeypatch, tmp_path
-):
-    monkeypatch.setenv("LIEX_CACHE", str(tmp_path))
-    path = pose_model.cache_path("mouse", "paper", 1)
-    path.write_bytes(b"model")
-    if note:
-        code = fingerprints.learning_code("paper") if note == "today" else note
-        trained_by.note(path, code)
-    digest = hashlib.sha256(b"model").hexdigest()[:16]
-    for variant in ("paper", "paper-no-metric"):  # of the same models
-        found = trained_by.model_digests("mouse", variant, 3, of_today=True)
-        assert found == [None, digest if note == "today" else None, None]
-        assert trained_by.model_digests("mouse", variant, 3) == [None, digest, None]
-    assert trained_by.model_digests("mouse", "default", 1, of_today=True) != [None]
+    worst = kept_rows["paper"]["failures"][0]
+    assert worst["error_mm"] >= max(0.0, kept_rows["paper"]["splits"]["clean"]["median_mm"])
 
 
 def test_every_figure_of_the_paper_is_made_or_said_to_be_a_drawing():
@@ -318,52 +238,6 @@ def test_a_part_that_is_none_is_refused_before_anything_is_measured(tmp_path):
     with pytest.raises(PlanError, match=r"no part 'speed'.*tracking, actions"):
         run.make_tables(tmp_path / "out", ["mouse"], without=["speed"])
     assert not (tmp_path / "out").exists()
-
-
-def test_a_cached_model_of_other_or_unknown_code_is_trained_again(tmp_path):
-    path = tmp_path / "mouse-paper-0.npz"
-    told = tmp_path / "mouse-paper-0.trained-by.json"
-    path.write_bytes(b"unknown")
-    trained_by.forget_unless_of(path, "today")
-    assert not path.exists()  # nobody knows which code trained it
-    path.write_bytes(b"model")
-    trained_by.note(path, "today")
-    trained_by.forget_unless_of(path, "today")
-    assert path.exists()
-    trained_by.forget_unless_of(path, "tomorrow")
-    assert not path.exists()
-    assert not told.exists()
-    path.write_bytes(b"model")
-    trained_by.note(path, "today")
-    path.write_bytes(b"another")
-    trained_by.forget_unless_of(path, "today")
-    assert not path.exists()  # the note is of another file
-    path.write_bytes(b"model")
-    told.write_text("no json")
-    assert not trained_by.is_of(path, "today")
-
-
-@pytest.mark.parametrize("variant", ["paper", "paper-one-pose", "paper-no-metric"])
-def test_a_row_that_is_measured_anew_does_not_take_a_model_without_a_note(
-    variant, monkeypatch, tmp_path
-):
-    monkeypatch.setenv("LIEX_CACHE", str(tmp_path))
-    trained_now = []
-
-    def cached(animal: str, name: str, progress: Any = silent, draw: int = 0) -> Any:
-        path = pose_model.cache_path(animal, name, draw)
-        if not path.is_file():
-            trained_now.append(draw)
-            path.write_bytes(b"fresh")
-        return path
-
-    monkeypatch.setattr(pose_model, "cached_model", cached)
-    monkeypatch.setattr("liex_lab.estimation.model.Model.load", lambda path: trained("paper").model)
-    pose_model.cache_path("mouse", "paper").write_bytes(b"of older code")
-    rows.runs_of("mouse", variant)
-    assert trained_now == [0, 1, 2]
-    rows.runs_of("mouse", variant)
-    assert trained_now == [0, 1, 2]  # now it is known
 
 
 @pytest.mark.slow
@@ -411,35 +285,6 @@ def test_tables_json_has_every_figure_by_split_and_method(made):
         assert len(set(split["paper-one-pose"]["run_median_mm"])) > 1  # draws are not one draw
 
 
-def view_of_one(fingerprint: str) -> common_view.CommonView:
-    none = np.zeros(3, np.bool_)
-    return common_view.CommonView(1.0, none, none, none, fingerprint)
-
-
-def test_a_kept_row_is_refused_for_every_reason_by_its_name():
-    made = {"recipe": {"n_images": 3}}
-    hashes = {"learning_code": "a", "training_pictures": "b", "models": ["c", None]}
-    views = {"clean": [view_of_one("x"), view_of_one("y")]}
-    row = {
-        "made": {"from": made, **hashes, "models": ["c", "d"]},
-        "splits": {"clean": {"fingerprint": fingerprints.fingerprint_of(views["clean"])}},
-    }
-
-    def why(row: Any, made: Any, hashes: Any, views: Any) -> str:
-        return cached_results.why_refused(row, made, hashes, views, {})
-
-    assert why(row, made, hashes, views) == ""
-    assert "another training" in why(row, {"recipe": {"n_images": 4}}, hashes, views)
-    assert "other code" in why(row, made, hashes | {"learning_code": "z"}, views)
-    pictures = hashes | {"training_pictures": "z"}
-    assert "other training pictures" in why(row, made, pictures, views)
-    assert "another number of models" in why(row, made, hashes | {"models": ["c"]}, views)
-    fewer = {"clean": views["clean"][:1]}  # `--frames` never mixes with kept rows
-    turned = {"clean": views["clean"][::-1]}
-    for other in (fewer, turned, views | {"hard": views["clean"]}):
-        assert "other test pictures or another foreground" in why(row, made, hashes, other)
-
-
 def test_with_fewer_frames_or_the_sealed_split_nothing_kept_is_used():
     assert run.Budget.of(None, False, False, (), False).fresh == ("default",)
     assert run.Budget.of(None, False, False, (), False).kept
@@ -471,17 +316,6 @@ def test_the_curves_of_fig_7_are_measured_where_they_are_asked_for():
         assert not other.curves
 
 
-def test_the_hash_of_code_is_of_what_it_does_not_of_how_it_is_told():
-    told = '"""Module."""\n\ndef f(x):\n    """Double."""\n    return 2 * x  # twice\n'
-    plain = "def f(x):\n    return 2 * x\n"
-    assert fingerprints.bare_source(told) == fingerprints.bare_source(plain)
-    assert fingerprints.bare_source(plain) != fingerprints.bare_source(plain.replace("2", "3"))
-    assert fingerprints.bare_source('x = "# no comment"\n') == 'x="#nocomment"'
-    for variant in run.ROWS:
-        assert len(fingerprints.learning_code(variant)) == 16
-    assert fingerprints.learning_code("rf") != fingerprints.learning_code("cnn")
-
-
 @pytest.mark.slow
 def test_every_row_measures_the_object_that_the_default_chooses():
 
@@ -492,17 +326,6 @@ def test_every_row_measures_the_object_that_the_default_chooses():
     told, *_ = common_view.measured(chooser, frames, scene, view, {})
     alone = chooser.estimate(frames, scene, view.size).chosen.pose.joints(chooser.skeleton)
     np.testing.assert_array_equal(told, alone)
-    again = common_view.common_view(recording, plan_of("mouse"), chooser)[2]
-    assert again.fingerprint == view.fingerprint
-
-
-def test_kept_results_of_another_schema_are_refused_in_a_sentence(tmp_path):
-    assert cached_results.kept_results("mouse", tmp_path) == {"rows": {}, "sensitivity": {}}
-    for content in ('{"schema": 99}', "no json"):
-        (tmp_path / "mouse.json").write_text(content)
-        with pytest.raises(LiexError, match=r"mouse\.json") as told:
-            cached_results.kept_results("mouse", tmp_path)
-        assert "\n" not in str(told.value)
 
 
 def results_with(medians: dict[str, float], half: float = 0.2) -> run.Results:
@@ -553,21 +376,20 @@ def test_what_differs_from_the_paper_is_what_the_methods_say():
     for animal in ("fish", "mouse", "hand"):
         skeleton = Skeleton.load(animal)
         method = method_of("paper", skeleton)
-        recipe = run.made_from("paper", skeleton)["recipe"]
+        recipe = recipe_of("paper", skeleton)
         k, images = {
             "fish": (40, 95_104), "mouse": (40, 104_096), "hand": (20, 72_757)
         }[animal]  # fmt: skip
-        examples = method.training_candidates * recipe["n_images"]
-        assert f"{examples:,} ({animal})" in told
-        assert re.search(rf"\b{k * images / examples:.0f}\b[\w, ]* times fewer", told)
+        n_examples = method.training_candidates * recipe.n_images
+        assert f"{n_examples:,} ({animal})" in told
+        assert re.search(rf"\b{k * images / n_examples:.0f}\b[\w, ]* times fewer", told)
         assert f"K is {method.training_candidates} " in told
-        own = run.made_from("default", skeleton)
-        assert f"{own['method']['training_candidates']} (" in told
-        for numbers in (recipe, own["recipe"]):
-            for name in ("n_images", "n_correction", "n_calibration"):
-                assert f"{numbers[name]:,}" in told or not numbers[name]
+        assert f"{method_of('default', skeleton).training_candidates} (" in told
+        for one in (recipe, recipe_of("default", skeleton)):
+            for amount in (one.n_images, one.n_correction, one.n_calibration):
+                assert f"{amount:,}" in told or not amount
         assert f"m: {method.regressors.n_tests};" in told
-        assert f"{recipe['n_images']:,} ({animal})" in told
+        assert f"{recipe.n_images:,} ({animal})" in told
         for plan in (method.regressors, method.metric):
             assert (plan.max_leaf, plan.min_leaf) == (5, 1)
         assert (method.rounds, method.n_candidates) == {
@@ -587,13 +409,12 @@ def test_every_variant_that_can_be_named_is_known_and_any_other_is_refused(monke
 def test_all_that_learns_beside_ours_learns_from_the_same_pictures_with_our_noise():
     for animal in bundled_models():
         skeleton = Skeleton.load(animal)
-        ours = run.made_from("default", skeleton)["recipe"]
-        papers = run.made_from("paper", skeleton)["recipe"]
-        assert papers["degraded_share"] == ours["degraded_share"]
-        assert papers["n_images"] >= 0.8 * ours["n_images"]
+        ours, papers = recipe_of("default", skeleton), recipe_of("paper", skeleton)
+        assert papers.degraded_share == ours.degraded_share
+        assert papers.n_images >= 0.8 * ours.n_images
         for variant in ("rf", "cnn"):
-            theirs = training_of(variant, skeleton).to_dict()["recipe"]
-            assert theirs | {"n_calibration": 0} == papers | {"n_calibration": 0}
+            theirs = training_of(variant, skeleton).recipe
+            assert replace(theirs, n_calibration=0) == replace(papers, n_calibration=0)
 
 
 def test_a_sweep_changes_one_number_of_a_method_and_nothing_else():
@@ -606,74 +427,124 @@ def test_a_sweep_changes_one_number_of_a_method_and_nothing_else():
 
 def test_a_kept_file_reads_as_what_was_kept_in_it(tmp_path):
     row = {
-        "made": {"from": {"lever_mm": 17.034481234, "sizes": [[0.0, 272]]}},
-        "splits": {"clean": {"median_mm": 1.23456789, "flip_rate": None, "fingerprint": "a"}},
+        "made": {"version": "0.1.0", "command": "liex evaluate tables", "seeds": [0, 1]},
+        "splits": {"clean": {"median_mm": 1.23456789, "flip_rate": None}},
         "rate": {"frames_per_s": 123456.789, "cores": 2},
         "examples": [{"frame": k, "joints_mm": [[0.1, -2.25, 300.0]] * 9} for k in range(3)],
         "failures": [{"frame": 7, "joints_mm": None, "error_mm": 9.5}],
     }
-    curves = {"paper": {"curves": {"rounds": [{"value": 1, "mean_mm": 14.7}]}}}
-    rows = {"default": row, "paper": row, "rf": row}
-    path = cached_results.keep_results(tmp_path, "mouse", rows, curves)
-    told = cached_results.kept_results("mouse", tmp_path)
-    assert set(told["rows"]) == {"paper", "rf"}  # the default is measured each time
+    curves = {"paper": {"curves": {"rounds": [{"value": 1, "mean_mm": 14.712345678}]}}}
+    path = kept.keep_results(tmp_path, "mouse", {"default": row, "paper": row}, curves)
+    told = kept.kept_results("mouse", tmp_path)
     rounded = {
-        "splits": {"clean": {"median_mm": 1.23457, "flip_rate": None, "fingerprint": "a"}},
+        "splits": {"clean": {"median_mm": 1.23457, "flip_rate": None}},
         "rate": {"frames_per_s": 123457.0, "cores": 2},
     }
-    assert told["rows"]["paper"] == {**row, **rounded}
-    assert "failures" not in told["rows"]["rf"]  # which Fig. 17 does not show
-    assert told["sensitivity"] == curves
-    lines = path.read_text().splitlines()
-    assert sum("joints_mm" in line for line in lines) == 3 + 1 + 3  # a pose a line
+    assert told == {"rows": {"paper": row | rounded}, "sensitivity": curves}
+    assert sum("joints_mm" in line for line in path.read_text().splitlines()) == 4  # a pose a line
 
 
-def test_what_is_kept_says_how_it_was_made_and_by_which_it_is_known_again():
-    for path in sorted(kept_results_folder().glob("*.json")):
-        check_kept(path)
+@pytest.mark.parametrize(
+    "content",
+    [
+        "no json",
+        "[]",
+        "{}",
+        '{"schema": 3, "rows": {}, "sensitivity": {}}',
+        '{"schema": 4, "rows": 3}',
+        b"\xff",
+    ],
+)
+def test_damaged_or_older_kept_results_are_refused_in_one_sentence(content, tmp_path):
+    assert kept.kept_results("mouse", tmp_path) == {"rows": {}, "sensitivity": {}}
+    data = content if isinstance(content, bytes) else content.encode()
+    (tmp_path / "mouse.json").write_bytes(data)
+    with pytest.raises(LiexError, match=r"mouse\.json.*--fresh$") as told:
+        kept.kept_results("mouse", tmp_path)
+    assert "\n" not in str(told.value)
 
 
-def check_kept(path: Path) -> None:
-    skeleton = Skeleton.load(path.stem)
-    kept = cached_results.kept_results(path.stem)
-    splits = simulator.world_of(skeleton).splits
-    assert path.stat().st_size < 100_000
-    assert len(path.read_text().splitlines()) < 1_000
-    assert set(kept["rows"]) <= set(run.ROWS)
-    for row in kept["rows"].values():
-        made = row["made"]
-        assert made["command"].startswith("liex evaluate tables")
-        assert made["version"]
-        assert made["code"]
-        assert isinstance(made["from"]["recipe"]["seed"], int)
-        assert {"learning_code", "training_pictures", "models", "seeds"} <= set(made)
-        assert ("processor" in made) == ("training_given" in made)
-        assert row["rate"]["frames_per_s"] > 0
-        assert set(row["splits"]) == set(splits)
-        for numbers in row["splits"].values():
-            assert numbers["n_frames"] >= 2000
-            assert len(numbers["fingerprint"]) == 16
-            assert numbers["n_recordings"] == 40
-            assert ("given" in numbers) == ("processor" in made)
-            if "given" in numbers:
-                assert given.Given.from_dict(numbers["given"]).n_frames == numbers["n_frames"]
-                assert len(numbers["given"]["size"]) == 40
-            assert len(numbers["joint_mm"]) == skeleton.n_joints
+def test_a_row_of_another_version_or_of_other_postures_is_named_as_such():
+    made = {"version": "0.0.9", "command": "liex evaluate tables --row=rf", "test_postures": "old"}
+    results = results_with({"rf": 1.0})
+    results.test_postures = "drawn"
+    results.rows["rf"] |= {"made": made, "origin": "kept"}
+    results.sensitivity = {"paper": {"made": made | {"test_postures": ""}, "origin": "kept"}}
+    assert table_text.words(results, quick=True)[1:] == [
+        "RF was measured by version 0.0.9 with `liex evaluate tables --row=rf`.",
+        "RF was measured with test postures old.",
+        "Fig. 7, paper, was measured by version 0.0.9 with `liex evaluate tables --row=rf`.",
+    ]
+    made |= {"version": package_version("liex_lab"), "test_postures": "drawn"}
+    results.sensitivity = {}
+    assert table_text.words(results, quick=True) == ["Test postures are drawn."]
 
 
-def test_a_variant_whose_initial_poses_are_proposed_has_no_number_of_them_to_vary():
-    """Curves of it that were kept say the same for every number; they are left out with why."""
-    hand, mouse = Skeleton.load("hand"), Skeleton.load("mouse")
-    proposed, drawn = method_of("default", hand), method_of("paper", mouse)
-    curve = [{"value": n, "mean_mm": 14.7, "median_mm": 8.2} for n in (10, 20)]
-    kept = {
-        "curves": {"initial poses": curve, "trees": curve},
-        "chosen": {"initial poses": 20, "trees": 10},
+def test_a_row_of_another_processor_is_marked_and_one_of_an_unknown_one_is_not(monkeypatch):
+    monkeypatch.setattr(table_text, "processor", lambda: "znver4")
+    for made, told in (
+        ({"processor": "znver4"}, "kept"),
+        ({"processor": "znver5"}, "kept, another processor"),
+        ({}, "kept"),
+    ):
+        assert table_text._origin({"origin": "kept", "made": made}) == told
+
+
+@pytest.fixture(scope="module")
+def from_kept(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What the verb makes of the kept rows; in place of the default, which is measured, RF."""
+
+    def instead(animal: str, *_: object) -> dict[str, Any]:
+        return {"default": kept.kept_results(animal)["rows"]["rf"]}
+
+    def no_recordings(skeleton: Skeleton, _: object) -> dict[str, list[Any]]:
+        return {split: [] for split in simulator.world_of(skeleton).splits}
+
+    out = tmp_path_factory.mktemp("tables") / "out"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(rows, "measured_rows", instead)
+        patch.setattr(run, "_tests", no_recordings)
+        patch.setattr(illustrations, "illustrate", lambda *_: {})
+        patch.setattr(examples, "shown_poses", lambda *_: [])
+        run.make_tables(out, ["mouse", "fish", "hand"])
+    return out
+
+
+def test_the_tables_of_the_kept_rows_are_those_that_the_manual_publishes(from_kept):
+    page = (Path(__file__).parents[3] / "docs" / "evidence.md").read_text(encoding="utf-8")
+    names = {
+        "paper": "the paper's variant",
+        "paper-one-pose": "without multiple initial poses",
+        "paper-no-metric": "without the learned metric",
+        "rf": "RF",
+        "cnn": "CNN",
     }
-    told = without_void(kept, proposed)
-    assert list(told["curves"]) == list(told["chosen"]) == ["trees"]
-    assert "a forest proposes" in told["left_out"]["initial poses"]
-    assert without_void(kept, drawn) == {**kept, "left_out": {}}
+    cells: dict[tuple[str, str], list[str]] = {}
+    for row in rows_of(from_kept / "table1.csv") + rows_of(from_kept / "table2.csv"):
+        numbers = map(float, (row["median_mm"], *json.loads(row["interval95"]), row["mean_mm"]))
+        text = [f"{x:.1f}" if row["animal"] == "hand" else f"{x:.2f}" for x in numbers]
+        cell = "{} ({} to {}); {}".format(*text)
+        cells.setdefault((row["animal"], row["variant"]), []).append(cell)
+    assert len(cells) == 3 * len(rows.ROWS)
+    for (animal, variant), line in cells.items():
+        if variant != "default":
+            assert f"| {animal}, {names[variant]} | {' | '.join(line)} |\n" in page
+
+
+def test_kept_rows_are_written_as_they_were_read_with_what_made_them(from_kept):
+    for path in sorted(kept_results_folder().glob("*.json")):
+        assert (from_kept / "kept" / path.name).read_bytes() == path.read_bytes()
+        skeleton = Skeleton.load(path.stem)
+        splits = set(simulator.world_of(skeleton).splits)
+        told = kept.kept_results(path.stem)
+        assert list(told["rows"]) == sorted(rows.ROWS[1:])
+        for row in told["rows"].values():
+            assert row["made"]["command"].startswith("liex evaluate tables")
+            assert {"version", "date", "machine", "seed", "seeds"} <= set(row["made"])
+            assert set(row["splits"]) == splits
+            for numbers in row["splits"].values():
+                assert (numbers["n_frames"], numbers["n_recordings"]) == (2000, 40)
+                assert len(numbers["joint_mm"]) == skeleton.n_joints
 
 
 class Still:
