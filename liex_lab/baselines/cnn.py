@@ -11,9 +11,7 @@ them do in half the time. The loss is the mean distance of the joints,
 
     L = 1/J sum_j |y_j - y_j*|,        in half sides of the patch.
 
-torch is an optional dependency: `pip install '.[cnn]'` in the folder of liex_lab. The error below
-says it in another way: its text is part of the code that kept rows of the paper's tables were made
-with.
+torch is an optional dependency: `pip install '.[cnn]'` in the folder of liex_lab.
 """
 
 from __future__ import annotations
@@ -77,7 +75,8 @@ def require_torch() -> None:
 
     if find_spec("torch") is None:
         raise MissingPackageError(
-            "the CNN baseline needs torch, which is not installed; pip install 'liex_lab[cnn]'"
+            "the CNN baseline needs torch, which is not installed; in the folder of liex_lab, run "
+            "pip install '.[cnn]'"
         )
 
 
