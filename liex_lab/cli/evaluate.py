@@ -156,7 +156,8 @@ def evaluate_tables(
         bool,
         typer.Option(
             "--fresh",
-            help="Train and measure every row again, which takes long; use no kept result.",
+            help="Measure every row again, with models that this version trains or has trained, "
+            "which takes long; use no kept result.",
         ),
     ] = False,
     rows: Annotated[
