@@ -215,6 +215,7 @@ class Film:
         for joints, word in zip(self.uv, words, strict=True):
             self._draw_animal(shown, (joints + 0.5 - [view.left, view.top]) * scale, row, word)
         self._write(shown, time_s, row, words, title)
+        self._write_length(shown, self._relief.pixel_mm * view.width / size[0])
         return shown
 
     def _draw_animal(self, picture: NDArray[np.uint8], at: Array, row: int, word: str) -> None:
@@ -268,6 +269,20 @@ class Film:
         for text, y in ((f"{self._relief.top_mm:.0f} mm", edge), ("0", edge + len(bar) - size)):
             small = max(size - 2, 8)
             write(picture, text, right - 4 - text_width(text, small), y, small)
+
+    def _write_length(self, picture: NDArray[np.uint8], pixel_mm: float) -> None:
+        """A bar as long as 1, 2 or 5 times a power of ten mm on the floor; `pixel_mm` is mm/px."""
+        height, width = picture.shape[:2]
+        size = max(height // 26, 9)
+        longest_mm = pixel_mm * width / 5.0
+        step_mm = 10.0 ** np.floor(np.log10(longest_mm))
+        length_mm = max(step_mm * k for k in (1, 2, 5) if step_mm * k <= longest_mm)
+        right = width - size // 2
+        left = right - round(length_mm / pixel_mm)
+        y = height - 5 * size // 2
+        picture[y - 2 : y, left:right] = 240
+        text = f"{length_mm:g} mm"
+        write(picture, text, left - size // 2 - text_width(text, size), y - size // 2, size)
 
 
 def _rgb(colour: str) -> tuple[int, int, int]:

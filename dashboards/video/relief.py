@@ -42,7 +42,7 @@ class Relief:
         rays = (u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy
         self._per_mm = (up[0] * rays[0] + up[1] * rays[1] + up[2]).astype(np.float32)
         self._above_mm = np.float32(np.asarray(session.T_arena_camera.translation, float)[2])
-        self._pixel_mm = float(self._above_mm) / camera.fx
+        self.pixel_mm = float(self._above_mm) / camera.fx
         self.top_mm = top_mm
         self.shape = (camera.height, camera.width)
         shades = colormaps["viridis"](np.linspace(0.08, 1.0, 256))
@@ -103,7 +103,7 @@ class Relief:
 
     def _light(self, heights: NDArray[np.float32]) -> NDArray[np.uint8]:
         """How light a slope is, `_PLAIN` where there is none: uint8 of the heights' shape."""
-        slope_y, slope_x = np.gradient(heights, self._pixel_mm)
+        slope_y, slope_x = np.gradient(heights, self.pixel_mm)
         light = 1.0 + _STRENGTH * (_LIGHT[0] * slope_x + _LIGHT[1] * slope_y)
         return (_PLAIN * np.clip(light, 0.6, 1.4)).astype(np.uint8)
 

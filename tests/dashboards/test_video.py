@@ -8,7 +8,7 @@ import av
 import numpy as np
 import pytest
 from liex_lab.dashboards.video import encoder
-from liex_lab.dashboards.video.film import Film
+from liex_lab.dashboards.video.film import Film, View
 from liex_lab.dashboards.video.relief import Relief, scale_mm
 from liex_lab.dashboards.video.video import matches
 
@@ -99,6 +99,22 @@ def test_heights_are_counted_from_the_floor(session):
     assert heights[10, 10] == pytest.approx(30.0, abs=0.1)
     assert heights[40, 60] == pytest.approx(0.0, abs=0.1)
     assert np.isnan(heights[0, 0])
+
+
+@pytest.mark.parametrize("share", [1.0, 0.4, 0.03])
+def test_the_bar_of_length_is_a_round_number_of_millimetres_on_the_floor(session, share):
+    film = Film(session, 80.0)
+    camera = session.camera
+    view = View(0, 0, round(share * camera.width), round(share * camera.height))
+    size = (636, 480)
+    row = (film.picture(0.0, view, size, "")[480 - 5 * 18 // 2 - 1] == 240).all(axis=1)
+    film.close()
+    length_px = np.flatnonzero(~row[: 636 - 18 // 2][::-1])[0]  # left of it stands the text
+    floor_mm = float(session.T_arena_camera.translation[2])  # seen at right angles
+    length_mm = length_px * view.width / 636 * floor_mm / camera.fx
+    digits = float(f"{length_mm:e}".split("e")[0])
+    assert min(abs(digits - k) / k for k in (1, 2, 5, 10)) < 1.5 / length_px
+    assert 636 / 5 / 2.5 - 1 <= length_px <= 636 / 5
 
 
 def test_the_frame_that_is_shown_is_the_last_one_until_then(session):
