@@ -60,6 +60,16 @@ def browser() -> Iterator[Browser]:
         started.close()
 
 
+@pytest.hookimpl(tryfirst=True)  # before pytest-xdist starts its workers
+def pytest_sessionstart(session: pytest.Session) -> None:
+    """Compile the kernels of a whole run of all tests once, on every core."""
+    if session.config.args_source is pytest.Config.ArgsSource.TESTPATHS:
+        from liex_lab.pipelines.compiling import compile_ahead
+
+        for animal in ("mouse", "fish", "hand"):
+            compile_ahead(animal)
+
+
 def excuse(report: pytest.TestReport | pytest.CollectReport) -> str:
     """Why a test was skipped."""
     return str(report.longrepr[2]) if isinstance(report.longrepr, tuple) else str(report.longrepr)

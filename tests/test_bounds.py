@@ -11,8 +11,9 @@ import pytest
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 
+pytestmark = pytest.mark.nightly
 
-@pytest.mark.slow
+
 def test_kernels_stay_within_their_arrays(tmp_path: Path) -> None:
     run = subprocess.run(
         [REPOSITORY / ".ci" / "with-bounds"],
@@ -31,6 +32,8 @@ def test_without_checked_bounds_the_plugin_refuses_to_run() -> None:
             "-m",
             "pytest",
             "-q",
+            "-n",
+            "0",
             "-p",
             "tests.bounds",
             "tests/runtime/test_shapes.py",

@@ -8,7 +8,11 @@ from collections.abc import Iterator
 from pathlib import Path
 from statistics import median
 
+import pytest
+
 from tests.conftest import REPOSITORY
+
+pytestmark = pytest.mark.checks
 
 FILES = [
     path

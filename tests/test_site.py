@@ -23,6 +23,8 @@ from tests.conftest import REPOSITORY
 if TYPE_CHECKING:
     from playwright.sync_api import Browser
 
+pytestmark = pytest.mark.checks
+
 LOOKED_AT = (
     "index.html",
     "start.html",
@@ -67,7 +69,6 @@ def address(site: Path) -> Iterator[str]:
         server.shutdown()
 
 
-@pytest.mark.slow
 def test_every_example_was_run_and_drew_or_printed(site: Path) -> None:
     scripts = sorted((REPOSITORY / "docs" / "examples").glob("plot_*.py"))
     assert len(scripts) >= 7
@@ -77,7 +78,6 @@ def test_every_example_was_run_and_drew_or_printed(site: Path) -> None:
         assert "Traceback" not in page, script.name
 
 
-@pytest.mark.slow
 def test_generated_pages_hold_what_the_program_says(site: Path) -> None:
     verbs = (site / "reference" / "command-line.html").read_text(encoding="utf-8")
     for verb in ("demo", "doctor", "run", "correct flip", "evaluate statistics"):
@@ -90,7 +90,6 @@ def test_generated_pages_hold_what_the_program_says(site: Path) -> None:
     assert ">run_session<" in (site / "reference" / "python.html").read_text(encoding="utf-8")
 
 
-@pytest.mark.slow
 def test_a_page_asks_no_other_machine_and_fits_a_phone(
     site: Path, address: str, browser: Browser
 ) -> None:

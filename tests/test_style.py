@@ -13,6 +13,8 @@ import pytest
 
 from tests.conftest import REPOSITORY
 
+pytestmark = pytest.mark.checks
+
 
 def run_module(*arguments: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
@@ -25,13 +27,11 @@ def test_ruff_finds_nothing() -> None:
     assert ran.returncode == 0, ran.stdout
 
 
-@pytest.mark.slow
 def test_mypy_finds_nothing() -> None:
     ran = run_module("mypy")
     assert ran.returncode == 0, ran.stdout
 
 
-@pytest.mark.slow
 def test_bandit_finds_nothing_that_has_no_reason_beside_it() -> None:
     rooms = ("liex_lab", "pipelines", "dashboards")
     ran = run_module("bandit", "-q", "-c", "pyproject.toml", "-r", *rooms)

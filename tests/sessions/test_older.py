@@ -127,6 +127,7 @@ def each_way_it_can_lie(place: Path, work: Callable[[], object]) -> Iterator[boo
     assert len(ways) > 3
 
 
+@pytest.mark.nightly
 def test_killed_at_any_call_of_publishing_the_corrections_stay(
     place: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -149,6 +150,7 @@ def test_killed_at_any_call_of_publishing_the_corrections_stay(
             assert [path.name for path in place.parent.iterdir()] == ["circle.liex"]
 
 
+@pytest.mark.nightly
 def test_killed_at_any_call_of_correcting_the_corrections_stay(place: Path) -> None:
     for _ in each_way_it_can_lie(place, lambda: groom(place, 0.2)):
         before = len(read_log(place).entries)
@@ -158,6 +160,7 @@ def test_killed_at_any_call_of_correcting_the_corrections_stay(place: Path) -> N
         assert [p.name for p in place.iterdir() if p.name.startswith("correct")] == ["corrected"]
 
 
+@pytest.mark.nightly
 def test_killed_at_any_call_of_setting_a_session_aside_the_corrections_stay(place: Path) -> None:
     set_outdated(place)
     again(place)
