@@ -328,6 +328,9 @@ def draw_figures(
             f"{path} holds nothing to draw of {', '.join(empty)}: no pose was found, or too few "
             "actions; its report says why"
         )
+    if not only:
+        for stale in set(target.glob("compare_*.*")) - set(files):  # of measures compared before
+            stale.unlink()
     return {"files": files, "empty": empty, "folder": target}
 
 

@@ -42,11 +42,12 @@ def test_every_file_that_a_page_names_exists(page: Path) -> None:
     made = {
         "study.toml",
         "plan.toml",
+        "gerbil.toml",
         "camera.toml",
         "raytrix.toml",
         "study/study.toml",
     }  # by the program, or by a user
-    made |= {"figures/", "study/study.toml", "derivatives/liex-lab/sub-m01/ses-01/behav/"}
+    made |= {"figures/", "study/study.toml", "study/derivatives/liex-lab/sub-m01/ses-day1/behav/"}
     missing = [path for path in named if path not in made and not is_there(path)]
     missing += [link for link in linked if not (page.parent / link).exists()]
     missing += [link for link in linked if {"auto_examples", "_build"} & set(Path(link).parts)]

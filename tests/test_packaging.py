@@ -124,7 +124,7 @@ def test_the_readmes_snippet_runs_in_the_folder_of_the_clone(tmp_path: Path) -> 
     text = (REPOSITORY / "README.md").read_text(encoding="utf-8")
     (snippet,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
     recording = "synthetic:walk?seed=3&frames=40"
-    for name, value in (("recording.tar.gz", recording), ("results", str(tmp_path))):
+    for name, value in (("datasets/mouse_walk.mcap", recording), ("results", str(tmp_path))):
         assert f'"{name}"' in snippet
         snippet = snippet.replace(f'"{name}"', repr(value))
     printed = python_in_the_clone("-c", snippet).splitlines()

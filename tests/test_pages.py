@@ -45,7 +45,9 @@ SKIPPED = {
     r"^liex dashboard ": "serves pages until it is stopped",
     r"^dandi ": "another program, which .ci/peers runs",
     r"movement\.kinematics": "another program, which .ci/peers runs",
-    r"snake\.toml|--plan plan\.toml": "trains for minutes; training/test_own_animal.py does it",
+    r"^liex (?:train|evaluate pose --animal) snake\.toml|--plan plan\.toml": (
+        "trains for minutes; training/test_own_animal.py does it"
+    ),
 }
 # what a reader types in place of a printed name, on every page
 NAMES = {

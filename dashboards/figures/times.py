@@ -105,6 +105,7 @@ def curves(seen: Seen) -> Figure | None:
         seen: the animal.
     """
     error = seen.broken(seen.frames["predicted_error_mm"])
+    n_measured = int(seen.frames["predicted_error_mm"].notna().sum())
     rows: list[tuple[str, str, Array, str, bool]] = []
     for one in drawn_curves(seen):
         values, unit = shown(seen.column(one.column), one.unit)
@@ -122,14 +123,14 @@ def curves(seen: Seen) -> Figure | None:
     colours = action_colours(seen.words)
     for k, (title, unit, values, colour, from_zero) in enumerate(rows):
         axes = panel(figure, LEFT_MM, 8.0 + (len(rows) - 1 - k) * step, width, _CURVE_MM)
-        n = int(np.isfinite(values).sum())
         if " height above the floor" in title and len(rears):
             title += "; rearing shaded"
             for a, b, word in rears:
                 shade = colours.get(str(word), MUTED)
                 axes.axvspan(a / size, b / size, color=shade, alpha=0.3, linewidth=0.0)
         axes.set_title(
-            f"{title}, {seen.who}, n = {counted(n, 'frame')}" if k == 0 else title, size=6.5
+            f"{title}, {seen.who}, n = {counted(n_measured, 'frame')}" if k == 0 else title,
+            size=6.5,
         )
         kept = kept_rows(values, _MOST_COLUMNS)
         axes.plot(time_s[kept] / size, values[kept], color=colour)
@@ -137,7 +138,7 @@ def curves(seen: Seen) -> Figure | None:
         axes.grid(axis="y", color=LINE, linewidth=0.4)
         _clock(axes, seen.duration_s, last=k == len(rows) - 1)
         if from_zero:
-            axes.set_ylim(bottom=min(0.0, float(np.nanmin(values)) if n else 0.0))
+            axes.set_ylim(bottom=min(0.0, float(np.nanmin(values, initial=0.0))))
     return figure
 
 
@@ -154,7 +155,9 @@ def cumulative_distance(seen: Seen) -> Figure | None:
     _, size = time_unit(seen.duration_s)
     figure = sheet(ONE_COLUMN_MM, 52.0)
     axes = panel(figure, 12.0, 9.0, ONE_COLUMN_MM - 17.0, 33.0)
-    axes.set_title(f"Cumulative distance, {seen.who}\n{metres[-1]:.2f} m, n = {counted(n, 'step')}")
+    axes.set_title(
+        f"Cumulative distance, {seen.who}\n{metres[-1]:.2f} m, n = {counted(n, 'frame')}"
+    )
     rows = kept_rows(metres, _MOST_COLUMNS)
     axes.plot(time_s[rows] / size, metres[rows], color=BLUE, linewidth=1.0)
     axes.set_ylabel("distance, m")
@@ -164,7 +167,7 @@ def cumulative_distance(seen: Seen) -> Figure | None:
 
 
 def walked(seen: Seen) -> tuple[Array, Array, int]:
-    """Times (n,) s, distance until then (n,) m, and the number of steps that were seen.
+    """Times (n,) s, distance until then (n,) m, and the number of frames with a speed.
 
     Args:
         seen: an animal with kinematics.

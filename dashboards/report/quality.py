@@ -123,7 +123,7 @@ def _of_frames(session: Session) -> list[str]:
     if doubtful > _DOUBTFUL_SHARE * n:
         found.append(
             f"{counted(doubtful, 'frame is', 'frames are')} doubtful ({doubtful / n:.1%} of "
-            f"{n:,}): the predicted error is large."
+            f"{n:,}): the predicted error is large, or the depth image contradicts the pose."
         )
     # two columns alone: the dashboard asks this of every session of a study
     error, spine = session.table("frames", ["predicted_error_mm", "spine_mm"]).median()

@@ -120,17 +120,16 @@ class Relief:
 def scale_mm(sessions: Sequence[Session]) -> float:
     """The one scale of heights of some sessions, mm.
 
-    What an animal on its hind legs reaches, and a quarter more than the usual height of one that
-    swims or is held up, so that its surface has shades.
+    A tenth more than what the joints reach, so that the surface above them has shades.
 
     Args:
         sessions: the opened sessions.
     """
-    reached = [float(session.metadata["animal"].get("spine_mm") or np.nan) for session in sessions]
-    for session in sessions:
-        heights = session.table("frames", ["centroid_z_mm"])["centroid_z_mm"]
-        reached.append(1.25 * float(heights.quantile(0.95)))
-    known = [length for length in reached if np.isfinite(length) and length > 0]
+    reached = [
+        1.1 * float(session.table("poses", ["z_mm"])["z_mm"].quantile(0.995))
+        for session in sessions
+    ]
+    known = [height for height in reached if np.isfinite(height)]
     return max(10.0 * float(np.ceil(max(known) / 10.0)), 20.0) if known else 80.0
 
 

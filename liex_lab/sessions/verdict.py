@@ -38,7 +38,7 @@ class Verdict:
     Attributes:
         n_frames: frames recorded.
         n_in_view: frames in which something of the animal's size is in view.
-        n_posed: frames with a pose, measured or bridged.
+        n_posed: frames with a measured pose.
         n_trusted: frames with a measured pose that nothing contradicts.
         expected_error_mm: median predicted joint error of the measured poses, mm; None without any.
         n_animals: how many things of the animal's size move in view at once; 0 where no frame has
@@ -91,7 +91,7 @@ class Verdict:
             n_in_view += int(part.known.any(axis=1).sum())
             n_depth += int(part.has_depth.sum())
             n_trusted += int((track[rows].observed & (track.flag[rows] == "")).sum())
-        n_posed = int(track.posed.sum())
+        n_posed = int(track.observed.sum())
         errors = track.predicted_error_mm[track.observed]
         doubtful = int((track.flag == "doubtful").sum())
         n_hidden = int((track.flag == "hidden").sum())
