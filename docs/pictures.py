@@ -191,7 +191,7 @@ def main() -> None:
         draw_animals(folder)
         draw_examples(folder)
         session = run_demo(folder)
-        save_small(DEMO, cv2.imread(str(photograph(session, folder / "demo.png")))[..., ::-1])
+        shutil.copyfile(photograph(session, folder / "demo.png"), DEMO)  # every colour of it
         shoot_pages(session)
         shoot_replay(session)
     for path in (*sorted(STATIC.glob("*.png")), DEMO):
