@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 DONE = ("done", "changed")  # states in which there is a session to look at
-NO_POSE = "no pose"
+NO_POSE = "no pose or no frame"
 OTHER = "other actions"
 GREY = "#a3a39b"
 VOID = "#ffffff"

@@ -20,7 +20,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from liex_lab.dashboards.app import plots, tables
-from liex_lab.dashboards.app.data import GREY, Ethogram, StudyData, colours_of, raster
+from liex_lab.dashboards.app.data import GREY, NO_POSE, Ethogram, StudyData, colours_of, raster
 from liex_lab.dashboards.app.guard import MOST_BYTES
 from liex_lab.dashboards.app.listener import MOST, Handler, Listener
 from liex_lab.dashboards.app.page_session import moved_to
@@ -129,8 +129,9 @@ def test_rows_of_ethograms_and_budgets_name_their_group_once_and_every_grey_has_
     parts = {part["name"]: part["marker"]["color"] for part in budget["data"]}
     assert parts == {"walk": "#4477aa", "other actions": GREY, "unlabelled": UNLABELLED}
     (rows,) = drawn["data"]
-    painted = {text: set(rows["z"][np.array(rows["text"]) == text]) for text in ("walk", "no pose")}
-    assert painted == {"walk": {3.0}, "no pose": {0.0}}
+    texts = np.array(rows["text"])
+    painted = {text: set(rows["z"][texts == text]) for text in ("walk", NO_POSE)}
+    assert painted == {"walk": {3.0}, NO_POSE: {0.0}}
     assert np.isnan(rows["z"][0][-100:]).all(), "nothing is painted after a session's end"
 
 
