@@ -312,6 +312,7 @@ def draw_figures(
         measures = [str(name) for name in dict.fromkeys(stats["measure"])]
         sets.check_names(only, ["effects", *measures, *sets.OF_STUDY])
         drawn = sets.comparison_figures(table, stats, sessions, only)
+        sets.remove_others(path / sets.FOLDER, measures)
     else:
         sets.check_names(only, list(sets.OF_STUDY))
         _, look = list_sessions(path)
@@ -328,9 +329,6 @@ def draw_figures(
             f"{path} holds nothing to draw of {', '.join(empty)}: no pose was found, or too few "
             "actions; its report says why"
         )
-    if not only:
-        for stale in set(target.glob("compare_*.*")) - set(files):  # of measures compared before
-            stale.unlink()
     return {"files": files, "empty": empty, "folder": target}
 
 

@@ -62,7 +62,7 @@ def browser() -> Iterator[Browser]:
 
 @pytest.hookimpl(tryfirst=True)  # before pytest-xdist starts its workers
 def pytest_sessionstart(session: pytest.Session) -> None:
-    """Compile the kernels of a whole run of all tests once, on every core."""
+    """Before a run of all tests, compile the kernels once, on every core."""
     if session.config.args_source is pytest.Config.ArgsSource.TESTPATHS:
         from liex_lab.pipelines.compiling import compile_ahead
 

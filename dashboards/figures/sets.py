@@ -126,7 +126,7 @@ def comparison_figures(
         yield Drawn("effects", "effect sizes with their intervals", groups.effects(stats, units))
     for measure in (one for one in dict.fromkeys(stats["measure"].astype(str)) if one in only):
         drawn = groups.comparison(table, stats, measure, units.get(measure, ""), said)
-        yield Drawn(safe_name(f"compare_{measure}"), "every animal, and the difference", drawn)
+        yield Drawn(_name_of(measure), "every animal, and the difference", drawn)
     wanted = [name for name in OF_STUDY if name in only]
     if sessions and wanted:
         yield from _of_many(_grouped(sessions, table), wanted, list(stats["reference"])[:1])
@@ -140,6 +140,24 @@ def _of_many(
     for name in only or OF_STUDY:
         what, draw = OF_STUDY[name]
         yield Drawn(name, what, draw(all_seen))
+
+
+def _name_of(measure: str) -> str:
+    """The name of a comparison's figure of a measure."""
+    return safe_name(f"compare_{measure}")
+
+
+def remove_others(folder: Path, measures: Sequence[str]) -> None:
+    """Remove figures of measures that were compared before and are compared no longer.
+
+    Args:
+        folder: the folder of a comparison's figures.
+        measures: what is compared now.
+    """
+    kept = {_name_of(measure) for measure in measures}
+    for path in _files(folder):
+        if path.name.startswith("compare_") and path.stem not in kept:
+            path.unlink()
 
 
 def write_figures(

@@ -105,7 +105,7 @@ def curves(seen: Seen) -> Figure | None:
         seen: the animal.
     """
     error = seen.broken(seen.frames["predicted_error_mm"])
-    n_measured = int(seen.frames["predicted_error_mm"].notna().sum())
+    n = int(seen.frames["predicted_error_mm"].notna().sum())
     rows: list[tuple[str, str, Array, str, bool]] = []
     for one in drawn_curves(seen):
         values, unit = shown(seen.column(one.column), one.unit)
@@ -129,8 +129,7 @@ def curves(seen: Seen) -> Figure | None:
                 shade = colours.get(str(word), MUTED)
                 axes.axvspan(a / size, b / size, color=shade, alpha=0.3, linewidth=0.0)
         axes.set_title(
-            f"{title}, {seen.who}, n = {counted(n_measured, 'frame')}" if k == 0 else title,
-            size=6.5,
+            f"{title}, {seen.who}, n = {counted(n, 'frame')}" if k == 0 else title, size=6.5
         )
         kept = kept_rows(values, _MOST_COLUMNS)
         axes.plot(time_s[kept] / size, values[kept], color=colour)
@@ -138,7 +137,7 @@ def curves(seen: Seen) -> Figure | None:
         axes.grid(axis="y", color=LINE, linewidth=0.4)
         _clock(axes, seen.duration_s, last=k == len(rows) - 1)
         if from_zero:
-            axes.set_ylim(bottom=min(0.0, float(np.nanmin(values, initial=0.0))))
+            axes.set_ylim(bottom=float(np.nanmin(values, initial=0.0)))
     return figure
 
 

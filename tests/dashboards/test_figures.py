@@ -432,6 +432,25 @@ def test_the_mean_of_a_group_counts_every_subject_alike(study):
     assert f"mean of {each:.1f} s each" in text
 
 
+@pytest.mark.slow
+def test_figures_of_measures_that_are_compared_no_longer_are_removed_and_no_other_file(
+    study, tmp_path
+):
+    place = tmp_path / "cmp"
+    compare_groups([study], place, ["mean_speed_mm_s", "rear_count"])
+    own = place / "figures" / "compare_with_last_year.txt"
+    own.write_text("a user's")
+    draw_figures(place, only=["effects"], formats=["png"])
+    compare_groups([study], place, ["rear_count"])
+    names = {path.name for path in (place / "figures").glob("compare_*")}
+    assert names == {own.name, "compare_rear_count.svg", "compare_rear_count.pdf"}
+    draw_figures(place, formats=["png"])
+    assert {path.name for path in (place / "figures").glob("compare_*")} == {
+        *names,
+        "compare_rear_count.png",
+    }
+
+
 def test_a_study_has_its_figures(study, tmp_path):
     found = draw_figures(study, formats=["svg"], out=tmp_path)
     assert {path.stem for path in found["files"]} == set(sets.OF_STUDY)
