@@ -55,6 +55,60 @@ PYTHON: dict[str, dict[str, str]] = {
     },
     "Errors": {"liex_lab.errors": "classes"},
 }
+# the columns that are used most
+FIRST_COLUMNS = (
+    "frames.frame_index",
+    "frames.time_s",
+    "frames.gap_before",
+    "frames.pulse_index",
+    "frames.predicted_error_mm",
+    "frames.residual_mm",
+    "frames.flag",
+    "frames.bridged",
+    "frames.p_flip",
+    "frames.centroid_x_mm",
+    "frames.wall_distance_mm",
+    "frames.zone",
+    "poses.joint",
+    "poses.x_mm",
+    "poses.z_mm",
+    "poses.u_px",
+    "poses.sd_mm",
+    "poses.sd_xy_mm",
+    "poses.sd_z_mm",
+    "kinematics.speed_mm_s",
+    "kinematics.speed_sd_mm_s",
+    "kinematics.acceleration_mm_s2",
+    "kinematics.heading_rad",
+    "kinematics.yaw_rate_rad_s",
+    "kinematics.body_pitch_rad",
+    "kinematics.length_mm",
+    "kinematics.bend_rad",
+    "kinematics.nose_height_mm",
+    "kinematics.tail_beat_hz",
+    "kinematics.tail_beat_mm",
+    "bouts.action",
+    "bouts.start_s",
+    "bouts.stop_s",
+    "bouts.duration_s",
+    "bouts.path_mm",
+    "bouts.peak_speed_mm_s",
+    "bouts.net_turn_rad",
+    "bouts.since_last_s",
+    "summary.observed_s",
+    "summary.distance_m",
+    "summary.mean_speed_mm_s",
+    "summary.speed_noise_mm_s",
+    "summary.outer_half_share",
+    "summary.rear_count",
+    "summary.rear_share",
+    "summary.rear_latency_s",
+    "transitions.n",
+    "transitions.by_chance",
+    "transitions.p_fdr",
+    "zones.n_visits",
+    "activity.distance_mm",
+)
 MODULES = ("liex_lab.api", "liex_lab.sessions.correcting", "liex_lab.errors")
 
 
@@ -106,7 +160,7 @@ def _option(one: Any, context: Any) -> str:
 
 def every_column() -> str:
     """Every column of every table, a section a table."""
-    from liex_lab.behaviour.listing import all_columns
+    from liex_lab.tables.schema import all_columns
 
     tables: dict[str, list[str]] = {}
     for column in all_columns().values():
@@ -122,9 +176,16 @@ def every_column() -> str:
 
 def first_columns() -> str:
     """The columns that are used most."""
-    from liex_lab.behaviour import listing
+    from liex_lab.tables.schema import all_columns
 
-    return listing.first_columns()
+    known = all_columns()
+    lines = ["| column | unit | meaning |", "|---|---|---|"]
+    for name in FIRST_COLUMNS:
+        column = known[name]
+        formula = f" ({column.formula})" if column.formula and len(column.formula) < 60 else ""
+        text = f"{column.meaning}{formula}".replace("|", "\\|")
+        lines.append(f"| {column.table} `{column.name}` | {column.unit} | {text} |")
+    return "\n".join(lines) + "\n"
 
 
 def settings() -> str:

@@ -13,9 +13,8 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from liex_lab.behaviour.summary_columns import activity_columns
 from liex_lab.tables.rows import stop_times
-from liex_lab.tables.schema import to_pandas
+from liex_lab.tables.schema import table_columns, to_pandas
 
 Array = NDArray[np.float64]
 
@@ -32,7 +31,7 @@ def activity(kinematics: pd.DataFrame, bouts: pd.DataFrame, words: Sequence[str]
         words: the actions' names.
 
     Returns:
-        The columns of `activity_columns`; a frame counts in the bin in which it begins.
+        The table; a frame counts in the bin in which it begins.
     """
     time_s = kinematics["time_s"].to_numpy(float)
     edges = intervals(float(stop_times(time_s)[-1]))
@@ -50,7 +49,7 @@ def activity(kinematics: pd.DataFrame, bouts: pd.DataFrame, words: Sequence[str]
     timed = total(hold, moved)
     spent = time_named(kinematics, bouts, words, row, n)
     return to_pandas(
-        activity_columns(words),
+        table_columns("activity", words=words),
         {
             **{name: [str(kinematics[name].iloc[0])] * n for name in ("session_id", "individual")},
             "start_s": edges[:-1],

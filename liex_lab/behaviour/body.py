@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,6 +10,7 @@ STANDS = "stands"  # on a floor, over which it moves
 SWIMS = "swims"  # in all three directions; its tail beats
 BRANCHES = "branches"  # limbs at a base, as a hand's fingers at the palm, and no front
 KINDS = (STANDS, SWIMS, BRANCHES)
+_OWN_COLUMN = {"bend_front_rad": SWIMS, "opening": BRANCHES}  # of the table `kinematics`
 
 
 @dataclass(frozen=True)
@@ -87,6 +88,11 @@ class BodyAxis:
         )
         trunk = tuple(k for k in range(n) if k != nose) or (nose,)
         return BodyAxis(names, STANDS, spine, (rump, neck), trunk)
+
+
+def kind_of(names: Iterable[Hashable]) -> str:
+    """The kind of body, one of `KINDS`, whose table `kinematics` has these columns."""
+    return next((_OWN_COLUMN[str(name)] for name in names if name in _OWN_COLUMN), STANDS)
 
 
 def parents_of(animal: Mapping[str, Any]) -> tuple[int, ...]:

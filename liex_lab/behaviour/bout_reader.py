@@ -14,8 +14,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from liex_lab.behaviour.body import STANDS, SWIMS
-from liex_lab.behaviour.columns import kind_of
+from liex_lab.behaviour.body import STANDS, SWIMS, kind_of
 from liex_lab.behaviour.kinematics import segments, smallest_turn
 from liex_lab.tables.rows import median_step, stop_times
 

@@ -40,7 +40,7 @@ from liex_lab.behaviour.statistics import (
     spread_of_animals,
 )
 from liex_lab.plan.subject import alike, one_animal, references_first
-from liex_lab.tables.schema import Column, columns, to_pandas
+from liex_lab.tables.schema import table_columns, to_pandas
 from liex_lab.tables.units import shown, titled
 
 if TYPE_CHECKING:
@@ -65,70 +65,7 @@ _USUAL = (
     "tail_beat_hz",
 )
 
-STATS: tuple[Column, ...] = columns(
-    "stats",
-    ("measure", "string", "", "column of the summary that is compared"),
-    ("contrast", "string", "", "the difference that is estimated: group - reference"),
-    ("group", "string", "", "the group that the reference is subtracted from"),
-    ("n_group", "int64", "", "units of `group`; see unit"),
-    ("reference", "string", "", "the group that is subtracted"),
-    ("n_reference", "int64", "", "units of `reference`"),
-    (
-        "estimate",
-        "float64",
-        "",
-        "difference of the groups, in the measure's own unit: of the units' means, or as the "
-        "mixed model estimates it where test names one",
-    ),
-    (
-        "ci_low",
-        "float64",
-        "",
-        "lower end of the difference's 95 % interval",
-        "t over the units, or of the mixed model where test names one",
-    ),
-    ("ci_high", "float64", "", "upper end of it", "as ci_low"),
-    (
-        "effect_size",
-        "float64",
-        "",
-        "Hedges' g: the difference in standard deviations between animals",
-        "J x estimate / pooled sd of the animals' means",
-    ),
-    ("effect_low", "float64", "", "lower end of its interval", "as effect_size, of ci_low"),
-    ("effect_high", "float64", "", "upper end of its interval", "as effect_size, of ci_high"),
-    ("p", "float64", "", "two-sided p of the test; empty where there is none, see refused"),
-    ("p_fdr", "float64", "", "p, corrected for the size of the family", "Benjamini-Hochberg"),
-    ("test", "string", "", "the test that was made"),
-    ("refused", "string", "", "why there is no test; empty where there is one"),
-    (
-        "unit",
-        "string",
-        "",
-        "what was assigned to a group, and so what n_group and n_reference count: cage, animal, "
-        "or an animal's own difference",
-    ),
-    ("n_animals", "int64", "", "animals in both groups"),
-    ("n_cages", "int64", "", "cages they live in; 0 when not stated"),
-    ("n_sessions", "int64", "", "sessions with a value"),
-    ("n_bouts", "int64", "", "bouts in them; 0 when not told"),
-    ("observed_min", "float64", "min", "time with a pose in them"),
-    (
-        "n_without_value",
-        "int64",
-        "",
-        "sessions of these groups that have no value and are left out",
-    ),
-    (
-        "smallest_p",
-        "float64",
-        "",
-        "the smallest p that a permutation of these units can give",
-        "2 / arrangements; 1 / arrangements where an arrangement has no mirror image",
-    ),
-    ("family", "string", "", "the tests that p_fdr is corrected for"),
-    ("n_family", "int64", "", "how many they are"),
-)
+STATS = table_columns("stats")
 
 
 def collect(sessions: Iterable[SessionTables]) -> pd.DataFrame:

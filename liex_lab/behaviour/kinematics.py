@@ -21,12 +21,11 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from liex_lab.behaviour.body import BRANCHES, STANDS, SWIMS, BodyAxis
-from liex_lab.behaviour.columns import kinematics_columns
 from liex_lab.behaviour.posture import Posture, Shape
 from liex_lab.behaviour.tail import tail_beat
 from liex_lab.runtime.memory import Allocator, blocks
 from liex_lab.tables.rows import gap_follows, median_step, stop_times
-from liex_lab.tables.schema import to_pandas
+from liex_lab.tables.schema import table_columns, to_pandas
 from liex_lab.tracking.track import Track
 
 Array = NDArray[np.float64]
@@ -163,7 +162,7 @@ def kinematics(
         allocate: makes the arrays of the columns (an allocator, as `np.empty`).
 
     Returns:
-        The columns of `kinematics_columns`: mm, s and rad in the arena frame, NaN where nothing is
+        The table: mm, s and rad in the arena frame, NaN where nothing is
         known.
     """
     joints = poses if isinstance(poses, Joints) else Joints.of_table(poses, len(frames))
@@ -188,7 +187,7 @@ def kinematics(
     }
     if body.kind == SWIMS:
         block |= _swimming(shape, time_s, segments(time_s, observed, begins), surface_z_mm)
-    return to_pandas(kinematics_columns(body.kind), block, copy=False)
+    return to_pandas(table_columns("kinematics", body.kind), block, copy=False)
 
 
 def _frame_by_frame(

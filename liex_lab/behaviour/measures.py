@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from liex_lab.behaviour.body import kind_of
 from liex_lab.behaviour.bout_reader import BoutReader
 from liex_lab.behaviour.checking import BoutCheck
-from liex_lab.behaviour.columns import bout_columns, kind_of, trusted
-from liex_lab.tables.schema import BOUTS, to_pandas
+from liex_lab.tables.schema import BOUTS, table_columns, to_pandas
 
 
 def measure_bouts(
@@ -33,16 +33,15 @@ def measure_bouts(
             checks nothing.
 
     Returns:
-        The columns `BOUTS` and those of `bout_columns`, one row per bout.
+        The table with all its columns, one row per bout.
     """
-    described = bout_columns(kind_of(kinematics))
+    columns = table_columns("bouts", kind_of(kinematics))
     reader = BoutReader(kinematics)
     check = BoutCheck(reader, meanings or {})
     spans = reader.rows_of(bouts)
     measured = [reader.measure(a, b) for a, b in spans]
-    known = trusted(described, reader.fps)
     block: dict[str, Any] = {c.name: bouts[c.name].to_numpy() for c in BOUTS}
-    for column in described:
+    for column in columns[len(BOUTS) :]:
         if column.name == "since_last_s":
             block[column.name] = reader.since_last(bouts, spans)
         elif column.name == "contradicts":
@@ -51,8 +50,7 @@ def measure_bouts(
                 for (a, b), word in zip(spans, bouts["action"], strict=True)
             ]
         else:
+            known = reader.fps >= (column.unreliable_below_fps or 0.0)
             empty = 0 if column.dtype == "int64" else np.nan
-            block[column.name] = [
-                m[column.name] if column.name in known else empty for m in measured
-            ]
-    return to_pandas([*BOUTS, *described], block)
+            block[column.name] = [m[column.name] if known else empty for m in measured]
+    return to_pandas(columns, block)

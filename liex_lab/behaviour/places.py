@@ -21,9 +21,8 @@ from liex_lab.arena.zones import SEPARATOR
 from liex_lab.behaviour.activity import observed_hold
 from liex_lab.behaviour.bouts import MouseRules, tidy
 from liex_lab.behaviour.kinematics import segments
-from liex_lab.behaviour.summary_columns import ZONES
 from liex_lab.tables.rows import stop_times
-from liex_lab.tables.schema import to_pandas
+from liex_lab.tables.schema import table_columns, to_pandas
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -101,11 +100,12 @@ def visits(
                 step[here].sum(),
             )
         )
-    names = [column.name for column in ZONES[2:]]
+    columns = table_columns("zones")
+    names = [column.name for column in columns[2:]]
     values = zip(*rows, strict=True) if rows else [[] for _ in names]
     who = {name: [str(frames[name].iloc[0])] * len(rows) for name in ("session_id", "individual")}
     return to_pandas(
-        ZONES, {**who, **{name: list(column) for name, column in zip(names, values, strict=True)}}
+        columns, {**who, **{name: list(column) for name, column in zip(names, values, strict=True)}}
     )
 
 

@@ -18,9 +18,8 @@ from numpy.typing import NDArray
 
 from liex_lab.actions.labels import HUMAN
 from liex_lab.behaviour.activity import activity, observed_hold, time_named
-from liex_lab.behaviour.body import SWIMS, parents_of
+from liex_lab.behaviour.body import SWIMS, kind_of, parents_of
 from liex_lab.behaviour.bouts import ACTIONS, MouseRules, find_bouts
-from liex_lab.behaviour.columns import kind_of
 from liex_lab.behaviour.kinematics import Joints, kinematics
 from liex_lab.behaviour.measures import measure_bouts
 from liex_lab.behaviour.places import (
@@ -31,11 +30,10 @@ from liex_lab.behaviour.places import (
     surface_height_mm,
     visits,
 )
-from liex_lab.behaviour.summary_columns import Vocabulary, rears_of, summary_columns
 from liex_lab.behaviour.transitions import transitions
 from liex_lab.runtime.memory import Allocator
 from liex_lab.tables.rows import stop_times
-from liex_lab.tables.schema import GAPS, empty_table, to_pandas
+from liex_lab.tables.schema import BEHAVIOUR, GAPS, Vocabulary, empty_table, rears_of, to_pandas
 from liex_lab.tracking.track import ends_of
 
 if TYPE_CHECKING:
@@ -43,9 +41,6 @@ if TYPE_CHECKING:
     from liex_lab.tables.session_tables import SessionTables
 
 Array = NDArray[np.float64]
-
-# of the table `frames`, what behaviour is measured by
-TABLES = ("kinematics", "bouts", "summary", "transitions", "activity", "zones")
 
 
 @dataclass(frozen=True)
@@ -77,7 +72,7 @@ class Behaviour:
     @property
     def tables(self) -> dict[str, pd.DataFrame]:
         """Every table by its name."""
-        return {name: getattr(self, name) for name in TABLES}
+        return {name: getattr(self, name) for name in BEHAVIOUR}
 
     def for_session(self) -> dict[str, Any]:
         """The arguments that hand it to a session: `writer.close(**behaviour.for_session())`."""
@@ -268,7 +263,7 @@ def summarise(
         rules: what is slower than their pause does not move for certain; None takes the defaults.
 
     Returns:
-        The columns of `summary_columns`.
+        The columns of the table `summary`.
     """
     words = words or Vocabulary(ACTIONS)
     around = around or Surroundings()
@@ -298,7 +293,7 @@ def summarise(
         block["distance_moving_m"] = _moving_m(
             kinematics, np.fmax(pause_mm_s, block["speed_noise_mm_s"])
         )
-    return to_pandas(summary_columns(words.words, words.zones, words.kind), block)
+    return to_pandas(words.table("summary"), block)
 
 
 def _motion(kinematics: pd.DataFrame, hold: Array) -> dict[str, float]:

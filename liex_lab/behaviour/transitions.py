@@ -15,8 +15,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from liex_lab.behaviour.multiplicity import false_discovery
-from liex_lab.behaviour.summary_columns import TRANSITIONS
-from liex_lab.tables.schema import to_pandas
+from liex_lab.tables.schema import table_columns, to_pandas
 
 Array = NDArray[np.float64]
 Counts = NDArray[np.int64]
@@ -40,7 +39,7 @@ def transitions(
         longest_pause_s: bouts further apart than this do not follow each other, s.
 
     Returns:
-        k (k - 1) rows with the columns `TRANSITIONS`.
+        k (k - 1) rows of the table `transitions`.
     """
     counts = count_transitions(bouts, words, gaps, longest_pause_s)
     expected = by_chance(counts)
@@ -53,7 +52,7 @@ def transitions(
     )
     names = np.array(words, dtype=object)
     return to_pandas(
-        TRANSITIONS,
+        table_columns("transitions"),
         {
             **{name: [_first(bouts, name)] * len(n) for name in ("session_id", "individual")},
             "from_action": names[rows],

@@ -1,16 +1,19 @@
-"""Schema of a session's tables (Apache Parquet): every column, its dtype, unit and meaning.
+"""Schema of all tables (Apache Parquet): every column, its dtype, unit and meaning.
 
-Every column is listed once, and there is one way for a table to get to disk and back: the writer,
-the reader, columns.json and the report's glossary all read `TABLES`. Tables that other packages
-make (behaviour) bring their own `Column` entries; a column without an entry is refused by
-`write_table`.
+Every column is one line of columns.csv. `when` says in which sessions it exists: always, once
+behaviour is measured, for some kinds of body, for each action or zone, or where rears of several
+kinds are distinguished. Writers, readers, columns.json, the report and the manual read this list;
+`write_table` refuses a column without an entry.
 """
 
 from __future__ import annotations
 
+import csv
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from functools import cache
+from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.actions.ethogram import ACROSS_GAPS
+from liex_lab.actions.vocabulary import WORDS
 from liex_lab.errors import SessionError
 from liex_lab.runtime.memory import blocks
 
@@ -26,6 +30,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 ROWS_PER_GROUP = 100_000  # a block of the widest table then takes some 20 MB
+_TEXTS = ("name", "dtype", "unit", "meaning", "formula", "source")
 Block = Mapping[str, Any]  # column -> one value for all rows, or an array
 
 
@@ -57,475 +62,98 @@ class Column:
     since: str = "0.1"
 
 
-def columns(table: str, *rows: tuple[str, ...]) -> tuple[Column, ...]:
+@cache
+def _listed() -> dict[str, list[dict[str, str]]]:
+    """The lines of columns.csv by table; `when` says in which sessions a column exists."""
+    tables: dict[str, list[dict[str, str]]] = {}
+    with Path(__file__).with_name("columns.csv").open(encoding="utf-8", newline="") as file:
+        for line in csv.DictReader(file):
+            tables.setdefault(line["table"], []).append(line)
+    return tables
+
+
+def table_columns(
+    table: str, kind: str = "", words: Sequence[str] = (), zones: Sequence[str] = ()
+) -> tuple[Column, ...]:
     """The columns of one table, in order.
 
     Args:
         table: name of the table.
-        *rows: (name, dtype, unit, meaning[, formula[, source]]) of each column.
-
-    Returns:
-        One `Column` for each row.
+        kind: of body, one of `behaviour.body.KINDS`; '' leaves out what is measured of behaviour.
+        words: the actions' names.
+        zones: the zones' names.
     """
-    made = []
-    for row in rows:
-        name, dtype, unit, meaning, formula, source = (*row, "", "")[:6]
-        made.append(Column(table, name, dtype, unit, meaning, formula, source))
-    return tuple(made)
+    named: dict[str, list[dict[str, str]]] = {
+        "each action": [{"action": word} for word in words],
+        "each zone": [{"zone": zone} for zone in zones],
+    }
+    if rears := rears_of(words):
+        sums = {f"rears_{of}": " + ".join(f"{one}_{of}" for one in rears) for of in ("count", "s")}
+        named["rears"] = [{"rears": " and ".join(rears), **sums}]
+    found = []
+    for when, lines in groupby(_listed()[table], lambda line: line["when"]):
+        once = not when or (kind and (when == "measured" or kind in when.split()))
+        group = list(lines)
+        for names in named.get(when, [{}] if once else []):
+            found += [_column(line, names) for line in group]
+    return tuple(found)
 
 
-_WHO = (
-    ("session_id", "string", "", "name of the session: one recording's results"),
-    (
-        "individual",
-        "string",
-        "",
-        "name of the animal within the session; the sessions table maps it to subject_id",
-    ),
-)
-_WHEN = (
-    (
-        "frame_index",
-        "int64",
-        "",
-        "number of the frame in the recording, from 0; frames that the camera did not deliver are "
-        "not counted, see frames pulse_index. Of a live stream it is the sender's count",
-        "",
-        "recording",
-    ),
-    (
-        "time_s",
-        "float64",
-        "s",
-        "time of the frame since the recording's first frame",
-        "",
-        "the recording's clock",
-    ),
-    (
-        "dt_s",
-        "float64",
-        "s",
-        "time since the previous recorded frame; empty at the first",
-        "",
-        "the recording's clock",
-    ),
-)
-_SPAN = (
-    ("start_s", "float64", "s", "onset, since the first frame", "", ""),
-    (
-        "stop_s",
-        "float64",
-        "s",
-        "time of the first frame outside; where the last frame inside precedes a gap or ends the "
-        "recording, its time + median dt",
-        "",
-        "",
-    ),
-    ("start_frame", "int64", "", "frame_index of the first frame inside"),
-    (
-        "stop_frame",
-        "int64",
-        "",
-        "frame_index of the first frame outside; at the end of the recording, last + 1",
-    ),
-)
-_AXES = "arena frame: z up from the floor, origin below the camera, x along the picture's rows"
-_MID = "joints lie on the body's mid-axis, not on the skin"
+def _column(line: Mapping[str, str], names: Mapping[str, str]) -> Column:
+    """The column that a line describes, with the names of an action or a zone filled in."""
+    texts = [line[one].format(across_gaps=ACROSS_GAPS, **names) for one in _TEXTS]
+    fps = line["unreliable_below_fps"]
+    return Column(line["table"], *texts, float(fps) if fps else None)
 
-FRAMES = columns(
-    "frames",
-    *_WHO,
-    *_WHEN,
-    ("time_ns", "int64", "ns", "time stamp of the frame as recorded", "", "the recording's clock"),
-    (
-        "gap_before",
-        "int64",
-        "",
-        "frames that the camera did not deliver just before this one; 1 where the clock jumped, "
-        "for how many were missing is unknown",
-        "time since the frame before / mean frame interval, rounded, - 1",
-        "the recording's clock",
-    ),
-    (
-        "pulse_index",
-        "int64",
-        "",
-        "number of the camera's pulse that took the frame, from 0 at the first frame; frames that "
-        "the camera did not deliver are counted. After a gap whose reason is clock_jumped it is a "
-        "guess",
-        "row number + sum of gap_before so far",
-        "the recording's clock",
-    ),
-    (
-        "predicted_error_mm",
-        "float64",
-        "mm",
-        "joint error to be expected in this frame, mean over the joints",
-        "",
-        "learned metric of the model, and the smoother",
-    ),
-    (
-        "residual_mm",
-        "float64",
-        "mm",
-        "distance between the body's surface and the depth seen, within the animal, with "
-        "the pose that the frame says by itself",
-        "median of |rendered - observed|",
-        "fit",
-    ),
-    ("n_foreground_px", "int64", "px", "pixels taken for the animal", "", "foreground"),
-    *(
-        (
-            f"centroid_{a}_mm",
-            "float64",
-            "mm",
-            f"centre of the animal's outline as seen from above; {_AXES}",
-            "mean over its pixels, weighted by the area they cover",
-            "foreground",
-        )
-        for a in "xy"
-    ),
-    (
-        "centroid_z_mm",
-        "float64",
-        "mm",
-        "mean height of the animal's back above the floor",
-        "",
-        "foreground",
-    ),
-    (
-        "centroid_u_px",
-        "float64",
-        "px",
-        "column of the centroid in the depth picture",
-        "",
-        "foreground",
-    ),
-    (
-        "centroid_v_px",
-        "float64",
-        "px",
-        "row of the centroid in the depth picture",
-        "",
-        "foreground",
-    ),
-    (
-        "wall_distance_mm",
-        "float64",
-        "mm",
-        "distance of the centroid from the nearest wall, negative beyond it; empty "
-        "where the arena's shape is not known",
-        "to the circle or rectangle in session.json, arena",
-        "arena",
-    ),
-    (
-        "zone",
-        "string",
-        "",
-        "the zones that the centroid lies in, in the order of the zones' file, with ; between "
-        "them; empty outside all of them and where there is no centroid",
-        "",
-        "arena.zones of the plan",
-    ),
-    (
-        "spine_mm",
-        "float64",
-        "mm",
-        "length of the fitted chain of joints, all bones added up",
-        "scale x length of the skeleton at home",
-        "fit",
-    ),
-    ("scale", "float64", "", "size of the animal relative to the skeleton's file", "", "fit"),
-    (
-        "p_flip",
-        "float64",
-        "",
-        "probability that head and tail are exchanged in this pose",
-        "two states over the whole "
-        "recording: what each frame says of either, and how fast animals turn",
-        "tracker",
-    ),
-    (
-        "bridged",
-        "bool",
-        "",
-        "nothing was measured; the pose is what lies between two measured ones, of which the "
-        "nearer is no farther than half of tracking.bridge_s of the plan; measures of behaviour "
-        "leave it out",
-        "",
-        "tracker",
-    ),
-    (
-        "flag",
-        "string",
-        "",
-        "empty when the pose is trusted; doubtful: its predicted error is large, or the picture "
-        "contradicts it; corrected: a person placed joints of it; hidden, not_found or no_depth: "
-        "nothing was measured, and there is no pose where it is not bridged; hidden: the animal is "
-        "behind or under something, whole or so much of it that nobody knows how it lies; "
-        "repeated: the depth image is a copy of the one before, with no pose where the stream "
-        "froze, and a pose between its neighbours where each image was written more than once",
-        "",
-        "tracker",
-    ),
-)
 
-POSES = columns(
-    "poses",
-    *_WHO,
-    *_WHEN,
-    ("joint", "string", "", f"name of the joint in the skeleton; {_MID}"),
-    ("x_mm", "float64", "mm", f"position of the joint; {_AXES}; {_MID}", "", "fit"),
-    ("y_mm", "float64", "mm", f"position of the joint; {_AXES}; {_MID}", "", "fit"),
-    ("z_mm", "float64", "mm", f"height of the joint above the floor; {_AXES}; {_MID}", "", "fit"),
-    (
-        "u_px",
-        "float64",
-        "px",
-        "column of the joint in the depth image; (0, 0) is the centre of the top-left pixel",
-        "pinhole projection",
-        "fit",
-    ),
-    (
-        "v_px",
-        "float64",
-        "px",
-        "row of the joint in the depth image; (0, 0) is the centre of the top-left pixel",
-        "pinhole projection",
-        "fit",
-    ),
-    (
-        "score",
-        "float64",
-        "",
-        "probability that the joint lies within 10 % of the spine's length of the truth; exports "
-        "give a likelihood made of it and of the frame's flag",
-        "chi distribution with 3 degrees of freedom at 0.1 spine_mm / s, where s^2 = "
-        "(2 sd_xy_mm^2 + sd_z_mm^2) / 3",
-        "sd_xy_mm, sd_z_mm",
-    ),
-    (
-        "sd_mm",
-        "float64",
-        "mm",
-        "standard deviation of the joint along one axis from one frame to another; speeds are made "
-        "of it",
-        "sqrt(trace of covariance / 3)",
-        "posterior of the smoother",
-    ),
-    (
-        "sd_xy_mm",
-        "float64",
-        "mm",
-        "standard deviation of x_mm and of y_mm: where along an animal's outline its joints lie is "
-        "a matter of its build, and may be wrong by the same amount throughout a recording",
-        "sqrt(sd_mm^2 + s^2 / 2), s of animals of builds that no forest was trained on",
-        "posterior of the smoother, calibration",
-    ),
-    (
-        "sd_z_mm",
-        "float64",
-        "mm",
-        "standard deviation of z_mm: a camera sees the back only, so how deep below it the joints "
-        "lie may be wrong by the same amount throughout a recording",
-        "sqrt(sd_mm^2 + h^2), h of animals of builds that no forest was trained on",
-        "posterior of the smoother, calibration",
-    ),
-)
+def rears_of(words: Sequence[str]) -> tuple[str, ...]:
+    """The kinds of rearing that a vocabulary distinguishes; none where it has rear itself."""
+    return () if "rear" in words else tuple(word for word in words if word.startswith("rear_"))
 
-_TURN = (
-    "rotation vector relative to the parent joint; row 'root': the body's base relative to the "
-    "arena"
-)
-_SHIFT = (
-    "row 'root' only: position of the body's base in the arena; empty in the rows of the joints"
-)
-_SPREAD = "posterior of the smoother"
-_OF_ROOT = ("wx_rad", "wy_rad", "wz_rad", "tx_mm", "ty_mm", "tz_mm")
-# of each pair of them, row by row of the upper triangle: name and unit
-ROOT_COVARIANCES = {
-    f"cov_{a[:2]}_{b[:2]}_{unit}": unit.replace("2", "²").replace("_", " ")
-    for k, a in enumerate(_OF_ROOT)
-    for b in _OF_ROOT[k + 1 :]
-    for unit in [a[3:] + "2" if a[3:] == b[3:] else f"{a[3:]}_{b[3:]}"]
-}
-ROTATIONS = columns(
-    "rotations",
-    *_WHO,
-    *_WHEN,
-    (
-        "joint",
-        "string",
-        "",
-        "name of the joint; 'root' is the rigid transform of the body's base, T_arena_root",
-    ),
-    *(
-        (
-            f"w{axis}_rad",
-            "float64",
-            "rad",
-            f"{axis} of the {_TURN}",
-            "logarithm of the rotation",
-            "fit",
-        )
-        for axis in "xyz"
-    ),
-    *(
-        (
-            f"sd_w{axis}_rad",
-            "float64",
-            "rad",
-            f"standard deviation of w{axis}_rad, in the joint's own frame",
-            "",
-            _SPREAD,
-        )
-        for axis in "xyz"
-    ),
-    *((f"t{axis}_mm", "float64", "mm", f"{axis}; {_SHIFT}", "", "fit") for axis in "xyz"),
-    *(
-        (
-            f"sd_t{axis}_mm",
-            "float64",
-            "mm",
-            f"standard deviation of t{axis}_mm, in the root's own frame",
-            "",
-            _SPREAD,
-        )
-        for axis in "xyz"
-    ),
-    *(
-        (
-            name,
-            "float64",
-            unit,
-            f"row 'root' only: covariance of the root's {name[4:6]} and {name[7:9]}, in its own "
-            "frame; the variances are the squares of their sd_",
-            "",
-            _SPREAD,
-        )
-        for name, unit in ROOT_COVARIANCES.items()
-    ),
-)
 
-BOUTS = columns(
-    "bouts",
-    *_WHO,
-    ("action", "string", "", "a word of the ethogram's vocabulary"),
-    *_SPAN[:2],
-    ("duration_s", "float64", "s", f"duration of the bout. {ACROSS_GAPS}", "stop_s - start_s"),
-    *_SPAN[2:],
-    (
-        "score",
-        "float64",
-        "",
-        "how well the bout fits its action, 0 to 1; for rules, the share of its frames that "
-        "satisfy the rule",
-    ),
-    ("source", "string", "", "who named it: rule, model or human"),
-    ("model_hash", "string", "", "hash of the model that named it; empty for a rule"),
-)
+@dataclass(frozen=True)
+class Vocabulary:
+    """What decides which columns the behaviour tables of a session have.
 
-GAPS = columns(
-    "gaps",
-    *_WHO,
-    *_SPAN,
-    (
-        "n_frames_missing",
-        "int64",
-        "",
-        "frames in which no pose was measured (bridged ones, which have a pose all the same, are "
-        "among them), or that the camera never delivered; 0 where only a time stamp was moved, 1 "
-        "where the clock jumped, for how many it were nobody knows",
-    ),
-    (
-        "reason",
-        "string",
-        "",
-        "camera_dropped: never recorded, start_frame = stop_frame = the next frame; "
-        "clock_jumped: the camera was stopped, or its clock set, before the frame; "
-        "stamp_repeated, stamp_out_of_order: this frame's own time stamp could not be true and "
-        "was moved; no_depth: recorded without any depth; repeated: the stream froze, and the "
-        "depth image before it was written again; hidden: the animal went behind or under "
-        "something; tracker_lost: nothing in the frame looks like the animal",
-    ),
-    (
-        "x_mm",
-        "float64",
-        "mm",
-        f"where the animal was last seen before it was hidden, else empty; {_AXES}",
-        "",
-        "tracker",
-    ),
-    (
-        "y_mm",
-        "float64",
-        "mm",
-        f"where the animal was last seen before it was hidden, else empty; {_AXES}",
-        "",
-        "tracker",
-    ),
-)
+    Attributes:
+        words: the actions' names.
+        zones: the zones' names.
+        kind: of body, one of `behaviour.body.KINDS`.
+    """
 
-FLIPS = columns(
-    "flips",
-    *_WHO,
-    *_SPAN,
-    (
-        "p_flip",
-        "float64",
-        "",
-        "probability that head and tail were exchanged: where applied, in what the single frames "
-        "said, else in the tables",
-        "mean over the span",
-        "tracker",
-    ),
-    ("applied", "bool", "", "whether the exchange was undone in the tables"),
-    ("source", "string", "", "who found it: model or human"),
-    ("undone_at", "string", "", "when a human took the correction back, ISO 8601; empty otherwise"),
-)
+    words: tuple[str, ...]
+    zones: tuple[str, ...] = ()
+    kind: str = "stands"
 
-SESSIONS = columns(
-    "sessions",
-    *_WHO,
-    (
-        "subject_id",
-        "string",
-        "",
-        "the animal across the study; empty when the recording does not say",
-    ),
-    ("group", "string", "", "experimental group; empty until stated"),
-    ("cage", "string", "", "home cage or tank; empty until stated"),
-    ("sex", "string", "", "sex; empty until stated"),
-    ("batch", "string", "", "batch of the experiment; empty until stated"),
-    (
-        "session_start_time",
-        "string",
-        "",
-        "when the recording began, ISO 8601 with zone; empty when unknown",
-    ),
-    ("n_frames", "int64", "", "recorded frames"),
-    (
-        "n_frames_observed",
-        "int64",
-        "",
-        "recorded frames with a measured pose; bridged ones do not count",
-    ),
-    (
-        "observed_s",
-        "float64",
-        "s",
-        "time with a measured pose",
-        "sum over frames with a measured pose of the time to the next frame; before a gap or the "
-        "end, the median dt",
-    ),
-    ("fps_median", "float64", "1/s", "frames per second", "1 / median dt"),
-    ("calibration_hash", "string", "", "hash of the camera's numbers and its place in the arena"),
-    ("software_version", "string", "", "version of liex_lab"),
-)
+    def table(self, name: str) -> tuple[Column, ...]:
+        """The columns of one of the tables."""
+        return table_columns(name, self.kind, self.words, self.zones)
 
+    @property
+    def columns(self) -> tuple[Column, ...]:
+        """Every column of the behaviour tables, of bouts those beyond `BOUTS`."""
+        every = [column for name in BEHAVIOUR for column in self.table(name)]
+        return tuple(column for column in every if column not in BOUTS)
+
+
+BEHAVIOUR = ("kinematics", "bouts", "summary", "transitions", "zones", "activity")
 TABLES: dict[str, tuple[Column, ...]] = {
-    rows[0].table: rows for rows in (FRAMES, POSES, ROTATIONS, BOUTS, GAPS, FLIPS, SESSIONS)
+    name: table_columns(name)
+    for name in ("frames", "poses", "rotations", "bouts", "gaps", "flips", "sessions")
 }
+FRAMES, POSES, ROTATIONS, BOUTS, GAPS, FLIPS, SESSIONS = TABLES.values()
+# of each pair of the root's coordinates, row by row of the upper triangle
+ROOT_COVARIANCES = tuple(column.name for column in ROTATIONS if column.name.startswith("cov_"))
+
+
+def all_columns() -> dict[str, Column]:
+    """Every column that a session can have, of every kind of body, by `table.name`."""
+    walking, swimming, branching = (
+        Vocabulary(tuple(WORDS.get(animal, ())), (), kind).columns
+        for animal, kind in (("mouse", "stands"), ("fish", "swims"), ("hand", "branches"))
+    )
+    stored = [column for rows in TABLES.values() for column in rows]
+    return {f"{c.table}.{c.name}": c for c in (*stored, *branching, *swimming, *walking)}
 
 
 def dictionary(*extra: Sequence[Column]) -> list[dict[str, Any]]:

@@ -11,56 +11,12 @@ from liex_lab.plan.study import PlannedSession, Study
 from liex_lab.runtime.durable import replacing, write_whole
 from liex_lab.runtime.places import unlinked_below
 from liex_lab.runtime.spreadsheets import harmless
-from liex_lab.tables.schema import columns, dictionary, write_table
+from liex_lab.tables.schema import dictionary, table_columns, write_table
 
 from .status import SessionStatus
 
-STUDY_SESSIONS = columns(
-    "study",
-    ("session_id", "string", "", "the session's id in the study"),
-    ("subject_id", "string", "", "the animal across the study"),
-    ("group", "string", "", "experimental group"),
-    ("cage", "string", "", "home cage or tank"),
-    ("sex", "string", "", "sex"),
-    ("batch", "string", "", "batch of the experiment"),
-    (
-        "state",
-        "string",
-        "",
-        "done; failed: see reason and remedy; excluded: by the study file; new, begun or "
-        "changed: to be done",
-    ),
-    (
-        "reason",
-        "string",
-        "",
-        "why it failed, is excluded or is to be done; of one that is done, what to look at or to "
-        "distrust",
-    ),
-    (
-        "shared",
-        "string",
-        "",
-        "what it shares with other sessions of its animal, or why it does not; empty where the "
-        "study has shared = 'off'",
-    ),
-    ("remedy", "string", "", "what to do about it"),
-    ("stage", "string", "", "what was being done when it failed"),
-    (
-        "frame",
-        "int64",
-        "",
-        "frames that had been measured when it failed; -1 where none was or it did not fail",
-    ),
-    ("n_frames", "int64", "", "recorded frames; 0 where it is not done"),
-    ("n_frames_observed", "int64", "", "recorded frames with a pose"),
-    ("observed_s", "float64", "s", "time with a pose"),
-    ("frames_per_s", "float64", "1/s", "frames measured per second of the run"),
-    ("peak_memory_mb", "float64", "MB", "the most memory the run held"),
-    ("recording", "string", "", "the recording, from the study's folder"),
-    ("folder", "string", "", "the session's folder, from the study's folder"),
-)
 TABLE = "study"
+STUDY_SESSIONS = table_columns(TABLE)
 
 
 def write_study_table(study: Study, standings: Sequence[SessionStatus]) -> Path:

@@ -8,13 +8,12 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from liex_lab.behaviour.body import BRANCHES, KINDS, BodyAxis, parents_of
-from liex_lab.behaviour.columns import bout_columns, kind_of, kinematics_columns
+from liex_lab.behaviour.body import BRANCHES, KINDS, BodyAxis, kind_of, parents_of
 from liex_lab.behaviour.curves import curves_of, logged_of
 from liex_lab.behaviour.kinematics import Joints, kinematics
 from liex_lab.behaviour.summary import measure
 from liex_lab.body.skeleton import Skeleton
-from liex_lab.tables.schema import FRAMES, to_pandas
+from liex_lab.tables.schema import FRAMES, table_columns, to_pandas
 
 HAND = Skeleton.load("hand")
 
@@ -61,7 +60,7 @@ def test_an_animal_with_paws_still_has_a_nose():
 
 def test_the_columns_tell_the_kind_of_body():
     for kind in KINDS:
-        assert kind_of(column.name for column in kinematics_columns(kind)) == kind
+        assert kind_of(column.name for column in table_columns("kinematics", kind)) == kind
 
 
 def frames_of(n: int) -> pd.DataFrame:
@@ -117,5 +116,5 @@ def test_a_hand_has_no_measures_of_rears_in_its_bouts():
     found = measure(frames_of(30), source)
     assert list(found.bouts["action"]) == ["pause"]
     assert not [name for name in found.bouts if "nose" in str(name) or "height" in str(name)]
-    assert not [column for column in bout_columns(BRANCHES) if "nose" in column.name]
+    assert not [column for column in table_columns("bouts", BRANCHES) if "nose" in column.name]
     assert "distance_moving_m" in found.summary

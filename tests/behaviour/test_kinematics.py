@@ -9,7 +9,6 @@ import pandas as pd
 import pytest
 
 from liex_lab.behaviour.body import STANDS, SWIMS, BodyAxis
-from liex_lab.behaviour.columns import kinematics_columns
 from liex_lab.behaviour.kinematics import Joints, kinematics, neighbours, segments, smallest_turn
 from liex_lab.recordings.timestamps import find_gaps, median_step
 from liex_lab.runtime.memory import on_disk, rest
@@ -161,7 +160,9 @@ def test_body_points_are_found_by_name_or_along_the_chain():
 
 def test_the_table_has_the_listed_columns_and_one_row_per_frame():
     moved = kinematics(*tables_of(WalkingMouse(steady(1.0))))
-    assert list(moved.columns) == [column.name for column in kinematics_columns(STANDS)]
+    assert list(moved.columns) == [
+        column.name for column in schema.table_columns("kinematics", STANDS)
+    ]
     assert len(moved) == 30
 
 

@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 
 from liex_lab.behaviour import ACTIONS, measure
-from liex_lab.behaviour.summary_columns import summary_columns
+from liex_lab.tables.schema import Vocabulary
 from tests.behaviour.test_kinematics import tables_of
 from tests.sessions.walking_mouse import SPINE_MM, WalkingMouse, steady
 
@@ -48,7 +48,7 @@ def test_an_animal_never_seen_has_a_row_that_says_so():
 
 def test_the_row_has_the_listed_columns():
     summary = measure(*tables_of(WalkingMouse(steady(1.0)))).summary
-    assert list(summary.columns) == [column.name for column in summary_columns(ACTIONS)]
+    assert list(summary.columns) == [column.name for column in Vocabulary(ACTIONS).table("summary")]
     assert len(summary) == 1
 
 

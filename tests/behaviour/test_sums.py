@@ -19,10 +19,9 @@ from liex_lab.behaviour.measures import measure_bouts
 from liex_lab.behaviour.multiplicity import false_discovery
 from liex_lab.behaviour.places import outer_margin_mm, visits
 from liex_lab.behaviour.summary import summarise
-from liex_lab.behaviour.summary_columns import Vocabulary
 from liex_lab.behaviour.transitions import by_chance, count_transitions, transitions
 from liex_lab.tables.rows import stop_times
-from liex_lab.tables.schema import BOUTS, GAPS, empty_table, to_pandas
+from liex_lab.tables.schema import BOUTS, GAPS, Vocabulary, empty_table, to_pandas
 from tests.behaviour.test_kinematics import tables_of
 from tests.sessions.walking_mouse import WalkingMouse, steady, write
 

@@ -9,14 +9,13 @@ import pandas as pd
 import pyarrow.parquet as pq
 import pytest
 
-from liex_lab.behaviour.listing import all_columns
 from liex_lab.errors import SessionError
 from liex_lab.sessions import Session
 from liex_lab.tables.schema import (
     BOUTS,
     TABLES,
     Column,
-    columns,
+    all_columns,
     dictionary,
     empty_table,
     to_pandas,
@@ -75,7 +74,7 @@ def test_the_dictionary_says_that_joints_lie_on_the_mid_axis(session):
 
 
 def test_a_column_without_an_entry_is_refused(tmp_path):
-    schema = columns("notes", ("text", "string", "", "what was noted"))
+    schema = [Column("notes", "text", "string", "", "what was noted")]
     with pytest.raises(SessionError, match=r"without a description \['extra'\]"):
         write_table(tmp_path / "notes.parquet", schema, [{"text": ["a"], "extra": [1]}], {})
     with pytest.raises(SessionError, match=r"lacks \['text'\]"):
@@ -148,9 +147,8 @@ def test_tables_without_rows_keep_their_columns(session):
 
 
 def test_a_block_becomes_the_frame_that_reading_it_back_gives(session, tmp_path):
-    schema = columns(
-        "t", ("who", "string", "", "a"), ("n", "int64", "", "b"), ("yes", "bool", "", "c")
-    )
+    kinds = {"who": "string", "n": "int64", "yes": "bool"}
+    schema = [Column("t", name, dtype, "", "what it is") for name, dtype in kinds.items()]
     block = {"who": "m", "n": np.array([1, 2]), "yes": [True, False]}
     write_table(tmp_path / "t.parquet", schema, [block], {})
     pd.testing.assert_frame_equal(pd.read_parquet(tmp_path / "t.parquet"), to_pandas(schema, block))
