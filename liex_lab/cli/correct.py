@@ -49,9 +49,7 @@ def flip(
     by: Author = "",
 ) -> None:
     """Exchange head and tail in a span."""
-    from liex_lab.sessions.correcting import flip_span
-
-    _do(session, [flip_span(_opened(session), start_s, stop_s)], by)
+    _say(session, ["flip", start_s, stop_s], by)
 
 
 @correct.command()
@@ -72,17 +70,11 @@ def joint(
     by: Author = "",
 ) -> None:
     """Move a joint in one frame; the others follow as bones and limits allow."""
-    from liex_lab.sessions.correcting import joint_move, joint_move_at_pixel
-
     if (to_mm is None) == (to_px is None):
         raise SessionError(
             "a joint's place is given in one way: --to-mm X Y Z in the arena, or --to-px U V"
         )
-    opened = _opened(session)
-    if to_px is not None:
-        _do(session, [joint_move_at_pixel(opened, frame, name, *to_px)], by)
-    else:
-        _do(session, [joint_move(opened, frame, name, to_mm)], by)
+    _say(session, ["joint", name, frame, *(to_px or to_mm or ())], by)
 
 
 @correct.command()
@@ -115,31 +107,26 @@ def bout(
     Rename: --at, --action (the present name confirms it). New span: --at, --from, --to. Delete:
     --at, --delete. Add: --action, --from, --to. Whole ethogram: --labels.
     """
-    from liex_lab.sessions import correcting
-
-    opened = _opened(session)
-    span = (start_s, stop_s)
-    match (at_s, action, span, delete, labels):
-        case (None, None, (None, None), False, Path()):
+    new = ["new"] if new_word else []
+    match (at_s, action, start_s, stop_s, delete, labels):
+        case (None, None, None, None, False, Path()):
             from liex_lab.pipelines.training.action_model import read_any_labels
+            from liex_lab.sessions.correcting import labelled_bouts
 
-            wanted: Sequence[Correction] = correcting.labelled_bouts(
-                opened, read_any_labels(labels)
-            )
-        case (None, str(), (float(), float()), False, None):
-            wanted = [correcting.add_bout(opened, action, *span, new_word=new_word)]
-        case (float(), str(), (None, None), False, None):
-            wanted = [correcting.rename_bout(opened, at_s, action, new_word=new_word)]
-        case (float(), None, (float(), float()), False, None):
-            wanted = [correcting.recut_bout(opened, at_s, *span)]
-        case (float(), None, (None, None), True, None):
-            wanted = [correcting.delete_bout(opened, at_s)]
+            _do(session, labelled_bouts(_opened(session), read_any_labels(labels)), by)
+        case (None, str(), float(), float(), False, None):
+            _say(session, ["add", action, start_s, stop_s, *new], by)
+        case (float(), str(), None, None, False, None):
+            _say(session, ["rename", at_s, action, *new], by)
+        case (float(), None, float(), float(), False, None):
+            _say(session, ["recut", at_s, start_s, stop_s], by)
+        case (float(), None, None, None, True, None):
+            _say(session, ["delete", at_s], by)
         case _:
             raise SessionError(
                 "one edit at a time: --at S with --action, with --from and --to, or with "
                 "--delete; --action with --from and --to; or --labels FILE"
             )
-    _do(session, wanted, by)
 
 
 @correct.command("list")
@@ -245,6 +232,12 @@ def _opened(session: Path) -> Session:
     from liex_lab.sessions import Session
 
     return Session.open(session)
+
+
+def _say(session: Path, sentence: Sequence[object], by: str) -> None:
+    from liex_lab.sessions.correcting import parse_correction
+
+    _do(session, [parse_correction(_opened(session), sentence)], by)
 
 
 def _do(session: Path, what: Sequence[Correction], by: str, undo: Sequence[int] = ()) -> None:

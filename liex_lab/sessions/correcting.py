@@ -10,7 +10,7 @@ from __future__ import annotations
 import difflib
 import math
 import shlex
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -45,7 +45,64 @@ _STANDS_OUT = 0.05
 _BESIDE = 0.5
 _SCENE_FRAMES = 256  # in so many frames the still scene is looked for
 _APART_S = 0.5  # after a longer time without a pose a turn contradicts nothing
+SENTENCES = (  # seconds since the first frame; a pixel u v, or a position x y z in mm of the arena
+    "flip FROM TO",
+    "joint NAME FRAME U V",
+    "joint NAME FRAME X Y Z",
+    "rename AT ACTION",
+    "recut AT FROM TO",
+    "delete AT",
+    "add ACTION FROM TO",
+)
 OFF_THE_ANIMAL = "height kept: the pixel is not on the animal"
+
+
+def parse_correction(
+    session: Session, sentence: str | Sequence[object], at_s: float | None = None
+) -> Correction:
+    """The correction in a sentence such as `joint nose 810 212 148`.
+
+    The forms are those of `SENTENCES`; `here` stands for the moment or the frame that is shown, and
+    `new` at the end of `rename` and `add` allows an action that the ethogram has no word for.
+
+    Args:
+        session: the session.
+        sentence: the sentence, or its words; a word with spaces is quoted in a sentence.
+        at_s: the moment that is shown, s since the first frame; None if none is.
+
+    Raises:
+        SessionError: the sentence has none of the forms, or the correction cannot be made.
+        LiexError: the action is not a printable word of up to 60 letters.
+    """
+
+    def numbers(*words: object) -> list[float]:
+        return [at_s if word == "here" and at_s is not None else float(str(word)) for word in words]
+
+    def frame(word: object) -> int:
+        if word != "here" or at_s is None:
+            return int(str(word))
+        row = int((session.frames["time_s"] - at_s).abs().to_numpy().argmin())
+        return int(session.frames["frame_index"].iloc[row])
+
+    try:
+        match shlex.split(sentence) if isinstance(sentence, str) else list(sentence):
+            case ["rename", at, action, *new] if new in ([], ["new"]):
+                return rename_bout(session, *numbers(at), str(action), new_word=bool(new))
+            case ["add", action, start, stop, *new] if new in ([], ["new"]):
+                return add_bout(session, str(action), *numbers(start, stop), new_word=bool(new))
+            case ["recut", at, start, stop]:
+                return recut_bout(session, *numbers(at, start, stop))
+            case ["delete", at]:
+                return delete_bout(session, *numbers(at))
+            case ["flip", start, stop]:
+                return flip_span(session, *numbers(start, stop))
+            case ["joint", name, row, u, v]:
+                return joint_move_at_pixel(session, frame(row), str(name), *numbers(u, v))
+            case ["joint", name, row, x, y, z]:
+                return joint_move(session, frame(row), str(name), numbers(x, y, z))
+    except ValueError:  # a word that should be a number, or an open quote
+        pass
+    raise SessionError(f"a correction is written as one of: {'; '.join(SENTENCES)}")
 
 
 def flip_span(session: Session, start_s: float, stop_s: float) -> FlipSpan:
@@ -502,7 +559,7 @@ def _word(session: Session, action: str, new_word: bool) -> str:
         hint = f"did you mean '{near[0]}'? " if near else ""
         raise SessionError(
             f"the ethogram has no word '{word}': {hint}known are {', '.join(known) or 'none'}; "
-            "--new-word makes it one"
+            "--new-word, or `new` after it, makes it one"
         )
     return word
 

@@ -396,6 +396,35 @@ MISTAKES: dict[str, tuple[Callable[[Session], object], str]] = {
 }
 
 
+def test_a_sentence_makes_the_same_correction_as_its_function(measured: Session) -> None:
+    x, y, z = np.round(measured.poses.loc[24, ["x_mm", "y_mm", "z_mm"]].to_numpy(float) + 4.0, 3)
+    u, v = measured.poses.loc[24, ["u_px", "v_px"]].to_numpy(float)
+    time_s = measured.frames["time_s"].iloc[4]
+    nose = correcting.joint_move_at_pixel(measured, 4, "nose", u, v)
+    same = {
+        "flip 1.0 1.5": correcting.flip_span(measured, 1.0, 1.5),
+        f"joint nose 4 {u} {v}": nose,
+        f"joint nose here {u} {v}": nose,
+        f"joint nose 4 {x} {y} {z}": correcting.joint_move(measured, 4, "nose", (x, y, z)),
+        "rename 2.5 run": correcting.rename_bout(measured, 2.5, "run"),
+        "recut 2.5 2.2 3": correcting.recut_bout(measured, 2.5, 2.2, 3.0),
+        "delete 2.5": correcting.delete_bout(measured, 2.5),
+        "add 'tail rattle' here 4.5 new": correcting.add_bout(
+            measured, "tail rattle", time_s, 4.5, new_word=True
+        ),
+    }
+    for sentence, what in same.items():
+        assert correcting.parse_correction(measured, sentence, time_s) == what
+
+
+@pytest.mark.parametrize(
+    "sentence", ["", "joint nose", "joint nose 4 here x", "flip 1 2 new", "add 'run 1 2", "fly 1 2"]
+)
+def test_a_sentence_of_no_form_is_answered_with_the_forms(measured: Session, sentence: str) -> None:
+    with pytest.raises(SessionError, match="written as one of: flip FROM TO; joint NAME FRAME U V"):
+        correcting.parse_correction(measured, sentence)
+
+
 @pytest.mark.parametrize("mistake", MISTAKES)
 def test_what_cannot_be_is_refused_with_a_sentence(measured: Session, mistake: str) -> None:
     ask_for, sentence = MISTAKES[mistake]
