@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from liex_lab.tables.units import shown, titled
+from liex_lab.tables.schema import shown, titled
 
 __all__ = ["counted", "day", "read_as", "reading", "shown", "titled"]
 

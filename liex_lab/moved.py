@@ -27,7 +27,7 @@ MOVED = {
     "liex_lab.actions.chain": "liex_lab.actions.semi_markov",
     "liex_lab.actions.labelled": "liex_lab.actions.labels",
     "liex_lab.actions.tables": "liex_lab.tables.rows",
-    "liex_lab.actions.windows": "liex_lab.actions.window_features",
+    "liex_lab.actions.windows": "liex_lab.actions.channels",
     "liex_lab.body.balls": "liex_lab.body.spheres",
     "liex_lab.camera": "liex_lab.optics.camera",
     "liex_lab.cli_correct": "liex_lab.cli.correct",

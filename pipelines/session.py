@@ -449,7 +449,7 @@ def name_actions(
         refused since they contradict their definition.
     """
     from liex_lab.actions.vocabulary import printed_meanings
-    from liex_lab.behaviour.checking import recognise
+    from liex_lab.behaviour.measures import recognise
     from liex_lab.tables.rows import bout_rows
 
     found = recognise(recogniser, rows.track, rows.wall_distance_mm, moved, allocate)

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
-from liex_lab.actions.colours import PALETTE, action_colours
+from liex_lab.actions.vocabulary import PALETTE, action_colours
 from liex_lab.behaviour import cohort
 from liex_lab.errors import LiexError, SessionError, one_line
 from liex_lab.runtime.progress import Progress, silent

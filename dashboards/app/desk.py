@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from liex_lab.actions.colours import action_colours
+from liex_lab.actions.vocabulary import action_colours
 from liex_lab.errors import LiexError, SessionError
 from liex_lab.sessions import Session
 from liex_lab.sessions.correcting import disagreements

@@ -16,7 +16,7 @@ import numpy as np
 from dash import ClientsideFunction, Dash, Input, Output, dcc, html
 from flask import Flask, Response, jsonify, request
 
-from liex_lab.actions.colours import action_colours
+from liex_lab.actions.vocabulary import action_colours
 from liex_lab.errors import LiexError, SessionError
 from liex_lab.sessions.review import (
     Clip,

@@ -22,7 +22,7 @@ from dash import (
     no_update,
 )
 
-from liex_lab.behaviour.curves import logged_of
+from liex_lab.behaviour.body import logged_of
 from liex_lab.errors import LiexError, SessionError
 
 from ..report.charts import traces

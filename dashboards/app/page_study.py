@@ -7,7 +7,7 @@ from typing import Any
 
 from dash import Dash, Input, Output, State, dcc, html, no_update
 
-from liex_lab.actions.colours import PALETTE, UNLABELLED
+from liex_lab.actions.vocabulary import PALETTE, UNLABELLED
 
 from . import plots
 from .data import (

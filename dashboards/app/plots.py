@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from liex_lab.actions.colours import UNLABELLED
+from liex_lab.actions.vocabulary import UNLABELLED
 from liex_lab.behaviour.cohort import counted_units
-from liex_lab.behaviour.design import animal_means
+from liex_lab.behaviour.statistics import animal_means
 from liex_lab.plan.subject import references_first
 
 from ..figures.style import INK, LINE, MUTED

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from liex_lab.actions.colours import UNLABELLED, action_colours
-from liex_lab.behaviour.around import Around, around_onsets
+from liex_lab.actions.vocabulary import UNLABELLED, action_colours
+from liex_lab.behaviour.activity import Around, around_onsets
 
 from ..units import counted, shown
 from .seen import Array, Seen

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pandas as pd
 
-from liex_lab.actions.colours import action_colours
+from liex_lab.actions.vocabulary import action_colours
 from liex_lab.behaviour.cohort import counted_units
-from liex_lab.behaviour.design import animal_means
-from liex_lab.behaviour.occupancy import Occupancy, occupancy
+from liex_lab.behaviour.places import Occupancy, occupancy
+from liex_lab.behaviour.statistics import animal_means
 from liex_lab.plan.subject import references_first
 
 from ..units import counted, read_as, shown, titled

@@ -9,9 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.arena.scene import Fixture
-from liex_lab.behaviour.body import BRANCHES
-from liex_lab.behaviour.curves import axis_of
-from liex_lab.behaviour.occupancy import Occupancy, occupancy
+from liex_lab.behaviour.body import BRANCHES, axis_of
+from liex_lab.behaviour.places import Occupancy, occupancy
 from liex_lab.sessions import Session
 
 from ..units import counted

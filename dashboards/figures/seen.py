@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from liex_lab.behaviour.occupancy import hold_times
+from liex_lab.behaviour.places import hold_times
 from liex_lab.sessions import Session
 
 if TYPE_CHECKING:

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from liex_lab.actions.colours import PREDICTED_ERROR, action_colours
-from liex_lab.behaviour.curves import Curve, curves_of
+from liex_lab.actions.vocabulary import PREDICTED_ERROR, action_colours
+from liex_lab.behaviour.body import Curve, curves_of
 
 from ..units import counted, shown
 from .seen import Array, Seen
@@ -196,7 +196,7 @@ def error_distribution(seen: Seen) -> Figure | None:
     Args:
         seen: the animal.
     """
-    from liex_lab.behaviour.occupancy import hold_times
+    from liex_lab.behaviour.places import hold_times
 
     values = seen.frames["predicted_error_mm"].to_numpy(float)
     hold = hold_times(seen.frames["time_s"].to_numpy(float))

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from liex_lab.behaviour.curves import Curve, curves_of
+from liex_lab.behaviour.body import Curve, curves_of
 from liex_lab.runtime.durable import replacing
 
 if TYPE_CHECKING:

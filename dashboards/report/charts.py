@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from liex_lab.actions.colours import PREDICTED_ERROR, action_colours
+from liex_lab.actions.vocabulary import PREDICTED_ERROR, action_colours
 from liex_lab.sessions import Session
 
 from ..figures.seen import animals

@@ -7,8 +7,7 @@ from typing import Any
 import numpy as np
 
 from liex_lab.actions.ethogram import ACROSS_GAPS
-from liex_lab.behaviour.body import BRANCHES, SWIMS
-from liex_lab.behaviour.curves import axis_of
+from liex_lab.behaviour.body import BRANCHES, SWIMS, axis_of
 from liex_lab.sessions import Session
 
 from ..units import counted

@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from liex_lab.actions.colours import NO_POSE, UNLABELLED, action_colours
 from liex_lab.actions.ethogram import ACROSS_GAPS
+from liex_lab.actions.vocabulary import NO_POSE, UNLABELLED, action_colours
 from liex_lab.runtime.durable import write_whole
 from liex_lab.sessions import Session
 from liex_lab.sessions.verdict import verdict_in

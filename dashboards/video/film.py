@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from liex_lab.actions.colours import action_colours
+from liex_lab.actions.vocabulary import action_colours
 from liex_lab.errors import SessionError
 from liex_lab.optics.camera import Camera
 from liex_lab.sessions import Session

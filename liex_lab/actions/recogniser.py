@@ -14,10 +14,105 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from liex_lab.actions.descriptors import position_descriptor, tangent_descriptor
+from liex_lab.actions.labels import some_rows
+from liex_lab.geometry import SE3, so3
 from liex_lab.tracking.track import Track
 
 Array = NDArray[np.float64]
+
+N_FRAMES = 32
+_PYRAMID = (4, 2, 1)  # equal parts, each described by its mean and standard deviation
+
+
+def tangent_descriptor(track: Track) -> Array:
+    """The temporal pyramid over a sequence's tangent vectors.
+
+    Frames without a measured pose are left out; of fewer than two the sequence stands still. The
+    end-effector carries no rotation and is left out of the hind half.
+
+    Args:
+        track: the sequence, of a skeleton that is one chain.
+
+    Returns:
+        (252,), rad and mm.
+    """
+    root, angles = _resampled(track)
+    now, following = (
+        SE3(root.rotation[part], root.translation[part])
+        for part in (slice(None, -1), slice(1, None))
+    )
+    step = (now.inverse() @ following).log()
+    base = np.concatenate([step, step[-1:]])
+    change = np.diff(angles, axis=0)
+    change = np.concatenate([change, change[-1:]])
+    # of the fish joints 2 to 10 and 11 to the last in the paper's count, which begins at the base
+    middle = max(2, (track.skeleton.n_joints - 1) // 2)
+    halves = [
+        rows[:, part].mean(axis=1)
+        for part in (slice(1, middle), slice(middle, -1))
+        for rows in (angles, change)
+    ]
+    return pyramid(np.concatenate([base, *halves], axis=1))
+
+
+def position_descriptor(track: Track) -> Array:
+    """The temporal pyramid over a sequence's joint positions, and the base's mean pose.
+
+    Args:
+        track: the sequence.
+
+    Returns:
+        (42 J + 6,), 888 for a fish's 21 joints: mm, arena frame, then the base's mean position, mm,
+        and mean rotation vector, rad; zeros where fewer than two poses were measured.
+    """
+    seen = track.observed
+    if seen.sum() < 2:
+        return np.zeros(14 * 3 * track.skeleton.n_joints + 6)
+    joints = _lerp(track.joints_mm[seen], _places(seen.sum()))
+    root = some_rows(track, seen).root
+    place = np.concatenate([root.translation.mean(axis=0), so3.log(so3.mean(root.rotation))])
+    return np.concatenate([pyramid(joints.reshape(N_FRAMES, -1)), place])
+
+
+def pyramid(rows: Array) -> Array:
+    """Mean and standard deviation over quarters, halves and the whole.
+
+    Args:
+        rows: (32, k) features of each frame.
+
+    Returns:
+        (14 k,) for each of the 7 parts, k means and k standard deviations.
+    """
+    parts = [part for n in _PYRAMID for part in np.split(rows, n)]
+    return np.concatenate([np.concatenate([part.mean(axis=0), part.std(axis=0)]) for part in parts])
+
+
+def _resampled(track: Track) -> tuple[SE3, Array]:
+    """Base T_arena_root (32) along geodesics and joint angles (32, J, 3) of the frames that have a
+    pose.
+    """
+    seen = track.observed
+    n = int(seen.sum())
+    if n < 2:
+        return SE3.identity(N_FRAMES), np.zeros((N_FRAMES, track.skeleton.n_joints, 3))
+    kept = some_rows(track, seen)
+    at = _places(n)
+    low = np.minimum(at.astype(int), n - 2)
+    before, after = (SE3(kept.root_rotation[rows], kept.root_mm[rows]) for rows in (low, low + 1))
+    return before.geodesic(after, at - low), _lerp(kept.angles_rad, at)
+
+
+def _places(n: int) -> Array:
+    """Where (32,) among n frames the resampled ones lie."""
+    return np.linspace(0.0, n - 1.0, N_FRAMES)
+
+
+def _lerp(values: Array, at: Array) -> Array:
+    """Rows of values (n, ...) at fractional places (32,)."""
+    low = np.minimum(at.astype(int), len(values) - 2)
+    share = (at - low).reshape(-1, *([1] * (values.ndim - 1)))
+    return values[low] * (1.0 - share) + values[low + 1] * share
+
 
 DESCRIPTORS: dict[str, Callable[[Track], Array]] = {
     "tangent": tangent_descriptor,

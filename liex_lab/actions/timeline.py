@@ -13,7 +13,7 @@ Ours; the recogniser of Lie-X section 4.3 names cut-out sequences alone (`recogn
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from typing import Any
@@ -21,18 +21,83 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from liex_lab.actions.channels import Segment, channel_names, segments_of
+from liex_lab.actions.channels import Segment, channel_names, segments_of, window_features
 from liex_lab.actions.ethogram import UNLABELLED, Ethogram, frame_stops, runs_of
 from liex_lab.actions.labels import LabelledTrack
-from liex_lab.actions.refusals import Broken, FrameCheck, Refused, commonest, overlap
 from liex_lab.actions.semi_markov import SemiMarkovModel
 from liex_lab.actions.vocabulary import FASTEST
-from liex_lab.actions.window_features import window_features
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.mlp import Network
 from liex_lab.recordings.timestamps import median_step
 from liex_lab.runtime.memory import Allocator, blocks
 from liex_lab.tracking.track import Track
+
+Broken = Callable[[int, int, str], str]
+
+
+@dataclass(frozen=True)
+class Refused:
+    """A bout that the network and the chain would have named, but that contradicts its definition.
+
+    Attributes:
+        rows: its frames.
+        action: the word that was refused.
+        named: what most of its frames are named instead, '' for nothing.
+        why: what of the definition does not hold.
+    """
+
+    rows: slice
+    action: str
+    named: str
+    why: str
+
+
+class FrameCheck:
+    """Checks bouts of ticks by their frames.
+
+    Args:
+        broken: says what frames [start, stop) break of a word's definition; None finds nothing.
+        first: row of the first frame of the segment.
+        tick: (r,) tick of each of its frames, ascending.
+    """
+
+    def __init__(self, broken: Broken | None, first: int, tick: NDArray[np.int64]) -> None:
+        self._broken = broken
+        self._first = first
+        self._tick = tick
+
+    def broken(self, start: int, stop: int, word: str) -> tuple[slice, str]:
+        """The frames of a bout of ticks, and what it breaks of its word's definition.
+
+        Args:
+            start: first tick.
+            stop: tick after the last.
+            word: the bout's name.
+        """
+        a, b = (self._first + int(k) for k in np.searchsorted(self._tick, [start, stop]))
+        if self._broken is None or word == UNLABELLED or a == b:
+            return slice(a, b), ""
+        return slice(a, b), self._broken(a, b, word)
+
+
+def overlap(one: slice, other: slice) -> bool:
+    """Whether two spans of frames have a frame in common.
+
+    Args:
+        one: a span.
+        other: another one.
+    """
+    return one.start < other.stop and other.start < one.stop
+
+
+def commonest(values: NDArray[np.int64]) -> int:
+    """The value that occurs most often, the smallest of several.
+
+    Args:
+        values: (n,) not negative, n at least 1.
+    """
+    return int(np.bincount(values).argmax())
+
 
 Array = NDArray[np.float64]
 

@@ -8,8 +8,9 @@ all come from these limits. Thresholds are starting values, with the literature'
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import cycle
 from typing import NamedTuple
 
 # by so much of itself a number said with "about" may be missed; a bout's ends are less certain
@@ -308,3 +309,63 @@ FASTEST: dict[str, dict[str, Fastest]] = {
         "dart": Fastest("its start", 0.12, 25.0),
     },
 }
+
+
+# Colours of actions: a word has the same in the report, the replay and the dashboard.
+
+
+NO_POSE = "#EE6677"
+PREDICTED_ERROR = "#997700"
+UNLABELLED = "#E2E2DC"
+PALETTE = (
+    "#FFAABB",
+    "#CCBB44",
+    "#4477AA",
+    "#BBBBBB",
+    "#228833",
+    "#66CCEE",
+    "#AA3377",
+    "#332288",
+    "#999933",
+    "#EE8866",
+    "#44BB99",
+    "#882255",
+)
+_OWN = {
+    "walk": "#4477AA",
+    "run": "#CCBB44",
+    "pause": "#BBBBBB",
+    "rear": "#AA3377",
+    "rear_supported": "#AA3377",
+    "rear_unsupported": "#FFAABB",
+    "turn_left": "#228833",
+    "turn_right": "#44BB99",
+    "groom": "#332288",
+    "freeze": "#66CCEE",
+    "sniff": "#999933",
+    "dart": "#EE8866",
+    "stretch_attend": "#882255",
+    "scoot": "#4477AA",
+    "j_turn": "#228833",
+    "r_turn": "#44BB99",
+    "c_turn": "#EE8866",
+    "surface": "#FFAABB",
+    "dive": "#332288",
+    "zigzag": "#CCBB44",
+    "thrash": "#AA3377",
+}
+
+
+def action_colours(words: Sequence[str]) -> dict[str, str]:
+    """The colour of each word of a vocabulary, as #rrggbb.
+
+    Args:
+        words: the words; beyond the palette colours come again.
+    """
+    chosen: dict[str, str] = {}
+    for word in words:
+        if word in _OWN and _OWN[word] not in chosen.values():
+            chosen[word] = _OWN[word]
+    free = [colour for colour in PALETTE if colour not in chosen.values()]
+    left = cycle(free or PALETTE)
+    return {word: chosen.get(word) or next(left) for word in words}

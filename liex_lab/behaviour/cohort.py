@@ -17,34 +17,31 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 
-from liex_lab.behaviour.design import (
+from liex_lab.behaviour.statistics import (
     ANIMAL,
     CAGE,
+    FEWEST_FOR_MODEL,
+    MOST_EXACT,
     PAIRED,
+    Estimate,
     NotComparable,
     Units,
     animal_means,
-    find_units,
-)
-from liex_lab.behaviour.multiplicity import false_discovery
-from liex_lab.behaviour.statistics import (
-    FEWEST_FOR_MODEL,
-    MOST_EXACT,
-    Estimate,
     arrangements,
     check_reachable,
     estimate,
+    false_discovery,
+    find_units,
     mixed_model,
     permutation,
     smallest_p,
     spread_of_animals,
 )
 from liex_lab.plan.subject import alike, one_animal, references_first
-from liex_lab.tables.schema import table_columns, to_pandas
-from liex_lab.tables.units import shown, titled
+from liex_lab.tables.schema import shown, table_columns, titled, to_pandas
 
 if TYPE_CHECKING:
-    from liex_lab.tables.session_tables import SessionTables
+    from liex_lab.tables.schema import SessionTables
 
 WHO = ("subject_id", "group", "cage", "sex", "batch")
 ENGINES = ("auto", "permutation", "mixed")

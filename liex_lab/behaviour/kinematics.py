@@ -21,8 +21,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from liex_lab.behaviour.body import BRANCHES, STANDS, SWIMS, BodyAxis
-from liex_lab.behaviour.posture import Posture, Shape
-from liex_lab.behaviour.tail import tail_beat
+from liex_lab.behaviour.posture import Posture, Shape, tail_beat
 from liex_lab.runtime.memory import Allocator, blocks
 from liex_lab.tables.rows import gap_follows, median_step, stop_times
 from liex_lab.tables.schema import table_columns, to_pandas

@@ -6,16 +6,368 @@ limits.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 
-from liex_lab.behaviour.body import kind_of
-from liex_lab.behaviour.bout_reader import BoutReader
-from liex_lab.behaviour.checking import BoutCheck
+from liex_lab.actions.vocabulary import Limit, limits_of, printed_meanings
+from liex_lab.behaviour.body import STANDS, SWIMS, kind_of
+from liex_lab.behaviour.kinematics import Joints, kinematics, segments, smallest_turn
+from liex_lab.runtime.memory import Allocator
+from liex_lab.tables.rows import Rows, median_step, stop_times
 from liex_lab.tables.schema import BOUTS, table_columns, to_pandas
+
+if TYPE_CHECKING:
+    from liex_lab.actions.timeline import Recognised, TimelineModel
+    from liex_lab.tracking.track import Track
+
+
+Array = NDArray[np.float64]
+_MOST_LAG_S = 0.25  # a wave that takes longer for a third of the body is none
+# of the curvatures of two thirds of the body, for a wave that runs from one to the other
+_LEAST_CORRELATION = 0.5
+
+
+class BoutReader:
+    """The table `kinematics` as arrays, from which rows [start, stop) of a bout are measured."""
+
+    def __init__(self, kinematics: pd.DataFrame) -> None:
+        self._table = kinematics
+        self.frame_index = kinematics["frame_index"].to_numpy()
+        self.time_s = kinematics["time_s"].to_numpy(float)
+        self.hold_s = stop_times(self.time_s) - self.time_s
+        step = median_step(self.time_s)
+        self.fps = 1.0 / step if step > 0 else 0.0
+        self.place = kinematics[["x_mm", "y_mm", "z_mm"]].to_numpy(float)
+        self.kind = kind_of(kinematics)
+        length = self._of("length_mm")
+        self.length_mm = float(np.nanmedian(length)) if np.isfinite(length).any() else np.nan
+        self._columns: dict[str, Array] = {}
+
+    def rows_of(self, bouts: pd.DataFrame) -> list[tuple[int, int]]:
+        """The rows [start, stop) of every bout, at least one row each.
+
+        Args:
+            bouts: the table `bouts`; start_frame and stop_frame are the camera's counts.
+        """
+        starts = np.searchsorted(self.frame_index, bouts["start_frame"].to_numpy())
+        stops = np.searchsorted(self.frame_index, bouts["stop_frame"].to_numpy())
+        n = len(self.frame_index)
+        return [
+            (min(int(a), n - 1), min(max(int(b), int(a) + 1), n))
+            for a, b in zip(starts, stops, strict=True)
+        ]
+
+    def measure(self, start: int, stop: int) -> dict[str, float]:
+        """All measures of one bout but since_last_s, which needs the bout before.
+
+        Args:
+            start: first row of the bout.
+            stop: row after its last.
+
+        Returns:
+            Column name to value; NaN where nothing is known.
+        """
+        found = {**self.motion(start, stop), **self.turn(start, stop)}
+        if self.kind == SWIMS:
+            return found | self._tail(start, stop)
+        return found | self.height(start, stop) if self.kind == STANDS else found
+
+    def since_last(self, bouts: pd.DataFrame, spans: Sequence[tuple[int, int]]) -> Array:
+        """(n,) time from the end of the last bout of the same action, s.
+
+        It is NaN at the first one, and where the animal was out of sight in between.
+
+        Args:
+            bouts: the table `bouts`, in order of time.
+            spans: the rows of the n bouts, see `rows_of`.
+        """
+        number = segments(self.time_s, np.isfinite(self.place[:, 0]))
+        last: dict[str, int] = {}
+        out = np.full(len(bouts), np.nan)
+        begin = bouts["start_s"].to_numpy(float)
+        end = bouts["stop_s"].to_numpy(float)
+        for k, action in enumerate(bouts["action"]):
+            before = last.get(action)
+            if (
+                before is not None
+                and number[spans[before][1] - 1] == number[min(spans[k][0], len(number) - 1)]
+            ):
+                out[k] = begin[k] - end[before]
+            last[action] = k
+        return out
+
+    def _of(self, name: str) -> Array:
+        return self._table[name].to_numpy(float)
+
+    def column(self, name: str, start: int, stop: int) -> Array:
+        """A column of the table `kinematics` within a bout.
+
+        Args:
+            name: of the column.
+            start: first row of the bout.
+            stop: row after its last.
+        """
+        if name not in self._columns:
+            self._columns[name] = self._of(name)
+        return self._columns[name][start:stop]
+
+    def seconds(self, start: int, stop: int) -> float:
+        """How long a bout lasts, s.
+
+        Args:
+            start: first row of the bout.
+            stop: row after its last.
+        """
+        return float(self.time_s[stop - 1] + self.hold_s[stop - 1] - self.time_s[start])
+
+    def motion(self, start: int, stop: int) -> dict[str, float]:
+        """Path, displacement and speeds of a bout, mm and mm/s.
+
+        Args:
+            start: first row of the bout.
+            stop: row after its last.
+        """
+        speed = self.column("speed_mm_s", start, stop)
+        step = self.column("step_mm", start, stop)
+        known = np.flatnonzero(np.isfinite(speed))
+        path = float(np.nansum(step))
+        timed = float(self.hold_s[start:stop][known].sum())
+        seen = start + np.flatnonzero(np.isfinite(self.place[start:stop, 0]))
+        displacement = (
+            self.place[seen[-1]] - self.place[seen[0]] if len(seen) else np.full(3, np.nan)
+        )
+        top = known[speed[known].argmax()] if len(known) else None
+        return {
+            "path_mm": path,
+            "path_bl": path / self.length_mm,
+            "displacement_mm": float(
+                np.linalg.norm(displacement if self.kind != STANDS else displacement[:2])
+            ),
+            "rise_mm": float(displacement[2]),
+            "mean_speed_mm_s": path / timed if timed > 0 else np.nan,
+            "median_speed_mm_s": _median(speed),
+            "peak_speed_mm_s": np.nan if top is None else float(speed[top]),
+            "peak_speed_sd_mm_s": np.nan
+            if top is None
+            else float(self.column("speed_sd_mm_s", start, stop)[top]),
+            "time_to_peak_s": np.nan
+            if top is None
+            else float(self.time_s[start + top] - self.time_s[start]),
+        }
+
+    def turn(self, start: int, stop: int) -> dict[str, float]:
+        """Turning, pitch and bend of a bout, rad.
+
+        Args:
+            start: first row of the bout.
+            stop: row after its last.
+        """
+        heading = self.column("heading_rad", start, stop)
+        sd = self.column("heading_sd_rad", start, stop)
+        known = np.isfinite(heading)
+        turned = np.append(0.0, np.cumsum(smallest_turn(np.diff(heading[known]))))
+        pitch = self.column("body_pitch_rad", start, stop)
+        bend = self.column("bend_rad", start, stop)
+        some = bool(known.any())
+        ends = sd[known][[0, -1]] if some else np.full(2, np.nan)
+        return {
+            "net_turn_rad": float(turned[-1]) if some else np.nan,
+            "net_turn_sd_rad": float(np.hypot(*ends)),
+            "heading_range_rad": float(np.ptp(turned)) if some else np.nan,
+            "mean_pitch_rad": _mean(pitch),
+            "bend_max_rad": _max(np.abs(bend)),
+        }
+
+    def height(self, start: int, stop: int) -> dict[str, float]:
+        """Heights of the nose of an animal that stands on the floor, mm.
+
+        Args:
+            start: first row of the bout.
+            stop: row after its last.
+        """
+        nose = self.column("nose_height_mm", start, stop)
+        known = np.flatnonzero(np.isfinite(nose))
+        top = known[nose[known].argmax()] if len(known) else None
+        return {
+            "peak_nose_height_mm": np.nan if top is None else float(nose[top]),
+            "peak_nose_over_rump_mm": _max(self.column("nose_over_rump_mm", start, stop)),
+            "time_to_peak_height_s": np.nan
+            if top is None
+            else float(self.time_s[start + top] - self.time_s[start]),
+        }
+
+    def _tail(self, start: int, stop: int) -> dict[str, float]:
+        angle = self.column("tail_angle_rad", start, stop)
+        bends = self.column("tail_extreme_rad", start, stop)
+        beat = self.column("tail_beat_hz", start, stop)
+        hold = self.hold_s[start:stop]
+        at = np.flatnonzero(np.isfinite(bends))
+        size = np.abs(bends[at])
+        n = len(at)
+        duration = self.seconds(start, stop)
+        left = max(_max(angle), 0.0)
+        right = max(_max(-angle), 0.0)
+        return {
+            "n_bends": n,
+            "n_oscillations": n / 2.0,
+            "tail_beat_hz": n / 2.0 / duration,
+            "tail_beat_max_hz": _max(beat),
+            "tail_beat_mean_hz": _mean(beat),
+            "tail_beat_median_hz": _median(beat),
+            "tail_max_rad": _max(size),
+            "tail_mean_rad": _mean(size),
+            "tail_median_rad": _median(size),
+            "first_bend_s": float(self.time_s[start + at[0]] - self.time_s[start]) if n else np.nan,
+            "first_bend_rad": float(bends[at[0]]) if n else np.nan,
+            "second_over_first": float(bends[at[1]] / bends[at[0]]) if n > 1 else np.nan,
+            "tail_angle_mean_rad": _mean_over(angle, hold),
+            "tail_angle_mean_abs_rad": _mean_over(np.abs(angle), hold),
+            "tail_symmetry": min(left, right) / max(left, right)
+            if max(left, right) > 0
+            else np.nan,
+            "wave_speed_mm_s": self._wave(start, stop) if n > 1 else np.nan,
+        }
+
+    def _wave(self, start: int, stop: int) -> float:
+        """Speed of the bend that runs from the middle third of the body to the rear one, mm/s."""
+        middle, rear = (self.column(f"bend_{part}_rad", start, stop) for part in ("middle", "rear"))
+        if not (np.isfinite(middle).all() and np.isfinite(rear).all()) or stop - start < 8:
+            return np.nan
+        time = self.time_s[start:stop]
+        fine: Array = np.arange(
+            time[0], time[-1], 0.1 / self.fps
+        )  # true times, on an even grid ten times as fine
+        a, b = (np.interp(fine, time, curve) - curve.mean() for curve in (middle, rear))
+        most = min(int(_MOST_LAG_S * 10 * self.fps), len(fine) // 2)
+        agreement = [_correlation(a[: len(a) - lag], b[lag:]) for lag in range(most)]
+        best = int(np.argmax(agreement)) if agreement else 0
+        # at an end of its range the correlation is not known to have its peak
+        if best in (0, most - 1) or agreement[best] < _LEAST_CORRELATION:
+            return np.nan
+        return self.length_mm / 3.0 / (best * 0.1 / self.fps)
+
+
+def _correlation(a: Array, b: Array) -> float:
+    size = float(np.sqrt((a * a).sum() * (b * b).sum()))
+    return float((a * b).sum()) / size if size > 0 else 0.0
+
+
+def _max(values: Array) -> float:
+    known = values[np.isfinite(values)]
+    return float(known.max()) if len(known) else np.nan
+
+
+def _mean(values: Array) -> float:
+    known = values[np.isfinite(values)]
+    return float(known.mean()) if len(known) else np.nan
+
+
+def _mean_over(values: Array, hold: Array) -> float:
+    known = np.isfinite(values)
+    time = float(hold[known].sum())
+    return float((values * hold)[known].sum()) / time if time > 0 else np.nan
+
+
+def _median(values: Array) -> float:
+    known = values[np.isfinite(values)]
+    return float(np.median(known)) if len(known) else np.nan
+
+
+# Check of bouts against the measurable part of their definitions.
+
+
+Reading = Callable[[BoutReader, int, int], tuple[float, ...]]
+
+
+def _motion(*names: str) -> Reading:
+    return lambda bout, a, b: tuple(bout.motion(a, b)[name] for name in names)
+
+
+def _turn(name: str, sign: float = 1.0) -> Reading:
+    return lambda bout, a, b: (sign * bout.turn(a, b)[name],)
+
+
+def _beyond_noise(bout: BoutReader, a: int, b: int) -> float:
+    """Mean speed less what errors of the pose alone look like, mm/s."""
+    noise = _median(bout.column("speed_sd_mm_s", a, b))
+    return max(bout.motion(a, b)["mean_speed_mm_s"] - (0.0 if np.isnan(noise) else noise), 0.0)
+
+
+# how each of `actions.vocabulary.MEASURES` is read; where there are two values both have to fit
+_READ: dict[str, Reading] = {
+    "speed_mm_s": _motion("mean_speed_mm_s", "median_speed_mm_s"),
+    "peak_speed_mm_s": _motion("peak_speed_mm_s"),
+    "quiet_bl_s": lambda bout, a, b: (_beyond_noise(bout, a, b) / bout.length_mm,),
+    "speed_bl_s": lambda bout, a, b: (bout.motion(a, b)["mean_speed_mm_s"] / bout.length_mm,),
+    "duration_s": lambda bout, a, b: (bout.seconds(a, b),),
+    "left_turn_rad": _turn("net_turn_rad"),
+    "right_turn_rad": _turn("net_turn_rad", -1.0),
+    "either_turn_rad": lambda bout, a, b: (abs(bout.turn(a, b)["net_turn_rad"]),),
+    "swing_rad": _turn("heading_range_rad"),
+    "bend_rad": _turn("bend_max_rad"),
+    "usual_bend_rad": lambda bout, a, b: (_median(np.abs(bout.column("bend_rad", a, b))),),
+    "pitch_rad": _turn("mean_pitch_rad"),
+    "raised_bl": lambda bout, a, b: (bout.height(a, b)["peak_nose_over_rump_mm"] / bout.length_mm,),
+    "moved_bl": lambda bout, a, b: (bout.motion(a, b)["displacement_mm"] / bout.length_mm,),
+}
+
+
+class BoutCheck:
+    """Says of a bout what of its printed definition does not hold.
+
+    Args:
+        bouts: reads the measures of bouts.
+        meanings: word -> definition as it is printed; only those of the bundled vocabularies have
+            limits, see `actions.vocabulary.limits_of`.
+    """
+
+    def __init__(self, bouts: BoutReader, meanings: Mapping[str, str]) -> None:
+        self._bouts = bouts
+        self._limits = {word: limits_of(meaning) for word, meaning in meanings.items()}
+
+    def broken(self, start: int, stop: int, word: str) -> str:
+        """What a bout breaks of its word's definition, in words; empty where it breaks nothing.
+
+        Args:
+            start: first row of the bout in the table `kinematics`.
+            stop: row after its last.
+            word: its name.
+        """
+        told = (self._told(limit, start, stop) for limit in self._limits.get(word, ()))
+        return "; ".join(filter(None, told))
+
+    def _told(self, limit: Limit, start: int, stop: int) -> str:
+        values = _READ[limit.measure](self._bouts, start, stop)
+        wrong = [value for value in values if not limit.holds(value)]
+        return f"{limit.shown(wrong[0])}, not {limit.span}" if wrong else ""
+
+
+def recognise(
+    recogniser: TimelineModel,
+    track: Track,
+    wall_mm: Array | None = None,
+    moved: pd.DataFrame | None = None,
+    allocate: Allocator = np.empty,
+) -> Recognised:
+    """The ethogram of a track, in which no bout contradicts its printed definition.
+
+    Args:
+        recogniser: names the track.
+        track: one animal's track of n frames.
+        wall_mm: (n,) distance of the animal from the nearest wall, mm; None where nobody knows.
+        moved: the table `kinematics` of the track; None makes it with the default settings.
+        allocate: allocator of large intermediate arrays and of the probabilities.
+    """
+    if moved is None:
+        frames = Rows(track, np.arange(track.n_frames), "", "").frames_table
+        moved = kinematics(frames, Joints.of_track(track), allocate=allocate)
+    meanings = printed_meanings(recogniser.skeleton, recogniser.definitions)
+    check = BoutCheck(BoutReader(moved), meanings)
+    return recogniser.recognise(track, wall_mm, allocate, check.broken)
 
 
 def measure_bouts(

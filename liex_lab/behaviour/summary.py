@@ -17,7 +17,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from liex_lab.actions.labels import HUMAN
-from liex_lab.behaviour.activity import activity, observed_hold, time_named
+from liex_lab.behaviour.activity import activity, observed_hold, time_named, transitions
 from liex_lab.behaviour.body import SWIMS, kind_of, parents_of
 from liex_lab.behaviour.bouts import ACTIONS, MouseRules, find_bouts
 from liex_lab.behaviour.kinematics import Joints, kinematics
@@ -30,7 +30,6 @@ from liex_lab.behaviour.places import (
     surface_height_mm,
     visits,
 )
-from liex_lab.behaviour.transitions import transitions
 from liex_lab.runtime.memory import Allocator
 from liex_lab.tables.rows import stop_times
 from liex_lab.tables.schema import BEHAVIOUR, GAPS, Vocabulary, empty_table, rears_of, to_pandas
@@ -38,7 +37,7 @@ from liex_lab.tracking.track import ends_of
 
 if TYPE_CHECKING:
     from liex_lab.tables.rows import Rows
-    from liex_lab.tables.session_tables import SessionTables
+    from liex_lab.tables.schema import SessionTables
 
 Array = NDArray[np.float64]
 

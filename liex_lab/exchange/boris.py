@@ -7,10 +7,20 @@ that has all of this is written.
 
 from __future__ import annotations
 
+import gzip
+import io
 import json
+import zlib
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
+
+from liex_lab.actions.labels import HUMAN, checked
+from liex_lab.errors import LiexError, one_line
+from liex_lab.runtime.spreadsheets import read_texts
+from liex_lab.runtime.text_files import decoded, read_text, split_lines
 from liex_lab.sessions import Session
 from liex_lab.sessions.videos import found_video, video_path
 
@@ -19,7 +29,7 @@ _MEDIA = "1"  # BORIS' first player
 _KEYS = "abcdefghijklmnopqrstuvwxyz0123456789"
 
 
-def write(session: Session, path: Path) -> None:
+def write_boris(session: Session, path: Path) -> None:
     """Write the project.
 
     Args:
@@ -138,3 +148,183 @@ def _date(session: Session) -> str:
     """The recording's beginning as BORIS writes dates; without a zone, as it knows none."""
     stated = session.metadata.get("session_start_time") or "1970-01-01T00:00:00"
     return str(stated)[:19]
+
+
+# Reader of human labels from BORIS project files (JSON) and from its aggregated-events exports.
+
+
+_STATE = "State event"
+_MOST_BYTES = 1 << 28  # unpacked
+
+
+def read_boris_project(path: str | Path) -> dict[str, Any]:
+    """Read the content of a BORIS project.
+
+    Args:
+        path: a .boris file, or one packed with gzip (.boris.gz), of up to 256 MB unpacked.
+
+    Raises:
+        LiexError: the file is no such project.
+    """
+    source = Path(path)
+    try:
+        raw = source.read_bytes()
+        document = json.loads(decoded(_unpacked(raw) if raw[:2] == b"\x1f\x8b" else raw))
+    except (OSError, EOFError, ValueError, RecursionError, zlib.error) as error:
+        raise LiexError(
+            f"{source} should be a BORIS project (JSON), but: {one_line(error)}"
+        ) from None
+    if not isinstance(document, dict) or not isinstance(document.get("observations"), dict):
+        raise LiexError(
+            f"{source} should be a BORIS project, but holds no observations; save it from BORIS "
+            "again"
+        )
+    return document
+
+
+def boris_labels(path: str | Path) -> pd.DataFrame:
+    """State events of a project as labels.
+
+    The observation's time offset is taken off. Point events have no length and are left out.
+
+    Args:
+        path: a .boris or .boris.gz file.
+
+    Returns:
+        A table with session_id (the observation), individual, action, start_s, stop_s (s) and
+        source.
+
+    Raises:
+        LiexError: the file is no BORIS project, or an event has no end; the message names it.
+    """
+    document = read_boris_project(path)
+    points = {
+        str(b.get("code"))
+        for b in _values(document.get("behaviors_conf"))
+        if str(b.get("type", _STATE)).lower().startswith("point")
+    }
+    rows: list[dict[str, Any]] = []
+    for name, observation in document["observations"].items():
+        name = " ".join(str(name).split())
+        if not isinstance(observation, dict):
+            raise LiexError(
+                f"{path}: the observation {name} is none; save the project from BORIS again"
+            )
+        rows += _pairs(
+            observation.get("events", []), points, name, _offset(observation, name, path), path
+        )
+    columns = ["session_id", "individual", "action", "start_s", "stop_s", "source"]
+    return checked(pd.DataFrame(rows, columns=columns), str(path))
+
+
+def boris_export_labels(path: str | Path) -> pd.DataFrame:
+    """Labels of BORIS's export 'aggregated events'; see `boris_labels`.
+
+    Args:
+        path: a TSV or CSV file.
+
+    Raises:
+        LiexError: the file is no such export.
+    """
+    source = Path(path)
+    try:
+        table = read_texts(source)
+    except (OSError, ValueError) as error:
+        raise LiexError(f"{source} should be an export of BORIS, but: {one_line(error)}") from None
+    wanted = {
+        "Observation id": "session_id",
+        "Subject": "individual",
+        "Behavior": "action",
+        "Start (s)": "start_s",
+        "Stop (s)": "stop_s",
+    }
+    lacking = [name for name in wanted if name not in table]
+    if lacking:
+        raise LiexError(
+            f"{source} should be BORIS's export of aggregated events; it lacks the column "
+            f"{lacking[0]}"
+        )
+    if "Behavior type" in table:
+        table = table[table["Behavior type"] == "STATE"]
+    return checked(table[list(wanted)].rename(columns=wanted).assign(source=HUMAN), str(source))
+
+
+def is_boris_export(path: str | Path) -> bool:
+    """Whether a table's first line is that of BORIS's aggregated-events exports.
+
+    Args:
+        path: a text file.
+    """
+    try:
+        lines = split_lines(read_text(Path(path)))[1]
+    except ValueError:
+        return False
+    return "".join(lines[:2]).startswith(("Observation id", '"Observation id"'))
+
+
+def _unpacked(raw: bytes) -> bytes:
+    """What gzip packed. Raises ValueError where it is more than 256 MB."""
+    with gzip.open(io.BytesIO(raw)) as file:
+        text = file.read(_MOST_BYTES + 1)
+    if len(text) > _MOST_BYTES:
+        raise ValueError(f"it unpacks to more than {_MOST_BYTES >> 20} MB")
+    return text
+
+
+def _offset(observation: dict[str, Any], name: str, path: str | Path) -> float:
+    """The observation's time offset, s."""
+    try:
+        return float(observation.get("time offset") or 0.0)
+    except (TypeError, ValueError, OverflowError):
+        raise LiexError(
+            f"{path}: the observation {name} has a time offset that is no number; correct it"
+        ) from None
+
+
+def _pairs(
+    events: Sequence[Sequence[Any]], points: set[str], name: str, offset: float, path: str | Path
+) -> list[dict[str, Any]]:
+    """Rows of labels from the events of one observation: state events alternate between start and
+    stop.
+    """
+    begun: dict[tuple[str, str, str], float] = {}
+    rows = []
+    try:
+        events = sorted(events, key=lambda event: float(event[0]))
+        for time, subject, code, modifier, *_ in events:
+            if str(code) in points:
+                continue
+            key = (str(subject), str(code), str(modifier))
+            if key not in begun:
+                begun[key] = float(time)
+                continue
+            start = begun.pop(key)
+            rows.append(
+                {
+                    "session_id": name,
+                    "individual": key[0],
+                    "action": key[1],
+                    "start_s": start - offset,
+                    "stop_s": float(time) - offset,
+                    "source": HUMAN,
+                }
+            )
+    except (TypeError, ValueError, IndexError, OverflowError, KeyError):
+        raise LiexError(
+            f"{path}: the observation {name} has an event that cannot be read; check it in BORIS"
+        ) from None
+    if begun:
+        (_, code, _), start = next(iter(begun.items()))
+        raise LiexError(
+            f"{path}: in the observation {name}, {code} starts at {start:g} s and never stops; "
+            "pair it in BORIS (Observations, Check state events)"
+        )
+    return rows
+
+
+def _values(conf: Any) -> list[dict[str, Any]]:
+    return (
+        [entry for entry in conf.values() if isinstance(entry, dict)]
+        if isinstance(conf, dict)
+        else []
+    )

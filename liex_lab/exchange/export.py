@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
 
@@ -12,32 +11,36 @@ from liex_lab.runtime.durable import replacing
 from liex_lab.runtime.places import inside
 from liex_lab.sessions import Session
 
-# target -> (module, ending of what it writes, what it is)
+# format -> (module and function that write it, ending of the name, what it is)
 TARGETS: dict[str, tuple[str, str, str]] = {
     "nwb": (
-        "liex_lab.exchange.nwb",
+        "nwb.write_nwb",
         ".nwb",
         "Neurodata Without Borders: poses (ndx-pose), rotations, actions (ndx-ethogram)",
     ),
-    "boris": ("liex_lab.exchange.boris", ".boris", "a BORIS project with the ethogram"),
+    "boris": ("boris.write_boris", ".boris", "a BORIS project with the ethogram"),
     "dlc": (
-        "liex_lab.exchange.dlc",
+        "pose_files.write_dlc",
         "_dlc",
         "a folder with DeepLabCut's CSV tables, in millimetres and in pixels",
     ),
-    "movement": ("liex_lab.exchange.movement", ".nc", "netCDF as movement keeps poses, true times"),
+    "movement": (
+        "pose_files.write_movement",
+        ".nc",
+        "netCDF as movement keeps poses, true times",
+    ),
     "sleap": (
-        "liex_lab.exchange.sleap",
+        "pose_files.write_sleap",
         ".analysis.h5",
         "SLEAP's analysis file, in pixels of the depth picture",
     ),
     "csv": (
-        "liex_lab.exchange.tables_csv",
+        "tables.write_csv_folder",
         "_csv",
         "a folder with every table as CSV, and columns.json",
     ),
     "xlsx": (
-        "liex_lab.exchange.tables_xlsx",
+        "tables.write_xlsx",
         ".xlsx",
         "an Excel workbook with every table as a sheet, and what every column means",
     ),
@@ -74,7 +77,8 @@ def export(
             f"there is no format '{to}' to export to: {hint}known are {', '.join(TARGETS)}, "
             f"{', '.join(ALIASES)} (the same as dlc) and video"
         )
-    home, ending, _ = TARGETS[to]
+    home, function = TARGETS[to][0].split(".")
+    ending = TARGETS[to][1]
     folder = session.path if out is None else Path(out)
     if folder.exists() and not folder.is_dir():
         raise SessionError(
@@ -89,9 +93,9 @@ def export(
             "--overwrite (in Python overwrite=True)"
         )
     try:
-        writer: Callable[[Session, Path], None] = import_module(home).write
+        write = getattr(import_module(f"liex_lab.exchange.{home}"), function)
         with replacing(path, replace_folder=True) as part:
-            writer(session, part)
+            write(session, part)
     except ImportError as error:
         raise SessionError(
             f"to write {to}, {error.name} is missing; {how_to_install('exchange')}"

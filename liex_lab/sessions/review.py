@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from liex_lab.actions.agreement import Agreement, cohens_kappa
+from liex_lab.actions.scores import Agreement, cohens_kappa
 from liex_lab.errors import SessionError
 from liex_lab.runtime.durable import write_whole
 from liex_lab.runtime.places import inside

@@ -19,8 +19,8 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
-from liex_lab.actions import colours
-from liex_lab.behaviour.curves import logged_of
+from liex_lab.actions import vocabulary
+from liex_lab.behaviour.body import logged_of
 from liex_lab.errors import SessionError
 from liex_lab.geometry import so3
 from liex_lab.runtime.disk import probe_full
@@ -34,7 +34,7 @@ from liex_lab.sessions.rrd_scene import FLOOR as FLOOR
 from liex_lab.sessions.rrd_scene import OVERLAY as OVERLAY
 from liex_lab.sessions.rrd_scene import log_hidden_places, log_surroundings
 from liex_lab.tables.rows import Rows, constant_runs, frame_count, stop_times
-from liex_lab.tables.units import shown
+from liex_lab.tables.schema import shown
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -56,10 +56,10 @@ _BLOCK = 8192  # frames of small things sent in one go
 _TURN_S = 2.0
 _PATIENCE_S = 60.0
 
-PALETTE = tuple(int(colour[1:], 16) for colour in colours.PALETTE)
+PALETTE = tuple(int(colour[1:], 16) for colour in vocabulary.PALETTE)
 _FLAG_COLOURS = {
     "doubtful": 0xCCBB44,
-    "not_found": int(colours.NO_POSE[1:], 16),
+    "not_found": int(vocabulary.NO_POSE[1:], 16),
     "hidden": 0xAA3377,
     "no_depth": 0xBBBBBB,
     "repeated": 0x66CCEE,
@@ -188,7 +188,7 @@ class ReplayWriter:
             (
                 "error/predicted",
                 "predicted error (mm)",
-                int(colours.PREDICTED_ERROR[1:], 16),
+                int(vocabulary.PREDICTED_ERROR[1:], 16),
                 rows.track.predicted_error_mm,
             )
         ]
@@ -513,7 +513,7 @@ class ReplayWriter:
             )
         )
         end = (int(rows.frame_index[-1]) + 1, float(stop_times(rows.time_s)[-1]))
-        own = colours.action_colours(words)
+        own = vocabulary.action_colours(words)
         self._log_lane(ACTIONS, spans, {word: int(own[word][1:], 16) for word in own}, end)
         count = frame_count(rows.frame_index)
         time = rows.time_s
@@ -526,15 +526,15 @@ class ReplayWriter:
         self._log_lane(TRACKING, marked, _FLAG_COLOURS, end)
 
     def _log_lane(
-        self, entity: str, spans: Sequence[Any], colours: dict[str, int], end: tuple[int, float]
+        self, entity: str, spans: Sequence[Any], vocabulary: dict[str, int], end: tuple[int, float]
     ) -> None:
         """One lane of half-open spans in order of time.
 
         A span is (start_frame, stop_frame, start_s, stop_s, word).
         """
-        labels = [word.replace("_", " ") for word in colours]
+        labels = [word.replace("_", " ") for word in vocabulary]
         kind = rr.StateConfiguration(
-            values=list(colours), labels=labels, colors=_rgba(list(colours.values()))
+            values=list(vocabulary), labels=labels, colors=_rgba(list(vocabulary.values()))
         )
         self._stream.log(entity, kind, static=True)
         changes: list[tuple[int, float, str]] = []
@@ -599,6 +599,6 @@ def _row(boxes: Boxes | None, k: int) -> Boxes | None:
     return None if boxes is None else boxes[k]
 
 
-def _rgba(colours: Sequence[int]) -> NDArray[np.uint32]:
+def _rgba(vocabulary: Sequence[int]) -> NDArray[np.uint32]:
     """0xRRGGBB to what Rerun takes as colours without mistaking a list of numbers for channels."""
-    return np.array([colour << 8 | 0xFF for colour in colours], np.uint32)
+    return np.array([colour << 8 | 0xFF for colour in vocabulary], np.uint32)

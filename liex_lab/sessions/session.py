@@ -34,8 +34,7 @@ from liex_lab.sessions.document import read_document
 from liex_lab.sessions.older import put_back_session
 from liex_lab.sessions.pose_arrays import Poses, dataset_of
 from liex_lab.sessions.reading import reading_from
-from liex_lab.tables.checks import check_footer, check_rows
-from liex_lab.tables.schema import FRAMES
+from liex_lab.tables.schema import FRAMES, check_footer, check_rows
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -15,7 +15,7 @@ from dataclasses import asdict, dataclass
 from functools import cache
 from itertools import groupby
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +28,10 @@ from liex_lab.runtime.memory import blocks
 if TYPE_CHECKING:
     import pandas as pd
     import pyarrow as pa
+
+    from liex_lab.arena.outline import Arena
+    from liex_lab.arena.zones import Zone
+
 
 ROWS_PER_GROUP = 100_000  # a block of the widest table then takes some 20 MB
 _TEXTS = ("name", "dtype", "unit", "meaning", "formula", "source")
@@ -367,3 +371,187 @@ def from_pandas(table: pd.DataFrame) -> Iterator[Block]:
 
 def _pandas_dtype(column: Column) -> str:
     return "str" if column.dtype == "string" else column.dtype
+
+
+# Units that people read: cm/s and degrees on pages and in replays; tables keep mm/s and rad.
+
+
+_SHOWN = {
+    "mm/s": ("cm/s", 0.1),
+    "mm/s²": ("cm/s²", 0.1),
+    "rad": ("°", 180.0 / np.pi),
+    "rad/s": ("°/s", 180.0 / np.pi),
+}
+
+
+def shown(value: Any, unit: str) -> tuple[Any, str]:
+    """A number, or an array of them, in the unit that people read, and that unit.
+
+    Args:
+        value: in the unit of the files.
+        unit: as columns.json names it; others than speeds and angles stay as they are.
+    """
+    name, factor = _SHOWN.get(unit, (unit, 1.0))
+    return (value * factor if factor != 1.0 else value), name
+
+
+def titled(column: str, unit: str) -> str:
+    """The name of a column as people read it: without its unit, which stands beside the number.
+
+    Args:
+        column: name of the column, such as `mean_speed_mm_s`.
+        unit: as columns.json names it.
+    """
+    tail = "_" + unit.replace("/", "_").replace("²", "2")
+    return (column.removesuffix(tail) if unit else column).replace("_", " ")
+
+
+# Protocol of a measured session's tables: what lower layers may read of `sessions.Session`.
+
+
+class SessionTables(Protocol):
+    """The tables of one session folder, and what its session.json states."""
+
+    @property
+    def metadata(self) -> dict[str, Any]:
+        """The content of session.json."""
+
+    @property
+    def arena(self) -> Arena:
+        """The outline of the floor, arena frame, mm."""
+
+    @property
+    def zones(self) -> Sequence[Zone]:
+        """The zones that were drawn, arena frame, mm."""
+
+    @property
+    def frames(self) -> pd.DataFrame:
+        """The table `frames`: one row per frame of the recording."""
+
+    @property
+    def gaps(self) -> pd.DataFrame:
+        """The table `gaps`: one row per stretch without frames or a measured pose."""
+
+    @property
+    def bouts(self) -> pd.DataFrame:
+        """The table `bouts`: the ethogram, one row per bout."""
+
+    @property
+    def summary(self) -> pd.DataFrame:
+        """One row per animal."""
+
+    def table(self, name: str, columns: list[str] | None = None) -> pd.DataFrame:
+        """Any table by its name, or some of its columns.
+
+        Args:
+            name: of the table, such as 'poses'.
+            columns: those that are wanted; None for all.
+
+        Returns:
+            The table in memory.
+        """
+
+
+# Checks of a session's tables that somebody else may have written, before anything is computed.
+
+
+# columns that tables of schema 1 do not have; one that a later schema adds is listed here, too
+_LATER = {
+    "frames": {"wall_distance_mm", "zone", "p_flip", "bridged", "pulse_index"},
+    "poses": {"sd_xy_mm", "sd_z_mm"},
+    "rotations": set(ROOT_COVARIANCES),
+    "gaps": {"x_mm", "y_mm"},
+}
+_ROWS_PER_BYTE = 8  # a frame's time stamp alone takes more
+_FEW = 10_000
+_SPANS = {"bouts", "gaps", "flips"}
+# how Parquet stores our types, and what pandas calls them
+_STORED = {"string": "BYTE_ARRAY", "float64": "DOUBLE", "int64": "INT64", "bool": "BOOLEAN"}
+_KINDS = {"string": "O", "float64": "f", "int64": "i", "bool": "b"}
+
+
+def check_footer(path: Path, name: str, n_frames: int, n_joints: int) -> None:
+    """Check columns, types and number of rows of a table's file.
+
+    Args:
+        path: the Parquet file.
+        name: the table's name.
+        n_frames: frames of the session.
+        n_joints: joints of the animal.
+
+    Raises:
+        ValueError: they are not those of a session with so many frames and joints.
+    """
+    import pyarrow.parquet as pq
+
+    footer = pq.read_metadata(path)
+    n_rows = footer.num_rows
+    found = {
+        leaf.name: leaf for leaf in (footer.schema.column(k) for k in range(footer.num_columns))
+    }
+    exact = {
+        "frames": n_frames,
+        "kinematics": n_frames,
+        "poses": n_frames * n_joints,
+        "rotations": n_frames * (n_joints + 1),
+        "sessions": 1,
+    }
+    if name in exact and n_rows != exact[name]:
+        raise ValueError(f"it has {n_rows} rows where the session has {exact[name]}")
+    if n_rows > max(_FEW, _ROWS_PER_BYTE * (n_joints + 1) * path.stat().st_size):
+        raise ValueError(f"it claims {n_rows} rows, which a file of its size does not hold")
+    if name not in exact and n_rows > max(_FEW, 4 * n_frames):
+        raise ValueError(f"it claims {n_rows} rows for {n_frames} frames")
+    if len(found) != footer.num_columns:
+        raise ValueError("it has two columns of one name")
+    for column in TABLES.get(name, ()):
+        leaf = found.get(column.name)
+        if leaf is None:
+            if column.name not in _LATER.get(name, ()):
+                raise ValueError(f"it lacks the column {column.name}")
+        elif leaf.physical_type != _STORED[column.dtype] or leaf.max_repetition_level:
+            raise ValueError(f"its column {column.name} is not {column.dtype}")
+
+
+def check_rows(name: str, table: pd.DataFrame, joints: Sequence[str]) -> None:
+    """Check the rows of a table, as far as its columns were read.
+
+    Args:
+        name: the table's name.
+        table: all its rows, or all rows of some frames.
+        joints: names of the animal's joints.
+
+    Raises:
+        ValueError: a name is missing, frames are out of order, times are not finite, or rows are
+            not those of the joints.
+    """
+    for column in TABLES.get(name, ()):
+        if column.name not in table:
+            continue
+        values = table[column.name]
+        if values.dtype.kind != _KINDS[column.dtype]:
+            raise ValueError(f"its column {column.name} is not {column.dtype}")
+        if column.dtype == "string" and values.hasnans:
+            raise ValueError(f"its column {column.name} lacks a value")
+    if "joint" in table and name in ("poses", "rotations"):
+        own = [*joints] if name == "poses" else ["root", *joints]
+        words = table["joint"]
+        if len(words) % len(own) or not all(
+            (words.iloc[k :: len(own)] == joint).all() for k, joint in enumerate(own)
+        ):
+            raise ValueError("its rows are not those of the session's joints in their order")
+    if name == "frames":
+        _check_frames(table)
+    if name in _SPANS:
+        for start, stop in (("start_frame", "stop_frame"), ("start_s", "stop_s")):
+            if {start, stop} <= set(table) and not (table[start] <= table[stop]).all():
+                raise ValueError(f"it has a {stop} before its {start}")
+
+
+def _check_frames(table: pd.DataFrame) -> None:
+    """Raises ValueError where frames or times do not go on."""
+    for column in ("frame_index", "time_ns", "time_s"):
+        if column in table:
+            values = table[column].to_numpy()
+            if not np.isfinite(values).all() or (values[1:] <= values[:-1]).any():
+                raise ValueError(f"its {column} does not go on from row to row")

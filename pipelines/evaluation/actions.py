@@ -302,9 +302,8 @@ def contradictions(
         are `contradicting`, and these `by_word`.
     """
     from liex_lab.actions.vocabulary import printed_meanings
-    from liex_lab.behaviour.checking import recognise
     from liex_lab.behaviour.kinematics import Joints, kinematics
-    from liex_lab.behaviour.measures import measure_bouts
+    from liex_lab.behaviour.measures import measure_bouts, recognise
     from liex_lab.tables.rows import Rows, bout_rows
 
     meanings = printed_meanings(recogniser.skeleton, recogniser.definitions)
@@ -356,7 +355,7 @@ def one_hour(
         `frames`, `seconds` by the clock, `core_seconds` of this process, and `cores` of the
         machine.
     """
-    from liex_lab.behaviour.checking import recognise
+    from liex_lab.behaviour.measures import recognise
 
     usual = float(np.median(np.diff(one.track.times_ns))) * 1e-9
     n = round(hour_s / usual)
@@ -381,7 +380,7 @@ def _minutes(tracks: Sequence[LabelledTrack]) -> float:
 
 def _scores(recogniser: TimelineModel, tracks: Sequence[LabelledTrack]) -> dict[str, Any]:
     from liex_lab.actions.scores import timeline_scores
-    from liex_lab.behaviour.checking import recognise
+    from liex_lab.behaviour.measures import recognise
 
     return timeline_scores(
         (

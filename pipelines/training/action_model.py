@@ -190,7 +190,7 @@ def read_any_labels(path: str | Path) -> pd.DataFrame:
         LiexError: there is no such file.
     """
     from liex_lab.actions.labels import read_labels
-    from liex_lab.exchange.boris_labels import boris_export_labels, boris_labels, is_boris_export
+    from liex_lab.exchange.boris import boris_export_labels, boris_labels, is_boris_export
 
     source = Path(path)
     if not source.is_file():
@@ -225,7 +225,7 @@ def suggest(
     """
     import pandas as pd
 
-    from liex_lab.actions.suggestions import doubtful_segments
+    from liex_lab.actions.learning import doubtful_segments
 
     opened, recogniser = _session_and_model(session, model)
     track = track_of(opened)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from sklearn.metrics import cohen_kappa_score
 
-from liex_lab.actions.agreement import cohens_kappa
+from liex_lab.actions.scores import cohens_kappa
 
 
 def raters(table: list[list[int]]) -> tuple[list[str], list[str]]:

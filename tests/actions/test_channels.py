@@ -7,10 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from liex_lab.actions.channels import channel_names, segments_of
-from liex_lab.actions.descriptors import position_descriptor, tangent_descriptor
+from liex_lab.actions.channels import channel_names, segments_of, window_features
 from liex_lab.actions.labels import some_rows
-from liex_lab.actions.window_features import window_features
+from liex_lab.actions.recogniser import position_descriptor, tangent_descriptor
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.geometry import SE3, so3
 from liex_lab.runtime.memory import on_disk

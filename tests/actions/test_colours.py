@@ -6,8 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from liex_lab.actions.colours import NO_POSE, PREDICTED_ERROR, action_colours
-from liex_lab.actions.vocabulary import WORDS
+from liex_lab.actions.vocabulary import NO_POSE, PREDICTED_ERROR, WORDS, action_colours
 
 # Machado, Oliveira and Fernandes 2009, severity 1.0, of linear RGB
 BLINDNESS = {

@@ -20,10 +20,9 @@ from threadpoolctl import threadpool_limits
 
 from liex_lab.actions import storage
 from liex_lab.actions.labels import LabelledTrack, read_labels, some_rows, words_of
-from liex_lab.actions.learning import learn, leave_one_animal_out
+from liex_lab.actions.learning import doubtful_segments, learn, leave_one_animal_out
 from liex_lab.actions.scores import timeline_scores
 from liex_lab.actions.storage import load_action_model, save_action_model
-from liex_lab.actions.suggestions import doubtful_segments
 from liex_lab.actions.timeline import TimelineModel
 from liex_lab.errors import LiexError, ModelError
 from liex_lab.mlp import Network

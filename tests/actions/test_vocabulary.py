@@ -6,14 +6,15 @@ import math
 
 import pytest
 
-from liex_lab.actions.colours import PALETTE, action_colours
 from liex_lab.actions.storage import bundled_action_models, load_action_model
 from liex_lab.actions.vocabulary import (
     ABOUT,
     DEFINITIONS,
     MEASURES,
+    PALETTE,
     WORDS,
     Limit,
+    action_colours,
     limits_of,
     printed_meanings,
 )

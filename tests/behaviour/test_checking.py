@@ -11,9 +11,8 @@ import pytest
 from liex_lab.actions.timeline import TimelineModel
 from liex_lab.actions.vocabulary import MEASURES, WORDS
 from liex_lab.behaviour import kinematics, measure_bouts
-from liex_lab.behaviour.bout_reader import BoutReader
-from liex_lab.behaviour.checking import _READ, BoutCheck, recognise
 from liex_lab.behaviour.kinematics import Joints
+from liex_lab.behaviour.measures import _READ, BoutCheck, BoutReader, recognise
 from liex_lab.tables.rows import Rows, bout_rows
 from tests.actions.toy import going_and_staying, taught_to_lie
 from tests.behaviour.test_kinematics import tables_of

@@ -8,8 +8,15 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from liex_lab.behaviour.body import BRANCHES, KINDS, BodyAxis, kind_of, parents_of
-from liex_lab.behaviour.curves import curves_of, logged_of
+from liex_lab.behaviour.body import (
+    BRANCHES,
+    KINDS,
+    BodyAxis,
+    curves_of,
+    kind_of,
+    logged_of,
+    parents_of,
+)
 from liex_lab.behaviour.kinematics import Joints, kinematics
 from liex_lab.behaviour.summary import measure
 from liex_lab.body.skeleton import Skeleton

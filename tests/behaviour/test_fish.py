@@ -8,7 +8,7 @@ import pytest
 
 from liex_lab.behaviour import Surroundings, measure, measure_bouts
 from liex_lab.behaviour.kinematics import ERROR_LASTS_S, kinematics
-from liex_lab.behaviour.tail import turning_points
+from liex_lab.behaviour.posture import turning_points
 from liex_lab.tables.schema import BOUTS, to_pandas
 from tests.behaviour.swimming_fish import LENGTH_MM, SwimmingFish, uneven
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from liex_lab.behaviour.occupancy import hold_times, occupancy
+from liex_lab.behaviour.places import hold_times, occupancy
 
 
 @pytest.mark.parametrize("sd_mm", [0.0, 5.0, 40.0])

@@ -20,11 +20,15 @@ from liex_lab.behaviour.cohort import (
     result,
     unified,
 )
-from liex_lab.behaviour.design import CAGE, PAIRED, NotComparable, Units, find_units
 from liex_lab.behaviour.statistics import (
+    CAGE,
     MOST_EXACT,
+    PAIRED,
+    NotComparable,
+    Units,
     arrangements,
     estimate,
+    find_units,
     permutation,
     smallest_p,
 )

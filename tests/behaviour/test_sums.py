@@ -14,12 +14,17 @@ from hypothesis import strategies as st
 from liex_lab.arena.outline import Arena
 from liex_lab.arena.zones import Zone, zone_names
 from liex_lab.behaviour import ACTIONS, Surroundings, measure, measure_session
-from liex_lab.behaviour.activity import activity, intervals
+from liex_lab.behaviour.activity import (
+    activity,
+    by_chance,
+    count_transitions,
+    intervals,
+    transitions,
+)
 from liex_lab.behaviour.measures import measure_bouts
-from liex_lab.behaviour.multiplicity import false_discovery
 from liex_lab.behaviour.places import outer_margin_mm, visits
+from liex_lab.behaviour.statistics import false_discovery
 from liex_lab.behaviour.summary import summarise
-from liex_lab.behaviour.transitions import by_chance, count_transitions, transitions
 from liex_lab.tables.rows import stop_times
 from liex_lab.tables.schema import BOUTS, GAPS, Vocabulary, empty_table, to_pandas
 from tests.behaviour.test_kinematics import tables_of

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.stats import binomtest
 
-from liex_lab.behaviour.transitions import _binomial
+from liex_lab.behaviour.activity import _binomial
 
 
 @pytest.mark.parametrize("total", [1, 2, 7, 60, 3000])

@@ -29,7 +29,7 @@ from liex_lab.pipelines.study.listing import list_sessions
 from typer.testing import CliRunner
 
 from liex_lab import api, cli
-from liex_lab.actions.colours import PALETTE, UNLABELLED, action_colours
+from liex_lab.actions.vocabulary import PALETTE, UNLABELLED, action_colours
 from liex_lab.errors import LiexError, SessionError
 from liex_lab.sessions import Session
 from liex_lab.sessions.listed import Entry

@@ -19,7 +19,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_hex
 from matplotlib.text import Text
 
-from liex_lab.actions.colours import action_colours
+from liex_lab.actions.vocabulary import action_colours
 from liex_lab.api import compare_groups, draw_figures
 from liex_lab.arena.outline import Arena
 from liex_lab.arena.zones import Zone

@@ -15,11 +15,11 @@ from liex_lab.dashboards.report.facts import beside_average
 from liex_lab.dashboards.report.quality import flip_rows, frame_account, warnings
 from liex_lab.dashboards.report.report import methods, render, write_report
 
-from liex_lab.actions import colours
+from liex_lab.actions import vocabulary
 from liex_lab.arena.outline import Arena
 from liex_lab.arena.zones import Zone
 from liex_lab.behaviour import measure_session
-from liex_lab.behaviour.around import around_onsets
+from liex_lab.behaviour.activity import around_onsets
 from liex_lab.body import Skeleton
 from liex_lab.exchange import export
 from liex_lab.optics.refraction import Water
@@ -282,12 +282,12 @@ def test_a_session_without_any_pose_has_a_report_too(tmp_path):
 
 
 def test_the_replay_and_the_report_give_an_action_the_same_colour(session, page):
-    assert tuple(int(colour[1:], 16) for colour in colours.PALETTE) == PALETTE
+    assert tuple(int(colour[1:], 16) for colour in vocabulary.PALETTE) == PALETTE
     (ethogram,) = re.findall(r'aria-label="ethogram.*?</svg>', page, flags=re.DOTALL)
     words = list(session.metadata["actions"])
     seen = set(session.bouts["action"])
     assert seen
-    for word, colour in colours.action_colours(words).items():
+    for word, colour in vocabulary.action_colours(words).items():
         if word in seen:
             assert colour.lower() in ethogram, word
 

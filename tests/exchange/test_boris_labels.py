@@ -10,7 +10,7 @@ import pandas as pd
 import pytest
 
 from liex_lab.errors import LiexError
-from liex_lab.exchange.boris_labels import boris_export_labels, boris_labels
+from liex_lab.exchange.boris import boris_export_labels, boris_labels
 
 EVENTS = [
     [0.5, "m01", "rear", "", "", 15],

@@ -19,7 +19,7 @@ from liex_lab.pipelines.training.action_model import (
 from liex_lab.actions.storage import bundled_action_models, find_action_model, load_action_model
 from liex_lab.errors import LiexError
 from liex_lab.exchange import export
-from liex_lab.exchange.boris_labels import read_boris_project
+from liex_lab.exchange.boris import read_boris_project
 from liex_lab.sessions import Session
 from liex_lab.sessions.applying import edited_bouts
 from liex_lab.sessions.correcting import labelled_bouts

@@ -1,8 +1,6 @@
-"""Every table of a session as one Excel workbook, a sheet for each, for those who ask for it.
+"""Every table of a session as CSV, for those who would rather not read Parquet.
 
-Written row by row, so that a long session needs no more memory than its longest table and the
-packed workbook. Texts stay texts: one that begins with "=" is no formula. CSV and Parquet keep full
-precision and any length; a sheet of Excel ends at 1,048,576 rows.
+Units are in the columns' names; columns.json describes every column.
 """
 
 from __future__ import annotations
@@ -16,11 +14,38 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from liex_lab.errors import SessionError
+from liex_lab.runtime.places import inside
+from liex_lab.runtime.spreadsheets import copy_harmless, write_csv
 from liex_lab.sessions import Session
+from liex_lab.sessions.reading import reading_from
 
 if TYPE_CHECKING:
     import pandas as pd
     from openpyxl import Workbook
+
+
+def write_csv_folder(session: Session, path: Path) -> None:
+    """Write a folder with one file per table, numbers in full precision, and columns.json.
+
+    Args:
+        session: the session.
+        path: the folder to make.
+    """
+    path.mkdir()
+    for name in sorted(
+        {file.name for file in session.path.glob("*.parquet")} | set(session.log.files)
+    ):
+        if name.endswith(".parquet"):
+            table = name.removesuffix(".parquet")
+            write_csv(session.table(table), inside(path, table, ".csv"))
+    if session.has("summary.csv"):
+        with reading_from(session.file("summary.csv")) as summary:
+            copy_harmless(summary, path / "summary.csv")
+    shutil.copyfile(session.file("columns.json"), path / "columns.json")
+
+
+# Every table of a session as one Excel workbook, a sheet for each, for those who ask for it.
+
 
 MAX_ROWS = 1_048_576  # of a sheet, its headings included
 _MOST_CHARACTERS = 32_767  # of a cell
@@ -30,7 +55,7 @@ _OTHER_BYTES = 1 << 21  # of what does not grow with the recording
 _EXACT = 10**15  # Excel has 15 digits; a longer whole number, a time in ns, is a text
 
 
-def write(session: Session, path: Path) -> None:
+def write_xlsx(session: Session, path: Path) -> None:
     """Write a workbook: the summary first, then every table, and what every column means.
 
     Args:
