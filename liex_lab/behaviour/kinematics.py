@@ -20,8 +20,8 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from liex_lab.behaviour.body import BRANCHES, STANDS, SWIMS, BodyAxis
-from liex_lab.behaviour.posture import Posture, Shape, tail_beat
+from liex_lab.behaviour.body import STANDS, SWIMS, BodyAxis
+from liex_lab.behaviour.posture import posture, tail_beat
 from liex_lab.runtime.memory import Allocator, blocks
 from liex_lab.tables.rows import gap_follows, median_step, stop_times
 from liex_lab.tables.schema import table_columns, to_pandas
@@ -36,32 +36,6 @@ IMPOSSIBLE_MM_S = 3000.0  # faster than any mouse: a tracking error
 # after which two errors agree by 1/e; on rendered recordings they last longer, smoothed or not
 ERROR_LASTS_S = 0.3
 _BLOCK = 16_384  # frames whose postures are in memory at a time
-_MOVING = (
-    "x_mm",
-    "y_mm",
-    "z_mm",
-    "position_sd_mm",
-    "speed_mm_s",
-    "speed_sd_mm_s",
-    "vertical_speed_mm_s",
-    "step_mm",
-    "acceleration_mm_s2",
-    "acceleration_sd_mm_s2",
-    "heading_rad",
-    "heading_sd_rad",
-    "yaw_rate_rad_s",
-    "yaw_rate_sd_rad_s",
-    "body_pitch_rad",
-    "body_pitch_sd_rad",
-)
-_HEIGHTS = (
-    "nose_height_mm",
-    "nose_height_sd_mm",
-    "back_height_mm",
-    "nose_over_rump_mm",
-    "reach_mm",
-)
-_BY_FRAME = {STANDS: _HEIGHTS, SWIMS: (), BRANCHES: ("opening",)}
 STEEP_RAD = np.radians(75.0)  # beyond it the body's axis has no reliable direction on the floor
 
 
@@ -166,43 +140,25 @@ def kinematics(
     """
     joints = poses if isinstance(poses, Joints) else Joints.of_table(poses, len(frames))
     body = BodyAxis.of(joints.names, joints.parents)
-    shape, own = _frame_by_frame(body, joints, allocate)
+    shape: dict[str, Array] = {}
+    for rows in blocks(joints.n_frames, _BLOCK):
+        _put(shape, rows, posture(body, *joints.at(rows)), joints.n_frames, allocate)
     time_s = frames["time_s"].to_numpy(float)
-    observed = np.isfinite(shape.centre[:, 0])
+    observed = np.isfinite(shape["centre"][:, 0])
     begins = np.isin(frames["frame_index"].to_numpy(), seams)
     spans = Spans.of(time_s, observed, half_window_s, begins)
     block: dict[str, Any] = {
         name: _put_away(frames[name], allocate) for name in ("frame_index", "time_s", "dt_s")
     }
     block |= {name: str(frames[name].iloc[0]) for name in ("session_id", "individual")}
-    block |= _moving(
-        shape, body.kind, spans, stop_times(time_s) - time_s, impossible_above_mm_s, allocate
-    )
-    block |= {
-        "length_mm": shape.length_mm,
-        "straightness": shape.straightness,
-        "bend_rad": shape.bend_rad,
-        **own,
-    }
+    hold_s = stop_times(time_s) - time_s
+    block |= shape | _moving(shape, body.kind, spans, hold_s, impossible_above_mm_s, allocate)
     if body.kind == SWIMS:
-        block |= _swimming(shape, time_s, segments(time_s, observed, begins), surface_z_mm)
+        number = segments(time_s, observed, begins)
+        surface = np.nan if surface_z_mm is None else surface_z_mm
+        block |= tail_beat(shape, time_s, number, median_step(time_s))
+        block["below_surface_mm"] = surface - shape["centre"][:, 2]
     return to_pandas(table_columns("kinematics", body.kind), block, copy=False)
-
-
-def _frame_by_frame(
-    body: BodyAxis, joints: Joints, allocate: Allocator
-) -> tuple[Shape, dict[str, Array]]:
-    """What each frame tells by itself: of every body, and of one of its kind, block by block."""
-    shape = Shape.empty(joints.n_frames, allocate)
-    own = {name: allocate((joints.n_frames,), float) for name in _BY_FRAME[body.kind]}
-    for rows in blocks(joints.n_frames, _BLOCK):
-        xyz, sd = joints.at(rows)
-        shape.put(rows, Posture.of(body, xyz, sd))
-        if body.kind == STANDS:
-            _put(own, rows, _walking(body, xyz, sd))
-        elif body.kind == BRANCHES:
-            _put(own, rows, {"opening": _opening(body, xyz)})
-    return shape, own
 
 
 def _put_away(column: pd.Series[Any], allocate: Allocator) -> NDArray[Any]:
@@ -212,14 +168,22 @@ def _put_away(column: pd.Series[Any], allocate: Allocator) -> NDArray[Any]:
     return values
 
 
-def _put(columns: dict[str, Array], rows: slice, values: dict[str, Array]) -> None:
-    """Write values (m,) of some rows into their columns (n,)."""
+def _put(
+    columns: dict[str, Array],
+    rows: slice,
+    values: dict[str, Array],
+    n: int,
+    allocate: Allocator,
+) -> None:
+    """Write values (m, ...) of some rows into their columns (n, ...), made where they are new."""
     for name, some in values.items():
+        if name not in columns:
+            columns[name] = allocate((n, *some.shape[1:]), float)
         columns[name][rows] = some
 
 
 def _moving(
-    shape: Shape,
+    shape: dict[str, Array],
     kind: str,
     spans: Spans,
     hold_s: Array,
@@ -227,89 +191,36 @@ def _moving(
     allocate: Allocator,
 ) -> dict[str, Array]:
     """Position, speed and turning of the whole body; hold_s (n,) is how long a frame counts, s."""
-    columns = {name: allocate((len(hold_s),), float) for name in _MOVING}
-    speed, speed_sd, heading, heading_sd = (
-        columns[name] for name in ("speed_mm_s", "speed_sd_mm_s", "heading_rad", "heading_sd_rad")
-    )
+    columns: dict[str, Array] = {}
     for rows in blocks(len(hold_s), _BLOCK):
-        centre = shape.centre[rows]
-        velocity = spans[rows].rate(shape.centre)
+        centre = shape["centre"][rows]
+        velocity = spans[rows].rate(shape["centre"])
         fast = np.linalg.norm(velocity[:, :2] if kind == STANDS else velocity, axis=1)
-        speed[rows] = np.where(fast > impossible_above_mm_s, np.nan, fast)
-        speed_sd[rows] = spans[rows].sd(shape.centre_sd)
-        flat = np.abs(shape.pitch_rad[rows]) < STEEP_RAD
-        heading[rows] = np.where(flat, shape.heading_rad[rows], np.nan)
-        heading_sd[rows] = np.where(flat, shape.heading_sd_rad[rows], np.nan)
-        _put(
-            columns,
-            rows,
-            {
-                "x_mm": centre[:, 0],
-                "y_mm": centre[:, 1],
-                "z_mm": centre[:, 2],
-                "position_sd_mm": shape.centre_sd[rows],
-                "vertical_speed_mm_s": velocity[:, 2],
-                "step_mm": speed[rows] * hold_s[rows],
-                "body_pitch_rad": shape.pitch_rad[rows],
-                "body_pitch_sd_rad": shape.pitch_sd_rad[rows],
-            },
-        )
+        speed = np.where(fast > impossible_above_mm_s, np.nan, fast)
+        flat = np.abs(shape["body_pitch_rad"][rows]) < STEEP_RAD
+        values = {
+            "x_mm": centre[:, 0],
+            "y_mm": centre[:, 1],
+            "z_mm": centre[:, 2],
+            "position_sd_mm": shape["centre_sd"][rows],
+            "speed_mm_s": speed,
+            "speed_sd_mm_s": spans[rows].sd(shape["centre_sd"]),
+            "vertical_speed_mm_s": velocity[:, 2],
+            "step_mm": speed * hold_s[rows],
+            "heading_rad": np.where(flat, shape["heading_rad"][rows], np.nan),
+            "heading_sd_rad": np.where(flat, shape["heading_sd_rad"][rows], np.nan),
+        }
+        _put(columns, rows, values, len(hold_s), allocate)
     for rows in blocks(len(hold_s), _BLOCK):  # now that those of the neighbours are known
         here = spans[rows]
-        _put(
-            columns,
-            rows,
-            {
-                "acceleration_mm_s2": here.rate(speed),
-                "acceleration_sd_mm_s2": here.sd(speed_sd),
-                "yaw_rate_rad_s": here.turning(heading),
-                "yaw_rate_sd_rad_s": here.sd(heading_sd),
-            },
-        )
+        values = {
+            "acceleration_mm_s2": here.rate(columns["speed_mm_s"]),
+            "acceleration_sd_mm_s2": here.sd(columns["speed_sd_mm_s"]),
+            "yaw_rate_rad_s": here.turning(columns["heading_rad"]),
+            "yaw_rate_sd_rad_s": here.sd(columns["heading_sd_rad"]),
+        }
+        _put(columns, rows, values, len(hold_s), allocate)
     return columns
-
-
-def _walking(body: BodyAxis, xyz: Array, sd: Array) -> dict[str, Array]:
-    """Heights of an animal that stands on the floor."""
-    nose = xyz[:, body.front]
-    rump = xyz[:, body.rear]
-    return {
-        "nose_height_mm": nose[:, 2],
-        "nose_height_sd_mm": sd[:, body.front],
-        "back_height_mm": xyz[:, list(body.back), 2].max(axis=1),
-        "nose_over_rump_mm": nose[:, 2] - rump[:, 2],
-        "reach_mm": np.hypot(*(nose - rump)[:, :2].T),
-    }
-
-
-def _opening(body: BodyAxis, xyz: Array) -> Array:
-    """(n,) how far the limbs are stretched out, 1 at most, of joints (n, J, 3)."""
-    shares = []
-    for limb in body.limbs:
-        at = xyz[:, list(limb)]
-        bones = np.linalg.norm(np.diff(at, axis=1), axis=2).sum(axis=1)
-        shares.append(np.linalg.norm(at[:, -1] - at[:, 0], axis=1) / bones)
-    return np.asarray(np.mean(shares, axis=0))
-
-
-def _swimming(
-    shape: Shape, time_s: Array, number: Rows, surface_z_mm: float | None
-) -> dict[str, Array]:
-    """Curvature along the body, the tail's beat, and the depth below the surface."""
-    beat = tail_beat(shape, time_s, number, median_step(time_s))
-    surface = np.nan if surface_z_mm is None else surface_z_mm
-    front, middle, rear = shape.thirds_rad.T
-    return {
-        "bend_front_rad": front,
-        "bend_middle_rad": middle,
-        "bend_rear_rad": rear,
-        "tail_angle_rad": shape.tail_angle_rad,
-        "tail_mm": shape.tail_mm,
-        "tail_extreme_rad": beat.extreme_rad,
-        "tail_beat_hz": beat.frequency_hz,
-        "tail_beat_mm": beat.amplitude_mm,
-        "below_surface_mm": surface - shape.centre[:, 2],
-    }
 
 
 @dataclass(frozen=True)
