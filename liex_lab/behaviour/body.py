@@ -186,7 +186,7 @@ def curves_of(animal: Mapping[str, Any]) -> tuple[Curve, ...]:
             Curve("tail_beat_hz", "Tail beat", "frequency", "Hz", _PURPLE),
         )
     if body.kind == BRANCHES:
-        opened = f"of {_limbs(body)}; 1: stretched out"
+        opened = f"of {_limb_names(body)}; 1: stretched out"
         return (
             speed,
             Curve("z_mm", "Height", f"of the {_base(body)} above the background", "mm", _GREEN),
@@ -212,7 +212,7 @@ def _base(body: BodyAxis) -> str:
     return body.joints[body.rear].replace("_", " ")
 
 
-def _curves_limbs(body: BodyAxis) -> str:
+def _limb_names(body: BodyAxis) -> str:
     """The limbs by the first word of their ends' names."""
     names = [body.joints[limb[-1]].split("_")[0] for limb in body.limbs]
     if len(set(names)) < len(names):
