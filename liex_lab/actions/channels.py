@@ -385,32 +385,19 @@ def window_features(segment: Segment, names: Sequence[str]) -> NDArray[np.float3
     x = segment.values
     step = segment.times_s[1] - segment.times_s[0]
     signed = np.array([name.endswith("~") for name in names])
-    n = x.shape[1]
-    n_signed = int(signed.sum())
-    n_features = (
-        n + n_signed + len(HALF_WINDOWS_S) * (2 * n + n_signed) + len(SIDE_WINDOWS_S) * 2 * n + n
-    )
-    found = np.empty((len(x), n_features), np.float32)
-    filled = 0
-
-    def put(*parts: Array) -> None:  # one by one, for all of them in double precision are large
-        """Append columns (m, k) to the features, one part after the other."""
-        nonlocal filled
-        for part in parts:
-            found[:, filled : filled + part.shape[1]] = part
-            filled += part.shape[1]
-
-    sums, squares = (np.concatenate([np.zeros((1, n)), np.cumsum(v, axis=0)]) for v in (x, x * x))
-    put(x, np.abs(x[:, signed]))
+    start_at = np.zeros((1, x.shape[1]))
+    sums, squares = (np.concatenate([start_at, np.cumsum(v, axis=0)]) for v in (x, x * x))
+    parts = [x, np.abs(x[:, signed])]
     for half in HALF_WINDOWS_S:
         mean, square = (_window_mean(total, -half, half, step) for total in (sums, squares))
-        put(mean, np.abs(mean[:, signed]), np.sqrt(np.maximum(square - mean * mean, 0.0)))
+        spread = np.sqrt(np.maximum(square - mean * mean, 0.0))
+        parts += [mean.astype(np.float32), np.abs(mean[:, signed]), spread.astype(np.float32)]
     for start, stop in SIDE_WINDOWS_S:
         mean, square = (_window_mean(total, start, stop, step) for total in (sums, squares))
-        put(np.where(signed, np.abs(mean), mean), np.sqrt(np.maximum(square, 0.0)))
-    put(_extreme(np.abs(x), RANGE_S, step))
-    assert filled == n_features
-    return found
+        level = np.where(signed, np.abs(mean), mean)
+        parts += [level.astype(np.float32), np.sqrt(np.maximum(square, 0.0)).astype(np.float32)]
+    parts.append(_extreme(np.abs(x), RANGE_S, step))
+    return np.concatenate(parts, axis=1, dtype=np.float32)
 
 
 def _window_mean(total: Array, start_s: float, stop_s: float, step: float) -> Array:

@@ -405,7 +405,6 @@ class Examples:
         features: (m, F) float32, see `window_features`.
         code: (m,) index of each tick's word.
         speed: (m,) `steady_speed`, body lengths a second.
-        animal: (m,) the animal's number.
         recording: (m,) the recording's number.
         runs: of every recording, its bouts (word, s) in order.
     """
@@ -413,7 +412,6 @@ class Examples:
     features: NDArray[np.float32]
     code: NDArray[np.int64]
     speed: Array
-    animal: NDArray[np.int64]
     recording: NDArray[np.int64]
     runs: list[list[tuple[int, float]]]
 
@@ -460,13 +458,8 @@ def gather(tracks: Sequence[LabelledTrack], words: Sequence[str], clock_hz: floa
     Returns:
         Features, codes and speeds of all ticks, and the bouts of every recording.
     """
-    features = []
-    codes = []
-    speeds = []
-    animals = []
-    recordings = []
+    ticks = []
     runs = []
-    number = {name: k for k, name in enumerate(sorted({one.animal for one in tracks}))}
     place = {word: k for k, word in enumerate(words)}
     for k, one in enumerate(tracks):
         names = channel_names(one.track.skeleton)
@@ -476,20 +469,11 @@ def gather(tracks: Sequence[LabelledTrack], words: Sequence[str], clock_hz: floa
             row = np.clip(
                 np.searchsorted(time_s, segment.times_s - 0.5 / clock_hz), 0, len(time_s) - 1
             )
-            features.append(window_features(segment, names))
-            codes.append(code[row])
-            speeds.append(steady_speed(segment, names))
-            animals.append(np.full(len(row), number[one.animal]))
-            recordings.append(np.full(len(row), k))
+            speed = steady_speed(segment, names)
+            ticks.append((window_features(segment, names), code[row], speed, np.full(len(row), k)))
         runs.append(_runs(one.words, one.track.times_ns, place))
-    return Examples(
-        np.concatenate(features),
-        np.concatenate(codes),
-        np.concatenate(speeds),
-        np.concatenate(animals),
-        np.concatenate(recordings),
-        runs,
-    )
+    columns: list[Any] = [np.concatenate(column) for column in zip(*ticks, strict=True)]
+    return Examples(*columns, runs)
 
 
 def _runs(

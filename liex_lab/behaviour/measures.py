@@ -35,7 +35,6 @@ class BoutReader:
     """The table `kinematics` as arrays, from which rows [start, stop) of a bout are measured."""
 
     def __init__(self, kinematics: pd.DataFrame) -> None:
-        self._table = kinematics
         self.frame_index = kinematics["frame_index"].to_numpy()
         self.time_s = kinematics["time_s"].to_numpy(float)
         self.hold_s = stop_times(self.time_s) - self.time_s
@@ -43,9 +42,13 @@ class BoutReader:
         self.fps = 1.0 / step if step > 0 else 0.0
         self.place = kinematics[["x_mm", "y_mm", "z_mm"]].to_numpy(float)
         self.kind = kind_of(kinematics)
-        length = self._of("length_mm")
+        self._columns = {
+            str(name): values.to_numpy(float)
+            for name, values in kinematics.items()
+            if values.dtype == float
+        }
+        length = self._columns["length_mm"]
         self.length_mm = float(np.nanmedian(length)) if np.isfinite(length).any() else np.nan
-        self._columns: dict[str, Array] = {}
 
     def rows_of(self, bouts: pd.DataFrame) -> list[tuple[int, int]]:
         """The rows [start, stop) of every bout, at least one row each.
@@ -86,22 +89,11 @@ class BoutReader:
             spans: the rows of the n bouts, see `rows_of`.
         """
         number = segments(self.time_s, np.isfinite(self.place[:, 0]))
-        last: dict[str, int] = {}
-        out = np.full(len(bouts), np.nan)
-        begin = bouts["start_s"].to_numpy(float)
-        end = bouts["stop_s"].to_numpy(float)
-        for k, action in enumerate(bouts["action"]):
-            before = last.get(action)
-            if (
-                before is not None
-                and number[spans[before][1] - 1] == number[min(spans[k][0], len(number) - 1)]
-            ):
-                out[k] = begin[k] - end[before]
-            last[action] = k
-        return out
-
-    def _of(self, name: str) -> Array:
-        return self._table[name].to_numpy(float)
+        start, stop = np.array(spans, np.int64).reshape(-1, 2).T
+        ends = {"action": bouts["action"].to_numpy(), "stop_s": bouts["stop_s"].to_numpy(float)}
+        last = pd.DataFrame({**ends, "number": number[stop - 1]}).groupby("action").shift()
+        since = bouts["start_s"].to_numpy(float) - last["stop_s"].to_numpy()
+        return np.where(last["number"].to_numpy() == number[start], since, np.nan)
 
     def column(self, name: str, start: int, stop: int) -> Array:
         """A column of the table `kinematics` within a bout.
@@ -111,8 +103,6 @@ class BoutReader:
             start: first row of the bout.
             stop: row after its last.
         """
-        if name not in self._columns:
-            self._columns[name] = self._of(name)
         return self._columns[name][start:stop]
 
     def seconds(self, start: int, stop: int) -> float:
@@ -140,7 +130,7 @@ class BoutReader:
         displacement = (
             self.place[seen[-1]] - self.place[seen[0]] if len(seen) else np.full(3, np.nan)
         )
-        top = known[speed[known].argmax()] if len(known) else None
+        top = _top(speed)
         return {
             "path_mm": path,
             "path_bl": path / self.length_mm,
@@ -149,7 +139,7 @@ class BoutReader:
             ),
             "rise_mm": float(displacement[2]),
             "mean_speed_mm_s": path / timed if timed > 0 else np.nan,
-            "median_speed_mm_s": _median(speed),
+            "median_speed_mm_s": of_known(np.median, speed),
             "peak_speed_mm_s": np.nan if top is None else float(speed[top]),
             "peak_speed_sd_mm_s": np.nan
             if top is None
@@ -178,8 +168,8 @@ class BoutReader:
             "net_turn_rad": float(turned[-1]) if some else np.nan,
             "net_turn_sd_rad": float(np.hypot(*ends)),
             "heading_range_rad": float(np.ptp(turned)) if some else np.nan,
-            "mean_pitch_rad": _mean(pitch),
-            "bend_max_rad": _max(np.abs(bend)),
+            "mean_pitch_rad": of_known(np.mean, pitch),
+            "bend_max_rad": of_known(np.max, np.abs(bend)),
         }
 
     def height(self, start: int, stop: int) -> dict[str, float]:
@@ -190,11 +180,12 @@ class BoutReader:
             stop: row after its last.
         """
         nose = self.column("nose_height_mm", start, stop)
-        known = np.flatnonzero(np.isfinite(nose))
-        top = known[nose[known].argmax()] if len(known) else None
+        top = _top(nose)
         return {
             "peak_nose_height_mm": np.nan if top is None else float(nose[top]),
-            "peak_nose_over_rump_mm": _max(self.column("nose_over_rump_mm", start, stop)),
+            "peak_nose_over_rump_mm": of_known(
+                np.max, self.column("nose_over_rump_mm", start, stop)
+            ),
             "time_to_peak_height_s": np.nan
             if top is None
             else float(self.time_s[start + top] - self.time_s[start]),
@@ -209,18 +200,18 @@ class BoutReader:
         size = np.abs(bends[at])
         n = len(at)
         duration = self.seconds(start, stop)
-        left = max(_max(angle), 0.0)
-        right = max(_max(-angle), 0.0)
+        left = max(of_known(np.max, angle), 0.0)
+        right = max(of_known(np.max, -angle), 0.0)
         return {
             "n_bends": n,
             "n_oscillations": n / 2.0,
             "tail_beat_hz": n / 2.0 / duration,
-            "tail_beat_max_hz": _max(beat),
-            "tail_beat_mean_hz": _mean(beat),
-            "tail_beat_median_hz": _median(beat),
-            "tail_max_rad": _max(size),
-            "tail_mean_rad": _mean(size),
-            "tail_median_rad": _median(size),
+            "tail_beat_max_hz": of_known(np.max, beat),
+            "tail_beat_mean_hz": of_known(np.mean, beat),
+            "tail_beat_median_hz": of_known(np.median, beat),
+            "tail_max_rad": of_known(np.max, size),
+            "tail_mean_rad": of_known(np.mean, size),
+            "tail_median_rad": of_known(np.median, size),
             "first_bend_s": float(self.time_s[start + at[0]] - self.time_s[start]) if n else np.nan,
             "first_bend_rad": float(bends[at[0]]) if n else np.nan,
             "second_over_first": float(bends[at[1]] / bends[at[0]]) if n > 1 else np.nan,
@@ -256,25 +247,21 @@ def _correlation(a: Array, b: Array) -> float:
     return float((a * b).sum()) / size if size > 0 else 0.0
 
 
-def _max(values: Array) -> float:
-    known = values[np.isfinite(values)]
-    return float(known.max()) if len(known) else np.nan
+def _top(values: Array) -> int | None:
+    """Where the largest value is; None if none is known."""
+    return int(np.nanargmax(values)) if np.isfinite(values).any() else None
 
 
-def _mean(values: Array) -> float:
+def of_known(measure: Callable[[Array], Any], values: Array) -> float:
+    """A measure, such as `np.median`, of the values that are known; NaN if there is none."""
     known = values[np.isfinite(values)]
-    return float(known.mean()) if len(known) else np.nan
+    return float(measure(known)) if len(known) else np.nan
 
 
 def _mean_over(values: Array, hold: Array) -> float:
     known = np.isfinite(values)
     time = float(hold[known].sum())
     return float((values * hold)[known].sum()) / time if time > 0 else np.nan
-
-
-def _median(values: Array) -> float:
-    known = values[np.isfinite(values)]
-    return float(np.median(known)) if len(known) else np.nan
 
 
 # Check of bouts against the measurable part of their definitions.
@@ -293,7 +280,7 @@ def _turn(name: str, sign: float = 1.0) -> Reading:
 
 def _beyond_noise(bout: BoutReader, a: int, b: int) -> float:
     """Mean speed less what errors of the pose alone look like, mm/s."""
-    noise = _median(bout.column("speed_sd_mm_s", a, b))
+    noise = of_known(np.median, bout.column("speed_sd_mm_s", a, b))
     return max(bout.motion(a, b)["mean_speed_mm_s"] - (0.0 if np.isnan(noise) else noise), 0.0)
 
 
@@ -309,7 +296,9 @@ _READ: dict[str, Reading] = {
     "either_turn_rad": lambda bout, a, b: (abs(bout.turn(a, b)["net_turn_rad"]),),
     "swing_rad": _turn("heading_range_rad"),
     "bend_rad": _turn("bend_max_rad"),
-    "usual_bend_rad": lambda bout, a, b: (_median(np.abs(bout.column("bend_rad", a, b))),),
+    "usual_bend_rad": lambda bout, a, b: (
+        of_known(np.median, np.abs(bout.column("bend_rad", a, b))),
+    ),
     "pitch_rad": _turn("mean_pitch_rad"),
     "raised_bl": lambda bout, a, b: (bout.height(a, b)["peak_nose_over_rump_mm"] / bout.length_mm,),
     "moved_bl": lambda bout, a, b: (bout.motion(a, b)["displacement_mm"] / bout.length_mm,),

@@ -21,7 +21,7 @@ from liex_lab.behaviour.activity import activity, observed_hold, time_named, tra
 from liex_lab.behaviour.body import SWIMS, kind_of, parents_of
 from liex_lab.behaviour.bouts import ACTIONS, MouseRules, find_bouts
 from liex_lab.behaviour.kinematics import Joints, kinematics
-from liex_lab.behaviour.measures import measure_bouts
+from liex_lab.behaviour.measures import measure_bouts, of_known
 from liex_lab.behaviour.places import (
     Surroundings,
     depth_measures,
@@ -367,6 +367,4 @@ def _time_in_zones(frames: pd.DataFrame, zones: Sequence[str], hold: Array) -> d
 
 
 def _median(values: pd.Series[Any]) -> float:
-    known = values.to_numpy(float)
-    known = known[np.isfinite(known)]
-    return float(np.median(known)) if len(known) else np.nan
+    return of_known(np.median, values.to_numpy(float))
