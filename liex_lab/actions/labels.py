@@ -7,7 +7,6 @@ from and are judged by.
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, fields
 from pathlib import Path
@@ -135,18 +134,6 @@ def words_of(
         start, stop = np.searchsorted(time_s, [start_s - 1e-6, stop_s - 1e-6])
         out[start:stop] = action
     return out
-
-
-def vocabulary(table: pd.DataFrame) -> Mapping[str, str]:
-    """The words of a table, sorted, each without a definition.
-
-    Args:
-        table: bouts.
-
-    Returns:
-        Word -> ''.
-    """
-    return dict.fromkeys(sorted(set(table["action"])), "")
 
 
 @dataclass(frozen=True)

@@ -232,24 +232,21 @@ def _table(
         for start, stop, key in constant_runs(np.where(runs >= 0, runs + len(code) * number, -1))
         if key >= 0
     ]
-    rows = [(str(label[a]), time_s[a], stop_s[b - 1], count[a], count[b]) for a, b in pieces]
-    action, start_s, end_s, start_frame, stop_frame = (
-        zip(*rows, strict=True) if rows else ([], [], [], [], [])
-    )
+    a, b = np.array(pieces, np.int64).reshape(-1, 2).T
     named = to_pandas(
         BOUTS,
         {
-            "session_id": [kinematics["session_id"].iloc[0]] * len(rows),
-            "individual": [kinematics["individual"].iloc[0]] * len(rows),
-            "action": list(action),
-            "start_s": list(start_s),
-            "stop_s": list(end_s),
-            "duration_s": list(np.subtract(end_s, start_s)),
-            "start_frame": list(start_frame),
-            "stop_frame": list(stop_frame),
-            "score": [float(raw[str(label[a])][a:b].mean()) for a, b in pieces],
-            "source": ["rule"] * len(rows),
-            "model_hash": [""] * len(rows),
+            "session_id": str(kinematics["session_id"].iloc[0]),
+            "individual": str(kinematics["individual"].iloc[0]),
+            "action": label[a],
+            "start_s": time_s[a],
+            "stop_s": stop_s[b - 1],
+            "duration_s": stop_s[b - 1] - time_s[a],
+            "start_frame": count[a],
+            "stop_frame": count[b],
+            "score": [float(raw[str(label[i])][i:j].mean()) for i, j in pieces],
+            "source": "rule",
+            "model_hash": "",
         },
     )
     return measure_bouts(named, kinematics)

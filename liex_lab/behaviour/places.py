@@ -90,23 +90,20 @@ def visits(
         stays = list(tidy(here, observed, number, time_s, stop_s, rules))
         lengths = [stop_s[b - 1] - time_s[a] for a, b in stays]
         rows.append(
-            (
-                zone,
-                hold[here].sum(),
-                hold[here].sum() / hold.sum() if hold.sum() > 0 else np.nan,
-                len(stays),
-                time_s[stays[0][0]] - first if stays else np.nan,
-                np.mean(lengths) if stays else np.nan,
-                step[here].sum(),
-            )
+            {
+                "session_id": str(frames["session_id"].iloc[0]),
+                "individual": str(frames["individual"].iloc[0]),
+                "zone": zone,
+                "time_s": hold[here].sum(),
+                "share": hold[here].sum() / hold.sum() if hold.sum() > 0 else np.nan,
+                "n_visits": len(stays),
+                "latency_s": time_s[stays[0][0]] - first if stays else np.nan,
+                "mean_visit_s": np.mean(lengths) if stays else np.nan,
+                "distance_mm": step[here].sum(),
+            }
         )
     columns = table_columns("zones")
-    names = [column.name for column in columns[2:]]
-    values = zip(*rows, strict=True) if rows else [[] for _ in names]
-    who = {name: [str(frames[name].iloc[0])] * len(rows) for name in ("session_id", "individual")}
-    return to_pandas(
-        columns, {**who, **{name: list(column) for name, column in zip(names, values, strict=True)}}
-    )
+    return to_pandas(columns, {c.name: [row[c.name] for row in rows] for c in columns})
 
 
 def inside_zones(frames: pd.DataFrame, zones: Sequence[str]) -> list[Mask]:

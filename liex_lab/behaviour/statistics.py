@@ -20,7 +20,7 @@ difference), never sessions or bouts.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from math import comb, prod
@@ -112,9 +112,14 @@ def find_units(
                 f"the group {group} has {number} animals with a value, and a comparison needs two"
             )
     cage = animals["cage"].to_numpy(str)
-    _check_cages(cage)
+    unknown = int((cage == "").sum())
+    if 0 < unknown < len(cage):
+        raise NotComparable(
+            f"the cage of {unknown} of {len(cage)} animals is not stated; state it for all, or for "
+            "none"
+        )
     crowded = len(set(cage)) < len(cage) and bool(cage[0])
-    mixed = crowded and _holds_both(cage, second)
+    mixed = crowded and _hold_both(cage, second)
     block = _blocks(animals, [*(["cage"] if mixed else []), *blocks], second)
     if crowded and not mixed:
         return _whole_cages(animals, second, block)
@@ -148,18 +153,9 @@ def animal_means(values: Array, animal: NDArray[np.int64]) -> Array:
     return np.bincount(animal, values) / np.bincount(animal)
 
 
-def _check_cages(cage: NDArray[np.str_]) -> None:
-    unknown = int((cage == "").sum())
-    if 0 < unknown < len(cage):
-        raise NotComparable(
-            f"the cage of {unknown} of {len(cage)} animals is not stated; state it for all, or for "
-            "none"
-        )
-
-
-def _holds_both(cage: NDArray[np.str_], second: NDArray[np.bool_]) -> bool:
-    """Whether any cage holds animals of both groups."""
-    return any(0 < second[cage == name].sum() < (cage == name).sum() for name in np.unique(cage))
+def _hold_both(names: NDArray[Any], second: NDArray[np.bool_]) -> bool:
+    """Whether any of the cages or blocks holds animals of both groups."""
+    return any(0 < second[names == one].sum() < (names == one).sum() for one in np.unique(names))
 
 
 def _blocks(
@@ -180,9 +176,7 @@ def _blocks(
         block = np.unique(
             np.stack([block, pd.factorize(animals[name])[0]]), axis=1, return_inverse=True
         )[1].ravel()
-    if known and not any(
-        0 < second[block == b].sum() < (block == b).sum() for b in np.unique(block)
-    ):
+    if known and not _hold_both(block, second):
         raise NotComparable(
             f"every {' and '.join(known)} has animals of one group only, so a difference may be "
             f"that of the {known[0]}; record both groups in each"
@@ -337,11 +331,16 @@ def arrangements(units: Units) -> int:
     """
     if units.paired:
         return int(2 ** len(units.values))
-    sizes = [
-        (int((units.block == b).sum()), int(units.second[units.block == b].sum()))
-        for b in np.unique(units.block)
-    ]
-    return prod(comb(n, k) for n, k in sizes)
+    return prod(comb(len(inside), k) for inside, k in _mixed_blocks(units))
+
+
+def _mixed_blocks(units: Units) -> Iterator[tuple[NDArray[np.int64], int]]:
+    """The units of each block that holds both groups, and how many are of the second group."""
+    for block in np.unique(units.block):
+        inside = np.flatnonzero(units.block == block)
+        k = int(units.second[inside].sum())
+        if 0 < k < len(inside):
+            yield inside, k
 
 
 def smallest_p(units: Units) -> float:
@@ -355,10 +354,7 @@ def smallest_p(units: Units) -> float:
     Args:
         units: the units of the comparison.
     """
-    blocks = [units.second[units.block == b] for b in np.unique(units.block)]
-    even = units.paired or all(
-        2 * int(second.sum()) == len(second) for second in blocks if 0 < second.sum() < len(second)
-    )
+    even = units.paired or all(2 * k == len(inside) for inside, k in _mixed_blocks(units))
     n_ways = arrangements(units)
     if n_ways > MOST_EXACT:
         return max((2.0 if even else 1.0) / n_ways, 1.0 / (1 + MOST_EXACT))
@@ -387,57 +383,39 @@ def permutation(units: Units, rng: np.random.Generator) -> float:
         observed * (1.0 - 1e-9) - 1e-12
     )  # the same difference in another order of adding up is the same
     if n_ways <= MOST_EXACT:
-        return float(np.mean(np.abs(_all_differences(units)) >= least))
-    drawn = np.abs(_some_differences(units, rng))
+        return float(np.mean(np.abs(_differences(units, None)) >= least))
+    drawn = np.abs(_differences(units, rng))
     return float((1 + (drawn >= least).sum()) / (1 + len(drawn)))
 
 
 def _weights(units: Units) -> Array:
     """Weights (n,) whose product with the values is the blocked difference, up to a factor."""
     out = np.zeros(len(units.values))
-    for block in np.unique(units.block):
-        inside = units.block == block
-        b = inside & units.second
-        n = int(inside.sum())
-        k = int(b.sum())
-        if 0 < k < n:
-            out[b] = (n - k) / n
-            out[inside & ~units.second] = -k / n
+    for inside, k in _mixed_blocks(units):
+        n = len(inside)
+        out[inside] = np.where(units.second[inside], (n - k) / n, -k / n)
     return out
 
 
-def _all_differences(units: Units) -> Array:
-    """The statistic for every arrangement, (`arrangements`,)."""
+def _differences(units: Units, rng: np.random.Generator | None) -> Array:
+    """The statistic for every arrangement; with a generator, for `MOST_EXACT` drawn at random."""
     y = units.values
     if units.paired:
+        if rng is not None:
+            return np.asarray(rng.choice([-1.0, 1.0], (MOST_EXACT, len(y))) @ y)
         signs = 1 - 2 * ((np.arange(2 ** len(y))[:, None] >> np.arange(len(y))) & 1)
         return np.asarray(signs @ y)
-    total = np.zeros(1)
-    for block in np.unique(units.block):
-        inside = np.flatnonzero(units.block == block)
-        k = int(units.second[inside].sum())
-        if k in (0, len(inside)):  # a block of one group can be arranged in one way
-            continue
-        ways = np.array(list(combinations(range(len(inside)), k)), np.int64)
-        # sum of weights x values: k of n values get (n - k) / n and the others -k / n, which is sum
-        # - k x mean
-        differences = y[inside][ways].sum(axis=1) - k * y[inside].mean()
-        total = (total[:, None] + differences).ravel()
-    return total
-
-
-def _some_differences(units: Units, rng: np.random.Generator) -> Array:
-    """The statistic for `MOST_EXACT` arrangements drawn at random, (`MOST_EXACT`,)."""
-    y = units.values
-    if units.paired:
-        return np.asarray(rng.choice([-1.0, 1.0], (MOST_EXACT, len(y))) @ y)
-    total = np.zeros(MOST_EXACT)
-    for block in np.unique(units.block):
-        inside = np.flatnonzero(units.block == block)
-        k = int(units.second[inside].sum())
-        if 0 < k < len(inside):
+    total = np.zeros(1 if rng is None else MOST_EXACT)
+    for inside, k in _mixed_blocks(units):
+        # sum of weights x values: k of n values get (n - k) / n and the others -k / n, which is
+        # sum - k x mean
+        expected = k * y[inside].mean()
+        if rng is None:
+            ways = np.array(list(combinations(range(len(inside)), k)), np.int64)
+            total = (total[:, None] + (y[inside][ways].sum(axis=1) - expected)).ravel()
+        else:
             order = rng.random((MOST_EXACT, len(inside))).argpartition(k - 1, axis=1)[:, :k]
-            total += y[inside][order].sum(axis=1) - k * y[inside].mean()
+            total += y[inside][order].sum(axis=1) - expected
     return total
 
 

@@ -148,7 +148,7 @@ def measure(
     words = Vocabulary(tuple(actions), tuple(around.zones), kind_of(moved))
     gaps = empty_table(GAPS) if gaps is None else gaps
     summary = summarise(frames, moved, named, words, around, rules)
-    behaviour = Behaviour(
+    return Behaviour(
         moved,
         named,
         summary,
@@ -159,7 +159,6 @@ def measure(
         words,
         actions,
     )
-    return behaviour
 
 
 def measure_rows(
@@ -289,9 +288,9 @@ def summarise(
         block |= {name: _median(kinematics[name]) for name in ("tail_beat_hz", "tail_beat_mm")}
     else:
         pause_mm_s = (rules or MouseRules()).pause_below_mm_s
-        block["distance_moving_m"] = _moving_m(
-            kinematics, np.fmax(pause_mm_s, block["speed_noise_mm_s"])
-        )
+        faster = kinematics["speed_mm_s"] > np.fmax(pause_mm_s, block["speed_noise_mm_s"])
+        step = kinematics["step_mm"].to_numpy(float)
+        block["distance_moving_m"] = float(np.nansum(step[faster.to_numpy()])) / 1000.0
     return to_pandas(words.table("summary"), block)
 
 
@@ -315,13 +314,6 @@ def _motion(kinematics: pd.DataFrame, hold: Array) -> dict[str, float]:
         "mean_abs_yaw_rate_rad_s": either / turn_s if turn_s > 0 else np.nan,
         "turn_bias": turned / either if either > 0 else np.nan,
     }
-
-
-def _moving_m(kinematics: pd.DataFrame, faster_than_mm_s: float) -> float:
-    """Way, m, of the frames that are faster than a speed."""
-    speed = kinematics["speed_mm_s"].to_numpy(float)
-    step = kinematics["step_mm"].to_numpy(float)
-    return float(np.nansum(step[speed > faster_than_mm_s])) / 1000.0
 
 
 def _budget(

@@ -14,6 +14,7 @@ be explained to every reader.
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -51,8 +52,11 @@ def add_intervals(made: NWBFile, session: Session, poses: Poses, estimate: Any) 
     catalogue = _catalogue(session)
     if len(catalogue):
         made.processing["behavior"].add(catalogue)
-    gaps = _gaps(session)
-    observed = _observed(poses) if len(gaps) else None
+    lacking = session.gaps
+    spans, reasons = lacking[["start_s", "stop_s"]].to_numpy(float), lacking["reason"].tolist()
+    gaps = _intervals("gaps", "frames that are missing or without a pose", spans, reasons)
+    when = "when actions could be named"
+    observed = _intervals("observed", when, observed_spans(poses), ()) if len(gaps) else None
     actions = _actions(session, estimate, catalogue, observed)
     for table in (actions, gaps, observed):
         if table is not None and len(table):
@@ -114,29 +118,16 @@ def _actions(session: Session, estimate: Any, catalogue: Any, observed: Any) -> 
     return table
 
 
-def _gaps(session: Session) -> Any:
-    """Frames that are missing or without a pose, and why."""
+def _intervals(name: str, description: str, spans: NDArray[Any], reasons: Sequence[str]) -> Any:
+    """A table of spans (m, 2) s; with why each is, where there are reasons."""
     from pynwb.epoch import TimeIntervals
 
-    table = TimeIntervals(name="gaps", description="frames that are missing or without a pose")
-    table.add_column("reason", "why")
-    missing = session.gaps
-    for start, stop, reason in zip(
-        missing["start_s"], missing["stop_s"], missing["reason"], strict=True
-    ):
-        table.add_row(
-            start_time=float(start), stop_time=float(stop), reason=str(reason), check_ragged=False
-        )
-    return table
-
-
-def _observed(poses: Poses) -> Any:
-    """When the animal had a pose, of which actions could be named."""
-    from pynwb.epoch import TimeIntervals
-
-    table = TimeIntervals(name="observed", description="when actions could be named")
-    for start, stop in observed_spans(poses):
-        table.add_row(start_time=float(start), stop_time=float(stop))
+    table = TimeIntervals(name=name, description=description)
+    if name == "gaps":
+        table.add_column("reason", "why")
+    for k, (start, stop) in enumerate(spans):
+        why = {"reason": str(reasons[k])} if name == "gaps" else {}
+        table.add_row(start_time=float(start), stop_time=float(stop), check_ragged=False, **why)
     return table
 
 

@@ -23,7 +23,15 @@ from liex_lab.geometry import so3
 from liex_lab.recordings.timestamps import frames_apart, rounded_step
 from liex_lab.recordings.timestamps import median_step as recorded_step
 from liex_lab.runtime.memory import blocks
-from liex_lab.tables.schema import FRAMES, ROOT_COVARIANCES, ROWS_PER_GROUP, Block, Words, to_pandas
+from liex_lab.tables.schema import (
+    BOUTS,
+    FRAMES,
+    ROOT_COVARIANCES,
+    ROWS_PER_GROUP,
+    Block,
+    Words,
+    to_pandas,
+)
 from liex_lab.tracking.track import Flip, Track
 
 if TYPE_CHECKING:
@@ -243,24 +251,15 @@ class Rows:
         found = []
         stops = stop_times(time)
         for gap in self.camera_gaps:
-            row = int(
-                np.searchsorted(
-                    self.track.times_ns, gap.stop_ns if gap.n_frames_missing else gap.start_ns
-                )
-            )
-            if row == len(time):
-                continue
-            frame = int(self.frame_index[row])
-            if gap.n_frames_missing:
-                span = (
-                    float(stops[row - 1]) if row else float(time[row]),
-                    float(time[row]),
-                    frame,
-                    frame,
-                )
-            else:
-                span = (float(time[row]), float(stops[row]), frame, frame + 1)
-            found.append((*span, gap.n_frames_missing, gap.reason, *_NOWHERE))
+            lost = bool(gap.n_frames_missing)
+            at_ns = gap.stop_ns if lost else gap.start_ns
+            row = int(np.searchsorted(self.track.times_ns, at_ns))
+            if row < len(time):
+                begin = stops[row - 1] if lost and row else time[row]
+                span = (float(begin), float(time[row] if lost else stops[row]))
+                frame = int(self.frame_index[row])
+                known = (frame, frame + (not lost), gap.n_frames_missing, gap.reason)
+                found.append((*span, *known, *_NOWHERE))
         return found
 
     def _last_place(self, seen_at: NDArray[np.int64], row: int) -> tuple[float, float]:
@@ -443,27 +442,21 @@ def bout_rows(ethogram: Ethogram, frames: pd.DataFrame, model_hash: str) -> pd.D
     Returns:
         One row for each bout.
     """
-    import pandas as pd
-
     times_ns = frames["time_ns"].to_numpy(np.int64)
-    index = frames["frame_index"].to_numpy(np.int64)
-    first = int(times_ns[0]) if len(times_ns) else 0
+    count = frame_count(frames["frame_index"].to_numpy(np.int64))
     start_ns = np.array([bout.start_ns for bout in ethogram], np.int64)
     stop_ns = np.array([bout.stop_ns for bout in ethogram], np.int64)
-    count = np.append(index, index[-1:] + 1)
-    n = len(ethogram)
-    return pd.DataFrame(
-        {
-            "session_id": pd.Series([frames["session_id"].iloc[0]] * n, dtype="str"),
-            "individual": pd.Series([frames["individual"].iloc[0]] * n, dtype="str"),
-            "action": pd.Series([bout.action for bout in ethogram], dtype="str"),
-            "start_s": (start_ns - first) * 1e-9,
-            "stop_s": (stop_ns - first) * 1e-9,
-            "duration_s": (stop_ns - start_ns) * 1e-9,
-            "start_frame": count[np.searchsorted(times_ns, start_ns)],
-            "stop_frame": count[np.searchsorted(times_ns, stop_ns)],
-            "score": np.array([bout.score for bout in ethogram], float),
-            "source": pd.Series([ethogram.source] * n, dtype="str"),
-            "model_hash": pd.Series([model_hash] * n, dtype="str"),
-        }
-    )
+    block = {
+        "session_id": str(frames["session_id"].iloc[0]),
+        "individual": str(frames["individual"].iloc[0]),
+        "action": [bout.action for bout in ethogram],
+        "start_s": (start_ns - times_ns[0]) * 1e-9,
+        "stop_s": (stop_ns - times_ns[0]) * 1e-9,
+        "duration_s": (stop_ns - start_ns) * 1e-9,
+        "start_frame": count[np.searchsorted(times_ns, start_ns)],
+        "stop_frame": count[np.searchsorted(times_ns, stop_ns)],
+        "score": [bout.score for bout in ethogram],
+        "source": ethogram.source,
+        "model_hash": model_hash,
+    }
+    return to_pandas(BOUTS, block)
