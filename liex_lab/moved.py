@@ -73,8 +73,6 @@ MOVED = {
     "liex_lab.recordings.nyu": "liex_lab.recordings.formats.images.nyu",
     "liex_lab.recordings.paths": "liex_lab.simulation.locomotion",
     "liex_lab.recordings.postures": "liex_lab.simulation.pose_prior",
-    "liex_lab.recordings.primesense": "liex_lab.recordings.formats.oni.reader",
-    "liex_lab.recordings.primesense_writer": "liex_lab.recordings.formats.oni.writer",
     "liex_lab.recordings.raytrix": "liex_lab.recordings.formats.images.raytrix",
     "liex_lab.recordings.rosbag": "liex_lab.recordings.formats.messages.rosbag",
     "liex_lab.recordings.sensors": "liex_lab.simulation.sensors",

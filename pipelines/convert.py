@@ -1,8 +1,7 @@
-"""Conversion of recordings, `liex convert`: any depth recording to MCAP, .oni or a folder of PNGs.
+"""Conversion of recordings, `liex convert`: any depth recording to MCAP or a folder of PNGs.
 
-MCAP keeps every depth as it is. 16-bit pictures keep whole steps of a size, mm: the largest of
-those that the format can state of which all depths of some frames are multiples, or the nearest
-steps of one that is stated.
+MCAP keeps every depth as it is. 16-bit images keep whole steps of a size, mm: the largest of some
+of which all depths of a few frames are multiples, or the nearest steps of a stated size.
 """
 
 from __future__ import annotations
@@ -20,23 +19,15 @@ from liex_lab.optics.camera import Lens
 from liex_lab.recordings import Recording, open_recording
 from liex_lab.recordings.camera_file import CAMERA_FILE
 from liex_lab.recordings.depth_units import whole_steps
-from liex_lab.recordings.writer import (
-    STAMPS,
-    OniRecordingWriter,
-    PictureFolderWriter,
-    RecordingWriter,
-)
+from liex_lab.recordings.writer import STAMPS, PictureFolderWriter, RecordingWriter
 from liex_lab.runtime.durable import replacing
 from liex_lab.runtime.progress import Progress, silent
 
-_STEPS_MM = {
-    ".oni": (1.0, 0.1),
-    "": (1.0, 0.5, 0.25, 0.2, 0.1, 0.05, 0.025, 0.02, 0.01),
-}  # what each format can state
+_STEPS_MM = (1.0, 0.5, 0.25, 0.2, 0.1, 0.05, 0.025, 0.02, 0.01)
 _N_PROBED = 8
 # a name that ends like another kind of file is no folder's
 _OTHER_KINDS = re.compile(
-    r"\.(bag|db3|dat|tar|gz|tgz|avi|mkv|mp4|png|tiff?|jpe?g|pgm|pclzf|ply|npy|npz|h5|nwb|rrd|zip|toml|csv|json)$",
+    r"\.(bag|db3|oni|dat|tar|gz|tgz|avi|mkv|mp4|png|tiff?|jpe?g|pgm|pclzf|ply|npy|npz|h5|nwb|rrd|zip|toml|csv|json)$",
     re.I,
 )
 _PICTURE = re.compile(r"frame_\d+\.png")
@@ -71,13 +62,13 @@ def convert(
     overwrite: bool = False,
     progress: Progress = silent,
 ) -> Converted:
-    """Write a recording as MCAP, .oni or a folder of PNG pictures.
+    """Write a recording as MCAP or a folder of PNG images.
 
     The target has its name only when it is whole.
 
     Args:
         recording: a path or address, or a recording that is open already.
-        to: NAME.mcap, NAME.oni, or else a folder for PNG pictures.
+        to: NAME.mcap, or else a folder for PNG images.
         camera: intrinsics that come before what the files state, as in `open_recording`.
         fps: frame rate of recordings without stamps, as in `open_recording`.
         topic: depth topic of a message log, as in `open_recording`.
@@ -118,14 +109,13 @@ def _convert(
 def _writer(
     recording: Recording, target: Path, part: Path, step_mm: float | None, ros: bool
 ) -> RecordingWriter:
-    kind = _kind(target)
     camera = recording.camera
-    if ros and kind != ".mcap":
+    if ros and not _is_mcap(target):
         raise RecordingError(
             f"ROS's messages are written into an .mcap file, not into {target.name}; leave out "
             "--ros"
         )
-    if kind == ".mcap":
+    if _is_mcap(target):
         from liex_lab.recordings.formats.messages.mcap_writer import McapDepthWriter
 
         if step_mm is not None:
@@ -140,40 +130,19 @@ def _writer(
         return McapDepthWriter(
             part, camera, messages="ros" if ros else "foxglove", metadata=metadata
         )
-    step = _step(recording, kind, target) if step_mm is None else step_mm
-    if kind == ".oni":
-        if step not in _STEPS_MM[kind]:
-            raise RecordingError(
-                f"{target.name} holds steps of 1 mm or 0.1 mm, got {step:g}; state one of them"
-            )
-        return OniRecordingWriter(
-            part,
-            camera,
-            step_mm=step,
-            exact=step_mm is None,
-            start_ns=int(recording.times_ns[0]),
-            rate_hz=recording.rate_hz if len(recording) > 1 else 30.0,
-        )
+    step = _step(recording, target) if step_mm is None else step_mm
     return PictureFolderWriter(
         part, camera, step_mm=step, exact=step_mm is None, metadata=recording.metadata
     )
 
 
-def _kind(target: Path) -> str:
-    """.mcap, .oni, or nothing for a folder."""
-    suffix = target.suffix.lower()
-    return suffix if suffix in (".mcap", ".oni") else ""
+def _is_mcap(target: Path) -> bool:
+    return target.suffix.lower() == ".mcap"
 
 
-def largest_step(recording: Recording, steps_mm: Sequence[float] = _STEPS_MM[""]) -> float | None:
-    """The largest step of which all depths of some frames are whole multiples.
-
-    Args:
-        recording: an open recording.
-        steps_mm: steps to choose from, mm, the largest first.
-
-    Returns:
-        The step, mm; None where there is none.
+def largest_step(recording: Recording, steps_mm: Sequence[float] = _STEPS_MM) -> float | None:
+    """The largest of some steps (mm, descending) of which the depths of a few frames are multiples;
+    None if there is none.
     """
     rows = np.unique(np.linspace(0, len(recording) - 1, _N_PROBED).round().astype(int))
     depths = [recording.frame(int(row)).depth for row in rows]
@@ -184,13 +153,13 @@ def largest_step(recording: Recording, steps_mm: Sequence[float] = _STEPS_MM[""]
     return 1.0 if max(float(depth.max()) for depth in depths) > 65535.0 else None
 
 
-def _step(recording: Recording, kind: str, target: Path) -> float:
+def _step(recording: Recording, target: Path) -> float:
     """The step of a target's 16-bit pictures."""
-    step = largest_step(recording, _STEPS_MM[kind])
+    step = largest_step(recording)
     if step is not None:
         return step
     raise RecordingError(
-        f"the depths of {recording.name} are no whole steps of {_STEPS_MM[kind][-1]:g} mm, and "
+        f"the depths of {recording.name} are no whole steps of {_STEPS_MM[-1]:g} mm, and "
         f"{target.name} would hold 16-bit pictures, which do not keep them; write an .mcap file, "
         "which does, or let them be rounded with --step-mm 0.1 (in Python step_mm=0.1)"
     )
@@ -200,8 +169,8 @@ def _check_target(target: Path, overwrite: bool) -> None:
     """Refuse to write over what is there, and over anything but a recording at all."""
     if _OTHER_KINDS.search(target.name):
         raise RecordingError(
-            f"{target.name} is no name of what can be written; give NAME.mcap, NAME.oni, or a "
-            "folder's name for PNG pictures"
+            f"{target.name} is no name of what can be written; give NAME.mcap, or a folder's "
+            "name for PNG images"
         )
     if not target.parent.is_dir():
         raise RecordingError(
@@ -209,7 +178,7 @@ def _check_target(target: Path, overwrite: bool) -> None:
         )
     if not target.exists():
         return
-    is_file = bool(_kind(target))
+    is_file = _is_mcap(target)
     if target.is_dir() if is_file else not target.is_dir():
         raise RecordingError(f"{target} is a {'folder' if is_file else 'file'}; give another name")
     others = (

@@ -22,9 +22,7 @@ def convert(
     recording: RecordingPath,
     to: Annotated[
         Path,
-        typer.Option(
-            "--to", metavar="TARGET", help="NAME.mcap, NAME.oni, or a folder for PNG pictures."
-        ),
+        typer.Option("--to", metavar="TARGET", help="NAME.mcap, or a folder for PNG images."),
     ],
     fps: Annotated[
         float | None, typer.Option("--fps", help="Frames per second, where the file has no times.")
@@ -43,9 +41,7 @@ def convert(
         bool, typer.Option("--overwrite", help="Replace what is there under this name.")
     ] = False,
 ) -> None:
-    """Write a recording as MCAP (which keeps every depth), as .oni, or as a folder of 16-bit PNG
-    pictures.
-    """
+    """Write a recording as MCAP (which keeps every depth) or as a folder of 16-bit PNG images."""
     from liex_lab.pipelines.convert import convert as job
 
     with progress_bar() as progress:

@@ -32,7 +32,7 @@ _ALONE = {  # how the name of a file ends that holds a whole recording: its modu
     ".avi": "moseq.reader.open_moseq",
     ".mkv": "moseq.reader.open_moseq",
     ".mcap": "messages.mcap.open_mcap",
-    ".oni": "oni.reader.open_oni",
+    ".oni": "oni.open_oni",
     ".bag": "messages.rosbag.open_bag",
     ".db3": "messages.rosbag.open_bag",
 }
@@ -100,7 +100,7 @@ class _How:
     strict: bool = False
 
     def open(self, where: str, path: Path) -> Recording:
-        """By the function `where` of `formats`, as in "oni.reader.open_oni"; it brings its
+        """By the function `where` of `formats`, as in "oni.open_oni"; it brings its
         libraries when asked for.
         """
         where = _STRICTLY.get(where, where) if self.strict else where

@@ -1,4 +1,4 @@
-"""Writers of recordings, frame by frame: their interface, folders of 16-bit PNG pictures, and .oni.
+"""Writers of recordings, frame by frame: their interface, and folders of 16-bit PNG images.
 
 A writer is used in a `with` block: what belongs at the end of the file is written where the block
 ends without an error. Its `notes` then say what a reader of the file should know. Depth is stored
@@ -145,74 +145,6 @@ class PictureFolderWriter(RecordingWriter):
 
     def release(self) -> None:
         """Do nothing, for no file is held open."""
-
-
-class OniRecordingWriter(RecordingWriter):
-    """Writer of PrimeSense's .oni, which holds microseconds and steps of 1.0 or 0.1 mm."""
-
-    def __init__(
-        self,
-        path: Path,
-        camera: Camera,
-        *,
-        step_mm: float = 1.0,
-        exact: bool = True,
-        start_ns: int = 0,
-        rate_hz: float = 30.0,
-    ) -> None:
-        """Open the file and write its beginning.
-
-        Args:
-            path: the .oni file.
-            camera: the camera of the frames; its lens distortion is left out, which `notes` then
-                say.
-            step_mm: mm of a stored step, 1.0 or 0.1.
-            exact: refuse depths between steps instead of rounding them.
-            start_ns: stamp of the first frame, ns, for the format has no time before zero.
-            rate_hz: the frame rate that the file states, Hz.
-        """
-        from liex_lab.recordings.formats.oni.writer import OniWriter
-
-        super().__init__(path, camera)
-        self._step_mm = step_mm
-        self._exact = exact
-        self._earlier_ns = min(0, start_ns)
-        self._rounded = False
-        self._oni = OniWriter(path, camera, unit_mm=step_mm, rate_hz=rate_hz, exact=exact)
-
-    def add(self, frame: DepthFrame) -> None:
-        """Write one picture with its time in microseconds.
-
-        Args:
-            frame: the frame, depth (H, W) float32 mm.
-
-        Raises:
-            RecordingError: its depth does not fit into 16 bits, or (exact) lies between steps.
-        """
-        time_us, rest = divmod(frame.time_ns - self._earlier_ns + 500, 1000)
-        self._rounded |= rest != 500
-        self._oni.add(time_us, frame.depth)
-
-    def finish(self) -> None:
-        """Write the seek table and the counts."""
-        self._oni.close()
-        if self._rounded:
-            self.notes.append("times were rounded to microseconds, which is what .oni holds")
-        if self._earlier_ns:
-            self.notes.append(
-                f"times count from {self._earlier_ns} ns, for .oni has none before zero"
-            )
-        if self.camera.distortion is not None:
-            self.notes.append(
-                f"the lens distortion ({self.camera.distortion}) was left out, for .oni has no "
-                "place for it"
-            )
-        if not self._exact:
-            self.notes.append(f"depth was rounded to whole steps of {self._step_mm:g} mm")
-
-    def release(self) -> None:
-        """Close the file; closing twice does no harm."""
-        self._oni.abandon()  # closing twice does no harm
 
 
 def steps_of(frame: DepthFrame, step_mm: float, exact: bool) -> NDArray[np.uint16]:

@@ -1,7 +1,7 @@
 """Benchmark of recording formats: decoding speed, opening time, peak memory.
 
 `liex evaluate speed --recordings` writes a rendered mouse (640 x 480, PrimeSense noise) as MCAP
-with zstd, MCAP with PNG, a folder of PNG pictures, MoSeq's .dat and 16-bit .oni, and reads each in
+with zstd, MCAP with PNG, a folder of PNG pictures, and MoSeq's .dat, and reads each in
 a process of its own on one thread. Numbers: frames/s (every frame to float32 mm in order, best of
 `n_repeats`), ms a frame to open, peak memory of the process, MB, and the peak extrapolated to an
 hour from 64 x 48 pictures, since what grows with length does not depend on their size.
@@ -27,7 +27,7 @@ from liex_lab.errors import LiexError
 from liex_lab.optics.camera import Camera
 from liex_lab.recordings.formats.messages.mcap_writer import McapDepthWriter
 from liex_lab.recordings.frame import Depth, DepthFrame
-from liex_lab.recordings.writer import OniRecordingWriter, PictureFolderWriter, RecordingWriter
+from liex_lab.recordings.writer import PictureFolderWriter, RecordingWriter
 from liex_lab.runtime.children import own_python
 from liex_lab.runtime.progress import Progress, silent
 
@@ -101,7 +101,6 @@ _FORMATS: dict[str, tuple[str, Callable[[Path, Camera], RecordingWriter], int]] 
     ),
     "png_folder": ("r", PictureFolderWriter, 6),
     "moseq_dat": ("r", MoseqWriter, 1),
-    "oni_16zt": ("r.oni", OniRecordingWriter, 1),
 }
 
 

@@ -1,6 +1,6 @@
 """Benchmark of whole runs by kind of recording: frames a second, decoding beside it, size, memory.
 
-A rendered mouse is written as raw MCAP and as .oni of 640 x 480 pixels, and as a MoSeq archive
+A rendered mouse is written as raw MCAP of 640 x 480 pixels and as a MoSeq archive
 (.tar.gz) of 512 x 424. Each is measured as by `liex run` in a process of its own, all files
 written, and read in another on one thread before and after it: the mean of both rates is what one
 core decodes in the same run. Numbers: frames/s, their ratio, bytes of session and recording, MB.
@@ -144,10 +144,6 @@ def _as_mcap(recording: Recording, place: Path) -> Path:
     return convert(recording, place / "walk.mcap").path
 
 
-def _as_oni(recording: Recording, place: Path) -> Path:
-    return convert(recording, place / "walk.oni", step_mm=1.0).path
-
-
 def _as_moseq(recording: Recording, place: Path) -> Path:
     """As MoSeq's extract packs a session: its folder's files in a .tar.gz."""
     folder = place / "session_walk"
@@ -165,6 +161,5 @@ def _as_moseq(recording: Recording, place: Path) -> Path:
 
 _KINDS: dict[str, tuple[str, Callable[[Recording, Path], Path]]] = {
     "mcap_raw_640x480": ("primesense", _as_mcap),
-    "oni_640x480": ("primesense", _as_oni),
     "moseq_gz_512x424": ("kinect-v2", _as_moseq),
 }

@@ -436,7 +436,7 @@ def test_convert_says_what_was_written_and_what_is_odd(
         "convert",
         "a.bag",
         "--to",
-        "b.oni",
+        "b.mcap",
         "--topic",
         "/d",
         "--step-mm",
@@ -446,10 +446,10 @@ def test_convert_says_what_was_written_and_what_is_odd(
         "--overwrite",
     ]
     result = CliRunner().invoke(cli.app, words)
-    assert result.output == "recording: b.oni (7 frames)\nnote: it was cut\nnote: a [note]\n"
+    assert result.output == "recording: b.mcap (7 frames)\nnote: it was cut\nnote: a [note]\n"
     assert seen == {
         "recording": Path("a.bag"),
-        "to": Path("b.oni"),
+        "to": Path("b.mcap"),
         "topic": "/d",
         "step_mm": 0.1,
         "fps": 30.0,

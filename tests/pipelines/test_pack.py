@@ -21,6 +21,7 @@ from liex_lab.recordings.formats.messages.mcap_writer import McapDepthWriter
 from liex_lab.recordings.formats.messages.pack_facts import PackFacts, hash_note
 from liex_lab.recordings.frame import DepthFrame
 from liex_lab.sessions import Session
+from tests.recordings.writers import write_oni_file
 from tests.sessions.walking_mouse import WalkingMouse, steady
 
 MOUSE = WalkingMouse(steady(2.0))
@@ -95,8 +96,11 @@ def test_stamps_that_were_moved_are_told_as_of_the_recording(tmp_path: Path) -> 
 
 
 def test_tenths_of_a_millimetre_are_kept(tmp_path: Path) -> None:
-    fine = recorded(tmp_path / "fine.mcap", step_mm=0.1)
-    convert(fine, tmp_path / "fine.oni")
+    with open_recording(recorded(tmp_path / "fine.mcap", step_mm=0.1)) as fine:
+        steps = np.rint(depths(fine) / 0.1).astype(np.uint16)
+        write_oni_file(
+            tmp_path / "fine.oni", steps, fine.camera, fine.times_ns.tolist(), tenths=True
+        )
     done = pack(tmp_path / "fine.oni", plan=PLAN, whole=True, verify=True)
     with open_recording(tmp_path / "fine.oni") as one, open_recording(done.path) as other:
         np.testing.assert_array_equal(depths(one), depths(other))

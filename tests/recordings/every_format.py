@@ -24,9 +24,8 @@ from numpy.typing import NDArray
 from liex_lab.recordings.formats.messages.mcap import McapFile
 from liex_lab.recordings.formats.messages.message_file import Envelope, MessageFile
 from liex_lab.recordings.formats.messages.rosbag import BagFile
-from liex_lab.recordings.formats.oni.writer import Codec
 from liex_lab.runtime.progress import silent
-from tests.recordings.oni_files import depth_builder, plain_payload
+from tests.recordings.oni_files import Codec, depth_builder, plain_payload
 from tests.recordings.picture_writers import (
     write_folder,
     write_nyu,

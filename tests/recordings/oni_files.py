@@ -1,17 +1,17 @@
-"""Putting .oni files together by hand, record by record, as old and odd programs wrote them.
-
-Independent of the product's writer, so that neither can hide the other's mistakes.
-"""
+"""Putting .oni files together by hand, record by record, as old and odd programs wrote them."""
 
 from __future__ import annotations
 
+import itertools
 import struct
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+Codec = Literal["16zT", "16zP", "NONE"]
 DEVICE, DEPTH, COLOUR, INFRARED = 1, 2, 3, 4
 STEP_US = 33_333
 OPEN_FILE = 0xFFFFFFFF  # the number of frames in a file that was never closed
@@ -40,7 +40,7 @@ class OniBuilder:
     def __init__(self, old: bool = False, version: tuple[int, int, int, int] | None = None) -> None:
         version = version or ((1, 0, 0, 5) if old else (1, 0, 1, 0))
         self.old = old
-        self.content = struct.pack("<4sBBHIQI", b"NI10", *version, 2**64 - 1, 9)
+        self.content = bytearray(struct.pack("<4sBBHIQI", b"NI10", *version, 2**64 - 1, 9))
         self.frames: dict[int, list[tuple[int, int]]] = {}  # node: time and position of each
 
     def record(
@@ -94,14 +94,18 @@ class OniBuilder:
         node: int,
         width: int,
         height: int,
-        fov: tuple[float, float] | None = (1.0, 0.8),
+        fov: tuple[float, ...] | None = (1.0, 0.8),
         crop: bytes = bytes(12),
+        pixel_format: int = 100,
+        lens: bytes = b"",
     ) -> None:
         """What OpenNI2's player wants of a depth node."""
         shape = mode(width, height)
         self.properties(
             node, xnMapOutputMode=shape, xnSupportedMapOutputModes=shape, xnCropping=crop
         )
+        if lens:
+            self.properties(node, liexIntrinsics=lens)
         if fov:
             self.properties(node, xnFOV=struct.pack("<dd", *fov))
         self.integers(
@@ -111,7 +115,7 @@ class OniBuilder:
             xnDeviceMaxDepth=10_000,
             xnSupportedMapOutputModesCount=1,
             xnPixelFormat=4,
-            oniPixelFormat=100,
+            oniPixelFormat=pixel_format,
             xnMirror=0,
         )
 
@@ -155,16 +159,16 @@ def depth_builder(
     closed: bool = True,
     table: bool = False,
     times_us: Sequence[int] | None = None,
-    crop: bytes = bytes(12),
+    **properties: Any,
 ) -> OniBuilder:
     """A file with one depth node, all but its last record. record: form of the node's own one;
-    table: of seeking.
+    table: of seeking; properties: see `depth_properties`.
     """
     where = 0
     for _ in range(2 if table else 1):  # where the table is, is known only once it is there
         made = OniBuilder(old)
         made.node(1, "Depth", DEPTH, codec, len(payloads) if closed else OPEN_FILE, record, where)
-        made.depth_properties(1, width, height, crop=crop)
+        made.depth_properties(1, width, height, **properties)
         made.begin(1)
         for k, payload in enumerate(payloads):
             made.frame(1, times_us[k] if times_us else k * STEP_US, payload)
@@ -174,19 +178,24 @@ def depth_builder(
 
 
 def plain_16z(numbers: NDArray[np.uint16]) -> bytes:
-    """A stream without runs, in the plainest way the code allows: half-filled bytes and whole
-    numbers.
-    """
-    out = struct.pack("<H", numbers[0])
-    for before, number in zip(numbers[:-1].tolist(), numbers[1:].tolist(), strict=True):
-        step = before - number
+    """A stream of runs, half-filled bytes and whole numbers: far from the best packing."""
+    out = bytearray(struct.pack("<H", numbers[0]))
+    run = 0
+    for before, number in itertools.pairwise([*numbers.tolist(), None]):
+        step = None if number is None else before - number
+        run += step == 0
+        if step != 0 or run == 30:
+            out += bytes([0xE0 + run // 2] * (run > 1) + [6 << 4 | 13] * (run % 2))
+            run = 0
+        if not step:
+            continue
         if abs(step) <= 6:
-            out += bytes([(step + 6) << 4 | 13])
+            out.append((step + 6) << 4 | 13)
         elif abs(step) <= 62:
             out += bytes([0xFF, step + 192])
         else:
             out += struct.pack(">BH", 0xFF, number)
-    return out
+    return bytes(out)
 
 
 def plain_payload(frame: NDArray[np.uint16], codec: str) -> bytes:

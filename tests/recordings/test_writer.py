@@ -22,7 +22,7 @@ from liex_lab.recordings import open_recording
 from liex_lab.recordings.depth_units import metres, nearest_steps, whole_steps
 from liex_lab.recordings.formats.messages.mcap_writer import McapDepthWriter
 from liex_lab.recordings.frame import DepthFrame, depth_mm
-from liex_lab.recordings.writer import OniRecordingWriter, PictureFolderWriter, RecordingWriter
+from liex_lab.recordings.writer import PictureFolderWriter, RecordingWriter
 from tests.recordings.writers import SMALL, START_NS, depth_frames, even_times
 
 STORED = depth_frames(40).astype(np.float32)
@@ -43,28 +43,19 @@ WRITERS: dict[str, Any] = {
         folder / "r.mcap", SMALL, messages="ros", packing="png"
     ),
     "pictures": lambda folder: PictureFolderWriter(folder / "r", SMALL),
-    "oni": lambda folder: OniRecordingWriter(folder / "r.oni", SMALL),
 }
 
 
 @pytest.mark.parametrize("kind", WRITERS)
 @pytest.mark.parametrize("start_ns", [START_NS, 0, -5_000_000_000, -5 * 33_333_333])
 def test_what_is_written_is_read_again(tmp_path: Path, kind: str, start_ns: int) -> None:
-    if kind == "oni":
-        start_ns = abs(start_ns)
     writer = WRITERS[kind](tmp_path)
-    notes = fill(writer, start_ns=start_ns)
+    assert fill(writer, start_ns=start_ns) == []
     with open_recording(writer.path, strict=True) as recording:
         assert recording.problems == []
-        exact = [(t + 500) // 1000 * 1000 for t in even_times(len(STORED), start_ns)]
-        assert recording.times_ns.tolist() == (
-            exact if kind == "oni" else even_times(len(STORED), start_ns)
-        )
+        assert recording.times_ns.tolist() == even_times(len(STORED), start_ns)
         np.testing.assert_array_equal([frame.depth for frame in recording], STORED)
         assert recording.camera.matrix.tolist() == SMALL.matrix.tolist()
-    assert notes == (
-        ["times were rounded to microseconds, which is what .oni holds"] if kind == "oni" else []
-    )
 
 
 BENT = [
@@ -81,19 +72,10 @@ def test_a_bent_lens_stays_bent(
 ) -> None:
     monkeypatch.setattr("tests.recordings.test_writer.SMALL", replace(SMALL, distortion=distortion))
     writer = WRITERS[kind](tmp_path)
-    notes = fill(writer, STORED[:2])
+    assert fill(writer, STORED[:2]) == []
     with open_recording(writer.path) as recording:
-        assert recording.camera.distortion == (None if kind == "oni" else distortion)
+        assert recording.camera.distortion == distortion
         np.testing.assert_array_equal(recording.frame(0).depth, STORED[0])
-    assert any("distortion" in note for note in notes) == (kind == "oni")
-
-
-def test_oni_counts_from_zero_where_a_recording_begins_before(tmp_path: Path) -> None:
-    writer = OniRecordingWriter(tmp_path / "r.oni", SMALL, start_ns=-5_000_000)
-    notes = fill(writer, STORED[:3], start_ns=-5_000_000)
-    assert "times count from -5000000 ns, for .oni has none before zero" in notes
-    with open_recording(writer.path) as recording:
-        assert recording.times_ns.tolist() == [0, 33_333_000, 66_667_000]
 
 
 @pytest.mark.parametrize("packing", ["raw", "png"])

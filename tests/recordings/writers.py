@@ -6,6 +6,8 @@ from __future__ import annotations
 
 import io
 import json
+import math
+import struct
 import tarfile
 from collections.abc import Sequence
 from pathlib import Path
@@ -22,7 +24,7 @@ from numpy.typing import NDArray
 
 from liex_lab.optics.camera import Camera
 from liex_lab.recordings import Recording
-from liex_lab.recordings.formats.oni.writer import Codec, write_oni
+from tests.recordings.oni_files import Codec, depth_builder, plain_payload
 
 Frames = NDArray[np.uint16]
 
@@ -238,13 +240,27 @@ def in_memory(
 
 def write_oni_file(
     path: Path,
-    frames: Frames,
+    frames: NDArray[Any],
     camera: Camera = SMALL,
     times_ns: Sequence[int] | None = None,
     codec: Codec = "16zT",
+    tenths: bool = False,
 ) -> Path:
-    """An .oni file by the product's own writer, which keeps times to the microsecond."""
-    return write_oni(in_memory(frames, camera, times_ns), path, codec=codec, overwrite=True)
+    """An .oni file of stored depths (mm, or tenths of them) with its intrinsics in a property."""
+    times = even_times(len(frames)) if times_ns is None else times_ns
+    sides = ((camera.width, camera.fx), (camera.height, camera.fy))
+    made = depth_builder(
+        [plain_payload(frame, codec) for frame in frames],
+        codec,
+        camera.width,
+        camera.height,
+        table=True,
+        times_us=[(time_ns + 500) // 1000 for time_ns in times],
+        fov=tuple(2 * math.atan(n / 2 / f) for n, f in sides),
+        lens=struct.pack("<dddd", camera.fx, camera.fy, camera.cx, camera.cy),
+        pixel_format=101 if tenths else 100,
+    )
+    return made.write(path)
 
 
 def cut(path: Path, share: float, to: Path | None = None) -> Path:

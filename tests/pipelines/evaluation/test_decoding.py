@@ -19,7 +19,6 @@ def test_what_is_promised_is_measured() -> None:
         "mcap_zstd_png",
         "png_folder",
         "moseq_dat",
-        "oni_16zt",
     }
     camera, pictures = job._rendered(silent)
     assert (camera.width, camera.height) == pictures.shape[:0:-1] == (640, 480)

@@ -11,7 +11,7 @@ from liex_lab.pipelines.evaluation.kinds import DEFINITIONS, evaluate_kinds
 @pytest.mark.slow
 def test_every_kind_of_recording_is_run_and_read_beside_it(tmp_path: Path) -> None:
     found = evaluate_kinds(40, tmp_path)
-    assert list(found) == ["mcap_raw_640x480", "oni_640x480", "moseq_gz_512x424"]
+    assert list(found) == ["mcap_raw_640x480", "moseq_gz_512x424"]
     for numbers in found.values():
         assert set(DEFINITIONS) <= set(numbers)
         ratio = numbers["frames_per_s"] / numbers["decoding_frames_per_s_1core"]

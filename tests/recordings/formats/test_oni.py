@@ -13,9 +13,7 @@ from hypothesis import strategies as st
 
 from liex_lab.optics.camera import Camera, Lens
 from liex_lab.recordings import Recording, open_recording
-from liex_lab.recordings.formats.oni import index as _oni_index
-from liex_lab.recordings.formats.oni._codec_kernels import pack_16z, unpack_16z
-from liex_lab.recordings.formats.oni.writer import Codec
+from liex_lab.recordings.formats._oni_kernels import unpack_16z
 from tests.oracles.oni import unpack_frame
 from tests.recordings.asking import refusal
 from tests.recordings.oni_files import (
@@ -24,6 +22,7 @@ from tests.recordings.oni_files import (
     DEVICE,
     INFRARED,
     STEP_US,
+    Codec,
     OniBuilder,
     cropping,
     depth_builder,
@@ -71,8 +70,7 @@ def test_packing_is_undone_and_read_alike_by_the_slow_twin(
     rng = np.random.default_rng(seed)
     changes = rng.integers(-spread, spread + 1, n) * (rng.random(n) < rng.random())
     pixels = np.clip(np.cumsum(changes) + rng.integers(0, 0x8000), 0, 0x7FFF).astype(np.uint16)
-    packed = pack_16z(pixels, codec == "16zT")
-    assert packed is not None
+    packed = plain_payload(pixels, codec)
     assert unpack_frame(packed, codec) == pixels.tolist()
     unpacked = unpack_16z(np.frombuffer(packed, np.uint8), ITSELF, n, codec == "16zT")
     np.testing.assert_array_equal(unpacked, pixels)
@@ -95,16 +93,6 @@ def test_any_bytes_are_read_as_the_slow_twin_reads_them_or_not_at_all(
         assert unpacked is None or unpacked.tolist() == expected
 
 
-def test_depths_that_the_code_cannot_hold_are_not_packed() -> None:
-    assert pack_16z(np.array([0, 0x8000], np.uint16), embedded_table=False) is None
-    assert pack_16z(np.array([0, 0x8000], np.uint16), embedded_table=True) is not None
-    assert (
-        pack_16z(np.array([*range(0, 0x10000, 2), 0xFFFF, 0], np.uint16), embedded_table=True)
-        is not None
-    )
-    assert pack_16z(np.arange(0x10000).astype(np.uint16), embedded_table=True) is None
-
-
 # the file
 
 
@@ -124,66 +112,8 @@ def test_files_of_every_version_are_read(
         assert_frames(recording[2:7:2], STORED[2:7:2])
 
 
-@pytest.mark.parametrize("old", [False, True])
-def test_a_large_file_is_read_by_its_seek_table(
-    path: Path, monkeypatch: pytest.MonkeyPatch, old: bool
-) -> None:
-    monkeypatch.setattr(_oni_index, "SCAN_UP_TO_BYTES", 0)
-    monkeypatch.setattr(
-        _oni_index.DepthNode, "add", (add := Counted(_oni_index.DepthNode.add)).method()
-    )
-    depth_builder(payloads("16zT"), "16zT", old=old, table=True).write(path)
-    with open_recording(path, strict=True) as recording:
-        assert recording.problems == []
-        assert recording.times_ns.tolist() == [k * STEP_US * 1000 for k in range(9)]
-        assert_frames(recording, STORED)
-    assert add.sizes == {-1}  # of frames whose records were not looked at
-
-
-class Counted:
-    """`DepthNode.add`, and the sizes it was told."""
-
-    def __init__(self, add: object) -> None:
-        self._add, self.sizes = add, set[int]()
-
-    def method(self) -> object:
-        def counted(node: object, time_us: int, place: int, size: int) -> None:
-            self.sizes.add(size)
-            self._add(node, time_us, place, size)  # type: ignore[operator]
-
-        return counted
-
-
 def lie(made: OniBuilder, at: int, content: bytes) -> None:
     made.content = made.content[:at] + content + made.content[at + len(content) :]
-
-
-@pytest.mark.parametrize(
-    "wrong", ["time", "position", "backward", "size", "configuration", "kind", "unclosed"]
-)
-def test_a_seek_table_that_lies_is_not_believed(
-    path: Path, monkeypatch: pytest.MonkeyPatch, wrong: str
-) -> None:
-    monkeypatch.setattr(_oni_index, "SCAN_UP_TO_BYTES", 0)
-    made = depth_builder(payloads("16zT"), "16zT", table=True)
-    table, entry = len(made.content) - 10 * 20, struct.calcsize("<QIQ")
-    if wrong == "time":
-        lie(made, table + 9 * entry, struct.pack("<Q", 17))
-    elif wrong == "position":
-        lie(made, table + 5 * entry + 12, struct.pack("<Q", made.frames[1][4][1] + 1))
-    elif wrong == "backward":
-        lie(made, table + 3 * entry + 12, struct.pack("<Q", made.frames[1][7][1]))
-    elif wrong == "size":
-        lie(made, table - 12, struct.pack("<I", 9 * entry))
-        made.content = made.content[:-entry]
-    elif wrong == "configuration":
-        lie(made, table + 3 * entry + 8, struct.pack("<I", 77))
-    elif wrong == "kind":
-        lie(made, table - 24, struct.pack("<I", 0x05))
-    made.write(path, closed=wrong != "unclosed")
-    with open_recording(path) as recording:
-        assert recording.times_ns.tolist() == [k * STEP_US * 1000 for k in range(9)]
-        assert_frames(recording, STORED)
 
 
 def test_the_depth_node_is_chosen_by_its_kind_and_not_by_its_name(path: Path) -> None:

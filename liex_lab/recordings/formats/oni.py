@@ -16,19 +16,18 @@ import numpy as np
 from liex_lab.errors import RecordingError
 from liex_lab.optics.camera import Camera, Lens
 from liex_lab.recordings.camera_file import CAMERA_FILE, CameraFile, rate
-from liex_lab.recordings.formats.oni._codec_kernels import WORST_BYTES_A_PIXEL, unpack_16z
-from liex_lab.recordings.formats.oni.index import (
+from liex_lab.recordings.formats._oni_kernels import WORST_BYTES_A_PIXEL, unpack_16z
+from liex_lab.recordings.formats.oni_file import (
     FIELD_OF_VIEW,
     INTRINSICS,
     OLD_LENS,
     PLANE_DISTANCE,
     PLANE_PIXEL,
     DepthNode,
-    Look,
-    OniIndex,
+    FrameFormat,
+    OniFile,
     index_file,
 )
-from liex_lab.recordings.formats.oni.records import OniFile
 from liex_lab.recordings.frame import Depth, depth_mm
 from liex_lab.recordings.recording import Recording
 from liex_lab.recordings.timestamps import (
@@ -62,23 +61,28 @@ class OniFrames:
     """Frames of one depth node, fetched from the file one at a time."""
 
     def __init__(
-        self, file: OniFile, node: DepthNode, look: Look, how: CameraFile, problems: list[str]
+        self,
+        file: OniFile,
+        node: DepthNode,
+        form: FrameFormat,
+        how: CameraFile,
+        problems: list[str],
     ) -> None:
         """Tabulate the depth of every stored value.
 
         Args:
             file: the open file.
             node: the depth node with the positions of its frames.
-            look: the picture format that frames must agree with to be of this recording.
+            form: the picture format that frames must agree with to be of this recording.
             how: a camera.toml beside the file, for its unit_mm (a further factor) and unread.
             problems: the recording's sentences, appended to when a damaged frame is met.
         """
         self._file = file
         self._node = node
-        self._look = look
+        self._form = form
         self._problems = problems
-        self._looks = list(node.looks)
-        self._unit_mm = _UNIT_MM[look.pixel_format] * how.unit_mm
+        self._formats = list(node.formats)
+        self._unit_mm = _UNIT_MM[form.pixel_format] * how.unit_mm
         self._unread = how.unread
         self._meaning = depth_mm(np.arange(1 << 16, dtype=np.uint16), self._unit_mm, self._unread)
         self._bad: set[int] = set()
@@ -99,10 +103,10 @@ class OniFrames:
         if number not in self._bad:
             self._bad.add(number)
             self._problems.append(
-                f"frame {number} is damaged or not of {self._look.width} x {self._look.height} "
+                f"frame {number} is damaged or not of {self._form.width} x {self._form.height} "
                 "pixels, and was taken as wholly unread"
             )
-        return np.zeros((self._look.height, self._look.width), np.float32)
+        return np.zeros((self._form.height, self._form.width), np.float32)
 
     def decode(self, number: int) -> Depth | None:
         """Depth of one frame, without a replacement for damaged ones.
@@ -113,33 +117,29 @@ class OniFrames:
         Returns:
             (H, W) float32 mm, 0 where unread; None where it is damaged or of another size.
         """
-        look = self._looks[self._node.look_of[number]]
-        if look is None or look.picture != self._look.picture:
+        form = self._formats[self._node.format_of[number]]
+        if form is None or form.constant != self._form.constant:
             return None
-        x, y, width, height = look.part
-        if not (width and height and x + width <= look.width and y + height <= look.height):
+        x, y, width, height = form.part
+        if not (width and height and x + width <= form.width and y + height <= form.height):
             return None
         part = self._unpack(self._payload(number, width * height), width * height)
         if part is None:
             return None
         depth = part.reshape(height, width)
-        if (width, height) != (look.width, look.height):
-            depth = np.zeros((look.height, look.width), np.float32)
+        if (width, height) != (form.width, form.height):
+            depth = np.zeros((form.height, form.width), np.float32)
             depth[y : y + height, x : x + width] = part.reshape(height, width)
         # a mirror image has the animal's left and right exchanged
-        return np.ascontiguousarray(depth[:, ::-1]) if look.mirrored else depth
+        return np.ascontiguousarray(depth[:, ::-1]) if form.mirrored else depth
 
     def _payload(self, number: int, n_pixels: int) -> bytes:
         """The stored bytes of a frame; none where they cannot be so many pixels."""
-        place = self._node.places[number]
         size = self._node.sizes[number]
+        # the code, the longest table, and the counts before both
+        most = WORST_BYTES_A_PIXEL * n_pixels + (1 << 17) + 4
         with self._lock:
-            if size < 0:
-                record = self._file.record_at(place)
-                place, size = (record.payload, record.payload_size) if record else (0, 0)
-            # the code, the longest table, and the counts before both
-            most = WORST_BYTES_A_PIXEL * n_pixels + (1 << 17) + 4
-            raw = self._file.read(place, size) if 0 < size <= most else b""
+            raw = self._file.read(self._node.positions[number], size) if size <= most else b""
         return raw if len(raw) == size else b""
 
     def _unpack(self, payload: bytes, n_pixels: int) -> Depth | None:
@@ -169,7 +169,7 @@ def open_oni(
         RecordingError: there are no depth frames, they cannot be decoded, or the camera is not
             known.
     """
-    file = OniFile.open(path)
+    file = OniFile(path)
     try:
         return _open(path, file, camera, fps, progress)
     except BaseException:
@@ -180,10 +180,10 @@ def open_oni(
 def _open(
     path: Path, file: OniFile, camera: Lens | None, fps: float | None, progress: Progress
 ) -> Recording:
-    index = index_file(file, progress)
+    nodes, others = index_file(file, progress)
     problems: list[str] = []
-    node = _choose(path, file, index, problems)
-    look = _look(path, node, problems)
+    node = _choose(path, file, nodes, others, problems)
+    form = _format(path, node, problems)
     n = len(node)
     whole = file.whole and (node.n_stated is None or node.n_stated <= len(node))
     if node.n_stated not in (None, n):
@@ -197,16 +197,16 @@ def _open(
         )
     camera_file = CameraFile.read(path.parent / CAMERA_FILE)
     problems += camera_file.problems
-    the_camera = _camera(path, node, look, camera_file, camera, problems)
-    monotone = _times(node, look, fps, problems)
+    the_camera = _camera(path, node, form, camera_file, camera, problems)
+    monotone = _times(node, form, fps, problems)
     times = monotone.times_ns
-    frames = OniFrames(file, node, look, camera_file, problems)
+    frames = OniFrames(file, node, form, camera_file, problems)
     if not any(
         frames.decode(i) is not None
         for i in np.linspace(0, n - 1, min(n, _N_PROBED)).astype(int).tolist()
     ):
         raise RecordingError(
-            f"{path} states pictures of {look.width} x {look.height} pixels, but its frames do not "
+            f"{path} states pictures of {form.width} x {form.height} pixels, but its frames do not "
             "unpack to that; it is damaged, so copy it again"
         )
     start = start_of_clock(int(times[0]))
@@ -226,14 +226,14 @@ def _open(
     )
 
 
-def _choose(path: Path, file: OniFile, index: OniIndex, problems: list[str]) -> DepthNode:
-    """The depth node with frames, by its kind: names are Depth, Depth1, or anything. The first, if
-    there are more.
-    """
-    nodes = [node for node in index.depth.values() if len(node)]
+def _choose(
+    path: Path, file: OniFile, depth: list[DepthNode], others: set[str], problems: list[str]
+) -> DepthNode:
+    """The first depth node with frames; nodes are chosen by kind, for names may be anything."""
+    nodes = [node for node in depth if len(node)]
     cut = "" if file.whole else "the file is cut or damaged, and "
     if not nodes:
-        named = sorted({node.name for node in index.depth.values()} | index.others)
+        named = sorted({node.name for node in depth} | others)
         what = f"its nodes are {', '.join(named)}" if named else "it holds no node of any kind"
         raise RecordingError(
             f"{path} holds no depth frames: {cut}{what}; give a recording of the depth camera"
@@ -252,26 +252,26 @@ def _choose(path: Path, file: OniFile, index: OniIndex, problems: list[str]) -> 
     return node
 
 
-def _look(path: Path, node: DepthNode, problems: list[str]) -> Look:
-    """The look that most frames have; those with another size or unit will be unread."""
+def _format(path: Path, node: DepthNode, problems: list[str]) -> FrameFormat:
+    """The format that most frames have; those with another size or unit will be unread."""
     count = np.bincount(
-        np.frombuffer(node.look_of, node.look_of.typecode), minlength=len(node.looks)
+        np.frombuffer(node.format_of, node.format_of.typecode), minlength=len(node.formats)
     )
-    look = list(node.looks)[int(count.argmax())]
-    if look is None:
+    form = list(node.formats)[int(count.argmax())]
+    if form is None:
         raise RecordingError(
             f"{path} does not state the size of its pictures (xnMapOutputMode); copy it again"
         )
-    if not 0 < look.width * look.height <= _MOST_PIXELS:
+    if not 0 < form.width * form.height <= _MOST_PIXELS:
         raise RecordingError(
-            f"{path} states pictures of {look.width} x {look.height} pixels, which no depth camera "
+            f"{path} states pictures of {form.width} x {form.height} pixels, which no depth camera "
             "has; it is damaged, so copy it again"
         )
-    if look.pixel_format not in _UNIT_MM:
+    if form.pixel_format not in _UNIT_MM:
         what = (
             "the sensor's raw shifts"
-            if look.pixel_format in _SHIFTS
-            else f"the unit {look.pixel_format}"
+            if form.pixel_format in _SHIFTS
+            else f"the unit {form.pixel_format}"
         )
         raise RecordingError(
             f"{path} holds {what} (oniPixelFormat), and depth in steps of 1 mm or 0.1 mm can be "
@@ -279,35 +279,37 @@ def _look(path: Path, node: DepthNode, problems: list[str]) -> Look:
         )
     others = sum(
         int(n)
-        for each, n in zip(node.looks, count, strict=True)
-        if not each or each.picture != look.picture
+        for each, n in zip(node.formats, count, strict=True)
+        if not each or each.constant != form.constant
     )
     if others:
         problems.append(
-            f"{others} of {len(node)} frames have another size or unit than {look.width} x "
-            f"{look.height} pixels, and are taken as wholly unread"
+            f"{others} of {len(node)} frames have another size or unit than {form.width} x "
+            f"{form.height} pixels, and are taken as wholly unread"
         )
-    if look.mirrored:
+    if form.mirrored:
         problems.append(
             "the camera delivered mirror images (xnMirror); left and right were put back in their "
             "places"
         )
-    if look.part[2:] != (look.width, look.height):
-        x, y, width, height = look.part
+    if form.part[2:] != (form.width, form.height):
+        x, y, width, height = form.part
         problems.append(
-            f"the camera recorded only {width} x {height} pixels at ({x}, {y}) of its {look.width} "
-            f"x {look.height}; the rest is unread"
+            f"the camera recorded only {width} x {height} pixels at ({x}, {y}) of its {form.width} "
+            f"x {form.height}; the rest is unread"
         )
-    return look
+    return form
 
 
-def _times(node: DepthNode, look: Look, fps: float | None, problems: list[str]) -> MonotoneTimes:
+def _times(
+    node: DepthNode, form: FrameFormat, fps: float | None, problems: list[str]
+) -> MonotoneTimes:
     """Microseconds as ns; a rate where the clock stood still."""
     stamps = np.frombuffer(node.times_us, node.times_us.typecode)
     n = len(stamps)
     if n > 1 and np.all(stamps == stamps[0]):
         stated = rate(fps, "the call")
-        hz = stated or float(look.fps if 0 < look.fps <= 1000 else _NOMINAL_HZ)
+        hz = stated or float(form.fps if 0 < form.fps <= 1000 else _NOMINAL_HZ)
         origin = (
             "as stated"
             if stated
@@ -334,7 +336,7 @@ def _times(node: DepthNode, look: Look, fps: float | None, problems: list[str]) 
 def _camera(
     path: Path,
     node: DepthNode,
-    look: Look,
+    form: FrameFormat,
     camera_file: CameraFile,
     stated: Lens | None,
     problems: list[str],
@@ -345,18 +347,18 @@ def _camera(
     # a camera.toml comes first here: what is in the file is the design of the make and no
     # calibration of this camera
     if stated is not None or camera_file.intrinsics:
-        return camera_file.camera(look.width, look.height, stated)
+        return camera_file.camera(form.width, form.height, stated)
     ours = node.numbers(INTRINSICS, "<dddd")
     if (
         ours is not None
         and np.isfinite(ours).all()
-        and _can_be((ours[0], ours[1]), (look.width, look.height))
+        and _can_be((ours[0], ours[1]), (form.width, form.height))
     ):
         source = f"intrinsics in the .oni file ({INTRINSICS})"
-        return Camera(ours[0], ours[1], ours[2], ours[3], look.width, look.height, source=source)
-    focal, source = _stated_focal(node, look, problems)
-    if focal is None and (look.width, look.height) in _USUAL_SIZES:
-        focal = (_VGA_FOCAL * look.width / _VGA_WIDTH,) * 2
+        return Camera(ours[0], ours[1], ours[2], ours[3], form.width, form.height, source=source)
+    focal, source = _stated_focal(node, form, problems)
+    if focal is None and (form.width, form.height) in _USUAL_SIZES:
+        focal = (_VGA_FOCAL * form.width / _VGA_WIDTH,) * 2
         source = "typical PrimeSense"
         problems.append(
             "the file states no field of view, so the intrinsics of a typical PrimeSense camera "
@@ -364,22 +366,22 @@ def _camera(
         )
     if focal is None:
         raise RecordingError(
-            f"{path} states no field of view for its {look.width} x {look.height} pixels; write a "
+            f"{path} states no field of view for its {form.width} x {form.height} pixels; write a "
             "camera.toml beside it with [camera], fx = ..., fy = ..., cx = ... and cy = ... in "
             "pixels"
         )
     # OpenNI places the optical axis at half the size, counted as we count pixels
-    cx = look.width / 2 if not look.mirrored else look.width - 1 - look.width / 2
-    return Camera(*focal, cx, look.height / 2, look.width, look.height, source=source)
+    cx = form.width / 2 if not form.mirrored else form.width - 1 - form.width / 2
+    return Camera(*focal, cx, form.height / 2, form.width, form.height, source=source)
 
 
 def _stated_focal(
-    node: DepthNode, look: Look, problems: list[str]
+    node: DepthNode, form: FrameFormat, problems: list[str]
 ) -> tuple[tuple[float, float] | None, str]:
     """Focal lengths (fx, fy) px and where they come from; (None, "") where the file states none
     that can be.
     """
-    size = look.width, look.height
+    size = form.width, form.height
     found: list[tuple[tuple[float, float], str]] = []
     if (view := node.numbers(FIELD_OF_VIEW, "<dd")) is not None and all(
         0 < angle < math.pi for angle in view
@@ -392,7 +394,7 @@ def _stated_focal(
     distance = node.number(PLANE_DISTANCE)
     pixel = node.numbers(PLANE_PIXEL, "<d")
     if distance is not None and pixel is not None and pixel[0] > 0:
-        focal = distance / pixel[0] * look.width / _SENSOR_WIDTH
+        focal = distance / pixel[0] * form.width / _SENSOR_WIDTH
         found.append(((focal, focal), "lens in the .oni file (ZPD and ZPPS)"))
     for focal_lengths, source in found:
         if _can_be(focal_lengths, size):

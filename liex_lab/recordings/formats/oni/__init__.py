@@ -1,1 +1,0 @@
-"""PrimeSense and OpenNI `.oni` recordings, read and written: records, index, 16z depth codec."""
