@@ -5,6 +5,7 @@ each comes from.
 from __future__ import annotations
 
 import json
+from array import array
 from pathlib import Path
 
 import av
@@ -15,10 +16,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from liex_lab.recordings import open_recording
+from liex_lab.recordings.formats._ffv1_kernels import crc_table, slices_agree
 from liex_lab.recordings.formats.moseq.azure_kinect import MODES, Mode, read_calibration
-from liex_lab.recordings.formats.video.ffv1 import crc_table, is_key, slices_agree
-from liex_lab.recordings.formats.video.index import DepthTrack
-from liex_lab.recordings.formats.video.video import DepthVideo, open_video
+from liex_lab.recordings.formats.video import DepthTrack, DepthVideo, open_video
 from liex_lab.runtime.progress import silent
 from tests.oracles import ffv1
 from tests.recordings.asking import refusal
@@ -89,15 +89,6 @@ def test_check_sums_agree_with_their_slow_twin(data: bytes, sealed: bool) -> Non
         == ffv1.slices_agree(data)
         == sealed
     )
-
-
-def test_key_pictures_are_told_by_their_first_bytes(tmp_path: Path) -> None:
-    path = write_avi(tmp_path / "a.avi", STORED, gop=7)
-    with av.open(str(path)) as container:
-        packets = [packet for packet in container.demux(video=0) if packet.size]
-        assert [is_key(bytes(packet)[:2]) for packet in packets] == [
-            packet.is_keyframe for packet in packets
-        ]
 
 
 def test_a_damaged_picture_costs_those_that_build_on_it_and_no_others(tmp_path: Path) -> None:
@@ -317,7 +308,7 @@ def test_a_raw_picture_of_another_size_is_unread(tmp_path: Path, n_bytes: int) -
     """Also of an odd number of bytes, which are no whole numbers of two."""
     path = tmp_path / "raw.avi"
     path.write_bytes(bytes(range(24)))
-    track = DepthTrack("b16g", 2, 2, offsets=[0, 8], sizes=[n_bytes, 8])
+    track = DepthTrack(2, 2, ">u2", offsets=array("q", [0, 8]), sizes=array("q", [n_bytes, 8]))
     video = DepthVideo(path, track)
     assert video.read(0) is None
     np.testing.assert_array_equal(video.read(1), [[0x0809, 0x0A0B], [0x0C0D, 0x0E0F]])

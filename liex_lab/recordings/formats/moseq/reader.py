@@ -13,7 +13,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
 from threading import Lock
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,7 +34,6 @@ from liex_lab.recordings.formats.moseq.metadata import (
     read_metadata,
     read_session_stamps,
 )
-from liex_lab.recordings.formats.video.index import DepthTrack
 from liex_lab.recordings.infrared import refuse_infrared
 from liex_lab.recordings.recording import Recording
 from liex_lab.recordings.timestamps import (
@@ -48,6 +47,9 @@ from liex_lab.recordings.timestamps import (
 from liex_lab.runtime.disk import STRETCH, let_go
 from liex_lab.runtime.progress import Progress, silent
 from liex_lab.runtime.scratch import Scratch
+
+if TYPE_CHECKING:
+    from liex_lab.recordings.formats.video import DepthTrack
 
 DEPTH = "depth.dat"
 VIDEOS = ("depth.avi", "depth.mkv")
@@ -277,7 +279,7 @@ class _Session:
     def _open_depth(self, once: bool) -> tuple[Stack, DepthTrack | None]:
         if self.depth.suffix.lower() == ".dat":
             return self._open_raw(once), None
-        from liex_lab.recordings.formats.video.video import open_video
+        from liex_lab.recordings.formats.video import open_video
 
         video = open_video(self.depth, self.progress)
         if self.metadata.size not in (None, (video.width, video.height)):
@@ -347,7 +349,7 @@ class _Session:
         if self.stated_camera is not None or self.camera_file.intrinsics:
             return self.camera_file.camera(width, height, self.stated_camera)
         mode = mode_of(width, height)
-        attached = track.attachments.values() if track is not None else ()
+        attached = track.attachments if track is not None else ()
         lens = next(filter(None, map(read_calibration, attached)), None)
         if mode is not None and lens is not None:
             return azure_camera(mode, lens)
