@@ -39,7 +39,7 @@ MOST_ROWS = 2000  # that are told of at once
 _LEAST_DOUBT_S = 0.5  # doubtful frames less far apart are one place
 _HELD = 6  # sessions whose desks stay in memory
 _FIRST = (
-    "liex_lab.recordings.formats.messages.mcap_replay",
+    "liex_lab.recordings.formats.messages.mcap_index",
     "cv2",
     "matplotlib",
     "pyarrow.parquet",

@@ -48,11 +48,11 @@ _MCAP = b"\x89MCAP0\r\n"
 _WITH_PATTERN = "images.folder.open_images"
 _WITH_TOPICS = (
     "messages.mcap.open_mcap",
-    "messages.mcap_skim.open_indexed",
+    "messages.mcap_index.open_indexed",
     "messages.rosbag.open_bag",
 )
 # what is damaged is refused when it is met, so nothing needs to be unpacked before
-_STRICTLY = {"messages.mcap.open_mcap": "messages.mcap_skim.open_indexed"}
+_STRICTLY = {"messages.mcap.open_mcap": "messages.mcap_index.open_indexed"}
 _RAYTRIX = (
     "is in Raytrix's own format, which only the maker's licensed software reads; compute metric "
     "depth in RxLive, save "

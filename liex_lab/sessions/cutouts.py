@@ -332,7 +332,7 @@ def open_pictures(session: Session) -> Recording:
         SessionError: the session keeps no depth.
         RecordingError: session.mcap cannot be read.
     """
-    from liex_lab.recordings.formats.messages.mcap_replay import open_replay
+    from liex_lab.recordings.formats.messages.mcap_index import open_replay
 
     try:
         return open_replay(session.path / "session.mcap")

@@ -2,24 +2,19 @@
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Callable
-from io import BytesIO
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from foxglove.mcap import MCAPCompression
-from mcap.data_stream import ReadDataStream
-from mcap.records import ChunkIndex
 from mcap.writer import CompressionType
 
 from liex_lab.errors import RecordingError
 from liex_lab.recordings import Recording, open_recording
 from liex_lab.recordings.formats.messages import message_file
 from liex_lab.recordings.formats.messages.mcap import McapFile
-from liex_lab.recordings.formats.messages.mcap_index import chunk_index
 from liex_lab.recordings.formats.messages.mcap_writer import McapDepthWriter
 from liex_lab.recordings.frame import DepthFrame
 from tests.recordings.asking import refusal
@@ -195,15 +190,3 @@ def test_a_chunk_that_states_any_size_costs_no_memory(path: Path, kind: str) -> 
     content[size_at : size_at + 8] = (1 << 50).to_bytes(8, "little")
     path.write_bytes(content)
     assert "cut short or damaged" in refusal(path, strict=True)
-
-
-def test_the_index_of_a_chunk_is_what_the_library_reads(path: Path) -> None:
-    KINDS["zstd"](path)
-    with path.open("rb") as file:
-        indexed = McapFile(path, file)
-        indexed._learn_ending()
-        assert len(indexed.listed) > 3
-        for content in indexed.listed:
-            assert chunk_index(content) == ChunkIndex.read(ReadDataStream(BytesIO(content)))
-            with pytest.raises((struct.error, ValueError)):
-                chunk_index(content[:-3])

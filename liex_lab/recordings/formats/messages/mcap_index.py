@@ -1,9 +1,25 @@
-"""The index of an MCAP file: its chunks, and the messages in them without unpacking."""
+"""MCAP files opened by their index, without unpacking their chunks.
+
+`open_indexed` compares the records of the file with its index first: it must list every chunk and
+every message. Of each depth message only the beginning is unpacked, where the sensor's stamp is,
+on several threads. Any other file is walked (`mcap`). A chunk is checked against its CRC-32 when a
+frame in it is read, and not before: that is for whoever refuses what is damaged
+(`open_recording(..., strict=True)`).
+
+`open_replay` opens session.mcap, which this program wrote under the times of its frames: its index
+is trusted and no stamp is read, for some frames out of an hour are needed at once.
+"""
 
 from __future__ import annotations
 
 import struct
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from io import BytesIO
+from itertools import pairwise
+from pathlib import Path
+from typing import IO
 
 import numpy as np
 from mcap.data_stream import ReadDataStream
@@ -12,47 +28,248 @@ from mcap.records import ChunkIndex
 from numpy.typing import NDArray
 
 from liex_lab.errors import RecordingError
-from liex_lab.recordings.formats.messages.mcap import MESSAGE, RECORD, McapFile
+from liex_lab.optics.camera import Lens
+from liex_lab.recordings.formats.messages.depth_topics import open_topic
+from liex_lab.recordings.formats.messages.mcap import (
+    DAMAGE,
+    FACTS,
+    LARGEST_FACT,
+    MAGIC,
+    MESSAGE,
+    RECORD,
+    THREADS,
+    McapFile,
+    Wanted,
+    open_file,
+)
 from liex_lab.recordings.formats.messages.message_file import (
     Channel,
     DamagedChunk,
+    Envelope,
     Listed,
     Place,
+    first_bytes,
 )
+from liex_lab.recordings.formats.messages.messages import CALIBRATION_SCHEMAS
+from liex_lab.recordings.formats.messages.parsers import plain_schema, stamp_reader
+from liex_lab.recordings.recording import Recording
+from liex_lab.runtime.progress import Progress, silent
 
-_UNTOLD = -1  # the length of a message that only its chunk tells
+_UNKNOWN = -1  # the length of a message that only its chunk states
 _LARGEST_INDEX = 1 << 26  # bytes of one
-LARGEST_OFFSET = 1 << 40
-INDEX = struct.Struct("<HI")  # of a message index: channel, bytes of its entries
-# of a chunk's index: first and last time, where it begins, its length, bytes of the places of its
-# message indexes; the channel and place of each; how long these are, bytes of the packing's name;
-# packed and unpacked bytes
-_OF_CHUNK = struct.Struct("<4QI")
-_AT = struct.Struct("<HQ")
-_LENGTHS = struct.Struct("<QI")
-_SIZES = struct.Struct("<QQ")
-ENTRY = np.dtype([("time_ns", "<u8"), ("offset", "<u8")])
+_LARGEST_OFFSET = 1 << 40
+_INDEX = struct.Struct("<HI")  # of a message index: channel, bytes of its entries
+_ENTRY = np.dtype([("time_ns", "<u8"), ("offset", "<u8")])
+_HEAD = 512  # bytes of a message's record in which its stamp is
+_BATCH = 32  # chunks from which one task unpacks the beginnings of messages
+_NOT_READ = (*DAMAGE, DamagedChunk)
+
+_StampReader = Callable[[memoryview], int | None]
+_Table = tuple[int, bytes]  # number of a chunk, and times and offsets of messages as written
 
 
-class IndexedMcap(McapFile):
-    """An MCAP file whose messages are found by its index.
+def open_indexed(
+    path: Path,
+    camera: Lens | None = None,
+    fps: float | None = None,
+    progress: Progress = silent,
+    topic: str | None = None,
+) -> Recording:
+    """Open one depth topic of an MCAP file by its index, or as `open_mcap` does if it has none.
 
-    Attributes:
-        advice: what to do where a chunk of it is damaged.
+    `fps` is not used, for every message has its time. Reading a frame raises a `RecordingError` if
+    its chunk is damaged.
+
+    Raises:
+        RecordingError: the file is not MCAP, or holds no depth that can be chosen.
     """
+    return open_topic(_Indexed(path, open_file(path)), "mcap", camera, topic, progress)
 
-    advice = ""
+
+def open_replay(path: Path, progress: Progress = silent) -> Recording:
+    """Open the depth of a session's replay, session.mcap, as a recording.
+
+    Raises:
+        RecordingError: it cannot be read, or holds no depth.
+    """
+    try:
+        return open_topic(_Replay(path, open_file(path)), "mcap", None, None, progress)
+    except OSError as error:
+        raise RecordingError(
+            f"{path} cannot be read ({error.strerror or error}); check it"
+        ) from None
+
+
+class _Indexed(McapFile):
+    """An MCAP file that is whole as its index says; any other is walked."""
+
+    trusted = False
+    advice = (
+        "copy it again, or go on with what is whole by adding --set recording.accept_truncated=true"
+    )
+
+    def walk(self, wanted: Wanted, progress: Progress) -> Iterator[Envelope | Listed]:
+        """The messages of the wanted channels by channel: the first of each with its data."""
+        self._learn_ending()
+        indexes: list[ChunkIndex] = []
+        usable = False
+        try:
+            indexes = [ChunkIndex.read(ReadDataStream(BytesIO(one))) for one in self.listed]
+            indexes.sort(key=lambda index: index.chunk_start_offset)
+            if self.trusted:
+                usable = all(index.message_index_length for index in indexes)
+            else:
+                usable = self._agrees(indexes, progress)
+        except _NOT_READ:
+            pass  # the walk says what it finds
+        if not (indexes and usable):
+            yield from super().walk(wanted, progress)
+            return
+        self.parsed = self.trusted
+        tables: dict[int, list[_Table]] = {}
+        for index in indexes:
+            try:
+                for channel_id, table in self._tables(index, wanted):
+                    tables.setdefault(channel_id, []).append(table)
+            except _NOT_READ:
+                self.whole = False
+        for channel_id, those in tables.items():
+            yield from self._messages(channel_id, those, wanted)
+
+    def _tables(self, index: ChunkIndex, wanted: Wanted) -> list[tuple[int, _Table]]:
+        """By channel what the message indexes of one chunk list."""
+        opcode, start, end = self._record(index.chunk_start_offset)
+        if opcode != Opcode.CHUNK:
+            raise DamagedChunk("there is no chunk where its index says")
+        number = len(self.chunks)
+        self.chunks.append(self._chunk(start, end - start))
+        offsets = index.message_index_offsets
+        first = min(offsets.values(), default=0)
+        if not 0 <= index.message_index_length <= min(_LARGEST_INDEX, self.size):
+            raise ValueError("an index is larger than its file")
+        self.file.seek(first)
+        content = self.file.read(index.message_index_length)
+        found = []
+        for channel_id, at in offsets.items():
+            if not wanted(self._by_id[channel_id]):
+                continue
+            kind, length = RECORD.unpack_from(content, at - first)
+            begin = at - first + RECORD.size
+            _, n_bytes = _INDEX.unpack_from(content, begin)
+            entries = content[begin + _INDEX.size : begin + length]
+            if kind != Opcode.MESSAGE_INDEX or n_bytes != len(entries) or n_bytes % _ENTRY.itemsize:
+                raise DamagedChunk("there is no index where it should be")
+            found.append((channel_id, (number, entries)))
+        return found
+
+    def _messages(
+        self, channel_id: int, tables: Sequence[_Table], wanted: Wanted
+    ) -> Iterator[Envelope | Listed]:
+        """One channel's messages: the first with its data, and the rest listed if that can be."""
+        channel = self._by_id[channel_id]
+        listed = _listed(channel, tables)
+        n_stated = sum(len(entries) for _, entries in tables) // _ENTRY.itemsize
+        self.whole &= len(listed.places) == n_stated
+        rest: Listed | None = None
+        tried = False
+        for k, (time_ns, numbers) in enumerate(
+            zip(listed.log_time_ns.tolist(), listed.places.tolist(), strict=True)
+        ):
+            if not wanted(channel):
+                return
+            try:
+                place = Place(*numbers)
+                data = self._message(place)
+                head = place.offset + RECORD.size
+                sent_ns = MESSAGE.unpack_from(self.unpack(place.chunk), head)[3]
+            except _NOT_READ:
+                self.whole = False
+                continue
+            yield Envelope(channel, time_ns, place, data, sent_ns)
+            if not tried:
+                later = Listed(channel, listed.log_time_ns[k + 1 :], listed.places[k + 1 :])
+                tried, rest = True, self._stamped(channel_id, later)
+            if rest is not None:
+                yield rest
+                return
+
+    def _stamped(self, channel_id: int, listed: Listed) -> Listed | None:
+        """Messages with the sensor's stamps; None if these cannot be read without the rest."""
+        channel = listed.channel
+        if self.trusted or plain_schema(channel) in CALIBRATION_SCHEMAS:
+            return listed
+        read = stamp_reader(channel)
+        if read is None:
+            return None
+        by_chunk = np.flatnonzero(np.diff(listed.places[:, 0])) + 1
+        edges = [0, *by_chunk[_BATCH - 1 :: _BATCH].tolist(), len(listed.places)]
+        parts = [listed.places[a:b] for a, b in pairwise(edges)]
+        logged = [listed.log_time_ns[a:b] for a, b in pairwise(edges)]
+        with ThreadPoolExecutor(THREADS) as unpackers:
+            found = list(unpackers.map(partial(self._stamps, read, channel_id), parts, logged))
+        if not all(one is not None for one in found):
+            return None
+        table = np.concatenate([one for one in found if one is not None])
+        good = table[:, 0] == 1
+        self.whole = self.whole and bool(good.all())
+        sent_ns = table[good, 2].view(np.uint64)
+        return Listed(
+            channel, listed.log_time_ns[good], listed.places[good], table[good, 1], sent_ns
+        )
+
+    def _stamps(
+        self,
+        read: _StampReader,
+        channel_id: int,
+        places: NDArray[np.int64],
+        logged_ns: NDArray[np.uint64],
+    ) -> NDArray[np.int64] | None:
+        """(n, 3) whether each of some messages could be read, its stamp and its time of sending,
+        ns; None if the beginnings of messages do not hold their stamps.
+        """
+        table = np.zeros((len(places), 3), np.int64)
+        with self.path.open("rb") as file:  # threads share no position
+            for rows in np.split(np.arange(len(places)), np.flatnonzero(np.diff(places[:, 0])) + 1):
+                if not len(rows):
+                    continue
+                try:
+                    heads = self._heads(file, places[rows])
+                    for row, head in zip(rows.tolist(), heads, strict=True):
+                        opcode, length = RECORD.unpack_from(head)
+                        whose, _, log_ns, sent_ns = MESSAGE.unpack_from(head, RECORD.size)
+                        if (opcode, whose, log_ns) != (Opcode.MESSAGE, channel_id, logged_ns[row]):
+                            raise DamagedChunk("there is another message than its index says")
+                        begin = RECORD.size + MESSAGE.size
+                        stamp_ns = read(memoryview(head)[begin : RECORD.size + length])
+                        if stamp_ns is None:
+                            return None
+                        table[row] = 1, stamp_ns, np.uint64(sent_ns).view(np.int64)
+                except _NOT_READ:
+                    table[rows, 0] = 0
+        return table
+
+    def _heads(self, file: IO[bytes], places: NDArray[np.int64]) -> list[bytes]:
+        """The first bytes of the records of messages of one chunk."""
+        offsets = places[:, 1].tolist()
+        chunk = self.believable(int(places[0, 0]))
+        if chunk.packing not in ("", "none"):
+            data = first_bytes(file, chunk, min(offsets[-1] + _HEAD, chunk.size))
+            return [data[at : at + _HEAD] for at in offsets]
+        if chunk.length != chunk.size:
+            raise DamagedChunk("its parts do not fit into it")
+        heads = []
+        for at in offsets:
+            file.seek(chunk.offset + at)
+            heads.append(file.read(max(0, min(_HEAD, chunk.length - at))))
+        return heads
 
     def read(self, place: Place) -> memoryview:
-        """The data of one message.
-
-        Args:
-            place: where it lies; a length that is not told is looked up in its chunk.
+        """The data of one message; an unknown length is looked up in its chunk.
 
         Raises:
             RecordingError: its chunk is damaged.
         """
-        if place.length != _UNTOLD:
+        if place.length != _UNKNOWN:
             return super().read(place)
         try:
             return self._message(place)
@@ -60,7 +277,7 @@ class IndexedMcap(McapFile):
             raise RecordingError(f"{self.path} is damaged ({error}); {self.advice}") from None
 
     def _message(self, place: Place) -> memoryview:
-        """The data of a message whose length only its chunk tells."""
+        """The data of a message whose length only its chunk states."""
         data = self.unpack(place.chunk)
         try:
             opcode, length = RECORD.unpack_from(data, place.offset)
@@ -71,121 +288,58 @@ class IndexedMcap(McapFile):
             raise DamagedChunk("there is no message where its index says")
         return data[begin + MESSAGE.size : begin + length]
 
-    def take_chunk(self, index: ChunkIndex) -> int:
-        """Note a chunk.
-
-        Args:
-            index: its index.
-
-        Returns:
-            Its number.
-
-        Raises:
-            DamagedChunk: there is none where its index says.
-        """
-        opcode, start, end = self._record(index.chunk_start_offset)
-        if opcode != Opcode.CHUNK:
-            raise DamagedChunk("there is no chunk where its index says")
-        self.chunks.append(self._chunk(start, end - start))
-        return len(self.chunks) - 1
-
-    def _listed(self, channel: Channel, at: int, number: int) -> Listed:
-        """The messages of a channel in a chunk, of the index at `at`, in file order."""
-        kind, begin, stop = self._record(at)
-        if kind != Opcode.MESSAGE_INDEX:
-            raise DamagedChunk("there is no index where it should be")
-        return listed_in(channel, number, self._message_index(begin, stop))
-
-    def indexes(self) -> list[ChunkIndex]:
-        """The indexes of its chunks, in file order."""
-        found = [chunk_index(content) for content in self.listed]
-        return sorted(found, key=lambda index: index.chunk_start_offset)
-
-    def _message_index(self, begin: int, stop: int) -> NDArray[np.void]:
-        """Times and offsets of one channel's messages in a chunk, in file order.
-
-        An hour's index lists a hundred thousand, so they are read as a table.
-        """
-        table = np.frombuffer(entries(self.between(begin, stop)), ENTRY)
-        if len(table) and table["offset"].max() > LARGEST_OFFSET:
-            raise ValueError("an index leads out of its chunk")
-        return table[np.argsort(table["offset"], kind="stable")]
-
-    def _stream(self, start: int, end: int) -> ReadDataStream:
-        """The bytes between, of a record of some kilobytes."""
-        return ReadDataStream(BytesIO(self.between(start, end)))
-
-    def between(self, start: int, end: int) -> bytes:
-        """The bytes of records of some kilobytes.
-
-        Args:
-            start: where they begin in the file.
-            end: where they end.
-
-        Raises:
-            ValueError: they are more than a file's index can be.
-        """
-        if not 0 <= end - start <= min(_LARGEST_INDEX, self.size):
-            raise ValueError("an index is larger than its file")
-        self.file.seek(start)
-        return self.file.read(end - start)
+    def _agrees(self, indexes: Sequence[ChunkIndex], progress: Progress) -> bool:
+        """Whether the file's records are those that its index lists, from beginning to end."""
+        at, n_messages = len(MAGIC), 0
+        unseen = {index.chunk_start_offset: index for index in indexes}
+        if len(unseen) < len(indexes):
+            return False
+        expected = set[int]()  # where the indexes of the messages in the last chunk are
+        while at + RECORD.size <= self.size:
+            opcode, start, end = self._record(at)
+            if opcode in (0, Opcode.MESSAGE) or end > self.size:
+                return False
+            if opcode == Opcode.MESSAGE_INDEX:
+                if at not in expected:
+                    return False
+                expected.remove(at)
+                n_messages += (end - start - _INDEX.size) // _ENTRY.itemsize
+            elif expected:
+                return False
+            elif opcode == Opcode.CHUNK:
+                index = unseen.pop(at, None)
+                if index is None or index.chunk_length != end - at:
+                    return False
+                expected = set(index.message_index_offsets.values())
+            elif opcode in FACTS and end - start <= LARGEST_FACT:
+                self._learn(opcode, ReadDataStream(BytesIO(self.file.read(end - start))))
+            elif opcode == Opcode.FOOTER:
+                known = {i for index in indexes for i in index.message_index_offsets}
+                agrees = n_messages == self.n_messages and known <= set(self._by_id)
+                return agrees and end + len(MAGIC) <= self.size and not unseen
+            at = end
+            progress(at >> 20, (self.size >> 20) + 1, "looking through the recording (MB)")
+        return False
 
 
-def entries(index: bytes) -> bytes:
-    """The times and offsets of messages, as they are written.
+class _Replay(_Indexed):
+    """An MCAP file whose index is trusted; one without an index is walked."""
 
-    Args:
-        index: content of a message index's record.
+    trusted = True
+    advice = "copy it again, or run `liex run` on its recording"
 
-    Raises:
-        struct.error, ValueError: they do not fit into it.
+
+def _listed(channel: Channel, tables: Sequence[_Table]) -> Listed:
+    """Messages of a channel in file order, without those whose offset cannot be.
+
+    An hour has sixteen thousand chunks, so their tables are read as one.
     """
-    _, length = INDEX.unpack_from(index)
-    if length != len(index) - INDEX.size or length % ENTRY.itemsize:
-        raise ValueError("an index does not fit into its record")
-    return index[INDEX.size :]
-
-
-def listed_in(channel: Channel, number: int | NDArray[np.int64], table: NDArray[np.void]) -> Listed:
-    """Messages whose lengths only their chunks tell.
-
-    Args:
-        channel: theirs.
-        number: of the chunk that they are in, or (n,) of each one's.
-        table: (n,) `ENTRY` of each.
-    """
-    places = np.empty((len(table), 3), np.int64)
-    places[:, 0] = number
-    places[:, 1] = table["offset"]
-    places[:, 2] = _UNTOLD
-    return Listed(channel, table["time_ns"], places)
-
-
-def chunk_index(content: bytes) -> ChunkIndex:
-    """The index of a chunk; the library reads it a number at a time, and of an hour there are
-    sixteen thousand.
-
-    Args:
-        content: of its record.
-
-    Raises:
-        struct.error: it is shorter than it says.
-        ValueError: a part does not fit into it.
-    """
-    first_ns, last_ns, start, length, n_bytes = _OF_CHUNK.unpack_from(content)
-    at = _OF_CHUNK.size
-    places = dict(_AT.iter_unpack(content[at : at + n_bytes]))
-    index_length, n_name = _LENGTHS.unpack_from(content, at + n_bytes)
-    at += n_bytes + _LENGTHS.size
-    packed, size = _SIZES.unpack_from(content, at + n_name)
-    return ChunkIndex(
-        chunk_length=length,
-        chunk_start_offset=start,
-        compression=content[at : at + n_name].decode(),
-        compressed_size=packed,
-        message_end_time=last_ns,
-        message_index_length=index_length,
-        message_index_offsets=places,
-        message_start_time=first_ns,
-        uncompressed_size=size,
-    )
+    table = np.frombuffer(b"".join(entries for _, entries in tables), _ENTRY)
+    counts = [len(entries) // _ENTRY.itemsize for _, entries in tables]
+    number = np.repeat(np.array([number for number, _ in tables], np.int64), counts)
+    order = np.lexsort((table["offset"], number))
+    order = order[table["offset"][order] <= _LARGEST_OFFSET]
+    places = np.full((len(order), 3), _UNKNOWN, np.int64)
+    places[:, 0] = number[order]
+    places[:, 1] = table["offset"][order]
+    return Listed(channel, table["time_ns"][order], places)
