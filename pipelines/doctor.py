@@ -20,7 +20,7 @@ from liex_lab.errors import LiexError
 from liex_lab.optics.presets import unusual_centre, unusual_lens
 from liex_lab.plan import Plan
 from liex_lab.plan.plan import arena_lines
-from liex_lab.recordings.depth_units import PLAUSIBLE_MM
+from liex_lab.recordings.frame import PLAUSIBLE_MM
 from liex_lab.recordings.timestamps import (
     DROPPED,
     Gap,

@@ -192,7 +192,7 @@ def session_bytes(recording: Recording, plan: Plan, length_mm: float, distance_m
         distance_mm: of the animal from the camera.
     """
     from liex_lab.body.skeleton import Skeleton
-    from liex_lab.recordings.rvl import to_millimetres
+    from liex_lab.recordings.depth_kernels import to_millimetres
     from liex_lab.sessions.room import Shown, needed_bytes
 
     rows = sorted({0, len(recording) // 2})

@@ -42,7 +42,7 @@ def whole_pictures(
             it is another one.
         RecordingError: the recording cannot be read.
     """
-    from liex_lab.recordings.rvl import to_millimetres
+    from liex_lab.recordings.depth_kernels import to_millimetres
     from liex_lab.sessions import Session
     from liex_lab.sessions.cutouts import ALL
     from liex_lab.sessions.evidence import provenance_of

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from liex_lab.recordings.formats.images.nyu_labels import POINTS
+from liex_lab.recordings.formats.images.nyu import POINTS
 
 from .looks import DPI, TRUE
 

@@ -91,7 +91,7 @@ def pack(
     ] = False,
 ) -> None:
     """Pack a recording without loss: its arena in 16 bits, half as large, read by every verb."""
-    from liex_lab.pipelines.pack import pack as job
+    from liex_lab.pipelines.convert import pack as job
     from liex_lab.plan import Plan
 
     if whole and region is not None:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from liex_lab.recordings.formats.images.nyu_labels import PALM, POINTS
+from liex_lab.recordings.formats.images.nyu import PALM, POINTS
 
 Array = NDArray[np.float64]
 

@@ -1,21 +1,21 @@
-"""The camera.toml format: intrinsics, depth encoding and clock of pictures that do not hold them.
+"""The camera.toml format: intrinsics, depth encoding and clock of images that do not hold them.
 
 Keys stand under [camera] (or [recording], or at the top); all may be left out. An unknown key is
-reported with the nearest known one.
+reported with the nearest known one. Also: infrared images, which are recognised by name.
 """
 
 from __future__ import annotations
 
 import difflib
 import math
+import re
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from liex_lab.errors import LiexError, RecordingError, UnknownCameraError
+from liex_lab.errors import LiexError, RecordingError, UnknownCameraError, printable
 from liex_lab.optics.camera import Camera, Distortion, Lens
-from liex_lab.recordings.depth_units import ENCODINGS, Stored, decode, own_unit_mm
-from liex_lab.recordings.frame import Depth
+from liex_lab.recordings.frame import ENCODINGS, Depth, Stored, decode, own_unit_mm
 from liex_lab.recordings.timestamp_files import UNITS
 from liex_lab.recordings.timestamps import start_of_day
 from liex_lab.runtime.places import named_beside
@@ -305,3 +305,41 @@ def _unknown_key(path: Path, key: str) -> str:
         f"{path.name} has a key {key!r} that means nothing "
         f"here{f'; did you mean {near[0]!r}?' if near else ''}"
     )
+
+
+# Infrared by its name: images of 16 bits that hold brightness and look like depth to a reader.
+
+
+_WORD = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+")
+_INFRARED = {"ir", "infra", "passiveir"}
+
+
+def is_infrared(name: str) -> bool:
+    """Whether the name of a file, topic or track is that of infrared images: "ir", "PASSIVE_IR".
+
+    The words of the name count, so "circle" is none; one that also says depth is depth.
+
+    Args:
+        name: a name or title, without the ending of a file's name.
+    """
+    words = {word.lower() for word in _WORD.findall(name)}
+    found = words & _INFRARED or {word for word in words if word.startswith("infrared")}
+    return bool(found) and "depth" not in words
+
+
+def refuse_infrared(path: Path, name: str) -> None:
+    """Refuse a file or folder whose name, or the title of its track, is that of infrared images.
+
+    Args:
+        path: the file or folder, for the sentence.
+        name: as in `is_infrared`.
+
+    Raises:
+        RecordingError: the name is one of infrared images.
+    """
+    if is_infrared(name):
+        raise RecordingError(
+            f"{path} holds infrared, by the name {printable(name)}, and depth was expected; give "
+            "the recording of the depth (a Matroska track titled DEPTH), or change the name if "
+            "this is depth"
+        )

@@ -1,6 +1,6 @@
 """Dispatch from a path to the reader of its format: the one entry point to depth recordings.
 
-The format is told from the name of a file, or from the names in a folder (an MCAP file, such as an
+The format follows from the name of a file, or from the names in a folder (an MCAP file, such as an
 archive by `liex pack`, under any name); the reader's module and
 its libraries are imported only when they are needed.
 """
@@ -26,20 +26,18 @@ _READS = (
 _PICTURES = (".png", ".tif", ".tiff", ".pgm", ".pclzf")
 _MOSEQ = ("depth.dat", "depth.avi", "depth.mkv")
 _ALONE = {  # how the name of a file ends that holds a whole recording: its module and function
-    ".tar.gz": "moseq.reader.open_moseq",
-    ".tgz": "moseq.reader.open_moseq",
-    ".tar": "moseq.reader.open_moseq",
-    ".avi": "moseq.reader.open_moseq",
-    ".mkv": "moseq.reader.open_moseq",
+    ".tar.gz": "moseq.open_moseq",
+    ".tgz": "moseq.open_moseq",
+    ".tar": "moseq.open_moseq",
+    ".avi": "moseq.open_moseq",
+    ".mkv": "moseq.open_moseq",
     ".mcap": "messages.mcap.open_mcap",
     ".oni": "oni.open_oni",
     ".bag": "messages.rosbag.open_bag",
     ".db3": "messages.rosbag.open_bag",
 }
 _FILES = (
-    _ALONE
-    | {".dat": "moseq.reader.open_moseq"}
-    | dict.fromkeys(_PICTURES, "images.folder.open_images")
+    _ALONE | {".dat": "moseq.open_moseq"} | dict.fromkeys(_PICTURES, "images.folder.open_images")
 )
 # an address of a virtual recording; rendering stands above reading, so it is named only here
 _RENDERED = "synthetic:"
@@ -138,7 +136,7 @@ def open_recording(
         pattern: which pictures of a folder to take, as in `*.tif`, before a camera.toml.
         strict: refuse a recording that is cut short, instead of only saying so in `problems` and
             `truncated`. A part of an MCAP file that is damaged is refused when it is read.
-        progress: told while an archive is unpacked or an index made.
+        progress: reports while an archive is unpacked or an index made.
 
     Returns:
         The recording; close it, or use it in a `with` block.
@@ -174,14 +172,13 @@ def stated_subject(path: Path, progress: Progress = silent) -> str:
 
     Args:
         path: a file or a folder.
-        progress: told while an archive is searched.
+        progress: reports while an archive is searched.
 
     Returns:
         As the recording states it; '' where it states none, or cannot be read.
     """
     from liex_lab.recordings.camera_file import CameraFile
-    from liex_lab.recordings.formats.moseq.archive import unpack
-    from liex_lab.recordings.formats.moseq.metadata import METADATA, read_metadata
+    from liex_lab.recordings.formats.moseq_files import METADATA, read_metadata, unpack
 
     folder = path if path.is_dir() else path.parent
     notes = {CAMERA_FILE: folder / CAMERA_FILE}
@@ -213,7 +210,7 @@ def _open(path: Path, how: _How) -> Recording:
 
     if looks_like_nyu(path.parent, [path.name]):
         return how.open("images.nyu.open_nyu", path)
-    if (where := _reader(path.name) or _told_by_content(path)) is not None:
+    if (where := _reader(path.name) or _reader_by_content(path)) is not None:
         if not path.stat().st_size:
             raise RecordingError(f"{path} is empty; copy the recording again")
         return how.open(where, path)
@@ -227,7 +224,7 @@ def _reader(name: str, files: dict[str, str] = _FILES) -> str | None:
     return next((where for end, where in files.items() if name.lower().endswith(end)), None)
 
 
-def _told_by_content(path: Path) -> str | None:
+def _reader_by_content(path: Path) -> str | None:
     """The reader of a file whose name says nothing and whose first bytes are those of MCAP."""
     with path.open("rb") as file:
         return _FILES[".mcap"] if file.read(len(_MCAP)) == _MCAP else None
@@ -245,7 +242,7 @@ def _open_folder(folder: Path, how: _How) -> Recording:
     if not inside:
         raise RecordingError(f"{folder} is an empty folder; give {_READS}")
     if any(name in inside for name in _MOSEQ):
-        return how.open("moseq.reader.open_moseq", folder)
+        return how.open("moseq.open_moseq", folder)
     if PROFILE_FILE in inside:
         return how.open("images.raytrix.open_raytrix", folder)
     if CAMERA_FILE not in inside and looks_like_raytrix(folder, inside):

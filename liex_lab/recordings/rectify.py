@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from liex_lab.optics.camera import Camera
 from liex_lab.optics.refraction import Water
-from liex_lab.recordings import _rectify_kernels as kernels
+from liex_lab.recordings import depth_kernels as kernels
 from liex_lab.recordings.frame import Depth
 from liex_lab.recordings.recording import Recording
 
@@ -224,7 +224,7 @@ def share_lost(camera: Camera) -> float:
         camera: the real camera, perhaps with distortion.
 
     Returns:
-        A share from 0 to 1, told from every eighth row and column; 0 without distortion.
+        A share from 0 to 1, measured on every eighth row and column; 0 without distortion.
     """
     if camera.distortion is None:
         return 0.0

@@ -19,8 +19,7 @@ from numpy.typing import NDArray
 from liex_lab.errors import RecordingError
 from liex_lab.optics.camera import Camera
 from liex_lab.recordings.camera_file import CAMERA_FILE
-from liex_lab.recordings.depth_units import LARGEST_STEP, nearest_steps, whole_steps
-from liex_lab.recordings.frame import Depth, DepthFrame
+from liex_lab.recordings.frame import LARGEST_STEP, Depth, DepthFrame, nearest_steps, whole_steps
 
 STAMPS = "timestamps.csv"
 _FACTS = ("subject_id", "session_start_time")  # of the metadata, those that a camera.toml can state

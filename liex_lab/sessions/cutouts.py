@@ -32,7 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.errors import RecordingError, SessionError
-from liex_lab.recordings.rvl import to_millimetres
+from liex_lab.recordings.depth_kernels import to_millimetres
 from liex_lab.sessions.reading import reading_from
 
 if TYPE_CHECKING:

@@ -27,7 +27,7 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
-from liex_lab.recordings.rvl import rvl_message
+from liex_lab.recordings.depth_kernels import rvl_message
 from liex_lab.sessions.cutouts import N_BOXES, N_WINDOWS, Boxes, window_around, windows
 from liex_lab.sessions.provenance import Provenance
 

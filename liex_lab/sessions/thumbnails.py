@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.optics.camera import Camera
-from liex_lab.recordings.rvl import to_millimetres
+from liex_lab.recordings.depth_kernels import to_millimetres
 from liex_lab.tables.rows import Rows
 from liex_lab.tracking.observations import Observations
 

@@ -23,7 +23,7 @@ from liex_lab.plan import Plan
 from liex_lab.runtime.progress import Progress, silent
 
 if TYPE_CHECKING:
-    from liex_lab.recordings.formats.images.nyu_labels import NyuReference
+    from liex_lab.recordings.formats.images.nyu import NyuReference
 
 _CHUNK = 32  # frames in memory at a time
 _SHOWN = 10  # hands in Fig 12 of Lie-X
@@ -66,7 +66,7 @@ def evaluate_nyu(
         LiexError: frames and labels do not belong together.
     """
     from liex_lab.evaluation.nyu import NYU_PROTOCOL, nyu_errors
-    from liex_lab.recordings.formats.images.nyu_labels import NyuReference
+    from liex_lab.recordings.formats.images.nyu import NyuReference
 
     folder = Path(reference)
     labels = NyuReference.load(folder)
@@ -125,7 +125,7 @@ def labels_used(numbers: NDArray[np.int64]) -> str:
     Args:
         numbers: (n,) numbers of the frames that are measured, from 1 on.
     """
-    from liex_lab.recordings.formats.images.nyu_labels import N_FIRST_PERSON
+    from liex_lab.recordings.formats.images.nyu import N_FIRST_PERSON
     from liex_lab.simulation.hand.pose_prior import SEEN_SHARE
 
     n = int((numbers <= N_FIRST_PERSON).sum())
@@ -186,7 +186,7 @@ def _ours(
     """
     from liex_lab.errors import ModelError
     from liex_lab.evaluation.nyu import nyu_errors
-    from liex_lab.recordings.formats.images.nyu_labels import points_of_joints
+    from liex_lab.recordings.formats.images.nyu import points_of_joints
 
     from ..build import build_estimator, build_recording, build_scene
 

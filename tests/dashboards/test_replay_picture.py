@@ -21,7 +21,7 @@ import pytest
 from liex_lab.dashboards.replay.rerun_blueprint import replay_blueprint
 
 from liex_lab.api import correct_session
-from liex_lab.recordings.rvl import rvl_message, to_millimetres
+from liex_lab.recordings.depth_kernels import rvl_message, to_millimetres
 from liex_lab.sessions import Session
 from liex_lab.sessions.correcting import joint_move
 from liex_lab.sessions.cutouts import Kept

@@ -13,7 +13,7 @@ from liex_lab.dashboards.paper.nyu_hands import draw_nyu_hands
 from liex_lab.pipelines.evaluation import nyu
 
 from liex_lab.evaluation.nyu import nyu_errors
-from liex_lab.recordings.formats.images.nyu_labels import PALM, POINTS, NyuReference
+from liex_lab.recordings.formats.images.nyu import PALM, POINTS, NyuReference
 
 PAPER = {
     "liex": (14.507, 15.62),

@@ -19,7 +19,7 @@ from liex_lab.foreground._blob_kernels import BLOCK
 from liex_lab.foreground.crop_camera import view_of
 from liex_lab.foreground.hand_segmenter import HandSegmenter, sight_rotations
 from liex_lab.optics.camera import Camera
-from liex_lab.recordings.formats.images.nyu_labels import NYU_CAMERA, NyuReference
+from liex_lab.recordings.formats.images.nyu import LABEL_CAMERA, NyuReference
 from liex_lab.recordings.recording import Recording
 from liex_lab.simulation.hand.simulator import HandSession, HandSimulator
 from tests.oracles.ends import ends_by_hand
@@ -99,7 +99,7 @@ def test_it_is_the_hand_and_no_elbow_and_no_chest(
     wrist: tuple[int, int], elbow: tuple[int, int], body: bool
 ) -> None:
     depth = drawn_arm(wrist, elbow, 700.0, body)
-    scene = scene_of(NYU_CAMERA)
+    scene = scene_of(LABEL_CAMERA)
     crops = scene.extract(depth[None], 1.0)
     rows, columns = np.nonzero(crops.heights[0])
     u, v = (crops.origin[0] + crops.step[0] * np.stack([columns, rows], axis=-1)).T
@@ -176,7 +176,7 @@ def test_lines_of_sight_are_turned_upright() -> None:
 
 
 def test_a_picture_without_a_hand_holds_none() -> None:
-    scene = scene_of(NYU_CAMERA)
+    scene = scene_of(LABEL_CAMERA)
     empty, wall, speck = np.zeros((3, 480, 640), np.float32)
     wall[:] = 2500.0
     speck[100:104, 100:110] = 600.0
@@ -184,7 +184,7 @@ def test_a_picture_without_a_hand_holds_none() -> None:
     assert not crops.found.any()
     assert (crops.n_blobs == 0).all()
     blank = Recording(
-        name="wall", format="test", camera=NYU_CAMERA, times_ns=np.arange(3), read=lambda k: wall
+        name="wall", format="test", camera=LABEL_CAMERA, times_ns=np.arange(3), read=lambda k: wall
     )
     with pytest.raises(EstimationError, match="no hand was found in 3 frames"):
         HandSegmenter.learn(blank, HAND.view)
@@ -240,7 +240,7 @@ def test_real_hands_before_real_people_are_found(reference_data: Path) -> None:
     )  # and it is the same one all along
     picture = read_picture(reference_data / "hand_nyu" / "depth_1_0000001.png")
     depth = (picture[..., 1].astype(np.float32) * 256 + picture[..., 0])[None]
-    scene = scene_of(NYU_CAMERA)
+    scene = scene_of(LABEL_CAMERA)
     crops = scene.extract(depth, 1.1)
     view, truth = (
         view_of(scene.crop_cameras(crops)),

@@ -33,7 +33,7 @@ def pretended_run(
 ) -> Path:
     """Stands in for `run_session`."""
     from liex_lab.catalog import find_model, sha256
-    from liex_lab.recordings.source_files import file_digest
+    from liex_lab.recordings.recording import file_digest
 
     name = Path(recording).stem
     marks = Path(recording).parents[1] / f"{name}.runs"

@@ -9,7 +9,7 @@ import pytest
 from liex_lab.pipelines.hashing import hashed_ahead
 
 from liex_lab.recordings import open_recording
-from liex_lab.recordings.source_files import file_digest
+from liex_lab.recordings.recording import file_digest
 from tests.recordings.writers import depth_frames, write_mcap
 
 

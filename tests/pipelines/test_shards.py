@@ -21,7 +21,7 @@ from liex_lab.pipelines.workers import Processes
 from liex_lab.api import run_session
 from liex_lab.errors import RecordingError, SessionError
 from liex_lab.plan import Plan
-from liex_lab.recordings.formats.moseq import reader
+from liex_lab.recordings.formats import moseq
 from liex_lab.recordings.recording import Recording
 from liex_lab.sessions import Session
 from liex_lab.sessions.source import linked_recording
@@ -161,13 +161,13 @@ def test_workers_of_this_machine_read_what_an_archive_was_unpacked_to(
     archive = write_archive(packed, tmp_path / "walk.tar.gz")
     write_camera(tmp_path, mouse.camera)
     told: list[Any] = []
-    unpack = reader.unpack
+    unpack = moseq.unpack
 
     def unpack_and_tell(*what: Any) -> Any:
         told.append(what[0])
         return unpack(*what)
 
-    monkeypatch.setattr(reader, "unpack", unpack_and_tell)
+    monkeypatch.setattr(moseq, "unpack", unpack_and_tell)
     shards._opened.cache_clear()
     pool = InTurn()
     pool.here = here

@@ -22,7 +22,7 @@ from mcap.writer import CompressionType
 from numpy.typing import NDArray
 
 from liex_lab.recordings.formats.messages.mcap import McapFile
-from liex_lab.recordings.formats.messages.message_file import Envelope, MessageFile
+from liex_lab.recordings.formats.messages.messages import Envelope, MessageFile
 from liex_lab.recordings.formats.messages.rosbag import BagFile
 from liex_lab.runtime.progress import silent
 from tests.recordings.oni_files import Codec, depth_builder, plain_payload

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import struct
 from collections.abc import Sequence
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal
 
@@ -202,8 +203,15 @@ def plain_payload(frame: NDArray[np.uint16], codec: str) -> bytes:
     """A frame in one of the three codecs."""
     if codec == "NONE":
         return frame.astype("<u2").tobytes()
+    return _packed(frame.astype("<u2").tobytes(), codec)
+
+
+@lru_cache(maxsize=4096)
+def _packed(pixels: bytes, codec: str) -> bytes:
+    """A packed frame; tests write the same ones again and again."""
+    frame = np.frombuffer(pixels, "<u2")
     if codec == "16zP":
-        return plain_16z(frame.ravel())
+        return plain_16z(frame)
     table, numbers = np.unique(frame, return_inverse=True)
     return (
         struct.pack("<H", len(table))

@@ -20,7 +20,7 @@ from rosbags import rosbag1, rosbag2
 from rosbags.typesys import Stores, get_typestore
 
 from liex_lab.optics.camera import Camera
-from liex_lab.recordings.rvl import pack_rvl
+from liex_lab.recordings.depth_kernels import pack_rvl
 from tests.recordings.writers import SMALL, STEP_NS, even_times
 
 INVERSE_A, INVERSE_B = 10100.0, 1.0 - 10100.0 / 10.0  # ROS's own values for depths up to 10 m

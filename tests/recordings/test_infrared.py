@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from liex_lab.recordings import open_recording
-from liex_lab.recordings.infrared import is_infrared
+from liex_lab.recordings.camera_file import is_infrared
 from tests.recordings.asking import refusal
 from tests.recordings.video_writers import write_avi, write_mkv
 from tests.recordings.writers import SMALL, depth_frames, even_times, write_png_folder

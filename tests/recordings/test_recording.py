@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from liex_lab.errors import RecordingError
 from liex_lab.recordings import DepthFrame, Recording, open_recording
 from liex_lab.recordings.frame import depth_mm
-from liex_lab.recordings.source_files import file_digest
+from liex_lab.recordings.recording import file_digest
 from tests.recordings.writers import (
     SMALL,
     depth_frames,

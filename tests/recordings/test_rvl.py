@@ -7,8 +7,8 @@ import struct
 import numpy as np
 import pytest
 
-from liex_lab.recordings.rvl import pack_rvl, rvl_message, to_millimetres
-from liex_lab.recordings.rvl import unpack_rvl as unpack
+from liex_lab.recordings.depth_kernels import pack_rvl, rvl_message, to_millimetres
+from liex_lab.recordings.depth_kernels import unpack_rvl as unpack
 from tests.oracles.rvl import unpack_rvl
 
 

@@ -15,7 +15,7 @@ import pytest
 
 from liex_lab.catalog import find_sample
 from liex_lab.errors import LiexError, RecordingError
-from liex_lab.recordings.formats.messages import message_file
+from liex_lab.recordings.formats.messages import messages
 from liex_lab.runtime.limits import check_limits, why_short
 from liex_lab.sessions.failure import describe_failure
 
@@ -68,7 +68,7 @@ def test_a_chunk_that_memory_does_not_suffice_for_is_not_damaged(
     def short(*_: object) -> bytes:
         raise ValueError("Allocation error : not enough memory")
 
-    monkeypatch.setattr(message_file, "_inflate", short)
+    monkeypatch.setattr(messages, "_inflate", short)
     from liex_lab.recordings import open_recording
 
     with pytest.raises((MemoryError, RecordingError)) as caught, open_recording(SAMPLE) as one:

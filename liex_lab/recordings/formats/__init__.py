@@ -1,1 +1,1 @@
-"""Readers and writers of depth formats, one package to a family; `recordings.open` chooses."""
+"""Readers and writers of depth formats, by family; `recordings.open` chooses among them."""

@@ -25,9 +25,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.errors import RecordingError
-from liex_lab.recordings.formats._ffv1_kernels import crc_table, slices_agree
-from liex_lab.recordings.formats.images.stack import not_depth_error, too_large
-from liex_lab.recordings.infrared import is_infrared, refuse_infrared
+from liex_lab.recordings.camera_file import is_infrared, refuse_infrared
+from liex_lab.recordings.depth_kernels import crc_table, slices_agree
+from liex_lab.recordings.formats.images.files import Stack, not_depth_error, too_large
 from liex_lab.recordings.timestamps import LIMIT_NS
 from liex_lab.runtime.progress import Progress
 
@@ -228,7 +228,7 @@ def _index(path: Path, progress: Progress) -> DepthTrack:
             dtype = _dtype(stream)
             if dtype is None:
                 codec = stream.codec_context
-                name = codec.name if is_mkv else codec.codec_tag
+                name = "unknown" if codec is None else codec.name if is_mkv else codec.codec_tag
                 raise RecordingError(
                     f"expected 16-bit depth in FFV1 or uncompressed, but {path} is packed with "
                     f"{name!r}; give the video of the depth itself"
@@ -275,8 +275,8 @@ def _title(stream: Any) -> str:
 def _dtype(stream: Any) -> str | None:
     """How raw numbers are stored, "" for FFV1, None for what is not read."""
     codec = stream.codec_context
-    if codec.name == _FFV1:
-        return ""
+    if codec is None or codec.name == _FFV1:
+        return None if codec is None else ""
     return _RAW.get(codec.format.name) if codec.name == "rawvideo" and codec.format else None
 
 
@@ -321,8 +321,8 @@ class Ffv1:
         return depth.astype(np.uint16, copy=False)
 
 
-class DepthVideo:
-    """Depth track of a video file as frames of one size; also a `Stack`."""
+class DepthVideo(Stack):
+    """Depth track of a video file as frames of one size."""
 
     def __init__(self, path: Path, track: DepthTrack) -> None:
         """Open the file, and find the key frames of FFV1.
@@ -333,7 +333,7 @@ class DepthVideo:
         self.track = track
         self.width = track.width
         self.height = track.height
-        self.problems: list[str] = []
+        self.problems = []
         self._path = path
         self._file = path.open("rb", buffering=0)
         self._lock = Lock()
@@ -368,11 +368,6 @@ class DepthVideo:
 
     def __len__(self) -> int:
         return len(self.track.offsets)
-
-    @property
-    def whole(self) -> list[bool]:
-        """(n,) True, for the frames that are listed lie whole in the file."""
-        return [True] * len(self)
 
     @property
     def truncated(self) -> bool:

@@ -11,7 +11,7 @@ import os
 from pathlib import Path
 
 from liex_lab.errors import LiexError
-from liex_lab.recordings.formats.images.nyu_labels import N_FIRST_PERSON, REFERENCE_FILE
+from liex_lab.recordings.formats.images.nyu import N_FIRST_PERSON, REFERENCE_FILE
 
 VARIABLE = "LIEX_NYU"
 FITTED = f"fitted to the labels of the NYU test frames from {N_FIRST_PERSON + 1} on"

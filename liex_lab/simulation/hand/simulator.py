@@ -23,9 +23,9 @@ from liex_lab.body.surface import Surface
 from liex_lab.errors import LiexError
 from liex_lab.foreground.hand_segmenter import sight_rotations
 from liex_lab.geometry import SE3
-from liex_lab.recordings.formats.images.nyu_labels import (
+from liex_lab.recordings.formats.images.nyu import (
+    LABEL_CAMERA,
     N_FIRST_PERSON,
-    NYU_CAMERA,
     NyuReference,
     fit_hands,
 )
@@ -42,7 +42,7 @@ from liex_lab.simulation.training_patches import BLOCK, PER_SESSION, TrainingPat
 
 Array = NDArray[np.float64]
 
-NYU_SENSOR = Sensor("NYU Kinect", NYU_CAMERA, PRIMESENSE_KIND)
+NYU_SENSOR = Sensor("NYU Kinect", LABEL_CAMERA, PRIMESENSE_KIND)
 FRAME_NS = 33_333_333
 N_SESSIONS = 40
 N_FRAMES = 50

@@ -13,7 +13,7 @@ from mcap.writer import CompressionType
 
 from liex_lab.errors import RecordingError
 from liex_lab.recordings import Recording, open_recording
-from liex_lab.recordings.formats.messages import message_file
+from liex_lab.recordings.formats.messages import messages
 from liex_lab.recordings.formats.messages.mcap import McapFile
 from liex_lab.recordings.formats.messages.mcap_writer import McapDepthWriter
 from liex_lab.recordings.frame import DepthFrame
@@ -103,12 +103,12 @@ def test_a_file_with_an_index_is_not_walked_and_few_chunks_are_unpacked(
     KINDS[kind](path)
     unpacked: list[int] = []
 
-    def count(packed: bytes, chunk: message_file.Chunk) -> bytes:
+    def count(packed: bytes, chunk: messages.Chunk) -> bytes:
         unpacked.append(chunk.size)
         return one(packed, chunk)
 
-    one = message_file.unpacked
-    monkeypatch.setattr(message_file, "unpacked", count)
+    one = messages.unpacked
+    monkeypatch.setattr(messages, "unpacked", count)
     monkeypatch.setattr(McapFile, "_walk", lambda *_: pytest.fail("the file was walked"))
     with open_recording(path, strict=True) as recording:
         assert len(recording) == 20

@@ -223,7 +223,7 @@ def test_what_an_archive_was_unpacked_to_opens_as_the_same_recording(
 def test_what_an_archive_was_unpacked_to_is_read_in_any_order_and_again(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stretch: int
 ) -> None:
-    monkeypatch.setattr("liex_lab.recordings.formats.moseq.reader.STRETCH", stretch)
+    monkeypatch.setattr("liex_lab.recordings.formats.moseq.STRETCH", stretch)
     monkeypatch.setattr("liex_lab.runtime.disk.STRETCH", stretch)
     with open_recording(write_archive(folder, tmp_path / "s.tar.gz")) as recording:
         for k in (*range(20), 19, 3, *np.random.default_rng(6).permutation(20), 0, 0):
@@ -279,7 +279,7 @@ def test_an_archive_may_be_several_gzips_one_after_the_other(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, packed: int
 ) -> None:
     # so that a border of reading meets every border
-    monkeypatch.setattr("liex_lab.recordings.formats.moseq.archive._PACKED", packed)
+    monkeypatch.setattr("liex_lab.recordings.formats.moseq_files._PACKED", packed)
     plain = gzip.decompress(write_archive(folder, tmp_path / "one.tar.gz").read_bytes())
     parts = [plain[i : i + 9000] for i in range(0, len(plain), 9000)]
     (tmp_path / "s.tar.gz").write_bytes(b"".join(map(gzip.compress, parts)) + bytes(700))

@@ -11,9 +11,9 @@ from scipy.io import savemat
 from liex_lab.body import Pose, Skeleton
 from liex_lab.errors import LiexError
 from liex_lab.geometry import SE3
-from liex_lab.recordings.formats.images.nyu_labels import (
+from liex_lab.recordings.formats.images.nyu import (
+    LABEL_CAMERA,
     N_FIRST_PERSON,
-    NYU_CAMERA,
     NYU_IDS,
     POINTS,
     REFERENCE_FILE,
@@ -36,7 +36,7 @@ def labels(n: int) -> np.ndarray:
         np.ones(n),
     )
     points = points_of_joints(HAND) @ pose.joints(HAND)
-    return np.concatenate([NYU_CAMERA.project(points), points[..., 2:]], axis=-1)
+    return np.concatenate([LABEL_CAMERA.project(points), points[..., 2:]], axis=-1)
 
 
 def test_every_point_is_a_mean_of_joints() -> None:

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from liex_lab.optics.camera import Camera, Lens
 from liex_lab.recordings import Recording, open_recording
-from liex_lab.recordings.formats._oni_kernels import unpack_16z
+from liex_lab.recordings.depth_kernels import unpack_16z
 from tests.oracles.oni import unpack_frame
 from tests.recordings.asking import refusal
 from tests.recordings.oni_files import (

@@ -14,9 +14,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from liex_lab.recordings import open_recording
-from liex_lab.recordings.depth_units import decode, own_unit_mm
-from liex_lab.recordings.formats.images._lzf_kernels import unpack_lzf
-from liex_lab.recordings.formats.images.pclzf import read_pclzf_camera
+from liex_lab.recordings.depth_kernels import unpack_lzf
+from liex_lab.recordings.formats.images.files import read_pclzf_camera
+from liex_lab.recordings.frame import decode, own_unit_mm
 from tests.oracles import lzf
 from tests.recordings.asking import refusal
 from tests.recordings.picture_writers import pack_lzf, write_folder, write_pclzf, write_pgm

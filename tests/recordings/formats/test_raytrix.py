@@ -15,8 +15,11 @@ import pytest
 from liex_lab.errors import RecordingError
 from liex_lab.optics.camera import Camera
 from liex_lab.recordings import open_recording
-from liex_lab.recordings.formats.images.raytrix import read_ray_calibration
-from liex_lab.recordings.formats.images.raytrix_profile import Profile, shipped_profiles
+from liex_lab.recordings.formats.images.raytrix import (
+    Profile,
+    read_ray_calibration,
+    shipped_profiles,
+)
 from tests.recordings.asking import refusal
 from tests.recordings.picture_writers import (
     points_of,

@@ -16,8 +16,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from liex_lab.recordings import open_recording
-from liex_lab.recordings.formats._ffv1_kernels import crc_table, slices_agree
-from liex_lab.recordings.formats.moseq.azure_kinect import MODES, Mode, read_calibration
+from liex_lab.recordings.depth_kernels import crc_table, slices_agree
+from liex_lab.recordings.formats.moseq import MODES, Mode, read_calibration
 from liex_lab.recordings.formats.video import DepthTrack, DepthVideo, open_video
 from liex_lab.runtime.progress import silent
 from tests.oracles import ffv1

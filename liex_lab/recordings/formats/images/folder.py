@@ -17,11 +17,16 @@ from numpy.typing import NDArray
 
 from liex_lab.errors import RecordingError, SeveralKindsError, UnknownTimesError
 from liex_lab.optics.camera import Lens
-from liex_lab.recordings.camera_file import CAMERA_FILE, WHAT_TO_WRITE, CameraFile, rate
-from liex_lab.recordings.depth_units import COLOUR, Stored
-from liex_lab.recordings.formats.images.stack import Stack
-from liex_lab.recordings.frame import Depth
-from liex_lab.recordings.infrared import is_infrared, refuse_infrared
+from liex_lab.recordings.camera_file import (
+    CAMERA_FILE,
+    WHAT_TO_WRITE,
+    CameraFile,
+    is_infrared,
+    rate,
+    refuse_infrared,
+)
+from liex_lab.recordings.formats.images.files import Stack
+from liex_lab.recordings.frame import COLOUR, Depth, Stored
 from liex_lab.recordings.recording import Recording
 from liex_lab.recordings.timestamp_files import name_numbers, name_times, read_stamps
 from liex_lab.recordings.timestamps import (
@@ -159,7 +164,7 @@ def open_images(
         camera: comes before a camera.toml.
         fps: frame rate, Hz; used only where there are no time stamps, and before that of a
             camera.toml.
-        progress: told how many pictures were looked at.
+        progress: reports how many pictures were looked at.
         pattern: which names of the folder to take; None takes those that camera.toml states.
 
     Returns:
@@ -227,7 +232,7 @@ class Folder:
     def _recording(self, format: str, camera: Lens | None, fps: float | None) -> Recording:
         stack, camera_toml = self.stack, self.camera_toml
         the_camera = camera_toml.camera(stack.width, stack.height, camera)
-        problems = [*camera_toml.problems, *stack.problems, *_say_cut(stack)]
+        problems = [*camera_toml.problems, *stack.problems, *_cut_problems(stack)]
         doubts: list[str] = []
         kept, monotone, start = self._times(fps, problems, doubts)
         _refuse_negative(stack, self.decode, camera_toml)
@@ -314,7 +319,7 @@ def _kind(path: Path) -> str:
 
 def _with_xml(camera_file: CameraFile, picture: Path) -> CameraFile:
     """The camera file completed by the intrinsics that PCL writes beside each picture."""
-    from liex_lab.recordings.formats.images.pclzf import read_pclzf_camera
+    from liex_lab.recordings.formats.images.files import read_pclzf_camera
 
     found = read_pclzf_camera(picture)
     if camera_file.intrinsics or found is None:
@@ -335,7 +340,7 @@ def open_stack(kind: str, files: list[Path], camera_file: CameraFile, progress: 
         kind: a key of `KINDS`.
         files: the pictures, in order.
         camera_file: what the folder's camera.toml says, for encoding and byte_order.
-        progress: told how many were looked at.
+        progress: reports how many were looked at.
 
     Returns:
         The pictures as a stack.
@@ -344,7 +349,7 @@ def open_stack(kind: str, files: list[Path], camera_file: CameraFile, progress: 
         RecordingError: they cannot be read, or the stated encoding does not fit their kind.
     """
     if kind == "PNG":
-        from liex_lab.recordings.formats.images.png import open_pngs
+        from liex_lab.recordings.formats.images.files import open_pngs
 
         return open_pngs(files, progress, colour=camera_file.encoding == COLOUR)
     if camera_file.encoding == COLOUR:
@@ -354,11 +359,11 @@ def open_stack(kind: str, files: list[Path], camera_file: CameraFile, progress: 
             f"{files[0].name} is a {kind} picture; correct it"
         )
     if kind == "PGM":
-        from liex_lab.recordings.formats.images.pgm import open_pgms
+        from liex_lab.recordings.formats.images.files import open_pgms
 
         return open_pgms(files, progress, camera_file.byte_order)
     if kind == "PCLZF":
-        from liex_lab.recordings.formats.images.pclzf import open_pclzfs
+        from liex_lab.recordings.formats.images.files import open_pclzfs
 
         return open_pclzfs(files, progress)
     from liex_lab.recordings.formats.images.tiff import open_tiffs
@@ -366,7 +371,7 @@ def open_stack(kind: str, files: list[Path], camera_file: CameraFile, progress: 
     return open_tiffs(files, progress)
 
 
-def _say_cut(stack: Stack) -> list[str]:
+def _cut_problems(stack: Stack) -> list[str]:
     cut = [i for i, whole in enumerate(stack.whole) if not whole]
     return [
         f"{len(cut)} of {len(stack)} pictures are cut short or damaged and were taken as wholly "

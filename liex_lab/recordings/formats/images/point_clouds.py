@@ -14,10 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.optics.camera import Camera
-from liex_lab.recordings.formats.images.stack import (
-    DAMAGED,
+from liex_lab.recordings.formats.images.files import (
     FileStack,
-    Look,
+    Probe,
     Size,
     open_files,
     something_else,
@@ -65,7 +64,7 @@ def open_clouds(
         camera: the camera that sees them.
         columns: of x, y, z in a text file, from 0.
         to_camera: a file's points (n, 3) in its own units to mm in the camera frame.
-        progress: told how many were looked at.
+        progress: reports how many were looked at.
 
     Returns:
         Pictures (H, W) float64 mm, 0 = unread, as a stack.
@@ -85,12 +84,12 @@ def open_clouds(
             (H, W) mm; None where it is damaged.
         """
         points = read_points(path, columns)
-        return None if points is None else see(to_camera(points), camera)
+        return None if points is None else render_points(to_camera(points), camera)
 
     return open_files(files, "point cloud", lambda path: _look(path, size), decode, progress)
 
 
-def see(p_camera: Points, camera: Camera) -> NDArray[np.float64]:
+def render_points(p_camera: Points, camera: Camera) -> NDArray[np.float64]:
     """Depth that a camera sees of points: the nearest in every pixel.
 
     Args:
@@ -127,21 +126,17 @@ def read_points(path: Path, columns: tuple[int, int, int]) -> Points | None:
         return None
 
 
-def _look(path: Path, size: Size) -> Look:
+def _look(path: Path, size: Size) -> Probe:
     with path.open("rb") as file:
         head = file.read(_HEAD_BYTES)
     if path.suffix.lower() != PLY:
         lines = head.decode("utf-8", "replace").splitlines()[:3]
-        return (
-            Look(size)
-            if any(_numbers(line) for line in lines)
-            else something_else(path, "point cloud")
-        )
+        return size if any(map(_numbers, lines)) else something_else(path, "point cloud")
     if not head.startswith(b"ply"[: len(head)]):
         return something_else(path, "PLY")
     header = _ply_header(head)
     there = header is not None and path.stat().st_size - header.start >= header.n * header.row_bytes
-    return Look(size) if there else DAMAGED
+    return size if there else None
 
 
 def _numbers(line: str) -> list[str]:
@@ -160,7 +155,7 @@ def _read_text(path: Path, columns: tuple[int, int, int]) -> Points:
         first = [file.readline(_HEAD_BYTES) for _ in range(3)]
     n_header = next((k for k, line in enumerate(first) if _numbers(line)), 0)
     delimiter = next((mark for mark in ";," if mark in first[n_header]), None)
-    with warnings.catch_warnings():  # an empty file is told as no points
+    with warnings.catch_warnings():  # an empty file has no points
         warnings.simplefilter("ignore", UserWarning)
         return np.loadtxt(
             path, delimiter=delimiter, skiprows=n_header, usecols=columns, ndmin=2, encoding="utf-8"

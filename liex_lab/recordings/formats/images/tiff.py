@@ -2,7 +2,7 @@
 
 Uncompressed pixels in one piece are read straight from their offset; other pages go through
 tifffile, and codecs that it leaves to another package (LZW) through OpenCV. A stack ends at its
-first bad page, for what follows cannot be told from noise.
+first bad page, for what follows may be noise.
 """
 
 from __future__ import annotations
@@ -20,7 +20,8 @@ import tifffile
 from numpy.typing import NDArray
 
 from liex_lab.errors import RecordingError
-from liex_lab.recordings.formats.images.stack import (
+from liex_lab.recordings.formats.images.files import (
+    Stack,
     none_whole_error,
     not_depth_error,
     one_size_error,
@@ -62,8 +63,8 @@ class _Page(NamedTuple):
 
 
 @dataclass
-class TiffStack:
-    """TIFF pictures of one size, in order; a `Stack` with one file open at a time.
+class TiffStack(Stack):
+    """TIFF pictures of one size, in order, with one file open at a time.
 
     Attributes:
         pages: the pictures.
@@ -186,7 +187,7 @@ def _fits(packed: bytes, compression: int, most: int) -> bool:
     except lzma.LZMAError:
         return False
     except zlib.error:
-        return True  # damage is told by who unpacks it
+        return True  # whoever unpacks it reports damage
     return unpacked <= most
 
 
@@ -208,7 +209,7 @@ def open_tiffs(files: list[Path], progress: Progress) -> TiffStack:
 
     Args:
         files: the files, in order, of one page or many.
-        progress: told how many files were looked at.
+        progress: reports how many files were looked at.
 
     Returns:
         The pictures as a stack.
@@ -223,7 +224,7 @@ def open_tiffs(files: list[Path], progress: Progress) -> TiffStack:
         found, size, ends = _list_pages(path)
         n_whole = next((i for i, page in enumerate(found) if not page.whole), len(found))
         if n_whole and (n_whole < len(found) or not ends):
-            # a stack ends at its first bad page: what follows cannot be told from noise
+            # a stack ends at its first bad page: what follows may be noise
             problems.append(
                 f"{path.name} is cut short: only its first {n_whole} pictures are whole"
             )

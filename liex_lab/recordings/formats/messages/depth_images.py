@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from liex_lab.errors import RecordingError
 from liex_lab.optics.camera import Camera
-from liex_lab.recordings.formats.images.png import decode_png, png_size
+from liex_lab.recordings.formats.images.files import decode_png, png_size
 from liex_lab.recordings.formats.messages.messages import (
     DamagedMessage,
     DepthMessage,
@@ -68,7 +68,7 @@ def picture_size(message: DepthMessage) -> tuple[int, int] | None:
     return found if found is not None and min(found) > 0 and _fits(found) else None
 
 
-def said_kind(message: DepthMessage) -> str:
+def stated_kind(message: DepthMessage) -> str:
     """What a message says that it holds, for a sentence.
 
     Args:
@@ -163,7 +163,7 @@ def _packed_pixels(message: PackedPicture) -> NDArray[Any] | None:
     body = _body(message)
     pixels: NDArray[Any] | None
     if _is_rvl(message):
-        from liex_lab.recordings.rvl import unpack_rvl
+        from liex_lab.recordings.depth_kernels import unpack_rvl
 
         width, height = _RVL_SIZE.unpack_from(body)
         pixels = unpack_rvl(body[_RVL_SIZE.size :], width, height)

@@ -25,38 +25,30 @@ from numpy.typing import NDArray
 from liex_lab.errors import LiexError, RecordingError, UnknownCameraError
 from liex_lab.optics.camera import Camera, Distortion, Lens
 from liex_lab.optics.presets import is_central
-from liex_lab.recordings.camera_file import CAMERA_FILE, CameraFile, fitting
-from liex_lab.recordings.depth_units import PLAUSIBLE_MM
+from liex_lab.recordings.camera_file import CAMERA_FILE, CameraFile, fitting, is_infrared
 from liex_lab.recordings.formats.messages.depth_images import (
     decode,
     picture_size,
-    said_kind,
-)
-from liex_lab.recordings.formats.messages.message_file import (
-    Channel,
-    DamagedChunk,
-    Envelope,
-    Listed,
-    MessageFile,
-    Place,
-    printable,
+    stated_kind,
 )
 from liex_lab.recordings.formats.messages.messages import (
     CLOUD_SCHEMAS,
     Calibration,
+    Channel,
+    DamagedChunk,
     DamagedMessage,
     DepthMessage,
+    Envelope,
+    Listed,
+    MessageFile,
     Parser,
+    Place,
     Statement,
+    printable,
 )
-from liex_lab.recordings.formats.messages.pack_facts import PackFacts
-from liex_lab.recordings.formats.messages.parsers import (
-    parser_of,
-    plain_schema,
-)
-from liex_lab.recordings.formats.messages.realsense import Statements, calibration_in
-from liex_lab.recordings.frame import Depth
-from liex_lab.recordings.infrared import is_infrared
+from liex_lab.recordings.formats.messages.parsers import parser_of, plain_schema
+from liex_lab.recordings.formats.messages.statements import PackFacts, Statements, calibration_in
+from liex_lab.recordings.frame import PLAUSIBLE_MM, Depth
 from liex_lab.recordings.recording import Recording
 from liex_lab.recordings.timestamps import in_order_of_sensor, start_of_clock
 from liex_lab.runtime.progress import Progress
@@ -193,9 +185,9 @@ class _Frames:
         camera: the camera of the recording.
         step_mm: mm in a step of 16-bit depth.
         unread: what a camera.toml calls unread.
-        problems: is told of pictures that cannot be read.
+        problems: sentences, appended to for frames that cannot be read.
         scale: what all depth is multiplied by.
-        bad: pictures of which it was told.
+        bad: frames that were reported.
         lock: held while the file is read.
     """
 
@@ -248,8 +240,8 @@ class _Frames:
         assert isinstance(message, DepthMessage)
         with suppress(*_DAMAGE):
             depth = decode(message, self.camera, self.step_mm, self.scale, self.unread)
-            return depth, said_kind(message)
-        return None, said_kind(message)
+            return depth, stated_kind(message)
+        return None, stated_kind(message)
 
     def scale_by(self, factors: Sequence[float]) -> None:
         """Multiply all depth by the first factor that gives depths of a camera above an animal.
@@ -276,7 +268,7 @@ def open_topic(
         kind: name of the format, for `Recording.format`.
         camera: comes before whatever the files state.
         topic: name of the depth topic; None for the only one.
-        progress: told how far the walk over the file is.
+        progress: reports how far the walk over the file is.
 
     Returns:
         The recording; it can be read on where the file grows (MCAP).
@@ -407,7 +399,7 @@ def _walk(file: MessageFile, found: _Found, progress: Progress) -> None:
     for channel, listed in found.listed.items():  # some, spread over the recording up to the last
         for k in np.linspace(0, len(listed) - 1, _N_COMPARED).astype(int).tolist():
             log_ns, place = listed[k]
-            with suppress(RecordingError):  # a damaged chunk: who reads its pictures is told
+            with suppress(RecordingError):  # a damaged chunk is reported when a frame in it is read
                 take(Envelope(channel, log_ns, place, file.read(place)))
     file.whole = file.whole and not found.failed.keys() & found.read
 
@@ -438,9 +430,9 @@ def _note(found: _Found, envelope: Envelope | Listed, parse: Parser) -> bool:
     if channel not in found.depths:
         size = picture_size(message)
         if size is None:
-            found.kinds[channel] = said_kind(message)
+            found.kinds[channel] = stated_kind(message)
             return False
-        metric = said_kind(message).startswith(("32FC1", "points"))
+        metric = stated_kind(message).startswith(("32FC1", "points"))
         found.depths[channel] = _Topic(channel, parse, message.frame_id, size, metric)
     found.depths[channel].add(envelope, message.stamp_ns)
     return True

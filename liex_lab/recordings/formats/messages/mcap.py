@@ -26,7 +26,7 @@ from mcap.records import Schema as SchemaRecord
 from liex_lab.errors import RecordingError
 from liex_lab.optics.camera import Lens
 from liex_lab.recordings.formats.messages.depth_topics import open_topic
-from liex_lab.recordings.formats.messages.message_file import (
+from liex_lab.recordings.formats.messages.messages import (
     Channel,
     Chunk,
     DamagedChunk,
@@ -83,7 +83,7 @@ def open_mcap(
         path: the .mcap file.
         camera: comes before whatever the files state.
         fps: not needed, for every message has its time.
-        progress: told how far the walk over the file is.
+        progress: reports how far the walk over the file is.
         topic: name of the depth topic; None for the only one.
 
     Returns:
@@ -128,9 +128,8 @@ class McapFile(MessageFile):
         self._schemas: dict[int, str] = {0: "no schema"}
         self.listed: list[bytes] = []  # the indexes of its chunks, as they are written
         self.n_messages: int | None = None  # in all chunks, as the file's own statistics say
-        self._coming: dict[
-            int, Future[bytes]
-        ] = {}  # chunks that are being unpacked, by where their content begins
+        # chunks that are being unpacked, by where their content begins
+        self._coming: dict[int, Future[bytes]] = {}
         self._sure = (
             len(MAGIC),
             0,
@@ -158,7 +157,7 @@ class McapFile(MessageFile):
 
         Args:
             wanted: says of a channel whether its messages are of use.
-            progress: told how many MB were walked over.
+            progress: reports how many MB were walked over.
 
         Yields:
             The messages.

@@ -42,7 +42,8 @@ from liex_lab.recordings.formats.messages.mcap import (
     Wanted,
     open_file,
 )
-from liex_lab.recordings.formats.messages.message_file import (
+from liex_lab.recordings.formats.messages.messages import (
+    CALIBRATION_SCHEMAS,
     Channel,
     DamagedChunk,
     Envelope,
@@ -50,7 +51,6 @@ from liex_lab.recordings.formats.messages.message_file import (
     Place,
     first_bytes,
 )
-from liex_lab.recordings.formats.messages.messages import CALIBRATION_SCHEMAS
 from liex_lab.recordings.formats.messages.parsers import plain_schema, stamp_reader
 from liex_lab.recordings.recording import Recording
 from liex_lab.runtime.progress import Progress, silent

@@ -1,14 +1,32 @@
-"""Common form of the messages that hold depth or describe it, whatever they were packed as.
+"""Files of messages on named topics, with packed chunks, and the messages in a common form.
+
+This is what MCAP files and ROS bags share. A file is walked once from beginning to end, which needs
+no index and so reads cut files, too; afterwards every message is read from its position.
 
 Schemas: foxglove.RawImage, CompressedImage, PointCloud and CameraCalibration; sensor_msgs/Image,
-CompressedImage, PointCloud2 and CameraInfo; std_msgs/String, std_msgs/Float32 and
-diagnostic_msgs/KeyValue for what the RealSense programs state (see `realsense`).
+CompressedImage, PointCloud2 and CameraInfo (`parsers`); std_msgs/String, std_msgs/Float32 and
+diagnostic_msgs/KeyValue for what the RealSense programs state (`statements`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import bz2
+import re
+from abc import ABC, abstractmethod
+from bisect import bisect_right
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
+from pathlib import Path
+from typing import IO, NamedTuple
+
+import numpy as np
+from isal import isal_zlib
+from numpy.typing import NDArray
+
+from liex_lab.errors import RecordingError
+from liex_lab.runtime.limits import why_short
+from liex_lab.runtime.progress import Progress
 
 PICTURE_SCHEMAS = (
     "foxglove.RawImage",
@@ -19,6 +37,8 @@ PICTURE_SCHEMAS = (
 CLOUD_SCHEMAS = ("foxglove.PointCloud", "sensor_msgs/PointCloud2")
 CALIBRATION_SCHEMAS = ("foxglove.CameraCalibration", "sensor_msgs/CameraInfo")
 STATEMENT_SCHEMAS = ("std_msgs/String", "std_msgs/Float32", "diagnostic_msgs/KeyValue")
+# topics of which the RealSense programs state facts
+STATES = re.compile(r"(/option/Depth[ _]Units/value|/image/metadata|/camera_info)$")
 
 
 class DamagedMessage(ValueError):
@@ -137,3 +157,354 @@ class Statement:
 DepthMessage = RawPicture | PackedPicture | PointCloud
 Message = DepthMessage | Calibration | Statement
 Parser = Callable[[memoryview], Message]
+
+
+# A chunk is some megabytes. A damaged one may state any size, and a few bytes unpack to as many
+# zeros as one likes.
+_LARGEST_CHUNK = 1 << 27
+_PACKINGS = {b"\x28\xb5\x2f\xfd": "zstd", b"\x04\x22\x4d\x18": "lz4"}  # by their first bytes
+_PIECE = 1 << 15  # bytes of a packed chunk that are read at once where its beginning is wanted
+
+
+class Place(NamedTuple):
+    """Where a message's data lies.
+
+    Attributes:
+        chunk: number of the chunk in whose unpacked bytes it lies; -1 for the file itself.
+        offset: where it begins there, bytes.
+        length: its length, bytes.
+    """
+
+    chunk: int
+    offset: int
+    length: int
+
+
+class Channel(NamedTuple):
+    """What is on a topic.
+
+    Attributes:
+        topic: name of the topic.
+        schema: type of its messages, as in sensor_msgs/Image.
+        encoding: protobuf, json, ros1 or cdr.
+    """
+
+    topic: str
+    schema: str
+    encoding: str
+
+
+class Envelope(NamedTuple):
+    """A message as it is met on the walk.
+
+    Attributes:
+        channel: topic, schema and encoding.
+        log_time_ns: time of logging, ns.
+        place: where its data lies, to fetch it again.
+        data: its bytes.
+        publish_time_ns: when it was sent, ns; 0 where the file does not state it.
+    """
+
+    channel: Channel
+    log_time_ns: int
+    place: Place
+    data: memoryview
+    publish_time_ns: int = 0
+
+
+class Listed(NamedTuple):
+    """Messages that an index lists: fetched when they are wanted.
+
+    Attributes:
+        channel: topic, schema and encoding.
+        log_time_ns: (n,) uint64 times of logging, ns.
+        places: (n, 3) int64 chunk, offset and length of each, as a `Place`.
+        stamp_ns: (n,) int64 stamps of the sensor, ns; None takes the times of logging.
+        publish_time_ns: (n,) when each was sent, ns; None where that was not read.
+    """
+
+    channel: Channel
+    log_time_ns: NDArray[np.uint64]
+    places: NDArray[np.int64]
+    stamp_ns: NDArray[np.int64] | None = None
+    publish_time_ns: NDArray[np.uint64] | None = None
+
+
+class Chunk(NamedTuple):
+    """Messages packed together.
+
+    Attributes:
+        offset: where the packed bytes begin in the file.
+        length: how many packed bytes there are.
+        packing: their compression: none, zstd, lz4 or bz2.
+        size: unpacked size, bytes.
+        crc: CRC-32 of the unpacked bytes; 0 for none.
+        cut: True where the file ends before the chunk does.
+    """
+
+    offset: int
+    length: int
+    packing: str
+    size: int
+    crc: int
+    cut: bool
+
+
+class DamagedChunk(Exception):
+    """A chunk does not unpack to what was packed."""
+
+
+class MessageFile(ABC):
+    """An open file of messages.
+
+    Attributes:
+        path: where the file is.
+        file: the open file.
+        size: its size, bytes.
+        whole: True while it ends as it should and nothing in it was found damaged.
+        parsed: False where messages were listed by an index, and only some of them looked at.
+        channels: all channels that were met, each once, in order; as keys, for a file may name
+            thousands of them.
+        notes: facts that the file states about itself.
+        chunks: all chunks that were met, in file order.
+        starts: where the records of chunks begin, as the file's own index says, in order.
+    """
+
+    def __init__(self, path: Path, file: IO[bytes]) -> None:
+        """Take an open file; nothing is read yet.
+
+        Args:
+            path: where the file is.
+            file: the open file.
+        """
+        self.path = path
+        self.file = file
+        self.size = path.stat().st_size
+        self.whole = True
+        self.parsed = True
+        self.channels: dict[Channel, None] = {}
+        self.notes: dict[str, str] = {}
+        self.chunks: list[Chunk] = []
+        self.starts: list[int] = []
+        self._last_chunk: tuple[int, memoryview] = (-1, memoryview(b""))
+
+    @abstractmethod
+    def walk(
+        self, wanted: Callable[[Channel], bool], progress: Progress
+    ) -> Iterator[Envelope | Listed]:
+        """Every whole message of the wanted channels, in file order.
+
+        Args:
+            wanted: says of a channel whether its messages are of use.
+            progress: reports how far the walk is.
+
+        Yields:
+            The messages.
+        """
+
+    def go_on(self) -> int | None:
+        """Make ready for a walk over what was written behind the last whole record since.
+
+        Returns:
+            How many chunks the walks before are sure of; None where the file has to be opened anew.
+        """
+        return None
+
+    def resume(self, at: int) -> int:
+        """Where to go on behind a damaged record: at the next chunk that is known, or the end.
+
+        Args:
+            at: position of the record, bytes.
+
+        Returns:
+            Position to read on from, bytes; `whole` is False afterwards.
+        """
+        self.whole = False
+        n = bisect_right(self.starts, at)
+        return self.starts[n] if n < len(self.starts) else self.size
+
+    def read(self, place: Place) -> memoryview:
+        """The data of one message.
+
+        Args:
+            place: where it lies.
+
+        Returns:
+            Its bytes.
+
+        Raises:
+            RecordingError: its chunk cannot be unpacked any more.
+        """
+        if place.chunk >= 0:
+            try:
+                return self.unpack(place.chunk)[place.offset : place.offset + place.length]
+            except DamagedChunk as error:
+                raise RecordingError(
+                    f"{self.path} changed while it was read ({error}); copy it again"
+                ) from None
+        self.file.seek(place.offset)
+        return memoryview(self.file.read(place.length))
+
+    def unpack(self, number: int) -> memoryview:
+        """The unpacked bytes of a chunk; the last one is kept, for neighbouring frames share it.
+
+        Args:
+            number: index into `chunks`.
+
+        Returns:
+            The bytes.
+
+        Raises:
+            DamagedChunk: it states a size that cannot be, or does not unpack to what was packed.
+        """
+        if self._last_chunk[0] != number:
+            chunk = self.believable(number)
+            self.file.seek(chunk.offset)
+            self._last_chunk = (-1, memoryview(b""))  # never two at once
+            self._last_chunk = (number, memoryview(unpacked(self.file.read(chunk.length), chunk)))
+        return self._last_chunk[1]
+
+    def believable(self, number: int) -> Chunk:
+        """A chunk whose stated size is one that it may have.
+
+        Args:
+            number: index into `chunks`.
+
+        Raises:
+            DamagedChunk: it states a size that cannot be.
+        """
+        chunk = self.chunks[number]
+        if chunk.size > max(_LARGEST_CHUNK, 2 * self.size):
+            raise DamagedChunk(f"it states that it unpacks to {chunk.size} bytes")
+        return chunk
+
+    def close(self) -> None:
+        """Close the file and let go of the last chunk."""
+        self.file.close()
+        self._last_chunk = (-1, memoryview(b""))
+
+
+def unpacked(packed: bytes, chunk: Chunk) -> bytes:
+    """The bytes of a chunk, checked against its size and CRC-32.
+
+    Of one that is cut, as many as there are: what lies before the cut is as it was written.
+
+    Args:
+        packed: its packed bytes.
+        chunk: what the file says of it.
+
+    Returns:
+        The unpacked bytes.
+
+    Raises:
+        DamagedChunk: it does not unpack to what was packed, or its compression is not known.
+    """
+    with _codec_errors():
+        data = _inflate(packed, chunk.packing, chunk.size)
+    if chunk.cut:
+        return data
+    if len(data) != chunk.size:
+        raise DamagedChunk(f"{len(data)} bytes came out of it and {chunk.size} went in")
+    if chunk.crc and isal_zlib.crc32(data) != chunk.crc:
+        raise DamagedChunk("its checksum is wrong")
+    return data
+
+
+def unpacked_message(data: memoryview) -> memoryview:
+    """The bytes of a message, unpacked where a recorder packs every message by itself.
+
+    Args:
+        data: the message; it begins otherwise than a packed one does if it is not packed.
+
+    Raises:
+        DamagedChunk: it does not unpack.
+    """
+    packing = _PACKINGS.get(bytes(data[:4]))
+    if packing is None:
+        return data
+    whole = Chunk(0, len(data), packing, _LARGEST_CHUNK, 0, cut=True)  # it does not state its size
+    return memoryview(unpacked(bytes(data), whole))
+
+
+def first_bytes(file: IO[bytes], chunk: Chunk, size: int) -> bytes:
+    """The first bytes of a packed chunk; no more of it is unpacked than that takes, nor checked.
+
+    Args:
+        file: the open file.
+        chunk: what the file says of the chunk, packed by zstd or lz4.
+        size: how many unpacked bytes are wanted.
+
+    Returns:
+        The bytes.
+
+    Raises:
+        DamagedChunk: there are fewer, or it does not unpack.
+    """
+    file.seek(chunk.offset)
+    with _codec_errors():
+        if chunk.packing == "zstd":
+            import zstandard
+
+            unpacker = zstandard.ZstdDecompressor()
+            with unpacker.stream_reader(file, read_size=_PIECE, closefd=False) as reader:
+                data = reader.read(size)
+        else:
+            data = _inflate(file.read(chunk.length), chunk.packing, size)
+    if len(data) < size:
+        raise DamagedChunk(f"{len(data)} bytes came out of it and {size} were expected")
+    return data
+
+
+@contextmanager
+def _codec_errors() -> Iterator[None]:
+    """Turn the exceptions of the codecs, which are foreign, into ours."""
+    try:
+        yield
+    except DamagedChunk:
+        raise
+    except Exception as error:
+        if why_short(error):  # which says nothing about the file
+            raise MemoryError(str(error)) from None
+        raise DamagedChunk(str(error)) from None
+
+
+def _inflate(packed: bytes, packing: str, size: int) -> bytes:
+    """At most `size` bytes. Piece by piece, so that a chunk that is cut gives what it still
+    holds.
+    """
+    if packing in ("", "none"):
+        return packed[:size]
+    if packing == "zstd":
+        import zstandard
+
+        unpacker = zstandard.ZstdDecompressor()
+        if zstandard.frame_content_size(packed) == size:  # in one go, and no more than that
+            try:
+                return unpacker.decompress(packed)
+            except zstandard.ZstdError:
+                pass  # it is cut
+        with unpacker.stream_reader(packed) as reader:
+            return reader.read(size)
+    if packing == "lz4":
+        import lz4.frame
+
+        unpacked: bytes = lz4.frame.LZ4FrameDecompressor().decompress(packed, max_length=size)
+        return unpacked
+    if packing == "bz2":
+        return bz2.BZ2Decompressor().decompress(packed, max_length=size)
+    raise DamagedChunk(f"its packing {packing[:20]!r} is not known")
+
+
+def printable(text: str, length: int = 80) -> str:
+    """A name out of a file, fit for a sentence: a damaged one may hold anything.
+
+    Args:
+        text: the name.
+        length: how many characters are kept.
+
+    Returns:
+        The name with ? for what cannot be printed, and ... where it was longer.
+    """
+    return "".join(c if c.isprintable() else "?" for c in text[:length]) + (
+        "..." if len(text) > length else ""
+    )

@@ -1,8 +1,8 @@
 """ROS bags, whole or cut: ROS 1 `.bag` (format 2.0, also RealSense's) and ROS 2 `.db3` (SQLite).
 
 A `.bag` is walked from its beginning and needs no index, which is written last and so is missing
-exactly where a recording broke off; `rosbags`, the library that the tests compare with, refuses
-such files. A record is a header of named fields and data; a chunk packs records (none, bz2, lz4).
+exactly if a recording broke off; `rosbags`, the library that the tests compare with, refuses such
+files. A record is a header of named fields and data; a chunk packs records (none, bz2, lz4).
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from typing import IO
 from liex_lab.errors import RecordingError
 from liex_lab.optics.camera import Lens
 from liex_lab.recordings.formats.messages.depth_topics import open_topic
-from liex_lab.recordings.formats.messages.message_file import (
+from liex_lab.recordings.formats.messages.messages import (
     Channel,
     Chunk,
     DamagedChunk,
@@ -56,7 +56,7 @@ def open_bag(
         path: the .bag or .db3 file.
         camera: comes before whatever the files state.
         fps: not needed, for every message has its time.
-        progress: told how far the walk over the file is.
+        progress: reports how far the walk over the file is.
         topic: name of the depth topic; None for the only one.
 
     Returns:
@@ -100,7 +100,7 @@ class BagFile(MessageFile):
 
         Args:
             wanted: says of a channel whether its messages are of use.
-            progress: told how many MB were walked over.
+            progress: reports how many MB were walked over.
 
         Yields:
             The messages.
@@ -263,7 +263,7 @@ class Db3File(MessageFile):
 
         Args:
             wanted: says of a channel whether its messages are of use.
-            progress: told how many messages were walked over.
+            progress: reports how many messages were walked over.
 
         Yields:
             The messages, up to the first that is damaged.

@@ -1,26 +1,35 @@
-"""Statements of the RealSense programs about their recordings: depth unit, camera, sensor times.
+"""What known programs state about their recordings: RealSense's, and `liex pack`.
 
-A `.bag` (until 2025) holds them in numbers, KeyValues and a CameraInfo; a `.db3` (since 2026) holds
-all of them in strings such as "fx=287.9;ppx=159.5". Both use the same topics, of a sensor or of one
-of its streams, and converters keep these. In a `.db3` a depth image's header has the time of
-arrival, counted from the beginning of the recording; the sensor's is in the metadata of its frame.
+A RealSense `.bag` (until 2025) holds depth unit, camera and sensor times in numbers, KeyValues and
+a CameraInfo; a `.db3` (since 2026) holds all of them in strings such as "fx=287.9;ppx=159.5". Both
+use the same topics, of a sensor or of one of its streams, and converters keep these. In a `.db3` a
+depth image's header has the time of arrival, counted from the beginning of the recording; the
+sensor's is in the metadata of its frame.
 """
 
 from __future__ import annotations
 
+import json
 import re
 from collections import Counter, defaultdict
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from decimal import Decimal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from liex_lab.recordings.formats.messages.message_file import Envelope, Place
-from liex_lab.recordings.formats.messages.messages import Calibration, Statement
-from liex_lab.recordings.timestamps import LIMIT_NS, start_of_clock
+from liex_lab.errors import RecordingError
+from liex_lab.recordings.formats.messages.messages import (
+    STATES,
+    Calibration,
+    Envelope,
+    Place,
+    Statement,
+)
+from liex_lab.recordings.timestamps import FAULTS, LIMIT_NS, start_of_clock
 
-STATES = re.compile(r"(/option/Depth[ _]Units/value|/image/metadata|/camera_info)$")
 _OF_PROGRAM = re.compile(r"^/device_\d+/sensor_\d+/")
 _ROUNDING_MM = 1e-3  # units are written with six decimals of a metre
 _LENS = ("width", "height", "fx", "ppx", "fy", "ppy")
@@ -98,8 +107,8 @@ class Statements:
         Args:
             topic: name of the depth topic.
             settled: whether a camera.toml states the unit.
-            problems: is told where a recording of the programs states none.
-            doubts: is told where it states several.
+            problems: appended to where a recording of the programs states none.
+            doubts: appended to where it states several.
 
         Returns:
             mm; None where the file does not state it, or states several and it is settled.
@@ -151,7 +160,7 @@ class Statements:
             topic: name of the depth topic.
             logged_ns: (n,) times of logging, ns, in order.
             arrived_ns: (n,) stamps in their headers, ns.
-            problems: is told where images have no metadata.
+            problems: appended to where images have no metadata.
 
         Returns:
             (n,) ns; the stamps of the headers where the file has no metadata.
@@ -179,3 +188,131 @@ def _ms_as_ns(text: str) -> int:
     if not abs(float(text)) * 1e6 < LIMIT_NS:
         raise ValueError(f"a time in the metadata is {text}")
     return int((Decimal(text.strip()) * 1_000_000).to_integral_value())
+
+
+# What an archive made by `liex pack` says of the recording that it was made of.
+
+
+SUFFIX = ".pack"  # of the name before .mcap; it is no part of the recording's name
+_FACTS = "packed"
+_HASH = "depth_sha256"
+
+
+@dataclass(frozen=True)
+class PackFacts:
+    """The facts; all at their defaults for a file that is no archive.
+
+    Attributes:
+        step_mm: mm of a stored step.
+        problems: sentences about the recording.
+        doubts: reasons not to rely on its times.
+        moved: frames whose stamps were moved, and why: index into `FAULTS` by row.
+        source: name, format and SHA-256 of the recording.
+        region_px: (u, v) corners of the polygon that the pixels kept lie in; empty for the whole
+            picture, or where it was found and is no polygon.
+        n_px: pixels of a picture that are kept; 0 where all are.
+        depth_sha256: SHA-256 of times (int64 ns) and pictures (uint16 steps), little endian, in
+            order; empty where it is not known.
+        packed: whether the file is an archive.
+    """
+
+    step_mm: float = 1.0
+    problems: list[str] = field(default_factory=list)
+    moved: dict[int, int] = field(default_factory=dict)
+    source: dict[str, str] = field(default_factory=dict)
+    region_px: list[list[float]] = field(default_factory=list)
+    n_px: int = 0
+    depth_sha256: str = ""
+    packed: bool = False
+    doubts: list[str] = field(default_factory=list)
+
+    @staticmethod
+    def of(notes: Mapping[str, str]) -> PackFacts:
+        """The facts in a file's notes.
+
+        Args:
+            notes: texts by name.
+
+        Raises:
+            RecordingError: they are not what `liex pack` writes.
+        """
+        if _FACTS not in notes:
+            return PackFacts()
+        try:
+            table = json.loads(notes[_FACTS])
+            moved = {int(row): int(why) for row, why in table["moved"].items()}
+            facts = PackFacts(
+                float(table["step_mm"]),
+                [str(problem) for problem in table["problems"]],
+                moved,
+                {str(key): str(value) for key, value in table["source"].items()},
+                [[float(u), float(v)] for u, v in table["region_px"]],
+                int(table["n_px"]),
+                notes.get(_HASH, ""),
+                True,
+                [str(doubt) for doubt in table.get("doubts", ())],
+            )
+            sound = 0.0 < facts.step_mm < 1000.0 and all(
+                0 < why < len(FAULTS) for why in moved.values()
+            )
+        except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
+            sound = False
+        if not sound:
+            raise RecordingError(
+                "the facts of this archive are damaged, so that its depth would have no unit; "
+                "pack the recording again"
+            )
+        return facts
+
+    def to_notes(self) -> dict[str, str]:
+        """The facts as texts for the file's notes, but for the hash, see `hash_note`."""
+        table = {
+            "step_mm": self.step_mm,
+            "problems": self.problems,
+            "moved": {str(row): why for row, why in self.moved.items()},
+            "source": self.source,
+            "region_px": self.region_px,
+            "n_px": self.n_px,
+            "doubts": self.doubts,
+        }
+        return {_FACTS: json.dumps(table)}
+
+    def name(self, stem: str) -> str:
+        """Name of the recording.
+
+        Args:
+            stem: name of the file without .mcap.
+        """
+        return stem.removesuffix(SUFFIX) if self.packed else stem
+
+    @property
+    def metadata(self) -> dict[str, Any]:
+        """What the open recording says of being an archive; nothing of another file."""
+        if not self.packed:
+            return {}
+        table = {"source": self.source, "step_mm": self.step_mm, "depth_sha256": self.depth_sha256}
+        return {"packed": table}
+
+    def faults(self, found: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """Why the stamps of the recording's frames were moved.
+
+        Args:
+            found: (n,) what the archive's own stamps say.
+
+        Returns:
+            (n,) index into `FAULTS`.
+        """
+        faults = found.copy()
+        for row, why in self.moved.items():
+            if 0 <= row < len(faults):
+                faults[row] = why
+        return faults
+
+
+def hash_note(depth_sha256: str) -> dict[str, str]:
+    """The text that closes an archive.
+
+    Args:
+        depth_sha256: see `PackFacts`.
+    """
+    return {_HASH: depth_sha256}

@@ -3,38 +3,45 @@
 A session is a folder or a .tar.gz. depth.dat is raw uint16, frame after frame, without a header.
 The camera is stated, or from the factory's calibration in the video, or typical of a Kinect v2 or
 an Azure Kinect; stamps lie beside the depth, or are the video's own, or follow a constant rate.
+
+The factory of an Azure Kinect (or Orbbec Femto, its successor) states normalised intrinsics of the
+whole sensor; a depth mode is a crop of it, perhaps binned two by two:
+
+    fx_px = fx side,    cx_px = cx side - left - 1/2.
+
+Distortion is Brown-Conrady with eight coefficients (ROS: rational_polynomial).
 """
 
 from __future__ import annotations
 
+import json
 import re
 import shutil
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
 from threading import Lock
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.errors import RecordingError
-from liex_lab.optics.camera import KINECT_V2, Camera, Lens
-from liex_lab.recordings.camera_file import CAMERA_FILE, CameraFile, rate
+from liex_lab.optics.camera import KINECT_V2, Camera, Distortion, Lens
+from liex_lab.recordings.camera_file import CAMERA_FILE, CameraFile, rate, refuse_infrared
+from liex_lab.recordings.formats.images.files import Stack
 from liex_lab.recordings.formats.images.folder import Pictures
-from liex_lab.recordings.formats.images.stack import Stack
-from liex_lab.recordings.formats.moseq.archive import Unpacked, unpack
-from liex_lab.recordings.formats.moseq.azure_kinect import azure_camera, mode_of, read_calibration
-from liex_lab.recordings.formats.moseq.metadata import (
+from liex_lab.recordings.formats.moseq_files import (
     AZURE,
     KINECT,
     METADATA,
     STAMPS,
     Metadata,
+    Unpacked,
     read_metadata,
     read_session_stamps,
+    unpack,
 )
-from liex_lab.recordings.infrared import refuse_infrared
 from liex_lab.recordings.recording import Recording
 from liex_lab.recordings.timestamps import (
     Times,
@@ -50,6 +57,122 @@ from liex_lab.runtime.scratch import Scratch
 
 if TYPE_CHECKING:
     from liex_lab.recordings.formats.video import DepthTrack
+
+
+class Mode(NamedTuple):
+    """A depth mode.
+
+    Attributes:
+        name: its name in the Azure Kinect sensor SDK.
+        width: columns of its pictures, px.
+        height: rows of its pictures, px.
+        side: side of the sensor once binned, px.
+        left: column of the picture's corner on it, px.
+        top: row of the picture's corner on it, px.
+    """
+
+    name: str
+    width: int
+    height: int
+    side: int
+    left: int
+    top: int
+
+
+MODES = (  # of the Azure Kinect sensor SDK
+    Mode("NFOV_UNBINNED", 640, 576, 1024, 192, 180),
+    Mode("NFOV_2X2BINNED", 320, 288, 512, 96, 90),
+    Mode("WFOV_2X2BINNED", 512, 512, 512, 0, 0),
+    Mode("WFOV_UNBINNED", 1024, 1024, 1024, 0, 0),
+)
+_TYPICAL = (
+    0.5,
+    0.5,
+    0.492,
+    0.492,
+)  # cx, cy, fx, fy as shares of the sensor's side; units differ by about 1 %
+_DEPTH_CAMERA = ("CALIBRATION_CameraLocationD0", "CALIBRATION_CameraPurposeDepth")
+
+
+class FactoryLens(NamedTuple):
+    """What a factory calibration says of the depth camera.
+
+    Attributes:
+        shares: cx, cy, fx, fy as shares of the sensor's side.
+        distortion: k1 k2 p1 p2 k3 k4 k5 k6.
+    """
+
+    shares: tuple[float, float, float, float]
+    distortion: tuple[float, ...]
+
+
+def mode_of(width: int, height: int) -> Mode | None:
+    """The depth mode with pictures of a given size.
+
+    Args:
+        width: columns, px.
+        height: rows, px.
+
+    Returns:
+        The mode; None where there is none.
+    """
+    return next((mode for mode in MODES if (mode.width, mode.height) == (width, height)), None)
+
+
+def read_calibration(data: bytes) -> FactoryLens | None:
+    """The depth camera in the calibration (JSON) that recorders attach to their files.
+
+    Args:
+        data: the JSON, perhaps with zeros at its end.
+
+    Returns:
+        The lens; None where the data do not state one.
+    """
+    try:
+        cameras = json.loads(data.rstrip(b"\0"))["CalibrationInformation"]["Cameras"]
+        depth = next(
+            c
+            for c in cameras
+            if c.get("Location") == _DEPTH_CAMERA[0] or c.get("Purpose") == _DEPTH_CAMERA[1]
+        )
+        values = [float(value) for value in depth["Intrinsics"]["ModelParameters"]]
+    except (ValueError, KeyError, TypeError, AttributeError, StopIteration, RecursionError):
+        return None
+    if len(values) < 14 or not np.isfinite(values).all() or min(values[2:4]) <= 0:
+        return None
+    cx, cy, fx, fy, k1, k2, k3, k4, k5, k6, _, _, p2, p1 = values[:14]
+    return FactoryLens((cx, cy, fx, fy), (k1, k2, p1, p2, k3, k4, k5, k6))
+
+
+def azure_camera(mode: Mode, lens: FactoryLens | None) -> Camera:
+    """The camera of a depth mode, in pixels of its pictures.
+
+    Pixel (0, 0) is the centre of the top-left pixel, hence the half that is taken off.
+
+    Args:
+        mode: the depth mode.
+        lens: the factory's calibration; None for typical numbers, which differ by about 1 % from
+            unit to unit.
+
+    Returns:
+        The camera, with distortion where lens is given.
+    """
+    cx, cy, fx, fy = _TYPICAL if lens is None else lens.shares
+    facts: dict[str, Any] = {
+        "fx": fx * mode.side,
+        "fy": fy * mode.side,
+        "cx": cx * mode.side - mode.left - 0.5,
+        "cy": cy * mode.side - mode.top - 0.5,
+        "width": mode.width,
+        "height": mode.height,
+    }
+    if lens is None:
+        return Camera(**facts, source=f"typical Azure Kinect, {mode.name}")
+    distortion = Distortion.of("rational_polynomial", lens.distortion)
+    return Camera(
+        **facts, source="the camera's factory calibration in the file", distortion=distortion
+    )
+
 
 DEPTH = "depth.dat"
 VIDEOS = ("depth.avi", "depth.mkv")
@@ -69,7 +192,7 @@ _OTHER_SIZES = (
 
 
 @dataclass
-class RawFrames:
+class RawFrames(Stack):
     """Frames one after the other in a file without a header, read with `seek`; a `Stack`.
 
     Not a memory map: mapped pages count as the process's memory, and a long session would look like
@@ -91,7 +214,7 @@ class RawFrames:
     height: int
     dtype: str
     n: int
-    truncated: bool
+    truncated: bool = False
     problems: list[str] = field(default_factory=list)
     once: bool = False
 
@@ -102,11 +225,6 @@ class RawFrames:
 
     def __len__(self) -> int:
         return self.n
-
-    @property
-    def whole(self) -> list[bool]:
-        """True for each frame, (n,), for only whole frames are counted."""
-        return [True] * self.n
 
     def read(self, index: int) -> NDArray[Any]:
         """Stored values of one frame.
@@ -162,7 +280,7 @@ def open_moseq(
         path: the folder or file.
         camera: comes before whatever the files state.
         fps: frame rate, Hz; used only where there are no time stamps.
-        progress: told how far unpacking and indexing are.
+        progress: reports how far unpacking and indexing are.
 
     Returns:
         The recording.

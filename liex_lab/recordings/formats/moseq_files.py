@@ -1,30 +1,35 @@
-"""Streaming extraction of a session from .tar or .tar.gz that keeps every byte a cut archive holds.
+"""Files of a MoSeq session: extraction from .tar or .tar.gz, metadata.json and time stamps.
 
 The archive is decompressed in order (DEFLATE has no random access): once, by ISA-L on a thread of
-its own, nearly three times as fast as zlib, where it is whole. One that is cut or damaged is
-unpacked once more by zlib, whose state can be copied: smaller and smaller pieces are tried until
-the last good byte has come out; the tar walk is then fed zeros, and each file is written only as
-far as its bytes are real.
+its own, nearly three times as fast as zlib, if it is whole. One that is cut or damaged is unpacked
+once more by zlib, whose state can be copied: smaller and smaller pieces are tried up to the last
+good byte; the tar walk then reads zeros, and each file is written only as far as its bytes are
+real. Stamps are in depth_ts.txt (ms) or timestamps.csv (s).
 """
 
 from __future__ import annotations
 
 import errno
 import gzip
+import json
 import shutil
 import tarfile
 import zlib
 from collections.abc import Generator, Iterator, Sequence
 from contextlib import closing, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
-from typing import IO
+from typing import IO, Any
 
 from isal import igzip_threaded, isal_zlib
 
 from liex_lab.errors import RecordingError
+from liex_lab.recordings.camera_file import CameraFile
+from liex_lab.recordings.timestamp_files import Stamps, read_stamps
+from liex_lab.recordings.timestamps import start_of_day
 from liex_lab.runtime.disk import write_through
 from liex_lab.runtime.progress import Progress
+from liex_lab.runtime.text_files import read_text
 
 _PACKED = 1 << 18  # bytes read at once
 _UNPACKED = 1 << 17  # and unpacked at once: an empty picture is a thousand times its packed size
@@ -95,7 +100,7 @@ class _Patient:
     Args:
         file: the open archive.
         size: its bytes.
-        progress: told how many MB were unpacked.
+        progress: reports how many MB were unpacked.
         fast: by ISA-L, which raises `_Damaged` where there is damage.
     """
 
@@ -245,7 +250,7 @@ def unpack(archive: Path, wanted: Sequence[str], folder: Path, progress: Progres
         archive: the .tar, .tar.gz or .tgz file.
         wanted: plain names of the members to write.
         folder: where they are written.
-        progress: told how many MB were unpacked.
+        progress: reports how many MB were unpacked.
 
     Returns:
         The files written, all names met, and whether the archive is cut.
@@ -340,3 +345,170 @@ def _copy(member: tarfile.TarInfo, to: Path, stream: _Patient) -> bool:
             ) from None
         raise
     return written < member.size
+
+
+# Metadata of a MoSeq session: metadata.json, depth_ts.txt (ms) and timestamps.csv (s).
+
+
+STAMPS = {"depth_ts.txt": 10**6, "timestamps.csv": 10**9}  # file: nanoseconds in its unit
+METADATA = "metadata.json"
+# cameras, as far as they are told apart
+AZURE = "Azure Kinect"
+KINECT = "Kinect v2"
+OTHER = "other"
+
+_CAMERA_KEYS = (
+    "camera",
+    "cameratype",
+    "cameramodel",
+    "device",
+    "devicename",
+    "devicemodel",
+    "sensor",
+)
+_CAMERA_WORDS = {  # word in a camera's name: which one it is; the first that is found counts
+    "azure": AZURE,
+    "k4a": AZURE,
+    "femto": AZURE,
+    "kinectv2": KINECT,
+    "kinect2": KINECT,
+    "kinectone": KINECT,
+    "kinectforwindowsv2": KINECT,
+}
+
+
+@dataclass(frozen=True)
+class Metadata:
+    """What metadata.json says.
+
+    Attributes:
+        size: (width, height), px; None when unstated.
+        dtype: of the stored depths, "<u2" or ">u2".
+        camera: `AZURE`, `KINECT`, `OTHER`, or None when it does not say.
+        camera_name: the camera in the file's own words; empty when unstated.
+        facts: for `Recording.metadata`.
+        problems: sentences about what was not used.
+    """
+
+    size: tuple[int, int] | None
+    dtype: str
+    camera: str | None
+    camera_name: str
+    facts: dict[str, Any]
+    problems: list[str]
+
+
+def read_metadata(path: Path | None, cut: bool) -> Metadata:
+    """Parse metadata.json, which is often missing.
+
+    Args:
+        path: the file; None where there is none, and then nothing is stated.
+        cut: True where its archive is cut; a broken file is then left out instead of refused.
+
+    Returns:
+        What it says.
+
+    Raises:
+        RecordingError: the file is no JSON object, or its DepthResolution cannot be.
+    """
+    nothing = Metadata(None, "<u2", None, "", {}, [])
+    if path is None:
+        return nothing
+    try:
+        document = json.loads(read_text(path))
+        if not isinstance(document, dict):
+            raise ValueError("it is not an object in braces")
+    except (
+        ValueError,
+        RecursionError,
+    ) as error:  # broken JSON and broken UTF-8 are both ValueErrors
+        if cut:
+            return replace(nothing, problems=[f"{METADATA} is cut short and was not used"])
+        raise RecordingError(
+            f"{METADATA} of the session is not JSON ({error}); correct or remove it"
+        ) from None
+    named = {
+        "subject_id": document.get("SubjectName"),
+        "session_name": document.get("SessionName"),
+    }
+    facts = {key: str(said).strip() for key, said in named.items() if type(said) in (str, int)}
+    stated = document.get("StartTime")
+    facts |= {"session_start_time": start_of_day(stated) or ""}
+    facts = {key: said for key, said in facts.items() if said}
+    problems = []
+    if stated is not None and "session_start_time" not in facts:
+        problems.append(
+            f"StartTime {stated!r} in {METADATA} is not a time with a zone, so it was not used"
+        )
+    little = document.get("IsLittleEndian", True) is not False
+    size = _stated_size(document.get("DepthResolution"))
+    return Metadata(size, "<u2" if little else ">u2", *_stated_camera(document), facts, problems)
+
+
+def _stated_size(value: Any) -> tuple[int, int] | None:
+    if value is None:
+        return None
+    if (
+        isinstance(value, list)
+        and len(value) == 2
+        and all(type(v) is int and 0 < v < 20_000 for v in value)
+    ):
+        return value[0], value[1]
+    raise RecordingError(
+        f"{METADATA} states DepthResolution = {value!r}; it is [width, height] in pixels"
+    )
+
+
+def _stated_camera(document: dict[str, Any]) -> tuple[str | None, str]:
+    """Which camera the metadata name, and in which words: programs that record for MoSeq have no
+    common key for it.
+    """
+    entries = {
+        key.lower().replace("_", "").replace(" ", ""): value for key, value in document.items()
+    }
+    stated = (entries[key].strip() for key in _CAMERA_KEYS if isinstance(entries.get(key), str))
+    name = next(filter(None, stated), "")
+    plain = "".join(letter for letter in name.lower() if letter.isalnum())
+    known = (camera for word, camera in _CAMERA_WORDS.items() if word in plain)
+    return next(known, OTHER if name else None), name
+
+
+def read_session_stamps(
+    files: dict[str, Path],
+    cut: bool,
+    camera_file: CameraFile,
+    problems: list[str],
+    doubts: list[str],
+) -> Stamps | None:
+    """Read the file of time stamps beside the depth.
+
+    depth_ts.txt counts milliseconds and timestamps.csv seconds, unless their first line names a
+    column in another unit, or camera.toml does. Of a cut archive, half a number at the end is
+    dropped, from the file too.
+
+    Args:
+        files: the session's files by name.
+        cut: True where their archive is cut.
+        camera_file: may state the column of times and its unit.
+        problems: sentences, appended to where the stamps are missing or give an unlikely rate.
+        doubts: reasons not to rely on the times, appended to.
+
+    Returns:
+        The stamps; None where there are none.
+
+    Raises:
+        RecordingError: a line has no stamp where one was expected.
+    """
+    name = next((name for name in STAMPS if name in files), None)
+    if name is None:
+        return None
+    path = files[name]
+    if cut:  # the archive may have broken off inside this file: half a number is a wrong number
+        text = path.read_bytes()
+        path.write_bytes(text[: text.rfind(b"\n") + 1])
+    stated = (camera_file.time_column, camera_file.time_unit, STAMPS[name])
+    stamps = read_stamps(path, doubts, *stated)
+    if not len(stamps):
+        problems.append(f"{name} holds no time stamp")
+        return None
+    return stamps

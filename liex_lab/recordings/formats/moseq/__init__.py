@@ -1,1 +1,0 @@
-"""MoSeq sessions (raw depth.dat, depth video or archive) with metadata; Azure Kinect files."""
