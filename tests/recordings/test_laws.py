@@ -9,7 +9,6 @@ import io
 import os
 import shutil
 import tracemalloc
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -37,12 +36,6 @@ def path(form: Format, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return form.write(tmp_path_factory.mktemp("laws"), STORED)
 
 
-@pytest.fixture
-def recording(path: Path) -> Iterator[Recording]:
-    with open_recording(path, strict=True) as recording:
-        yield recording
-
-
 def assert_is(depth: np.ndarray, index: int, form: Format, stored: np.ndarray = STORED) -> None:
     """The frame is that which was written."""
     assert depth.dtype == np.float32
@@ -50,7 +43,7 @@ def assert_is(depth: np.ndarray, index: int, form: Format, stored: np.ndarray = 
     np.testing.assert_array_equal(depth == 0, stored[index] == 0)  # unread stays unread
 
 
-def test_it_holds_what_was_written(recording: Recording, form: Format) -> None:
+def it_holds_what_was_written(recording: Recording, form: Format) -> None:
     assert (len(recording), recording.n_whole, recording.truncated) == (N, N, False)
     assert (recording.width, recording.height) == (64, 48)
     lens = recording.camera
@@ -63,7 +56,7 @@ def test_it_holds_what_was_written(recording: Recording, form: Format) -> None:
         assert_is(frame.depth, index, form)
 
 
-def test_times_increase_by_what_was_written(recording: Recording) -> None:
+def times_increase_by_what_was_written(recording: Recording, form: Format) -> None:
     assert recording.times_ns.dtype == np.int64
     assert np.all(np.diff(recording.times_ns) > 0)
     np.testing.assert_allclose(
@@ -73,7 +66,7 @@ def test_times_increase_by_what_was_written(recording: Recording) -> None:
     assert (recording.gaps, recording.faults) == ([], [])
 
 
-def test_it_reads_in_any_order_and_again(recording: Recording, form: Format) -> None:
+def it_reads_in_any_order_and_again(recording: Recording, form: Format) -> None:
     for index in (5, 0, 3, 3, -1, 6, 1):
         assert_is(recording.frame(index).depth, index % N, form)
     first, second = list(recording), list(recording)
@@ -83,21 +76,37 @@ def test_it_reads_in_any_order_and_again(recording: Recording, form: Format) -> 
         assert_is(later.depth, here.index + 2, form)
 
 
-@pytest.mark.parametrize("part", [slice(2, 5), slice(None, None, 2), slice(-3, None), slice(1, 2)])
-def test_a_slice_is_a_recording_of_its_frames(
-    recording: Recording, form: Format, part: slice
-) -> None:
-    cut, rows = recording[part], range(N)[part]
-    assert len(cut) == len(rows)
-    np.testing.assert_array_equal(cut.times_ns, recording.times_ns[part])
-    assert [frame.index for frame in cut] == list(range(len(rows)))
-    for frame, row in zip(cut, rows, strict=True):
-        assert_is(frame.depth, row, form)
+def a_slice_is_a_recording_of_its_frames(recording: Recording, form: Format) -> None:
+    for part in (slice(2, 5), slice(None, None, 2), slice(-3, None), slice(1, 2)):
+        cut, rows = recording[part], range(N)[part]
+        assert len(cut) == len(rows)
+        np.testing.assert_array_equal(cut.times_ns, recording.times_ns[part])
+        assert [frame.index for frame in cut] == list(range(len(rows)))
+        for frame, row in zip(cut, rows, strict=True):
+            assert_is(frame.depth, row, form)
 
 
-def test_pictures_may_be_written_on(recording: Recording, form: Format) -> None:
+def images_may_be_written_on(recording: Recording, form: Format) -> None:
     recording.frame(1).depth[:] = -1
     assert_is(recording.frame(1).depth, 1, form)
+
+
+READING = (
+    it_holds_what_was_written,
+    times_increase_by_what_was_written,
+    it_reads_in_any_order_and_again,
+    a_slice_is_a_recording_of_its_frames,
+    images_may_be_written_on,
+)
+
+
+def test_an_open_recording_keeps_the_laws_of_reading(
+    form: Format, path: Path, subtests: pytest.Subtests
+) -> None:
+    with open_recording(path, strict=True) as recording:
+        for law in READING:
+            with subtests.test(law.__name__):
+                law(recording, form)
 
 
 def test_what_goes_while_it_is_read_gives_its_frames_or_a_sentence(
