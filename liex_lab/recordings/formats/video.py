@@ -242,10 +242,10 @@ def _index(path: Path, progress: Progress) -> DepthTrack:
                 track.session_start = began.isoformat()
             number, n_stated, time_base = stream.index, stream.frames, stream.time_base
             first = next(container.demux(stream), None)
-    except av.FFmpegError as error:
+    except av.FFmpegError:
         raise RecordingError(
-            f"{path} is no {'Matroska' if is_mkv else 'AVI'} video that can be read ({error}); "
-            "copy it again or give another file"
+            f"{path} is named like {'a Matroska' if is_mkv else 'an AVI'} video but cannot be read "
+            "as one; copy it again, or give another file"
         ) from None
     size = path.stat().st_size
     with path.open("rb", buffering=0) as file:
