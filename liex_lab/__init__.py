@@ -15,12 +15,12 @@ import os
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from liex_lab.moved import keep_old_paths
+from liex_lab.deprecated_paths import install_path_finder
 from liex_lab.runtime.kernel_cache import keep_kernels
 
 __version__ = "0.1.0"
 
-keep_old_paths()
+install_path_finder()
 # kernels' threads that have nothing to do sleep; OpenMP's usual ones spin, on cores on which
 # recordings are read and logs are written meanwhile (libgomp reads this when it is loaded)
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")

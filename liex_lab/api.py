@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 from liex_lab.errors import MissingPackageError, how_to_install
 from liex_lab.plan import Plan
 from liex_lab.plan.study import Study
-from liex_lab.runtime.limits import check_limits
+from liex_lab.runtime.memory import check_limits
 from liex_lab.runtime.progress import Board, Progress, progress_board, silent, telling_of_compiling
 from liex_lab.runtime.threads import imported_ahead
 

@@ -35,9 +35,9 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from liex_lab.arena.region import Corners
     from liex_lab.plan.sections import SeveralArenas
     from liex_lab.recordings.recording import Recording
+    from liex_lab.scene.region import Corners
     from liex_lab.sessions import SessionWriter
     from liex_lab.sessions.writer import BlueprintMaker, ReportMaker
 
@@ -126,8 +126,8 @@ def measure_arenas(
         PlanError: a region is none in the picture, two overlap, or none are seen.
         SessionError: a session is there already, or another process writes it.
     """
-    from liex_lab.arena.region import masks_apart
     from liex_lab.recordings.timestamps import unwritable_times
+    from liex_lab.scene.region import masks_apart
 
     first = plan or Plan.load(USUAL).with_settings(settings)
     with build_recording(recording, first, progress) as opened:

@@ -27,11 +27,11 @@ if TYPE_CHECKING:
     from liex_lab.behaviour.bouts import MouseRules
     from liex_lab.body.skeleton import Skeleton
     from liex_lab.estimation.estimator import PoseEstimator
-    from liex_lab.foreground.segmenter import Segmenter
     from liex_lab.optics.camera import Camera, Distortion, Lens
     from liex_lab.optics.refraction import Water
     from liex_lab.plan.sections import SharedShape
     from liex_lab.recordings.recording import Recording
+    from liex_lab.scene.segmenter import Segmenter
     from liex_lab.tracking.own_shape import StatedShape
     from liex_lab.tracking.tracker import FrameTracker
 
@@ -130,7 +130,7 @@ def _stated_distortion(plan: Plan) -> Distortion | None:
 def _overruled(camera: Camera, plan: Plan) -> Camera:
     """The camera with what the plan states put in."""
     if plan.camera.preset is not None:
-        from liex_lab.optics.presets import preset
+        from liex_lab.optics.camera import preset
 
         camera = preset(plan.camera.preset, camera.width, camera.height)
     stated: dict[str, Any] = plan.camera.model_dump(
@@ -308,8 +308,8 @@ def build_scene(
         EstimationError: no floor or no animal is found in the sample.
     """
     from liex_lab.body.skeleton import FOREGROUNDS
-    from liex_lab.foreground.background_segmenter import BackgroundSubtraction
-    from liex_lab.foreground.hand_segmenter import HandSegmenter
+    from liex_lab.scene.background_segmenter import BackgroundSubtraction
+    from liex_lab.scene.hand_segmenter import HandSegmenter
 
     animal = animal_of(plan)
     foreground = plan.foreground

@@ -23,7 +23,7 @@ from .origin import animal_of
 if TYPE_CHECKING:
     from liex_lab.estimation.estimator import PoseEstimator
     from liex_lab.recordings.recording import Recording
-    from liex_lab.tracking.sample_fit import SampleFit
+    from liex_lab.tracking.residual import SampleFit
     from liex_lab.tracking.tracker import FrameTracker
 
 USUAL = "mouse"  # tried first where no plan is named
@@ -202,7 +202,7 @@ def fit_plan(
 
 def _shows_an_animal(tracker: FrameTracker) -> bool:
     """Whether anything moved, or the body covers what stands still before the floor."""
-    from liex_lab.foreground.background_segmenter import BackgroundSubtraction
+    from liex_lab.scene.background_segmenter import BackgroundSubtraction
 
     scene = tracker.scene
     fit = tracker.sample_fit
@@ -280,8 +280,8 @@ def _refusal(plan: Plan, misfits: Sequence[str], fitting: Look | None) -> str:
 
 def _right_way_round(found: Fitted, progress: Progress) -> Fitted:
     """The same, or the mirror image where the pictures are of a hand and fit better so."""
-    from liex_lab.foreground.hand_segmenter import HandSegmenter
     from liex_lab.recordings.rectify import mirrored
+    from liex_lab.scene.hand_segmenter import HandSegmenter
 
     plan = found.plan
     fit = found.tracker.sample_fit

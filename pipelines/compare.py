@@ -32,7 +32,7 @@ from liex_lab.plan.study import Study
 from liex_lab.plan.subject import same
 from liex_lab.runtime.durable import replacing, write_whole
 from liex_lab.runtime.progress import Progress, silent
-from liex_lab.runtime.spreadsheets import read_texts, write_csv
+from liex_lab.runtime.text_files import read_texts, write_csv
 from liex_lab.sessions import Session
 from liex_lab.sessions.failure import FAILED_FILE, read_failure
 from liex_lab.sessions.listed import Entry

@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any
 
 from liex_lab.catalog import MODELS
-from liex_lab.runtime.children import own_python
+from liex_lab.runtime.processes import own_python
 from liex_lab.runtime.progress import COMPILING, Progress, silent
 
 from .workers import n_cores

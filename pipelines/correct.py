@@ -73,7 +73,7 @@ def correct_session(
         SessionError: a correction cannot be applied, there is none, those of the log were made on
             another measurement, or another program corrects the session.
     """
-    from liex_lab.runtime.lock import locked
+    from liex_lab.runtime.durable import locked
     from liex_lab.sessions import Session
 
     raw = Session.open(session, raw=True)

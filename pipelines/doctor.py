@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.errors import LiexError
-from liex_lab.optics.presets import unusual_centre, unusual_lens
+from liex_lab.optics.camera import unusual_centre, unusual_lens
 from liex_lab.plan import Plan
 from liex_lab.plan.plan import arena_lines
 from liex_lab.recordings.frame import PLAUSIBLE_MM
@@ -123,8 +123,8 @@ def examine(
     Raises:
         RecordingError: the recording cannot be opened at all.
     """
-    from liex_lab.foreground.background import sample_frames, stride_for
     from liex_lab.recordings.rectify import rectified
+    from liex_lab.scene.background import sample_frames, stride_for
 
     asked = plan if named else None
     plan = _asked(plan or Plan(), fps, topic)
@@ -205,7 +205,7 @@ def _session_mb(
 
 def _several(seen: Recording, plan: Plan, misplaced: list[str]) -> list[SeveralArenas]:
     """The several arenas of a picture, listed or proposed; what is wrong with them is told."""
-    from liex_lab.arena.region import masks_apart
+    from liex_lab.scene.region import masks_apart
 
     try:
         if plan.arenas is None:
@@ -232,8 +232,8 @@ def _copies_told(recording: Recording, sample: NDArray[np.float32]) -> list[str]
     """Sentences on frames that repeat the depth image before them, of a long recording in windows
     spread over it.
     """
-    from liex_lab.foreground.background import has_noise, sampled
-    from liex_lab.tracking.copies import copies_told
+    from liex_lab.scene.background import has_noise, sampled
+    from liex_lab.tracking.offline import copies_told
 
     if recording.format == "synthetic":  # rendered when asked for
         return []

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from liex_lab.errors import SeveralKindsError, UnknownCameraError, UnknownTimesError
-from liex_lab.optics.presets import of_size, preset
+from liex_lab.optics.camera import of_size, preset
 from liex_lab.plan import Plan
 from liex_lab.runtime.progress import Progress, silent
 

@@ -21,10 +21,10 @@ from .origin import animal_of, build_zones
 from .regions import region_of, stated_floor
 
 if TYPE_CHECKING:
-    from liex_lab.arena.floor import Floor
-    from liex_lab.foreground.background_segmenter import BackgroundSubtraction
     from liex_lab.optics.refraction import Water
     from liex_lab.recordings.recording import Recording
+    from liex_lab.scene.background_segmenter import BackgroundSubtraction
+    from liex_lab.scene.floor import Floor
 
 _LEVEL_RAD = math.radians(3.0)  # a tank's floor is as level as the water over it, to this
 _MUCH_UNREAD = 0.2  # share of the pixels on the floor
@@ -74,11 +74,11 @@ class SceneLook:
 
     def at_scene(self) -> None:
         """Look at floor, noise, arena, water and animal; fills facts and problems."""
-        from liex_lab.arena.floor import Floor, floor_patch
-        from liex_lab.arena.outline import find_arena
         from liex_lab.body.skeleton import Skeleton
-        from liex_lab.foreground.background import learn_background
-        from liex_lab.foreground.standing import SampledScene, find_standing
+        from liex_lab.scene.background import learn_background
+        from liex_lab.scene.floor import Floor, floor_patch
+        from liex_lab.scene.outline import find_arena
+        from liex_lab.scene.support_plane import SampledScene, find_standing
 
         grid = self.seen.camera.every(self.stride)
         try:
@@ -181,9 +181,9 @@ class SceneLook:
         size.
         """
         from liex_lab.body.skeleton import Skeleton
-        from liex_lab.foreground.background import sampled
-        from liex_lab.foreground.background_segmenter import BackgroundSubtraction
         from liex_lab.recordings.recording import Recording
+        from liex_lab.scene.background import sampled
+        from liex_lab.scene.background_segmenter import BackgroundSubtraction
 
         animal = animal_of(self.plan)
         foreground = self.plan.foreground

@@ -8,10 +8,10 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from liex_lab.arena.outline import Arena
-from liex_lab.arena.scene import Fixture
 from liex_lab.errors import printable
-from liex_lab.optics.sensor_card import SensorCard
+from liex_lab.optics.camera import SensorCard
+from liex_lab.scene.outline import Arena
+from liex_lab.scene.scene import Fixture
 from liex_lab.sessions.room import megabytes
 
 # lines that decide whether a run makes sense

@@ -11,14 +11,14 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from liex_lab.arena.outline import Arena
-    from liex_lab.arena.scene import Scene
-    from liex_lab.arena.zones import DrawnZone, Zone
     from liex_lab.behaviour.places import Surroundings
-    from liex_lab.foreground.segmenter import Segmenter
     from liex_lab.plan import Plan
     from liex_lab.plan.sections import Animal
     from liex_lab.recordings.recording import Recording
+    from liex_lab.scene.outline import Arena
+    from liex_lab.scene.scene import Scene
+    from liex_lab.scene.segmenter import Segmenter
+    from liex_lab.scene.zones import DrawnZone, Zone
     from liex_lab.sessions import Provenance
     from liex_lab.tracking.tracker import FrameTracker
 
@@ -114,7 +114,7 @@ def build_background(
         plan: its section `replay`.
         segmenter: the learned segmentation, which tells an animal at rest from the scene.
     """
-    from liex_lab.foreground.background_segmenter import BackgroundSubtraction
+    from liex_lab.scene.background_segmenter import BackgroundSubtraction
     from liex_lab.sessions.cutouts import ANIMAL, ARENA, still_scene
 
     if plan.replay.depth not in (ANIMAL, ARENA):
@@ -131,7 +131,7 @@ def build_described_scene(segmenter: Segmenter, arena: Arena) -> Scene | None:
         segmenter: the learned segmentation.
         arena: the outline of its floor.
     """
-    from liex_lab.foreground.background_segmenter import BackgroundSubtraction
+    from liex_lab.scene.background_segmenter import BackgroundSubtraction
 
     if not isinstance(segmenter, BackgroundSubtraction):
         return None
@@ -145,9 +145,9 @@ def build_arena(scene: Segmenter, plan: Plan) -> tuple[Arena, tuple[Zone, ...]]:
         scene: the learned segmentation; a hand has no arena, so its outline is unknown.
         plan: names the file of zones.
     """
-    from liex_lab.arena.floor import Floor
-    from liex_lab.arena.outline import UNKNOWN, find_arena
-    from liex_lab.foreground.background_segmenter import BackgroundSubtraction
+    from liex_lab.scene.background_segmenter import BackgroundSubtraction
+    from liex_lab.scene.floor import Floor
+    from liex_lab.scene.outline import UNKNOWN, find_arena
 
     arena = UNKNOWN
     if isinstance(scene, BackgroundSubtraction):
@@ -165,7 +165,7 @@ def build_zones(plan: Plan) -> tuple[DrawnZone, ...]:
     Raises:
         PlanError: the file of zones cannot be used.
     """
-    from liex_lab.arena.zones import read_zones
+    from liex_lab.scene.zones import read_zones
 
     return read_zones(plan.arena.zones) if plan.arena.zones else ()
 

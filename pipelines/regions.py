@@ -19,12 +19,12 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from liex_lab.arena.floor import Floor
-    from liex_lab.arena.region import Corners
-    from liex_lab.foreground.standing import SampledScene
     from liex_lab.optics.camera import Camera
     from liex_lab.plan.sections import Region, SeveralArenas
     from liex_lab.recordings.recording import Recording
+    from liex_lab.scene.floor import Floor
+    from liex_lab.scene.region import Corners
+    from liex_lab.scene.support_plane import SampledScene
 
 _N_SAMPLED = 96
 
@@ -53,7 +53,7 @@ def stated_corners(recording: Recording, plan: Plan, region: Region) -> Corners:
         plan: states the floor, or the animals that stand on it.
         region: the region.
     """
-    from liex_lab.arena.region import region_corners_px
+    from liex_lab.scene.region import region_corners_px
 
     floor = None if region.unit == "px" else _floor_of_picture(recording, plan)
     return region_corners_px(region, recording.camera, floor)
@@ -82,7 +82,7 @@ def stated_floor(camera: Camera, plan: Plan) -> Floor | None:
     Raises:
         PlanError: the floor does not face the camera.
     """
-    from liex_lab.arena.scene import plane_of
+    from liex_lab.scene.scene import plane_of
 
     floor = plan.arena.floor
     return None if isinstance(floor, str) else plane_of(floor.point, floor.normal, camera)
@@ -98,7 +98,7 @@ def region_of(recording: Recording, plan: Plan) -> NDArray[np.bool_] | None:
     Raises:
         PlanError: the region is none in this picture.
     """
-    from liex_lab.arena.scene import region_mask
+    from liex_lab.recordings.frame import region_mask
 
     corners = recording.region_px
     if not corners and plan.arena.region is not None:
@@ -108,8 +108,8 @@ def region_of(recording: Recording, plan: Plan) -> NDArray[np.bool_] | None:
 
 def _floor_of_picture(recording: Recording, plan: Plan) -> Floor:
     """The floor on which animals stand in the whole picture, or the one that the plan states."""
-    from liex_lab.arena.floor import Floor
-    from liex_lab.foreground.standing import find_standing
+    from liex_lab.scene.floor import Floor
+    from liex_lab.scene.support_plane import find_standing
 
     stated = stated_floor(recording.camera, plan)
     if stated is not None:
@@ -121,8 +121,8 @@ def _floor_of_picture(recording: Recording, plan: Plan) -> Floor:
 def _sampled(recording: Recording, plan: Plan) -> tuple[SampledScene, int]:
     """Frames spread over a recording with their background, and the stride of their pixels."""
     from liex_lab.body.skeleton import Skeleton
-    from liex_lab.foreground.background import learn_background, sample_frames, stride_for
-    from liex_lab.foreground.standing import SampledScene
+    from liex_lab.scene.background import learn_background, sample_frames, stride_for
+    from liex_lab.scene.support_plane import SampledScene
 
     animal = animal_of(plan)
     stride = stride_for(recording, animal.spine_min_mm)
@@ -173,8 +173,8 @@ def propose_arenas(recording: Recording, plan: Plan) -> list[SeveralArenas]:
         Two to eight of them with a polygon each that touches no other; [] where only one is seen.
     """
     from liex_lab.body.skeleton import VIEWS, Skeleton
-    from liex_lab.foreground.several import arenas_apart
     from liex_lab.plan.sections import SeveralArenas
+    from liex_lab.scene.multi_arena import arenas_apart
 
     view = Skeleton.load(plan.animal.skeleton).view
     if view.frame != VIEWS[0] or recording.region_px:

@@ -74,7 +74,7 @@ def write_sample(path: str | Path, *, progress: Progress = silent) -> Path:
 def virtual_mouse() -> SyntheticSession:
     """The animal of the sample, its arena and its camera, with the exact truth of every frame."""
     from liex_lab.simulation.locomotion import walking_session
-    from liex_lab.simulation.sensors import PRIMESENSE_QVGA_SENSOR
+    from liex_lab.simulation.species import PRIMESENSE_QVGA_SENSOR
 
     return walking_session(
         SEED, N_FRAMES, sensor=PRIMESENSE_QVGA_SENSOR, spine_mm=SPINE_MM, name="mouse_walk"

@@ -337,11 +337,11 @@ def make_track(writer: SessionWriter, fitted: Fitted) -> Verdict:
     Returns:
         How it went.
     """
-    from liex_lab.optics.presets import unusual_centre, unusual_lens
+    from liex_lab.optics.camera import unusual_centre, unusual_lens
     from liex_lab.sessions.verdict import Verdict
-    from liex_lab.tracking.copies import copies_told
     from liex_lab.tracking.observations import Observations
-    from liex_lab.tracking.pace import why_too_fast
+    from liex_lab.tracking.offline import copies_told
+    from liex_lab.tracking.trust import why_too_fast
 
     tracker = fitted.tracker
     whole = writer.seen(Observations)

@@ -206,8 +206,8 @@ class StatedRegions:
 
     def _shown(self, place: Place, session: Session | None) -> list[list[float]] | None:
         """The corners of what is stated, px."""
-        from liex_lab.arena.floor import Floor
-        from liex_lab.arena.region import region_corners_px
+        from liex_lab.scene.floor import Floor
+        from liex_lab.scene.region import region_corners_px
 
         if place.stated is None:
             return None
@@ -228,8 +228,8 @@ class StatedRegions:
         self, key: str, session: Session | None, corners: Sequence[Any]
     ) -> list[list[float]]:
         """The corners as they are written, if they are a region of the picture."""
-        from liex_lab.arena.region import region_corners_px
-        from liex_lab.arena.scene import region_mask
+        from liex_lab.recordings.frame import region_mask
+        from liex_lab.scene.region import region_corners_px
 
         if not isinstance(corners, list) or len(corners) > _MOST_CORNERS:
             raise PlanError(f"a region is a list of at most {_MOST_CORNERS} corners [x, y]")
@@ -314,8 +314,8 @@ def _region(stated: Any) -> Region:
 
 
 def _px(region: Region) -> Any:
-    from liex_lab.arena.region import region_corners_px
     from liex_lab.optics.camera import Camera
+    from liex_lab.scene.region import region_corners_px
 
     return region_corners_px(region, Camera(1.0, 1.0, 0.0, 0.0, 1, 1), None)
 
@@ -339,7 +339,7 @@ def _table(file: Path) -> dict[str, Any]:
 
 def _usual(recording: Any) -> NDArray[np.uint16]:
     """Each pixel's median over frames of a whole recording, of those that read it."""
-    from liex_lab.foreground.background import sample_frames, usual_depth
+    from liex_lab.scene.background import sample_frames, usual_depth
 
     sample = sample_frames(recording, _N_PICTURES)
     return usual_depth(np.clip(np.rint(sample), 0, 65_535).astype(np.uint16))

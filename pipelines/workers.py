@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from typing import Protocol, TypeVar
 
 from liex_lab.errors import SessionError
-from liex_lab.runtime.children import end_children, end_with_parent
+from liex_lab.runtime.processes import end_children, end_with_parent
 
 # that one process keeps busy: it uses more than one and a half
 _CORES = 2

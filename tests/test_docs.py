@@ -21,7 +21,7 @@ ROOMS = [
     "liex_lab",
     "liex_lab/recordings",
     "liex_lab/recordings/formats",
-    "liex_lab/foreground",
+    "liex_lab/scene",
     "liex_lab/estimation",
     "liex_lab/tracking",
     "liex_lab/sessions",

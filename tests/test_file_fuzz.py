@@ -15,9 +15,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from liex_lab.pipelines.study.slurm import SlurmTable
 
-from liex_lab.arena.zones import read_zones
 from liex_lab.body.skeleton import PRESETS, Skeleton
 from liex_lab.body.surface import Surface
+from liex_lab.scene.zones import read_zones
 from tests.damage import ANYTHING, check, damage
 
 _MOUSE = tomllib.loads((PRESETS / "mouse.toml").read_text(encoding="utf-8"))

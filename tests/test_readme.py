@@ -11,15 +11,15 @@ import pytest
 from typer.testing import CliRunner
 
 from liex_lab import cli
-from liex_lab.arena.scene import Fixture, Scene
-from liex_lab.arena.zones import read_zones
 from liex_lab.behaviour.cohort import STATS
 from liex_lab.body import Skeleton
 from liex_lab.catalog import bundled_models
 from liex_lab.exchange import TARGETS
 from liex_lab.exchange.export import ALIASES
-from liex_lab.optics.sensor_card import SensorCard
+from liex_lab.optics.camera import SensorCard
 from liex_lab.plan import Plan
+from liex_lab.scene.scene import Fixture, Scene
+from liex_lab.scene.zones import read_zones
 from liex_lab.sessions.session import FILES
 from liex_lab.tables.schema import all_columns
 from tests.conftest import REPOSITORY

@@ -17,16 +17,16 @@ from liex_lab.pipelines.build import build_recording
 from liex_lab.pipelines.doctor import examine
 from numpy.typing import NDArray
 
-from liex_lab.arena.floor import Floor
 from liex_lab.behaviour.kinematics import kinematics
-from liex_lab.foreground.background_segmenter import BackgroundSubtraction
-from liex_lab.foreground.height_maps import Patches
 from liex_lab.optics import camera as cameras
 from liex_lab.optics.camera import KINECT_V2, PRIMESENSE, PRIMESENSE_QVGA, Camera, Distortion
 from liex_lab.optics.refraction import Water
 from liex_lab.plan import Plan
 from liex_lab.recordings import open_recording
-from liex_lab.simulation.sensors import BY_NAME
+from liex_lab.scene.background_segmenter import BackgroundSubtraction
+from liex_lab.scene.floor import Floor
+from liex_lab.scene.height_maps import Patches
+from liex_lab.simulation.species import BY_NAME
 from tests.behaviour.test_kinematics import tables_of
 from tests.oracles.plate import Plate
 from tests.recordings.writers import depth_frames, even_times, write_moseq_folder, write_png_folder

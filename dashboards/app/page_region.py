@@ -16,7 +16,7 @@ from flask import Flask, Response, jsonify, request
 from numpy.typing import NDArray
 
 from liex_lab.errors import LiexError, PlanError, SessionError
-from liex_lab.foreground.background import usual_depth
+from liex_lab.scene.background import usual_depth
 from liex_lab.sessions import Session
 
 from ..report.contact_sheet import png_uri, shade

@@ -16,7 +16,7 @@ from urllib.parse import parse_qs, unquote
 from dash import ALL, MATCH, ClientsideFunction, Dash, Input, Output, State, dcc, html
 
 from liex_lab.errors import LiexError
-from liex_lab.runtime.signals import Ended
+from liex_lab.runtime.processes import Ended
 
 from . import (
     page_corrections,

@@ -16,7 +16,7 @@ import pandas as pd
 from dash import dcc, html
 
 from liex_lab.errors import SessionError
-from liex_lab.runtime.spreadsheets import harmless_table
+from liex_lab.runtime.text_files import harmless_table
 from liex_lab.sessions.listed import state_in_words
 
 from ..units import counted, read_as

@@ -23,7 +23,7 @@ from liex_lab.runtime.durable import replacing
 from liex_lab.runtime.memory import uncollected
 from liex_lab.runtime.places import inside, safe_name, unlinked
 from liex_lab.runtime.progress import Progress, silent
-from liex_lab.runtime.spreadsheets import read_harmless
+from liex_lab.runtime.text_files import read_harmless
 from liex_lab.sessions import Session
 
 from . import actions, groups, places, times

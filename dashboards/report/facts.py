@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from liex_lab.optics.sensor_card import SensorCard
+from liex_lab.optics.camera import SensorCard
 from liex_lab.sessions import Session
 
 from ..units import counted

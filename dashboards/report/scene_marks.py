@@ -14,7 +14,7 @@ from html import escape
 import numpy as np
 from numpy.typing import NDArray
 
-from liex_lab.arena.scene import Fixture
+from liex_lab.scene.scene import Fixture
 from liex_lab.sessions import Session
 
 Array = NDArray[np.float64]

@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 
 from liex_lab.actions.ethogram import UNLABELLED
 from liex_lab.errors import LiexError, one_line
-from liex_lab.runtime.spreadsheets import read_texts
-from liex_lab.runtime.text_files import clock_s, number
+from liex_lab.runtime.text_files import clock_s, number, read_texts
 from liex_lab.tracking.track import Track
 
 Array = NDArray[np.float64]

@@ -13,8 +13,8 @@ from numba import njit, prange
 
 from liex_lab.estimation._cascade_kernels import mode_of_votes
 from liex_lab.estimation._feature_kernels import correct_base, correct_joint, fill_view, place_joint
-from liex_lab.foreground._crop_camera_kernels import crop_camera
 from liex_lab.forests._kernels import VIEW, descend
+from liex_lab.scene._height_map_kernels import crop_camera
 
 _BINS = 72  # of the circle in which headings are counted: 5 degrees each
 _SMOOTH = 3  # bins to either side that a vote for a heading also counts in

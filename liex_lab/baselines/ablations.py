@@ -16,9 +16,8 @@ from numpy.typing import NDArray
 from liex_lab.baselines.baseline import Guesses, chosen, second_is_likelier
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.estimation.estimator import PoseEstimator
-from liex_lab.foreground.crop_camera import in_camera_frame
-from liex_lab.foreground.height_maps import HeightMaps
-from liex_lab.foreground.segmenter import Segmenter
+from liex_lab.scene.height_maps import HeightMaps, in_camera_frame
+from liex_lab.scene.segmenter import Segmenter
 
 Array = NDArray[np.float64]
 

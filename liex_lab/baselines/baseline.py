@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.body.skeleton import Skeleton
-from liex_lab.foreground.height_maps import HeightMaps
-from liex_lab.foreground.segmenter import Segmenter
+from liex_lab.scene.height_maps import HeightMaps
+from liex_lab.scene.segmenter import Segmenter
 
 Array = NDArray[np.float64]
 

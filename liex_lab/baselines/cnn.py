@@ -31,10 +31,9 @@ from liex_lab.baselines.patches import frames_of, joints_of, patches_of, targets
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.errors import MissingPackageError, ModelError
 from liex_lab.estimation.training import Tell, TrainingSet
-from liex_lab.foreground.crop_camera import in_camera_frame
-from liex_lab.foreground.height_maps import HeightMaps
-from liex_lab.foreground.segmenter import Segmenter
 from liex_lab.runtime.threads import threads
+from liex_lab.scene.height_maps import HeightMaps, in_camera_frame
+from liex_lab.scene.segmenter import Segmenter
 
 if TYPE_CHECKING:
     import torch

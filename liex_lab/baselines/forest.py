@@ -31,19 +31,17 @@ from numpy.typing import NDArray
 
 from liex_lab.baselines import _forest as kernels
 from liex_lab.baselines.baseline import DAMAGE, Guesses, see
-from liex_lab.body.kinematic_tree import KinematicTree
-from liex_lab.body.kinematics import forward_kinematics
+from liex_lab.body.kinematics import KinematicTree, forward_kinematics
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.errors import ModelError
 from liex_lab.estimation.training import Tell, TrainingSet
-from liex_lab.foreground.crop_camera import in_camera_frame
-from liex_lab.foreground.height_maps import HeightMaps
-from liex_lab.foreground.segmenter import Segmenter
 from liex_lab.forests._kernels import VIEW
 from liex_lab.forests.forest import Forest, Samples, check_forest
 from liex_lab.forests.grow import GrowthPlan, grow_forest
 from liex_lab.geometry import SE3, so3
 from liex_lab.runtime.threads import threads
+from liex_lab.scene.height_maps import HeightMaps, in_camera_frame
+from liex_lab.scene.segmenter import Segmenter
 
 Array = NDArray[np.float64]
 

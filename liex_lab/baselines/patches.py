@@ -15,8 +15,8 @@ import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
 
-from liex_lab.foreground._crop_camera_kernels import N_CROP_CAMERA, crop_camera
 from liex_lab.runtime.shapes import check_shapes
+from liex_lab.scene._height_map_kernels import N_CROP_CAMERA, crop_camera
 
 Array = NDArray[np.float64]
 

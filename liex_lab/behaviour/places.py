@@ -16,11 +16,11 @@ import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 
-from liex_lab.arena.outline import UNKNOWN, Arena
-from liex_lab.arena.zones import SEPARATOR
 from liex_lab.behaviour.activity import observed_hold
 from liex_lab.behaviour.bouts import MouseRules, tidy
 from liex_lab.behaviour.kinematics import segments
+from liex_lab.scene.outline import UNKNOWN, Arena
+from liex_lab.scene.zones import SEPARATOR
 from liex_lab.tables.rows import stop_times
 from liex_lab.tables.schema import table_columns, to_pandas
 

@@ -41,10 +41,10 @@ from liex_lab.cli.sections import MODELS, RECORDINGS, SESSIONS, START, STUDIES, 
 from liex_lab.cli.study import cohort, dashboard, verify
 from liex_lab.cli.train import train
 from liex_lab.errors import LiexError, MisfitError, printable
-from liex_lab.runtime.disk import is_full, why_full
-from liex_lab.runtime.limits import why_short
+from liex_lab.runtime.memory import why_short
+from liex_lab.runtime.places import is_full, why_full
+from liex_lab.runtime.processes import Ended, ending
 from liex_lab.runtime.progress import progress_bar
-from liex_lab.runtime.signals import Ended, ending
 
 if TYPE_CHECKING:
     from liex_lab.pipelines.arenas import ArenaOutcome

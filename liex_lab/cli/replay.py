@@ -76,7 +76,7 @@ def _whole_depth(session: Path, scratch: Path, recording: str | None) -> list[Pa
 
 def _show(replay: Path, more: list[Path], at_s: float | None, web: bool) -> None:
     """Open a replay and wait until its viewer is closed."""
-    from liex_lab.runtime.children import own_python
+    from liex_lab.runtime.processes import own_python
     from liex_lab.sessions.viewer import replays_with, show_replay
 
     if at_s is not None:

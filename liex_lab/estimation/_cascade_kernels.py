@@ -23,9 +23,9 @@ from liex_lab.estimation._feature_kernels import (
     place_rest,
 )
 from liex_lab.estimation._residual_kernels import N_FIT, explain_pose
-from liex_lab.foreground._blob_kernels import ANGLE
 from liex_lab.forests._kernels import VIEW
 from liex_lab.forests._walk import LANES, walk_one_view, walk_views
+from liex_lab.scene._blob_kernels import ANGLE
 
 FRAMES = 8
 _SHIFTS = 4  # mean-shift steps; the mode of ten votes settles within these

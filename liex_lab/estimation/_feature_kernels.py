@@ -17,8 +17,6 @@ from __future__ import annotations
 import numpy as np
 from numba import njit, prange
 
-from liex_lab.foreground._blob_kernels import unpack_moments
-from liex_lab.foreground._crop_camera_kernels import crop_camera, to_camera
 from liex_lab.forests._kernels import (
     COLUMN_SLOPE,
     ROW_SLOPE,
@@ -26,7 +24,9 @@ from liex_lab.forests._kernels import (
     VIEW_HEIGHT,
     VIEW_ROW,
 )
-from liex_lab.geometry._so3_kernels import exp_so3
+from liex_lab.geometry._kernels import exp_so3
+from liex_lab.scene._blob_kernels import unpack_moments
+from liex_lab.scene._height_map_kernels import crop_camera, to_camera, to_pixel
 
 N_SCALARS = 11
 # a threshold is an integer: logarithms and sines are scaled up to resolve a few thousandths
@@ -323,3 +323,197 @@ def correct_joint_all(j, rotations, axes, values, lever):
     """
     for s in prange(values.shape[0]):
         correct_joint(rotations[s, j], axes, values[s], lever)
+
+
+# Numba kernels of the ridge correction's features: height profile of the back along a chain.
+
+
+_WINDOW = 2  # crop pixels to each side of a joint over which the back's height is averaged
+_STEP = 0.5  # crop pixels
+# of the chain's length: beyond its ends, and back from them, the animal's end is looked for
+_END_SHARE = 0.15
+
+
+@njit(cache=True)
+def back_over(heights, packed_camera, position, most, out):
+    """Height of the animal's back over a joint.
+
+    It is the mean over a window of crop pixels of the readings within `most` of their median.
+
+    Args:
+        heights: (S, S) int16 height map, 1/16 mm, 0 where there is no animal.
+        packed_camera: (17,) packed crop camera.
+        position: (3,) the joint, mm, view frame.
+        most: readings farther than this from the median are left out, mm.
+        out: (2,) filled with the height above the joint, mm, 0 where nothing is read, and the share
+            of the window that shows the animal.
+    """
+    last = heights.shape[0] - 1
+    u, v = to_pixel(crop_camera(packed_camera), position[0], position[1], position[2])
+    column = int(np.floor(u + 0.5))
+    row = int(np.floor(v + 0.5))
+    seen = np.empty((2 * _WINDOW + 1) ** 2)
+    n = 0
+    for r in range(max(row - _WINDOW, 0), min(row + _WINDOW, last) + 1):
+        for c in range(max(column - _WINDOW, 0), min(column + _WINDOW, last) + 1):
+            if heights[r, c] > 0:
+                seen[n] = heights[r, c] / 16.0 - position[2]
+                n += 1
+    out[0] = 0.0
+    out[1] = n / seen.size
+    if n == 0:
+        return
+    middle = np.sort(seen[:n])[n // 2]
+    total = 0.0
+    many = 0
+    for i in range(n):
+        if abs(seen[i] - middle) <= most:
+            total += seen[i]
+            many += 1
+    out[0] = total / many
+
+
+@njit(cache=True)
+def end_past(heights, packed_camera, end, before, reach):
+    """How far the animal goes on past the end of a chain, straight on from the joint before it.
+
+    Args:
+        heights: (S, S) int16 height map, 1/16 mm, 0 where there is no animal.
+        packed_camera: (17,) packed crop camera.
+        end: (3,) the end joint, mm, view frame.
+        before: (3,) the joint before it.
+        reach: how far to look in either direction, mm.
+
+    Returns:
+        mm, at most `reach`; negative where the animal ends before the joint.
+    """
+    last = heights.shape[0] - 1
+    camera = crop_camera(packed_camera)
+    way = end - before
+    length = np.sqrt(np.sum(way * way))
+    way = way / max(length, 1e-9)
+    first_u, first_v = to_pixel(camera, end[0], end[1], end[2])
+    second_u, second_v = to_pixel(camera, before[0], before[1], before[2])
+    per_px = length / max(np.hypot(first_u - second_u, first_v - second_v), 0.2)
+    n = int(reach / per_px / _STEP)
+    for k in range(-n, n + 1):
+        past = k * _STEP * per_px
+        u, v = to_pixel(
+            camera, end[0] + past * way[0], end[1] + past * way[1], end[2] + past * way[2]
+        )
+        column = int(np.floor(u + 0.5))
+        row = int(np.floor(v + 0.5))
+        on = False
+        for r in range(max(row - 1, 0), min(row + 1, last) + 1):
+            for c in range(max(column - 1, 0), min(column + 1, last) + 1):
+                on |= heights[r, c] > 0
+        if not on:
+            return past
+    return reach
+
+
+@njit(cache=True, parallel=True)
+def look_along(heights, crop_cameras, positions, length, most_share, out):
+    """Profile of each chain: the back's height over all joints, and the reach past both ends.
+
+    Args:
+        heights: (n, S, S) int16 height maps, 1/16 mm, 0 where there is no animal.
+        crop_cameras: (n, 17) packed crop cameras of the height maps.
+        positions: (n, J, 3) joints, mm, view frame.
+        length: (n,) lengths of the animals, mm.
+        most_share: of the length; see `most` of `back_over`.
+        out: (n, 2 J + 2) filled with heights (J), shares seen (J), and `end_past` of the first and
+            the last joint, mm.
+    """
+    m = positions.shape[1]
+    for i in prange(positions.shape[0]):
+        here = np.empty(2)
+        for k in range(m):
+            back_over(heights[i], crop_cameras[i], positions[i, k], most_share * length[i], here)
+            out[i, k] = here[0]
+            out[i, m + k] = here[1]
+        for end in range(2):
+            k, before = (m - 1, m - 2) if end else (0, 1)
+            reach = _END_SHARE * length[i]
+            out[i, 2 * m + end] = end_past(
+                heights[i], crop_cameras[i], positions[i, k], positions[i, before], reach
+            )
+
+
+# Numba kernel of the head-tail classifier: resamples a height map along an animal's direction.
+
+
+@njit(cache=True, parallel=True)
+def lay_along(heights, crop_cameras, rump, tip, middle, size, along, across, out):
+    """Resample height maps on a grid that lies along the animals.
+
+    Grid point (a, b) is middle + size (along[a] d + across[b] d_left), d being the unit direction
+    from base to tip in the image plane; the nearest pixel is taken.
+
+    Args:
+        heights: (n, S, S) int16 height maps, 1/16 mm, 0 where there is no animal.
+        crop_cameras: (n, 17) packed crop cameras of the height maps.
+        rump: (n, 3) base joints, mm, view frame.
+        tip: (n, 3) joints that the animals point at, mm, view frame.
+        middle: (n, 3) centres of the grids, mm, view frame.
+        size: (n,) the animals' size over home size.
+        along: (A,) grid coordinates along the animal, mm at home size.
+        across: (B,) grid coordinates to its left, mm at home size.
+        out: (n, A, B) filled with heights, mm; 0 beside the animal.
+    """
+    last = heights.shape[1] - 1
+    for i in prange(len(middle)):
+        dx = tip[i, 0] - rump[i, 0]
+        dy = tip[i, 1] - rump[i, 1]
+        camera = crop_camera(crop_cameras[i])
+        length = max(np.sqrt(dx * dx + dy * dy), 1e-9)
+        dx = dx / length
+        dy = dy / length
+        for a in range(len(along)):
+            for b in range(len(across)):
+                x = middle[i, 0] + size[i] * (along[a] * dx - across[b] * dy)
+                y = middle[i, 1] + size[i] * (along[a] * dy + across[b] * dx)
+                u, v = to_pixel(camera, x, y, middle[i, 2])
+                column = int(np.floor(u + 0.5))
+                row = int(np.floor(v + 0.5))
+                inside = 0 <= row <= last and 0 <= column <= last
+                out[i, a, b] = heights[i, row, column] / 16.0 if inside else 0.0
+
+
+# Numba kernel of the mean cross-sections: a height map read across the mid-axis of a chain.
+
+
+@njit(cache=True, parallel=True)
+def read_across(heights, crop_cameras, points, sideways, lateral, seen, height):
+    """Read height maps at distances to the left and right of points on the mid-axis.
+
+    Args:
+        heights: (n, H, W) int16 height maps, 1/16 mm, 0 where there is no animal.
+        crop_cameras: (n, 17) packed crop cameras of the height maps.
+        points: (n, S, 3) on the mid-axis, mm, view frame.
+        sideways: (n, S, 2) unit vectors across the axis, view frame.
+        lateral: (T,) distances from the axis, mm.
+        seen: (n, S, T) filled with how many of the two sides show the animal, over 2.
+        height: (n, S, T) filled with the mean height of those over the axis, mm, 0 where none does.
+    """
+    for i in prange(points.shape[0]):
+        camera = crop_camera(crop_cameras[i])
+        for s in range(points.shape[1]):
+            for t in range(lateral.shape[0]):
+                n = 0
+                total = 0.0
+                for side in (-1.0, 1.0):
+                    u, v = to_pixel(
+                        camera,
+                        points[i, s, 0] + side * lateral[t] * sideways[i, s, 0],
+                        points[i, s, 1] + side * lateral[t] * sideways[i, s, 1],
+                        points[i, s, 2],
+                    )
+                    column = int(np.floor(u + 0.5))
+                    row = int(np.floor(v + 0.5))
+                    inside = 0 <= row < heights.shape[1] and 0 <= column < heights.shape[2]
+                    if inside and heights[i, row, column] > 0:
+                        n += 1
+                        total += heights[i, row, column] / 16.0 - points[i, s, 2]
+                seen[i, s, t] = 0.5 * n
+                height[i, s, t] = total / n if n > 0 else 0.0

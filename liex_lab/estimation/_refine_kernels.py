@@ -16,9 +16,8 @@ import numpy as np
 from numba import njit, prange
 
 from liex_lab.estimation._residual_kernels import nearest_ball, place_balls
-from liex_lab.foreground._crop_camera_kernels import crop_camera, to_pixel, to_point
-from liex_lab.geometry._cholesky_kernels import cholesky, substitute
-from liex_lab.geometry._so3_kernels import exp_so3
+from liex_lab.geometry._kernels import cholesky, exp_so3, substitute
+from liex_lab.scene._height_map_kernels import crop_camera, to_pixel, to_point
 
 _STRIDE = 4  # every so many crop pixels a reading pulls
 _ROOT = 7  # twist of the base and log of the scale come before the angles

@@ -13,8 +13,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numba import njit, prange
 
-from liex_lab.foreground._blob_kernels import ANGLE
-from liex_lab.foreground._crop_camera_kernels import crop_camera, to_pixel, to_point
+from liex_lab.scene._blob_kernels import ANGLE
+from liex_lab.scene._height_map_kernels import crop_camera, to_pixel, to_point
 
 N_FIT = 8
 # columns of the fit, see `explain`

@@ -24,10 +24,9 @@ from liex_lab.estimation.model import Calibration, Model
 from liex_lab.estimation.ridge_correction import RidgeCorrection
 from liex_lab.estimation.scoring import LEAST_MM, LOG_UNIT, Chosen, clue_samples
 from liex_lab.estimation.training import TrainingSet, quantised
-from liex_lab.foreground.crop_camera import crop_columns
-from liex_lab.foreground.height_maps import HeightMaps
 from liex_lab.forests.forest import Samples, predict
 from liex_lab.forests.grow import GrowthPlan, boost_forest
+from liex_lab.scene.height_maps import HeightMaps, crop_columns
 
 Array = NDArray[np.float64]
 

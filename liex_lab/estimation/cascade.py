@@ -20,20 +20,19 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from liex_lab.body.kinematic_tree import KinematicTree
-from liex_lab.body.kinematics import aim
+from liex_lab.body.capsules import Spheres
+from liex_lab.body.kinematics import KinematicTree, aim
 from liex_lab.body.skeleton import Skeleton
-from liex_lab.body.spheres import Spheres
 from liex_lab.estimation import _feature_kernels as kernels
 from liex_lab.estimation import _residual_kernels as residual_kernels
 from liex_lab.estimation._cascade_kernels import modes_of_votes
 from liex_lab.estimation.method import Method
-from liex_lab.foreground._blob_kernels import N_MOMENTS
-from liex_lab.foreground._crop_camera_kernels import N_CROP_CAMERA
 from liex_lab.forests._kernels import VIEW
 from liex_lab.forests.forest import Forest, Samples, predict, predict_each
 from liex_lab.geometry import SE3, so3
 from liex_lab.runtime.shapes import check_index, check_shapes
+from liex_lab.scene._blob_kernels import N_MOMENTS
+from liex_lab.scene._height_map_kernels import N_CROP_CAMERA
 
 Array = NDArray[np.float64]
 

@@ -22,7 +22,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from liex_lab.body.kinematic_tree import KinematicTree
+from liex_lab.body.kinematics import KinematicTree
 from liex_lab.body.pose import Pose
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.catalog import find_model
@@ -32,19 +32,17 @@ from liex_lab.estimation._residual_kernels import SphereModel
 from liex_lab.estimation.cascade import ImageSet, body_of
 from liex_lab.estimation.forest_correction import corrected
 from liex_lab.estimation.head_tail import HeadTailClassifier, both_ways
-from liex_lab.estimation.initial import draw_starts, start_poses
+from liex_lab.estimation.initial import N_WAYS, draw_starts, propose, start_poses
 from liex_lab.estimation.model import Model, check_model
-from liex_lab.estimation.proposals import N_WAYS, propose
 from liex_lab.estimation.refine import Refiner
 from liex_lab.estimation.ridge_correction import SURE_SHARE, RidgeCorrection
 from liex_lab.estimation.scoring import Chosen, choose, with_best, with_expected_error
 from liex_lab.estimation.training import base_at_front
-from liex_lab.foreground.crop_camera import view_of
-from liex_lab.foreground.height_maps import HeightMaps
-from liex_lab.foreground.segmenter import Segmenter
 from liex_lab.forests.forest import Forest
 from liex_lab.geometry import SE3
 from liex_lab.runtime.threads import threads
+from liex_lab.scene.height_maps import HeightMaps, view_of
+from liex_lab.scene.segmenter import Segmenter
 
 Array = NDArray[np.float64]
 

@@ -22,8 +22,8 @@ from liex_lab.body.pose import Pose
 from liex_lab.estimation.cascade import Candidates, ImageSet
 from liex_lab.estimation.model import Model
 from liex_lab.estimation.scoring import Chosen
-from liex_lab.foreground.crop_camera import mm_per_px
 from liex_lab.forests.forest import Samples, predict
+from liex_lab.scene.height_maps import mm_per_px
 
 Array = NDArray[np.float64]
 

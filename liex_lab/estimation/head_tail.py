@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.body.skeleton import Skeleton
-from liex_lab.estimation import _head_tail_kernels as kernels
+from liex_lab.estimation import _feature_kernels as kernels
 from liex_lab.estimation.cascade import ImageSet
 from liex_lab.mlp import Network, descend
 from liex_lab.runtime.shapes import check_shapes

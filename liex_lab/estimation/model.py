@@ -31,7 +31,7 @@ from liex_lab.estimation.ridge_correction import N_OTHERS
 from liex_lab.forests._kernels import number_nodes
 from liex_lab.forests.forest import Forest, check_forest, check_roots
 from liex_lab.mlp import Network, check_layers
-from liex_lab.runtime.npz import check_npz
+from liex_lab.runtime.memory import check_npz
 
 N_CLUES = 22  # of `scoring.clue_samples`, the residuals apart
 SCHEMA = 3  # of a model that tells which way an animal faces; 2 of one that does not

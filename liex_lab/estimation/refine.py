@@ -19,17 +19,17 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from liex_lab.body.kinematic_tree import KinematicTree
+from liex_lab.body.capsules import Spheres
+from liex_lab.body.kinematics import KinematicTree
 from liex_lab.body.pose import Pose
 from liex_lab.body.skeleton import Skeleton
-from liex_lab.body.spheres import Spheres
 from liex_lab.estimation import _refine_kernels as kernels
 from liex_lab.estimation import _residual_kernels as residual_kernels
 from liex_lab.estimation.cascade import ImageSet, body_of
-from liex_lab.foreground._blob_kernels import N_MOMENTS
-from liex_lab.foreground._crop_camera_kernels import N_CROP_CAMERA
 from liex_lab.geometry import SE3
 from liex_lab.runtime.shapes import check_shapes
+from liex_lab.scene._blob_kernels import N_MOMENTS
+from liex_lab.scene._height_map_kernels import N_CROP_CAMERA
 
 Array = NDArray[np.float64]
 

@@ -19,10 +19,10 @@ from numpy.typing import NDArray
 
 from liex_lab.body.pose import Pose
 from liex_lab.body.skeleton import Skeleton
-from liex_lab.estimation import _profile_kernels as kernels
+from liex_lab.estimation import _feature_kernels as kernels
 from liex_lab.estimation.cascade import ImageSet
-from liex_lab.foreground.crop_camera import mm_per_px
 from liex_lab.runtime.shapes import check_shapes
+from liex_lab.scene.height_maps import mm_per_px
 
 Array = NDArray[np.float64]
 

@@ -22,11 +22,10 @@ from liex_lab.body.pose import Pose
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.estimation.method import Method
 from liex_lab.estimation.model import Calibration, Model
-from liex_lab.foreground.crop_camera import mm_per_px
-from liex_lab.foreground.height_maps import moment_columns
 from liex_lab.forests._kernels import VIEW
 from liex_lab.forests.forest import Samples, predict
 from liex_lab.geometry import SE3, so3
+from liex_lab.scene.height_maps import mm_per_px, moment_columns
 
 Array = NDArray[np.float64]
 

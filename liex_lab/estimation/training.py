@@ -20,9 +20,8 @@ from numpy.typing import NDArray
 
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.estimation.cascade import Candidates, Cascade, ImageSet, Truth
-from liex_lab.estimation.initial import draw_starts, start_poses
+from liex_lab.estimation.initial import N_WAYS, draw_starts, propose, start_poses, train_proposals
 from liex_lab.estimation.method import Method
-from liex_lab.estimation.proposals import N_WAYS, propose, train_proposals
 from liex_lab.forests.forest import Forest
 from liex_lab.forests.grow import boost_forest, grow_forest
 from liex_lab.geometry import SE3, so3

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pandas as pd
 
-from liex_lab.runtime.spreadsheets import write_csv
+from liex_lab.runtime.text_files import write_csv
 from liex_lab.sessions import Session
 from liex_lab.sessions.pose_arrays import Array, Poses
 

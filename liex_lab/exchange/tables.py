@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from liex_lab.errors import SessionError
 from liex_lab.runtime.places import inside
-from liex_lab.runtime.spreadsheets import copy_harmless, write_csv
+from liex_lab.runtime.text_files import copy_harmless, write_csv
 from liex_lab.sessions import Session
 from liex_lab.sessions.reading import reading_from
 

@@ -16,7 +16,7 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator, model_valida
 Positive = Annotated[float, Field(gt=0)]
 Factor = Annotated[float, Field(gt=1e-3, lt=1e3)]
 N_PLACES = 5  # along the body, of liex_lab.estimation.session_shape
-# names of liex_lab.optics.presets, stated here for a plan is read before any library is there
+# names of liex_lab.optics.camera, stated here for a plan is read before any library is there
 CameraName = Literal["kinect-v2", "primesense", "azure-nfov", "femto-bolt", "d435", "raytrix-r5"]
 NotNegative = Annotated[float, Field(ge=0)]
 _SPECIES = "Latin name of its species, as Rattus norvegicus; not set: that of the animal's kind"

@@ -21,10 +21,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from liex_lab.errors import PlanError
+
 Depth = NDArray[np.float32]
 
 _FEW = 16  # one row and column of so many
 _ROWS = 64
+_LEAST_REGION_PX = 64
 _MOST_ROOMS = 6  # that are kept: being filled, waiting, looked at (two at once), written
 
 
@@ -312,3 +315,42 @@ def metres(depth: Depth) -> tuple[NDArray[np.float32], int]:
         scaled[inexact] = np.where(fits, other, scaled[inexact])
         inexact[inexact] = ~fits
     return scaled, int(inexact.sum())
+
+
+def region_mask(corners: Sequence[Sequence[float]], width: int, height: int) -> NDArray[np.bool_]:
+    """The pixels inside a polygon.
+
+    Args:
+        corners: (u, v) pixels, at least three.
+        width: of the picture, px.
+        height: of the picture, px.
+
+    Returns:
+        (height, width) bool.
+
+    Raises:
+        PlanError: the corners are no polygon, or nothing of it is in the picture.
+    """
+    import cv2
+
+    points = np.asarray([list(corner)[:2] for corner in corners], float)
+    if len(points) < 3 or points.shape[1:] != (2,) or not np.isfinite(points).all():
+        raise PlanError(
+            f"arena.region takes three or more corners x,y in pixels, got {len(points)}; name the "
+            "corners of a polygon around the arena"
+        )
+    x, y = points.T
+    area = 0.5 * abs(float(x @ np.roll(y, -1) - y @ np.roll(x, -1)))
+    if area < _LEAST_REGION_PX:
+        raise PlanError(
+            f"arena.region encloses {area:.0f} pixels, too few to hold an arena; its corners "
+            "should go round it in order"
+        )
+    mask = np.zeros((height, width), np.uint8)
+    cv2.fillPoly(mask, [np.rint(np.clip(points, -30_000, 30_000)).astype(np.int32)], 1)
+    if int(mask.sum()) < _LEAST_REGION_PX:
+        raise PlanError(
+            f"arena.region lies outside the picture, whose columns are 0 to {width - 1} and rows "
+            f"0 to {height - 1}; its corners are x,y in pixels"
+        )
+    return mask.astype(bool)

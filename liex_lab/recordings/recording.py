@@ -31,8 +31,8 @@ from liex_lab.recordings.timestamps import (
     find_gaps,
     median_step,
 )
-from liex_lab.runtime.disk import is_full
-from liex_lab.runtime.limits import why_short
+from liex_lab.runtime.memory import why_short
+from liex_lab.runtime.places import is_full
 from liex_lab.runtime.progress import Progress, silent
 
 Stamp = list[list[str | int]]
@@ -502,8 +502,6 @@ class Recording:
         Raises:
             PlanError: the corners are no polygon in the picture.
         """
-        from liex_lab.arena.scene import region_mask
-
         inside = region_mask(region_px, self.width, self.height)
         cut = self.seen_by(
             self.camera,

@@ -12,11 +12,14 @@ import errno
 import os
 import shutil
 import sys
+import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import IO
 
+from liex_lab.errors import LiexError, SessionError
 from liex_lab.runtime.places import unlinked
 
 # shares and file systems on which this cannot be asked for
@@ -222,3 +225,125 @@ def _sync(path: Path, flags: int) -> None:
             raise
     finally:
         os.close(opened)
+
+
+# Exclusive advisory file lock (flock, or msvcrt.locking on Windows): one process at a time.
+
+
+_NO_LINKS = getattr(os, "O_NOFOLLOW", 0)
+
+
+def take_lock(path: Path) -> IO[bytes] | None:
+    """Lock a file, which is made if needed; None where another process holds it.
+
+    A folder that was renamed or removed in between is no longer the one that was asked for: None,
+    too.
+
+    Args:
+        path: the lock file.
+
+    Returns:
+        The open file; closing it releases the lock.
+
+    Raises:
+        PlaceError: a symbolic link lies there.
+        OSError: the file cannot be made.
+    """
+    opened = os.open(unlinked(path), os.O_WRONLY | os.O_CREAT | os.O_APPEND | _NO_LINKS, 0o666)
+    file = os.fdopen(opened, "ab")
+    try:
+        _lock(file)
+        same = os.path.samestat(os.fstat(file.fileno()), path.stat())
+    except OSError:
+        same = False
+    if not same:
+        file.close()
+        return None
+    return file
+
+
+@contextmanager
+def locked(path: Path, held: str) -> Iterator[None]:
+    """Hold a lock within the block, and remove its file afterwards.
+
+    Args:
+        path: the lock file.
+        held: half a sentence for the error, such as 'the study is being measured'.
+
+    Raises:
+        SessionError: another process holds it.
+    """
+    file = take_lock(path)
+    if file is None:
+        raise SessionError(f"{held}; wait until it is done, or end it")
+    try:
+        yield
+    finally:
+        if sys.platform != "win32":  # there, a file in use cannot go
+            path.unlink(missing_ok=True)
+        file.close()
+        if sys.platform == "win32":
+            with suppress(OSError):
+                path.unlink()
+
+
+def _lock(file: IO[bytes]) -> None:
+    """Lock an open file without waiting. Raises OSError where another process holds it."""
+    if sys.platform == "win32":
+        import msvcrt
+
+        file.seek(0)
+        msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)
+    else:
+        import fcntl
+
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+
+
+# Temporary folders that do not outlive their process, however it ends.
+
+
+_PREFIX = "liex-scratch-"
+_LOCK = ".lock"
+
+
+class Scratch:
+    """A new temporary folder, below TMPDIR; those of dead processes are removed before.
+
+    Attributes:
+        folder: the folder.
+    """
+
+    def __init__(self) -> None:
+        remove_stale()
+        held: IO[bytes] | None = None
+        while held is None:  # somebody who removes stale ones may be faster
+            self.folder = Path(tempfile.mkdtemp(prefix=_PREFIX))
+            with suppress(FileNotFoundError):
+                held = take_lock(self.folder / _LOCK)
+        self._held = held
+
+    def close(self) -> None:
+        """Remove the folder with all that is in it."""
+        self._held.close()
+        shutil.rmtree(self.folder, ignore_errors=True)
+
+
+def remove_stale() -> None:
+    """Remove this account's temporary folders whose processes are no more.
+
+    A process may be killed before it has locked its folder, or while it removes it.
+    """
+    for folder in Path(tempfile.gettempdir()).glob(f"{_PREFIX}*"):
+        with suppress(OSError, LiexError):
+            if folder.is_symlink() or not _own(folder):
+                continue
+            held = take_lock(folder / _LOCK)
+            if held is not None:
+                held.close()
+                shutil.rmtree(folder, ignore_errors=True)
+
+
+def _own(folder: Path) -> bool:
+    """Whether a folder is this account's."""
+    return not hasattr(os, "getuid") or folder.stat().st_uid == os.getuid()

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import errno
 import gc
+import math
 import mmap
 import os
 import shutil
@@ -16,6 +17,7 @@ import sys
 import tempfile
 import threading
 import weakref
+import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -23,6 +25,8 @@ from typing import IO, Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from liex_lab.errors import LiexError
 
 _ZEROS = 1 << 20  # bytes written at once
 _FULL = (errno.ENOSPC, getattr(errno, "EDQUOT", errno.ENOSPC))
@@ -180,3 +184,117 @@ def blocks(n: int, size: int) -> Iterator[slice]:
         _release_pages()
     if n > size:
         rest()
+
+
+# Bounds of a NumPy archive (.npz) from somewhere else, checked before any of it is unpacked.
+
+
+_HEADS = {
+    (1, 0): np.lib.format.read_array_header_1_0,
+    (2, 0): np.lib.format.read_array_header_2_0,
+}
+
+
+def check_npz(source: Path | IO[bytes], most_bytes: int) -> None:
+    """Check that an .npz holds arrays of plain numbers, and no more of them than it may.
+
+    Args:
+        source: the file.
+        most_bytes: bytes of all arrays together.
+
+    Raises:
+        ValueError: it holds more, an array is larger than its part of the file, or it is no
+            archive of arrays.
+    """
+    try:
+        with zipfile.ZipFile(source) as archive:
+            entries = archive.infolist()
+            total = sum(entry.file_size for entry in entries)
+            if total > most_bytes:
+                raise ValueError(
+                    f"it unpacks to {total / 1e9:.1f} GB, and at most {most_bytes / 1e9:.1f} GB "
+                    "are expected"
+                )
+            for entry in entries:
+                with archive.open(entry) as file:
+                    _check_array(file, entry)
+    except (zipfile.BadZipFile, EOFError, NotImplementedError, OverflowError) as error:
+        raise ValueError(f"it is no archive of arrays ({error})") from None
+    if not isinstance(source, Path):
+        source.seek(0)
+
+
+def _check_array(file: IO[bytes], entry: zipfile.ZipInfo) -> None:
+    """Raises ValueError where an array's header claims another size than its file has."""
+    version = np.lib.format.read_magic(file)
+    if version not in _HEADS:
+        raise ValueError(f"{entry.filename} has a header of an unknown kind")
+    shape, _, dtype = _HEADS[version](file)
+    if dtype.hasobject:
+        raise ValueError(f"{entry.filename} does not hold plain numbers")
+    if math.prod(shape) * dtype.itemsize > entry.file_size:
+        raise ValueError(f"{entry.filename} claims {shape} numbers, more than there are")
+
+
+# What the system gives a process: memory, threads and open files, and which errors say that it
+# gives no more.
+
+
+# addresses that a run takes up, most of them never used: below that libraries end the process
+_LEAST_GB = 4.5
+_MEMORY = (
+    "cannot allocate",
+    "can't allocate",
+    "failed to allocate",
+    "failed to map segment",
+    "not enough memory",
+    "insufficient memory",
+    "out of memory",
+    "can't start new thread",
+)
+_NO_MEMORY = (
+    "the memory was not enough; close other programs, use fewer workers, or let the process have "
+    "more (ulimit -v unlimited), and run the same command again"
+)
+_NO_FILES = (
+    "the system lets this process open no more files; allow more (ulimit -n 1024) and run the same "
+    "command again"
+)
+_FILES = (errno.EMFILE, errno.ENFILE)
+
+
+def why_short(error: BaseException | None) -> str:
+    """What the system gives no more of, and what to do; empty where an error does not say so.
+
+    Args:
+        error: any error, with those that it was raised from; None for none.
+    """
+    asked: set[int] = set()
+    while error is not None and id(error) not in asked:
+        asked.add(id(error))
+        if isinstance(error, OSError) and error.errno in _FILES:
+            return _NO_FILES
+        if isinstance(error, MemoryError) or getattr(error, "errno", None) == errno.ENOMEM:
+            return _NO_MEMORY
+        if not isinstance(error, LiexError) and any(said in str(error).lower() for said in _MEMORY):
+            return _NO_MEMORY
+        error = error.__cause__ or error.__context__
+    return ""
+
+
+def check_limits() -> None:
+    """Refuse to begin where this process may take up too few addresses (`ulimit -v`).
+
+    Raises:
+        LiexError: it is so.
+    """
+    try:
+        import resource
+    except ImportError:  # Windows knows no such limit
+        return
+    limit = resource.getrlimit(resource.RLIMIT_AS)[0]
+    if limit != resource.RLIM_INFINITY and limit < _LEAST_GB * 2**30:
+        raise LiexError(
+            f"this process may take up {limit / 2**30:.1f} GB of addresses and a run takes up "
+            f"{_LEAST_GB:g}, most of it never used; allow more (ulimit -v unlimited)"
+        )

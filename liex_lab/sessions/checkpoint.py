@@ -22,8 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.errors import SessionError
-from liex_lab.runtime.durable import sync_file, sync_tree, write_whole
-from liex_lab.runtime.lock import take_lock
+from liex_lab.runtime.durable import sync_file, sync_tree, take_lock, write_whole
 from liex_lab.runtime.memory import mapped
 from liex_lab.runtime.places import unlinked, unlinked_tree
 

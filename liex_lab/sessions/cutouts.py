@@ -38,8 +38,8 @@ from liex_lab.sessions.reading import reading_from
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from liex_lab.foreground.still_scene import StillScene
     from liex_lab.recordings.recording import Recording
+    from liex_lab.scene.still_scene import StillScene
     from liex_lab.sessions.provenance import Provenance
     from liex_lab.sessions.session import Session
     from liex_lab.tracking.observations import Observations
@@ -75,7 +75,7 @@ def still_scene(recording: Recording, known: StillScene | None = None) -> Depth:
     """
     import cv2
 
-    from liex_lab.foreground.background import learn_background, sample_frames
+    from liex_lab.scene.background import learn_background, sample_frames
 
     learned = to_millimetres(learn_background(sample_frames(recording, _FRAMES))[0])
     # specks of 16 frames are no scene
@@ -95,7 +95,7 @@ def _without_animals(picture: Depth, known: StillScene) -> Depth:
     """
     import cv2
 
-    from liex_lab.foreground.still_scene import at_every_pixel
+    from liex_lab.scene.still_scene import at_every_pixel
 
     step = known.stride
     limit, background = (
@@ -176,7 +176,7 @@ class PictureKeeper:
 
 def _region(origin: Provenance) -> NDArray[np.bool_] | None:
     """(H, W) the arena's region; None is the whole picture."""
-    from liex_lab.arena.scene import region_mask
+    from liex_lab.recordings.frame import region_mask
 
     if origin.scene is None or not origin.scene.region_px:
         return None

@@ -14,12 +14,12 @@ from typing import Annotated, Any, NoReturn
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from liex_lab.arena.outline import Arena
-from liex_lab.arena.zones import Zone
 from liex_lab.errors import SessionError
 from liex_lab.geometry import SE3
 from liex_lab.optics.camera import Camera
 from liex_lab.plan.sections import Factor
+from liex_lab.scene.outline import Arena
+from liex_lab.scene.zones import Zone
 from liex_lab.sessions.provenance import SCHEMA_VERSION
 from liex_lab.sessions.thumbnails import FOLDER
 

@@ -17,14 +17,12 @@ from numpy.typing import NDArray
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.errors import SessionError
 from liex_lab.recordings.timestamps import Gap
-from liex_lab.runtime.memory import blocks
-from liex_lab.runtime.npz import check_npz
+from liex_lab.runtime.memory import blocks, check_npz
 from liex_lab.sessions.provenance import Provenance
 from liex_lab.sessions.reading import reading_from
 from liex_lab.tables.rows import LOST
 from liex_lab.tracking.observations import COLUMNS, Observations
-from liex_lab.tracking.subject import Subject
-from liex_lab.tracking.track import Flip
+from liex_lab.tracking.track import Flip, Subject
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -10,10 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from liex_lab.errors import LiexError
-from liex_lab.runtime.disk import is_full, why_full
 from liex_lab.runtime.durable import write_whole
-from liex_lab.runtime.limits import why_short
-from liex_lab.runtime.places import storable_document, unlinked
+from liex_lab.runtime.memory import why_short
+from liex_lab.runtime.places import is_full, storable_document, unlinked, why_full
 from liex_lab.sessions.provenance import versions
 
 FAILED_FILE = "failed.json"

@@ -19,20 +19,20 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from liex_lab.arena.outline import UNKNOWN, Arena
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.errors import SessionError
 from liex_lab.geometry import SE3
 from liex_lab.optics.camera import Camera
 from liex_lab.runtime.places import storable
+from liex_lab.scene.outline import UNKNOWN, Arena
 
 if TYPE_CHECKING:
-    from liex_lab.arena.floor import Floor
-    from liex_lab.arena.scene import Scene
-    from liex_lab.arena.zones import Zone
     from liex_lab.plan import Plan
     from liex_lab.recordings.recording import Recording
     from liex_lab.recordings.timestamps import Gap
+    from liex_lab.scene.floor import Floor
+    from liex_lab.scene.scene import Scene
+    from liex_lab.scene.zones import Zone
 
 SCHEMA_VERSION = 8
 _PACKAGES = (

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from liex_lab.runtime.spreadsheets import write_csv
+from liex_lab.runtime.text_files import write_csv
 from liex_lab.sessions.provenance import Provenance, package_version
 from liex_lab.tables import schema as tables
 from liex_lab.tables.rows import Rows, median_step, stop_times

@@ -23,8 +23,8 @@ from liex_lab.actions import vocabulary
 from liex_lab.behaviour.body import logged_of
 from liex_lab.errors import SessionError
 from liex_lab.geometry import so3
-from liex_lab.runtime.disk import probe_full
 from liex_lab.runtime.memory import blocks
+from liex_lab.runtime.places import probe_full
 from liex_lab.sessions.drawn import dot_mm, dot_pt
 from liex_lab.sessions.joining import RRD_HEAD, rrd_messages
 from liex_lab.sessions.provenance import Provenance

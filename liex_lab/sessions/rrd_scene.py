@@ -13,7 +13,7 @@ import rerun as rr
 from liex_lab.sessions.rrd_depth import IMAGE, MM_PER_UNIT
 
 if TYPE_CHECKING:
-    from liex_lab.arena.scene import Scene
+    from liex_lab.scene.scene import Scene
     from liex_lab.tables.rows import Rows
 
 OVERLAY: Final = f"{IMAGE}/overlay"

@@ -16,13 +16,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from liex_lab.arena.outline import Arena
-from liex_lab.arena.zones import Zone
 from liex_lab.errors import SessionError
 from liex_lab.geometry import SE3
 from liex_lab.optics.camera import Camera
 from liex_lab.runtime.memory import rest
-from liex_lab.runtime.spreadsheets import read_harmless
+from liex_lab.runtime.text_files import read_harmless
+from liex_lab.scene.outline import Arena
+from liex_lab.scene.zones import Zone
 from liex_lab.sessions.corrections import (
     Log,
     applies,

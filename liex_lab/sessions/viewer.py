@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from liex_lab.errors import LiexError
-from liex_lab.runtime.children import own_python
+from liex_lab.runtime.processes import own_python
 
 _PATIENCE_S = 30.0  # for a viewer to come up
 

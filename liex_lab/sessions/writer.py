@@ -25,10 +25,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.errors import LiexError, SessionError
-from liex_lab.runtime.disk import is_full, probe_full, why_full
 from liex_lab.runtime.durable import put_in_place, sync_tree
 from liex_lab.runtime.memory import Allocator, on_disk, peak_memory_mb, rest
-from liex_lab.runtime.places import storable_document, unlinked_tree
+from liex_lab.runtime.places import is_full, probe_full, storable_document, unlinked_tree, why_full
 from liex_lab.sessions.buffer import Columnar, TrackBuffer, columns_of
 from liex_lab.sessions.checkpoint import LOGS, Checkpoint
 from liex_lab.sessions.corrections import FOLDER
@@ -57,7 +56,7 @@ if TYPE_CHECKING:
 
     from liex_lab.recordings.frame import DepthFrame
     from liex_lab.sessions.session import Session
-    from liex_lab.tracking.subject import Subject
+    from liex_lab.tracking.track import Subject
 
 INDEX = "frame_index"
 TIMES = "frame_time_ns"

@@ -17,8 +17,8 @@ from liex_lab.optics.camera import Lens
 from liex_lab.recordings.camera_file import fitting
 from liex_lab.recordings.recording import Recording
 from liex_lab.simulation.recording import TrueRecording
-from liex_lab.simulation.sensors import BY_NAME
 from liex_lab.simulation.simulator import world_of
+from liex_lab.simulation.species import BY_NAME
 from liex_lab.simulation.tracking_sequences import SEQUENCES, tracking_sequence
 
 _ANIMALS: Final = {"walk": "mouse", "swim": "fish", "gesture": "hand"}  # "move" takes any

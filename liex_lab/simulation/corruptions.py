@@ -16,8 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.optics.camera import Camera
-from liex_lab.simulation.objects import N_PARTS, THING_FACES, draw_thing, rounded
-from liex_lab.simulation.scene import SimulatedScene
+from liex_lab.simulation.scene import N_PARTS, THING_FACES, SimulatedScene, draw_thing, rounded
 
 Array = NDArray[np.float64]
 Beside = Callable[

@@ -16,13 +16,11 @@ from numpy.typing import NDArray
 from liex_lab.body.pose import Pose
 from liex_lab.body.shape import BodyShape
 from liex_lab.body.skeleton import Skeleton
-from liex_lab.body.surface import Body
-from liex_lab.body.variation import joint_reaches, vary_body
+from liex_lab.body.surface import Body, joint_reaches, vary_body
 from liex_lab.geometry import SE3
 from liex_lab.simulation.pose_prior import root_rotation
 from liex_lab.simulation.scene import SceneSpec
-from liex_lab.simulation.sensors import RAYTRIX_R5_SENSOR, Sensor
-from liex_lab.simulation.species import Postures
+from liex_lab.simulation.species import RAYTRIX_R5_SENSOR, Postures, Sensor
 
 Array = NDArray[np.float64]
 

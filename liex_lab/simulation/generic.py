@@ -16,15 +16,13 @@ from numpy.typing import NDArray
 
 from liex_lab.body.pose import Pose
 from liex_lab.body.skeleton import VIEWS, Skeleton
-from liex_lab.body.surface import Body, Surface
-from liex_lab.body.variation import vary_body
+from liex_lab.body.surface import Body, Surface, vary_body
 from liex_lab.geometry import SE3
 from liex_lab.simulation.locomotion import smoothed, wander
 from liex_lab.simulation.pose_prior import root_rotation
 from liex_lab.simulation.recording import SyntheticSession, assemble
 from liex_lab.simulation.scene import ARENA, SceneSpec, SimulatedScene
-from liex_lab.simulation.sensors import RAYTRIX_R5_SENSOR, SENSORS, Sensor
-from liex_lab.simulation.species import Postures
+from liex_lab.simulation.species import RAYTRIX_R5_SENSOR, SENSORS, Postures, Sensor
 
 Array = NDArray[np.float64]
 

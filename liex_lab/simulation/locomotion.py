@@ -22,8 +22,7 @@ from liex_lab.simulation.fish import FishSpecies, bend_profile, clearance, hung
 from liex_lab.simulation.pose_prior import KINDS, Posture, draw_postures, root_rotation, stand
 from liex_lab.simulation.recording import SyntheticSession, assemble
 from liex_lab.simulation.scene import SimulatedScene, floor_point
-from liex_lab.simulation.sensors import KINECT_V2_SENSOR, RAYTRIX_R5_SENSOR, Sensor
-from liex_lab.simulation.species import MouseSpecies
+from liex_lab.simulation.species import KINECT_V2_SENSOR, RAYTRIX_R5_SENSOR, MouseSpecies, Sensor
 
 Array = NDArray[np.float64]
 Script = Callable[[np.random.Generator, int], tuple[NDArray[np.int64], Array]]

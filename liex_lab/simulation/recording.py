@@ -16,7 +16,6 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from liex_lab.arena.floor import Floor
 from liex_lab.body.pose import Pose
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.body.surface import Body, Surface
@@ -24,12 +23,11 @@ from liex_lab.errors import LiexError
 from liex_lab.geometry import SE3
 from liex_lab.recordings.frame import Depth, DepthFrame
 from liex_lab.recordings.recording import Recording
+from liex_lab.scene.floor import Floor
 from liex_lab.simulation import _render_kernels as render_kernels
 from liex_lab.simulation._sensor_kernels import NORMAL, UNIT
-from liex_lab.simulation.objects import THING_FACES, draw_thing
-from liex_lab.simulation.scene import SimulatedScene, outline_of
-from liex_lab.simulation.sensors import Sensor, unseen
-from liex_lab.simulation.species import MouseSpecies, Species
+from liex_lab.simulation.scene import THING_FACES, SimulatedScene, draw_thing, outline_of
+from liex_lab.simulation.species import MouseSpecies, Sensor, Species, unseen
 
 Array = NDArray[np.float64]
 

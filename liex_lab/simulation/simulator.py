@@ -17,7 +17,7 @@ from liex_lab.body.skeleton import Skeleton
 from liex_lab.simulation import generic, locomotion, recording, training_patches
 from liex_lab.simulation.fish import FishSpecies
 from liex_lab.simulation.generic import GenericSpecies
-from liex_lab.simulation.hand.reference import find_reference
+from liex_lab.simulation.hand.pose_prior import find_reference
 from liex_lab.simulation.hand.simulator import HandSimulator
 from liex_lab.simulation.recording import SyntheticSession, TrueRecording
 from liex_lab.simulation.species import MouseSpecies, Species

@@ -23,8 +23,8 @@ from liex_lab.simulation import corruptions
 from liex_lab.simulation.corruptions import Event, Loss
 from liex_lab.simulation.hand.simulator import FRAME_NS, NYU_SENSOR, HandSession, HandSimulator
 from liex_lab.simulation.recording import FrameContents, SyntheticSession, TrueRecording
-from liex_lab.simulation.sensors import Sensor
 from liex_lab.simulation.simulator import BodySimulator, Simulator
+from liex_lab.simulation.species import Sensor
 
 Array = NDArray[np.float64]
 

@@ -27,9 +27,8 @@ from liex_lab.geometry import SE3
 from liex_lab.runtime.threads import threads
 from liex_lab.simulation import _render_kernels as render_kernels
 from liex_lab.simulation._sensor_kernels import EROSION, NOISE, NORMAL
-from liex_lab.simulation.objects import PART_FACES, rounded
-from liex_lab.simulation.scene import SceneSpec, draw_views
-from liex_lab.simulation.scenes.worn import draw_worn
+from liex_lab.simulation.scene import PART_FACES, SceneSpec, draw_views, rounded
+from liex_lab.simulation.scenes.meshes import draw_worn
 from liex_lab.simulation.species import MouseSpecies, Species
 
 Array = NDArray[np.float64]

@@ -17,8 +17,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.actions.ethogram import Ethogram, runs_of
-from liex_lab.arena.outline import UNKNOWN, Arena
-from liex_lab.arena.zones import Zone, zone_names
 from liex_lab.geometry import so3
 from liex_lab.recordings.timestamps import frames_apart, rounded_step
 from liex_lab.recordings.timestamps import median_step as recorded_step

@@ -29,8 +29,8 @@ if TYPE_CHECKING:
     import pandas as pd
     import pyarrow as pa
 
-    from liex_lab.arena.outline import Arena
-    from liex_lab.arena.zones import Zone
+    from liex_lab.scene.outline import Arena
+    from liex_lab.scene.zones import Zone
 
 
 ROWS_PER_GROUP = 100_000  # a block of the widest table then takes some 20 MB

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from liex_lab.body.pose import Pose
 from liex_lab.geometry import SE3, so3
-from liex_lab.tracking import _kalman_kernels as kernels
+from liex_lab.tracking import _smoother_kernels as kernels
 from liex_lab.tracking.motion_model import TrackingParameters
 from liex_lab.tracking.smoother import Motion
 from liex_lab.tracking.track import Track

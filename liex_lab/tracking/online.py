@@ -15,8 +15,7 @@ from liex_lab.tracking.association import NONE, HypothesisAssociation
 from liex_lab.tracking.motion_model import TrackingParameters
 from liex_lab.tracking.observations import Observations
 from liex_lab.tracking.smoother import smooth
-from liex_lab.tracking.subject import Subject
-from liex_lab.tracking.track import Track
+from liex_lab.tracking.track import Subject, Track
 from liex_lab.tracking.track_rows import hide, to_track
 from liex_lab.tracking.trust import Watch
 

@@ -24,10 +24,10 @@ from numpy.typing import NDArray
 from liex_lab.body.pose import Pose
 from liex_lab.estimation.cascade import Candidates, ImageSet
 from liex_lab.estimation.estimator import Estimates, PoseEstimator
-from liex_lab.foreground.crop_camera import view_of
-from liex_lab.foreground.segmenter import Segmenter
 from liex_lab.geometry import SE3, brownian_ends, brownian_steps, so3
 from liex_lab.recordings.frame import DepthFrame
+from liex_lab.scene.height_maps import view_of
+from liex_lab.scene.segmenter import Segmenter
 
 Array = NDArray[np.float64]
 

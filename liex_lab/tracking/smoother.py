@@ -7,7 +7,7 @@ reweighted smoothing: w = (ν + 1) / (ν + δ^2) with δ the distance from the c
 error, and a gate beyond which a measurement does not count. Of the error's variance the share c^2
 is correlated over neighbouring frames: no smoother takes it away, so it is left out of the filter
 and added to the posterior. Calibration factors then scale the posterior spread to the errors
-observed on rendered sequences. The kernels are in `_smoother_kernels` and `_kalman_kernels`.
+observed on rendered sequences. The kernels are in `_smoother_kernels`.
 """
 
 from __future__ import annotations
@@ -17,12 +17,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from liex_lab.body.kinematic_tree import KinematicTree
+from liex_lab.body.kinematics import KinematicTree
 from liex_lab.body.pose import Pose
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.geometry import SE3
 from liex_lab.runtime.shapes import check_shapes
-from liex_lab.tracking import _kalman_kernels as kalman
 from liex_lab.tracking import _smoother_kernels as kernels
 from liex_lab.tracking.observations import joints_of
 
@@ -314,7 +313,7 @@ class _Smoother:
             r,
         )
         out = np.empty((n, 3))
-        kalman.smooth_positions(
+        kernels.smooth_positions(
             self.seconds,
             middle,
             r,
@@ -325,28 +324,28 @@ class _Smoother:
             out,
             spread.middle,
         )
-        gain, covariances = kalman.Gains.blank(n), kalman.Covariances.blank(n)
+        gain, covariances = kernels.Gains.blank(n), kernels.Covariances.blank(n)
         later = np.maximum(np.arange(n), start)
 
-        def fill(a: int, group: Array, left: Array | None = None) -> kalman.Gains:
+        def fill(a: int, group: Array, left: Array | None = None) -> kernels.Gains:
             """The gains of an axis whose moves these are, and its posterior variance."""
             relative, axis = group[0] / length, gain.axis(a)
             measured = relative * relative * variance
-            kalman.gains(self.seconds, measured, group[1], group[2], start, axis, covariances)
+            kernels.gains(self.seconds, measured, group[1], group[2], start, axis, covariances)
             if left is not None:
                 left[:] = covariances.smoothed[later, 0, 0]
             return axis
 
         for a in range(3):
             fill(a, moves.turn[a], spread.turn[:, a])
-        kalman.smooth_rotations(seen.rotation, used, start, gain, made.rotation, np.zeros((n, 3)))
+        kernels.smooth_rotations(seen.rotation, used, start, gain, made.rotation, np.zeros((n, 3)))
         bend = [fill(a, moves.bend[a], spread.bend[:, a]) for a in range(3)]
         value, rate = np.zeros(n), np.zeros(n)
         for j, a in self.body.free:
-            kalman.smooth_values(seen.angles[:, j, a].copy(), used, start, bend[a], value, rate)
+            kernels.smooth_values(seen.angles[:, j, a].copy(), used, start, bend[a], value, rate)
             made.angles[:, j, a] = value
         size = fill(0, moves.size)
-        kalman.smooth_values(seen.log_scale, used, start, size, made.log_scale, rate)
+        kernels.smooth_values(seen.log_scale, used, start, size, made.log_scale, rate)
         kernels.place_middles(self.body, out, made)
 
 

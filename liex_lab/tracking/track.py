@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, fields
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ from numpy.typing import NDArray
 from liex_lab.body.pose import Pose
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.geometry import SE3
+from liex_lab.optics.camera import Camera
 from liex_lab.runtime.memory import Allocator, blocks
 
 Array = NDArray[np.float64]
@@ -290,3 +292,106 @@ class Tracked:
     track: Track
     flips: tuple[Flip, ...]
     cuts: tuple[int, ...] = ()
+
+
+# Whom a track is of.
+
+
+@dataclass(frozen=True)
+class Subject:
+    """Whom a track is of, before which camera, and by which limits its rows are kept or flagged.
+
+    Attributes:
+        skeleton: kinematic tree of the animal.
+        camera: the depth camera that took the recording.
+        T_arena_camera: pose of the camera in the arena frame, mm.
+        length_mm: spine length of this animal, mm.
+        doubtful_mm: frames with a larger predicted mean joint error, mm, are flagged.
+        bridge_s: so long a gap without a measurement is bridged, s, and half as far into a longer
+            one from both its ends.
+        joint_share: (J,) error of each joint over the mean of all joints.
+        stretch_sd: standard deviation of the share by which all distances from the base may be off
+            throughout, for an animal whose ends a sensor eats is taken for a smaller one; None
+            where nothing is known of it, which takes the usual share of `Motion`.
+        unseen: standard deviations over the length of the joints' height and of their place along
+            the body that a session's own shape leaves; None without one, which takes those of
+            `Motion`.
+        n_animals: how many animals are in view at once, one of which is followed.
+    """
+
+    skeleton: Skeleton
+    camera: Camera
+    T_arena_camera: SE3
+    length_mm: float
+    doubtful_mm: float
+    bridge_s: float
+    joint_share: tuple[float, ...]
+    stretch_sd: float | None = None
+    unseen: tuple[float, float] | None = None
+    n_animals: int = 1
+
+
+# Gaps between measured frames, in seconds, and runs of frames.
+
+
+def short_gaps(
+    seconds: Array, measured: NDArray[np.bool_], bridge_s: float, ahead: bool = False
+) -> NDArray[np.bool_]:
+    """Mask (n,) of the unmeasured frames that are bridged.
+
+    A frame between two measured ones is bridged where the nearer of them is no farther than half of
+    bridge_s, so a gap no longer than bridge_s is bridged whole.
+
+    Args:
+        seconds: (n,) s, increasing.
+        measured: (n,) True where the pose was measured.
+        bridge_s: the longest gap that is bridged whole, s.
+        ahead: also bridge the frames within bridge_s after the last measured one.
+
+    Returns:
+        (n,) bool, False at measured frames.
+    """
+    rows = np.flatnonzero(measured)
+    if not len(rows):
+        return np.zeros(len(measured), np.bool_)
+    t = np.arange(len(measured))
+    after = np.searchsorted(rows, t)
+    inside = (after > 0) & (after < len(rows))
+    before = rows[np.maximum(after - 1, 0)]
+    after = rows[np.minimum(after, len(rows) - 1)]
+    away = np.minimum(seconds - seconds[before], seconds[after] - seconds)
+    short = inside & (away <= 0.5 * bridge_s)
+    if ahead:
+        short[rows[-1] + 1 :] = seconds[rows[-1] + 1 :] - seconds[rows[-1]] <= bridge_s
+    return short & ~measured
+
+
+def whole_gaps(seconds: Array, measured: NDArray[np.bool_], bridge_s: float) -> NDArray[np.bool_]:
+    """Mask (n,) of the unmeasured frames in gaps no longer than bridge_s.
+
+    Args:
+        seconds: (n,) s, increasing.
+        measured: (n,) True where the pose was measured.
+        bridge_s: the longest gap, s.
+
+    Returns:
+        (n,) bool, False at measured frames, and before the first and after the last of them.
+    """
+    rows = np.flatnonzero(measured)
+    out = np.zeros(len(measured), np.bool_)
+    for before, after in pairwise(rows):
+        out[before + 1 : after] = seconds[after] - seconds[before] <= bridge_s
+    return out
+
+
+def spans(where: NDArray[np.bool_]) -> list[tuple[int, int]]:
+    """The runs of True in a mask, as (start, stop) with stop exclusive.
+
+    Args:
+        where: (n,) bool.
+
+    Returns:
+        One pair of indices for each run, in order.
+    """
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], where, [False]]).astype(np.int8)))
+    return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]

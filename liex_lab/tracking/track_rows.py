@@ -15,12 +15,10 @@ from numpy.typing import NDArray
 
 from liex_lab.geometry import so3
 from liex_lab.tracking.association import NONE
-from liex_lab.tracking.gaps import short_gaps
 from liex_lab.tracking.motion_model import TrackingParameters
 from liex_lab.tracking.observations import Observations, joints_of
 from liex_lab.tracking.smoother import Curve
-from liex_lab.tracking.subject import Subject
-from liex_lab.tracking.track import Track
+from liex_lab.tracking.track import Subject, Track, short_gaps
 from liex_lab.tracking.trust import (
     MOST_ERROR,
     WHOLE,

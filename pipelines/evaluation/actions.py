@@ -29,13 +29,13 @@ from numpy.typing import NDArray
 from liex_lab.errors import LiexError
 from liex_lab.runtime.progress import Progress, silent
 
-from ..training.action_model import train_actions
-from ..training.agent_data import (
+from ..training.action_model import (
     FAST_HZ,
     RATE_HZ,
     by_usual_camera,
     cut_sequences,
     test_recordings,
+    train_actions,
     training_recordings,
 )
 from ..training.agent_tracks import AgentTrack, acted, acted_tracks

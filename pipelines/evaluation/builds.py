@@ -99,8 +99,8 @@ def film(animal: str, seed: int, k: int, family: str) -> TrueRecording:
         LiexError: the animal's simulator knows one build only.
     """
     from liex_lab.body.skeleton import Skeleton
-    from liex_lab.simulation.sensors import unseen
     from liex_lab.simulation.simulator import BodySimulator, world_of
+    from liex_lab.simulation.species import unseen
 
     world = world_of(Skeleton.load(animal))
     if not isinstance(world, BodySimulator) or animal not in ("mouse", "fish"):

@@ -28,7 +28,7 @@ from liex_lab.optics.camera import Camera
 from liex_lab.recordings.formats.messages.mcap_writer import McapDepthWriter
 from liex_lab.recordings.frame import Depth, DepthFrame
 from liex_lab.recordings.writer import PictureFolderWriter, RecordingWriter
-from liex_lab.runtime.children import own_python
+from liex_lab.runtime.processes import own_python
 from liex_lab.runtime.progress import Progress, silent
 
 _N_FRAMES = 150

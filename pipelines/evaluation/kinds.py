@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from liex_lab.errors import LiexError
-from liex_lab.runtime.children import own_python
+from liex_lab.runtime.processes import own_python
 from liex_lab.runtime.progress import Progress, silent
 
 from ..convert import convert

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from liex_lab.sessions import Provenance
     from liex_lab.sessions.writer import ReportMaker
     from liex_lab.tracking.observations import Observations
-    from liex_lab.tracking.subject import Subject
+    from liex_lab.tracking.track import Subject
 
 FPS = 30
 _SHORT = "synthetic:walk?seed=5&frames=300&sensor=primesense-qvga"

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from liex_lab.errors import LiexError
 from liex_lab.evaluation.motion import POINTS, Motion, motion_figures
-from liex_lab.runtime.npz import check_npz
+from liex_lab.runtime.memory import check_npz
 from liex_lab.runtime.progress import Progress, silent
 
 if TYPE_CHECKING:
@@ -244,7 +244,7 @@ def on_back(skeleton: Skeleton, bodies: Bodies, along: Array, above: float) -> A
     Returns:
         (n, P, 3) mm, in the frame of the poses.
     """
-    from liex_lab.body.variation import joint_reaches
+    from liex_lab.body.surface import joint_reaches
 
     frames = bodies.pose.frames(skeleton)
     joints, upwards = frames.translation, frames.rotation[..., 2]

@@ -33,7 +33,7 @@ from ..build import plan_of
 if TYPE_CHECKING:
     from liex_lab.baselines.baseline import Baseline
     from liex_lab.estimation.estimator import PoseEstimator
-    from liex_lab.foreground.segmenter import Segmenter
+    from liex_lab.scene.segmenter import Segmenter
     from liex_lab.simulation.recording import TrueRecording
 
 Array = NDArray[np.float64]

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from liex_lab.errors import SessionError
-from liex_lab.runtime.children import own_python
+from liex_lab.runtime.processes import own_python
 from liex_lab.runtime.progress import Progress, silent
 
 if TYPE_CHECKING:
@@ -32,7 +32,7 @@ _COPIED = ("plan.toml", "session.rrd", "session.mcap")
 # them together
 _MEASURE = """
 import json, resource, subprocess, sys, time
-from liex_lab.runtime.children import own_python
+from liex_lab.runtime.processes import own_python
 began = time.perf_counter()
 command = own_python("-m", "liex_lab", "report", sys.argv[1])
 code = subprocess.run(command, stdout=subprocess.DEVNULL).returncode

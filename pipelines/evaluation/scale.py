@@ -27,7 +27,7 @@ import numpy as np
 
 from liex_lab.plan import Plan
 from liex_lab.plan.study import Study
-from liex_lab.runtime.children import own_python
+from liex_lab.runtime.processes import own_python
 from liex_lab.runtime.progress import Progress, silent
 
 from ..build import build_recording, build_tracker, kept_estimator

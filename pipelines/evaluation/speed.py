@@ -27,7 +27,7 @@ from liex_lab.runtime.progress import Progress, silent
 if TYPE_CHECKING:
     from liex_lab.baselines.baseline import Baseline
     from liex_lab.estimation.estimator import PoseEstimator
-    from liex_lab.foreground.segmenter import Segmenter
+    from liex_lab.scene.segmenter import Segmenter
 
 Array = NDArray[Any]
 N_FRAMES = 128

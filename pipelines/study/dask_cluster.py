@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from liex_lab.errors import MissingPackageError, StudyError, how_to_install
-from liex_lab.runtime.scratch import Scratch
+from liex_lab.runtime.durable import Scratch
 
 from ..workers import n_cores, worker_environment
 from .cluster_watch import KeptWorkers

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 from liex_lab.errors import StudyError
 from liex_lab.plan.study import PlannedSession, Study
-from liex_lab.runtime.lock import locked
+from liex_lab.runtime.durable import locked
 from liex_lab.runtime.places import unlinked_below
 from liex_lab.runtime.progress import Board
 from liex_lab.sessions.corrections import Description

@@ -34,7 +34,7 @@ from liex_lab.sessions.provenance import SCHEMA_VERSION, versions
 from .changes import input_stamp, what_changed
 
 if TYPE_CHECKING:
-    from liex_lab.tracking.shared_body import Found
+    from liex_lab.tracking.own_shape import Found
 
 LOOK_FILE = "look.json"
 LOOKING = "looking at the animal"
@@ -165,7 +165,7 @@ def together(
         group: sessions of one animal.
         looks: of each of them, by id, as `look_at` gives it.
     """
-    from liex_lab.tracking.shared_body import MOST_APART, agree, spread_of
+    from liex_lab.tracking.own_shape import MOST_APART, agree, spread_of
 
     subject = group[0].animal.id
     taking_part = {s.id: found_in(looks[s.id]) for s in group if not _why_not(looks[s.id])}
@@ -226,7 +226,7 @@ def found_in(look: Mapping[str, Any]) -> Found:
     Raises:
         ValueError: it is damaged.
     """
-    from liex_lab.tracking.shared_body import Found
+    from liex_lab.tracking.own_shape import Found
 
     from ..build import shape_labels
 

@@ -10,8 +10,9 @@ sampling: it names what a person should label next by the entropy of the recogni
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +20,9 @@ from numpy.typing import NDArray
 from liex_lab.errors import LiexError
 from liex_lab.runtime.progress import Progress, silent
 from liex_lab.sessions.tracks import track_of, wall_of
+from liex_lab.simulation.agents import fish, mouse
+
+from .agent_tracks import Scenario
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -27,6 +31,7 @@ if TYPE_CHECKING:
     from liex_lab.actions.timeline import TimelineModel
     from liex_lab.estimation.estimator import PoseEstimator
     from liex_lab.sessions import Session
+
 
 Array = NDArray[np.float64]
 
@@ -54,7 +59,6 @@ def learning_set(
     Raises:
         LiexError: no actions are generated for this animal.
     """
-    from .agent_data import RATE_HZ, WORDS, by_usual_camera, cut_sequences, training_recordings
     from .agent_tracks import acted, acted_tracks
 
     if animal not in WORDS:
@@ -249,3 +253,91 @@ def _session_and_model(
             "another"
         )
     return opened, recogniser
+
+
+# Training and test splits of generated behaviour for action recognition.
+
+
+Recorded = TypeVar("Recorded")
+
+WORDS = {"fish": fish.ACTIONS, "mouse": mouse.ACTIONS}
+RATE_HZ = {"fish": 50.0, "mouse": 30.0}  # of their cameras
+FAST_HZ = 100.0
+# cut-out sequences, as in the paper, of 5 and 2 fish
+N_TRAIN = 426
+N_TEST = 173
+_TRAIN_FISH = (101, 102, 103, 104, 105)
+_TEST_FISH = (106, 107)
+_TRAIN_SET = tuple(range(201, 225))
+_TEST_SET = tuple(range(301, 307))
+_FAST_SET = {"fish": tuple(range(225, 233))}
+_SECONDS = 40.0
+_FAST_SECONDS = 20.0
+_TEST_SECONDS = 300.0  # of a test recording, about: fewer minutes are fewer of the same recordings
+_FAST_SHARE = 1.0 / 6.0  # of every test recording is filmed by a faster camera as well
+
+
+def cut_sequences(animal: str, test: bool) -> list[Scenario]:
+    """Cut-out sequences of single actions, the actions in turn: the paper's experiment.
+
+    Args:
+        animal: `fish` or `mouse`, a key of `WORDS`.
+        test: the 173 test sequences of two individuals, else the 426 training sequences of five.
+    """
+    individuals, n = (_TEST_FISH, N_TEST) if test else (_TRAIN_FISH, N_TRAIN)
+    words = WORDS[animal]
+    return [
+        Scenario(
+            animal,
+            individuals[k % len(individuals)],
+            1000 + k,
+            RATE_HZ[animal],
+            word=words[k % len(words)],
+        )
+        for k in range(n)
+    ]
+
+
+def training_recordings(animal: str) -> list[Scenario]:
+    """Uncut recordings to learn from, 40 s each; a fish's last 8 by a 100 Hz camera, 20 s each.
+
+    Args:
+        animal: `fish` or `mouse`.
+    """
+    usual = [Scenario(animal, one, 1, RATE_HZ[animal], _SECONDS) for one in _TRAIN_SET]
+    return usual + [
+        Scenario(animal, one, 2, FAST_HZ, _FAST_SECONDS) for one in _FAST_SET.get(animal, ())
+    ]
+
+
+def by_usual_camera(recordings: Sequence[Recorded]) -> list[Recorded]:
+    """Those by the animal's usual camera, the first 24.
+
+    Args:
+        recordings: one entry for each of `training_recordings`, in that order.
+    """
+    return list(recordings[: len(_TRAIN_SET)])
+
+
+def test_recordings(animal: str, fast: bool, minutes: float) -> list[Scenario]:
+    """Uncut test recordings of individuals whose traits no other individual has.
+
+    Args:
+        animal: `fish` or `mouse`.
+        fast: the first sixth of the same recordings by a 100 Hz camera, instead of all of them by
+            the usual one.
+        minutes: length in all; about 5 minutes come from each of at most 6 individuals.
+    """
+    n = int(np.clip(round(60.0 * minutes / _TEST_SECONDS), 1, len(_TEST_SET)))
+    seconds = 60.0 * minutes / n
+    usual = [
+        Scenario(animal, one, 3, RATE_HZ[animal], seconds, novel=True) for one in _TEST_SET[:n]
+    ]
+    return (
+        [replace(one, rate_hz=FAST_HZ, filmed_s=_FAST_SHARE * seconds) for one in usual]
+        if fast
+        else usual
+    )
+
+
+test_recordings.__test__ = False  # type: ignore[attr-defined]  # its name is not a test's

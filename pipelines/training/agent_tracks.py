@@ -25,18 +25,18 @@ from liex_lab.estimation.estimator import PoseEstimator
 from liex_lab.geometry import SE3
 from liex_lab.optics.camera import Camera
 from liex_lab.runtime.progress import Progress, silent
+from liex_lab.scene.height_maps import Patches
 from liex_lab.simulation import agents
 from liex_lab.simulation._render_kernels import WALL_COLUMNS
 from liex_lab.simulation.agents import fish as fish_acts
 from liex_lab.simulation.agents import mouse as mouse_acts
-from liex_lab.simulation.agents.agent import STEP_S, Individual, Motion
-from liex_lab.simulation.agents.render import CameraPath, render_agent
+from liex_lab.simulation.agents.agent import STEP_S, CameraPath, Individual, Motion, render_agent
 from liex_lab.simulation.fish import FishSpecies
 from liex_lab.simulation.species import MouseSpecies
 from liex_lab.tracking.observations import COLUMNS, Observations
 from liex_lab.tracking.offline import track_whole
-from liex_lab.tracking.patch_observer import PatchObserver
-from liex_lab.tracking.subject import Subject
+from liex_lab.tracking.track import Subject
+from liex_lab.tracking.tracker import PatchObserver
 
 from .pose_model import cache_folder
 
@@ -386,3 +386,68 @@ def _load(path: Path, estimator: PoseEstimator, group: Sequence[Scenario]) -> li
             )
         )
     return found
+
+
+# A cut-out action as a camera sees it: poses of all its frames, and what is seen in some of them.
+
+
+_WINDOW_PX = 128
+_ABOVE_GROUND_MM = 4.0  # a pixel so far before the empty ground shows the animal or is noise
+_NEAR = 0.25  # of the body's length: what is farther from every joint is noise
+
+
+@dataclass(frozen=True)
+class Film:
+    """An action of n frames.
+
+    Attributes:
+        joints: (n, J, 3) true joints, mm, arena frame.
+        rows: (k,) the key frames among them.
+        points: of each key frame (m, 3) what the camera sees of the animal, mm, arena frame.
+        edges: pairs of joints that a bone connects.
+    """
+
+    joints: Array
+    rows: NDArray[np.int64]
+    points: list[Array]
+    edges: list[tuple[int, int]]
+
+
+def filmed_at(scenario: Scenario, n_key_frames: int) -> Film:
+    """An action acted, and rendered at key frames that are evenly spread over it.
+
+    Args:
+        scenario: a cut-out action; what comes before and after it is left out.
+        n_key_frames: number of key frames, the first and the last frame among them.
+    """
+    rng = np.random.default_rng([scenario.individual, scenario.seed])
+    motion, steps, pose, girth, walls, species, camera, shape, _ = staged(scenario, rng)
+    inside = np.flatnonzero(motion.word[steps] == scenario.word)
+    rows = np.linspace(0, len(inside) - 1, min(n_key_frames, len(inside))).round().astype(int)
+    at = inside[rows]
+    near = None if walls is None else walls[at]
+    (seen,) = render_agent(rng, species, camera, shape, pose[at], girth[at], near, _WINDOW_PX)
+    joints = pose[inside].joints(species.skeleton)
+    reach = _NEAR * species.skeleton.length
+    points = [
+        _beside(_points(seen, k, camera.T_arena_camera), joints[row], reach)
+        for k, row in enumerate(rows)
+    ]
+    return Film(joints, rows, points, list(species.skeleton.edges))
+
+
+def _points(seen: Patches, k: int, T_arena_camera: SE3) -> Array:
+    """What patch k shows before the ground, (m, 3) mm, arena frame."""
+    depth = seen.depth[k].astype(float)
+    v, u = np.nonzero((depth > 0) & (seen.background[k] - depth > _ABOVE_GROUND_MM))
+    fx, fy, cx, cy = seen.intrinsics[k]
+    z = depth[v, u]
+    x = (u + seen.origin[k, 0] - cx) / fx * z
+    y = (v + seen.origin[k, 1] - cy) / fy * z
+    return np.asarray(T_arena_camera @ np.stack([x, y, z], axis=-1))
+
+
+def _beside(points: Array, joints: Array, reach_mm: float) -> Array:
+    """Those of the points (m, 3) that are near a joint."""
+    off = np.linalg.norm(points[:, None] - joints[None], axis=-1).min(axis=1)
+    return np.asarray(points[off < reach_mm])

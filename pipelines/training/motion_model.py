@@ -41,8 +41,7 @@ from liex_lab.simulation.tracking_sequences import tracking_sequence
 from liex_lab.tracking.motion_model import TrackingParameters, tunings_with
 from liex_lab.tracking.observations import Observations
 from liex_lab.tracking.offline import track_whole
-from liex_lab.tracking.subject import Subject
-from liex_lab.tracking.track import Track
+from liex_lab.tracking.track import Subject, Track
 from liex_lab.tracking.track_rows import single_frames, stretch_of
 from liex_lab.tracking.tracker import FrameTracker
 

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from liex_lab.estimation.method import Method
     from liex_lab.estimation.model import Model
     from liex_lab.estimation.training import TrainingSet
-    from liex_lab.foreground.height_maps import HeightMaps
+    from liex_lab.scene.height_maps import HeightMaps
     from liex_lab.simulation.training_patches import TrainingPatches
 
 Array = NDArray[np.float64]
@@ -224,7 +224,7 @@ def make_model(
     from liex_lab.estimation.calibration import calibrate, with_corrector, with_facing, with_settler
     from liex_lab.estimation.model import Calibration, Model
     from liex_lab.estimation.training import train_cascade, train_metric, train_pruner
-    from liex_lab.foreground.height_maps import moment_columns
+    from liex_lab.scene.height_maps import moment_columns
     from liex_lab.simulation.simulator import world_of
 
     rng = np.random.default_rng([recipe.seed, _DRAW, draw] if draw else recipe.seed)
@@ -404,9 +404,9 @@ def cut_out(skeleton: Skeleton, method: Method, windows: TrainingPatches) -> Tra
     """
     from liex_lab.body.skeleton import FOREGROUNDS
     from liex_lab.estimation.training import TrainingSet
-    from liex_lab.foreground.background_segmenter import SPREADS
-    from liex_lab.foreground.hand_segmenter import HandPatches
-    from liex_lab.foreground.height_maps import Patches
+    from liex_lab.scene.background_segmenter import SPREADS
+    from liex_lab.scene.hand_segmenter import HandPatches
+    from liex_lab.scene.height_maps import Patches
 
     size = windows.spine_mm / skeleton.length
     origin = windows.origin.astype(float)
@@ -460,8 +460,8 @@ def with_truth(
     from liex_lab.body.pose import Pose
     from liex_lab.estimation.cascade import ImageSet, Truth
     from liex_lab.estimation.training import TrainingSet
-    from liex_lab.foreground.crop_camera import view_of
     from liex_lab.geometry import SE3
+    from liex_lab.scene.height_maps import view_of
 
     T_view_camera = view_of(crop_cameras)
     pose = Pose(T_view_camera @ windows.root, windows.angles, windows.scale)

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from liex_lab.body.skeleton import Skeleton
     from liex_lab.estimation.estimator import PoseEstimator
     from liex_lab.estimation.session_shape import ShapePrior
-    from liex_lab.foreground.height_maps import HeightMaps
+    from liex_lab.scene.height_maps import HeightMaps
     from liex_lab.simulation.training_patches import TrainingPatches
 
 Array = NDArray[np.float64]
@@ -172,7 +172,7 @@ def _measured(
 ) -> Iterator[MiniSession]:
     """The mini-sessions of one block."""
     from liex_lab.body.pose import Pose
-    from liex_lab.foreground.crop_camera import view_of
+    from liex_lab.scene.height_maps import view_of
 
     skeleton = estimator.skeleton
     crops, crop_cameras = _cut(estimator, windows)
@@ -191,8 +191,8 @@ def _measured(
 
 def _cut(estimator: PoseEstimator, windows: TrainingPatches) -> tuple[HeightMaps, Array]:
     """Height maps of the animals in patches, cut out by the product's own segmentation."""
-    from liex_lab.foreground.background_segmenter import SPREADS
-    from liex_lab.foreground.height_maps import Patches
+    from liex_lab.scene.background_segmenter import SPREADS
+    from liex_lab.scene.height_maps import Patches
 
     skeleton = estimator.skeleton
     size = windows.spine_mm / skeleton.length
@@ -228,7 +228,7 @@ def _mini_session(
     truth (n, J, 3) mm are its true joints in the view frames.
     """
     from liex_lab.estimation.session_shape import session_clues
-    from liex_lab.foreground.crop_camera import view_of
+    from liex_lab.scene.height_maps import view_of
 
     skeleton = estimator.skeleton
     plain = replace(estimator, model=replace(estimator.model, corrector=None))

@@ -13,7 +13,7 @@ from liex_lab.recordings.recording import Recording
 from liex_lab.simulation.locomotion import walking_session
 from liex_lab.simulation.recording import SyntheticSession
 from liex_lab.simulation.scene import BOX, SimulatedScene
-from liex_lab.simulation.sensors import PRIMESENSE_QVGA_SENSOR
+from liex_lab.simulation.species import PRIMESENSE_QVGA_SENSOR
 
 CAMERA = PRIMESENSE_QVGA_SENSOR.camera
 

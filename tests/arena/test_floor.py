@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from liex_lab.arena.floor import Floor
 from liex_lab.optics.camera import Camera
+from liex_lab.scene.floor import Floor
 
 CAMERA = Camera(365.0, 365.0, 255.5, 211.5, 512, 424)
 

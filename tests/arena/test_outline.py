@@ -12,11 +12,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from liex_lab.arena.floor import find_floor
-from liex_lab.arena.outline import Arena, find_arena, fit_circle, fit_rectangle
-from liex_lab.foreground.background import learn_background
 from liex_lab.optics.camera import KINECT_V2, PRIMESENSE, PRIMESENSE_QVGA, Camera
 from liex_lab.recordings import open_recording
+from liex_lab.scene.background import learn_background
+from liex_lab.scene.floor import find_floor
+from liex_lab.scene.outline import Arena, find_arena, fit_circle, fit_rectangle
 from liex_lab.simulation.scene import SimulatedScene
 
 

@@ -10,12 +10,12 @@ import pytest
 from liex_lab.pipelines.build import build_scene
 from typer.testing import CliRunner
 
-from liex_lab.arena.scene import find_fixtures, plane_of, region_mask
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.errors import EstimationError, PlanError
-from liex_lab.foreground.background_segmenter import BackgroundSubtraction
 from liex_lab.plan import Plan
 from liex_lab.recordings.recording import Recording
+from liex_lab.scene.background_segmenter import BackgroundSubtraction
+from liex_lab.scene.scene import find_fixtures, plane_of, region_mask
 from tests.arena.staged import CAMERA, changed, stage, walk
 
 N_FRAMES = 24
@@ -163,7 +163,7 @@ def test_a_preset_of_another_resolution_is_told_by_the_commands(command, tmp_pat
 
 
 def test_rough_ground_is_told_by_its_spread():
-    from liex_lab.arena.scene import roughness
+    from liex_lab.scene.scene import roughness
 
     rng = np.random.default_rng(0)
     bare = np.full((80, 80), 700.0, np.float32)

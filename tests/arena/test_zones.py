@@ -9,11 +9,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from liex_lab.arena.floor import Floor
-from liex_lab.arena.outline import Arena
-from liex_lab.arena.zones import Zone, read_zones, zone_names
 from liex_lab.errors import PlanError
 from liex_lab.optics.camera import Camera
+from liex_lab.scene.floor import Floor
+from liex_lab.scene.outline import Arena
+from liex_lab.scene.zones import Zone, read_zones, zone_names
 
 CAMERA = Camera(300.0, 300.0, 159.5, 119.5, 320, 240)
 FLOOR = Floor.from_plane(np.array([0.1, -0.05, 1.0]), 700.0, CAMERA)

@@ -23,7 +23,7 @@ from liex_lab.baselines.forest import (
     levers,
     train_forests,
 )
-from liex_lab.body.kinematic_tree import KinematicTree
+from liex_lab.body.kinematics import KinematicTree
 from liex_lab.body.pose import Pose
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.errors import ModelError

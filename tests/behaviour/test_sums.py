@@ -11,8 +11,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from liex_lab.arena.outline import Arena
-from liex_lab.arena.zones import Zone, zone_names
 from liex_lab.behaviour import ACTIONS, Surroundings, measure, measure_session
 from liex_lab.behaviour.activity import (
     activity,
@@ -25,6 +23,8 @@ from liex_lab.behaviour.measures import measure_bouts
 from liex_lab.behaviour.places import outer_margin_mm, visits
 from liex_lab.behaviour.statistics import false_discovery
 from liex_lab.behaviour.summary import summarise
+from liex_lab.scene.outline import Arena
+from liex_lab.scene.zones import Zone, zone_names
 from liex_lab.tables.rows import stop_times
 from liex_lab.tables.schema import BOUTS, GAPS, Vocabulary, empty_table, to_pandas
 from tests.behaviour.test_kinematics import tables_of

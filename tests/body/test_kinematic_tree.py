@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from liex_lab.body.kinematic_tree import KinematicTree
+from liex_lab.body.kinematics import KinematicTree
 from liex_lab.body.skeleton import Skeleton
 
 

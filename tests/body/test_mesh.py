@@ -12,8 +12,7 @@ import pytest
 
 from liex_lab.body import Pose, Skeleton
 from liex_lab.body.mesh import MeshBody
-from liex_lab.body.surface import Surface
-from liex_lab.body.variation import vary_body
+from liex_lab.body.surface import Surface, vary_body
 from liex_lab.catalog import find_sample
 from liex_lab.errors import LiexError
 from liex_lab.geometry import SE3

@@ -10,8 +10,7 @@ import pytest
 from liex_lab.body.capsules import Capsules
 from liex_lab.body.shape import FAMILIES, BodyShape
 from liex_lab.body.skeleton import Skeleton
-from liex_lab.body.surface import Surface
-from liex_lab.body.variation import vary_body
+from liex_lab.body.surface import Surface, vary_body
 from liex_lab.catalog import find_sample
 from liex_lab.errors import LiexError
 

@@ -21,11 +21,11 @@ from matplotlib.text import Text
 
 from liex_lab.actions.vocabulary import action_colours
 from liex_lab.api import compare_groups, draw_figures
-from liex_lab.arena.outline import Arena
-from liex_lab.arena.zones import Zone
 from liex_lab.behaviour.cohort import compare
 from liex_lab.errors import PlaceError, SessionError
 from liex_lab.plan import Plan
+from liex_lab.scene.outline import Arena
+from liex_lab.scene.zones import Zone
 from liex_lab.sessions import Session
 from tests.sessions.walking_mouse import FLOOR_MM, WalkingMouse, steady, write
 

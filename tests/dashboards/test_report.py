@@ -16,14 +16,14 @@ from liex_lab.dashboards.report.quality import flip_rows, frame_account, warning
 from liex_lab.dashboards.report.report import methods, render, write_report
 
 from liex_lab.actions import vocabulary
-from liex_lab.arena.outline import Arena
-from liex_lab.arena.zones import Zone
 from liex_lab.behaviour import measure_session
 from liex_lab.behaviour.activity import around_onsets
 from liex_lab.body import Skeleton
 from liex_lab.exchange import export
 from liex_lab.optics.refraction import Water
 from liex_lab.recordings.timestamps import find_gaps, median_step
+from liex_lab.scene.outline import Arena
+from liex_lab.scene.zones import Zone
 from liex_lab.sessions import Session, SessionWriter
 from liex_lab.sessions.rrd import PALETTE
 from liex_lab.sessions.verdict import Verdict

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from liex_lab.estimation.estimator import PoseEstimator
-from liex_lab.foreground.hand_segmenter import HandSegmenter
+from liex_lab.scene.hand_segmenter import HandSegmenter
 from liex_lab.simulation.hand.simulator import HandSimulator
 
 

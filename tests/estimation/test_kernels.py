@@ -5,16 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from liex_lab.arena.floor import Floor
-from liex_lab.body.kinematic_tree import KinematicTree
-from liex_lab.body.kinematics import forward_kinematics
+from liex_lab.body.kinematics import KinematicTree, forward_kinematics
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.estimation import _feature_kernels as kernels
-from liex_lab.foreground.background_segmenter import BackgroundSubtraction
-from liex_lab.foreground.height_maps import HeightMaps
 from liex_lab.forests._kernels import VIEW
 from liex_lab.geometry import SE3, so3
 from liex_lab.optics.camera import KINECT_V2, PRIMESENSE, Camera
+from liex_lab.scene.background_segmenter import BackgroundSubtraction
+from liex_lab.scene.floor import Floor
+from liex_lab.scene.height_maps import HeightMaps
 
 REACH = 50.0
 

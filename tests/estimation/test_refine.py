@@ -10,20 +10,19 @@ import numpy as np
 import pytest
 from scipy.ndimage import distance_transform_edt
 
-from liex_lab.arena.floor import Floor
+from liex_lab.body.capsules import Spheres
 from liex_lab.body.pose import Pose
 from liex_lab.body.skeleton import Skeleton
-from liex_lab.body.spheres import Spheres
 from liex_lab.body.surface import Surface
 from liex_lab.estimation import _refine_kernels as kernels
 from liex_lab.estimation._residual_kernels import place_balls
 from liex_lab.estimation.cascade import ImageSet
 from liex_lab.estimation.refine import Refiner
-from liex_lab.foreground.crop_camera import view_of
-from liex_lab.foreground.hand_segmenter import HandSegmenter, sight_rotations
-from liex_lab.foreground.height_maps import HeightMaps
 from liex_lab.geometry import SE3, so3
 from liex_lab.optics.camera import Camera
+from liex_lab.scene.floor import Floor
+from liex_lab.scene.hand_segmenter import HandSegmenter, sight_rotations
+from liex_lab.scene.height_maps import HeightMaps, view_of
 from liex_lab.simulation.hand.pose_prior import draw_seen
 from tests.oracles.explain import explained
 

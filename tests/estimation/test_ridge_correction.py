@@ -12,7 +12,7 @@ import pytest
 from liex_lab.body.pose import Pose
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.errors import ModelError
-from liex_lab.estimation import _profile_kernels as kernels
+from liex_lab.estimation import _feature_kernels as kernels
 from liex_lab.estimation.cascade import ImageSet
 from liex_lab.estimation.model import Model
 from liex_lab.estimation.ridge_correction import N_OTHERS, RidgeCorrection, tangents

@@ -14,13 +14,20 @@ import pytest
 from liex_lab.body.pose import Pose
 from liex_lab.body.shape import BodyShape
 from liex_lab.catalog import find_model
-from liex_lab.estimation import _cross_section_kernels as kernels
-from liex_lab.estimation.cross_sections import N_STATIONS, CrossSections
+from liex_lab.estimation import _feature_kernels as kernels
 from liex_lab.estimation.model import Model
-from liex_lab.estimation.session_shape import PLACES, Build, ShapePrior, labels_of, session_clues
-from liex_lab.foreground._crop_camera_kernels import CropCamera, to_pixel
-from liex_lab.foreground.crop_camera import view_of
+from liex_lab.estimation.session_shape import (
+    N_STATIONS,
+    PLACES,
+    Build,
+    CrossSections,
+    ShapePrior,
+    labels_of,
+    session_clues,
+)
 from liex_lab.geometry import SE3
+from liex_lab.scene._height_map_kernels import CropCamera, to_pixel
+from liex_lab.scene.height_maps import view_of
 from tests.estimation.toy import SCENE, Toy, rendered, toy_mice
 
 AT = np.linspace(-0.10, 1.10, N_STATIONS)

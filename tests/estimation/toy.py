@@ -13,7 +13,6 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from liex_lab.arena.floor import Floor
 from liex_lab.body.pose import Pose
 from liex_lab.body.shape import BodyShape
 from liex_lab.body.skeleton import PRESETS, Skeleton
@@ -22,10 +21,11 @@ from liex_lab.estimation.cascade import Candidates, ImageSet, Truth
 from liex_lab.estimation.method import METHODS, Method
 from liex_lab.estimation.model import Calibration, Model
 from liex_lab.estimation.training import TrainingSet, train_cascade, train_metric
-from liex_lab.foreground.background_segmenter import BackgroundSubtraction
 from liex_lab.forests.grow import GrowthPlan
 from liex_lab.geometry import SE3, so3
 from liex_lab.optics.camera import Camera
+from liex_lab.scene.background_segmenter import BackgroundSubtraction
+from liex_lab.scene.floor import Floor
 
 CAMERA = Camera(300.0, 300.0, 79.5, 59.5, 160, 120)
 FLOOR = Floor.from_plane(np.array([0.06, -0.04, 1.0]), 600.0, CAMERA)

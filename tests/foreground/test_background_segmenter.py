@@ -9,12 +9,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from liex_lab.arena.floor import Floor, find_floor
 from liex_lab.errors import EstimationError
-from liex_lab.foreground.background import learn_background
-from liex_lab.foreground.background_segmenter import BackgroundSubtraction
 from liex_lab.optics.camera import Camera
 from liex_lab.recordings.recording import Recording
+from liex_lab.scene.background import learn_background
+from liex_lab.scene.background_segmenter import BackgroundSubtraction
+from liex_lab.scene.floor import Floor, find_floor
 
 CAMERA = Camera(300.0, 300.0, 79.5, 59.5, 160, 120)
 SPINES = (40.0, 115.0)

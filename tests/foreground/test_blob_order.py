@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from liex_lab.foreground._blob_kernels import MAX_BLOBS, N_BLOB, Blob
-from liex_lab.foreground._height_map_kernels import AREA_FACTOR, order_blobs
+from liex_lab.scene._blob_kernels import MAX_BLOBS, N_BLOB, Blob
+from liex_lab.scene._height_map_kernels import AREA_FACTOR, order_blobs
 
 
 def test_components_come_in_the_order_of_their_areas_distance_and_equal_ones_in_their_own():

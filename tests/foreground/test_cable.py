@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from liex_lab.arena.floor import Floor
-from liex_lab.foreground.cable import Cable
 from liex_lab.optics.camera import Camera
+from liex_lab.scene.floor import Floor
+from liex_lab.scene.worn import Cable
 
 CAMERA = Camera(365.0, 365.0, 159.5, 119.5, 320, 240)
 FLOOR_MM = 660.0

@@ -9,14 +9,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from liex_lab.arena.floor import Floor
 from liex_lab.body.skeleton import View
 from liex_lab.estimation.initial import draw_starts, start_poses
-from liex_lab.foreground import _blob_kernels as blob_kernels
-from liex_lab.foreground.background import stride_for
-from liex_lab.foreground.background_segmenter import BackgroundSubtraction
 from liex_lab.optics.camera import Camera
 from liex_lab.recordings.recording import Recording
+from liex_lab.scene import _blob_kernels as blob_kernels
+from liex_lab.scene.background import stride_for
+from liex_lab.scene.background_segmenter import BackgroundSubtraction
+from liex_lab.scene.floor import Floor
 
 CAMERA = Camera(600.0, 600.0, 119.5, 89.5, 240, 180)
 FLOOR = Floor.from_plane(np.array([0.0, 0.0, 1.0]), 300.0, CAMERA)

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from liex_lab.foreground.components import components
+from liex_lab.scene.worn import components
 
 
 @pytest.mark.parametrize("density", [0.01, 0.2, 0.45, 0.7])

@@ -7,8 +7,8 @@ from functools import cache
 import numpy as np
 import pytest
 
-from liex_lab.foreground.background_segmenter import BackgroundSubtraction
-from liex_lab.foreground.floor_level import FloorLevel, wandering
+from liex_lab.scene.background import FloorLevel, wandering
+from liex_lab.scene.background_segmenter import BackgroundSubtraction
 from tests.arena.staged import changed, stage, walk
 
 SPINES = (40.0, 115.0)

@@ -11,16 +11,16 @@ import cv2
 import numpy as np
 import pytest
 
-from liex_lab.arena.floor import Floor
 from liex_lab.body import Skeleton
 from liex_lab.errors import EstimationError
-from liex_lab.foreground import _geodesic_kernels as geodesic_kernels
-from liex_lab.foreground._blob_kernels import BLOCK
-from liex_lab.foreground.crop_camera import view_of
-from liex_lab.foreground.hand_segmenter import HandSegmenter, sight_rotations
 from liex_lab.optics.camera import Camera
 from liex_lab.recordings.formats.images.nyu import LABEL_CAMERA, NyuReference
 from liex_lab.recordings.recording import Recording
+from liex_lab.scene import _geodesic_kernels as geodesic_kernels
+from liex_lab.scene._blob_kernels import BLOCK
+from liex_lab.scene.floor import Floor
+from liex_lab.scene.hand_segmenter import HandSegmenter, sight_rotations
+from liex_lab.scene.height_maps import view_of
 from liex_lab.simulation.hand.simulator import HandSession, HandSimulator
 from tests.oracles.ends import ends_by_hand
 

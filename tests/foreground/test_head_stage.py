@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from liex_lab.arena.floor import Floor
-from liex_lab.foreground.background_segmenter import BackgroundSubtraction
-from liex_lab.foreground.head_stage import HeadStage
 from liex_lab.optics.camera import Camera
+from liex_lab.scene.background_segmenter import BackgroundSubtraction
+from liex_lab.scene.floor import Floor
+from liex_lab.scene.worn import HeadStage
 from tests.arena.staged import stage, walk
 
 CAMERA = Camera(365.0, 365.0, 159.5, 119.5, 320, 240)

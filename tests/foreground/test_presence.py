@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from liex_lab.errors import EstimationError
-from liex_lab.foreground.background import learn_background
-from liex_lab.foreground.background_segmenter import BackgroundSubtraction
 from liex_lab.recordings.recording import Recording
+from liex_lab.scene.background import learn_background
+from liex_lab.scene.background_segmenter import BackgroundSubtraction
 from tests.arena.staged import changed, stage, walk
 
 SPINES = (40.0, 115.0)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from liex_lab.arena.scene import Fixture
-from liex_lab.foreground.background_segmenter import BackgroundSubtraction
+from liex_lab.scene.background_segmenter import BackgroundSubtraction
+from liex_lab.scene.scene import Fixture
 from tests.foreground.test_background_segmenter import SPINES, recording_of, tilted, with_box
 
 N_FRAMES = 60

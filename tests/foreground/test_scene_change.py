@@ -7,9 +7,9 @@ from functools import cache
 import numpy as np
 import pytest
 
-from liex_lab.foreground.background_segmenter import BackgroundSubtraction
-from liex_lab.foreground.scene_change import SceneChange
 from liex_lab.optics.camera import Camera
+from liex_lab.scene.background_segmenter import BackgroundSubtraction
+from liex_lab.scene.still_scene import SceneChange
 from tests.arena.staged import changed, stage, walk
 
 SPINES = (40.0, 115.0)

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from liex_lab.foreground.background_segmenter import BackgroundSubtraction
-from liex_lab.optics.sensor_card import SensorCard
+from liex_lab.optics.camera import SensorCard
 from liex_lab.recordings.recording import Recording
+from liex_lab.scene.background_segmenter import BackgroundSubtraction
 from tests.foreground.test_background_segmenter import CAMERA, SPINES, tilted, with_box
 
 N_FRAMES = 40

@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from liex_lab.arena.floor import find_floor
-from liex_lab.arena.outline import find_arena
-from liex_lab.arena.scene import LARGEST
 from liex_lab.errors import EstimationError
-from liex_lab.foreground.background_segmenter import BackgroundSubtraction
 from liex_lab.recordings.recording import Recording
+from liex_lab.scene.background_segmenter import BackgroundSubtraction
+from liex_lab.scene.floor import find_floor
+from liex_lab.scene.outline import find_arena
+from liex_lab.scene.scene import LARGEST
 from liex_lab.simulation.scenes.catalogue import film
 from tests.arena.staged import changed, stage, walk
 
@@ -99,7 +99,7 @@ def test_a_glossy_floor_with_holes_is_still_the_floor():
 def test_in_an_ordinary_scene_the_floor_is_the_largest_plane_to_the_last_bit():
     mouse = walk(stage((250.0, 200.0), height_mm=700.0, room=False), N_FRAMES)
     scene, sample = BackgroundSubtraction.learn(mouse, SPINES, N_FRAMES)
-    from liex_lab.foreground.background import learn_background
+    from liex_lab.scene.background import learn_background
 
     present = find_floor(learn_background(sample)[0], mouse.camera)
     assert scene.floor.distance_mm == present.distance_mm
@@ -111,7 +111,7 @@ def test_in_an_ordinary_scene_the_floor_is_the_largest_plane_to_the_last_bit():
 
 def test_where_nothing_moves_the_walled_ground_is_taken_and_said_to_be_in_doubt():
     from liex_lab.body.skeleton import MOUSE_VIEW
-    from liex_lab.foreground.standing import SampledScene, Standing, find_standing
+    from liex_lab.scene.support_plane import SampledScene, Standing, find_standing
 
     def stood_on(frames: np.ndarray, still: np.ndarray) -> Standing:
         spread = np.zeros_like(still)

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 import pytest
 
-from liex_lab.foreground.background_segmenter import BackgroundSubtraction
 from liex_lab.recordings import open_recording
+from liex_lab.scene.background_segmenter import BackgroundSubtraction
 from tests.foreground.test_background_segmenter import SPINES, recording_of, tilted, with_box
 
 if TYPE_CHECKING:

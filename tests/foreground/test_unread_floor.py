@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from liex_lab.foreground.unread_floor import unread_floor
+from liex_lab.scene.background import unread_floor
 
 FLOOR_MM = 700.0
 

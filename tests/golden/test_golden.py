@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from liex_lab.dashboards.report.report import render
 
-from liex_lab.arena.outline import UNKNOWN
 from liex_lab.plan import Plan
 from liex_lab.recordings import open_recording
+from liex_lab.scene.outline import UNKNOWN
 from liex_lab.sessions import Session
 from liex_lab.sessions.provenance import SCHEMA_VERSION
 from tests.golden.write import ARENA, CAMERA, HERE, TABLES, ZONES, contents

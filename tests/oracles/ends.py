@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from liex_lab.foreground._blob_kernels import BLOCK
+from liex_lab.scene._blob_kernels import BLOCK
 
 
 def ends_by_hand(

@@ -17,13 +17,12 @@ from liex_lab.pipelines.choice import Look, best, fit_plan, misfits_of
 from liex_lab.pipelines.origin import animal_of
 
 from liex_lab.errors import EstimationError, MisfitError
-from liex_lab.foreground.hand_segmenter import HandSegmenter
 from liex_lab.optics.camera import KINECT_V2
 from liex_lab.plan import Plan
 from liex_lab.recordings.recording import Recording
+from liex_lab.scene.hand_segmenter import HandSegmenter
 from liex_lab.simulation.scenes.catalogue import film
-from liex_lab.tracking.residual import Agreement
-from liex_lab.tracking.sample_fit import SampleFit, count_animals
+from liex_lab.tracking.residual import Agreement, SampleFit, count_animals
 
 GOOD = SampleFit(96, 96, 65.0, 2.0, 1.5, 0.8, 0.03)
 FISH = replace(GOOD, spine_mm=30.0, error_mm=1.0, residual_mm=0.7)

@@ -150,6 +150,8 @@ def test_they_compile_what_is_installed_wherever_they_are_started(
 
 
 def test_a_kernel_that_is_called_otherwise_now_is_left_to_the_run() -> None:
-    compiling.compile_kernel({"kernel": "liex_lab.body._kernels:gone", "args": []})
+    compiling.compile_kernel({"kernel": "liex_lab.body._skinning_kernels:gone", "args": []})
     compiling.compile_kernel({"kernel": "liex_lab.no_such_module:gone", "args": []})
-    compiling.compile_kernel({"kernel": "liex_lab.body._kernels:place_joints", "args": ["int64"]})
+    compiling.compile_kernel(
+        {"kernel": "liex_lab.body._skinning_kernels:place_joints", "args": ["int64"]}
+    )

@@ -13,11 +13,11 @@ import pytest
 from liex_lab.pipelines.doctor import FINDINGS, examine
 from liex_lab.pipelines.doctor_text import lines, print_report
 
-from liex_lab.arena.floor import Floor
 from liex_lab.errors import RecordingError
 from liex_lab.optics.camera import Camera, Distortion
 from liex_lab.optics.refraction import Water
 from liex_lab.plan import Plan
+from liex_lab.scene.floor import Floor
 from tests.oracles.plate import Plate, bent_down
 from tests.oracles.refraction import seen
 from tests.recordings.oni_files import depth_builder

@@ -17,8 +17,7 @@ from liex_lab.pipelines.doctor import examine
 from liex_lab.pipelines.doctor_files import next_command, open_anyhow
 
 from liex_lab.errors import LiexError, RecordingError
-from liex_lab.optics.camera import Camera
-from liex_lab.optics.presets import PRESETS, of_size, preset, unusual_centre, unusual_lens
+from liex_lab.optics.camera import PRESETS, Camera, of_size, preset, unusual_centre, unusual_lens
 from liex_lab.plan import Plan
 from liex_lab.plan.sections import CameraName
 from tests.pipelines.test_choice import FISH, GOOD, RECORDING

@@ -24,7 +24,7 @@ from liex_lab.pipelines.correct import correct_session
 from liex_lab.errors import PlaceError, SessionError
 from liex_lab.exchange import TARGETS, export
 from liex_lab.plan import Plan
-from liex_lab.runtime.lock import locked, take_lock
+from liex_lab.runtime.durable import locked, take_lock
 from liex_lab.runtime.places import inside, safe_name
 from liex_lab.sessions import Session
 from liex_lab.sessions.corrections import BoutEdit, Description

@@ -24,7 +24,7 @@ from liex_lab.recordings.recording import Recording
 from liex_lab.sessions import Session
 from liex_lab.simulation.locomotion import walking_session
 from liex_lab.simulation.recording import FRAME_NS, SyntheticSession
-from liex_lab.simulation.sensors import PRIMESENSE_QVGA_SENSOR
+from liex_lab.simulation.species import PRIMESENSE_QVGA_SENSOR
 from liex_lab.tracking.observations import Observations
 from liex_lab.tracking.tracker import FrameTracker
 from tests.recordings.ros_writers import Info, write_bag
@@ -260,7 +260,7 @@ def test_zones_are_drawn_in_a_file_that_the_plan_names(folder, session, tmp_path
 
 
 def test_a_slip_in_the_zones_is_told_before_any_work(folder, tmp_path, monkeypatch):
-    learn = "liex_lab.foreground.background_segmenter.BackgroundSubtraction.learn"
+    learn = "liex_lab.scene.background_segmenter.BackgroundSubtraction.learn"
     monkeypatch.setattr(learn, lambda *_: pytest.fail("work was begun"))
     plan = Plan.load("mouse").with_settings([f"arena.zones={tmp_path / 'none.toml'}"])
     with pytest.raises(PlanError, match=r"there is no file .*none\.toml"):

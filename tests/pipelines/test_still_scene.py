@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from liex_lab.pipelines.origin import build_background
 
-from liex_lab.foreground.background_segmenter import BackgroundSubtraction
-from liex_lab.foreground.still_scene import StillScene
 from liex_lab.plan import Plan
 from liex_lab.recordings.recording import Recording
+from liex_lab.scene.background_segmenter import BackgroundSubtraction
+from liex_lab.scene.still_scene import StillScene
 from liex_lab.sessions.cutouts import still_scene
 from tests.foreground.test_background_segmenter import (
     CAMERA,

@@ -11,11 +11,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from liex_lab.arena.zones import read_zones
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.errors import LiexError
 from liex_lab.plan import Plan
 from liex_lab.plan.study import Study
+from liex_lab.scene.zones import read_zones
 
 _WHOLE = Plan().model_dump()
 _WORDS = st.sampled_from(

@@ -30,7 +30,7 @@ from liex_lab.estimation.model import Model
 from liex_lab.plan.study import Study
 from liex_lab.recordings import open_recording
 from liex_lab.recordings.formats.images.tiff import open_tiffs
-from liex_lab.runtime.npz import check_npz
+from liex_lab.runtime.memory import check_npz
 from liex_lab.runtime.progress import silent
 
 LENS = "[camera]\nfx = 300.0\nfy = 300.0\ncx = 160.0\ncy = 120.0\nfps = 30.0\n"

@@ -10,19 +10,19 @@ from typing import IO
 import numpy as np
 import pytest
 
-from liex_lab.runtime import disk
+from liex_lab.runtime import places
 
 
 @pytest.mark.parametrize("stretch", [1, 1000, 1 << 20])
 def test_parts_are_written_in_their_order_and_counted(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stretch: int
 ) -> None:
-    monkeypatch.setattr(disk, "STRETCH", stretch)
+    monkeypatch.setattr(places, "STRETCH", stretch)
     rng = np.random.default_rng(3)
     parts = [rng.bytes(int(n)) for n in rng.integers(0, 5000, 100)]
     path = tmp_path / "written"
     with path.open("wb") as file:
-        n = disk.write_through((memoryview(part) for part in parts), file)
+        n = places.write_through((memoryview(part) for part in parts), file)
     assert path.read_bytes() == b"".join(parts)
     assert n == path.stat().st_size
 
@@ -30,11 +30,11 @@ def test_parts_are_written_in_their_order_and_counted(
 def test_every_byte_but_the_last_stretches_is_given_up_once_it_is_on_the_disk(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(disk, "STRETCH", 1000)
+    monkeypatch.setattr(places, "STRETCH", 1000)
     told: list[tuple[int, int]] = []
-    monkeypatch.setattr(disk, "let_go", lambda file, first, last: told.append((first, last)))
+    monkeypatch.setattr(places, "let_go", lambda file, first, last: told.append((first, last)))
     with (tmp_path / "written").open("wb") as file:
-        disk.write_through([memoryview(bytes(250))] * 20, file)
+        places.write_through([memoryview(bytes(250))] * 20, file)
     assert told == [(0, 1000), (0, 2000), (1000, 3000), (2000, 4000), (3000, 5000)]
 
 
@@ -44,14 +44,14 @@ def test_what_is_let_go_is_read_again(tmp_path: Path) -> None:
     path.write_bytes(content)
     with path.open("rb") as file:
         assert file.read(1000) == content[:1000]
-        disk.let_go(file, 0, len(content))
+        places.let_go(file, 0, len(content))
         assert file.read() == content[1000:]
 
 
 def test_a_system_that_cannot_be_told_writes_all_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(disk, "STRETCH", 10)
+    monkeypatch.setattr(places, "STRETCH", 10)
     monkeypatch.delattr(os, "posix_fadvise", raising=False)
     out: IO[bytes] = io.BytesIO()  # has no number of its own either
-    assert disk.write_through([memoryview(b"abcdefgh")] * 4, out) == 32
+    assert places.write_through([memoryview(b"abcdefgh")] * 4, out) == 32
     out.seek(0)
     assert out.read() == b"abcdefgh" * 4

@@ -65,7 +65,7 @@ def test_no_place_at_all_is_told(nowhere: Path, monkeypatch: pytest.MonkeyPatch)
 
 
 def test_liex_starts_where_a_stated_place_cannot_be_written() -> None:
-    code = "import liex_lab.geometry._so3_kernels, os; print(os.environ['NUMBA_CACHE_DIR'])"
+    code = "import liex_lab.geometry._kernels, os; print(os.environ['NUMBA_CACHE_DIR'])"
     environment = {**os.environ, VARIABLE: os.devnull + "/none"}
     ran = subprocess.run(
         [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=False

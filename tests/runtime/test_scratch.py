@@ -11,10 +11,10 @@ from pathlib import Path
 
 import pytest
 
-from liex_lab.runtime.scratch import Scratch, remove_stale
+from liex_lab.runtime.durable import Scratch, remove_stale
 
 KEEPS = """
-from liex_lab.runtime.scratch import Scratch
+from liex_lab.runtime.durable import Scratch
 import time
 scratch = Scratch()
 (scratch.folder / "big").write_bytes(bytes(1000))

@@ -10,13 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from liex_lab.runtime.spreadsheets import (
-    as_it_was,
-    copy_harmless,
-    harmless,
-    read_harmless,
-    write_csv,
-)
+from liex_lab.runtime.text_files import as_it_was, copy_harmless, harmless, read_harmless, write_csv
 
 FORMULAS = [
     "=1+1",

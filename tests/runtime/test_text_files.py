@@ -13,13 +13,13 @@ from hypothesis import strategies as st
 from liex_lab.pipelines.training.action_model import read_any_labels
 
 from liex_lab.actions.labels import read_labels
-from liex_lab.arena.zones import read_zones
 from liex_lab.body.skeleton import PRESETS, Skeleton
 from liex_lab.errors import LiexError
 from liex_lab.plan import Plan
 from liex_lab.plan.study import Study
 from liex_lab.recordings.camera_file import CameraFile
 from liex_lab.runtime.text_files import clock_s, decoded, number
+from liex_lab.scene.zones import read_zones
 
 ENCODINGS = ["utf-8", "utf-8-sig", "utf-16", "utf-16-le", "utf-16-be"]
 

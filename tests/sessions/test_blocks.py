@@ -8,15 +8,15 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from liex_lab.arena.outline import Arena
-from liex_lab.arena.zones import Zone
+from liex_lab.scene.outline import Arena
+from liex_lab.scene.zones import Zone
 from liex_lab.sessions import evidence
 from liex_lab.sessions.evidence import FILE, write_evidence
 from liex_lab.tables import rows as rows_module
 from liex_lab.tables import schema
 from liex_lab.tables.rows import Rows, seconds
 from liex_lab.tracking.observations import COLUMNS, Observations
-from liex_lab.tracking.subject import Subject
+from liex_lab.tracking.track import Subject
 from tests.sessions.walking_mouse import WalkingMouse, steady, write
 
 MOUSE = WalkingMouse(np.delete(steady(3.0), slice(30, 36)), lost=(40, 41, 70))

@@ -13,7 +13,6 @@ import pytest
 from mcap.reader import make_reader
 
 import liex_lab.sessions.rrd_depth as depth_of
-from liex_lab.arena.scene import region_mask
 from liex_lab.body.pose import Pose
 from liex_lab.errors import RecordingError, SessionError
 from liex_lab.geometry import SE3

@@ -23,7 +23,7 @@ from liex_lab.sessions.checkpoint import LOGS, Checkpoint
 from liex_lab.sessions.evidence import read_evidence, read_flips, write_evidence
 from liex_lab.sessions.failure import read_failure
 from liex_lab.tracking.observations import Observations
-from liex_lab.tracking.subject import Subject
+from liex_lab.tracking.track import Subject
 from tests.damage import ANYTHING, check, damage
 from tests.sessions.walking_mouse import WalkingMouse, steady, write
 

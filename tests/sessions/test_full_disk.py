@@ -18,7 +18,7 @@ import pytest
 
 import liex_lab.sessions.rrd as replay
 from liex_lab.errors import SessionError
-from liex_lab.runtime.disk import is_full, why_full
+from liex_lab.runtime.places import is_full, why_full
 from liex_lab.sessions import SessionWriter
 from liex_lab.sessions.mcap import _WatchedFile
 from tests.sessions.interrupted import MOUSE, write_session

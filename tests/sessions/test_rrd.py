@@ -13,18 +13,17 @@ import pytest
 
 import liex_lab.sessions.rrd as replay
 import liex_lab.sessions.rrd_depth as depth_of
-from liex_lab.arena.outline import Arena
-from liex_lab.arena.zones import Zone
 from liex_lab.body.pose import Pose
 from liex_lab.body.surface import Surface
 from liex_lab.geometry import SE3, so3
 from liex_lab.optics.camera import Camera
 from liex_lab.recordings.timestamps import find_gaps, median_step
+from liex_lab.scene.outline import Arena
+from liex_lab.scene.zones import Zone
 from liex_lab.sessions import SessionWriter
 from liex_lab.sessions.rrd_body import BODY, body_parts
 from liex_lab.tracking.observations import Observations
-from liex_lab.tracking.subject import Subject
-from liex_lab.tracking.track import Tracked
+from liex_lab.tracking.track import Subject, Tracked
 from tests.oracles.rvl import unpack_rvl
 from tests.sessions.walking_mouse import WalkingMouse, steady, write
 

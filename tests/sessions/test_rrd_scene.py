@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from liex_lab.arena.floor import Floor
-from liex_lab.arena.scene import Fixture, Scene
 from liex_lab.optics.camera import KINECT_V2
+from liex_lab.scene.floor import Floor
+from liex_lab.scene.scene import Fixture, Scene
 from liex_lab.sessions.rrd_scene import FLOOR, OVERLAY, log_hidden_places, log_surroundings
 from liex_lab.tables.rows import Rows
 from liex_lab.tracking.offline import track_whole

@@ -16,13 +16,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from liex_lab.arena.floor import Floor
-from liex_lab.arena.outline import UNKNOWN, Arena
-from liex_lab.arena.zones import Zone
 from liex_lab.errors import SessionError
 from liex_lab.plan import Plan
 from liex_lab.recordings.recording import Recording
 from liex_lab.recordings.timestamps import find_gaps
+from liex_lab.scene.floor import Floor
+from liex_lab.scene.outline import UNKNOWN, Arena
+from liex_lab.scene.zones import Zone
 from liex_lab.sessions import Provenance, Session, SessionWriter
 from liex_lab.sessions.provenance import SCHEMA_VERSION
 from liex_lab.tracking.track import Track

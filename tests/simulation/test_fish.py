@@ -17,7 +17,7 @@ from liex_lab.simulation import training_patches
 from liex_lab.simulation.fish import KINDS, FishSpecies, draw_bends
 from liex_lab.simulation.locomotion import swimming_session
 from liex_lab.simulation.recording import SyntheticSession
-from liex_lab.simulation.sensors import RAYTRIX_R5_SENSOR
+from liex_lab.simulation.species import RAYTRIX_R5_SENSOR
 from liex_lab.simulation.training_patches import TrainingPatches, training_blocks
 
 FISH = Skeleton.load("fish")

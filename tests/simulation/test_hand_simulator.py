@@ -12,7 +12,7 @@ from liex_lab.body import Skeleton
 from liex_lab.errors import LiexError
 from liex_lab.recordings.formats.images.nyu import N_FIRST_PERSON, NyuReference
 from liex_lab.simulation.hand import reference, simulator
-from liex_lab.simulation.hand.reference import find_reference
+from liex_lab.simulation.hand.pose_prior import find_reference
 from liex_lab.simulation.hand.simulator import HandSimulator, gesture_session
 from liex_lab.simulation.simulator import world_of
 from liex_lab.simulation.training_patches import TrainingPatches
@@ -117,13 +117,13 @@ def test_the_labels_are_looked_for_in_one_place_whatever_folder_a_command_runs_i
     beside.mkdir(parents=True)
     (beside / "nyu_test_14joints.npz").touch()
     (tmp_path / "work").mkdir()
-    monkeypatch.setattr(reference, "_REPOSITORY", tmp_path / "elsewhere" / "repository")
+    monkeypatch.setattr(pose_prior, "_REPOSITORY", tmp_path / "elsewhere" / "repository")
     monkeypatch.delenv("LIEX_NYU", raising=False)
     monkeypatch.chdir(tmp_path / "work")
     assert find_reference() is None  # what lies beside the current folder does not count
-    monkeypatch.setattr(reference, "_REPOSITORY", tmp_path / "repository")
+    monkeypatch.setattr(pose_prior, "_REPOSITORY", tmp_path / "repository")
     assert find_reference() == beside
-    monkeypatch.setattr(reference, "_REPOSITORY", tmp_path / "elsewhere" / "repository")
+    monkeypatch.setattr(pose_prior, "_REPOSITORY", tmp_path / "elsewhere" / "repository")
     monkeypatch.setenv("LIEX_NYU", str(beside))
     assert find_reference() == beside
     monkeypatch.setenv("LIEX_NYU", str(tmp_path))

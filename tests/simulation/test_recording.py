@@ -24,8 +24,8 @@ from liex_lab.simulation.recording import (
     split_of,
     test_split,
 )
-from liex_lab.simulation.sensors import KINECT_V2_SENSOR, PRIMESENSE_SENSOR, SENSORS
 from liex_lab.simulation.simulator import world_of
+from liex_lab.simulation.species import KINECT_V2_SENSOR, PRIMESENSE_SENSOR, SENSORS
 from liex_lab.simulation.training_patches import (
     BLOCK,
     PER_SESSION,

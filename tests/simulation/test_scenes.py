@@ -12,7 +12,7 @@ from liex_lab.simulation.scenes.catalogue import SCENES, SEALED_FROM, film
 from liex_lab.simulation.scenes.meshes import box, joined, render_still
 from liex_lab.simulation.scenes.places import look_down
 from liex_lab.simulation.scenes.recording import SceneRecording, TrueScene
-from liex_lab.simulation.sensors import KINECT_V2_SENSOR, PRIMESENSE_QVGA_SENSOR
+from liex_lab.simulation.species import KINECT_V2_SENSOR, PRIMESENSE_QVGA_SENSOR
 from liex_lab.simulation.training_patches import BLOCK, PER_SESSION, training_windows
 
 SEED = 41

@@ -11,7 +11,7 @@ from liex_lab.body.skeleton import Skeleton
 from liex_lab.body.surface import Surface
 from liex_lab.catalog import find_sample
 from liex_lab.errors import LiexError
-from liex_lab.foreground.background_segmenter import BackgroundSubtraction
+from liex_lab.scene.background_segmenter import BackgroundSubtraction
 from liex_lab.simulation import training_patches
 from liex_lab.simulation.generic import GenericSpecies, draw_angles, moving_session
 from liex_lab.simulation.recording import SyntheticSession

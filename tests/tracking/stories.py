@@ -9,7 +9,7 @@ from liex_lab.body.skeleton import Skeleton
 from liex_lab.geometry import SE3, so3
 from liex_lab.optics.camera import KINECT_V2
 from liex_lab.tracking.observations import Observations, reversed_pose
-from liex_lab.tracking.subject import Subject
+from liex_lab.tracking.track import Subject
 
 MOUSE = Skeleton.load("mouse")
 ERROR_MM = 2.0

@@ -7,11 +7,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from liex_lab.foreground.background import has_noise
 from liex_lab.recordings.frame import DepthFrame, marked
 from liex_lab.recordings.recording import Recording
-from liex_lab.tracking.copies import asked_too_often, copies_told
-from liex_lab.tracking.offline import track_whole
+from liex_lab.scene.background import has_noise
+from liex_lab.tracking.offline import asked_too_often, copies_told, track_whole
 from tests.recordings.writers import SMALL
 from tests.tracking.stories import SUBJECT, joint_error, noisy, told, walk
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from liex_lab.foreground.height_maps import CROP, HeightMaps
+from liex_lab.scene.height_maps import CROP, HeightMaps
 from liex_lab.tables.rows import Rows
 from liex_lab.tracking.observations import Observations
-from liex_lab.tracking.occluders import behind_something
+from liex_lab.tracking.occlusion import behind_something
 from liex_lab.tracking.offline import track_whole
 from liex_lab.tracking.online import OnlineTracker
 from liex_lab.tracking.track import Track

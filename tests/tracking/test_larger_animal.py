@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from liex_lab.tracking.larger_animal import cost_of_the_other
+from liex_lab.tracking.association import cost_of_the_other
 from liex_lab.tracking.observations import Observations, joints_of
 from liex_lab.tracking.offline import track_whole
 from tests.tracking.stories import MOUSE, told, walk

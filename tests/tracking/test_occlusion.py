@@ -7,13 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from liex_lab.arena.floor import Floor
 from liex_lab.body.pose import Pose
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.body.surface import Surface, render_meshes
-from liex_lab.foreground.background_segmenter import BackgroundSubtraction
 from liex_lab.geometry import SE3, so3
 from liex_lab.optics.camera import Camera
+from liex_lab.scene.background_segmenter import BackgroundSubtraction
+from liex_lab.scene.floor import Floor
 from liex_lab.tracking.observations import reversed_pose
 from liex_lab.tracking.occlusion import OcclusionCorrection
 

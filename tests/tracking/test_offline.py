@@ -15,12 +15,11 @@ from liex_lab.body.pose import Pose
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.geometry import SE3, so3
 from liex_lab.runtime.memory import on_disk
-from liex_lab.tracking.gaps import short_gaps, spans, whole_gaps
 from liex_lab.tracking.observations import Observations, joints_of, reversed_pose
 from liex_lab.tracking.offline import track_whole
 from liex_lab.tracking.online import OnlineTracker
 from liex_lab.tracking.smoother import Curve
-from liex_lab.tracking.track import Flip, Track, ends_of
+from liex_lab.tracking.track import Flip, Track, ends_of, short_gaps, spans, whole_gaps
 from liex_lab.tracking.track_rows import covariance_of_root, single_frames
 from tests.tracking.stories import MOUSE, SUBJECT, joint_error, lose, noisy, told, walk
 

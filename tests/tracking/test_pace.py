@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from liex_lab.body.skeleton import Skeleton
-from liex_lab.tracking.pace import why_too_fast
 from liex_lab.tracking.track import Track
+from liex_lab.tracking.trust import why_too_fast
 
 LENGTH_MM = 45.0
 

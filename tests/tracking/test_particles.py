@@ -11,10 +11,10 @@ import pytest
 
 from liex_lab.estimation.cascade import Candidates, ImageSet
 from liex_lab.estimation.estimator import PoseEstimator
-from liex_lab.foreground.crop_camera import view_of
-from liex_lab.foreground.hand_segmenter import HandSegmenter
 from liex_lab.geometry import SE3
 from liex_lab.recordings.frame import DepthFrame
+from liex_lab.scene.hand_segmenter import HandSegmenter
+from liex_lab.scene.height_maps import view_of
 from liex_lab.simulation.hand.simulator import HandSimulator
 from liex_lab.tracking.particles import ParticleFilter, ProcessNoise
 from tests.estimation.toy import CAMERA, FLOOR, SCENE, Toy, toy_mice, trained

@@ -9,13 +9,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from liex_lab.arena.floor import Floor
 from liex_lab.body.pose import Pose
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.body.surface import Surface
-from liex_lab.foreground.background_segmenter import BackgroundSubtraction
 from liex_lab.geometry import SE3
 from liex_lab.optics.camera import Camera
+from liex_lab.scene.background_segmenter import BackgroundSubtraction
+from liex_lab.scene.floor import Floor
 from liex_lab.tracking.residual import BodyResidual, median_of, render_crops
 from tests.estimation.toy import CAMERA, FLOOR, SCENE, Toy, rendered, toy_mice
 

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from liex_lab.tracking.shared_body import Found, agree, spread_of
+from liex_lab.tracking.own_shape import Found, agree, spread_of
 
 FOUND = st.builds(
     Found,

@@ -7,8 +7,8 @@ import pytest
 from scipy.linalg import expm
 
 from liex_lab.geometry import so3
-from liex_lab.geometry._so3_kernels import exp_so3, log_so3
-from liex_lab.tracking import _kalman_kernels as kernels
+from liex_lab.geometry._kernels import exp_so3, log_so3
+from liex_lab.tracking import _smoother_kernels as kernels
 from liex_lab.tracking import _smoother_kernels as poses
 
 TIMES = np.cumsum([0.0, 0.03, 0.03, 0.1, 0.03, 0.03, 0.2, 0.03, 0.03])

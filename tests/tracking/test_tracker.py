@@ -9,9 +9,9 @@ import pytest
 
 from liex_lab.errors import EstimationError
 from liex_lab.estimation.estimator import PoseEstimator
-from liex_lab.foreground.background_segmenter import BackgroundSubtraction
 from liex_lab.geometry import so3
 from liex_lab.recordings.frame import DepthFrame
+from liex_lab.scene.background_segmenter import BackgroundSubtraction
 from liex_lab.tracking.own_shape import StatedShape
 from liex_lab.tracking.track import Track
 from liex_lab.tracking.tracker import FrameTracker

@@ -51,9 +51,9 @@ from liex_lab.recordings.timestamps import (
     median_step,
     unpaired,
 )
-from liex_lab.runtime.disk import STRETCH, let_go
+from liex_lab.runtime.durable import Scratch
+from liex_lab.runtime.places import STRETCH, let_go
 from liex_lab.runtime.progress import Progress, silent
-from liex_lab.runtime.scratch import Scratch
 
 if TYPE_CHECKING:
     from liex_lab.recordings.formats.video import DepthTrack

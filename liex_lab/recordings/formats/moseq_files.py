@@ -27,7 +27,7 @@ from liex_lab.errors import RecordingError
 from liex_lab.recordings.camera_file import CameraFile
 from liex_lab.recordings.timestamp_files import Stamps, read_stamps
 from liex_lab.recordings.timestamps import start_of_day
-from liex_lab.runtime.disk import write_through
+from liex_lab.runtime.places import write_through
 from liex_lab.runtime.progress import Progress
 from liex_lab.runtime.text_files import read_text
 

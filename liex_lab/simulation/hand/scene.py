@@ -17,13 +17,13 @@ from liex_lab.body.capsules import Capsules
 from liex_lab.body.hand_shape import N_ARM_CAPSULES, HandShape, arm_vertices, forearms
 from liex_lab.body.pose import Pose
 from liex_lab.body.skeleton import Skeleton
-from liex_lab.foreground.hand_segmenter import sight_rotations
 from liex_lab.geometry import SE3
 from liex_lab.runtime.threads import threads
+from liex_lab.scene.hand_segmenter import sight_rotations
+from liex_lab.simulation import _render_kernels as kernels
 from liex_lab.simulation._render_kernels import PatchCamera, SensorNoise
 from liex_lab.simulation._sensor_kernels import NORMAL
-from liex_lab.simulation.hand import _render_kernels as kernels
-from liex_lab.simulation.objects import PART_FACES, SPHERE, rounded
+from liex_lab.simulation.scene import PART_FACES, SPHERE, rounded
 
 Array = NDArray[np.float64]
 

@@ -16,12 +16,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from liex_lab.arena.floor import Floor
 from liex_lab.body.hand_shape import HandShape, draw_hands
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.body.surface import Surface
 from liex_lab.errors import LiexError
-from liex_lab.foreground.hand_segmenter import sight_rotations
 from liex_lab.geometry import SE3
 from liex_lab.recordings.formats.images.nyu import (
     LABEL_CAMERA,
@@ -30,14 +28,14 @@ from liex_lab.recordings.formats.images.nyu import (
     fit_hands,
 )
 from liex_lab.recordings.frame import Depth
+from liex_lab.scene.floor import Floor
+from liex_lab.scene.hand_segmenter import sight_rotations
 from liex_lab.simulation._sensor_kernels import PRIMESENSE_KIND
 from liex_lab.simulation.hand import scene
-from liex_lab.simulation.hand.gestures import draw_gestures
-from liex_lab.simulation.hand.pose_prior import draw_seen, draw_wide
-from liex_lab.simulation.hand.reference import DRAWN, FITTED
+from liex_lab.simulation.hand.pose_prior import DRAWN, FITTED, draw_gestures, draw_seen, draw_wide
 from liex_lab.simulation.pose_prior import SIZE_RANGE
 from liex_lab.simulation.recording import OTHER_CAMERA, SEALED, TrueRecording, split_of
-from liex_lab.simulation.sensors import KINECT_V2_SENSOR, Sensor, unseen
+from liex_lab.simulation.species import KINECT_V2_SENSOR, Sensor, unseen
 from liex_lab.simulation.training_patches import BLOCK, PER_SESSION, TrainingPatches, _degrade
 
 Array = NDArray[np.float64]

@@ -3,17 +3,447 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Final
 
+import numpy as np
+from numpy.typing import NDArray
+
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.errors import RecordingError
+from liex_lab.optics.camera import Camera
 from liex_lab.simulation.hand.simulator import gesture_session
 from liex_lab.simulation.locomotion import swimming_session
-from liex_lab.simulation.scenes.making import Making
-from liex_lab.simulation.scenes.recipes import RECIPES
-from liex_lab.simulation.scenes.recording import OneAnimal, TrueScene
-from liex_lab.simulation.sensors import KINECT_V2_SENSOR, Sensor
+from liex_lab.simulation.scene import BOX, ROUND, THING_FACES, SimulatedScene, draw_thing
+from liex_lab.simulation.scenes import meshes, places
+from liex_lab.simulation.scenes.cast import (
+    Animal,
+    calm_script,
+    keeping_apart,
+    timing_of,
+    visiting,
+)
+from liex_lab.simulation.scenes.meshes import Mesh, box, render_still, turned
+from liex_lab.simulation.scenes.places import Bedding, Ground
+from liex_lab.simulation.scenes.recording import Moving, OneAnimal, SceneRecording, Stage, TrueScene
+from liex_lab.simulation.species import KINECT_V2_SENSOR, MouseSpecies, Sensor
+
+
+@dataclass(frozen=True)
+class SceneRecipe:
+    """What a scene of mice is made of.
+
+    Attributes:
+        says: what stands before the camera, in words.
+        camera_mm: height of the camera above the floor, mm.
+        tilt_rad: of the camera, rad.
+        kind: outline of the arena, 'box' or 'round'.
+        half_mm: half the arena's sides, mm.
+        wall_mm: height of its walls, mm.
+        n_arenas: arenas in the picture, 1, 2 or 4, each with an animal of its own.
+        around: 'bench', 'untidy' or 'table', see `places`.
+        n_animals: in one arena.
+        presence: of the animals, one of `cast.PRESENCES`.
+        worn: '', 'head stage' or 'tether'.
+        fixture: '', 'house', 'object', which is put in, 'object out', which is taken out, or 'lid'.
+        bedding: whether there is bedding on the floor.
+        glossy: whether the floor reflects, so that it is unread in places.
+        drift_mm: what the sensor's depth changes by while it warms up, mm.
+    """
+
+    says: str
+    camera_mm: float = 660.0
+    tilt_rad: float = 0.06
+    kind: str = BOX
+    half_mm: tuple[float, float] = (260.0, 220.0)
+    wall_mm: float = 160.0
+    n_arenas: int = 1
+    around: str = "bench"
+    n_animals: int = 1
+    presence: str = "always"
+    worn: str = ""
+    fixture: str = ""
+    bedding: bool = False
+    glossy: bool = False
+    drift_mm: float = 0.0
+
+
+def _recipes() -> dict[str, SceneRecipe]:
+    plain = SceneRecipe("one mouse in a clean open field whose floor is the largest plane")
+    unlike = {
+        "small": {
+            "says": "an arena of 30 cm among things of all heights, 15 % of the picture",
+            "camera_mm": 610.0,
+            "half_mm": (150.0, 150.0),
+            "wall_mm": 140.0,
+            "around": "untidy",
+        },
+        "raised": {
+            "says": "an arena on a stool, the room's floor in view 48 cm below",
+            "half_mm": (190.0, 190.0),
+            "wall_mm": 150.0,
+            "around": "table",
+        },
+        "tilted": {
+            "says": "the camera tilted by 35 degrees",
+            "camera_mm": 560.0,
+            "tilt_rad": float(np.radians(35.0)),
+            "half_mm": (230.0, 200.0),
+            "wall_mm": 90.0,
+        },
+        "glossy": {"says": "a glossy floor, unread in places", "glossy": True},
+        "round": {
+            "says": "a round open field",
+            "kind": ROUND,
+            "half_mm": (230.0, 230.0),
+            "wall_mm": 220.0,
+        },
+        "two-arenas": {
+            "says": "two arenas in one picture, a mouse in each",
+            "camera_mm": 720.0,
+            "half_mm": (170.0, 210.0),
+            "wall_mm": 120.0,
+            "n_arenas": 2,
+        },
+        "four-arenas": {
+            "says": "four arenas in one picture, a mouse in each",
+            "camera_mm": 800.0,
+            "half_mm": (165.0, 150.0),
+            "wall_mm": 110.0,
+            "n_arenas": 4,
+        },
+        "tether": {"says": "a cable from the head to a commutator above", "worn": "tether"},
+        "head-stage": {"says": "a head stage of 10 x 8 x 12 mm", "worn": "head stage"},
+        "bedding": {
+            "says": "bedding with lumps of 18 mm that change where the animal walks",
+            "half_mm": (210.0, 180.0),
+            "bedding": True,
+        },
+        "house": {
+            "says": "a shelter into which the animal goes",
+            "half_mm": (240.0, 210.0),
+            "fixture": "house",
+        },
+        "object": {
+            "says": "a novel object, put in during the recording, that stays",
+            "fixture": "object",
+        },
+        "object-out": {
+            "says": "an object that is taken out during the recording",
+            "fixture": "object out",
+        },
+        "asleep": {"says": "motionless for 78 % of the recording", "presence": "asleep"},
+        "still": {"says": "the animal never moves", "presence": "still"},
+        "late": {"says": "the animal is put in after two thirds", "presence": "late"},
+        "leaves": {"says": "the animal is taken out before the middle", "presence": "leaves"},
+        "empty": {"says": "no animal at all", "presence": "never", "n_animals": 0},
+        "two-animals": {"says": "two mice in one arena", "n_animals": 2},
+        "drift": {"says": "the sensor warms up by 5 mm", "drift_mm": 5.0},
+        "cage": {
+            "says": "a home cage with sloping walls, its rim, and the bars of its lid over a third",
+            "camera_mm": 560.0,
+            "half_mm": (185.0, 115.0),
+            "wall_mm": 130.0,
+            "fixture": "lid",
+        },
+    }
+    return {"plain": plain} | {
+        name: replace(plain, **changes)  # type: ignore[arg-type]
+        for name, changes in unlike.items()
+    }
+
+
+RECIPES: Final[Mapping[str, SceneRecipe]] = MappingProxyType(_recipes())
+
+
+# How a recording of mice is made from a recipe and a seed.
+
+
+Array = NDArray[np.float64]
+
+_EPOCHS = 64  # most still pictures of one recording
+_EPOCH_FRAMES = 12
+_COMMUTATOR_MM = np.array([80.0, 110.0, 300.0])  # from the middle of the arena
+_HAND_FRAMES = 16  # that a hand takes to put something in
+_OBJECTS = {"object": 0.4, "object out": 0.6}  # when it is put in or taken out, of the recording
+_WARM_UP = 0.35  # of the recording, in which a sensor's drift falls by a factor e
+
+
+@dataclass(frozen=True)
+class Making:
+    """The making of one recording; every part has a stream of random numbers of its own.
+
+    Attributes:
+        name: of the scene.
+        recipe: what it is made of.
+        seed: that everything is drawn from.
+        n_frames: length of the recording.
+        sensor: the camera's make.
+        family: of body shapes, see `body.shape.draw_shapes`.
+        spine_mm: length of the animals, mm; None draws it.
+    """
+
+    name: str
+    recipe: SceneRecipe
+    seed: int
+    n_frames: int
+    sensor: Sensor
+    family: str
+    spine_mm: float | None
+
+    def _rng(self, part: str) -> np.random.Generator:
+        parts = ("camera", "place", "floor", "bedding", "worn", "sensor", "noise", "object")
+        return np.random.default_rng([self.seed, 77, parts.index(part)])
+
+    def recording(self) -> SceneRecording:
+        """The recording with the truth of all animals in it."""
+        recipe = self.recipe
+        species = MouseSpecies()
+        arenas = self._arenas()
+        animals, moving, parts = self._cast(species, arenas)
+        beddings: list[Bedding] = []
+        floor = self._rng("floor")
+        grounds = [Ground.draw(floor, arena) for arena in arenas]
+        if recipe.bedding:
+            tracks = animals[0].middle(species)[:, :2]
+            tracks = np.where(animals[0].present[:, None], tracks, np.nan)
+            beddings = [Bedding.draw(self._rng("bedding"), grounds[0], tracks, self._epoch_frames)]
+            animals = (animals[0].lifted(beddings[0].below(np.nan_to_num(tracks))), *animals[1:])
+        moving += self._worn(species, arenas[0], animals, parts)
+        stills, epoch = self._stills(arenas, grounds, beddings, parts)
+        fur = animals[0].shape.fur if animals else np.array([0.5])
+        noise = self._rng("noise")
+        stage = Stage(
+            arenas[0].camera,
+            arenas[0].T_arena_camera,
+            species,
+            tuple(animals),
+            tuple(moving),
+            stills,
+            epoch,
+            self.sensor.draw(self._rng("sensor"), 1, fur)[0],
+            noise.integers(1, 2**63, self.n_frames).astype(np.uint64),
+            recipe.drift_mm
+            * (1.0 - np.exp(-np.arange(self.n_frames) / max(1.0, _WARM_UP * self.n_frames))),
+        )
+        return SceneRecording(f"scene-{self.name}-{self.seed}", self.name, stage)
+
+    @property
+    def _epoch_frames(self) -> int:
+        return max(_EPOCH_FRAMES, -(-self.n_frames // _EPOCHS))
+
+    def _arenas(self) -> list[SimulatedScene]:
+        """The arenas of the picture, around the point that the camera's axis meets."""
+        recipe = self.recipe
+        rng = self._rng("camera")
+        camera: Camera = self.sensor.camera
+        toward = np.pi / 2 + float(rng.uniform(-0.3, 0.3))
+        T_arena_camera = places.look_down(recipe.camera_mm, recipe.tilt_rad, toward)
+        yaw = float(rng.uniform(-0.08, 0.08))
+        step = np.array(recipe.half_mm) + 18.0
+        cells = {1: [(0, 0)], 2: [(-1, 0), (1, 0)], 4: [(-1, -1), (1, -1), (-1, 1), (1, 1)]}
+        clutter = np.zeros((0, 2))
+        whole = places.arena_at(
+            camera, T_arena_camera, (0.0, 0.0), recipe.half_mm, yaw, recipe.wall_mm, clutter
+        )
+        if recipe.fixture in ("house", *_OBJECTS):
+            clutter = self._clutter(whole)
+        made = []
+        for cell in cells[recipe.n_arenas]:
+            x, y = turned(step * np.array(cell, float), yaw)
+            made.append(
+                places.arena_at(
+                    camera,
+                    T_arena_camera,
+                    (float(x), float(y)),
+                    recipe.half_mm,
+                    yaw,
+                    recipe.wall_mm,
+                    clutter,
+                    recipe.kind,
+                )
+            )
+        return made
+
+    def _house(self, arena: SimulatedScene) -> tuple[Array, float]:
+        """Where a house stands, (2,) mm, and the way out of it, rad."""
+        corner = turned((arena.half - [85.0, 75.0]) * [1.0, 1.0], arena.yaw)
+        return arena.centre + corner, float(np.pi + arena.yaw)
+
+    def _clutter(self, arena: SimulatedScene) -> Array:
+        """Outlines (n, 2) mm of what animals walk around."""
+        if self.recipe.fixture in _OBJECTS:
+            return np.asarray(self._object(arena).vertices[:, :2])
+        place, yaw = self._house(arena)
+        edge = np.linspace(-1.0, 1.0, 13)[:, None]
+        local = np.concatenate([edge * [60.0, 0.0] + [0.0, side * 48.0] for side in (-1, 1)])
+        return place + turned(np.concatenate([local, edge * [0.0, 48.0] - [60.0, 0.0]]), yaw)
+
+    def _object(self, arena: SimulatedScene) -> Mesh:
+        """A novel object: a block of about 5 x 4 x 6 cm."""
+        rng = self._rng("object")
+        half = rng.uniform([22.0, 18.0, 24.0], [30.0, 26.0, 34.0])
+        spot = arena.centre + turned(arena.half * [-0.45, 0.4], arena.yaw)
+        return box([*spot, half[2]], half, float(rng.uniform(-np.pi, np.pi)))
+
+    def _cast(
+        self, species: MouseSpecies, arenas: list[SimulatedScene]
+    ) -> tuple[tuple[Animal, ...], list[Moving], list[Mesh]]:
+        """The animals, what moves with them, and what stands still because of them."""
+        recipe = self.recipe
+        timing = timing_of(recipe.presence, self.n_frames)
+        script = path = None
+        still: list[Mesh] = []
+        moving: list[Moving] = []
+        if recipe.fixture == "house":
+            place, out = self._house(arenas[0])
+            ahead = np.array([np.cos(out), np.sin(out)])
+            path = visiting(place + 105.0 * ahead, place - 6.0 * ahead, ((0.1, 0.55), (0.72, 0.95)))
+            script = calm_script
+            still += places.house(arenas[0], place, out)
+        animals: list[Animal] = []
+        for which in range(max(recipe.n_animals, recipe.n_arenas) if recipe.n_animals else 0):
+            arena = arenas[which % len(arenas)]
+            if which and recipe.n_arenas == 1:
+                path = keeping_apart(animals[0].middle(species)[:, :2], animals[0].spine_mm)
+            animals.append(
+                Animal.draw(
+                    self.seed,
+                    which,
+                    species,
+                    arena,
+                    self.family,
+                    self.spine_mm,
+                    timing,
+                    script,
+                    path,
+                )
+            )
+        if recipe.fixture in _OBJECTS:
+            change = int(_OBJECTS[recipe.fixture] * self.n_frames)
+            later = np.arange(self.n_frames) >= change
+            thing = self._object(arenas[0])
+            moving.append(Moving.fixed(thing, later if recipe.fixture == "object" else ~later))
+            moving.append(self._hand(thing.vertices[:, :2].mean(axis=0), change))
+        if recipe.presence in ("late", "leaves") and animals:
+            there = animals[0].present
+            change = int(np.argmax(there)) if recipe.presence == "late" else int(there.sum())
+            spot = animals[0].middle(species)[min(change, self.n_frames - 1), :2]
+            moving.append(self._hand(spot, change))
+        return tuple(animals), moving, still
+
+    def _hand(self, spot: Array, change: int) -> Moving:
+        """A hand that comes down to a place, lets go of or takes something, and leaves."""
+        mesh = draw_thing(self._rng("object"), "hand", 65.0)
+        mesh[:, 2] -= mesh[:, 2].min()
+        reach = _HAND_FRAMES // 2
+        height = 45.0 + 22.0 * np.abs(np.arange(-reach, reach + 1))
+        vertices = mesh + np.column_stack([np.tile(spot, (len(height), 1)), height])[:, None]
+        moment = np.arange(self.n_frames) - change + reach
+        there = (moment >= 0) & (moment < len(height))
+        return Moving(vertices, THING_FACES, np.where(there, moment, -1))
+
+    def _worn(
+        self,
+        species: MouseSpecies,
+        arena: SimulatedScene,
+        animals: tuple[Animal, ...],
+        parts: list[Mesh],
+    ) -> list[Moving]:
+        """What the first animal wears."""
+        if not self.recipe.worn:
+            return []
+        rng = self._rng("worn")
+        animal = animals[0]
+        mount = meshes.on_head(species.skeleton, animal.pose, animal.shape[0], animal.girth)
+        sides = meshes.HEAD_STAGE_MM if self.recipe.worn == "head stage" else meshes.PLUG_MM
+        moving = [Moving.always(*meshes.stage_on(mount, sides), animal.present)]
+        if self.recipe.worn == "tether":
+            spot = arena.centre + _COMMUTATOR_MM[:2] + rng.normal(0.0, 15.0, 2)
+            above = np.array([*spot, _COMMUTATOR_MM[2]])
+            parts += meshes.holder(above)
+            cable = meshes.tether(rng, mount, above, float(rng.uniform(3.0, 5.0)))
+            moving.append(Moving.always(*cable, animal.present))
+        return moving
+
+    def _stills(
+        self,
+        arenas: list[SimulatedScene],
+        grounds: list[Ground],
+        beddings: list[Bedding],
+        parts: list[Mesh],
+    ) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+        """The still scene epoch by epoch (E, H, W) mm, and the epoch of every frame (n,)."""
+        recipe = self.recipe
+        rng = self._rng("place")
+        fixed = list(parts)
+        for arena in arenas:
+            lid = recipe.fixture == "lid"
+            fixed += places.walls_of(arena, *((14.0, 13.0) if lid else ()))
+            fixed += places.lid_bars(arena) if lid else []
+        if recipe.around == "table":
+            fixed += places.table(rng, arenas[0], 480.0)
+        elif recipe.around == "untidy":
+            fixed += places.untidy(rng, arenas[0])
+        else:
+            middle = np.mean([arena.centre for arena in arenas], axis=0)
+            fixed += places.bench(middle)
+        camera = arenas[0].camera
+        T_camera_arena = arenas[0].T_arena_camera.inverse()
+        changing = bool(beddings) or recipe.glossy
+        n_epochs = -(-self.n_frames // self._epoch_frames) if changing else 1
+        floors = [] if beddings else [ground.mesh() for ground in grounds]
+        base = render_still([*fixed, *floors], camera, T_camera_arena)
+        bare = render_still(floors, camera, T_camera_arena) == base
+        stills = np.repeat(base[None], n_epochs, axis=0)
+        for e, still in enumerate(stills):
+            for bedding in beddings:
+                lain = render_still(
+                    [bedding.ground.mesh(bedding.heights[e])], camera, T_camera_arena
+                )
+                nearer = (lain > 0) & ((still == 0) | (lain < still))
+                still[nearer] = lain[nearer]
+            if recipe.glossy:
+                still[bare & _reflections(self._rng("floor"), rng, camera, still.shape)] = 0.0
+        epoch = (
+            np.arange(self.n_frames) // self._epoch_frames
+            if changing
+            else np.zeros(self.n_frames, np.int64)
+        )
+        return stills, epoch.astype(np.int64)
+
+
+def _reflections(
+    same: np.random.Generator, own: np.random.Generator, camera: Camera, shape: tuple[int, ...]
+) -> NDArray[np.bool_]:
+    """Where a glossy floor is not read: about the camera's own reflection, and in patches.
+
+    Args:
+        same: gives all epochs the same patches.
+        own: gives each epoch borders of its own.
+        camera: the camera.
+        shape: (H, W) of the picture.
+
+    Returns:
+        (H, W) bool.
+    """
+    v, u = np.mgrid[: shape[0], : shape[1]].astype(float)
+    strength = np.full(shape, -1.0)
+    spots = [(camera.cx, camera.cy, 26.0)]
+    spots += [
+        (same.uniform(0.2, 0.8) * camera.width, same.uniform(0.2, 0.8) * camera.height, r)
+        for r in same.uniform(5.0, 16.0, 7)
+    ]
+    for at_u, at_v, radius in spots:
+        wide = same.uniform(0.8, 2.2)
+        way = same.uniform(-np.pi, np.pi)
+        x, y = (turned(np.stack([u - at_u, v - at_v], axis=-1), way) / radius).transpose(2, 0, 1)
+        strength = np.maximum(strength, 1.0 - np.hypot(x / wide, y * wide))
+    rough = own.normal(0.0, 1.0, (shape[0] // 4 + 1, shape[1] // 4 + 1))
+    ragged = np.repeat(np.repeat(rough, 4, axis=0), 4, axis=1)[: shape[0], : shape[1]]
+    return np.asarray(strength + 0.12 * ragged > 0.0)
+
 
 SEALED_FROM: Final = 900_000_000  # seeds from here on are kept for the sealed split
 # name: (the plan of its animal, the scene beside which it stands, '' for none)

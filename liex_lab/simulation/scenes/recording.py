@@ -15,12 +15,12 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from liex_lab.arena.floor import Floor
 from liex_lab.body.pose import Pose
 from liex_lab.body.surface import Surface, render_mesh
 from liex_lab.geometry import SE3
 from liex_lab.optics.camera import Camera
 from liex_lab.recordings.frame import Depth
+from liex_lab.scene.floor import Floor
 from liex_lab.simulation import _render_kernels as render_kernels
 from liex_lab.simulation._sensor_kernels import NORMAL, UNIT
 from liex_lab.simulation.recording import TrueRecording

@@ -31,8 +31,8 @@ from ...build import build_scene, plan_of
 
 if TYPE_CHECKING:
     from liex_lab.estimation.estimator import PoseEstimator
-    from liex_lab.foreground.segmenter import Segmenter
     from liex_lab.plan import Plan
+    from liex_lab.scene.segmenter import Segmenter
     from liex_lab.simulation.tracking_sequences import TestSequence
 
 Array = NDArray[np.float64]

@@ -21,9 +21,9 @@ from ...build import build_scene
 if TYPE_CHECKING:
     from liex_lab.baselines.baseline import Baseline
     from liex_lab.estimation.estimator import PoseEstimator
-    from liex_lab.foreground.height_maps import HeightMaps
-    from liex_lab.foreground.segmenter import Segmenter
     from liex_lab.plan import Plan
+    from liex_lab.scene.height_maps import HeightMaps
+    from liex_lab.scene.segmenter import Segmenter
     from liex_lab.simulation.recording import TrueRecording
 
 Array = NDArray[np.float64]
@@ -81,8 +81,8 @@ def is_other(crops: HeightMaps, crop_cameras: Array, recording: TrueRecording) -
         crop_cameras: (n, 17) their crop cameras.
         recording: the recording with its truth.
     """
-    from liex_lab.foreground.crop_camera import view_of
     from liex_lab.geometry import SE3
+    from liex_lab.scene.height_maps import view_of
 
     T = view_of(crop_cameras)
     joints = SE3(T.rotation[:, None], T.translation[:, None]) @ recording.joints_camera

@@ -136,7 +136,7 @@ def _tracking(path: Path, quick: bool, drawers: Drawers, progress: Progress) -> 
 def _actions(quick: bool, progress: Progress) -> dict[str, Any]:
     from liex_lab.actions.storage import load_action_model
 
-    from ...training.agent_data import cut_sequences
+    from ...training.action_model import cut_sequences
     from ...training.agent_tracks import acted_tracks
     from ..actions import sequence_scores
     from ..pose import estimator_of

@@ -44,7 +44,7 @@ def illustrate(model: Model, n_images: int = 128) -> dict[str, Any]:
         at home size (of the example its own), after every joint and round; `heights`, `true_px` and
         `edges` of the example; amounts and protocol.
     """
-    from liex_lab.estimation.proposals import N_WAYS
+    from liex_lab.estimation.initial import N_WAYS
     from liex_lab.estimation.training import Proposals, start_candidates
 
     skeleton = model.skeleton
@@ -157,7 +157,7 @@ def _pixels(positions: Array, data: TrainingSet, image: int) -> Array:
     """Where joints (m, J, 3) of one image's view frame lie in its height map: column and row (m, J,
     2).
     """
-    from liex_lab.foreground.crop_camera import CropCamera, in_camera_frame
+    from liex_lab.scene.height_maps import CropCamera, in_camera_frame
 
     look = data.images.crop_cameras[image]
     x, y, z = np.moveaxis(

@@ -11,9 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...training.agent_data import cut_sequences
-from ...training.agent_film import filmed_at
-from ...training.agent_tracks import Scenario
+from ...training.action_model import cut_sequences
+from ...training.agent_tracks import Scenario, filmed_at
 
 Array = NDArray[np.float64]
 

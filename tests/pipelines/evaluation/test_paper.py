@@ -57,8 +57,7 @@ from liex_lab.runtime.progress import silent
 from liex_lab.sessions.provenance import package_version
 from liex_lab.simulation import simulator
 from liex_lab.simulation.recording import SyntheticSession
-from liex_lab.simulation.sensors import PRIMESENSE_QVGA_SENSOR
-from liex_lab.simulation.species import MouseSpecies
+from liex_lab.simulation.species import PRIMESENSE_QVGA_SENSOR, MouseSpecies
 from tests.estimation.toy import toy_mice, trained, training_set
 
 N_SESSIONS, N_FRAMES = 2, 10

@@ -20,7 +20,7 @@ from liex_lab.plan import Plan
 from liex_lab.runtime.progress import Progress, silent
 from liex_lab.simulation import recording
 from liex_lab.simulation.recording import SyntheticSession
-from liex_lab.simulation.sensors import PRIMESENSE_QVGA_SENSOR, PRIMESENSE_SENSOR
+from liex_lab.simulation.species import PRIMESENSE_QVGA_SENSOR, PRIMESENSE_SENSOR
 from liex_lab.tracking.track import Track
 from tests.estimation.toy import trained
 from tests.sessions import walking_mouse

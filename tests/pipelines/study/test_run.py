@@ -372,7 +372,7 @@ def test_two_names_of_one_animal_and_one_recording_listed_twice_are_told(tmp_pat
 
 
 def test_two_runs_of_a_study_at_once_are_refused(tmp_path: Path) -> None:
-    from liex_lab.runtime.lock import take_lock
+    from liex_lab.runtime.durable import take_lock
 
     file = make_study(tmp_path, ["good"])
     folder = Study.load(file).cohort_folder

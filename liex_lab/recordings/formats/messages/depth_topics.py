@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from liex_lab.errors import LiexError, RecordingError, UnknownCameraError
 from liex_lab.optics.camera import Camera, Distortion, Lens
-from liex_lab.optics.presets import is_central
+from liex_lab.optics.camera import is_central
 from liex_lab.recordings.camera_file import CAMERA_FILE, CameraFile, fitting, is_infrared
 from liex_lab.recordings.formats.messages.depth_images import (
     decode,

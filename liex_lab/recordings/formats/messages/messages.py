@@ -25,7 +25,7 @@ from isal import isal_zlib
 from numpy.typing import NDArray
 
 from liex_lab.errors import RecordingError
-from liex_lab.runtime.limits import why_short
+from liex_lab.runtime.memory import why_short
 from liex_lab.runtime.progress import Progress
 
 PICTURE_SCHEMAS = (

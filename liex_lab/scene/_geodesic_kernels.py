@@ -1,0 +1,460 @@
+"""Kernels of geodesic extrema: where surfaces end that come into the picture, as an arm in a hand.
+
+The geodesic distance from where a surface leaves the picture is found by breadth-first search over
+its blocks; its maxima are the extrema (accumulative geodesic extrema, Plagemann et al., ICRA 2010).
+A maximum counts by its persistence (Edelsbrunner et al. 2002): added from the far end inwards,
+blocks make islands that a union-find merges, and the lower of two islands that meet has stuck out
+by the difference.
+
+Arrays that all kernels share: blocks (h, w) float32, the depth in mm of what is nearest in every
+block of BLOCK x BLOCK pixels, 0 for nothing within range; labels (h, w) int32, which surface a
+block belongs to, -1 none. The blocks of one surface are also listed (`Surface`), for most of a
+picture is none.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numba import njit
+
+from liex_lab.scene import _blob_kernels as blob_kernels
+from liex_lab.scene._blob_kernels import BLOCK, find_root
+
+MAX_SURFACES = 24
+MAX_TIPS = 256
+# of a home-sized hand: how far its points and the beginning of its arm lie from its middle
+AROUND_MM = 190.0
+_MIN_IN_BLOCK = 5
+_THICK_MM = 25.0  # readings of one block this far behind its nearest belong to something else
+_JUMP_MM = 50.0  # neighbouring blocks differ by less on one surface
+# of a home-sized hand: an end of a surface stands out by this, which an elbow does not
+_STICKS_OUT_MM = 90.0
+# sticking out once more as far is worth being nearer by this, up to so often
+_WORTH_MM = 60.0
+_MOST_OUT = 3.0
+_APART = 0.6  # of that radius: ends that lie nearer to each other show the same hand
+_MARGIN = 2  # blocks: many cameras read nothing along the borders of their pictures
+# columns of a geodesic extremum: depth mm, less for what sticks out far, by which they are ranked;
+# block row; block column; depth mm
+N_END = 4
+END_RANK = 0
+END_ROW = 1
+END_COLUMN = 2
+END_DEPTH = 3
+
+
+class Surface(NamedTuple):
+    """The n blocks of a surface, row by row.
+
+    Attributes:
+        slot: its label.
+        cells: (n, 2) int32 row and column.
+        points: (n, 3) x, y, z mm of their centres, camera frame.
+    """
+
+    slot: Any
+    cells: Any
+    points: Any
+
+
+@njit(cache=True)
+def block_depths(depth, near, far, blocks):
+    """The depth of what is nearest in every block.
+
+    The mean of the readings up to 25 mm behind the block's second nearest.
+
+    Args:
+        depth: (H, W) mm, 0 where unread.
+        near: nearer than this nothing counts, mm.
+        far: farther than this nothing counts, mm.
+        blocks: (h, w) float32 mm, out; 0 where fewer than 5 readings agree.
+    """
+    nothing = np.float32(1e9)
+    for i in range(blocks.shape[0]):
+        for j in range(blocks.shape[1]):
+            first = nothing
+            second = nothing
+            for r in range(i * BLOCK, i * BLOCK + BLOCK):
+                for c in range(j * BLOCK, j * BLOCK + BLOCK):
+                    z = np.float32(depth[r, c])
+                    z = z if near < z < far else nothing
+                    second = min(
+                        second, max(first, z)
+                    )  # no branches: what comes next cannot be foretold
+                    first = min(first, z)
+            total = 0.0
+            n = 0
+            if second < 1e8:
+                for r in range(i * BLOCK, i * BLOCK + BLOCK):
+                    for c in range(j * BLOCK, j * BLOCK + BLOCK):
+                        z = depth[r, c]
+                        if near < z < second + _THICK_MM:
+                            total += z
+                            n += 1
+            blocks[i, j] = total / n if n >= _MIN_IN_BLOCK else 0.0
+
+
+@njit(cache=True)
+def label_surfaces(blocks, labels, focal2, least_mm2, areas):
+    """Connected surfaces: flood fill over blocks whose depths differ by less than 50 mm.
+
+    Where there are more than fit, the largest are kept.
+
+    Args:
+        blocks: (h, w) float32 mm.
+        labels: (h, w) int32, out: the surface of each block, -1 none.
+        focal2: fx * fy, px^2.
+        least_mm2: smaller surfaces are dropped.
+        areas: (MAX_SURFACES,) mm^2, out.
+
+    Returns:
+        The number of surfaces.
+    """
+    n_rows, n_columns = blocks.shape
+    for i in range(n_rows):
+        for j in range(n_columns):
+            labels[i, j] = -2 if blocks[i, j] > 0 else -1
+    stack = np.empty((n_rows * n_columns, 2), np.int32)
+    n_surfaces = 0
+    for i in range(n_rows):
+        for j in range(n_columns):
+            if labels[i, j] != -2:
+                continue
+            stack[0, 0] = i
+            stack[0, 1] = j
+            labels[i, j] = MAX_SURFACES
+            at = 0
+            top = 1
+            area = 0.0
+            while at < top:
+                r = stack[at, 0]
+                c = stack[at, 1]
+                at += 1
+                here = blocks[r, c]
+                area += BLOCK * BLOCK * here * here / focal2
+                for a in range(max(r - 1, 0), min(r + 2, n_rows)):
+                    for b in range(max(c - 1, 0), min(c + 2, n_columns)):
+                        if labels[a, b] == -2 and abs(blocks[a, b] - here) < _JUMP_MM:
+                            labels[a, b] = MAX_SURFACES
+                            stack[top, 0] = a
+                            stack[top, 1] = b
+                            top += 1
+            slot = -1
+            if area >= least_mm2:
+                slot = n_surfaces if n_surfaces < MAX_SURFACES else int(np.argmin(areas))
+                if n_surfaces < MAX_SURFACES:
+                    n_surfaces += 1
+                elif areas[slot] > area:
+                    slot = -1
+                else:
+                    blob_kernels.forget(labels, slot)
+            for k in range(top):
+                labels[stack[k, 0], stack[k, 1]] = slot
+            if slot >= 0:
+                areas[slot] = area
+    return n_surfaces
+
+
+@njit(cache=True)
+def list_surfaces(blocks, labels, n_surfaces, intrinsics):
+    """The blocks of all surfaces.
+
+    Args:
+        blocks: (h, w) float32 mm.
+        labels: (h, w) int32.
+        n_surfaces: surfaces that are labelled.
+        intrinsics: (4,) fx, fy, cx, cy px.
+
+    Returns:
+        A `Surface` of each.
+    """
+    starts = np.zeros(n_surfaces + 1, np.int64)
+    for i in range(labels.shape[0]):
+        for j in range(labels.shape[1]):
+            if labels[i, j] >= 0:
+                starts[labels[i, j] + 1] += 1
+    starts = np.cumsum(starts)
+    cells = np.empty((starts[-1], 2), np.int32)
+    points = np.empty((starts[-1], 3))
+    filled = starts.copy()
+    for i in range(labels.shape[0]):
+        for j in range(labels.shape[1]):
+            slot = labels[i, j]
+            if slot >= 0:
+                at = filled[slot]
+                filled[slot] += 1
+                cells[at, 0] = i
+                cells[at, 1] = j
+                points[at, 0], points[at, 1], points[at, 2] = point_of_block(
+                    blocks, i, j, intrinsics
+                )
+    return [
+        Surface(
+            slot,
+            cells[starts[slot] : starts[slot + 1]],
+            points[starts[slot] : starts[slot + 1]],
+        )
+        for slot in range(n_surfaces)
+    ]
+
+
+@njit(cache=True)
+def walk(blocks, labels, surface, position, order, hops):
+    """All blocks of a surface by geodesic distance from where it leaves the picture.
+
+    Breadth-first search in steps of one block. Of the border, only the farther part counts as the
+    arm, since a hand may touch it, too. A surface that does not leave the picture is walked from
+    its farthest block.
+
+    Args:
+        blocks: (h, w) float32 mm.
+        labels: (h, w) int32.
+        surface: the `Surface`.
+        position: (h, w) int32, out: where in the order a block is; comes in as -1.
+        order: (n_blocks, 2) int32, out: row and column of the blocks.
+        hops: (n_blocks,) int32, out: their distances in blocks.
+
+    Returns:
+        The number of blocks reached.
+    """
+    n = 0
+    deepest = np.float32(0.0)
+    nearest = np.float32(1e9)
+    far_border = np.float32(0.0)
+    farthest = 0
+    last_i = labels.shape[0] - 1
+    last_j = labels.shape[1] - 1
+    cells = surface.cells
+    for k in range(len(cells)):
+        i = cells[k, 0]
+        j = cells[k, 1]
+        nearest = min(nearest, blocks[i, j])
+        if blocks[i, j] > deepest:
+            deepest = blocks[i, j]
+            farthest = k
+        if min(i, j, last_i - i, last_j - j) < _MARGIN:
+            far_border = max(far_border, blocks[i, j])
+    # a hand may touch the border, too; the arm is farther away
+    arm = 0.5 * (nearest + far_border)
+    for k in range(len(cells)):
+        i = cells[k, 0]
+        j = cells[k, 1]
+        if min(i, j, last_i - i, last_j - j) < _MARGIN and blocks[i, j] >= arm:
+            order[n, 0] = i
+            order[n, 1] = j
+            hops[n] = 0
+            position[i, j] = n
+            n += 1
+    if n == 0:
+        i = cells[farthest, 0]
+        j = cells[farthest, 1]
+        return walk_from(blocks, labels, surface.slot, i, j, position, order, hops)
+    return _spread(blocks, labels, surface.slot, n, position, order, hops)
+
+
+@njit(cache=True)
+def walk_from(blocks, labels, slot, i, j, position, order, hops):
+    """`walk` from one block of the surface.
+
+    Args:
+        blocks: (h, w) float32 mm.
+        labels: (h, w) int32.
+        slot: the surface.
+        i: row of the block.
+        j: column of the block.
+        position: (h, w) int32, out; comes in as -1.
+        order: (n_blocks, 2) int32, out.
+        hops: (n_blocks,) int32, out.
+
+    Returns:
+        The number of blocks reached.
+    """
+    order[0, 0] = i
+    order[0, 1] = j
+    hops[0] = 0
+    position[i, j] = 0
+    return _spread(blocks, labels, slot, 1, position, order, hops)
+
+
+@njit(cache=True)
+def _spread(blocks, labels, slot, n, position, order, hops):
+    """Breadth-first search from the first n blocks; returns how many there are in the end."""
+    at = 0
+    while at < n:
+        i = order[at, 0]
+        j = order[at, 1]
+        for a in range(max(i - 1, 0), min(i + 2, labels.shape[0])):
+            for b in range(max(j - 1, 0), min(j + 2, labels.shape[1])):
+                if position[a, b] >= 0 or labels[a, b] != slot:
+                    continue
+                if abs(blocks[a, b] - blocks[i, j]) < _JUMP_MM:
+                    order[n, 0] = a
+                    order[n, 1] = b
+                    hops[n] = hops[at] + 1
+                    position[a, b] = n
+                    n += 1
+        at += 1
+    return n
+
+
+@njit(cache=True)
+def ends(blocks, order, hops, position, n, focal, least_mm, tips, n_tips):
+    """The geodesic extrema of a walked surface whose persistence is at least `least_mm`.
+
+    From the far end of the walk inwards, islands appear and grow together; the lower of two islands
+    that meet has stuck out by the difference (its persistence). The farthest block of the walk is
+    an extremum in any case.
+
+    Args:
+        blocks: (h, w) float32 mm.
+        order: (n, 2) int32, blocks in the order of the walk.
+        hops: (n,) int32, their distances in blocks.
+        position: (h, w) int32, where in the order a block is.
+        n: blocks of the walk.
+        focal: px.
+        least_mm: by how much an extremum stands out, mm.
+        tips: (MAX_TIPS, N_END), out: the extrema, columns END_RANK to END_DEPTH.
+        n_tips: rows that are filled already.
+
+    Returns:
+        The number of rows filled now.
+    """
+    parent = np.arange(n)
+    for k in range(n - 1, -1, -1):
+        i = order[k, 0]
+        j = order[k, 1]
+        mine = k
+        for a in range(max(i - 1, 0), min(i + 2, blocks.shape[0])):
+            for b in range(max(j - 1, 0), min(j + 2, blocks.shape[1])):
+                other = position[a, b]
+                if other <= k or other >= n or order[other, 0] != a or order[other, 1] != b:
+                    continue
+                if parent[other] == mine:  # most blocks are of the same island, one step away
+                    continue
+                theirs = find_root(parent, other)
+                if mine == theirs:
+                    continue
+                # an island is known by its outermost block, which comes last in the order
+                low = min(mine, theirs)
+                high = max(mine, theirs)
+                parent[low] = high
+                mine = high
+                z = blocks[order[low, 0], order[low, 1]]
+                out_mm = (hops[low] - hops[k]) * BLOCK * z / focal
+                if out_mm >= least_mm:
+                    n_tips = _note(tips, n_tips, z, out_mm / least_mm, order[low])
+    i = order[n - 1, 0]
+    j = order[n - 1, 1]
+    return _note(
+        tips,
+        n_tips,
+        blocks[i, j],
+        hops[n - 1] * BLOCK * blocks[i, j] / focal / least_mm,
+        order[n - 1],
+    )
+
+
+@njit(cache=True)
+def _note(tips, n_tips, z, out, block):
+    """Add an extremum at depth z mm that sticks out `out` times as far as one must."""
+    if n_tips == MAX_TIPS:
+        return n_tips
+    tips[n_tips, END_RANK] = z - _WORTH_MM * min(out, _MOST_OUT)
+    tips[n_tips, END_ROW] = block[0]
+    tips[n_tips, END_COLUMN] = block[1]
+    tips[n_tips, END_DEPTH] = z
+    return n_tips + 1
+
+
+@njit(cache=True)
+def nearest_ends(blocks, labels, surfaces, size, intrinsics, chosen):
+    """Positions where a hand may be, the nearest first, no two alike.
+
+    A surface is walked twice: from where it leaves the picture, and from the extremum that lies
+    farthest from there, as it may be the hand that lies at the border. What of it is nearest may be
+    a hand before a body that it touches.
+
+    Args:
+        blocks: (h, w) float32 mm.
+        labels: (h, w) int32.
+        surfaces: a `Surface` of each.
+        size: the hand's length over the skeleton's home length.
+        intrinsics: (4,) fx, fy, cx, cy px.
+        chosen: (m, N_END), out: rows as in `ends`, at least 0.6 of the hand's sphere apart.
+
+    Returns:
+        The number of rows filled, at most m.
+    """
+    focal = np.sqrt(intrinsics[0] * intrinsics[1])
+    n_blocks = blocks.size
+    position = np.full(blocks.shape, -1, np.int32)
+    order = np.empty((n_blocks, 2), np.int32)
+    hops = np.empty(n_blocks, np.int32)
+    tips = np.empty((MAX_TIPS, N_END))
+    n_tips = 0
+    for surface in surfaces:
+        n = walk(blocks, labels, surface, position, order, hops)
+        n_tips = ends(blocks, order, hops, position, n, focal, _STICKS_OUT_MM * size, tips, n_tips)
+        last_i = order[n - 1, 0]
+        last_j = order[n - 1, 1]
+        nearest = 0
+        for k in range(n):
+            if blocks[order[k, 0], order[k, 1]] < blocks[order[nearest, 0], order[nearest, 1]]:
+                nearest = k
+            position[order[k, 0], order[k, 1]] = -1
+        i = order[nearest, 0]
+        j = order[nearest, 1]
+        n_tips = _note(tips, n_tips, blocks[i, j], 0.5, order[nearest])
+        n = walk_from(blocks, labels, surface.slot, last_i, last_j, position, order, hops)
+        n_tips = ends(blocks, order, hops, position, n, focal, _STICKS_OUT_MM * size, tips, n_tips)
+    ranked = np.argsort(tips[:n_tips, END_RANK])
+    n_chosen = 0
+    for t in ranked:
+        if n_chosen == len(chosen):
+            break
+        tip = tips[t]
+        x, y, z = point_of_block(blocks, int(tip[END_ROW]), int(tip[END_COLUMN]), intrinsics)
+        own = True
+        for k in range(n_chosen):
+            end = chosen[k]
+            a, b, c = point_of_block(blocks, int(end[END_ROW]), int(end[END_COLUMN]), intrinsics)
+            off = np.sqrt((x - a) ** 2 + (y - b) ** 2 + (z - c) ** 2)
+            own &= off > _APART * AROUND_MM * size
+        if own:
+            chosen[n_chosen] = tip
+            n_chosen += 1
+    return n_chosen
+
+
+@njit(cache=True)
+def point_of_block(blocks, i, j, intrinsics):
+    """The point of a block's centre at its depth.
+
+    Args:
+        blocks: (h, w) float32 mm.
+        i: row of the block.
+        j: column of the block.
+        intrinsics: (4,) fx, fy, cx, cy px.
+
+    Returns:
+        x, y and z, mm, camera frame: three numbers, for an array would be made anew for each block.
+    """
+    z = np.float64(blocks[i, j])
+    x = (j * BLOCK + 0.5 * (BLOCK - 1) - intrinsics[2]) / intrinsics[0] * z
+    y = (i * BLOCK + 0.5 * (BLOCK - 1) - intrinsics[3]) / intrinsics[1] * z
+    return x, y, z
+
+
+@njit(cache=True)
+def relabel(labels, surface):
+    """Give all blocks of a surface its own label again.
+
+    Args:
+        labels: (h, w) int32; changed in place.
+        surface: the `Surface`.
+    """
+    cells = surface.cells
+    for k in range(len(cells)):
+        labels[cells[k, 0], cells[k, 1]] = surface.slot

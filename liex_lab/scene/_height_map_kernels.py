@@ -1,0 +1,527 @@
+"""Kernels that choose the animal among connected components and cut its height map, frame by frame.
+
+Every frame: `label_blobs` joins foreground pixels to components; the component whose area in mm^2
+(pixels times the squared mean depth over fx fy) is nearest to the animal's on a logarithmic scale
+is the animal; `cut_heights`, `keep_largest`, `smooth_heights` and `blob_moments` make its height
+map. In camera view, what merely hangs together with the animal in the picture is told apart by the
+largest gap in depth.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numba import njit, prange
+
+from liex_lab.scene import _blob_kernels as blob_kernels
+
+AREA_FACTOR = 4.0  # a blob this many times larger or smaller than the animal is not the animal
+BRIDGE = 4  # blocks without readings that may lie between the parts of an animal of the camera view
+_MORE = 1.3  # times the area of the animal: there may be something with it
+_APART = 2.0  # roots of the animal's area: what lies farther before the animal is not a part of it
+_LAYERS = 3  # so often: before the animal a bar, behind it a speck
+_FAR = 65_535  # mm: behind everything
+_ON_FLOOR_SHARE = 0.3  # of an animal that leans out over the edge of the floor still covers it
+
+
+class Sight(NamedTuple):
+    """How a camera looks at the floor, and how heights above it are measured.
+
+    Attributes:
+        intrinsics: (4,) fx, fy, cx, cy px.
+        plane: (3,) the floor, 1 / z = a u + b v + c.
+        rotation: (3, 3) of T_view_camera.
+        behind_mm: 0 measures heights above the floor, else along the optical axis from so far
+            behind the mean depth.
+        smooth_mm: width over which heights are averaged, mm.
+    """
+
+    intrinsics: Any
+    plane: Any
+    rotation: Any
+    behind_mm: Any
+    smooth_mm: Any
+
+
+@njit(cache=True, parallel=True, nogil=True)
+def blob_areas(depths, limit, on_floor, bridge, mm2_per_px, areas):
+    """Areas of the connected components of every frame; 0 for one that does not stand on the floor.
+
+    Args:
+        depths: (n, H, W) mm, 0 where unread.
+        limit: (H, W) mm; a reading below it is foreground.
+        on_floor: (H, W) bool, the floor; a component stands on it with 30 % of its pixels.
+        bridge: blocks without readings that may lie between the parts of one component.
+        mm2_per_px: 1 / (fx fy).
+        areas: (n, MAX_BLOBS) mm^2, out; comes in as 0.
+    """
+    for k in prange(depths.shape[0]):
+        labels = np.empty(
+            (depths.shape[1] // blob_kernels.BLOCK, depths.shape[2] // blob_kernels.BLOCK), np.int32
+        )
+        blobs = np.empty((blob_kernels.MAX_BLOBS, blob_kernels.N_BLOB))
+        for slot in range(
+            blob_kernels.label_blobs(depths[k], limit, on_floor, bridge, labels, blobs)
+        ):
+            blob = blob_kernels.unpack_blob(blobs[slot])
+            if blob.n_on_floor >= _ON_FLOOR_SHARE * blob.n_px:
+                areas[k, slot] = blob_area(blob, mm2_per_px)
+
+
+@njit(cache=True)
+def blob_area(blob, mm2_per_px):
+    """Area mm^2, seen from the camera, of a component at its mean depth.
+
+    Args:
+        blob: the component's counts.
+        mm2_per_px: 1 / (fx fy).
+    """
+    return blob.n_px * (blob.depth_sum / blob.n_px) ** 2 * mm2_per_px
+
+
+@njit(cache=True)
+def order_blobs(blobs, n_blobs, area, mm2_per_px):
+    """The components in the order in which their areas come near to the animal's, and how many do.
+
+    While `area` is 0 the largest comes first.
+
+    Args:
+        blobs: (MAX_BLOBS, N_BLOB) as `label_blobs` fills it.
+        n_blobs: how many of the rows are filled.
+        area: the animal's usual area, mm^2, 0 while unknown.
+        mm2_per_px: 1 / (fx fy).
+
+    Returns:
+        Rows of blobs, nearest first, and how many stand on the floor and have about the animal's
+        area (within a factor of 4).
+    """
+    distances = np.full(n_blobs, np.inf)
+    n_near = 0
+    for slot in range(n_blobs):
+        blob = blob_kernels.unpack_blob(blobs[slot])
+        if blob.n_on_floor < _ON_FLOOR_SHARE * blob.n_px:
+            continue
+        here = blob_area(blob, mm2_per_px)
+        distances[slot] = abs(np.log(here / area)) if area > 0 else 1.0 / here
+        if area > 0 and distances[slot] > np.log(AREA_FACTOR):
+            distances[slot] = np.inf
+        else:
+            n_near += 1
+    order = np.empty(n_blobs, np.int64)
+    for slot in range(n_blobs):  # by insertion, in the order of equals: they are few
+        place = slot
+        while place > 0 and distances[order[place - 1]] > distances[slot]:
+            order[place] = order[place - 1]
+            place -= 1
+        order[place] = slot
+    return order, n_near
+
+
+@njit(cache=True)
+def parted(depth, limit, labels, blobs, area, mm2_per_px):
+    """The picture without what hangs together with the animal in it alone, by the gap in depth.
+
+    Of two layers far from one another the animal is the one whose area is nearer to its own. What
+    lies before it hides parts of it, and is taken for unread; what lies behind it there is
+    background. Elsewhere nothing is: of a bar and some specks the bar is likest to the animal,
+    which may swim beside them.
+
+    Args:
+        depth: (H, W) mm, 0 where unread.
+        limit: (H, W) mm; a reading below it is foreground.
+        labels: (H // BLOCK, W // BLOCK) int32, component of each block.
+        blobs: (n_blobs, N_BLOB) as `label_blobs` fills it.
+        area: the animal's usual area, mm^2.
+        mm2_per_px: 1 / (fx fy).
+
+    Returns:
+        The picture, a copy where it changed, and whether it did.
+    """
+    for slot in range(len(blobs)):
+        blob = blob_kernels.unpack_blob(blobs[slot])
+        if blob_area(blob, mm2_per_px) > _MORE * area:
+            cut, near, far = blob_kernels.layers(
+                depth, limit, labels, slot, blob, _APART * np.sqrt(area)
+            )
+            if cut > 0.0:
+                behind = abs(np.log(far * mm2_per_px / area)) < abs(
+                    np.log(near * mm2_per_px / area)
+                )
+                out = depth.copy()
+                if behind:
+                    for v in range(depth.shape[0]):
+                        for u in range(depth.shape[1]):
+                            if depth[v, u] < cut:
+                                out[v, u] = 0
+                else:
+                    _push_back(out, labels, slot, cut)
+                return out, True
+    return depth, False
+
+
+@njit(cache=True)
+def _push_back(depth, labels, slot, cut):
+    """Make background of what lies farther than `cut` mm in a component and at its border."""
+    for i in range(labels.shape[0]):
+        for j in range(labels.shape[1]):
+            if blob_kernels.is_animal_block(labels, i, j, slot):
+                for v in range(i * blob_kernels.BLOCK, (i + 1) * blob_kernels.BLOCK):
+                    for u in range(j * blob_kernels.BLOCK, (j + 1) * blob_kernels.BLOCK):
+                        if depth[v, u] > cut:
+                            depth[v, u] = _FAR
+
+
+@njit(cache=True)
+def extract_one(depth, limit, on_floor, area, n_things, parts, sight, crops, k):
+    """Find the animal in one frame and fill its row of the batch.
+
+    Where n_things is 2, the batch has twice as many rows as there are frames, and the second half
+    gets what comes next near.
+
+    Args:
+        depth: (H, W) mm, 0 where unread.
+        limit: (H, W) mm; a reading below it is foreground.
+        on_floor: (H, W) bool, the floor.
+        area: the animal's usual area, mm^2, 0 while unknown.
+        n_things: candidates a frame, 1 or 2.
+        parts: whether what hangs together with the animal in the picture alone is told apart by its
+            depth, see `parted`.
+        sight: `Sight` of the picture.
+        crops: `CropRows`, out.
+        k: the frame's row.
+    """
+    labels = np.empty(
+        (depth.shape[0] // blob_kernels.BLOCK, depth.shape[1] // blob_kernels.BLOCK), np.int32
+    )
+    blobs = np.empty((blob_kernels.MAX_BLOBS, blob_kernels.N_BLOB))
+    mm2_per_px = 1.0 / (sight.intrinsics[0] * sight.intrinsics[1])
+    bridge = BRIDGE if sight.behind_mm > 0.0 else 0
+    n_found = blob_kernels.label_blobs(depth, limit, on_floor, bridge, labels, blobs)
+    for _ in range(_LAYERS if parts and area > 0.0 else 0):
+        depth, changed = parted(depth, limit, labels, blobs[:n_found], area, mm2_per_px)
+        if not changed:
+            break
+        n_found = blob_kernels.label_blobs(depth, limit, on_floor, bridge, labels, blobs)
+    order, n_near = order_blobs(blobs, n_found, area, mm2_per_px)
+    for rank in range(n_things):
+        row = k + rank * (len(crops.n_px) // n_things)
+        crops.n_blobs[row] = n_near
+        if rank < n_near:
+            slot = order[rank]
+            blob = blob_kernels.unpack_blob(blobs[slot])
+            cut_crop(depth, limit, labels, slot, blob, sight, crops, row)
+            crops.n_px[row] = int(blob.n_px)
+
+
+@njit(cache=True)
+def cut_crop(depth, limit, labels, slot, blob, sight, crops, k):
+    """The height map of one component, smoothed, and its moments, into row k of the batch.
+
+    The crop is a square around the component in steps of whole pixels. Where heights are measured
+    along the optical axis, the row's distance moves to behind_mm behind the animal.
+
+    Args:
+        depth: (H, W) mm, 0 where unread.
+        limit: (H, W) mm; a reading below it is foreground.
+        labels: (H // BLOCK, W // BLOCK) int32, component of each block.
+        slot: the component.
+        blob: its counts.
+        sight: `Sight` of the picture.
+        crops: `CropRows`, out.
+        k: the row.
+    """
+    crop = crops.heights.shape[1]
+    v0 = blob.first_row * blob_kernels.BLOCK
+    v1 = (blob.last_row + 1) * blob_kernels.BLOCK
+    u0 = blob.first_column * blob_kernels.BLOCK
+    u1 = (blob.last_column + 1) * blob_kernels.BLOCK
+    span = max(v1 - v0, u1 - u0) + 2 * blob_kernels.BLOCK
+    step = max(1, int(np.ceil(span / (crop - 4))))
+    mean_depth = blob.depth_sum / blob.n_px
+    heights = crops.heights[k]
+    origin = crops.origin[k]
+    origin[0] = int((u0 + u1) / 2 - step * crop / 2)
+    origin[1] = int((v0 + v1) / 2 - step * crop / 2)
+    crops.step[k] = step
+    raw = np.empty((crop, crop), np.float32)
+    view_plane = sight.plane
+    if (
+        sight.behind_mm > 0.0
+    ):  # first from far behind, for the blob's mean depth is that of all that hangs together
+        crops.distance[k] = mean_depth + 8.0 * sight.behind_mm
+        view_plane = np.array([0.0, 0.0, 1.0 / crops.distance[k]])
+    blob_kernels.cut_heights(
+        depth, limit, labels, slot, view_plane, crops.distance[k], origin, step, raw
+    )
+    blob_kernels.keep_largest(raw, np.empty((crop * crop, 5), np.int32))
+    if sight.behind_mm > 0.0:
+        crops.distance[k] += blob_kernels.level_heights(raw, sight.behind_mm)
+        view_plane[2] = 1.0 / crops.distance[k]
+    mm_per_px = step * mean_depth / np.sqrt(sight.intrinsics[0] * sight.intrinsics[1])
+    radius = min(3, max(1, int(sight.smooth_mm / mm_per_px + 0.5)))
+    blob_kernels.smooth_heights(raw, radius, heights)
+    distance = crops.distance[k]
+    moments = crops.moments[k]
+    blob_kernels.blob_moments(
+        heights, origin, step, view_plane, sight.intrinsics, sight.rotation, distance, moments
+    )
+    if sight.behind_mm > 0.0:
+        moments[blob_kernels.SLOPE] = blob_kernels.back_slope(
+            heights, origin, step, sight.intrinsics, distance, moments
+        )
+
+
+@njit(cache=True, parallel=True, nogil=True)
+def extract_all(depths, limit, on_floor, area, n_things, parts, sight, crops):
+    """Find the animal in every frame of one camera and fill the batch, frames in parallel.
+
+    Args:
+        depths: (n, H, W) mm, 0 where unread.
+        limit: (H, W) mm; a reading below it is foreground.
+        on_floor: (H, W) bool, the floor.
+        area: the animal's usual area, mm^2, 0 while unknown.
+        n_things: candidates a frame; the batch has N = n_things n rows, best candidates first.
+        parts: whether layers far apart in depth are told apart, see `parted`.
+        sight: `Sight` of all pictures.
+        crops: `CropRows`, out.
+    """
+    for k in prange(depths.shape[0]):
+        # a number of one type: the loop's own has two on the way, and all would be compiled twice
+        row = np.int64(k)
+        extract_one(depths[k], limit, on_floor, area, n_things, parts, sight, crops, row)
+
+
+@njit(cache=True, parallel=True, nogil=True)
+def extract_windows(depths, background, margin, area, n_things, sights, crops):
+    """Find the animal in patches of pictures from many cameras and fill the batch, in parallel.
+
+    The limit of each patch is its background, or the floor where that is unread, less its margin;
+    all of it counts as floor.
+
+    Args:
+        depths: (n, H, W) mm, 0 where unread.
+        background: (n, H, W) mm, 0 where unread.
+        margin: (n,) mm by which the animal stands out at least.
+        area: (n,) usual areas of the animals, mm^2.
+        n_things: candidates a patch; the batch has N = n_things n rows, best candidates first.
+        sights: `Sight` of the patches, each field with a leading axis (n,), in pixels of the
+            patches.
+        crops: `CropRows`, out.
+    """
+    for k in prange(depths.shape[0]):
+        plane = sights.plane[k]
+        limit = np.empty(depths.shape[1:], np.float32)
+        everywhere = np.ones(depths.shape[1:], np.bool_)
+        for v in range(limit.shape[0]):
+            for u in range(limit.shape[1]):
+                behind = float(background[k, v, u])
+                if behind == 0.0:
+                    inverse = plane[0] * u + plane[1] * v + plane[2]
+                    behind = 1.0 / inverse if inverse > 1e-6 else 0.0
+                limit[v, u] = max(behind - margin[k], 0.0)
+        sight = Sight(
+            sights.intrinsics[k],
+            plane,
+            sights.rotation[k],
+            sights.behind_mm[k],
+            sights.smooth_mm[k],
+        )
+        row = np.int64(k)
+        extract_one(depths[k], limit, everywhere, area[k], n_things, False, sight, crops, row)
+
+
+# Pinhole projection of a crop: points of its view frame to its pixels, and pixels back to points.
+
+
+N_CROP_CAMERA = 17  # numbers of a packed crop camera
+
+
+class CropCamera(NamedTuple):
+    """The camera of one crop, or columns (n,) of many, in the order in which they are packed.
+
+    Attributes:
+        fx: focal length along the picture's rows, px of the whole picture.
+        fy: focal length along its columns, px.
+        cx: principal point, px of the whole picture.
+        cy: principal point, px of the whole picture.
+        r00: rotation of T_view_camera, first row; r00 to r22 row by row.
+        r01: see r00.
+        r02: see r00.
+        r10: see r00.
+        r11: see r00.
+        r12: see r00.
+        r20: see r00.
+        r21: see r00.
+        r22: see r00.
+        distance: z of the camera's centre in the view frame, mm.
+        u0: column of the whole picture that is the crop's first.
+        v0: row of the whole picture that is the crop's first.
+        step: pixels of the whole picture from one crop pixel to the next.
+    """
+
+    fx: Any
+    fy: Any
+    cx: Any
+    cy: Any
+    r00: Any
+    r01: Any
+    r02: Any
+    r10: Any
+    r11: Any
+    r12: Any
+    r20: Any
+    r21: Any
+    r22: Any
+    distance: Any
+    u0: Any
+    v0: Any
+    step: Any
+
+
+class CropRows(NamedTuple):
+    """The rows of a batch of height maps, as a segmenter's kernels fill them.
+
+    Attributes:
+        heights: (N, S, S) int16, 1/16 mm.
+        origin: (N, 2) int32, picture pixel (u, v) of crop pixel (0, 0).
+        step: (N,) int32, picture pixels a crop pixel.
+        n_px: (N,) int64, readings on the animal, 0 where it was not found.
+        moments: (N, N_MOMENTS), each a packed `BlobMoments`.
+        distance: (N,) mm of the view's origin from the camera.
+        n_blobs: (N,) int64, components of about the animal's size.
+    """
+
+    heights: Any
+    origin: Any
+    step: Any
+    n_px: Any
+    moments: Any
+    distance: Any
+    n_blobs: Any
+
+
+@njit(cache=True)
+def crop_camera(packed):
+    """The record of one packed crop camera (17,)."""
+    return CropCamera(
+        packed[0],
+        packed[1],
+        packed[2],
+        packed[3],
+        packed[4],
+        packed[5],
+        packed[6],
+        packed[7],
+        packed[8],
+        packed[9],
+        packed[10],
+        packed[11],
+        packed[12],
+        packed[13],
+        packed[14],
+        packed[15],
+        packed[16],
+    )
+
+
+@njit(cache=True)
+def to_camera(camera, x0, y0, z0):
+    """x, y, z mm in the camera frame of a point of the view frame; z is at least 1 mm."""
+    z0 -= camera.distance
+    x = camera.r00 * x0 + camera.r10 * y0 + camera.r20 * z0
+    y = camera.r01 * x0 + camera.r11 * y0 + camera.r21 * z0
+    z = max(camera.r02 * x0 + camera.r12 * y0 + camera.r22 * z0, 1.0)
+    return x, y, z
+
+
+@njit(cache=True)
+def to_pixel(camera, x0, y0, z0):
+    """Column and row of the crop, not rounded, at which a point mm of the view frame is seen."""
+    x, y, z = to_camera(camera, x0, y0, z0)
+    column = (camera.fx * x / z + camera.cx - camera.u0) / camera.step
+    row = (camera.fy * y / z + camera.cy - camera.v0) / camera.step
+    return column, row
+
+
+@njit(cache=True)
+def to_point(camera, row, column, height):
+    """x, y mm of the view frame of what a crop pixel shows, `height` mm above its plane."""
+    dx = (camera.u0 + camera.step * column - camera.cx) / camera.fx
+    dy = (camera.v0 + camera.step * row - camera.cy) / camera.fy
+    z = (height - camera.distance) / (camera.r20 * dx + camera.r21 * dy + camera.r22)
+    x = z * (camera.r00 * dx + camera.r01 * dy + camera.r02)
+    y = z * (camera.r10 * dx + camera.r11 * dy + camera.r12)
+    return x, y
+
+
+# Kernels of the per-pixel background model: the farthest mode of a pixel's sorted readings.
+
+
+@njit(cache=True)
+def far_mode(values, window):
+    """Depth and spread of the farthest cluster in sorted readings; (0, 0) without one.
+
+    An animal is always nearer than what it covers, so the background is the farthest depth that
+    comes back, not the most frequent: a pixel covered nine tenths of the time still shows it. A
+    cluster needs a twentieth of the readings (at least 3) within `window` mm, which lone outliers
+    beyond the floor do not reach.
+
+    Args:
+        values: (n,) readings of one pixel, mm, ascending.
+        window: how far apart the readings of one surface lie, mm.
+
+    Returns:
+        The cluster's median, mm, and half of its range from 16 to 84 %, mm.
+    """
+    n = values.size
+    need = max(3, (n + 19) // 20)
+    if n < need:
+        return 0.0, 0.0
+    top = n - 1
+    while top - need + 1 >= 0:
+        if values[top] - values[top - need + 1] <= window:
+            low = top
+            while low > 0 and values[top] - values[low - 1] <= window:
+                low -= 1
+            middle = values[(low + top) // 2]
+            # re-centre on the cluster's own middle, so that a few far readings do not cut its near
+            # half off
+            low = top
+            while low > 0 and middle - values[low - 1] <= window:
+                low -= 1
+            count = top - low + 1
+            middle = values[low + count // 2]
+            spread = 0.5 * (
+                values[low + int(0.84 * (count - 1))] - values[low + int(0.16 * (count - 1))]
+            )
+            return middle, spread
+        top -= 1
+    return 0.0, 0.0
+
+
+@njit(cache=True, parallel=True, nogil=True)
+def far_modes(ordered, window_share, window_mm, near_share, depth, spread, near):
+    """Background depth, its spread and the nearest usual depth of every pixel.
+
+    Runs `far_mode` in every pixel, pixels in parallel.
+
+    Args:
+        ordered: (n_pixels, n) float32 mm, each pixel's readings, ascending; 0 where unread.
+        window_share: width of a cluster, of the pixel's farthest reading.
+        window_mm: width of a cluster at least, mm.
+        near_share: share of a pixel's readings that are nearer than `near`.
+        depth: (n_pixels,) float32 mm, out: the farthest mode, 0 without one.
+        spread: (n_pixels,) float32 mm, out: its standard deviation.
+        near: (n_pixels,) float32 mm, out: the depth that only `near_share` of the readings are
+            nearer than, 0 where never read.
+    """
+    for pixel in prange(ordered.shape[0]):
+        first = 0
+        while first < ordered.shape[1] and not ordered[pixel, first] > 0:
+            first += 1
+        values = ordered[pixel, first:]
+        n = values.size
+        window = window_mm if n == 0 else max(window_mm, window_share * values[-1])
+        depth[pixel], spread[pixel] = far_mode(values, window)
+        near[pixel] = values[int(near_share * n)] if n > 0 else 0.0

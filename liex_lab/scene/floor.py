@@ -1,0 +1,543 @@
+"""Floor plane of a depth picture by RANSAC on inverse depth, and the arena frame that stands on it.
+
+A plane in a pinhole picture has 1 / z = a u + b v + c, linear in the pixel (u, v). `find_floor`
+tries 600 planes through three pixels each (RANSAC, Fischler and Bolles 1981), on few voters first
+and the best 20 on more, and fits the winner to its inliers (8 mm) by least squares, three rounds.
+`floor_region` says where in the picture the floor lies.
+
+Arena frame: z up from the floor, origin at the foot of the camera's perpendicular, x along the
+camera's x.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from liex_lab.errors import EstimationError
+from liex_lab.geometry import SE3
+from liex_lab.optics.camera import Camera
+
+Array = NDArray[np.float64]
+
+# pixels that vote for a plane, and planes tried
+_N_VOTERS = 6000
+_N_TRIALS = 600
+_N_FITTED = 60_000  # pixels that the plane is fitted to
+_INLIER_MM = 8.0  # a floor is flat to about this much, depth noise included
+_MIN_SHARE = 0.2  # of the readable pixels must lie on the floor
+_MAX_TILT_DEG = 60.0
+# background this near to the plane is floor: flatness, noise and lens errors together
+_FLAT_MM = 15.0
+# what is said of a camera's place: beyond these no model has learned
+_PLAUSIBLE_MM = (150.0, 3000.0)
+_MUCH_TILT_RAD = math.radians(15.0)
+
+
+@dataclass(frozen=True)
+class Floor:
+    """The floor plane normal . p = distance_mm in the camera frame.
+
+    Attributes:
+        normal: (3,) unit normal, pointing away from the lens.
+        distance_mm: of the plane from the camera, mm.
+        inverse_depth: (3,) a, b, c of 1 / z = a u + b v + c, 1/mm per pixel and 1/mm.
+    """
+
+    normal: Array
+    distance_mm: float
+    inverse_depth: Array
+
+    @staticmethod
+    def from_inverse_depth(coefficients: Array, camera: Camera) -> Floor:
+        """The plane with 1 / z = a u + b v + c.
+
+        Args:
+            coefficients: (3,) a, b, c, 1/mm per pixel and 1/mm.
+            camera: whose pixels they count.
+
+        Returns:
+            The plane.
+        """
+        a, b, c = coefficients
+        toward = np.array([a * camera.fx, b * camera.fy, c + a * camera.cx + b * camera.cy])
+        length = float(np.linalg.norm(toward))
+        return Floor(toward / length, 1.0 / length, np.asarray(coefficients, float))
+
+    @staticmethod
+    def from_plane(normal: Array, distance_mm: float, camera: Camera) -> Floor:
+        """The plane normal . p = distance_mm in the camera frame.
+
+        Args:
+            normal: (3,) pointing away from the lens, of any length.
+            distance_mm: from the camera along the unit normal, mm.
+            camera: in whose pixels `inverse_depth` counts.
+
+        Returns:
+            The plane.
+        """
+        n = np.asarray(normal, float) / np.linalg.norm(normal)
+        a = n[0] / camera.fx / distance_mm
+        b = n[1] / camera.fy / distance_mm
+        return Floor(
+            n,
+            float(distance_mm),
+            np.array([a, b, n[2] / distance_mm - a * camera.cx - b * camera.cy]),
+        )
+
+    @cached_property
+    def T_arena_camera(self) -> SE3:
+        """Transform from the camera frame into the arena frame.
+
+        Arena frame: z up from the floor, origin at the foot of the camera's perpendicular, x along
+        the camera's.
+        """
+        up = -self.normal
+        x = np.array([1.0, 0.0, 0.0]) - up[0] * up
+        x = x / np.linalg.norm(x)
+        return SE3(np.stack([x, np.cross(up, x), up]), np.array([0.0, 0.0, self.distance_mm]))
+
+    @property
+    def tilt_rad(self) -> float:
+        """Angle between the optical axis and the floor's perpendicular, rad."""
+        return math.acos(min(1.0, float(self.normal[2])))
+
+    def lens_distance_mm(self, lift_mm: Array | None = None) -> float:
+        """Distance of the plane from the real lens, mm.
+
+        Args:
+            lift_mm: see `unusual`.
+        """
+        up = 0.0 if lift_mm is None else float(lift_mm @ self.normal)
+        return self.distance_mm - up
+
+    def unusual(self, lift_mm: Array | None = None) -> list[str]:
+        """What is unlike the places of cameras that models learn from, a sentence each.
+
+        Args:
+            lift_mm: (3,) from the real lens to the camera's origin, mm, where water makes an ideal
+                camera of it; None without water.
+        """
+        found = []
+        distance = self.lens_distance_mm(lift_mm)
+        low, high = _PLAUSIBLE_MM
+        if not low <= distance <= high:
+            found.append(
+                f"the floor lies {distance:.0f} mm from the camera, outside the usual {low:.0f} to "
+                f"{high:.0f} mm; check the unit and the camera's height"
+            )
+        if self.tilt_rad > _MUCH_TILT_RAD:
+            found.append(
+                f"the camera looks down at {math.degrees(self.tilt_rad):.0f} degrees from "
+                "straight, and poses are learned up to 10; turn it to look straight down"
+            )
+        return found
+
+    def depth(self, width: int, height: int) -> NDArray[np.float32]:
+        """Depth of the bare floor under every pixel.
+
+        Args:
+            width: of the picture, px.
+            height: of the picture, px.
+
+        Returns:
+            (height, width) float32 mm; 0 above the horizon.
+        """
+        a, b, c = self.inverse_depth
+        inverse = a * np.arange(width)[None, :] + b * np.arange(height)[:, None] + c
+        return np.where(inverse > 1e-6, 1.0 / np.maximum(inverse, 1e-6), 0.0).astype(np.float32)
+
+
+def find_floor(background: NDArray[np.float32], camera: Camera, seed: int = 0) -> Floor:
+    """The largest plane of an empty scene, by RANSAC on inverse depth and least squares.
+
+    Args:
+        background: (H, W) float32 mm, 0 where unread.
+        camera: that took it, free of lens distortion.
+        seed: of the random pixels.
+
+    Returns:
+        The floor.
+
+    Raises:
+        EstimationError: less than a fifth of the readable pixels lie on one plane that faces the
+            camera (tilted by at most 60 degrees), fewer than 500 pixels are readable, or the
+            camera's distortion was not undone.
+    """
+    if camera.distortion is not None:
+        raise EstimationError(
+            "a floor is found in pictures of a straight lens, but this camera's distortion was "
+            "not undone; pass the recording through liex_lab.recordings.rectify.rectified"
+        )
+    rows, columns = np.nonzero(background > 0)
+    if len(rows) < 500:
+        raise EstimationError(
+            f"a floor needs at least 500 readable background pixels, got {len(rows)}; check the "
+            "depth unit and range"
+        )
+    rng = np.random.default_rng(seed)
+    chosen = rng.choice(len(rows), min(_N_FITTED, len(rows)), replace=False)
+    rows = rows[chosen]
+    columns = columns[chosen]
+    depth = background[rows, columns].astype(float)
+    middle = np.array([background.shape[1] / 2.0, background.shape[0] / 2.0])
+    # pixels counted from the picture's middle, in units of its size: so the sums below lose no
+    # digits
+    points = np.stack(
+        [(columns - middle[0]) / middle[0], (rows - middle[1]) / middle[0], np.ones(len(rows))],
+        axis=1,
+    )
+    plane = _largest_plane(points[:_N_VOTERS], depth[:_N_VOTERS], camera.fx / middle[0], rng)
+    share = 0.0
+    for _ in range(3):  # least squares on many pixels, not only on the voters
+        plane, share = _refit(points, depth, plane)
+    floor = _in_pixels(plane, middle, camera)
+    tilt = np.degrees(np.arccos(np.clip(floor.normal[2], -1, 1)))
+    if share < _MIN_SHARE or tilt > _MAX_TILT_DEG:
+        raise EstimationError(
+            f"no floor was found: the largest plane holds {share:.0%} of the readable pixels and "
+            f"is tilted by {tilt:.0f} degrees; the camera should look down on a floor"
+        )
+    return floor
+
+
+def _largest_plane(points: Array, depth: Array, focal: float, rng: np.random.Generator) -> Array:
+    """The plane (3,), 1 / depth = points . plane, that the most points (n, 3) are on, out of many
+    through three each.
+
+    Planes that do not face the camera (a wall) do not stand. All are tried on some points, the best
+    few on more. focal: in the units of the points.
+    """
+    three = rng.integers(0, len(depth), (_N_TRIALS, 3))
+    p = points[three]
+    w = 1.0 / depth[three]
+    ends = np.stack([p[:, 1] - p[:, 0], p[:, 2] - p[:, 0]], axis=1)
+    rise = np.stack([w[:, 1] - w[:, 0], w[:, 2] - w[:, 0]], axis=1)
+    area = ends[:, 0, 0] * ends[:, 1, 1] - ends[:, 0, 1] * ends[:, 1, 0]
+    area = np.where(np.abs(area) > 1e-4, area, np.nan)  # three points in a line
+    a = (rise[:, 0] * ends[:, 1, 1] - rise[:, 1] * ends[:, 0, 1]) / area
+    b = (ends[:, 0, 0] * rise[:, 1] - ends[:, 1, 0] * rise[:, 0]) / area
+    planes = np.stack([a, b, w[:, 0] - a * p[:, 0, 0] - b * p[:, 0, 1]], axis=1)
+    steepness = (
+        np.hypot(a, b) * focal / np.where(planes[:, 2] > 0, planes[:, 2], np.nan)
+    )  # tangent of the tilt
+    planes = planes[steepness < np.tan(np.radians(_MAX_TILT_DEG))]
+    for n_kept, n_voters in ((20, _N_VOTERS // 6), (1, _N_VOTERS)):
+        votes = _is_near(points[:n_voters] @ planes.T, depth[:n_voters, None]).sum(axis=0)
+        planes = planes[np.argsort(-votes, kind="stable")[:n_kept]]
+    return planes[0] if len(planes) else np.array([0.0, 0.0, 1.0 / float(np.median(depth))])
+
+
+def _is_near(inverse: Array, depth: Array) -> NDArray[np.bool_]:
+    """Whether points at `depth` lie within `_INLIER_MM` of a plane that has 1 / z = inverse
+    there.
+    """
+    return np.asarray(np.abs(depth * inverse - 1.0) < _INLIER_MM * inverse)
+
+
+def _in_pixels(plane: Array, middle: Array, camera: Camera) -> Floor:
+    a, b, c = plane / [middle[0], middle[0], 1.0]
+    return Floor.from_inverse_depth(np.array([a, b, c - a * middle[0] - b * middle[1]]), camera)
+
+
+def _refit(points: Array, depth: Array, plane: Array) -> tuple[Array, float]:
+    """The plane again from every point near it, and the share of points that are."""
+    near = _is_near(points @ plane, depth)
+    if near.sum() < 3:
+        return plane, 0.0
+    some = points[near]
+    fitted = np.linalg.lstsq(some.T @ some, some.T @ (1.0 / depth[near]), rcond=None)[0]
+    return np.asarray(fitted, float), float(near.mean())
+
+
+def fit_plane(background: NDArray[np.float32], where: NDArray[np.bool_], camera: Camera) -> Floor:
+    """The plane of some pixels, by least squares on inverse depth.
+
+    Args:
+        background: (H, W) float32 mm.
+        where: (H, W) bool, readable pixels, at least three that are in no line.
+        camera: that took it, free of lens distortion.
+
+    Returns:
+        The plane.
+    """
+    rows, columns = np.nonzero(where)
+    middle = np.array([background.shape[1] / 2.0, background.shape[0] / 2.0])
+    points = np.stack(
+        [(columns - middle[0]) / middle[0], (rows - middle[1]) / middle[0], np.ones(len(rows))],
+        axis=1,
+    )
+    inverse = 1.0 / background[where].astype(float)
+    plane = np.linalg.lstsq(points.T @ points, points.T @ inverse, rcond=None)[0]
+    return _in_pixels(np.asarray(plane, float), middle, camera)
+
+
+def floor_region(background: NDArray[np.float32], bare: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """Where the floor lies: the convex hull of the largest part of the background on the plane.
+
+    Floors of arenas and tanks are convex; what stands on them or hides them leaves holes, which the
+    hull closes. Where no connected part is left, all pixels near the plane are taken.
+
+    Args:
+        background: (H, W) float32 mm, 0 where unread.
+        bare: (H, W) float32 mm, depth of the bare floor, see `Floor.depth`.
+
+    Returns:
+        (H, W) bool.
+    """
+    import cv2
+
+    patch = floor_patch(background, bare)
+    if not patch.any():
+        return near_plane(background, bare)
+    region = np.zeros(patch.shape, np.uint8)
+    cv2.fillConvexPoly(region, cv2.convexHull(cv2.findNonZero(patch.astype(np.uint8))), 1)
+    return region.astype(bool)
+
+
+def floor_patch(background: NDArray[np.float32], bare: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """The largest connected part of the background that lies on the bare floor.
+
+    Pixels near the plane are opened with a square of 5 px before their components are labelled.
+
+    Args:
+        background: (H, W) float32 mm, 0 where unread.
+        bare: (H, W) float32 mm, depth of the bare floor.
+
+    Returns:
+        (H, W) bool, all False where nothing lies on it.
+    """
+    import cv2
+
+    flat = near_plane(background, bare).astype(np.uint8)
+    opened = cv2.morphologyEx(flat, cv2.MORPH_OPEN, np.ones((5, 5), np.uint8))
+    n, labels, stats, _ = cv2.connectedComponentsWithStats(opened)
+    if n < 2:
+        return np.zeros(flat.shape, np.bool_)
+    return np.asarray(labels == 1 + int(np.argmax(stats[1:, cv2.CC_STAT_AREA])))
+
+
+def near_plane(background: NDArray[np.float32], bare: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """Where the background lies within 15 mm of the bare floor.
+
+    Args:
+        background: (H, W) float32 mm, 0 where unread.
+        bare: (H, W) float32 mm, depth of the bare floor.
+
+    Returns:
+        (H, W) bool.
+    """
+    return (background > 0) & (np.abs(background - bare) < _FLAT_MM)
+
+
+# Flat grounds of an empty scene: every large plane that faces the camera, and its patches.
+
+
+_WINDOWS = 14  # along the picture's longer side, each overlapping its neighbours by half
+_READ_SHARE = 0.5  # of a window's pixels that must be readable
+_FLAT_SHARE = 0.7  # and of those, that must lie on its plane
+_GROUND_FLAT_MM = 8.0
+_SIDE = 160  # pixels a side that are looked at
+_MAX_PLANES = 8
+_ROUNDS = 4
+_BEYOND_PX = 6  # so far from a patch its surroundings are looked at
+_RISE_MM = 20.0  # by which a wall rises above its floor at least
+
+
+@dataclass(frozen=True)
+class Ground:
+    """A connected flat patch of an empty scene that faces the camera.
+
+    Attributes:
+        floor: its plane.
+        patch: (H, W) bool, where it lies in the picture.
+        enclosed: share of its outline, 0 to 1, from which something rises.
+    """
+
+    floor: Floor
+    patch: NDArray[np.bool_]
+    enclosed: float
+
+    def region(self, reach_px: float) -> NDArray[np.bool_]:
+        """The ground's convex hull, and what lies around it.
+
+        Args:
+            reach_px: how far around it, px.
+
+        Returns:
+            (H, W) bool.
+        """
+        import cv2
+
+        region = np.zeros(self.patch.shape, np.uint8)
+        points = cv2.findNonZero(self.patch.astype(np.uint8))
+        cv2.fillConvexPoly(region, cv2.convexHull(points), 1)
+        away = cv2.distanceTransform(1 - region, cv2.DIST_L2, 5)
+        return np.asarray(away <= reach_px)
+
+
+def flat_grounds(background: NDArray[np.float32], camera: Camera, least_mm2: float) -> list[Ground]:
+    """The flat patches of an empty scene, those of the plane with the most pixels first.
+
+    Args:
+        background: (H, W) float32 mm, 0 where unread.
+        camera: that took it, free of lens distortion.
+        least_mm2: smaller patches are left out, mm^2.
+
+    Returns:
+        The grounds, none where nothing is flat.
+    """
+    step = max(1, max(background.shape) // _SIDE)
+    rows, columns = np.mgrid[0 : background.shape[0] : step, 0 : background.shape[1] : step]
+    depth = background[::step, ::step].astype(float)
+    middle = np.array([background.shape[1] / 2.0, background.shape[0] / 2.0])
+    points = np.stack(
+        [(columns - middle[0]) / middle[0], (rows - middle[1]) / middle[0], np.ones(rows.shape)],
+        axis=-1,
+    )
+    read = depth > 0
+    seeds = _seeds(points, depth, camera.fx / middle[0])
+    left = read.copy()
+    mm2_per_px = step * step / (camera.fx * camera.fy)
+    grounds: list[Ground] = []
+    for _ in range(_MAX_PLANES):
+        if not len(seeds) or not left.any():
+            break
+        some = points[left]
+        at = depth[left]
+        stride = max(1, len(at) // 4000)
+        votes = _on(some[::stride] @ seeds.T, at[::stride, None], _GROUND_FLAT_MM).sum(axis=0)
+        best = int(np.argmax(votes))
+        if votes[best] * stride * float(np.median(at)) ** 2 * mm2_per_px < least_mm2:
+            break
+        plane = seeds[best]
+        for _ in range(_ROUNDS):
+            near = _on(some @ plane, at, _GROUND_FLAT_MM)
+            if near.sum() >= 3:
+                plane = _fit(some[near], at[near])
+        grounds += _patches(background, _in_pixels(plane, middle, camera), camera, least_mm2)
+        taken = left & _on(points @ plane, depth, 2.0 * _GROUND_FLAT_MM)
+        left &= ~taken
+        seeds = np.delete(seeds, best, axis=0)
+        seeds = seeds[~_same(seeds, plane, points[taken])]
+    return grounds
+
+
+def _seeds(points: Array, depth: Array, focal: float) -> Array:
+    """The planes (n, 3), 1 / depth = points . plane, of the picture's flat windows."""
+    side = max(4, max(depth.shape) // _WINDOWS)
+    found = []
+    for row in range(0, max(1, depth.shape[0] - side + 1), side // 2):
+        for column in range(0, max(1, depth.shape[1] - side + 1), side // 2):
+            window = (slice(row, row + side), slice(column, column + side))
+            read = depth[window] > 0
+            if read.mean() < _READ_SHARE or read.sum() < 12:
+                continue
+            some = points[window][read]
+            at = depth[window][read]
+            kept = np.abs(at - np.median(at)) < 4.0 * np.median(np.abs(at - np.median(at))) + 1.0
+            plane = _fit(some[kept], at[kept])
+            if _on(some @ plane, at, _GROUND_FLAT_MM).mean() >= _FLAT_SHARE and plane[2] > 0:
+                found.append(plane)
+    planes = np.array(found).reshape(-1, 3)
+    steepness = np.hypot(planes[:, 0], planes[:, 1]) * focal / np.maximum(planes[:, 2], 1e-12)
+    return np.asarray(planes[steepness < np.tan(np.radians(_MAX_TILT_DEG))])
+
+
+def _fit(points: Array, depth: Array) -> Array:
+    """The plane (3,) nearest to points (n, 3) at depth (n,) mm, by least squares."""
+    return np.asarray(
+        np.linalg.lstsq(points.T @ points, points.T @ (1.0 / depth), rcond=None)[0], float
+    )
+
+
+def _on(inverse: Array, depth: Array, within_mm: float) -> NDArray[np.bool_]:
+    """Whether points at `depth` lie within so many mm of the plane that has 1 / z = inverse."""
+    return np.asarray((depth > 0) & (np.abs(depth * inverse - 1.0) < within_mm * inverse))
+
+
+def _same(planes: Array, plane: Array, points: Array) -> NDArray[np.bool_]:
+    """Which of the planes (n, 3) differ from one by less than a floor's flatness over points."""
+    if not len(points):
+        return np.zeros(len(planes), np.bool_)
+    some = points[:: max(1, len(points) // 200)]
+    depth = 1.0 / np.maximum(some @ plane, 1e-9)
+    return np.asarray(_on(some @ planes.T, depth[:, None], _GROUND_FLAT_MM).mean(axis=0) > 0.9)
+
+
+def _patches(
+    background: NDArray[np.float32], floor: Floor, camera: Camera, least_mm2: float
+) -> list[Ground]:
+    """The connected parts of the background on a plane, largest first, each with a plane of its
+    own.
+
+    Pixels without a reading between pixels of the plane count as on it: glossy floors have holes.
+    """
+    import cv2
+
+    height, width = background.shape
+    bare = floor.depth(width, height)
+    flat = near_plane(background, bare)
+    holes = cv2.morphologyEx(flat.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((7, 7), np.uint8))
+    whole = flat | ((holes > 0) & (background == 0))
+    opened = cv2.morphologyEx(whole.astype(np.uint8), cv2.MORPH_OPEN, np.ones((5, 5), np.uint8))
+    n, labels, stats, _ = cv2.connectedComponentsWithStats(opened)
+    found = []
+    for k in sorted(range(1, n), key=lambda k: -int(stats[k, cv2.CC_STAT_AREA]))[:_MAX_PLANES]:
+        patch = (labels == k) & flat
+        area = float((background[patch].astype(float) ** 2).sum()) / (camera.fx * camera.fy)
+        if area < least_mm2:
+            break
+        own = _refitted(background, patch, floor, camera)
+        found.append(Ground(own, labels == k, _enclosed(background, labels == k, own, camera)))
+    return found
+
+
+def _refitted(
+    background: NDArray[np.float32], patch: NDArray[np.bool_], floor: Floor, camera: Camera
+) -> Floor:
+    """The plane of one patch's own pixels, from the whole plane's."""
+    rows, columns = np.nonzero(patch)
+    depth = background[rows, columns].astype(float)
+    middle = np.array([background.shape[1] / 2.0, background.shape[0] / 2.0])
+    points = np.stack(
+        [(columns - middle[0]) / middle[0], (rows - middle[1]) / middle[0], np.ones(len(rows))],
+        axis=1,
+    )
+    a, b, c = floor.inverse_depth
+    plane = np.array([a * middle[0], b * middle[0], c + a * middle[0] + b * middle[1]])
+    for _ in range(_ROUNDS):
+        near = _on(points @ plane, depth, _GROUND_FLAT_MM)
+        if near.sum() < 50:
+            return floor
+        plane = _fit(points[near], depth[near])
+    return _in_pixels(plane, middle, camera)
+
+
+def _enclosed(
+    background: NDArray[np.float32], patch: NDArray[np.bool_], floor: Floor, camera: Camera
+) -> float:
+    """The share of a patch's outline just beyond which something rises above the floor.
+
+    What the picture's border cuts is not enclosed.
+    """
+    import cv2
+
+    height, width = background.shape
+    hull = np.zeros(patch.shape, np.uint8)
+    outline = cv2.convexHull(cv2.findNonZero(patch.astype(np.uint8)))
+    cv2.fillConvexPoly(hull, outline, 1)
+    reach = 2 * max(_BEYOND_PX, width // 40) + 1
+    a, b, c = floor.inverse_depth
+    v, u = np.mgrid[0:height, 0:width]
+    above = floor.distance_mm * (1.0 - background * (a * u + b * v + c))
+    high = np.where((background > 0) & (hull == 0), above, -1e6).astype(np.float32)
+    highest = cv2.dilate(high, np.ones((reach, reach), np.uint8))
+    ring = (cv2.dilate(hull, np.ones((3, 3), np.uint8)) > 0) & (hull == 0)
+    inside = hull.astype(bool)
+    n_cut = int(inside[0].sum() + inside[-1].sum() + inside[:, 0].sum() + inside[:, -1].sum())
+    return float((highest[ring] > _RISE_MM).sum()) / max(1, int(ring.sum()) + n_cut)

@@ -1,0 +1,100 @@
+"""Regions of a picture that a plan states: polygon, rectangle or circle, in pixels or millimetres.
+
+Millimetres are those of the floor, in the arena's frame: its origin lies below the camera, x goes
+along the picture's rows and y up the picture. Each corner is carried to the picture by the pinhole
+projection of its place on the floor. What several arenas have in common is refused.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from itertools import combinations
+
+import numpy as np
+
+from liex_lab.errors import PlanError
+from liex_lab.optics.camera import Camera
+from liex_lab.plan.sections import Region
+from liex_lab.recordings.frame import region_mask
+from liex_lab.scene.floor import Floor
+from liex_lab.scene.outline import circle_points
+from liex_lab.scene.polygon import crossing_sides
+from liex_lab.scene.scene import Mask
+
+Corners = tuple[tuple[float, float], ...]
+
+_N_CORNERS = 64  # of a circle
+_DEEPEST_SHARE = 1e-3  # a place on the floor lies at least this share of its distance before it
+
+
+def region_corners_px(region: Region, camera: Camera, floor: Floor | None) -> Corners:
+    """The corners of a region in the picture.
+
+    Args:
+        region: as a plan states it.
+        camera: the ideal pinhole camera of the recording.
+        floor: on which millimetres count; needed for those alone.
+
+    Returns:
+        (u, v) pixels.
+
+    Raises:
+        PlanError: sides of its polygon cross, or a corner in millimetres lies behind the camera.
+    """
+    corners = _drawn(region)
+    if (crossing := crossing_sides(corners)) is not None:
+        raise PlanError(
+            f"arena.region: sides {crossing[0] + 1} and {crossing[1] + 1} of its polygon cross; "
+            "list the corners in the order in which they go round the arena"
+        )
+    if region.unit == "px":
+        return tuple((float(u), float(v)) for u, v in corners)
+    if floor is None:
+        raise PlanError("a region in mm needs a floor; state it in pixels, or state arena.floor")
+    place = np.column_stack([corners, np.zeros(len(corners))])
+    seen = floor.T_arena_camera.inverse() @ place
+    if (seen[:, 2] < _DEEPEST_SHARE * floor.distance_mm).any():
+        raise PlanError(
+            "arena.region has corners that lie behind the camera; millimetres count from the place "
+            "on the floor below the camera"
+        )
+    return tuple((float(u), float(v)) for u, v in camera.project(seen))
+
+
+def _drawn(region: Region) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
+    """The corners (n, 2) in the region's own unit."""
+    if region.circle is not None:
+        return np.array(region.circle.centre) + region.circle.radius * circle_points(_N_CORNERS)
+    if region.rectangle is not None:
+        (x0, y0), (x1, y1) = region.rectangle
+        return np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]], float)
+    return np.array(region.polygon, float).reshape(-1, 2)
+
+
+def masks_apart(regions: Mapping[str, Corners], width: int, height: int) -> dict[str, Mask]:
+    """The pixels of several arenas, which have none in common.
+
+    Args:
+        regions: (u, v) corners, pixels, by the arena's name.
+        width: of the picture, px.
+        height: of the picture, px.
+
+    Returns:
+        (height, width) bool by the arena's name.
+
+    Raises:
+        PlanError: a region is no polygon in the picture, or two overlap.
+    """
+    masks = {}
+    for name, corners in regions.items():
+        try:
+            masks[name] = region_mask(corners, width, height)
+        except PlanError as error:
+            raise PlanError(f"the arena {name}: {error}") from None
+    for one, other in combinations(masks, 2):
+        if n := int((masks[one] & masks[other]).sum()):
+            raise PlanError(
+                f"the arenas {one} and {other} overlap in {n} pixels, and an animal there would be "
+                "in both; move their regions apart"
+            )
+    return masks
