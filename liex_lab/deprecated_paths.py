@@ -31,7 +31,9 @@ class _PathFinder:
             ModuleNotFoundError: the path is gone; the message names its successor.
         """
         if name in GONE:
-            raise ModuleNotFoundError(f"{name} is now {GONE[name]}; import it from there", name=name)
+            raise ModuleNotFoundError(
+                f"{name} is now {GONE[name]}; import it from there", name=name
+            )
         package = _LIBRARY.parent / name.removeprefix("liex_lab.") / "__init__.py"
         if name in BESIDE and package.is_file():
             return spec_from_file_location(name, package)

@@ -10,8 +10,8 @@ from typing import Any
 from liex_lab.plan.study import PlannedSession, Study
 from liex_lab.runtime.durable import replacing, write_whole
 from liex_lab.runtime.places import unlinked_below
-from liex_lab.tables.schema import dictionary, table_columns, write_table
 from liex_lab.runtime.text_files import harmless
+from liex_lab.tables.schema import dictionary, table_columns, write_table
 
 from .status import SessionStatus
 

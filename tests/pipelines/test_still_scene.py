@@ -13,7 +13,7 @@ from liex_lab.recordings.recording import Recording
 from liex_lab.scene.background_segmenter import BackgroundSubtraction
 from liex_lab.scene.still_scene import StillScene
 from liex_lab.sessions.cutouts import still_scene
-from tests.foreground.test_background_segmenter import (
+from tests.scene.test_background_segmenter import (
     CAMERA,
     SPINES,
     recording_of,

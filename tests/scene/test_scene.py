@@ -13,10 +13,11 @@ from typer.testing import CliRunner
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.errors import EstimationError, PlanError
 from liex_lab.plan import Plan
+from liex_lab.recordings.frame import region_mask
 from liex_lab.recordings.recording import Recording
 from liex_lab.scene.background_segmenter import BackgroundSubtraction
-from liex_lab.scene.scene import find_fixtures, plane_of, region_mask
-from tests.arena.staged import CAMERA, changed, stage, walk
+from liex_lab.scene.scene import find_fixtures, plane_of
+from tests.scene.staged import CAMERA, changed, stage, walk
 
 N_FRAMES = 24
 

@@ -7,7 +7,7 @@ import pytest
 
 from liex_lab.scene.background_segmenter import BackgroundSubtraction
 from liex_lab.scene.scene import Fixture
-from tests.foreground.test_background_segmenter import SPINES, recording_of, tilted, with_box
+from tests.scene.test_background_segmenter import SPINES, recording_of, tilted, with_box
 
 N_FRAMES = 60
 FLOOR = tilted(2.0)

@@ -9,7 +9,7 @@ import pytest
 
 from liex_lab.scene.background import FloorLevel, wandering
 from liex_lab.scene.background_segmenter import BackgroundSubtraction
-from tests.arena.staged import changed, stage, walk
+from tests.scene.staged import changed, stage, walk
 
 SPINES = (40.0, 115.0)
 N_FRAMES = 48

@@ -8,7 +8,7 @@ import pytest
 from liex_lab.optics.camera import SensorCard
 from liex_lab.recordings.recording import Recording
 from liex_lab.scene.background_segmenter import BackgroundSubtraction
-from tests.foreground.test_background_segmenter import CAMERA, SPINES, tilted, with_box
+from tests.scene.test_background_segmenter import CAMERA, SPINES, tilted, with_box
 
 N_FRAMES = 40
 

@@ -10,7 +10,7 @@ import pytest
 from liex_lab.optics.camera import Camera
 from liex_lab.scene.background_segmenter import BackgroundSubtraction
 from liex_lab.scene.still_scene import SceneChange
-from tests.arena.staged import changed, stage, walk
+from tests.scene.staged import changed, stage, walk
 
 SPINES = (40.0, 115.0)
 N_FRAMES = 64

@@ -11,7 +11,7 @@ from liex_lab.errors import EstimationError
 from liex_lab.recordings.recording import Recording
 from liex_lab.scene.background import learn_background
 from liex_lab.scene.background_segmenter import BackgroundSubtraction
-from tests.arena.staged import changed, stage, walk
+from tests.scene.staged import changed, stage, walk
 
 SPINES = (40.0, 115.0)
 N_FRAMES = 48

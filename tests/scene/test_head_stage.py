@@ -8,7 +8,7 @@ from liex_lab.optics.camera import Camera
 from liex_lab.scene.background_segmenter import BackgroundSubtraction
 from liex_lab.scene.floor import Floor
 from liex_lab.scene.worn import HeadStage
-from tests.arena.staged import stage, walk
+from tests.scene.staged import stage, walk
 
 CAMERA = Camera(365.0, 365.0, 159.5, 119.5, 320, 240)
 FLOOR_MM = 660.0

@@ -9,7 +9,7 @@ import pytest
 
 from liex_lab.recordings import open_recording
 from liex_lab.scene.background_segmenter import BackgroundSubtraction
-from tests.foreground.test_background_segmenter import SPINES, recording_of, tilted, with_box
+from tests.scene.test_background_segmenter import SPINES, recording_of, tilted, with_box
 
 if TYPE_CHECKING:
     from liex_lab.simulation.recording import TrueRecording

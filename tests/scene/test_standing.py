@@ -15,7 +15,7 @@ from liex_lab.scene.floor import find_floor
 from liex_lab.scene.outline import find_arena
 from liex_lab.scene.scene import LARGEST
 from liex_lab.simulation.scenes.catalogue import film
-from tests.arena.staged import changed, stage, walk
+from tests.scene.staged import changed, stage, walk
 
 SPINES = (40.0, 115.0)
 N_FRAMES = 24
