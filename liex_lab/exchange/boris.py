@@ -19,8 +19,7 @@ import pandas as pd
 
 from liex_lab.actions.labels import HUMAN, checked
 from liex_lab.errors import LiexError, one_line
-from liex_lab.runtime.text_files import read_texts
-from liex_lab.runtime.text_files import decoded, read_text, split_lines
+from liex_lab.runtime.text_files import decoded, read_text, read_texts, split_lines
 from liex_lab.sessions import Session
 from liex_lab.sessions.videos import found_video, video_path
 
