@@ -37,8 +37,8 @@ from liex_lab.runtime.progress import Progress, silent
 from .build import build_recording, build_tracker, open_planned
 
 if TYPE_CHECKING:
-    from liex_lab.scene.region import Corners
     from liex_lab.recordings.frame import Depth
+    from liex_lab.scene.region import Corners
     from liex_lab.tracking.tracker import FrameTracker
 
 
@@ -405,7 +405,7 @@ def _region(
 
     A region that was found is kept where the tracker learned from it is that of whole pictures.
     """
-    from liex_lab.scene.scene import region_mask
+    from liex_lab.recordings.frame import region_mask
 
     if corners:
         return region_mask(corners, opened.width, opened.height), []

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from liex_lab.errors import RecordingError
 from liex_lab.optics.camera import Camera
-from liex_lab.recordings.frame import Depth, DepthFrame, marked
+from liex_lab.recordings.frame import Depth, DepthFrame, marked, region_mask
 from liex_lab.recordings.timestamps import (
     FAULTS,
     JUMPED,

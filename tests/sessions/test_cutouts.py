@@ -19,6 +19,7 @@ from liex_lab.geometry import SE3
 from liex_lab.recordings import open_recording
 from liex_lab.recordings.depth_kernels import to_millimetres, unpack_rvl
 from liex_lab.recordings.formats.messages.mcap import McapFile
+from liex_lab.recordings.frame import region_mask
 from liex_lab.sessions import Session, SessionWriter, correcting
 from liex_lab.sessions.cutouts import (
     FILE,

@@ -11,7 +11,7 @@ import pytest
 from liex_lab.body import Skeleton
 from liex_lab.errors import LiexError
 from liex_lab.recordings.formats.images.nyu import N_FIRST_PERSON, NyuReference
-from liex_lab.simulation.hand import reference, simulator
+from liex_lab.simulation.hand import pose_prior, simulator
 from liex_lab.simulation.hand.pose_prior import find_reference
 from liex_lab.simulation.hand.simulator import HandSimulator, gesture_session
 from liex_lab.simulation.simulator import world_of

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.errors import LiexError
 from liex_lab.geometry import so3
-from liex_lab.recordings.formats.images.nyu_labels import N_FIRST_PERSON, REFERENCE_FILE
+from liex_lab.recordings.formats.images.nyu import N_FIRST_PERSON, REFERENCE_FILE
 
 Array = NDArray[np.float64]
 

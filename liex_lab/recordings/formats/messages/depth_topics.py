@@ -23,8 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.errors import LiexError, RecordingError, UnknownCameraError
-from liex_lab.optics.camera import Camera, Distortion, Lens
-from liex_lab.optics.camera import is_central
+from liex_lab.optics.camera import Camera, Distortion, Lens, is_central
 from liex_lab.recordings.camera_file import CAMERA_FILE, CameraFile, fitting, is_infrared
 from liex_lab.recordings.formats.messages.depth_images import (
     decode,
