@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 from liex_lab.deprecated_paths import install_path_finder
 from liex_lab.runtime.kernel_cache import keep_kernels
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 install_path_finder()
 # kernels' threads that have nothing to do sleep; OpenMP's usual ones spin, on cores on which
