@@ -12,12 +12,12 @@ is trusted and no stamp is read, for some frames out of an hour are needed at on
 
 from __future__ import annotations
 
+import itertools
 import struct
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from io import BytesIO
-from itertools import pairwise
 from pathlib import Path
 from typing import IO
 
@@ -61,6 +61,8 @@ _LARGEST_OFFSET = 1 << 40
 _INDEX = struct.Struct("<HI")  # of a message index: channel, bytes of its entries
 _ENTRY = np.dtype([("time_ns", "<u8"), ("offset", "<u8")])
 _HEAD = 512  # bytes of a message's record in which its stamp is
+# share of the packed bytes; if more must be unpacked for the stamps, all of them are
+_WORTH_IT = 0.6
 _BATCH = 32  # chunks from which one task unpacks the beginnings of messages
 _NOT_READ = (*DAMAGE, DamagedChunk)
 
@@ -122,17 +124,18 @@ class _Indexed(McapFile):
                 usable = self._agrees(indexes, progress)
         except _NOT_READ:
             pass  # the walk says what it finds
-        if not (indexes and usable):
-            yield from super().walk(wanted, progress)
-            return
-        self.parsed = self.trusted
         tables: dict[int, list[_Table]] = {}
-        for index in indexes:
+        for index in indexes if usable else []:
             try:
                 for channel_id, table in self._tables(index, wanted):
                     tables.setdefault(channel_id, []).append(table)
             except _NOT_READ:
                 self.whole = False
+        if not (indexes and usable and (self.trusted or self._is_worth_it(tables))):
+            self.chunks.clear()
+            yield from super().walk(wanted, progress)
+            return
+        self.parsed = self.trusted
         for channel_id, those in tables.items():
             yield from self._messages(channel_id, those, wanted)
 
@@ -161,6 +164,20 @@ class _Indexed(McapFile):
                 raise DamagedChunk("there is no index where it should be")
             found.append((channel_id, (number, entries)))
         return found
+
+    def _is_worth_it(self, tables: dict[int, list[_Table]]) -> bool:
+        """Whether the stamps lie in so few bytes that the rest need not be unpacked."""
+        last = [0] * len(self.chunks)
+        for number, entries in itertools.chain.from_iterable(tables.values()):
+            offsets = np.frombuffer(entries, _ENTRY)["offset"]
+            last[number] = max(last[number], int(offsets.max(initial=0)) + _HEAD)
+        packed = [
+            (n, chunk.size)
+            for n, chunk in enumerate(self.chunks)
+            if chunk.packing not in ("", "none")
+        ]
+        needed = sum(min(last[n], size) for n, size in packed)
+        return needed <= _WORTH_IT * sum(size for _, size in packed)
 
     def _messages(
         self, channel_id: int, tables: Sequence[_Table], wanted: Wanted
@@ -203,8 +220,8 @@ class _Indexed(McapFile):
             return None
         by_chunk = np.flatnonzero(np.diff(listed.places[:, 0])) + 1
         edges = [0, *by_chunk[_BATCH - 1 :: _BATCH].tolist(), len(listed.places)]
-        parts = [listed.places[a:b] for a, b in pairwise(edges)]
-        logged = [listed.log_time_ns[a:b] for a, b in pairwise(edges)]
+        parts = [listed.places[a:b] for a, b in itertools.pairwise(edges)]
+        logged = [listed.log_time_ns[a:b] for a, b in itertools.pairwise(edges)]
         with ThreadPoolExecutor(THREADS) as unpackers:
             found = list(unpackers.map(partial(self._stamps, read, channel_id), parts, logged))
         if not all(one is not None for one in found):
