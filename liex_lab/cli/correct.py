@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from liex_lab.cli.options import say
-from liex_lab.cli.sections import group_of_verbs
+from liex_lab.cli.options import group_of_verbs, say
 from liex_lab.errors import SessionError, printable
 from liex_lab.runtime.progress import progress_bar
 

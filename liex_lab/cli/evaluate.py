@@ -12,12 +12,12 @@ from liex_lab.cli.options import (
     JsonFile,
     RowName,
     SessionPath,
+    group_of_verbs,
     keep_numbers,
     say,
     tell_numbers,
     tell_rows,
 )
-from liex_lab.cli.sections import group_of_verbs
 from liex_lab.errors import LiexError
 from liex_lab.pipelines.evaluation.paper.deviations import DEVIATIONS, HAND
 from liex_lab.runtime.progress import progress_bar

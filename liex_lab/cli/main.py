@@ -21,6 +21,11 @@ import liex_lab
 from liex_lab.cli.correct import correct, describe
 from liex_lab.cli.evaluate import evaluate
 from liex_lab.cli.options import (
+    MODELS,
+    RECORDINGS,
+    SESSIONS,
+    START,
+    STUDIES,
     JsonFile,
     OutFolder,
     PlanName,
@@ -29,15 +34,13 @@ from liex_lab.cli.options import (
     Settings,
     TopicName,
     WhichPlan,
+    group_of_verbs,
     region_setting,
     say,
     tell_numbers,
     to_json,
 )
-from liex_lab.cli.recordings import convert, pack
-from liex_lab.cli.replay import show
-from liex_lab.cli.results import compare, export, figures, report
-from liex_lab.cli.sections import MODELS, RECORDINGS, SESSIONS, START, STUDIES, group_of_verbs
+from liex_lab.cli.sessions import compare, convert, export, figures, pack, report, show
 from liex_lab.cli.study import cohort, dashboard, verify
 from liex_lab.cli.train import train
 from liex_lab.errors import LiexError, MisfitError, printable

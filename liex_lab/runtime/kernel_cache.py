@@ -13,7 +13,7 @@ import sys
 from pathlib import Path
 
 VARIABLE = "NUMBA_CACHE_DIR"
-_ROOM = Path(__file__).resolve().parents[1] / "foreground"  # one of those with kernels
+_ROOM = Path(__file__).resolve().parents[1] / "scene"  # one of those with kernels
 
 
 def keep_kernels() -> str:

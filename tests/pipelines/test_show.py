@@ -12,7 +12,7 @@ import rerun.chunk
 from liex_lab.pipelines.show import whole_pictures
 from typer.testing import CliRunner
 
-from liex_lab.cli import replay as verb
+from liex_lab.cli import sessions as verb
 from liex_lab.cli.main import app
 from liex_lab.errors import SessionError
 from liex_lab.plan import Plan
