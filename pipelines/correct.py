@@ -149,7 +149,7 @@ def _apply(raw: Session, log: Log, folder: Path, blueprint: BlueprintMaker | Non
     ReplayWriter(replay, origin, made, corrected=True).finish(
         rows, behaviour.kinematics, behaviour.bouts, list(behaviour.actions), ()
     )
-    return replace(log, files=file_facts(folder, {REPLAY: replay}), facts=facts)
+    return replace(log, files=file_facts(folder), facts=facts)
 
 
 def _describe(raw: Session, log: Log, folder: Path) -> Log:
@@ -167,7 +167,7 @@ def _describe(raw: Session, log: Log, folder: Path) -> Log:
     metadata = provenance_of(raw, skeleton_of(raw)).table_metadata()
     schema.write_table(path, schema.SESSIONS, schema.from_pandas(table.assign(**said)), metadata)
     kept = {name: facts for name, facts in log.files.items() if name != path.name}
-    return replace(log, files={**kept, path.name: file_facts(folder, {})[path.name]})
+    return replace(log, files={**kept, path.name: file_facts(folder)[path.name]})
 
 
 def _told(log: Log) -> dict[str, Any]:

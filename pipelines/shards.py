@@ -105,12 +105,12 @@ def measure_shards(pool: WorkerPool, whole: Shard, path: Path, progress: Progres
     Raises:
         SessionError: a worker ended without a word, or another process writes the session.
     """
-    from liex_lab.sessions.shards import is_whole, shard_folder, take_over
+    from liex_lab.sessions.shards import append_shard, is_whole, shard_folder
     from liex_lab.sessions.writer import unfinished
 
     held = unfinished(path, whole.origin)
     try:
-        held.begin_to_take()
+        held.begin_shards()
         began = time.monotonic()
         done = held.state.n_frames
         planned = [
@@ -124,8 +124,8 @@ def measure_shards(pool: WorkerPool, whole: Shard, path: Path, progress: Progres
             n_looked_at -= shard.stop - shard.start
             while waiting and is_whole(waiting[0].folder):
                 one = waiting.pop(0)
-                seconds = held.seconds_before + time.monotonic() - began
-                take_over(held, one.folder, one.stop, seconds)
+                seconds = round(held.seconds_before + time.monotonic() - began, 3)
+                append_shard(held, one.folder, one.stop, seconds)
             progress(whole.stop - n_looked_at, whole.stop, MEASURING)
     finally:
         held.leave(keep=True)

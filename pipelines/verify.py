@@ -153,11 +153,10 @@ def _corrections(session: Session) -> Iterator[Finding]:
 
 def _logs(session: Session) -> Iterator[Finding]:
     """Whether replay and messages are whole, by their own check sums and lengths."""
-    from liex_lab.sessions.joining import rrd_messages
+    from liex_lab.sessions.rrd_file import rrd_messages
 
     try:
-        with (session.path / "session.rrd").open("rb") as file:
-            n = sum(1 for _ in rrd_messages(file, (session.path / "session.rrd").stat().st_size))
+        n = sum(1 for _ in rrd_messages(session.path / "session.rrd"))
         n_depth = _depth_messages(session)
     except SessionError as error:
         yield Finding("wrong", str(error))

@@ -1,20 +1,22 @@
 """Checkpoint and restart of an unfinished session: append-only files and a record of their lengths.
 
-An unfinished session is a folder beside the final place. The observations of its frames lie in it
-as plain arrays that only grow; the logs (replay, MCAP) grow beside them. Every few seconds
-`checkpoint.json` records, by an atomic rename, how many bytes of each were valid at one moment.
-Whatever lies behind that is truncated before the work goes on.
+An unfinished session is a folder beside the final one. It holds the observations of its frames as
+plain arrays that only grow, and the two logs, session.rrd and session.mcap. Every few seconds
+`checkpoint.json` records, by an atomic rename, how many bytes of each file were valid at one
+moment. Whatever follows is truncated before the work resumes. Rerun cannot append to a file, so a
+resumed run writes resumed.rrd, whose messages are appended to session.rrd later.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
+import os
 import shutil
 import time
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
@@ -25,6 +27,8 @@ from liex_lab.errors import SessionError
 from liex_lab.runtime.durable import sync_file, sync_tree, take_lock, write_whole
 from liex_lab.runtime.memory import mapped
 from liex_lab.runtime.places import unlinked, unlinked_tree
+from liex_lab.sessions.mcap_log import append_chunks
+from liex_lab.sessions.rrd_file import append_rrd
 
 # between two checkpoints: as much work is lost at most, besides what it takes to begin
 EVERY_S = 3.0
@@ -36,13 +40,14 @@ STRETCHES = "stretches"
 # of work: three hundred years; whole numbers beyond what a float holds are no seconds either
 _MOST_S = 1e10
 _MOST = 1 << 20  # values of one column that a frame may have
-OWN = (_STATE, _LOCK, _SEEN, _INPUT, STRETCHES)  # what is no part of the finished session
+OWN = (_STATE, _LOCK, _SEEN, _INPUT, STRETCHES, "resumed.rrd")  # not in the finished session
 
 if TYPE_CHECKING:
     from liex_lab.recordings.recording import Recording
     from liex_lab.runtime.progress import Progress
 
 LOGS = ("session.rrd", "session.mcap")
+_RESUMED = "resumed.rrd"
 Clock = Callable[[], float]
 
 
@@ -51,22 +56,18 @@ class State:
     """How far a session is: the content of checkpoint.json.
 
     Attributes:
-        key: SHA-256 of the facts that the session is made from; only the same ones go on.
+        key: SHA-256 of the facts that the session is made from; only the same ones are resumed.
         n_frames: frames written, with their observations.
         seconds: time spent on them, s.
-        runs: parts that each log is in, one for each time that the work was begun and one for each
-            shard that another process wrote.
-        logs: for each log the bytes of each of its parts, in the order of writing: "session.mcap"
-            -> [1200, 5030].
-        stretches: how many of the parts are shards taken over.
+        interruptions: how often the work will have been interrupted if it resumes from here.
+        logs: valid bytes of each log.
     """
 
     key: str
     n_frames: int = 0
     seconds: float = 0.0
-    runs: int = 1
-    logs: dict[str, list[int]] = field(default_factory=dict)
-    stretches: int = 0
+    interruptions: int = 0
+    logs: dict[str, int] = field(default_factory=dict)
 
 
 class Checkpoint:
@@ -76,6 +77,8 @@ class Checkpoint:
         folder: the folder.
         state: how far the session is.
         seconds_before: time spent in earlier runs, s.
+        n_interruptions: how often the work was interrupted before.
+        replay: where Rerun's messages of this run go.
         seen: the observations on disk.
     """
 
@@ -113,13 +116,18 @@ class Checkpoint:
         if state is None or state.key != key or not self._cut(state):
             self._empty()
             state = State(key)
-        else:
-            state.runs += 1
         self.state = state
         self.seconds_before = state.seconds
+        self.n_interruptions = state.interruptions
         (folder / _SEEN).mkdir(exist_ok=True)
         self.seen = Columns(folder / _SEEN)
         self._last = clock()
+        replay, resumed = folder / LOGS[0], folder / _RESUMED
+        if resumed.is_file():
+            append_rrd(resumed, replay)
+            self._keep(n_frames=state.n_frames, logs={log: _size(folder / log) for log in LOGS})
+            resumed.unlink()
+        self.replay = resumed if replay.is_file() else replay
 
     @property
     def is_saved(self) -> bool:
@@ -136,128 +144,51 @@ class Checkpoint:
         """Whether the last checkpoint was `EVERY_S` ago or longer."""
         return self._clock() - self._last >= EVERY_S
 
-    def save(self, n_frames: int, seconds: float, logs: Mapping[str, int]) -> None:
+    def save(self, n_frames: int, seconds: float, replay: int, messages: int) -> None:
         """Record that everything up to a frame is on disk.
 
         Args:
             n_frames: frames written, with their observations.
             seconds: time spent on them, s, earlier runs included.
-            logs: bytes of the present part of each log.
+            replay: bytes of the file `replay`.
+            messages: bytes of session.mcap.
         """
-        self.seen.flush()
-        present = {
-            name: [*self.state.logs.get(name, [])[: self.n_parts - 1], size]
-            for name, size in logs.items()
-        }
-        self._keep(
-            State(
-                self.state.key,
-                n_frames,
-                round(seconds, 3),
-                self.state.runs,
-                present,
-                self.state.stretches,
-            )
-        )
+        logs = {**self.state.logs, self.replay.name: replay, LOGS[1]: messages}
+        interruptions = self.n_interruptions + 1
+        self._keep(n_frames=n_frames, seconds=seconds, logs=logs, interruptions=interruptions)
 
-    def take(self, n_frames: int, seconds: float, logs: Mapping[str, Path]) -> None:
-        """Take over the next part of each log, a shard that another process wrote.
-
-        Its observations are in `seen` already.
+    def append(self, shard: Path, n_frames: int, seconds: float) -> None:
+        """Append the logs of a shard, whose observations are in `seen` already.
 
         Args:
+            shard: its folder.
             n_frames: frames that the session has then.
             seconds: time spent on them, s.
-            logs: the file of each log; it is moved.
         """
-        self.seen.flush()
-        sizes = {}
-        k = self.n_parts - 1
-        for log, path in logs.items():
-            sizes[log] = [*self.state.logs.get(log, [])[:k], path.stat().st_size]
-            path.replace(self.part(log, k))
-        self._keep(
-            State(
-                self.state.key, n_frames, round(seconds, 3), k + 1, sizes, self.state.stretches + 1
-            )
-        )
-        self.state.runs += 1  # the next part, not begun yet
+        for log, append in zip(LOGS, (append_rrd, append_chunks), strict=True):
+            append(shard / log, self.folder / log)
+        logs = {log: _size(self.folder / log) for log in LOGS}
+        self._keep(n_frames=n_frames, seconds=seconds, logs=logs)
 
-    def _keep(self, state: State) -> None:
-        """Note what is there, once it is on disk: a power cut leaves nothing that is not."""
+    def begin_shards(self) -> None:
+        """Record that nothing is there yet, so that what others write meanwhile is kept."""
+        if not self.is_saved:
+            self._keep()
+
+    def _keep(self, **changes: Any) -> None:
+        """Record a state once its files are on disk: a power cut leaves nothing that is not."""
+        self.seen.flush()
+        state = replace(self.state, **changes)
         sync_tree(self.folder / _SEEN)
-        for log, sizes in state.logs.items():
-            part = self.part(log, len(sizes) - 1)
-            if part.is_file():  # not yet, where nothing was written to it
-                sync_file(part)
+        for log in state.logs:
+            sync_file(self.folder / log)
         write_whole(self.folder / _STATE, json.dumps(vars(state)))
         self.state, self._last = state, self._clock()
 
-    def begin_to_take(self) -> None:
-        """Record that nothing is there yet, so that what others write meanwhile is kept."""
-        if not (self.folder / _STATE).is_file():
-            self._keep(State(self.state.key, runs=0))
-            self.state.runs = 1
-
-    @property
-    def n_parts(self) -> int:
-        """How many parts each log is in.
-
-        One, and one more for each time the work went on or a shard was taken over.
-        """
-        return self.state.runs
-
-    @property
-    def n_interruptions(self) -> int:
-        """How often the work was interrupted."""
-        return max(0, self.n_parts - 1 - self.state.stretches)
-
-    def part(self, log: str, number: int) -> Path:
-        """Path of a part of a log; the first one lies under the log's own name.
-
-        Args:
-            log: the log's name, one of `LOGS`.
-            number: which part, from 0.
-        """
-        path = self.folder / log
-        return path if number == 0 else path.with_name(f"{path.stem}-{number}{path.suffix}")
-
-    def parts(self, log: str) -> list[tuple[Path, int | None]]:
-        """Parts of a log in order, with the bytes of each that count.
-
-        Args:
-            log: the log's name, one of `LOGS`.
-
-        Returns:
-            (path, bytes) of each part; None for all bytes of the present one.
-        """
-        sizes: list[int | None] = [*self.state.logs.get(log, [])[: self.n_parts - 1], None]
-        return [(self.part(log, k), size) for k, size in enumerate(sizes)]
-
-    @property
-    def logs(self) -> dict[str, Path]:
-        """Each log's name in the finished session, and the path where it lies once it is joined."""
-        joined = "" if self.n_parts == 1 else "whole-"
-        return {log: self.folder / f"{joined}{log}" for log in LOGS}
-
-    def join_logs(self) -> None:
-        """Join logs that were written in parts into one file each."""
-        from liex_lab.sessions.joining import join_mcap, join_rrd
-
-        if self.n_parts > 1:
-            for (log, whole), join in zip(self.logs.items(), (join_rrd, join_mcap), strict=True):
-                join(self.parts(log), whole)
-
-    def drop_parts(self) -> None:
-        """Put the joined logs in the place of their parts.
-
-        Until now the work could have gone on from the parts.
-        """
-        if self.n_parts > 1:
-            for log, whole in self.logs.items():
-                for path, _ in self.parts(log)[1:]:
-                    path.unlink()
-                whole.replace(self.folder / log)
+    def join_replay(self) -> None:
+        """Complete session.rrd, all of whose parts were closed."""
+        if self.replay.name == _RESUMED:
+            append_rrd(self.replay, self.folder / LOGS[0])
 
     def tidy(self, folder: Path) -> None:
         """Remove what is no part of the finished session, and let go of the lock.
@@ -267,11 +198,7 @@ class Checkpoint:
         """
         self.seen.close()
         for name in OWN:
-            path = folder / name
-            if path.is_dir():
-                shutil.rmtree(path)
-            else:
-                path.unlink(missing_ok=True)
+            _remove(folder / name)
         self._held.close()
 
     def leave(self, keep: bool) -> None:
@@ -289,29 +216,20 @@ class Checkpoint:
 
     def _cut(self, state: State) -> bool:
         """Cut everything back to the checkpoint; False where something is shorter than it says."""
-        for log, sizes in state.logs.items():
-            for k, size in enumerate(sizes):
-                path = self.part(log, k)
-                if not path.is_file() or path.stat().st_size < size:
-                    return False
-                with path.open("r+b") as file:
-                    file.truncate(size)
-        for (
-            path
-        ) in self.folder.iterdir():  # half-written tables, and parts begun after the checkpoint
-            known = {
-                self.part(log, k).name
-                for log, sizes in state.logs.items()
-                for k in range(len(sizes))
-            }
-            if path.name not in {*OWN, *known}:
-                shutil.rmtree(path) if path.is_dir() else path.unlink()
+        for path in self.folder.iterdir():  # half-written tables, and logs without a checkpoint
+            own = path.name in OWN and path.name != _RESUMED
+            if not own and path.name not in state.logs:
+                _remove(path)
+        for log, size in state.logs.items():
+            if _size(self.folder / log) < size:
+                return False
+            os.truncate(self.folder / log, size)
         return Columns.cut(self.folder / _SEEN, state.n_frames)
 
     def _empty(self) -> None:
         for path in self.folder.iterdir():
             if path.name not in (_LOCK, _INPUT):
-                shutil.rmtree(path) if path.is_dir() else path.unlink()
+                _remove(path)
 
 
 class Columns:
@@ -408,6 +326,18 @@ class Columns:
         return True
 
 
+def _size(path: Path) -> int:
+    """Bytes of a file; -1 if it does not exist."""
+    return path.stat().st_size if path.is_file() else -1
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)
+
+
 def hash_once(recording: Recording, folder: Path, progress: Progress) -> None:
     """Compute the recording's SHA-256, or take it from an interrupted run of the same files.
 
@@ -469,13 +399,10 @@ def _read_state(path: Path) -> State | None:
     """The state in a file; None where there is none that could be gone on with."""
     try:
         state = State(**json.loads(path.read_text(encoding="utf-8")))
-        sizes = [size for log in state.logs.values() for size in log]
-        counts = [state.n_frames, state.runs, state.stretches, *sizes]
+        counts = [state.n_frames, state.interruptions, *state.logs.values()]
         sound = isinstance(state.key, str) and 0.0 <= state.seconds < _MOST_S
         sound = sound and all(isinstance(n, int) and n >= 0 for n in counts)
-        sound = sound and all(
-            log in LOGS and len(parts) == state.runs for log, parts in state.logs.items()
-        )
+        sound = sound and set(state.logs) <= {*LOGS, _RESUMED}
     except (OSError, ValueError, TypeError, AttributeError, RecursionError):
         return None
     return state if sound else None

@@ -11,8 +11,8 @@ everything small is written at the end from the same track the tables are made o
 from __future__ import annotations
 
 import json
-import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import closing, contextmanager
 from itertools import zip_longest
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from liex_lab.geometry import SE3, so3
 from liex_lab.runtime.memory import blocks
 from liex_lab.sessions.drawn import dot_mm
-from liex_lab.sessions.mcap_file import McapFile, SchemaOf
+from liex_lab.sessions.mcap_log import McapLog, MessageType
 from liex_lab.sessions.provenance import Provenance, package_version
 from liex_lab.tables.rows import Rows
 from liex_lab.tracking.track import Track
@@ -62,10 +62,25 @@ _ERROR_SCHEMA: dict[str, Any] = {
     "type": "object",
     "properties": {"timestamp": _TIME, "predicted_error_mm": {"type": "number"}},
 }
-_ACTIONS, _ERRORS = (
-    SchemaOf(one["title"], "jsonschema", json.dumps(one).encode(), "json")
-    for one in (_ACTION_SCHEMA, _ERROR_SCHEMA)
-)
+_DEPTH = "/camera/depth"
+_PROTOBUF = {
+    "/camera/calibration": messages.CameraCalibration,
+    "/tf": messages.FrameTransforms,
+    _DEPTH: messages.RawImage,
+    "/skeleton/scene": messages.SceneUpdate,
+    "/skeleton/joints": messages.PosesInFrame,
+    "/camera/skeleton": messages.ImageAnnotations,
+    "/log": messages.Log,
+}
+_JSON = {"/predicted_error": _ERROR_SCHEMA, "/actions": _ACTION_SCHEMA}
+_TYPES = {
+    topic: MessageType(schema.name, schema.encoding, schema.data, "protobuf")
+    for topic, kind in _PROTOBUF.items()
+    if (schema := kind.get_schema())
+} | {
+    topic: MessageType(schema["title"], "jsonschema", json.dumps(schema).encode(), "json")
+    for topic, schema in _JSON.items()
+}
 _BONE = messages.Color(r=1.0, g=1.0, b=1.0, a=1.0)
 _JOINT = messages.Color(r=1.0, g=0.31, b=0.24, a=1.0)
 
@@ -76,7 +91,7 @@ class _Packing(NamedTuple):
     Attributes:
         level: of Zstandard.
         chunk_size: bytes packed together.
-        repetition: bytes of what is looked for far back, see `McapFile`.
+        repetition: bytes of what is looked for far back, see `McapLog`.
         window: bytes in which that is looked for.
     """
 
@@ -113,6 +128,7 @@ class McapWriter:
         *,
         level: int | None = None,
         chunk_size: int | None = None,
+        resume: bool = False,
     ) -> None:
         """Open the file.
 
@@ -122,12 +138,14 @@ class McapWriter:
             level: Zstandard compression level, 0 for the usual one, 22 for the smallest file; None
                 takes what suits the pictures that are kept.
             chunk_size: bytes packed at once; None as well.
+            resume: append to a file that ends after `flushed`.
         """
         usual = _packing_of(origin)
+        self._path = path
         self._origin = origin
         self._dot_m = dot_mm(origin.skeleton) / 1000.0
-        self._file = _WatchedFile(path)
-        self._writer = McapFile(
+        self._file = path.open("a+b" if resume else "wb")
+        self._log = McapLog(
             self._file,
             profile="liex_lab",
             library=f"liex_lab {package_version('liex_lab')}",
@@ -135,18 +153,19 @@ class McapWriter:
             chunk_size=usual.chunk_size if chunk_size is None else chunk_size,
             repetition=usual.repetition,
             window=usual.window,
+            written=self._file if resume else None,
         )
-        self._depth = self._topic("/camera/depth", messages.RawImage)
-        self._calibration = self._topic("/camera/calibration", messages.CameraCalibration)
-        self._transforms = self._topic("/tf", messages.FrameTransforms)
-        self._scene = self._topic("/skeleton/scene", messages.SceneUpdate)
-        self._poses = self._topic("/skeleton/joints", messages.PosesInFrame)
-        self._overlay = self._topic("/camera/skeleton", messages.ImageAnnotations)
-        self._log = self._topic("/log", messages.Log)
+        for topic, kind in _TYPES.items():
+            self._log.declare(topic, kind)
         self._calibrated_ns: int | None = None
 
-    def _topic(self, name: str, kind: Any) -> _Topic:
-        return _Topic(self._writer, name, kind)
+    def _log_message(self, topic: str, time_ns: int, message: Any) -> None:
+        self._log.log(topic, _TYPES[topic], [message.encode()], time_ns)
+
+    def _log_json(self, topic: str, time_ns: int, content: dict[str, Any]) -> None:
+        sec, nsec = divmod(time_ns, _SECOND)
+        stamped = {"timestamp": {"sec": sec, "nsec": nsec}, **content}
+        self._log.log(topic, _TYPES[topic], [json.dumps(stamped).encode()], time_ns)
 
     def add(self, times_ns: Sequence[int], depth: Sequence[NDArray[np.uint16]]) -> None:
         """Write the depth of consecutive frames, and the calibration about once a second.
@@ -158,13 +177,12 @@ class McapWriter:
         Raises:
             OSError: the system refused to write.
         """
-        for time_ns, image in zip_longest(times_ns, depth):
-            if self._calibrated_ns is None or time_ns - self._calibrated_ns >= _SECOND:
-                self._log_camera(int(time_ns))
-            if image is None:
-                continue
-            self._depth.log_parts(_picture(time_ns, image), log_time=int(time_ns))
-        self._file.check()
+        with _naming(self._path):
+            for time_ns, image in zip_longest(map(int, times_ns), depth):
+                if self._calibrated_ns is None or time_ns - self._calibrated_ns >= _SECOND:
+                    self._log_camera(time_ns)
+                if image is not None:
+                    self._log.log(_DEPTH, _TYPES[_DEPTH], _picture(time_ns, image), time_ns)
 
     def finish(
         self, rows: Rows, bouts: pd.DataFrame, words: Sequence[str], problems: Sequence[str]
@@ -181,11 +199,12 @@ class McapWriter:
             OSError: the system refused to write.
         """
         track = rows.track
-        for part in blocks(track.n_frames, _BLOCK):
-            self._log_track(track[part])
-        self._log_actions(rows, bouts, words)
-        if len(track.times_ns):
-            self._log_notes(int(track.times_ns[0]), problems)
+        with _naming(self._path):
+            for part in blocks(track.n_frames, _BLOCK):
+                self._log_track(track[part])
+            self._log_actions(rows, bouts, words)
+            for problem in problems if len(track.times_ns) else ():
+                self._log_note(int(track.times_ns[0]), problem)
         self.abandon()
 
     def _log_track(self, track: Track) -> None:
@@ -196,19 +215,18 @@ class McapWriter:
             zip(track.times_ns.tolist(), posed.tolist(), strict=True)
         ):
             joints_m = track.joints_mm[i] / 1000.0
-            self._scene.log(self._scene_update(time_ns, joints_m, seen), log_time=time_ns)
-            self._poses.log(_joint_poses(time_ns, joints_m, seen), log_time=time_ns)
-            self._overlay.log(self._annotations(time_ns, track.uv_px[i], seen), log_time=time_ns)
+            self._log_message(
+                "/skeleton/scene", time_ns, self._scene_update(time_ns, joints_m, seen)
+            )
+            self._log_message("/skeleton/joints", time_ns, _joint_poses(time_ns, joints_m, seen))
+            overlay = self._annotations(time_ns, track.uv_px[i], seen)
+            self._log_message("/camera/skeleton", time_ns, overlay)
             if seen:
                 root = _transform(time_ns, "arena", "root", track.root_mm[i], quaternions[i])
-                self._transforms.log(messages.FrameTransforms(transforms=[root]), log_time=time_ns)
-            if np.isfinite(track.predicted_error_mm[i]):
-                sec, nsec = divmod(time_ns, _SECOND)
-                error = {
-                    "timestamp": {"sec": sec, "nsec": nsec},
-                    "predicted_error_mm": float(track.predicted_error_mm[i]),
-                }
-                self._writer.log("/predicted_error", _ERRORS, [json.dumps(error).encode()], time_ns)
+                self._log_message("/tf", time_ns, messages.FrameTransforms(transforms=[root]))
+            error_mm = float(track.predicted_error_mm[i])
+            if np.isfinite(error_mm):
+                self._log_json("/predicted_error", time_ns, {"predicted_error_mm": error_mm})
 
     def flushed(self) -> int:
         """Hand everything to the operating system; returns the file's bytes.
@@ -216,10 +234,10 @@ class McapWriter:
         Raises:
             OSError: the system refused to write.
         """
-        self._writer.flush()
-        self._file.flush()
-        self._file.check()
-        return self._file.size
+        with _naming(self._path):
+            self._log.flush()
+            self._file.flush()
+        return self._file.tell()
 
     def abandon(self) -> None:
         """Close the file, whole or not.
@@ -227,9 +245,8 @@ class McapWriter:
         Raises:
             OSError: the system refused to write.
         """
-        self._writer.close()
-        self._file.close()
-        self._file.check()
+        with _naming(self._path), closing(self._file):
+            self._log.close()
 
     def _log_camera(self, time_ns: int) -> None:
         """Write calibration and camera pose, about once a second: a viewer may start anywhere."""
@@ -246,9 +263,9 @@ class McapWriter:
             R=np.eye(3).ravel().tolist(),
             P=np.hstack([k, np.zeros((3, 1))]).ravel().tolist(),
         )
-        self._calibration.log(calibration, log_time=time_ns)
+        self._log_message("/camera/calibration", time_ns, calibration)
         transform = _transform(time_ns, "arena", "camera", place.translation, _quaternion(place))
-        self._transforms.log(messages.FrameTransforms(transforms=[transform]), log_time=time_ns)
+        self._log_message("/tf", time_ns, messages.FrameTransforms(transforms=[transform]))
 
     def _scene_update(self, time_ns: int, joints_m: Array, seen: bool) -> messages.SceneUpdate:
         """Bones as lines and joints as spheres under one entity id; the entity goes when the animal
@@ -312,90 +329,29 @@ class McapWriter:
         elapsed = rows.track.times_ns - first
         for at, action in sorted(changes.items()):
             row = min(int(np.searchsorted(elapsed, at)), len(elapsed) - 1)
-            sec, nsec = divmod(first + at, _SECOND)
             state = {
-                "timestamp": {"sec": sec, "nsec": nsec},
                 "action": action,
                 "index": list(words).index(action) if action else -1,
                 "frame_index": int(rows.frame_index[row]),
             }
-            self._writer.log("/actions", _ACTIONS, [json.dumps(state).encode()], first + at)
+            self._log_json("/actions", first + at, state)
 
-    def _log_notes(self, time_ns: int, problems: Sequence[str]) -> None:
-        for problem in problems:
-            note = messages.Log(
-                timestamp=_stamp(time_ns),
-                level=messages.LogLevel.Warning,
-                message=problem,
-                name="liex_lab",
-            )
-            self._log.log(note, log_time=time_ns)
+    def _log_note(self, time_ns: int, problem: str) -> None:
+        level = messages.LogLevel.Warning
+        note = messages.Log(
+            timestamp=_stamp(time_ns), level=level, message=problem, name="liex_lab"
+        )
+        self._log_message("/log", time_ns, note)
 
 
-class _Topic:
-    """A topic of messages of one of Foxglove's kinds."""
-
-    def __init__(self, file: McapFile, name: str, kind: Any) -> None:
-        schema = kind.get_schema()
-        self._file = file
-        self._name = name
-        self._schema = SchemaOf(schema.name, schema.encoding, schema.data, "protobuf")
-
-    def log(self, message: Any, log_time: int) -> None:
-        """Write a message at a time in ns."""
-        self.log_parts([message.encode()], log_time)
-
-    def log_parts(self, parts: Sequence[bytes | memoryview], log_time: int) -> None:
-        """Write a message that is encoded already, in its parts, at a time in ns."""
-        self._file.log(self._name, self._schema, parts, log_time)
-
-
-class _WatchedFile:
-    """A file that remembers its first error for `check`, and drops what comes after it.
-
-    So a full disk is told once, where the writer can act on it.
-    """
-
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        self._file = path.open("wb")
-        self._error: OSError | None = None
-
-    @property
-    def size(self) -> int:
-        """Bytes so far."""
-        return os.fstat(self._file.fileno()).st_size
-
-    def write(self, data: bytes | bytearray) -> int:
-        """As a file does."""
-        if self._error is None:
-            try:
-                self._file.write(data)
-            except OSError as error:
-                self._error = error
-        return len(data)
-
-    def flush(self) -> None:
-        """As a file does."""
-        if self._error is None:
-            try:
-                self._file.flush()
-            except OSError as error:
-                self._error = error
-
-    def close(self) -> None:
-        """As a file does, but what goes wrong is told by `check`."""
-        try:
-            self._file.close()
-        except OSError as error:
-            self._error = self._error or error
-
-    def check(self) -> None:
-        """Raise what went wrong so far."""
-        if self._error is not None:
-            if self._error.filename is None and self._error.errno is not None:
-                self._error.filename = str(self._path)  # writing does not tell what was written
-            raise self._error
+@contextmanager
+def _naming(path: Path) -> Iterator[None]:
+    """Add the file's name to errors of the system within the block; writing leaves it out."""
+    try:
+        yield
+    except OSError as error:
+        error.filename = error.filename or str(path)
+        raise
 
 
 def _joint_poses(time_ns: int, joints_m: Array, seen: bool) -> messages.PosesInFrame:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +12,7 @@ from liex_lab.sessions.checkpoint import OWN
 from liex_lab.sessions.failure import FAILED_FILE
 from liex_lab.sessions.older import aside_folder, part_folder
 
+_LOGS = {".rrd", ".mcap"}
 _HASHED = {".parquet", ".csv", ".json", ".toml"}
 
 
@@ -53,18 +53,15 @@ def check_place(path: Path, overwrite: bool) -> None:
         )
 
 
-def file_facts(folder: Path, logs: Mapping[str, Path]) -> dict[str, Any]:
-    """Bytes and SHA-256 of the tables and small files, bytes of the logs, for `liex verify`.
+def file_facts(folder: Path) -> dict[str, Any]:
+    """Bytes of every table, log and small file of a folder by its name, for `liex verify`.
 
-    Args:
-        folder: the folder of the unfinished session.
-        logs: path of each log by its name in the finished session.
-
-    Returns:
-        For each file name a table with `bytes` and, but for logs, `sha256`.
+    All but the logs have their SHA-256, too.
     """
     found: dict[str, Any] = {}
     for path in sorted(folder.iterdir()):
-        if path.suffix in _HASHED and path.name not in OWN:
+        if path.suffix in _LOGS and path.name not in OWN:
+            found[path.name] = {"bytes": path.stat().st_size}
+        elif path.suffix in _HASHED and path.name not in OWN:
             found[path.name] = {"bytes": path.stat().st_size, "sha256": sha256(path)}
-    return found | {log: {"bytes": path.stat().st_size} for log, path in logs.items()}
+    return found

@@ -26,10 +26,10 @@ from liex_lab.geometry import so3
 from liex_lab.runtime.memory import blocks
 from liex_lab.runtime.places import probe_full
 from liex_lab.sessions.drawn import dot_mm, dot_pt
-from liex_lab.sessions.joining import RRD_HEAD, rrd_messages
 from liex_lab.sessions.provenance import Provenance
 from liex_lab.sessions.rrd_body import log_body, send_body
 from liex_lab.sessions.rrd_depth import IMAGE, MM_PER_UNIT, DepthColumns, timeline
+from liex_lab.sessions.rrd_file import HEAD, rrd_messages
 from liex_lab.sessions.rrd_scene import FLOOR as FLOOR
 from liex_lab.sessions.rrd_scene import OVERLAY as OVERLAY
 from liex_lab.sessions.rrd_scene import log_hidden_places, log_surroundings
@@ -101,7 +101,7 @@ class ReplayWriter:
         self._n_sent = 0
         self._broken = False
         self._corrected = corrected
-        self._checked = 0
+        self._checked = HEAD
         self._n_found = 0
         self._stream.save(path)
         if blueprint is not None:
@@ -237,23 +237,20 @@ class ReplayWriter:
         """
         self._send_depth()
         self._flush()
-        size = self._count()
+        self._count()
         if self._n_found < self._n_sent:
             raise self._unwritten()
-        return size
+        return self._checked
 
-    def _count(self) -> int:
-        """Count the messages that are new on disk; returns the file's bytes.
+    def _count(self) -> None:
+        """Count the messages that are new on disk.
 
         Raises:
             SessionError: the last of them is not there as a whole.
         """
-        size = self._path.stat().st_size
-        with self._path.open("rb") as file:
-            for at, length in rrd_messages(file, size, self._checked or RRD_HEAD):
-                self._checked = at + length
-                self._n_found = self._n_found + 1
-        return size
+        for at, length in rrd_messages(self._path, self._checked):
+            self._checked = at + length
+            self._n_found += 1
 
     def _flush(self) -> None:
         """Wait until Rerun's thread has written what it was given.
@@ -298,9 +295,10 @@ class ReplayWriter:
     def _ended(self) -> bool:
         """Whether the closed file holds its end, with the index that Rerun writes last of all."""
         try:
-            return self._count() > (self._checked or RRD_HEAD)
+            self._count()
         except SessionError:
             return False
+        return self._path.stat().st_size > self._checked
 
     def abandon(self) -> None:
         """Close the file, whole or not.

@@ -53,8 +53,8 @@ def is_whole(folder: Path) -> bool:
         return False
 
 
-def take_over(held: Checkpoint, folder: Path, n_frames: int, seconds: float) -> None:
-    """Make a whole shard the next part of an unfinished session; its folder is removed.
+def append_shard(held: Checkpoint, folder: Path, n_frames: int, seconds: float) -> None:
+    """Append a whole shard to an unfinished session; its folder is removed.
 
     Args:
         held: the unfinished session, held by this process.
@@ -63,7 +63,7 @@ def take_over(held: Checkpoint, folder: Path, n_frames: int, seconds: float) -> 
         seconds: time spent on them, s.
     """
     held.seen.append(Columns(folder / _SEEN).read())
-    held.take(n_frames, seconds, {log: folder / log for log in LOGS})
+    held.append(folder, n_frames, seconds)
     shutil.rmtree(folder, ignore_errors=True)
 
 

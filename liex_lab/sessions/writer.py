@@ -143,11 +143,9 @@ class SessionWriter:
         from liex_lab.sessions.rrd import ReplayWriter
 
         made = blueprint(self._document) if blueprint else None
-        replay, messages = (
-            self._checkpoint.part(log, self._checkpoint.n_parts - 1) for log in LOGS
-        )
-        self._replay = ReplayWriter(replay, self.origin, made)
-        self._mcap = McapWriter(messages, self.origin)
+        messages = self._folder / LOGS[1]
+        self._replay = ReplayWriter(self._checkpoint.replay, self.origin, made)
+        self._mcap = McapWriter(messages, self.origin, resume=messages.is_file())
         if self._times_ns:
             self._replay.go_on(self._times_ns[0])
 
@@ -271,11 +269,10 @@ class SessionWriter:
         can go on.
         """
         self._drain()
-        sizes = dict(zip(LOGS, (self._replay.flushed(), self._mcap.flushed()), strict=True))
+        sizes = self._replay.flushed(), self._mcap.flushed()
         if len(self._checkpoint.seen) == len(self._index):
-            self._checkpoint.save(
-                len(self._index), self._checkpoint.seconds_before + self._elapsed, sizes
-            )
+            seconds = round(self._checkpoint.seconds_before + self._elapsed, 3)
+            self._checkpoint.save(len(self._index), seconds, *sizes)
 
     @property
     def allocate(self) -> Allocator:
@@ -415,7 +412,7 @@ class SessionWriter:
         problems = self._document["problems"]
         self._replay.finish(rows, kinematics, bouts, words, problems, self._candidates)
         self._mcap.finish(rows, bouts, words, problems)
-        self._checkpoint.join_logs()
+        self._checkpoint.join_replay()
         kept = self._checkpoint.seen.read()
         if BOXES in kept:
             write_boxes(self._folder, kept[BOXES])
@@ -428,7 +425,7 @@ class SessionWriter:
             self._document |= {} if whole is None else {"whole_picture": whole}
         (self._folder / "plan.toml").write_text(self.origin.plan_toml, encoding="utf-8")
         self._seconds += time.perf_counter() - began
-        self._document["files"] = file_facts(self._folder, self._checkpoint.logs)
+        self._document["files"] = file_facts(self._folder)
         self._document.update(self._account(of_track, dict(timings_s or {})))
         made = corrections_for(self.path)
         if made is not None and made.parent != self.path:
@@ -500,7 +497,6 @@ class SessionWriter:
         if made is not None:  # they apply again where the poses came out the same
             shutil.copytree(unlinked_tree(made), copy)
             sync_tree(copy)
-        self._checkpoint.drop_parts()
         put_in_place(self._folder, self.path, aside_folder(self.path))
         self._done = True
         self._stop_logging()

@@ -33,8 +33,8 @@ from liex_lab.sessions.cutouts import (
     window_around,
     windows,
 )
-from liex_lab.sessions.joining import join_rrd
 from liex_lab.sessions.rrd import ReplayWriter
+from liex_lab.sessions.rrd_file import append_rrd
 from liex_lab.sessions.source import link_to, linked_recording
 from liex_lab.tracking.observations import Observations
 from tests.sessions.test_rrd import columns_of
@@ -263,7 +263,6 @@ def test_of_every_cut_out_one_window_is_shown_at_a_time_also_where_a_run_went_on
         width, height = sizes[rng.integers(len(sizes))]
         boxes[row, 0] = (0, 0, width, height)
     boxes[60:64, 1] = (8, 8, 20, 20)  # the second one goes where one message ends
-    parts = []
     for number, part in enumerate((slice(0, 80), slice(80, 150))):
         path = tmp_path / f"{number}.rrd"
         replay = ReplayWriter(path, origin)
@@ -273,9 +272,9 @@ def test_of_every_cut_out_one_window_is_shown_at_a_time_also_where_a_run_went_on
         replay.add(
             frames, [k * 33_000_000 for k in frames], [BACKGROUND] * len(frames), boxes[part]
         )
-        parts.append((path, replay.flushed()))
+        replay.flushed()
         replay.abandon()
-    join_rrd(parts, tmp_path / "session.rrd")
+        append_rrd(path, tmp_path / "session.rrd")
     for row in (0, 1, 40, 60, 63, 64, 79, 80, 81, 149):
         there = [(k, box) for k, box in enumerate(boxes[row].tolist()) if box[2]]
         assert shown_at(tmp_path, row) == {

@@ -20,7 +20,6 @@ import liex_lab.sessions.rrd as replay
 from liex_lab.errors import SessionError
 from liex_lab.runtime.places import is_full, why_full
 from liex_lab.sessions import SessionWriter
-from liex_lab.sessions.mcap import _WatchedFile
 from tests.sessions.interrupted import MOUSE, write_session
 
 FULL = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
@@ -118,26 +117,6 @@ def test_a_replay_that_stands_still_on_a_disk_with_room_is_given_up_as_well(
     with pytest.raises(SessionError, match=r"session\.rrd was not written whole"):
         writer.flushed()
     writer.abandon()
-
-
-def test_a_watched_file_keeps_the_first_error_to_itself_and_drops_what_comes_after_it(
-    tmp_path: Path,
-) -> None:
-    file = _WatchedFile(tmp_path / "a.mcap")
-    assert file.write(b"12345678") == 8
-
-    class Full:
-        def write(self, data: bytes) -> int:
-            raise FULL
-
-    whole = file._file
-    file._file = Full()  # type: ignore[assignment]
-    assert file.write(b"1234") == 4
-    assert file.write(b"56") == 2
-    file.flush()
-    with pytest.raises(OSError, match="No space left"):
-        file.check()
-    whole.close()
 
 
 def test_which_errors_tell_of_a_full_disk() -> None:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import io
+from collections import Counter
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,10 +14,11 @@ from mcap.exceptions import McapError
 from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader
 
-from liex_lab.sessions.mcap_file import McapFile, SchemaOf
+from liex_lab.errors import SessionError
+from liex_lab.sessions.mcap_log import McapLog, MessageType, append_chunks
 
-ONE = SchemaOf("one", "jsonschema", b"{}", "json")
-OTHER = SchemaOf("other", "jsonschema", b'{"type": "object"}', "json")
+ONE = MessageType("one", "jsonschema", b"{}", "json")
+OTHER = MessageType("other", "jsonschema", b'{"type": "object"}', "json")
 Said = list[tuple[str, int, bytes]]
 
 
@@ -36,7 +39,7 @@ def parts(data: bytes) -> list[bytes | memoryview]:
 
 def written(told: Said, chunk_size: int = 4_000, level: int = 1, flush_at: int = -1) -> io.BytesIO:
     sink = io.BytesIO()
-    file = McapFile(sink, profile="p", library="l", level=level, chunk_size=chunk_size)
+    file = McapLog(sink, profile="p", library="l", level=level, chunk_size=chunk_size)
     for k, (topic, time_ns, data) in enumerate(told):
         if k == flush_at:
             file.flush()
@@ -74,7 +77,7 @@ def test_every_message_comes_back_by_the_index_in_the_order_of_time(
 @pytest.mark.parametrize("window", [1, 40, 1 << 20, 1 << 33])
 def test_pictures_of_any_size_have_a_window_that_readers_take(window: int) -> None:
     sink = io.BytesIO()
-    file = McapFile(sink, profile="p", library="l", level=1, chunk_size=4_000, window=window)
+    file = McapLog(sink, profile="p", library="l", level=1, chunk_size=4_000, window=window)
     for _, time_ns, data in said():
         file.log("/a", ONE, parts(data), time_ns)
     file.close()
@@ -95,7 +98,7 @@ def test_records_follow_each_other_as_the_format_says_and_checksums_hold() -> No
 def test_a_file_that_ends_after_a_flush_holds_what_was_written_before() -> None:
     told = said()
     whole = io.BytesIO()
-    file = McapFile(whole, profile="p", library="l", level=1, chunk_size=10**9)
+    file = McapLog(whole, profile="p", library="l", level=1, chunk_size=10**9)
     for topic, time_ns, data in told[:25]:
         file.log(topic, ONE if topic == "/a" else OTHER, parts(data), time_ns)
     file.flush()
@@ -133,3 +136,53 @@ def test_pictures_that_are_alike_are_stored_once() -> None:
         pictures.append(picture.tobytes())
     size = len(written([("/a", k, data) for k, data in enumerate(pictures)], 10**9).getvalue())
     assert size < 1.2 * len(pictures[0])
+
+
+def log_all(file: McapLog, told: Said) -> None:
+    for topic in ("/a", "/b"):
+        file.declare(topic, ONE if topic == "/a" else OTHER)
+    for topic, time_ns, data in told:
+        file.log(topic, ONE if topic == "/a" else OTHER, parts(data), time_ns)
+
+
+@pytest.mark.parametrize("first_topics", ["/a", "/b", "/a/b"])
+def test_a_file_that_was_cut_after_a_flush_is_resumed_and_shards_are_appended(
+    tmp_path: Path, first_topics: str
+) -> None:
+    told = [one for one in said(20) if one[0] in first_topics]
+    pieces, place = [told, said(30)[20:], said(50)[30:]], tmp_path / "log.mcap"
+    settings: dict[str, Any] = {"profile": "p", "library": "l", "level": 1, "chunk_size": 4_000}
+    for k, piece in enumerate(pieces[:2]):  # a first run that was killed, and a shard
+        with (tmp_path / f"{k}.mcap").open("wb") as sink:
+            file = McapLog(sink, **settings)
+            log_all(file, piece)
+            file.flush()
+        append_chunks(tmp_path / f"{k}.mcap", place)
+    with place.open("a+b") as sink:
+        file = McapLog(sink, **settings, written=sink)
+        log_all(file, pieces[2])
+        file.close()
+    with place.open("rb") as whole:
+        reader = make_reader(whole, validate_crcs=True)
+        found = [
+            (channel.topic, message.log_time, message.data)
+            for _, channel, message in reader.iter_messages()
+        ]
+        summary = reader.get_summary()
+    assert found == sorted([one for piece in pieces for one in piece], key=lambda one: one[1])
+    assert summary is not None
+    assert summary.statistics is not None
+    counts = {
+        c.topic: summary.statistics.channel_message_counts[i] for i, c in summary.channels.items()
+    }
+    assert counts == Counter(topic for topic, _, _ in found)
+    with place.open("rb") as whole:
+        walked = StreamReader(whole, validate_crcs=True).records
+        assert sum(type(record).__name__ == "Message" for record in walked) == len(found)
+
+
+def test_a_log_that_is_cut_within_a_record_is_not_resumed(tmp_path: Path) -> None:
+    place = tmp_path / "log.mcap"
+    place.write_bytes(written(said()).getvalue()[:-500])
+    with place.open("a+b") as sink, pytest.raises(SessionError, match="not written whole"):
+        McapLog(sink, profile="p", library="l", level=1, chunk_size=1, written=sink)
