@@ -229,8 +229,7 @@ def follow_live(
     from liex_lab.dashboards.replay.rerun_blueprint import live_blueprint
     from liex_lab.pipelines.live import follow_live as job
     from liex_lab.pipelines.live import open_live
-    from liex_lab.sessions.live import LiveView
-    from liex_lab.sessions.viewer import need_screen
+    from liex_lab.sessions.viewer import LiveView, need_screen
 
     if to == "viewer":  # before minutes are waited for
         need_screen("write a file with --to NAME.rrd, which any viewer opens")
@@ -420,7 +419,7 @@ def export_video(
     from liex_lab.errors import SessionError
     from liex_lab.pipelines.compare import find_sessions
     from liex_lab.sessions import Session
-    from liex_lab.sessions.videos import stretch, video_path
+    from liex_lab.sessions.session import stretch, video_path
 
     given = [places] if isinstance(places, str | Path) else list(places)
     opened = [Session.open(folder) for folder in find_sessions(given)]

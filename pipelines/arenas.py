@@ -227,7 +227,7 @@ def _measure(
                     report=report,
                 )
             )
-            work.writer.go_on(partial(_depth, work.prepared.recording))
+            work.writer.resume(partial(_depth, work.prepared.recording))
         done = [(work, work.writer.n_frames) for work in works if work.writer is not None]
         with closing(read_ahead(shared, min(n for _, n in done))) as chunks:
             for frames in chunks:

@@ -34,10 +34,9 @@ from liex_lab.runtime.durable import replacing, write_whole
 from liex_lab.runtime.progress import Progress, silent
 from liex_lab.runtime.text_files import read_texts, write_csv
 from liex_lab.sessions import Session
-from liex_lab.sessions.failure import FAILED_FILE, read_failure
-from liex_lab.sessions.listed import Entry
-from liex_lab.sessions.source import link_to
-from liex_lab.sessions.verdict import LOOK_AT_IT, OTHER_ANIMAL, read_verdict
+from liex_lab.sessions.evidence import link_to
+from liex_lab.sessions.folder import FAILED_FILE, read_failure
+from liex_lab.sessions.verdict import LOOK_AT_IT, OTHER_ANIMAL, Entry, read_verdict
 from liex_lab.tables.schema import dictionary, from_pandas, write_table
 
 from .study.status import misnamed

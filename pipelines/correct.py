@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from liex_lab.behaviour.summary import Behaviour
     from liex_lab.sessions import Session
     from liex_lab.sessions.applying import CorrectedTrack
-    from liex_lab.sessions.results import Results
+    from liex_lab.sessions.track_tables import Results
     from liex_lab.sessions.writer import BlueprintMaker, ReportMaker
 
 _BUSY = ".correcting"
@@ -120,11 +120,10 @@ def _apply(raw: Session, log: Log, folder: Path, blueprint: BlueprintMaker | Non
     Returns the log that lists them.
     """
     from liex_lab.sessions.applying import corrected_track
-    from liex_lab.sessions.evidence import provenance_of
-    from liex_lab.sessions.place import file_facts
-    from liex_lab.sessions.results import Results
+    from liex_lab.sessions.evidence import provenance_of, skeleton_of
+    from liex_lab.sessions.folder import file_facts
     from liex_lab.sessions.rrd import ReplayWriter
-    from liex_lab.sessions.tracks import skeleton_of
+    from liex_lab.sessions.track_tables import Results
     from liex_lab.tables.rows import Rows
 
     skeleton = skeleton_of(raw)
@@ -156,9 +155,8 @@ def _describe(raw: Session, log: Log, folder: Path) -> Log:
     """Write the table `sessions` with what people said of the animal; returns the log with it."""
     import pandas as pd
 
-    from liex_lab.sessions.evidence import provenance_of
-    from liex_lab.sessions.place import file_facts
-    from liex_lab.sessions.tracks import skeleton_of
+    from liex_lab.sessions.evidence import provenance_of, skeleton_of
+    from liex_lab.sessions.folder import file_facts
     from liex_lab.tables import schema
 
     path = folder / "sessions.parquet"

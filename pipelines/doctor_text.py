@@ -12,7 +12,7 @@ from liex_lab.errors import printable
 from liex_lab.optics.camera import SensorCard
 from liex_lab.scene.outline import Arena
 from liex_lab.scene.scene import Fixture
-from liex_lab.sessions.room import megabytes
+from liex_lab.sessions.folder import megabytes
 
 # lines that decide whether a run makes sense
 _FIRST = ("frames", "rate", "gaps", "intrinsics from", "floor", "arena", "animal", "plan")

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
-from itertools import chain, tee
+from itertools import chain, islice, tee
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -76,7 +76,7 @@ def follow_live(
         plan: how the recording is measured.
         learn_frames: frames that background, floor and size are learned from.
         viewer: makes a viewer from tracker and source, which is shown each frame with its row.
-        progress: told frame by frame.
+        progress: reports frame by frame.
 
     Returns:
         `name`, `n_frames`, `n_live`, `latency_median_ms`, `latency_p95_ms` (None without live
@@ -90,7 +90,7 @@ def follow_live(
     from liex_lab.tracking.online import OnlineTracker
 
     frames = arriving.frames
-    held = _first(frames, learn_frames)
+    held = list(islice(frames, learn_frames))
     if not held:
         raise RecordingError("the recording was over before it had a frame")
     progress(0, None, "learning the background, the floor and the animal's size")
@@ -127,11 +127,6 @@ def follow_live(
         "n_bridged": int(tracked.track.bridged.sum()),
     }
     return numbers, tracked
-
-
-def _first(frames: Iterator[Arrival], n: int) -> list[Arrival]:
-    """The next n of them, or as many as there are."""
-    return [arrival for _, arrival in zip(range(n), frames, strict=False)]
 
 
 def _chained(held: list[Arrival], frames: Iterator[Arrival]) -> Iterator[Arrival]:

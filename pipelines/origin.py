@@ -61,7 +61,7 @@ def build_provenance(
         recording: an open recording; hashing its content is the longest wait here.
         plan: names the model and the zones.
         tracker: the prepared tracker: background, animal's size, girth.
-        progress: told while the content is hashed.
+        progress: reports while the content is hashed.
     """
     from liex_lab.catalog import find_model, sha256
     from liex_lab.sessions import Provenance
@@ -107,7 +107,7 @@ def animal_facts(plan: Plan, tracker: FrameTracker) -> dict[str, Any]:
 def build_background(
     recording: Recording, plan: Plan, segmenter: Segmenter
 ) -> NDArray[np.uint16] | None:
-    """The still scene (H, W) mm before which the replay shows cut-outs; None where it shows none.
+    """The still scene (H, W) mm before which the replay shows cut-outs; None if it shows none.
 
     Args:
         recording: an open recording.
@@ -193,13 +193,10 @@ def session_bytes(recording: Recording, plan: Plan, length_mm: float, distance_m
     """
     from liex_lab.body.skeleton import Skeleton
     from liex_lab.recordings.depth_kernels import to_millimetres
-    from liex_lab.sessions.room import Shown, needed_bytes
+    from liex_lab.sessions.cutouts import needed_bytes
 
     rows = sorted({0, len(recording) // 2})
-    shown = Shown(
-        len(recording),
-        Skeleton.load(plan.animal.skeleton).n_joints,
-        recording.camera.fx * length_mm / distance_mm,
-        [to_millimetres(recording.frame(row).depth) for row in rows],
-    )
-    return needed_bytes(shown, plan.replay.depth)
+    images = [to_millimetres(recording.frame(row).depth) for row in rows]
+    n_joints = Skeleton.load(plan.animal.skeleton).n_joints
+    length_px = recording.camera.fx * length_mm / distance_mm
+    return needed_bytes(images, len(recording), n_joints, length_px, plan.replay.depth)

@@ -91,7 +91,7 @@ def measure_session(
         blueprint: makes the layout of the replay, see `SessionWriter`.
         report: makes the report in the folder, see `SessionWriter`.
         pool: pool of workers for the shards of a long recording.
-        progress: told frame by frame.
+        progress: reports frame by frame.
 
     Returns:
         The session folder.
@@ -116,7 +116,7 @@ def measure_session(
     ):
         from liex_lab.recordings.timestamps import unwritable_times
         from liex_lab.sessions import SessionWriter
-        from liex_lab.sessions.older import part_folder
+        from liex_lab.sessions.folder import part_folder
 
         folder = folder or inside(Path(out), first.session.name or opened.name, ".liex")
         if told := unwritable_times(opened.times_ns):
@@ -138,7 +138,7 @@ def measure_session(
         with SessionWriter(
             folder, prepared.origin, overwrite=overwrite, blueprint=blueprint, report=report
         ) as writer:
-            writer.go_on(lambda row: prepared.recording.frame(row).depth)
+            writer.resume(lambda row: prepared.recording.frame(row).depth)
             with closing(read_ahead(prepared.recording, writer.n_frames)) as chunks:
                 prepared.measure_all(chunks, writer, progress)
             session = prepared.finish(writer, recording, notes)
@@ -176,12 +176,12 @@ def check_unused(folder: Path, overwrite: bool) -> None:
     Raises:
         SessionError: it may not be written there.
     """
+    from liex_lab.sessions.backups import put_back_session
     from liex_lab.sessions.checkpoint import check_free
-    from liex_lab.sessions.older import part_folder, put_back_session
-    from liex_lab.sessions.place import check_place
+    from liex_lab.sessions.folder import check_writable, part_folder
 
     put_back_session(folder)
-    check_place(folder, overwrite)
+    check_writable(folder, overwrite)
     check_free(part_folder(folder))
 
 
@@ -226,7 +226,7 @@ class Prepared:
         Args:
             stretches: as this recording shows them.
             writer: of the session.
-            progress: told frame by frame.
+            progress: reports frame by frame.
         """
         with closing(observed(self.fitted.tracker, stretches)) as coming:
             began = time.perf_counter()
@@ -243,7 +243,7 @@ class Prepared:
             pool: the workers.
             recording: path or address, which each of them opens; of an archive that is unpacked
                 here, workers of this machine open what came out.
-            progress: told shard by shard.
+            progress: reports shard by shard.
         """
         n = len(self.recording)
         if n <= max(2 * LENGTH, pool.fewest):
@@ -267,7 +267,7 @@ class Prepared:
                 handed over open has none.
             notes: what session.json is to hold besides.
         """
-        from liex_lab.sessions.source import link_to
+        from liex_lab.sessions.evidence import link_to
 
         began = time.perf_counter()
         verdict = make_track(writer, self.fitted)
@@ -286,16 +286,15 @@ def prepare(fitted: Fitted, folder: Path, started: float, progress: Progress) ->
         fitted: plan, recording and tracker.
         folder: the session folder to be.
         started: when its preparation began, by `time.perf_counter`.
-        progress: told while the recording is hashed.
+        progress: reports while the recording is hashed.
 
     Raises:
         ModelError: there is no such recogniser.
         PlanError: it was made for another skeleton.
-        SessionError: the disk has by far no room for it.
+        SessionError: the disk has not enough room for it.
     """
     from liex_lab.sessions.checkpoint import hash_once
-    from liex_lab.sessions.older import part_folder
-    from liex_lab.sessions.room import check_room, megabytes
+    from liex_lab.sessions.folder import check_room, megabytes, part_folder
 
     build_recogniser(fitted.plan, fitted.tracker.estimator.skeleton)
     hash_once(fitted.recording, part_folder(folder), progress)

@@ -12,6 +12,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -100,15 +101,15 @@ def measure_shards(pool: WorkerPool, whole: Shard, path: Path, progress: Progres
         pool: the pool of workers.
         whole: the recording as one shard; its folder does not matter.
         path: the session folder that is to be; what is unfinished lies beside it.
-        progress: told shard by shard.
+        progress: reports shard by shard.
 
     Raises:
         SessionError: a worker ended without a word, or another process writes the session.
     """
     from liex_lab.sessions.shards import append_shard, is_whole, shard_folder
-    from liex_lab.sessions.writer import unfinished
+    from liex_lab.sessions.writer import open_unfinished
 
-    held = unfinished(path, whole.origin)
+    held = open_unfinished(path, whole.origin)
     try:
         held.begin_shards()
         began = time.monotonic()
@@ -118,23 +119,18 @@ def measure_shards(pool: WorkerPool, whole: Shard, path: Path, progress: Progres
             for start, stop in _cuts(done, whole.stop)
         ]
         waiting = list(planned)
-        n_looked_at = whole.stop - done
+        n_left = whole.stop - done
         there = [shard for shard in planned if is_whole(shard.folder)]
-        for shard in _all_of(there, pool, [one for one in planned if one not in there]):
-            n_looked_at -= shard.stop - shard.start
+        others = [shard for shard in planned if shard not in there]
+        for shard in chain(there, pool.each(measure_shard, others)):
+            n_left -= shard.stop - shard.start
             while waiting and is_whole(waiting[0].folder):
                 one = waiting.pop(0)
                 seconds = round(held.seconds_before + time.monotonic() - began, 3)
                 append_shard(held, one.folder, one.stop, seconds)
-            progress(whole.stop - n_looked_at, whole.stop, MEASURING)
+            progress(whole.stop - n_left, whole.stop, MEASURING)
     finally:
         held.leave(keep=True)
-
-
-def _all_of(there: list[Shard], pool: WorkerPool, others: list[Shard]) -> Iterator[Shard]:
-    """Shards that are there already, and then the others as workers finish them."""
-    yield from there
-    yield from pool.each(measure_shard, others)
 
 
 def _cuts(first: int, stop: int) -> Iterator[tuple[int, int]]:

@@ -1,7 +1,7 @@
-"""Whole depth pictures beside a session's replay, `liex show --depth all`.
+"""Whole depth images beside a session's replay, `liex show --depth all`.
 
 A session keeps cut-outs of the depth; the recording that it is linked to has all of it. Its
-pictures are written into a replay of their own, which Rerun shows as one with the session's.
+images are written into a replay of their own, which Rerun shows as one with the session's.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ _CHUNK = 32  # frames in memory at a time
 def whole_pictures(
     session: str | Path, out: Path, recording: str | None = None, progress: Progress = silent
 ) -> Path:
-    """Write the whole depth pictures of a session's recording into a replay.
+    """Write the whole depth images of a session's recording into a replay.
 
     Args:
         session: the session folder.
         out: the .rrd file to write.
         recording: path of the recording, where it is no longer where the session says.
-        progress: told while the recording is hashed and read.
+        progress: reports while the recording is hashed and read.
 
     Returns:
         `out`.
@@ -45,9 +45,8 @@ def whole_pictures(
     from liex_lab.recordings.depth_kernels import to_millimetres
     from liex_lab.sessions import Session
     from liex_lab.sessions.cutouts import ALL
-    from liex_lab.sessions.evidence import provenance_of
+    from liex_lab.sessions.evidence import provenance_of, skeleton_of
     from liex_lab.sessions.rrd import ReplayWriter
-    from liex_lab.sessions.tracks import skeleton_of
 
     opened = Session.open(session, raw=True)
     origin = replace(provenance_of(opened, skeleton_of(opened)), replay_depth=ALL)
@@ -69,7 +68,7 @@ def whole_pictures(
 
 def _recording_of(session: Session, stated: str | None, progress: Progress) -> Recording:
     """The recording of a session, opened as it was when it was measured; its hash is the same."""
-    from liex_lab.sessions.source import linked_recording
+    from liex_lab.sessions.evidence import linked_recording
 
     where = stated or linked_recording(session)
     if where is None:

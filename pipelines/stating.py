@@ -258,7 +258,7 @@ class StatedRegions:
 
     def _recording(self, key: str, session: Session | None) -> str:
         """The recording as a command names it."""
-        from liex_lab.sessions.source import linked_recording
+        from liex_lab.sessions.evidence import linked_recording
 
         if self._study is not None:
             return shlex.quote(self._planned(key)[1].recording)

@@ -60,7 +60,7 @@ def verify_session(
         path: the session folder; what was measured is looked at, and the log of corrections.
         run: measures a recording, `liex_lab.api.run_session`.
         recording: it is measured again, which takes as long as the first time; None leaves it out.
-        progress: told while the recording is measured.
+        progress: reports while the recording is measured.
 
     Raises:
         SessionError: there is no session at all.
@@ -153,7 +153,7 @@ def _corrections(session: Session) -> Iterator[Finding]:
 
 def _logs(session: Session) -> Iterator[Finding]:
     """Whether replay and messages are whole, by their own check sums and lengths."""
-    from liex_lab.sessions.rrd_file import rrd_messages
+    from liex_lab.sessions.checkpoint import rrd_messages
 
     try:
         n = sum(1 for _ in rrd_messages(session.path / "session.rrd"))
@@ -175,7 +175,7 @@ def _logs(session: Session) -> Iterator[Finding]:
 
 
 def _depth_messages(session: Session) -> int:
-    """How many depth pictures the summary of session.mcap lists."""
+    """How many depth images the summary of session.mcap lists."""
     from mcap.exceptions import McapError
     from mcap.reader import make_reader
 

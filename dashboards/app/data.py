@@ -22,7 +22,7 @@ from liex_lab.errors import LiexError, SessionError, one_line
 from liex_lab.runtime.progress import Progress, silent
 from liex_lab.sessions import Session
 from liex_lab.sessions.corrections import LOG, corrected_folder
-from liex_lab.sessions.listed import WHO, Entry
+from liex_lab.sessions.verdict import WHO, Entry
 
 from ..report.quality import warnings
 

@@ -17,7 +17,7 @@ from dash import dcc, html
 
 from liex_lab.errors import SessionError
 from liex_lab.runtime.text_files import harmless_table
-from liex_lab.sessions.listed import state_in_words
+from liex_lab.sessions.verdict import state_in_words
 
 from ..units import counted, read_as
 from ..units import shown as as_read

@@ -42,8 +42,8 @@ def live_blueprint(body_m: float) -> Any:
     """
     import rerun.blueprint as rrb
 
-    from liex_lab.sessions.live import ERROR
     from liex_lab.sessions.rrd import SKELETON
+    from liex_lab.sessions.viewer import ERROR
 
     picture = rrb.Spatial2DView(
         origin="arena/camera/image",

@@ -16,8 +16,8 @@ from liex_lab.actions.ethogram import ACROSS_GAPS
 from liex_lab.actions.vocabulary import NO_POSE, UNLABELLED, action_colours
 from liex_lab.runtime.durable import write_whole
 from liex_lab.sessions import Session
+from liex_lab.sessions.session import found_video
 from liex_lab.sessions.verdict import verdict_in
-from liex_lab.sessions.videos import found_video
 
 from ..figures.seen import FRAMES, KINEMATICS
 from ..figures.sets import FOLDER, for_the_page

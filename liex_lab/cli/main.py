@@ -254,7 +254,7 @@ def suggest(
 
     from liex_lab.pipelines.training.action_model import suggest as job
     from liex_lab.sessions import Session
-    from liex_lab.sessions.videos import found_video, stretch
+    from liex_lab.sessions.session import found_video, stretch
 
     rows = list(job(session, model=model, n=n).itertuples())
     if video:
@@ -422,8 +422,8 @@ def _tell_session(session: Path, further: str = "") -> None:
 
 def _told_session(session: Path, further: str = "") -> int:
     """Say where the session is, and how it went; returns the exit code."""
-    from liex_lab.sessions.older import taken_from
-    from liex_lab.sessions.room import folder_bytes, megabytes
+    from liex_lab.sessions.backups import taken_from
+    from liex_lab.sessions.folder import folder_bytes, megabytes
     from liex_lab.sessions.verdict import read_verdict
 
     say(f"session: {session}")

@@ -21,7 +21,7 @@ from liex_lab.actions.labels import HUMAN, checked
 from liex_lab.errors import LiexError, one_line
 from liex_lab.runtime.text_files import decoded, read_text, read_texts, split_lines
 from liex_lab.sessions import Session
-from liex_lab.sessions.videos import found_video, video_path
+from liex_lab.sessions.session import found_video, video_path
 
 VERSION = "7.0"
 _MEDIA = "1"  # BORIS' first player

@@ -26,8 +26,8 @@ from numpy.typing import NDArray
 from liex_lab.errors import SessionError
 from liex_lab.sessions import Session
 from liex_lab.sessions.corrections import BoutEdit
-from liex_lab.sessions.pose_arrays import Poses
 from liex_lab.sessions.session import PULSE
+from liex_lab.sessions.track_tables import Poses
 from liex_lab.tables.rows import stop_times
 
 from .pose_files import hdf5_file

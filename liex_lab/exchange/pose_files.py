@@ -19,7 +19,7 @@ import pandas as pd
 
 from liex_lab.runtime.text_files import write_csv
 from liex_lab.sessions import Session
-from liex_lab.sessions.pose_arrays import Array, Poses
+from liex_lab.sessions.track_tables import Array, Poses
 
 if TYPE_CHECKING:
     import h5py

@@ -17,7 +17,7 @@ from liex_lab.errors import SessionError
 from liex_lab.runtime.places import inside
 from liex_lab.runtime.text_files import copy_harmless, write_csv
 from liex_lab.sessions import Session
-from liex_lab.sessions.reading import reading_from
+from liex_lab.sessions.document import reading_from
 
 if TYPE_CHECKING:
     import pandas as pd

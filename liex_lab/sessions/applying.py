@@ -23,8 +23,7 @@ from liex_lab.body.pose import Pose
 from liex_lab.errors import SessionError
 from liex_lab.geometry import SE3
 from liex_lab.sessions.corrections import BoutEdit, FlipSpan, JointMove, Log
-from liex_lab.sessions.evidence import read_evidence, read_flips
-from liex_lab.sessions.tracks import track_of
+from liex_lab.sessions.evidence import read_evidence, read_flips, track_of
 from liex_lab.tables.rows import frame_count
 from liex_lab.tables.schema import BOUTS
 from liex_lab.tracking.following import let_follow

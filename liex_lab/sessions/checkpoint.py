@@ -13,22 +13,22 @@ import hashlib
 import json
 import os
 import shutil
+import struct
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any
+from typing import IO, TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, NonNegativeInt
 
 from liex_lab.errors import SessionError
 from liex_lab.runtime.durable import sync_file, sync_tree, take_lock, write_whole
 from liex_lab.runtime.memory import mapped
 from liex_lab.runtime.places import unlinked, unlinked_tree
 from liex_lab.sessions.mcap_log import append_chunks
-from liex_lab.sessions.rrd_file import append_rrd
 
 # between two checkpoints: as much work is lost at most, besides what it takes to begin
 EVERY_S = 3.0
@@ -47,12 +47,15 @@ if TYPE_CHECKING:
     from liex_lab.runtime.progress import Progress
 
 LOGS = ("session.rrd", "session.mcap")
+# an .rrd file: a header, then messages that begin with kind and length, 8 bytes each
+RRD_HEAD = 12  # magic, version and options
+_RRD_END = 0  # kind of the message that ends a stream
+_BLOCK = 1 << 22
 _RESUMED = "resumed.rrd"
 Clock = Callable[[], float]
 
 
-@dataclass
-class State:
+class State(BaseModel):
     """How far a session is: the content of checkpoint.json.
 
     Attributes:
@@ -63,11 +66,12 @@ class State:
         logs: valid bytes of each log.
     """
 
+    model_config = ConfigDict(strict=True, frozen=True)
     key: str
-    n_frames: int = 0
-    seconds: float = 0.0
-    interruptions: int = 0
-    logs: dict[str, int] = field(default_factory=dict)
+    n_frames: NonNegativeInt = 0
+    seconds: Annotated[float, Field(ge=0.0, lt=_MOST_S)] = 0.0
+    interruptions: NonNegativeInt = 0
+    logs: dict[Literal["session.rrd", "resumed.rrd", "session.mcap"], NonNegativeInt] = {}
 
 
 class Checkpoint:
@@ -85,7 +89,7 @@ class Checkpoint:
     def __init__(
         self, folder: Path, facts: Mapping[str, Any], clock: Clock = time.monotonic
     ) -> None:
-        """Begin, or go on where a session of the same facts was left.
+        """Begin, or resume where a session of the same facts was left.
 
         Args:
             folder: the folder NAME.part; made if needed.
@@ -115,7 +119,7 @@ class Checkpoint:
         state = _read_state(folder / _STATE)
         if state is None or state.key != key or not self._cut(state):
             self._empty()
-            state = State(key)
+            state = State(key=key)
         self.state = state
         self.seconds_before = state.seconds
         self.n_interruptions = state.interruptions
@@ -125,13 +129,13 @@ class Checkpoint:
         replay, resumed = folder / LOGS[0], folder / _RESUMED
         if resumed.is_file():
             append_rrd(resumed, replay)
-            self._keep(n_frames=state.n_frames, logs={log: _size(folder / log) for log in LOGS})
+            self._keep(logs={log: _size(folder / log) for log in LOGS})
             resumed.unlink()
         self.replay = resumed if replay.is_file() else replay
 
     @property
     def is_saved(self) -> bool:
-        """Whether there is a checkpoint to go on from."""
+        """Whether there is a checkpoint to resume from."""
         return (self.folder / _STATE).is_file()
 
     @property
@@ -178,11 +182,11 @@ class Checkpoint:
     def _keep(self, **changes: Any) -> None:
         """Record a state once its files are on disk: a power cut leaves nothing that is not."""
         self.seen.flush()
-        state = replace(self.state, **changes)
+        state = self.state.model_copy(update=changes)
         sync_tree(self.folder / _SEEN)
         for log in state.logs:
             sync_file(self.folder / log)
-        write_whole(self.folder / _STATE, json.dumps(vars(state)))
+        write_whole(self.folder / _STATE, state.model_dump_json())
         self.state, self._last = state, self._clock()
 
     def join_replay(self) -> None:
@@ -205,8 +209,8 @@ class Checkpoint:
         """Let go of the folder without finishing the session.
 
         Args:
-            keep: leave it there if it has a checkpoint, so that the work can go on later; otherwise
-                nothing stays.
+            keep: leave it there if it has a checkpoint, so that the work can resume later;
+                otherwise nothing stays.
         """
         with suppress(OSError):  # what the disk does not take is behind the checkpoint
             self.seen.close()
@@ -326,6 +330,48 @@ class Columns:
         return True
 
 
+def rrd_messages(path: Path, start: int = RRD_HEAD) -> Iterator[tuple[int, int]]:
+    """Offset and length of each message, up to the end message if there is one.
+
+    Args:
+        path: the .rrd file.
+        start: offset of the first message to read.
+
+    Raises:
+        SessionError: a message is cut, so the file was not written whole.
+    """
+    size = path.stat().st_size
+    at = start
+    with path.open("rb") as file:
+        while at < size:
+            file.seek(at)
+            head = file.read(16)
+            kind, length = struct.unpack("<QQ", head) if len(head) == 16 else (0, size)
+            if at + 16 + length > size:
+                raise SessionError(
+                    "the replay was not written whole; make room on the disk and run it again"
+                )
+            if kind == _RRD_END:
+                return
+            yield at, 16 + length
+            at += 16 + length
+
+
+def append_rrd(source: Path, target: Path) -> None:
+    """Append the messages of an .rrd file to another one, which is made if it does not exist.
+
+    The index that ends a file is left out, for it counts from the file's own beginning.
+
+    Raises:
+        SessionError: the last message of `source` is cut.
+    """
+    end = max((at + length for at, length in rrd_messages(source)), default=RRD_HEAD)
+    with source.open("rb") as file, target.open("ab") as whole:
+        file.seek(RRD_HEAD if whole.tell() else 0)
+        while block := file.read(min(_BLOCK, end - file.tell())):
+            whole.write(block)
+
+
 def _size(path: Path) -> int:
     """Bytes of a file; -1 if it does not exist."""
     return path.stat().st_size if path.is_file() else -1
@@ -347,7 +393,7 @@ def hash_once(recording: Recording, folder: Path, progress: Progress) -> None:
     Args:
         recording: the recording, which holds its hash afterwards.
         folder: the folder of the unfinished session.
-        progress: told how many MB were read.
+        progress: reports how many MB were read.
     """
     stamp = recording.files.stamp
     try:
@@ -386,7 +432,7 @@ def hold(folder: Path) -> IO[bytes] | None:
         folder: the folder NAME.part.
 
     Returns:
-        The lock, which goes with `close`; None where another process writes the session, or it
+        The lock, which goes with `close`; None if another process writes the session, or it
         became whole just now.
     """
     try:
@@ -396,20 +442,15 @@ def hold(folder: Path) -> IO[bytes] | None:
 
 
 def _read_state(path: Path) -> State | None:
-    """The state in a file; None where there is none that could be gone on with."""
+    """The state in a file; None if there is none to resume from."""
     try:
-        state = State(**json.loads(path.read_text(encoding="utf-8")))
-        counts = [state.n_frames, state.interruptions, *state.logs.values()]
-        sound = isinstance(state.key, str) and 0.0 <= state.seconds < _MOST_S
-        sound = sound and all(isinstance(n, int) and n >= 0 for n in counts)
-        sound = sound and set(state.logs) <= {*LOGS, _RESUMED}
-    except (OSError, ValueError, TypeError, AttributeError, RecursionError):
+        return State.model_validate_json(path.read_bytes())
+    except (OSError, ValueError):
         return None
-    return state if sound else None
 
 
 def _read_kinds(folder: Path) -> dict[str, tuple[str, list[int]]] | None:
-    """What columns.json says of the columns: dtype and shape of a row by name; None where it makes
+    """What columns.json says of the columns: dtype and shape of a row by name; None if it makes
     no sense.
     """
     try:

@@ -22,7 +22,7 @@ from typing import Any, ClassVar
 from liex_lab.catalog import sha256
 from liex_lab.errors import SessionError
 from liex_lab.runtime.places import safe_name
-from liex_lab.sessions.listed import ALSO, WHO
+from liex_lab.sessions.verdict import ALSO, WHO
 
 FOLDER = "corrected"
 LOG = "corrections.json"

@@ -9,12 +9,14 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
 from typing import Annotated, Any, NoReturn
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from liex_lab.errors import SessionError
+from liex_lab.errors import LiexError, SessionError, one_line
 from liex_lab.geometry import SE3
 from liex_lab.optics.camera import Camera
 from liex_lab.plan.sections import Factor
@@ -311,3 +313,29 @@ def _damaged(path: Path, why: str) -> SessionError:
     return SessionError(
         f"{path} is damaged and cannot be read ({why[:200]}); run `liex run` on the recording again"
     )
+
+
+# Error translation for reading files of a session: whatever goes wrong becomes one sentence.
+
+
+@contextmanager
+def reading_from(path: Path) -> Iterator[Path]:
+    """Within the block, turn any error into a SessionError that names the file as damaged.
+
+    A LiexError passes as it is.
+
+    Args:
+        path: the file that is read in the block; it is what the `with` statement gives.
+
+    Raises:
+        SessionError: anything went wrong in the block.
+    """
+    try:
+        yield path
+    except LiexError:
+        raise
+    except Exception as error:
+        raise SessionError(
+            f"{path} is damaged and cannot be read ({type(error).__name__}: {one_line(error)}); "
+            "run `liex run` on the recording again"
+        ) from None

@@ -1,12 +1,14 @@
-"""Observations behind a session's track (observations.npz), kept to make the track again later.
+"""What a session was made of, read back: observations, skeleton, track, provenance, recording.
 
-They hold the pose hypotheses of every single frame, before association and smoothing, and the
-animal and camera that they are of. After a human's correction the track is made again from them.
+The file observations.npz contains the pose hypotheses of every single frame, before association and
+smoothing, and the animal and camera that they are of. The track is made again from them after a
+correction.
 """
 
 from __future__ import annotations
 
 import json
+import os
 import zipfile
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
@@ -16,18 +18,27 @@ from numpy.typing import NDArray
 
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.errors import SessionError
+from liex_lab.geometry import so3
 from liex_lab.recordings.timestamps import Gap
 from liex_lab.runtime.memory import blocks, check_npz
+from liex_lab.sessions.document import reading_from
 from liex_lab.sessions.provenance import Provenance
-from liex_lab.sessions.reading import reading_from
+from liex_lab.sessions.track_tables import spreads
 from liex_lab.tables.rows import LOST
+from liex_lab.tables.schema import ROOT_COVARIANCES
 from liex_lab.tracking.observations import COLUMNS, Observations
-from liex_lab.tracking.track import Flip, Subject
+from liex_lab.tracking.track import Flip, Subject, Track
 
 if TYPE_CHECKING:
     import pandas as pd
 
     from liex_lab.sessions.session import Session
+
+_SCALARS = ("scale", "predicted_error_mm", "residual_mm", "n_foreground_px", "p_flip", "bridged")
+
+_ADDRESS = "synthetic:"
+
+Array = NDArray[np.float64]
 
 FILE = "observations.npz"
 # columns that sessions of earlier versions do not hold
@@ -40,7 +51,7 @@ _BLOCK = 16_384  # frames that are in memory at a time
 def write_evidence(folder: Path, seen: Observations, subject: Subject) -> None:
     """Write observations.npz, a compressed NumPy archive without pickle.
 
-    Blocks of frames are written one after the other, so that hours of recording need little memory.
+    Blocks of frames are written in turn, so that hours of recording need little memory.
 
     Args:
         folder: the folder that the file goes into.
@@ -273,3 +284,129 @@ def _camera_gaps(session: Session) -> list[Gap]:
 def _rows_of(table: pd.DataFrame) -> list[dict[str, Any]]:
     """Rows of a short table as dicts."""
     return [{str(name): value for name, value in row.items()} for row in table.to_dict("records")]
+
+
+def link_to(recording: str | Path, folder: Path) -> dict[str, Any]:
+    """The link for the section `input` of session.json, beside the recording's hash.
+
+    Args:
+        recording: path of the recording, or address of a virtual one.
+        folder: where the session will be.
+    """
+    if str(recording).startswith(_ADDRESS):
+        return {"path": str(recording)}
+    whole = Path(recording).resolve()
+    try:
+        return {"path": Path(os.path.relpath(whole, folder.resolve())).as_posix()}
+    except ValueError:  # on another drive of Windows
+        return {"path": whole.as_posix()}
+
+
+def linked_recording(session: Session) -> str | None:
+    """Path or address of the recording, whether it is there or not.
+
+    Args:
+        session: the session.
+
+    Returns:
+        None of a session that does not say, as those of earlier versions.
+    """
+    stated = session.metadata["input"].get("path")
+    if not isinstance(stated, str) or not stated:
+        return None
+    return stated if stated.startswith(_ADDRESS) else os.path.normpath(session.path / stated)
+
+
+def skeleton_of(session: Session) -> Skeleton:
+    """Skeleton of a session: as it was then or, for an older session, as it is now.
+
+    Args:
+        session: the session.
+    """
+    kept = read_skeleton(session)
+    if kept is not None:
+        return kept
+    planned = session.metadata["plan"].get("animal")
+    return Skeleton.load(
+        planned["skeleton"] if isinstance(planned, dict) else session.metadata["animal"]["name"]
+    )
+
+
+def track_of(session: Session, skeleton: Skeleton | None = None) -> Track:
+    """The whole track of a session; what an older session does not tell is as in `Track.empty`.
+
+    Args:
+        session: the session.
+        skeleton: its skeleton; None reads it.
+
+    Raises:
+        SessionError: the tables have other numbers of rows than the frames and joints need.
+    """
+    skeleton = skeleton or skeleton_of(session)
+    frames = session.frames
+    n = len(session.frames)
+    j = skeleton.n_joints
+    poses = session.poses
+    rotations = session.rotations
+    if len(poses) != n * j or len(rotations) != n * (j + 1):
+        raise SessionError(
+            f"{session.path} holds {len(poses)} rows of poses for {n} frames, {j} joints; run it "
+            "again"
+        )
+    track = Track.empty(skeleton, frames["time_ns"].to_numpy(np.int64))
+    track.joints_mm[:] = _columns(poses, [f"{a}_mm" for a in "xyz"]).reshape(n, j, 3)
+    track.uv_px[:] = _columns(poses, ["u_px", "v_px"]).reshape(n, j, 2)
+    track.sd_mm[:] = poses["sd_mm"].to_numpy(float).reshape(n, j)
+    track.sd_xy_mm[:], _, track.sd_z_mm[:] = np.moveaxis(spreads(poses).reshape(n, j, 3), -1, 0)
+    turns = _columns(rotations, [f"w{a}_rad" for a in "xyz"]).reshape(n, j + 1, 3)
+    spread = _columns(rotations, [f"sd_w{a}_rad" for a in "xyz"]).reshape(n, j + 1, 3)
+    track.angles_rad[:] = turns[:, 1:]
+    track.sd_angles_rad[:] = spread[:, 1:]
+    seen = np.isfinite(turns[:, 0]).all(axis=1)
+    track.root_rotation[seen] = so3.exp(turns[seen, 0])
+    track.root_mm[:] = _columns(rotations, [f"t{a}_mm" for a in "xyz"]).reshape(n, j + 1, 3)[:, 0]
+    shift = _columns(rotations, [f"sd_t{a}_mm" for a in "xyz"]).reshape(n, j + 1, 3)[:, 0]
+    track.cov_root[:] = _covariance(
+        rotations.iloc[:: j + 1], np.concatenate([spread[:, 0], shift], axis=1)
+    )
+    for name in _SCALARS:
+        if name in frames:
+            getattr(track, name)[:] = frames[name].to_numpy()
+    track.centroid_mm[:] = _columns(frames, [f"centroid_{a}_mm" for a in "xyz"])
+    track.centroid_px[:] = _columns(frames, [f"centroid_{a}_px" for a in "uv"])
+    track.flag[:] = frames["flag"].to_numpy().astype(track.flag.dtype)
+    return track
+
+
+def _covariance(roots: pd.DataFrame, sd: Array) -> Array:
+    """Covariances (n, 6, 6) of the root from its rows and its standard deviations (n, 6).
+
+    Of an older session the standard deviations alone are known; the rest is NaN.
+    """
+    out = np.zeros((len(sd), 6, 6))
+    out[:, range(6), range(6)] = sd**2
+    rows, columns = np.triu_indices(6, 1)
+    out[:, rows, columns] = out[:, columns, rows] = _columns(roots, list(ROOT_COVARIANCES))
+    return out
+
+
+def wall_of(session: Session) -> Array:
+    """(n,) distance of the animal from the nearest wall, mm; NaN if unknown.
+
+    Args:
+        session: the session.
+    """
+    frames = session.frames
+    return (
+        frames["wall_distance_mm"].to_numpy(float)
+        if "wall_distance_mm" in frames
+        else np.full(len(frames), np.nan)
+    )
+
+
+def _columns(table: pd.DataFrame, names: list[str]) -> Array:
+    """Columns side by side, NaN where an older table lacks one."""
+    lacking = np.full(len(table), np.nan)
+    return np.column_stack(
+        [table[name].to_numpy(float) if name in table else lacking for name in names]
+    )

@@ -3,9 +3,9 @@
 Messages follow Foxglove's schemas (RawImage 16UC1 in mm, CameraCalibration, FrameTransforms,
 SceneUpdate, PosesInFrame, ImageAnnotations, Log) and JSON schemas of our own for actions and the
 predicted error.
-Pictures are whole, for Foxglove shows one image; where the still scene stands behind cut-outs,
-Zstandard finds it in the picture before, some 50 pictures to a chunk. Depth streams in as it comes;
-everything small is written at the end from the same track the tables are made of.
+Images are whole, for Foxglove shows a single one. Zstandard finds the still scene behind cut-outs
+in the previous image, some 50 images to a chunk. Depth streams in as it comes; everything small is
+written at the end from the same track the tables are made of.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from numpy.typing import NDArray
 
 from liex_lab.geometry import SE3, so3
 from liex_lab.runtime.memory import blocks
-from liex_lab.sessions.drawn import dot_mm
 from liex_lab.sessions.mcap_log import McapLog, MessageType
 from liex_lab.sessions.provenance import Provenance, package_version
+from liex_lab.sessions.rrd_scene import dot_mm
 from liex_lab.tables.rows import Rows
 from liex_lab.tracking.track import Track
 
@@ -86,7 +86,7 @@ _JOINT = messages.Color(r=1.0, g=0.31, b=0.24, a=1.0)
 
 
 class _Packing(NamedTuple):
-    """How pictures are packed.
+    """How images are packed.
 
     Attributes:
         level: of Zstandard.
@@ -102,9 +102,9 @@ class _Packing(NamedTuple):
 
 
 def _packing_of(origin: Provenance) -> _Packing:
-    """Whole pictures one to a chunk; or those that are alike but for a cut-out.
+    """Whole images one to a chunk; or those that are alike but for a cut-out.
 
-    The still scene of these is in the picture before, and short repetitions would end where it goes
+    The still scene of these is in the image before, and short repetitions would end where it goes
     on.
     """
     if origin.background is None:
@@ -136,7 +136,7 @@ class McapWriter:
             path: the file to write.
             origin: camera, its position and the skeleton.
             level: Zstandard compression level, 0 for the usual one, 22 for the smallest file; None
-                takes what suits the pictures that are kept.
+                takes what suits the images that are kept.
             chunk_size: bytes packed at once; None as well.
             resume: append to a file that ends after `flushed`.
         """
@@ -172,7 +172,7 @@ class McapWriter:
 
         Args:
             times_ns: times of the n frames, ns.
-            depth: n pictures (H, W) uint16 mm, 0 where unread; none where depth is not kept.
+            depth: n images (H, W) uint16 mm, 0 where unread; none where depth is not kept.
 
         Raises:
             OSError: the system refused to write.
@@ -303,7 +303,7 @@ class McapWriter:
         return messages.SceneUpdate(entities=[entity])
 
     def _annotations(self, time_ns: int, uv: Array, seen: bool) -> messages.ImageAnnotations:
-        """The skeleton over the depth picture."""
+        """The skeleton over the depth image."""
         if not seen:
             return messages.ImageAnnotations(points=[])
         at = [messages.Point2(x=u, y=v) for u, v in uv.tolist()]
@@ -385,7 +385,7 @@ def _quaternion(transform: SE3) -> Array:
 
 
 def _picture(time_ns: int | np.int64, image: NDArray[np.uint16]) -> list[bytes | memoryview]:
-    """A depth picture as a `RawImage`, in parts: the pixels are not copied into it.
+    """A depth image as a `RawImage`, in parts: the pixels are not copied into it.
 
     Protobuf's fields follow each other by their numbers, and only that of the frame comes after the
     pixels.

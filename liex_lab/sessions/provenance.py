@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from liex_lab.scene.scene import Scene
     from liex_lab.scene.zones import Zone
 
+
 SCHEMA_VERSION = 8
 _PACKAGES = (
     "liex_lab",
@@ -63,7 +64,7 @@ class Provenance:
         input_sha256: SHA-256 of the recording's bytes.
         plan_toml: the plan as resolved, TOML text.
         format: the recording's format.
-        profile: how its stored numbers were read, where a profile says so.
+        profile: how its stored numbers were read, where a profile states it.
         individual: the animal's name in the session.
         n_frames: frames to be expected; None when unknown.
         gaps: frames that the camera did not deliver, and timestamps that were moved.
@@ -76,11 +77,11 @@ class Provenance:
         optics: what was undone of lens and water.
         arena: the shape of the floor.
         zones: those that a person has drawn on it.
-        scene: floor, region, fixtures and how many animals move; None where there is no floor.
+        scene: floor, region, fixtures and how many animals move; None if there is no floor.
         replay_depth: how much of the depth the replay is to hold: 'animal', 'arena', 'all', 'none'.
         replay_candidates: whether it is to hold every hypothesis of single frames.
-        background: (H, W) uint16 mm, the still scene before which cut-outs are shown; None where
-            whole pictures are kept, or none.
+        background: (H, W) uint16 mm, the still scene before which cut-outs are shown; None if
+            whole images are kept, or none.
     """
 
     name: str
@@ -265,3 +266,6 @@ def versions() -> dict[str, str]:
 
 def _hash(value: Any) -> str:
     return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()[:16]
+
+
+# Link from a session to the recording that it was measured from: a path, and the hash it had.

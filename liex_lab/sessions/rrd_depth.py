@@ -1,19 +1,18 @@
-"""Depth pictures of a Rerun replay: whole ones, or cut-outs before the still scene.
+"""Depth images of a Rerun replay: whole ones, or cut-outs before the still scene.
 
-Depth is stored without loss: RVL (Wilson 2017, run-length and variable-length coding), or PNG where
-sensor noise makes that smaller. A cut-out is seen by a pinhole camera of its own, whose principal
-point is that of the camera less the corner (left, top) of the window that it stands in (see
-`cutouts.windows`):
+Depth is stored without loss: RVL (Wilson 2017, run-length and variable-length coding), or PNG if
+sensor noise makes that smaller. A cut-out belongs to a pinhole camera of its own, whose principal
+point is that of the camera less the corner (left, top) of its window (see `cutouts.windows`):
 
     K' = K - [[0, 0, left], [0, 0, top], [0, 0, 0]].
 
-The still scene is there once. Where cut-outs lie in the picture say the entities below `PLACES`,
-see `cutout_frame`.
+The still scene is stored once. The entities below `PLACES` give the place of every cut-out in the
+image, see `cutout_frame`.
 
-Rerun 0.41 takes what an entity shows over time for a film (rerun-io/rerun#12801). It complains of
-nothing where all its pictures have one size and one packing, and the packing stands there once for
-all times. So every size of window and every packing has an entity of its own, and of those that
-belong together one shows a picture at a time. Without a time only PNG is no error.
+Rerun 0.41 treats what an entity shows over time as a film (rerun-io/rerun#12801). It reports no
+problem if all images of an entity have one size and one packing, and the packing is logged once for
+all times. So every size of window and every packing has an entity of its own, and only one of those
+that belong together shows an image at a time. Without a time only PNG is accepted.
 """
 
 from __future__ import annotations
@@ -36,12 +35,12 @@ Packed = tuple[NDArray[np.uint8], str]  # bytes and media type
 
 IMAGE = "arena/camera/image"
 DEPTH = f"{IMAGE}/depth"
-NOISY = f"{DEPTH}/png"  # whole pictures whose noise makes PNG smaller
+NOISY = f"{DEPTH}/png"  # whole images whose noise makes PNG smaller
 BACKGROUND = f"{IMAGE}/background"
 PLACES = f"{IMAGE}/places"
 CUTOUTS = "arena/camera/cutouts"
 MM_PER_UNIT = 1000.0  # our depth is in mm, the scene in metres
-# one above the other in the picture; whole pictures may be shown over the cut-outs
+# one above the other in the image; whole images may be shown over the cut-outs
 _BACKMOST = -40.0
 _BEHIND = -30.0
 _WHOLE = -20.0
@@ -56,14 +55,14 @@ _NOISY_PNG = (
     17,
     2,
 )  # OpenCV's IMWRITE_PNG_COMPRESSION 1 and IMWRITE_PNG_STRATEGY 2, HUFFMAN_ONLY
-# pictures, and their bytes, in one message: for each message the index that ends the file takes
+# images, and their bytes, in one message: for each message the index that ends the file takes
 # some 5 kB of memory
 _TOGETHER = 128
 _TOGETHER_BYTES = 1 << 23
 
 
 class DepthColumns:
-    """Depth pictures that wait to be written together.
+    """Depth images that wait to be written together.
 
     Args:
         origin: camera, its distance from the floor, and the still scene.
@@ -75,13 +74,13 @@ class DepthColumns:
         self._n_bytes = 0
         self._n_messages = 0
         self._introduced: set[str] = set()
-        self._shown: set[str] = set()  # entities that show a picture of frames before
+        self._shown: set[str] = set()  # entities that show an image of frames before
 
     @cached_property
     def _windows(self) -> list[tuple[int, int]]:
         return windows(self._origin)
 
-    def go_on(self) -> None:
+    def resume(self) -> None:
         """Continue another file, of which it is not known what it shows at its end."""
         cut_out = self._origin.background is not None
         self._shown = set(cutout_entities() if cut_out else (DEPTH, NOISY))
@@ -93,14 +92,14 @@ class DepthColumns:
         depth: NDArray[np.uint16],
         boxes: Boxes | None,
     ) -> bool:
-        """Take the next picture.
+        """Take the next image.
 
         Args:
             frame_index: the camera's count of the frame.
             elapsed_ns: time since the first frame, ns.
             depth: (H, W) uint16 mm, 0 where unread; outside of its cut-outs the still scene.
-            boxes: (K, 4) left, top, right and bottom of its cut-outs, px, all 0 for none; None for
-                a whole picture.
+            boxes: (K, 4) left, top, right and bottom of its cut-outs, px, all 0 if absent; None for
+                a whole image.
 
         Returns:
             Whether it is time to `send` what waits.
@@ -141,7 +140,7 @@ class DepthColumns:
             stream: the Rerun stream.
 
         Returns:
-            How many messages of pictures that made.
+            How many messages of images that made.
         """
         waiting = self._waiting
         self._waiting = []
@@ -157,7 +156,7 @@ class DepthColumns:
         return self._n_messages
 
     def _send_pictures(self, stream: Any, entity: str, waiting: Sequence[_Picture]) -> None:
-        """Pictures of an entity, and from when on it shows none."""
+        """Images of an entity, and from when on it shows none."""
         blobs = []
         rows = []
         counts = []
@@ -178,7 +177,7 @@ class DepthColumns:
         self._n_messages += 1
 
     def _send_lens(self, stream: Any, k: int, waiting: Sequence[_Picture]) -> None:
-        """Lenses of the k-th cut-out of frames, and where in the picture it lies."""
+        """Lenses of the k-th cut-out of frames, and where in the image it lies."""
         boxes = np.array([picture.windows[k] for picture in waiting], np.float64)
         there = boxes[:, 2] > boxes[:, 0]
         if not there.any() and k:
@@ -209,12 +208,12 @@ class DepthColumns:
         self._introduced.add(entity)
 
     def log_kind(self, stream: Any, first: NDArray[np.uint16], *, whole: bool) -> None:
-        """Log what holds for whole pictures: packing, unit, colours, layout; or the still scene.
+        """Log what holds for whole images: packing, unit, colours, layout; or the still scene.
 
         Args:
             stream: the Rerun stream.
-            first: (H, W) uint16 mm, the first picture.
-            whole: whole pictures are kept, no cut-outs.
+            first: (H, W) uint16 mm, the first image.
+            whole: whole images are kept, no cut-outs.
         """
         if whole:
             for entity, media_type in ((DEPTH, _RVL), (NOISY, _PNG)):
@@ -236,7 +235,7 @@ class DepthColumns:
         stream.log(BACKGROUND, scene, static=True)
 
     def _look(self, depth: NDArray[np.uint16]) -> dict[str, Any]:
-        """Unit and colours of pictures that are like this one."""
+        """Unit and colours of images that are like this one."""
         return {
             "meter": MM_PER_UNIT,
             "colormap": "viridis",
@@ -248,7 +247,7 @@ class DepthColumns:
 @dataclass(frozen=True)
 class _Picture:
     """What is kept of a frame's depth: its packed parts by entity, and the windows of its cut-outs
-    (left, top, right, bottom, px; all 0 for none), none for a whole one.
+    (left, top, right, bottom, px; all 0 if absent), none for a whole one.
     """
 
     index: int
@@ -258,7 +257,7 @@ class _Picture:
 
 
 def _when(pictures: Sequence[_Picture]) -> list[rr.TimeColumn]:
-    """The timelines of pictures."""
+    """The timelines of images."""
     return timeline(
         np.array([picture.index for picture in pictures], np.int64),
         np.array([picture.elapsed_ns for picture in pictures], np.int64),
@@ -284,10 +283,10 @@ def cutout_entities() -> list[str]:
 
 
 def cutout_frame(k: int) -> str:
-    """Rerun's name of the coordinate frame of the k-th cut-out in the picture.
+    """Rerun's name of the coordinate frame of the k-th cut-out in the image.
 
-    In space a cut-out is seen by a pinhole camera of its own; in a view of the picture its entity
-    is put into this frame instead, for Rerun shows what one camera sees in no other's picture.
+    In space a cut-out is seen by a pinhole camera of its own; in a view of the image its entity
+    is put into this frame instead, for Rerun shows what one camera sees in no other's image.
 
     Args:
         k: counted from 0.
@@ -296,9 +295,9 @@ def cutout_frame(k: int) -> str:
 
 
 def packed(depth: NDArray[np.uint16]) -> Packed:
-    """Encode a depth picture without loss.
+    """Encode a depth image without loss.
 
-    RVL takes half of what raw pictures do and is quick. Where noise makes it large, beyond 0.54
+    RVL takes half of what raw images do and is quick. Where noise makes it large, beyond 0.54
     bytes per pixel, PNG is taken if it is smaller (Huffman coding alone: noise has no runs to look
     for).
 

@@ -20,9 +20,11 @@ from liex_lab.errors import SessionError
 from liex_lab.geometry import SE3
 from liex_lab.optics.camera import Camera
 from liex_lab.runtime.memory import rest
+from liex_lab.runtime.places import safe_name
 from liex_lab.runtime.text_files import read_harmless
 from liex_lab.scene.outline import Arena
 from liex_lab.scene.zones import Zone
+from liex_lab.sessions.backups import put_back_session
 from liex_lab.sessions.corrections import (
     Log,
     applies,
@@ -30,10 +32,8 @@ from liex_lab.sessions.corrections import (
     read_log,
     with_description,
 )
-from liex_lab.sessions.document import read_document
-from liex_lab.sessions.older import put_back_session
-from liex_lab.sessions.pose_arrays import Poses, dataset_of
-from liex_lab.sessions.reading import reading_from
+from liex_lab.sessions.document import read_document, reading_from
+from liex_lab.sessions.track_tables import Poses, dataset_of
 from liex_lab.tables.schema import FRAMES, check_footer, check_rows
 
 if TYPE_CHECKING:
@@ -91,8 +91,8 @@ class Session:
     Args:
         path: the session folder.
         metadata: the content of session.json.
-        log: the corrections that apply; None for none.
-        described: what people said of the animal since, see `Log.described`; None for nothing.
+        log: the corrections that apply; None if absent.
+        described: what people said of the animal since, see `Log.described`; None if absent.
     """
 
     def __init__(
@@ -165,8 +165,7 @@ class Session:
     @property
     def name(self) -> str:
         """The session's id."""
-        with reading_from(self.path / "session.json"):
-            return str(self.metadata["session_id"])
+        return str(self.metadata["session_id"])
 
     def file(self, name: str) -> Path:
         """Path of a file of the session: the corrected one where there is one, else its own.
@@ -276,26 +275,22 @@ class Session:
 
         `metadata["camera"]["optics"]` says what of lens and water was undone for that.
         """
-        with reading_from(self.path / "session.json"):
-            return Camera.from_dict(self.metadata["camera"])
+        return Camera.from_dict(self.metadata["camera"])
 
     @cached_property
     def T_arena_camera(self) -> SE3:
         """Rigid transform that carries points of the camera frame (mm) into the arena frame."""
-        with reading_from(self.path / "session.json"):
-            return SE3.from_matrix(np.array(self.metadata["camera"]["T_arena_camera"], float))
+        return SE3.from_matrix(np.array(self.metadata["camera"]["T_arena_camera"], float))
 
     @cached_property
     def arena(self) -> Arena:
-        """The shape of the floor; open where it is not known."""
-        with reading_from(self.path / "session.json"):
-            return Arena.from_dict(self.metadata.get("arena", {"kind": "open"}))
+        """The shape of the floor; open if unknown."""
+        return Arena.from_dict(self.metadata.get("arena") or {"kind": "open"})
 
     @cached_property
     def zones(self) -> list[Zone]:
         """The zones that a person has drawn on the floor; their table is `zone_visits`."""
-        with reading_from(self.path / "session.json"):
-            return [Zone.from_dict(zone) for zone in self.metadata.get("zones", [])]
+        return [Zone.from_dict(zone) for zone in self.metadata.get("zones", [])]
 
     @property
     def plan(self) -> str:
@@ -409,3 +404,37 @@ def _rows_of(path: Path, columns: list[str] | None, frame_index: list[int]) -> p
     rest()
     rows = pd.concat(found, ignore_index=True)
     return rows if columns is None else rows[columns]
+
+
+def video_path(folder: Path, name: str, what: str = "") -> Path:
+    """Path of a video.
+
+    Args:
+        folder: the folder that it lies in.
+        name: of the session, or of the study.
+        what: what of it is shown, such as an action; "" for all of it.
+    """
+    tail = "".join(c if c.isalnum() or c in "-_.+" else "_" for c in what)
+    return folder / safe_name(f"{name}_{tail}" if tail else name, ".mp4")
+
+
+def stretch(start_s: float | None, stop_s: float | None) -> str:
+    """What a video of a part of a session is called.
+
+    Args:
+        start_s: where it begins, s; None at the beginning.
+        stop_s: where it ends, s; None at the end.
+    """
+    start = f"from_{start_s or 0.0:.2f}s"
+    return start if stop_s is None else f"{start}_to_{stop_s:.2f}s"
+
+
+def found_video(session: Session, what: str = "") -> Path | None:
+    """The video of a session in its folder; None if none was made.
+
+    Args:
+        session: the opened session.
+        what: what of it is shown; "" for all of it.
+    """
+    path = video_path(session.path, session.name, what)
+    return path if path.is_file() else None

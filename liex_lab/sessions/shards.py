@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 
 from liex_lab.runtime.durable import sync_folder, sync_tree, write_whole
 from liex_lab.sessions.checkpoint import LOGS, STRETCHES, Checkpoint, Columns
-from liex_lab.sessions.cutouts import PictureKeeper
+from liex_lab.sessions.cutouts import DepthKeeper
 from liex_lab.sessions.provenance import Provenance
 from liex_lab.sessions.writer import seen_rows
 
@@ -79,7 +79,7 @@ class ShardWriter:
         Args:
             folder: the shard's folder.
             origin: what is known about the recording.
-            first_ns: time of the recording's first frame, ns; None where that is in this shard.
+            first_ns: time of the recording's first frame, ns; None if that is in this shard.
         """
         from liex_lab.sessions.mcap import McapWriter
         from liex_lab.sessions.rrd import ReplayWriter
@@ -92,9 +92,9 @@ class ShardWriter:
         replay, messages = (self._folder / log for log in LOGS)
         self._replay = ReplayWriter(replay, origin)
         self._mcap = McapWriter(messages, origin)
-        self._keeper = PictureKeeper(origin)
+        self._keeper = DepthKeeper(origin)
         if first_ns is not None:
-            self._replay.go_on(first_ns)
+            self._replay.resume(first_ns)
 
     def __enter__(self) -> ShardWriter:
         return self

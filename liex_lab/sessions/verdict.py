@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,6 +21,7 @@ from liex_lab.runtime.memory import blocks
 if TYPE_CHECKING:
     from liex_lab.tracking.observations import Observations
     from liex_lab.tracking.track import Track
+
 
 LOOK_AT_IT = "look at it"
 CAUTION = "note"
@@ -76,7 +77,7 @@ class Verdict:
 
         Args:
             track: one row for every frame.
-            seen: what the single frames said.
+            seen: the observations.
             misfits: how the scene does not fit the plan.
             doubts: why its scene or its clock is not to be relied on.
             n_animals: how many animals were counted in the frames that were learned from.
@@ -191,3 +192,43 @@ def verdict_in(document: Mapping[str, Any]) -> Mapping[str, Any]:
             name: one for name, one in found.items() if isinstance(one, type(unsaid.get(name, one)))
         },
     }
+
+
+# Entry of a study's session list, shared by the jobs that make it and the views that show it.
+
+
+WHO = ("subject_id", "group", "cage", "sex", "batch")
+ALSO = ("species", "age")  # what archives ask for as well; nothing is grouped by them
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A session as the study lists it.
+
+    Attributes:
+        key: its name in the study.
+        state: done, failed, new, begun, changed or excluded.
+        reason: why it is in this state.
+        remedy: what to do about it.
+        folder: the session folder; None if it was not measured.
+        who: those of `WHO` (subject, group, cage, sex, batch) that are known.
+    """
+
+    key: str
+    state: str
+    reason: str = ""
+    remedy: str = ""
+    folder: Path | None = None
+    who: dict[str, str] = field(default_factory=dict)
+
+
+def state_in_words(state: str, reason: str) -> str:
+    """The state of a session for people: of one that is done, whether all is well with it.
+
+    Args:
+        state: done, failed, new, begun, changed or excluded.
+        reason: why it is in this state, or what to look at although it is done.
+    """
+    if state == "done" and reason.startswith(LOOK_AT_IT):
+        return f"done, {LOOK_AT_IT}"
+    return "done with cautions" if state == "done" and reason.startswith(CAUTION) else state

@@ -1,4 +1,4 @@
-"""Launcher of the Rerun viewer that shows a session's replay at a moment in time."""
+"""Rerun viewer: launching it, showing a session's replay in it, and streaming live to it."""
 
 from __future__ import annotations
 
@@ -9,15 +9,28 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
+import numpy as np
+import rerun as rr
+
+from liex_lab.body.skeleton import Skeleton
 from liex_lab.errors import LiexError
+from liex_lab.geometry import SE3
+from liex_lab.optics.camera import Camera
+from liex_lab.recordings.frame import DepthFrame
 from liex_lab.runtime.processes import own_python
+from liex_lab.sessions.rrd import BONE_COLOUR, JOINT_COLOUR, SKELETON
+from liex_lab.sessions.rrd_depth import DEPTH, MM_PER_UNIT, colour_range
+from liex_lab.sessions.rrd_scene import dot_mm, log_camera
+from liex_lab.tracking.track import Track
 
 _PATIENCE_S = 30.0  # for a viewer to come up
+Made = TypeVar("Made")
 
 
 @dataclass(frozen=True)
@@ -102,26 +115,16 @@ def show_replay(
         need_screen(f"open {replay} on a computer with a screen")
     from rerun.experimental import ViewerClient
 
-    port = _free_port()
-    process = _begin(
-        "--port", str(port), "--hide-welcome-screen", *(["--headless"] if headless else [])
-    )
-    ends = time.monotonic() + _PATIENCE_S
-    seen = ""
-    while time.monotonic() < ends and process.poll() is None:
-        try:
-            client = ViewerClient.connect(f"rerun+http://127.0.0.1:{port}/proxy")
-            for file in replays_with(replay, more):
-                client.open(str(file.resolve()))
-            client.set_time("time", duration=at_s, play_state="paused")
-            return Shown(process, client)
-        except Exception as error:  # not up yet; what it raises then is not documented
-            seen = str(error).partition("\n")[0][:200]
-            time.sleep(0.3)
-    _end(process)
-    raise LiexError(
-        f"Rerun did not show {replay} ({seen or 'it ended at once'}); try `liex show` in a terminal"
-    )
+    port, process = _begin(*(["--headless"] if headless else []))
+
+    def opened() -> Shown:
+        client = ViewerClient.connect(f"rerun+http://127.0.0.1:{port}/proxy")
+        for file in replays_with(replay, more):
+            client.open(str(file.resolve()))
+        client.set_time("time", duration=at_s, play_state="paused")
+        return Shown(process, client)
+
+    return _once_up(process, opened, f"Rerun did not show {replay}; try `liex show` in a terminal")
 
 
 def begin_viewer() -> str:
@@ -134,29 +137,40 @@ def begin_viewer() -> str:
         LiexError: there is no screen, or the viewer does not come up within 30 s.
     """
     need_screen("have it written to a file, or name the address of a viewer elsewhere")
-    port = _free_port()
-    process = _begin("--port", str(port), "--hide-welcome-screen", stays=True)
+    port, process = _begin(stays=True)
+    connect = partial(socket.create_connection, ("127.0.0.1", port), timeout=1.0)
+    failed = "Rerun's viewer did not open; have it written to a file NAME.rrd instead"
+    _once_up(process, connect, failed).close()
+    return f"rerun+http://127.0.0.1:{port}/proxy"
+
+
+def _once_up(process: subprocess.Popen[bytes], attempt: Callable[[], Made], failed: str) -> Made:
+    """What an attempt returns that is repeated until the viewer is up.
+
+    Raises:
+        LiexError: the viewer ended, or is not up within 30 s.
+    """
     ends = time.monotonic() + _PATIENCE_S
+    why = "it ended at once"
     while time.monotonic() < ends and process.poll() is None:
         try:
-            socket.create_connection(("127.0.0.1", port), timeout=1.0).close()
-        except OSError:  # not up yet
-            time.sleep(0.1)
-        else:
-            return f"rerun+http://127.0.0.1:{port}/proxy"
+            return attempt()
+        except Exception as error:  # not up yet; what Rerun raises then is not documented
+            why = str(error).partition("\n")[0][:200]
+            time.sleep(0.2)
     _end(process)
-    raise LiexError("Rerun's viewer did not open; have it written to a file NAME.rrd instead")
+    sentence, _, remedy = failed.partition("; ")
+    raise LiexError(f"{sentence} ({why}); {remedy}")
 
 
-def _free_port() -> int:
+def _begin(*arguments: str, stays: bool = False) -> tuple[int, subprocess.Popen[bytes]]:
+    """Start a viewer; returns its port and its process."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
-
-
-def _begin(*arguments: str, stays: bool = False) -> subprocess.Popen[bytes]:
-    # RERUN_ANALYTICS: what a laboratory looks at is nobody else's business
-    command = own_python("-m", "rerun", *arguments, "--bind", "127.0.0.1")
+        port = int(probe.getsockname()[1])
+    given = ("--port", str(port), "--hide-welcome-screen", "--bind", "127.0.0.1")
+    command = own_python("-m", "rerun", *given, *arguments)
+    # RERUN_ANALYTICS: a laboratory's data are nobody else's business
     viewer = subprocess.Popen(
         command,
         env={**os.environ, "RERUN_ANALYTICS": "0"},
@@ -167,7 +181,7 @@ def _begin(*arguments: str, stays: bool = False) -> subprocess.Popen[bytes]:
     )
     if not stays:
         atexit.register(_end, viewer)
-    return viewer
+    return port, viewer
 
 
 def _end(viewer: subprocess.Popen[bytes]) -> None:
@@ -178,3 +192,88 @@ def _end(viewer: subprocess.Popen[bytes]) -> None:
         else:
             viewer.terminate()
         viewer.wait(timeout=10)
+
+
+# Live stream of depth and skeletons to a Rerun viewer, in a scene of metres.
+
+
+ERROR = "error/predicted"
+_DEPTH_EVERY = 5  # frames; an image takes longer to send than a skeleton
+
+
+class LiveView:
+    """A stream of depth and skeletons while the recording goes on.
+
+    Args:
+        name: the recording's name.
+        camera: the depth camera.
+        T_arena_camera: carries the camera frame (mm) into the arena frame.
+        skeleton: the animal's skeleton.
+        to: 'viewer' starts a viewer on this machine; a name ending in .rrd is a file to write; else
+            the address of a viewer.
+        blueprint: the layout, a Rerun blueprint; None if absent.
+
+    Raises:
+        LiexError: there is no screen for a viewer.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        camera: Camera,
+        T_arena_camera: SE3,
+        skeleton: Skeleton,
+        to: str,
+        blueprint: Any = None,
+    ) -> None:
+        self._edges = skeleton.edges
+        self._stream = rr.RecordingStream(
+            "liex_lab", recording_id=f"live-{name}", send_properties=False
+        )
+        if to.endswith(".rrd"):
+            self._stream.save(Path(to))
+        else:
+            self._stream.connect_grpc(begin_viewer() if to == "viewer" else to)
+        if blueprint is not None:
+            self._stream.send_blueprint(blueprint)
+        self._floor_mm = float(T_arena_camera.translation[2])
+        log_camera(self._stream, camera, T_arena_camera)
+        dot_m = dot_mm(skeleton) / MM_PER_UNIT
+        dots = rr.Points3D.from_fields(radii=dot_m, colors=JOINT_COLOUR)
+        self._stream.log(f"{SKELETON}/joints", dots, static=True)
+        lines = rr.LineStrips3D.from_fields(radii=dot_m / 2.0, colors=BONE_COLOUR)
+        self._stream.log(f"{SKELETON}/bones", lines, static=True)
+        self._first_ns: int | None = None
+        self._range: Any = None
+
+    def show(self, frame: DepthFrame, row: Track) -> None:
+        """Show the skeleton of one frame and, every fifth frame, the depth image.
+
+        Args:
+            frame: the frame.
+            row: its track of one row; without a pose the last skeleton goes.
+        """
+        self._first_ns = frame.time_ns if self._first_ns is None else self._first_ns
+        self._stream.set_time("frame", sequence=frame.index)
+        self._stream.set_time("time", duration=np.timedelta64(frame.time_ns - self._first_ns, "ns"))
+        if row.posed[0]:
+            joints_m = row.joints_mm[0] / MM_PER_UNIT
+            bones = [joints_m[list(edge)] for edge in self._edges]
+            self._stream.log(f"{SKELETON}/joints", rr.Points3D(joints_m))
+            self._stream.log(f"{SKELETON}/bones", rr.LineStrips3D(bones))
+            self._stream.log(ERROR, rr.Scalars(float(row.predicted_error_mm[0])))
+        else:
+            self._stream.log(f"{SKELETON}/joints", rr.Points3D([]))
+            self._stream.log(f"{SKELETON}/bones", rr.LineStrips3D([]))
+        if frame.index % _DEPTH_EVERY == 0:
+            depth = np.clip(np.rint(frame.depth), 0, 65535).astype(np.uint16)
+            if not self._range:
+                self._range = colour_range(depth, self._floor_mm)
+            look: dict[str, Any] = {"colormap": "viridis", "point_fill_ratio": 0.25}
+            picture = rr.DepthImage(depth, meter=MM_PER_UNIT, depth_range=self._range, **look)
+            self._stream.log(DEPTH, picture)
+
+    def close(self) -> None:
+        """Send what is held back, and end the stream."""
+        self._stream.flush()
+        self._stream.disconnect()

@@ -2,7 +2,7 @@
 
 The session grows in the folder NAME.part beside its final place. Depth streams straight into the
 Rerun replay and the MCAP file; tables are written at the end. A checkpoint every few seconds lets
-an interrupted run go on there (see `liex_lab.sessions.checkpoint`).
+an interrupted run resume there (see `liex_lab.sessions.checkpoint`).
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
+from dataclasses import fields
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -28,23 +29,15 @@ from liex_lab.errors import LiexError, SessionError
 from liex_lab.runtime.durable import put_in_place, sync_tree
 from liex_lab.runtime.memory import Allocator, on_disk, peak_memory_mb, rest
 from liex_lab.runtime.places import is_full, probe_full, storable_document, unlinked_tree, why_full
-from liex_lab.sessions.buffer import Columnar, TrackBuffer, columns_of
+from liex_lab.sessions.backups import corrections_for, note_taken, put_back_held, put_back_session
 from liex_lab.sessions.checkpoint import LOGS, Checkpoint
 from liex_lab.sessions.corrections import FOLDER
-from liex_lab.sessions.cutouts import Boxes, PictureKeeper, write_boxes
+from liex_lab.sessions.cutouts import Boxes, DepthKeeper, write_boxes
 from liex_lab.sessions.evidence import write_evidence
-from liex_lab.sessions.older import (
-    aside_folder,
-    corrections_for,
-    note_taken,
-    part_folder,
-    put_back_held,
-    put_back_session,
-)
-from liex_lab.sessions.place import check_place, file_facts
+from liex_lab.sessions.folder import aside_folder, check_writable, file_facts, part_folder
 from liex_lab.sessions.provenance import Provenance
-from liex_lab.sessions.results import Results
-from liex_lab.sessions.thumbnails import Keepsakes
+from liex_lab.sessions.thumbnails import Thumbnails
+from liex_lab.sessions.track_tables import Results
 from liex_lab.tables import schema
 from liex_lab.tables.rows import Rows, rows_only
 from liex_lab.tables.schema import Column
@@ -105,7 +98,7 @@ class SessionWriter:
     ) -> None:
         path = Path(path)
         put_back_session(path)
-        check_place(path, overwrite)
+        check_writable(path, overwrite)
         self.path = path
         self.origin = origin
         self._overwrite = overwrite
@@ -113,16 +106,16 @@ class SessionWriter:
         self._document = origin.document()
         self._started = time.perf_counter()
         self._seconds = 0.0
-        self._held = TrackBuffer(origin.skeleton, 0)
+        self._track = Track.empty(origin.skeleton, np.zeros(0, np.int64))
         self._rows: Rows | None = None
         self._flips: Sequence[Flip] = ()
         self._candidates: Observations | None = None
         self._together: Observations | None = None
-        self._keepsakes = Keepsakes()
-        self._keeper = PictureKeeper(origin)
+        self._thumbnails = Thumbnails()
+        self._keeper = DepthKeeper(origin)
         self._done = False
         self._folder = part_folder(path)
-        self._checkpoint = unfinished(path, origin)
+        self._checkpoint = open_unfinished(path, origin)
         before = self._checkpoint.seen.read()
         self._index, self._times_ns = (
             array("q", before.get(name, np.zeros(0, np.int64)).tobytes()) for name in (INDEX, TIMES)
@@ -147,7 +140,7 @@ class SessionWriter:
         self._replay = ReplayWriter(self._checkpoint.replay, self.origin, made)
         self._mcap = McapWriter(messages, self.origin, resume=messages.is_file())
         if self._times_ns:
-            self._replay.go_on(self._times_ns[0])
+            self._replay.resume(self._times_ns[0])
 
     def __enter__(self) -> SessionWriter:
         return self
@@ -181,39 +174,33 @@ class SessionWriter:
         """
         return len(self._index)
 
-    def go_on(self, depth: Callable[[int], NDArray[np.float32]]) -> None:
-        """Look once more at the few frames kept for the report, where some frames are in already.
+    def resume(self, depth: Callable[[int], NDArray[np.float32]]) -> None:
+        """Sample frames for the thumbnails again if some frames are in the session already.
 
         Args:
             depth: depth (H, W) float32 mm of a frame by its row.
         """
-        self._keepsakes.again(self.n_frames, depth)
+        self._thumbnails.resume(self.n_frames, depth)
 
     def add(
         self,
         frames: Sequence[DepthFrame],
-        track_part: Track | None = None,
-        seen: Columnar | None = None,
+        seen: Observations | Track | None = None,
     ) -> None:
         """Write consecutive frames.
 
         Args:
             frames: the next frames.
-            track_part: their rows of the track, unless `close` gets the whole track.
-            seen: their observations, one row per frame, kept on disk until the session is whole: an
-                interrupted run can go on from there, see `seen`. They say where the animal is,
-                around which the depth is kept.
+            seen: their observations, one row per frame, kept on disk until the session is whole so
+                that an interrupted run can resume. The depth around the animal in them is kept.
 
         Raises:
-            SessionError: the track part is of other frames, or a log could not be written.
+            SessionError: a log could not be written.
         """
         if not frames:
             return
         began = time.perf_counter()
         times = [int(frame.time_ns) for frame in frames]
-        if track_part is not None:
-            _check_times(np.array(times, np.int64), track_part)
-            self._held.append(track_part)
         index = [int(frame.index) for frame in frames]
         # of all frames at once, as a call costs as much as a frame
         boxes = self._keeper.boxes(seen if isinstance(seen, Observations) else None)
@@ -231,14 +218,13 @@ class SessionWriter:
             )
             self._logging.append(messages.submit(self._mcap.add, times[part], kept))
             for image in depth:
-                self._keepsakes.add(image)
-        self._rows = None
+                self._thumbnails.add(image)
         self._index.extend(index)
         self._times_ns.extend(times)
         if seen is not None:
             self._checkpoint.seen.append(seen_rows(frames, seen, boxes))
         if self._checkpoint.due:
-            self._take_down()
+            self._save_checkpoint()
         self._seconds += time.perf_counter() - began
 
     def seen(self, kind: Callable[..., Kept]) -> Kept:
@@ -264,9 +250,9 @@ class SessionWriter:
         for logger in self._loggers.values():
             logger.shutdown(cancel_futures=True)
 
-    def _take_down(self) -> None:
+    def _save_checkpoint(self) -> None:
         """A checkpoint: everything so far need not be done again. Only what `seen` was given for
-        can go on.
+        can resume.
         """
         self._drain()
         sizes = self._replay.flushed(), self._mcap.flushed()
@@ -285,7 +271,7 @@ class SessionWriter:
     @property
     def track(self) -> Track:
         """The track so far, one row per frame."""
-        return self._held.track
+        return self._track
 
     @track.setter
     def track(self, track: Track) -> None:
@@ -298,7 +284,7 @@ class SessionWriter:
             SessionError: the track is of other frames.
         """
         _check_times(np.array(self._times_ns, np.int64), track)
-        self._held = TrackBuffer.of(track)
+        self._track = track
         self._rows = None
 
     def take(self, tracked: Tracked, seen: Observations, subject: Subject) -> None:
@@ -364,7 +350,7 @@ class SessionWriter:
         """Write everything else and put the session in its place; returns it opened.
 
         Corrections of the session that was there are taken over; where there was none, those of an
-        outdated copy of it (see `liex_lab.sessions.older`), and session.json says so under
+        outdated copy of it (see `liex_lab.sessions.backups`), and session.json states it under
         `corrections_taken_from`.
 
         The report is written last; where that fails the session is kept all the same.
@@ -389,39 +375,30 @@ class SessionWriter:
         began = time.perf_counter()
         self._drain()
         if self._checkpoint.state.n_frames:  # it took long: what follows may be interrupted, too
-            self._take_down()
+            self._save_checkpoint()
         rows = self.rows
         _check_times(np.array(self._times_ns, np.int64), rows.track)
-        results = dict(results or {})
-        if "bouts" not in results:
-            results["bouts"] = schema.empty_table(
-                [*schema.BOUTS, *(c for c in columns if c.table == "bouts")]
-            )
+        if results is None:
+            results = {"bouts": schema.empty_table(schema.BOUTS), "kinematics": rows_only(rows)}
         bouts = results["bouts"]
-        if "kinematics" not in results:
-            results["kinematics"] = rows_only(rows)
-        kinematics = results["kinematics"]
         of_track = Results(self.origin, rows, self._flips)
         of_track.write_track(self._folder)
         of_track.write_measured(self._folder, results, columns)
         rest()
-        words = [
-            *(actions or {}),
-            *sorted({str(word) for word in bouts["action"]} - set(actions or {})),
-        ]
+        actions = dict(actions or {})
+        actions |= dict.fromkeys(sorted({str(word) for word in bouts["action"]} - set(actions)), "")
+        words = [*actions]
         problems = self._document["problems"]
-        self._replay.finish(rows, kinematics, bouts, words, problems, self._candidates)
+        self._replay.finish(rows, results["kinematics"], bouts, words, problems, self._candidates)
         self._mcap.finish(rows, bouts, words, problems)
         self._checkpoint.join_replay()
         kept = self._checkpoint.seen.read()
         if BOXES in kept:
             write_boxes(self._folder, kept[BOXES])
-        self.note(
-            actions={word: (actions or {}).get(word, "") for word in words}, **dict(record or {})
-        )
-        self._document["thumbnails"] = self._keepsakes.save(self._folder, rows, self.origin.camera)
+        self.note(actions=actions, **dict(record or {}))
+        self._document["thumbnails"] = self._thumbnails.save(self._folder, rows, self.origin.camera)
         if self._together is not None:
-            whole = self._keepsakes.save_whole(self._folder, rows, self._together)
+            whole = self._thumbnails.save_whole(self._folder, rows, self._together)
             self._document |= {} if whole is None else {"whole_picture": whole}
         (self._folder / "plan.toml").write_text(self.origin.plan_toml, encoding="utf-8")
         self._seconds += time.perf_counter() - began
@@ -489,8 +466,8 @@ class SessionWriter:
     def _publish(self) -> None:
         """Put the whole folder in place; an older session goes only when this one is on disk."""
         put_back_held(self.path)
-        check_place(self.path, self._overwrite)
-        sync_tree(self._folder)  # hours may lie there; until it is done the work can go on
+        check_writable(self.path, self._overwrite)
+        sync_tree(self._folder)  # hours may lie there; until it is done the work can resume
         made = corrections_for(self.path)
         copy = self._folder / FOLDER
         shutil.rmtree(copy, ignore_errors=True)
@@ -521,7 +498,7 @@ def full_disk(folder: Path, error: BaseException | None) -> str | None:
 
     Args:
         folder: the folder that is written to.
-        error: the error under way; None for none.
+        error: the error under way; None if absent.
     """
     if error is None or isinstance(error, LiexError) or not isinstance(error, Exception):
         return None
@@ -533,26 +510,28 @@ def full_disk(folder: Path, error: BaseException | None) -> str | None:
 
 
 def seen_rows(
-    frames: Sequence[DepthFrame], seen: Columnar, boxes: Boxes | None = None
+    frames: Sequence[DepthFrame], seen: Observations | Track, boxes: Boxes | None = None
 ) -> dict[str, NDArray[Any]]:
     """Columns kept on disk of consecutive frames: observations, camera's frame count, time (ns).
 
     Args:
         frames: n consecutive frames.
         seen: their observations, n rows.
-        boxes: (n, K, 4) where their kept pictures are not the background; None where whole
-            pictures are kept.
+        boxes: (n, K, 4) where their kept images are not the background; None if whole
+            images are kept.
 
     Returns:
         Arrays (n, ...) by name.
     """
-    index, times = ([getattr(frame, name) for frame in frames] for name in ("index", "time_ns"))
-    counted = {INDEX: np.array(index, np.int64), TIMES: np.array(times, np.int64)}
-    return {**columns_of(seen), **counted, **({} if boxes is None else {BOXES: boxes})}
+    columns: dict[str, Any] = {one.name: getattr(seen, one.name) for one in fields(seen)}
+    columns = {name: kept for name, kept in columns.items() if isinstance(kept, np.ndarray)}
+    columns[INDEX] = np.array([frame.index for frame in frames], np.int64)
+    columns[TIMES] = np.array([frame.time_ns for frame in frames], np.int64)
+    return columns if boxes is None else {**columns, BOXES: boxes}
 
 
-def unfinished(path: Path, origin: Provenance) -> Checkpoint:
-    """Open the unfinished session of a place, begun or gone on with.
+def open_unfinished(path: Path, origin: Provenance) -> Checkpoint:
+    """Open the unfinished session of a place, begun or resumed.
 
     Args:
         path: where the session will be.

@@ -95,7 +95,7 @@ def _written(
 def _measured(recording: Path, place: Path) -> dict[str, float]:
     """The numbers of one recording."""
     from liex_lab.sessions import Session
-    from liex_lab.sessions.room import folder_bytes
+    from liex_lab.sessions.folder import folder_bytes
 
     before = read_alone(recording, 1)
     with_start, whole = _run(recording, place / "results")

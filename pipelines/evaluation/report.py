@@ -98,9 +98,8 @@ def repeat_session(session: Session, folder: Path, seconds: float) -> tuple[int,
         Its number of frames, and its length in s.
     """
     from liex_lab.behaviour.summary import measure_rows, stated_by
-    from liex_lab.sessions.evidence import provenance_of
-    from liex_lab.sessions.results import Results
-    from liex_lab.sessions.tracks import track_of
+    from liex_lab.sessions.evidence import provenance_of, track_of
+    from liex_lab.sessions.track_tables import Results
     from liex_lab.tables.rows import Rows, stop_times
 
     time_s = session.frames["time_s"].to_numpy(float)

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 from liex_lab.errors import StudyError
 from liex_lab.plan.study import PlannedSession
 from liex_lab.runtime.progress import Progress
-from liex_lab.sessions.failure import describe_failure
+from liex_lab.sessions.folder import describe_failure
 
 from ..workers import Done, Work
 from .one_session import RunSession, measure_one, quarantine

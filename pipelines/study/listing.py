@@ -8,9 +8,8 @@ from pathlib import Path
 from liex_lab.errors import LiexError, StudyError
 from liex_lab.plan.study import STUDY_FILE, Study
 from liex_lab.sessions import Session
-from liex_lab.sessions.failure import FAILED_FILE, read_failure
-from liex_lab.sessions.listed import WHO, Entry
-from liex_lab.sessions.verdict import verdict_in
+from liex_lab.sessions.folder import FAILED_FILE, read_failure
+from liex_lab.sessions.verdict import WHO, Entry, verdict_in
 
 from ..compare import find_sessions
 from .status import SessionStatus, standings, to_look_at

@@ -11,8 +11,8 @@ from liex_lab.errors import RecordingError
 from liex_lab.plan import Plan
 from liex_lab.plan.study import PlannedSession
 from liex_lab.runtime.progress import Progress, silent
-from liex_lab.sessions.failure import describe_failure, read_failure, write_failure
-from liex_lab.sessions.older import set_outdated, taken_from
+from liex_lab.sessions.backups import set_outdated, taken_from
+from liex_lab.sessions.folder import describe_failure, read_failure, write_failure
 from liex_lab.sessions.verdict import read_verdict
 
 from ..shards import MEASURING

@@ -28,7 +28,7 @@ from liex_lab.runtime.durable import write_whole
 from liex_lab.runtime.places import storable_document, unlinked
 from liex_lab.runtime.progress import Progress, silent
 from liex_lab.runtime.threads import in_background
-from liex_lab.sessions.failure import describe_failure
+from liex_lab.sessions.folder import describe_failure
 from liex_lab.sessions.provenance import SCHEMA_VERSION, versions
 
 from .changes import input_stamp, what_changed

@@ -17,9 +17,8 @@ from liex_lab.plan import Plan
 from liex_lab.plan.study import PlannedSession, Study
 from liex_lab.plan.subject import find_subject, same
 from liex_lab.sessions.corrections import DESCRIBED, START, read_log, with_description
-from liex_lab.sessions.failure import read_failure
-from liex_lab.sessions.listed import state_in_words
-from liex_lab.sessions.verdict import CAUTION, LOOK_AT_IT, verdict_in
+from liex_lab.sessions.folder import read_failure
+from liex_lab.sessions.verdict import CAUTION, LOOK_AT_IT, state_in_words, verdict_in
 
 from .changes import what_changed
 from .sharing import shared_sessions

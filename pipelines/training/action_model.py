@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from liex_lab.errors import LiexError
 from liex_lab.runtime.progress import Progress, silent
-from liex_lab.sessions.tracks import track_of, wall_of
+from liex_lab.sessions.evidence import track_of, wall_of
 from liex_lab.simulation.agents import fish, mouse
 
 from .agent_tracks import Scenario

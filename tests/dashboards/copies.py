@@ -15,7 +15,7 @@ from liex_lab.dashboards.report.report import write_report
 
 from liex_lab.scene.outline import Arena
 from liex_lab.sessions import Session
-from liex_lab.sessions.failure import write_failure
+from liex_lab.sessions.folder import write_failure
 from tests.sessions.walking_mouse import WalkingMouse, steady, write
 
 GROUPS = (

@@ -32,7 +32,7 @@ from liex_lab import api, cli
 from liex_lab.actions.vocabulary import PALETTE, UNLABELLED, action_colours
 from liex_lab.errors import LiexError, SessionError
 from liex_lab.sessions import Session
-from liex_lab.sessions.listed import Entry
+from liex_lab.sessions.verdict import Entry
 from tests.dashboards import copies
 
 KEY = "sub-m003_ses-01"

@@ -266,8 +266,9 @@ def test_a_session_of_an_older_version_can_be_reported_measured_and_exported(tmp
 
 def test_a_session_without_behaviour_has_a_report_too(tmp_path):
     with SessionWriter(tmp_path / "bare.liex", MOUSE.provenance(), report=write_report) as writer:
-        for frames, track in MOUSE.chunks(20):
-            writer.add(frames, track)
+        for frames, _ in MOUSE.chunks(20):
+            writer.add(frames)
+        writer.track = MOUSE.track()
         session = writer.close()
     assert "Over time" in (session.path / "report.html").read_text()
 

@@ -14,7 +14,7 @@ import pytest
 
 from liex_lab.exchange import export
 from liex_lab.sessions import Session
-from liex_lab.sessions.videos import video_path
+from liex_lab.sessions.session import video_path
 
 READER = Path(__file__).with_name("boris_reader.py")
 

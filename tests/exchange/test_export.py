@@ -23,7 +23,7 @@ from liex_lab import cli
 from liex_lab.errors import MissingPackageError, SessionError
 from liex_lab.exchange import TARGETS, export
 from liex_lab.sessions import Session
-from liex_lab.sessions.pose_arrays import Poses
+from liex_lab.sessions.track_tables import Poses
 from liex_lab.tables.rows import Rows
 from liex_lab.tables.schema import POSES, to_pandas
 from tests.sessions.walking_mouse import WalkingMouse, steady, write

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 
 from liex_lab import cli
 from liex_lab.errors import SessionError
-from liex_lab.sessions.failure import write_failure
+from liex_lab.sessions.folder import write_failure
 from liex_lab.sessions.verdict import OTHER_ANIMAL
 from tests.sessions.walking_mouse import WalkingMouse, steady, write
 

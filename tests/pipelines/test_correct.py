@@ -26,7 +26,7 @@ from liex_lab.exchange import export
 from liex_lab.plan import Plan
 from liex_lab.sessions import Session, correcting
 from liex_lab.sessions.corrections import Correction, Entry, Log, read_log
-from liex_lab.sessions.tracks import track_of
+from liex_lab.sessions.evidence import track_of
 from tests.golden.test_golden import golden  # noqa: F401
 from tests.sessions.walking_mouse import FLOOR_MM, WalkingMouse, write
 

@@ -23,7 +23,7 @@ from liex_lab.sessions import Session, correcting
 from liex_lab.sessions.applying import corrected_track
 from liex_lab.sessions.correcting import disagreements, flip_span
 from liex_lab.sessions.corrections import Entry, FlipSpan, JointMove, Log
-from liex_lab.sessions.tracks import skeleton_of, track_of
+from liex_lab.sessions.evidence import skeleton_of, track_of
 
 ADDRESS = "synthetic:walk?seed=3&frames=30&sensor=primesense-qvga&spine_mm=70"
 SPAN = slice(9, 18)

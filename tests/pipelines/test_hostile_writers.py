@@ -28,8 +28,8 @@ from liex_lab.runtime.durable import locked, take_lock
 from liex_lab.runtime.places import inside, safe_name
 from liex_lab.sessions import Session
 from liex_lab.sessions.corrections import BoutEdit, Description
-from liex_lab.sessions.failure import describe_failure, write_failure
-from liex_lab.sessions.videos import video_path
+from liex_lab.sessions.folder import describe_failure, write_failure
+from liex_lab.sessions.session import video_path
 from tests.hostile_names import NAMES
 from tests.sessions.walking_mouse import WalkingMouse, steady, write
 

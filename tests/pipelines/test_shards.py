@@ -24,7 +24,7 @@ from liex_lab.plan import Plan
 from liex_lab.recordings.formats import moseq
 from liex_lab.recordings.recording import Recording
 from liex_lab.sessions import Session
-from liex_lab.sessions.source import linked_recording
+from liex_lab.sessions.evidence import linked_recording
 from tests.pipelines.test_session import N_RENDERED, folder, mouse, pictures, session, times_ns  # noqa: F401
 from tests.recordings.writers import write_archive, write_camera, write_moseq_folder
 from tests.sessions.test_checkpoint import depth_messages, tables_of

@@ -17,7 +17,7 @@ from liex_lab.catalog import find_sample
 from liex_lab.errors import LiexError, RecordingError
 from liex_lab.recordings.formats.messages import messages
 from liex_lab.runtime.memory import check_limits, why_short
-from liex_lab.sessions.failure import describe_failure
+from liex_lab.sessions.folder import describe_failure
 
 SAMPLE = find_sample("mouse_walk.mcap")
 

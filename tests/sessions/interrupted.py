@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import multiprocessing
 import time
+from collections.abc import Callable
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 
@@ -45,7 +46,7 @@ def _write(place: str, pause_s: float) -> None:
     from liex_lab.tracking.track import Track
 
     with SessionWriter(place, MOUSE.provenance(), overwrite=True) as writer:
-        writer.go_on(lambda row: MOUSE.frame(row).depth)
+        writer.resume(lambda row: MOUSE.frame(row).depth)
         for frames, track in MOUSE.chunks(CHUNK):
             if frames[0].index >= writer.n_frames:
                 writer.add(frames, seen=track)
@@ -55,11 +56,16 @@ def _write(place: str, pause_s: float) -> None:
 
 
 def start(place: Path, pause_s: float = 0.0, every_s: float = 0.0) -> BaseProcess:
-    """A process that writes the session. It is forked off a server that has everything imported,
-    and no threads.
-    """
+    """A process that writes the session."""
+    return forked(write_session, str(place), pause_s, every_s)
+
+
+def forked(work: Callable[..., object], *arguments: object) -> BaseProcess:
+    """A process forked off a server that has everything imported, and no threads."""
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(_PRELOADED)
-    process = context.Process(target=write_session, args=(str(place), pause_s, every_s))
-    process.start()
+    process = context.Process(target=work, args=arguments)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("RUST_LOG", "off")  # of the server, when it is started
+        process.start()
     return process

@@ -16,8 +16,7 @@ from mcap.reader import make_reader
 
 from liex_lab.errors import SessionError
 from liex_lab.sessions import Session, SessionWriter, checkpoint, rrd, rrd_depth
-from liex_lab.sessions.checkpoint import Checkpoint, Columns
-from liex_lab.sessions.rrd_file import rrd_messages
+from liex_lab.sessions.checkpoint import Checkpoint, Columns, rrd_messages
 from tests.sessions.interrupted import CHUNK, MOUSE, start, write_session
 from tests.sessions.test_rrd import columns_of
 
@@ -132,7 +131,9 @@ def test_two_processes_do_not_write_one_session(tmp_path: Path) -> None:
     with SessionWriter(place, MOUSE.provenance()) as writer:
         with pytest.raises(SessionError, match="another process is writing the session"):
             SessionWriter(place, MOUSE.provenance())
-        writer.add(*next(MOUSE.chunks(10)))
+        frames, track = next(MOUSE.chunks(10))
+        writer.add(frames)
+        writer.track = track
         writer.close()
     assert len(Session.open(place).frames) == 10
 

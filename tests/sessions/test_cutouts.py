@@ -21,21 +21,21 @@ from liex_lab.recordings.depth_kernels import to_millimetres, unpack_rvl
 from liex_lab.recordings.formats.messages.mcap import McapFile
 from liex_lab.recordings.frame import region_mask
 from liex_lab.sessions import Session, SessionWriter, correcting
+from liex_lab.sessions.checkpoint import append_rrd
 from liex_lab.sessions.cutouts import (
     FILE,
     N_BOXES,
     N_WINDOWS,
+    DepthKeeper,
     Kept,
-    PictureKeeper,
     boxes_around,
     composed,
     open_pictures,
     window_around,
     windows,
 )
+from liex_lab.sessions.evidence import link_to, linked_recording
 from liex_lab.sessions.rrd import ReplayWriter
-from liex_lab.sessions.rrd_file import append_rrd
-from liex_lab.sessions.source import link_to, linked_recording
 from liex_lab.tracking.observations import Observations
 from tests.sessions.test_rrd import columns_of
 from tests.sessions.walking_mouse import FLOOR_MM, WalkingMouse, steady
@@ -76,9 +76,10 @@ def written(folder: Path, depth: str, **own: Any) -> Session:
     )
     with SessionWriter(folder, origin, **own) as writer:
         done = 0
-        for frames, track in MOUSE.chunks(20):
-            writer.add(frames, track, SEEN[done : done + len(frames)])
+        for frames, _ in MOUSE.chunks(20):
+            writer.add(frames, SEEN[done : done + len(frames)])
             done += len(frames)
+        writer.track = MOUSE.track()
         return writer.close()
 
 
@@ -267,7 +268,7 @@ def test_of_every_cut_out_one_window_is_shown_at_a_time_also_where_a_run_went_on
         path = tmp_path / f"{number}.rrd"
         replay = ReplayWriter(path, origin)
         if number:
-            replay.go_on(0)
+            replay.resume(0)
         frames = list(range(150)[part])
         replay.add(
             frames, [k * 33_000_000 for k in frames], [BACKGROUND] * len(frames), boxes[part]
@@ -334,7 +335,7 @@ def test_damaged_boxes_are_told_in_a_sentence(session: Session, tmp_path: Path) 
 
 
 def test_nobody_looked_so_everything_is_kept() -> None:
-    keeper = PictureKeeper(MOUSE.provenance(replay_depth="animal", background=BACKGROUND))
+    keeper = DepthKeeper(MOUSE.provenance(replay_depth="animal", background=BACKGROUND))
     depth = MOUSE.frame(0).depth
     boxes = keeper.boxes(None)
     assert boxes is None

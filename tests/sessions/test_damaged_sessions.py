@@ -21,7 +21,7 @@ from liex_lab.errors import LiexError, SessionError
 from liex_lab.sessions import Session
 from liex_lab.sessions.checkpoint import LOGS, Checkpoint
 from liex_lab.sessions.evidence import read_evidence, read_flips, write_evidence
-from liex_lab.sessions.failure import read_failure
+from liex_lab.sessions.folder import read_failure
 from liex_lab.tracking.observations import Observations
 from liex_lab.tracking.track import Subject
 from tests.damage import ANYTHING, check, damage

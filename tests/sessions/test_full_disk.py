@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import errno
 import os
-import subprocess
+import resource
+import signal
 import sys
 import time
 from pathlib import Path
@@ -17,26 +18,25 @@ from typing import Any
 import pytest
 
 import liex_lab.sessions.rrd as replay
-from liex_lab.errors import SessionError
+from liex_lab.errors import LiexError, SessionError
 from liex_lab.runtime.places import is_full, why_full
 from liex_lab.sessions import SessionWriter
-from tests.sessions.interrupted import MOUSE, write_session
+from tests.sessions.interrupted import MOUSE, forked, write_session
 
 FULL = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-_LIMITED = """
-import resource, signal, sys
-from liex_lab.errors import LiexError
-from tests.sessions.interrupted import write_session
-import liex_lab.sessions.rrd, liex_lab.sessions.mcap, liex_lab.behaviour, pyarrow.parquet
-liex_lab.sessions.rrd._PATIENCE_S = 3.0  # no probe meets a limit above its own size
-signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[2]), int(sys.argv[2])))
-try:
-    write_session(sys.argv[1])
-except LiexError as error:
-    print(error, file=sys.stderr)
-    sys.exit(1)
-"""
+
+
+def limited(place: str, limit: int, told: str) -> None:
+    """Write the session where no file may be larger; what is said goes to a file."""
+    os.dup2(os.open(told, os.O_WRONLY | os.O_CREAT), 2)
+    replay._PATIENCE_S = 3.0  # no probe meets a limit above its own size
+    signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
+    try:
+        write_session(place)
+    except LiexError as error:
+        os.write(2, f"{error}\n".encode())
+        sys.exit(1)
 
 
 # the last four after the last frame: the track is put into the replay, and then its index
@@ -47,23 +47,18 @@ def test_a_session_that_meets_a_limit_ends_in_a_sentence_and_goes_on_later(
     tmp_path: Path, limit: int
 ) -> None:
     place = tmp_path / "walk.liex"
-    done = subprocess.run(
-        [sys.executable, "-c", _LIMITED, str(place), str(limit)],
-        capture_output=True,
-        text=True,
-        timeout=90,
-        env={**os.environ, "RUST_LOG": "off"},
-        check=False,
-    )
-    assert done.returncode == 1, done.stderr
-    assert len(done.stderr.splitlines()) == 1, done.stderr
-    assert str(tmp_path) in done.stderr
-    assert "full" in done.stderr or "was not written whole" in done.stderr
-    assert "run the same command again" in done.stderr
+    process = forked(limited, str(place), limit, str(tmp_path / "told"))
+    process.join(90)
+    told = (tmp_path / "told").read_text()
+    assert process.exitcode == 1, told
+    assert len(told.splitlines()) == 1, told
+    assert str(tmp_path) in told
+    assert "full" in told or "was not written whole" in told
+    assert "run the same command again" in told
     assert not place.exists()
     kept = (tmp_path / "walk.liex.part").is_dir()
-    if "full" in done.stderr:
-        assert kept == ("goes on after" in done.stderr)
+    if "full" in told:
+        assert kept == ("goes on after" in told)
     write_session(str(place))
     assert (place / "session.json").is_file()
 
@@ -97,7 +92,7 @@ def test_a_replay_whose_thread_is_dead_is_let_go_within_seconds(
         with writer:
             frames, track = next(iter(MOUSE.chunks(16)))
             writer.add(frames, seen=track)
-            writer._take_down()
+            writer._save_checkpoint()
 
     with pytest.raises(SessionError, match=r"is full \(No space left on device\)"):
         write()

@@ -13,6 +13,7 @@ import pytest
 
 import liex_lab.sessions.rrd as replay
 import liex_lab.sessions.rrd_depth as depth_of
+import liex_lab.sessions.rrd_scene as scene_of
 from liex_lab.body.pose import Pose
 from liex_lab.body.surface import Surface
 from liex_lab.geometry import SE3, so3
@@ -21,7 +22,7 @@ from liex_lab.recordings.timestamps import find_gaps, median_step
 from liex_lab.scene.outline import Arena
 from liex_lab.scene.zones import Zone
 from liex_lab.sessions import SessionWriter
-from liex_lab.sessions.rrd_body import BODY, body_parts
+from liex_lab.sessions.rrd_scene import BODY, body_parts
 from liex_lab.tracking.observations import Observations
 from liex_lab.tracking.track import Subject, Tracked
 from tests.oracles.rvl import unpack_rvl
@@ -98,11 +99,11 @@ def test_walls_and_zones_are_drawn_on_the_floor_and_in_the_picture(tmp_path, str
     nest = Zone("nest a/b", polygon_mm=((0.0, 0.0), (50.0, 0.0), (50.0, 50.0)))
     bowl = Arena("round", (10.0, 0.0), 150.0)
     session = write(tmp_path / "c.liex", WalkingMouse(steady(0.5)), arena=bowl, zones=(nest,))
-    (ring,) = columns_of(session, f"{replay.FLOOR}/walls")["LineStrips3D:strips"][0]
+    (ring,) = columns_of(session, f"{scene_of.FLOOR}/walls")["LineStrips3D:strips"][0]
     np.testing.assert_allclose(
         np.hypot(np.array(ring)[:, 0] - 0.01, np.array(ring)[:, 1]), 0.15, atol=1e-6
     )
-    (zone,) = columns_of(session, replay.FLOOR + "/zones/nest\\ a\\/b")["LineStrips3D:strips"][0]
+    (zone,) = columns_of(session, scene_of.FLOOR + "/zones/nest\\ a\\/b")["LineStrips3D:strips"][0]
     np.testing.assert_allclose(
         np.array(zone)[:, :2] * 1000, [[0, 0], [50, 0], [50, 50], [0, 0]], atol=1e-4
     )
@@ -156,8 +157,9 @@ def test_a_noisy_frame_takes_less_than_180_kilobytes_and_without_depth_next_to_n
     for depth in ("all", "none"):
         place = tmp_path / f"{depth}.liex"
         with SessionWriter(place, mouse.provenance(replay_depth=depth)) as writer:
-            for frames, track in mouse.chunks(12):
-                writer.add([noisy(frame) for frame in frames], track)
+            for frames, _ in mouse.chunks(12):
+                writer.add([noisy(frame) for frame in frames])
+            writer.track = mouse.track()
             writer.close()
         sizes[depth] = (place / "session.rrd").stat().st_size / 24
     assert sizes["all"] < 180_000

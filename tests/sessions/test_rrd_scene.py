@@ -5,11 +5,20 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import pytest
 
+from liex_lab.body import Skeleton
 from liex_lab.optics.camera import KINECT_V2
 from liex_lab.scene.floor import Floor
 from liex_lab.scene.scene import Fixture, Scene
-from liex_lab.sessions.rrd_scene import FLOOR, OVERLAY, log_hidden_places, log_surroundings
+from liex_lab.sessions.rrd_scene import (
+    FLOOR,
+    OVERLAY,
+    dot_mm,
+    dot_pt,
+    log_hidden_places,
+    log_surroundings,
+)
 from liex_lab.tables.rows import Rows
 from liex_lab.tracking.offline import track_whole
 from tests.tracking.stories import SUBJECT, lose, noisy, told, walk
@@ -65,3 +74,18 @@ def test_the_place_where_the_animal_hid_is_drawn_with_since_when() -> None:
     first = int(np.flatnonzero(track.flag == "hidden")[0])
     (label,) = points.labels.as_arrow_array().to_pylist()
     assert label.startswith(f"hidden {first / 30.0:.1f} to 3.3")
+
+
+@pytest.mark.parametrize("name", ["mouse", "fish", "hand"])
+def test_two_joints_beside_each_other_are_two_dots(name):
+    skeleton = Skeleton.load(name)
+    bones = np.linalg.norm(skeleton.offsets[1:], axis=1)
+    assert 2.0 * dot_mm(skeleton) < np.median(bones)
+    assert 1.5 <= dot_pt(skeleton) <= 3.5
+
+
+def test_a_mouse_is_drawn_thicker_than_a_fish():
+    mouse, fish = Skeleton.load("mouse"), Skeleton.load("fish")
+    assert dot_mm(mouse) == 3.0
+    assert dot_mm(fish) < 1.0
+    assert dot_pt(mouse) > 2.0 * dot_pt(fish)

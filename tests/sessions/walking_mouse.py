@@ -106,7 +106,13 @@ class WalkingMouse:
         return forget(track, self.lost)
 
     def frame(self, row: int) -> DepthFrame:
-        """A depth frame: the floor, and an ellipsoid where the animal is."""
+        """A depth frame: the floor, and an ellipsoid where the animal is; it is kept."""
+        kept = self.__dict__.setdefault("_kept_frames", {})
+        if row not in kept:
+            kept[row] = self._render(row)
+        return kept[row]
+
+    def _render(self, row: int) -> DepthFrame:
         joints = self._joints[row]
         camera = self.camera
         v, u = np.mgrid[: camera.height, : camera.width]
@@ -189,8 +195,9 @@ def write(folder: Path, mouse: WalkingMouse, chunk: int = 20, **more: Any) -> Se
 
     own = {name: more.pop(name) for name in ("overwrite", "blueprint", "report") if name in more}
     with SessionWriter(folder, mouse.provenance(**more), **own) as writer:
-        for frames, track in mouse.chunks(chunk):
-            writer.add(frames, track)
+        for frames, _ in mouse.chunks(chunk):
+            writer.add(frames)
+        writer.track = mouse.track()
         origin = writer.origin
         around = behaviour.Surroundings(origin.arena, [zone.name for zone in origin.zones])
         measured = behaviour.measure_rows(writer.rows, None, around)

@@ -23,7 +23,7 @@ from liex_lab.exchange.boris import read_boris_project
 from liex_lab.sessions import Session
 from liex_lab.sessions.applying import edited_bouts
 from liex_lab.sessions.correcting import labelled_bouts
-from liex_lab.sessions.tracks import track_of, wall_of
+from liex_lab.sessions.evidence import track_of, wall_of
 from liex_lab.simulation.agents import fish
 from liex_lab.simulation.agents import mouse as mouse_acts
 from tests.sessions.walking_mouse import WalkingMouse, write

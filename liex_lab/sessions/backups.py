@@ -16,32 +16,9 @@ from liex_lab.errors import SessionError
 from liex_lab.runtime import durable
 from liex_lab.sessions.checkpoint import hold
 from liex_lab.sessions.corrections import FOLDER, LOG, corrected_folder, read_log
-from liex_lab.sessions.failure import FAILED_FILE
+from liex_lab.sessions.folder import FAILED_FILE, aside_folder, part_folder
 
 _TAKEN = "corrected.taken"  # in an outdated copy: corrections that a later session has, too
-
-
-def part_folder(path: Path) -> Path:
-    """Folder NAME.part in which a session lies until it is whole.
-
-    Args:
-        path: the session folder to be.
-    """
-    return _named(path).with_name(f"{_named(path).name}.part")
-
-
-def aside_folder(path: Path) -> Path:
-    """Folder NAME.old in which a session waits while a new one takes its place.
-
-    Args:
-        path: the session folder.
-    """
-    return _named(path).with_name(f"{_named(path).name}.old")
-
-
-def _named(path: Path) -> Path:
-    """The folder by a name of its own, which "." and ".." are not."""
-    return path if path.name not in ("", "..") else path.resolve()
 
 
 def put_back_session(path: Path) -> bool:
@@ -119,7 +96,7 @@ def set_outdated(path: Path) -> None:
 
 
 def corrections_for(path: Path) -> Path | None:
-    """Folder of the corrections that a new session of a place takes over; None for none.
+    """Folder of the corrections that a new session of a place takes over; None if absent.
 
     They are those of the session that is there; where it has none, those of its newest outdated
     copy that has some which can be read and were not taken over before.

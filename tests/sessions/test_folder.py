@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from liex_lab.errors import SessionError
-from liex_lab.sessions.older import part_folder
-from liex_lab.sessions.room import Shown, check_room, megabytes, needed_bytes
+from liex_lab.sessions.cutouts import needed_bytes
+from liex_lab.sessions.folder import check_room, megabytes, part_folder
 
 Usage = namedtuple("Usage", "total used free")
 RNG = np.random.default_rng(3)
@@ -24,17 +24,17 @@ def free(monkeypatch: pytest.MonkeyPatch, size: int) -> None:
 
 
 def test_more_of_the_depth_takes_more_room_and_noise_packs_badly() -> None:
-    noisy, flat = (Shown(1000, 5, 30.0, pictures) for pictures in (NOISY, FLAT))
-    sizes = [needed_bytes(noisy, kept) for kept in ("none", "animal", "arena", "all")]
+    kinds = ("none", "animal", "arena", "all")
+    sizes = [needed_bytes(NOISY, 1000, 5, 30.0, kept) for kept in kinds]
     assert sizes[0] < sizes[1] < sizes[3] < sizes[2]
-    assert needed_bytes(flat, "all") < 0.2 * needed_bytes(noisy, "all")
+    assert needed_bytes(FLAT, 1000, 5, 30.0, "all") < 0.2 * sizes[3]
 
 
 def test_every_frame_takes_as_much_as_every_other_one() -> None:
     ten, thousand, both = (
-        needed_bytes(Shown(n, 5, 30.0, NOISY)) for n in (10, 1000, 1010)
+        needed_bytes(NOISY, n, 5, 30.0) for n in (10, 1000, 1010)
     )  # and what is there once
-    once = needed_bytes(Shown(0, 5, 30.0, NOISY))
+    once = needed_bytes(NOISY, 0, 5, 30.0)
     assert both - once == (ten - once) + (thousand - once)
 
 

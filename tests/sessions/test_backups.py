@@ -17,9 +17,9 @@ from liex_lab import behaviour
 from liex_lab.plan import Plan
 from liex_lab.sessions import Session, SessionWriter
 from liex_lab.sessions import correcting as ask
+from liex_lab.sessions.backups import put_back_session, set_outdated, taken_from
 from liex_lab.sessions.corrections import read_log
-from liex_lab.sessions.failure import write_failure
-from liex_lab.sessions.older import put_back_session, set_outdated, taken_from
+from liex_lab.sessions.folder import write_failure
 from tests.sessions.kills import check_order, killed_at, recorded
 from tests.sessions.walking_mouse import WalkingMouse, write
 
@@ -86,7 +86,8 @@ def test_nothing_is_put_back_while_a_writer_is_at_work(place: Path) -> None:
         place.rename(old)
         assert not put_back_session(place)
         assert old.is_dir()
-        writer.add([MOUSE.frame(row) for row in range(12)], MOUSE.track())
+        writer.add([MOUSE.frame(row) for row in range(12)])
+        writer.track = MOUSE.track()
         writer.close()
     assert len(read_log(place).entries) == 1
 
@@ -132,8 +133,9 @@ def test_killed_at_any_call_of_publishing_the_corrections_stay(
     place: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with SessionWriter(place, MOUSE.provenance(plan_toml=TOML), overwrite=True) as writer:
-        for frames, track in MOUSE.chunks(20):
-            writer.add(frames, track)
+        for frames, _ in MOUSE.chunks(20):
+            writer.add(frames)
+        writer.track = MOUSE.track()
         measured = behaviour.measure_rows(writer.rows).for_session()
         with monkeypatch.context() as patch:
             patch.setattr(writer, "_publish", lambda: None)
