@@ -71,7 +71,7 @@ def compare_sessions(
             the sessions say.
         engine: `auto`, `permutation` or `mixed`.
         only_trusted: leave out sessions that someone has to look at.
-        progress: told session by session.
+        progress: accounted session by session.
 
     Returns:
         `stats`: the table's rows; `folder`: where the files are; `sessions`: a sentence that
@@ -102,7 +102,7 @@ def compare_sessions(
     check += [f"{one.key}: {one.reason}" for one in entries if one.key in sessions and one.reason]
     grouped = set(table.loc[table["group"].fillna("") != "", "session_id"])
     left |= {key: "has no group" for key, one in sessions.items() if one.name not in grouped}
-    told = _in_words(entries, left)
+    accounted = _in_words(entries, left)
     wanted = list(measures) or usual_measures(table)
     if absent := [name for name in wanted if name not in table]:
         raise SessionError(
@@ -128,7 +128,12 @@ def compare_sessions(
             write_csv(written, part)
     columns = [entry for entry in dictionary(STATS) if entry["table"] == "stats"]
     places_of = [link_to(session.path, target)["path"] for session in sessions.values()]
-    document = {"sessions": places_of, "reference": reference, "accounted": told, "check": check}
+    document = {
+        "sessions": places_of,
+        "reference": reference,
+        "accounted": accounted,
+        "check": check,
+    }
     first = next(iter(sessions.values())).columns
     units = dict(zip(first["name"], first["unit"].fillna(""), strict=True))
     results = [result(row, units.get(row["measure"], "")) for row in stats.to_dict("records")]
@@ -136,12 +141,12 @@ def compare_sessions(
     texts = {
         "columns.json": json.dumps(columns, indent=1, ensure_ascii=False),
         "comparison.json": json.dumps(document, indent=1),
-        "results.txt": "\n".join([*results, "", told, *warned]),
-        "methods.txt": methods(stats, table, [told, *warned]),
+        "results.txt": "\n".join([*results, "", accounted, *warned]),
+        "methods.txt": methods(stats, table, [accounted, *warned]),
     }
     for name, text in texts.items():
         write_whole(target / name, f"{text}\n")
-    return {"stats": stats, "folder": target, "sessions": told, "check": check}
+    return {"stats": stats, "folder": target, "sessions": accounted, "check": check}
 
 
 def _counted_otherwise(sessions: Mapping[str, Session]) -> list[str]:
@@ -160,9 +165,9 @@ def _in_words(entries: Sequence[Entry], left: Mapping[str, str]) -> str:
     """How many sessions there are, how many are compared, and the state of each other one."""
     n = len(entries)
     states = (f"{one.key} {left.get(one.key, one.state)}" for one in entries)
-    said = "; ".join(state for state in states if not state.endswith(" done"))
+    others = "; ".join(state for state in states if not state.endswith(" done"))
     counts = f"{n} session{'s' * (n != 1)} in the study, {n - len(left)} compared"
-    return f"{counts}: {said}" if said else counts
+    return f"{counts}: {others}" if others else counts
 
 
 def account(places: Sequence[str | Path]) -> tuple[list[Entry], list[str]]:

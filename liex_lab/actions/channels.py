@@ -86,12 +86,12 @@ def segments_of(
     """The channels of a track, one unbroken segment after the other.
 
     Lengths are over the animal's median length in the track, predicted errors over their median:
-    how large errors are depends on camera and animal, and says nothing of actions.
+    how large errors are depends on camera and animal, and is unrelated to actions.
 
     Args:
         track: one animal's track.
         rate_hz: ticks a second.
-        wall_mm: (n,) distance of the animal from the nearest wall, mm; None where nobody knows.
+        wall_mm: (n,) distance of the animal from the nearest wall, mm; None if unknown.
         allocate: allocator of the channels.
 
     Returns:
@@ -104,7 +104,7 @@ def segments_of(
     good = good[~_reversed(track, good, time_s)]
     length_mm = float(np.median(track.scale[good])) * track.skeleton.length
     # a doubt is one beside the recording's usual errors: how large these are depends on camera and
-    # animal, and on how errors are predicted, and says nothing of actions
+    # animal, and on how errors are predicted, and is unrelated to actions
     usual_mm = float(np.median(np.nan_to_num(track.predicted_error_mm[good], nan=0.0))) or 1.0
     wall = np.full(len(time_s), np.nan) if wall_mm is None else wall_mm
     cuts = np.flatnonzero(np.diff(time_s[good]) > max(LONGEST_GAP_S, 2.5 * _usual_step(time_s))) + 1
@@ -198,8 +198,8 @@ class _OnClock:
             ticks: consecutive ticks of the clock.
 
         Returns:
-            Joints (m, J, 3) mm, joint angles (m, J, 3) rad, distance from a wall (m,) mm, 1e6 where
-            nobody knows it, and predicted error (m,) mm.
+            Joints (m, J, 3) mm, joint angles (m, J, 3) rad, distance from a wall (m,) mm, 1e6 if
+            unknown, and predicted error (m,) mm.
         """
         if self._n == 1:
             out = np.repeat(self._measured(0, 1), ticks.stop - ticks.start, axis=0)
@@ -207,8 +207,8 @@ class _OnClock:
             low = self._low[ticks]
             share = self._share[ticks]
             first = int(low[0])
-            seen = self._measured(first, int(low[-1]) + 2)
-            out = seen[low - first] * (1.0 - share) + seen[low - first + 1] * share
+            measured = self._measured(first, int(low[-1]) + 2)
+            out = measured[low - first] * (1.0 - share) + measured[low - first + 1] * share
         j = self._track.skeleton.n_joints
         return (
             out[:, : 3 * j].reshape(-1, j, 3),

@@ -143,7 +143,7 @@ class LabelledTrack:
         track: one animal's track.
         words: (n,) '' where a frame has none.
         animal: whose it is.
-        wall_mm: (n,) how far its middle is from the nearest wall, mm, NaN where nobody knows.
+        wall_mm: (n,) how far its middle is from the nearest wall, mm, NaN if unknown.
         truth: (n, J, 3) mm, true joints, of rendered animals; None otherwise.
     """
 

@@ -41,7 +41,7 @@ _SHARPNESS = 0.1
 _USUAL = (0.005, 0.99)
 _LEAST_PEAK = 0.01
 _FAST = 1.0  # lengths a second, in the mean of a bout: an action that goes fast
-_NEVER = -30.0  # what a network says of a word that it has not seen
+_NEVER = -30.0  # the logit of a word that it has not seen
 
 
 def learn(
@@ -60,7 +60,7 @@ def learn(
         definitions: word -> definition, to be kept in the model.
         sequences: single actions cut out of somewhere, without their surroundings: they teach the
             networks, not the order and length of actions.
-        progress: told of three pieces of work.
+        progress: reports three steps.
 
     Returns:
         The model, without a card.
@@ -212,7 +212,7 @@ def leave_one_animal_out(
     Args:
         tracks: labelled recordings.
         seed: of the networks.
-        progress: told before every animal.
+        progress: reports every animal.
 
     Returns:
         Number of animals, macro F1 by animal, and `timeline_scores` over all; of one animal alone,
@@ -271,7 +271,7 @@ def doubtful_segments(
     Windows begin every half of their length; those taken do not overlap.
 
     Args:
-        found: what the recogniser says of the recording.
+        found: the result of recognising the recording.
         times_ns: (n,) time stamps.
         n: the most segments that are wanted.
         least_s: length of a segment, s.

@@ -65,13 +65,13 @@ def position_descriptor(track: Track) -> Array:
         (42 J + 6,), 888 for a fish's 21 joints: mm, arena frame, then the base's mean position, mm,
         and mean rotation vector, rad; zeros where fewer than two poses were measured.
     """
-    seen = track.observed
-    if seen.sum() < 2:
+    observed = track.observed
+    if observed.sum() < 2:
         return np.zeros(14 * 3 * track.skeleton.n_joints + 6)
-    joints = _lerp(track.joints_mm[seen], _places(seen.sum()))
-    root = some_rows(track, seen).root
-    place = np.concatenate([root.translation.mean(axis=0), so3.log(so3.mean(root.rotation))])
-    return np.concatenate([pyramid(joints.reshape(N_FRAMES, -1)), place])
+    joints = _lerp(track.joints_mm[observed], _places(observed.sum()))
+    root = some_rows(track, observed).root
+    base = np.concatenate([root.translation.mean(axis=0), so3.log(so3.mean(root.rotation))])
+    return np.concatenate([pyramid(joints.reshape(N_FRAMES, -1)), base])
 
 
 def pyramid(rows: Array) -> Array:
@@ -91,11 +91,11 @@ def _resampled(track: Track) -> tuple[SE3, Array]:
     """Base T_arena_root (32) along geodesics and joint angles (32, J, 3) of the frames that have a
     pose.
     """
-    seen = track.observed
-    n = int(seen.sum())
+    observed = track.observed
+    n = int(observed.sum())
     if n < 2:
         return SE3.identity(N_FRAMES), np.zeros((N_FRAMES, track.skeleton.n_joints, 3))
-    kept = some_rows(track, seen)
+    kept = some_rows(track, observed)
     at = _places(n)
     low = np.minimum(at.astype(int), n - 2)
     before, after = (SE3(kept.root_rotation[rows], kept.root_mm[rows]) for rows in (low, low + 1))

@@ -61,10 +61,10 @@ def timeline_scores(
         }
         for word in words
     }
-    seen = [word for word in named if frames[word][2] > 0]
+    labelled = [word for word in named if frames[word][2] > 0]
     return {
-        "macro_f1": float(np.mean([per_action[word]["f1"] for word in seen]))
-        if seen
+        "macro_f1": float(np.mean([per_action[word]["f1"] for word in labelled]))
+        if labelled
         else float("nan"),
         "segment_f1_50": _f1(sum(hits.values()), sum(found.values()), sum(true.values())),
         "per_action": per_action,
@@ -126,11 +126,11 @@ def confusion(true: Sequence[str], found: Sequence[str], words: Sequence[str]) -
     Returns:
         (K, K) counts as lists.
     """
-    place = {word: k for k, word in enumerate(words)}
+    index = {word: k for k, word in enumerate(words)}
     out = np.zeros((len(words), len(words)), int)
     for a, b in zip(true, found, strict=True):
-        if b in place:
-            out[place[a], place[b]] += 1
+        if b in index:
+            out[index[a], index[b]] += 1
     return out.tolist()
 
 
@@ -164,10 +164,10 @@ class Agreement:
     Attributes:
         n: things that both rated.
         observed: share of them that both call the same.
-        expected: share on which two who do not look would agree.
+        expected: share on which two who guess would agree.
         kappa: agreement beyond chance over the most there can be: 1 where they always agree, 0
             where no more than by chance; NaN where there is nothing to agree on.
-        low: lower limit of its 95 % interval; NaN where it cannot be told.
+        low: lower limit of its 95 % interval; NaN if it cannot be computed.
         high: upper limit.
     """
 
@@ -196,10 +196,10 @@ def cohens_kappa(first: Sequence[str], second: Sequence[str]) -> Agreement:
     if n == 0:
         return Agreement(0, nan, nan, nan, nan, nan)
     words = sorted({*first, *second})
-    place = {word: k for k, word in enumerate(words)}
+    index = {word: k for k, word in enumerate(words)}
     share = np.zeros((len(words), len(words)))
     for a, b in zip(first, second, strict=True):
-        share[place[a], place[b]] += 1.0 / n
+        share[index[a], index[b]] += 1.0 / n
     rows = share.sum(axis=1)
     columns = share.sum(axis=0)
     observed = float(np.trace(share))

@@ -56,7 +56,7 @@ class FrameCheck:
     """Checks bouts of ticks by their frames.
 
     Args:
-        broken: says what frames [start, stop) break of a word's definition; None finds nothing.
+        broken: returns what frames [start, stop) break of a word's definition; None finds nothing.
         first: row of the first frame of the segment.
         tick: (r,) tick of each of its frames, ascending.
     """
@@ -212,9 +212,9 @@ class TimelineModel:
 
         Args:
             track: one animal's track of n frames.
-            wall_mm: (n,) distance of the animal from the nearest wall, mm; None where nobody knows.
+            wall_mm: (n,) distance of the animal from the nearest wall, mm; None if unknown.
             allocate: allocator of large intermediate arrays and of the probabilities.
-            broken: says of the frames [start, stop) what of a word's definition does not hold
+            broken: returns which part of a word's definition does not hold
                 there, '' for nothing; such a bout is refused and the track decoded again, in the
                 end without a name. None refuses only what is never as fast as its word asks for.
 
@@ -247,11 +247,11 @@ class TimelineModel:
             certain = self.chain.probabilities(scores, step, allocate)
             for piece in blocks(last - first, _PIECE):
                 rows = slice(first + piece.start, first + piece.stop)
-                told = certain[tick[piece]]
+                certainty = certain[tick[piece]]
                 code[rows] = decoded[tick[piece]]
-                probability[rows] = told
+                probability[rows] = certainty
                 part[rows] = number
-                score[rows] = np.take_along_axis(told, code[rows, None], axis=1)[:, 0]
+                score[rows] = np.take_along_axis(certainty, code[rows, None], axis=1)[:, 0]
         if broken is not None and n:
             self._unname(code, part, broken, refused)
         ethogram = Ethogram.of_words(
@@ -340,21 +340,21 @@ class TimelineModel:
         fastest = FASTEST.get(self.skeleton, {})
         found = {}
         for word, shortest in zip(self.words, self.chain.shortest_s, strict=True):
-            told = []
+            reasons = []
             if word != UNLABELLED and shortest * rate < _FRAMES_NEEDED:
-                told.append(
+                reasons.append(
                     f"its shortest bouts last {shortest:.2f} s, {shortest * rate:.1f} frames at "
                     f"{rate:.0f} per second, and may be missed"
                 )
             part = fastest.get(word)
             if part is not None and rate < part.least_hz - _RATE_SLACK_HZ:
-                told.append(
+                reasons.append(
                     f"{part.what} takes about {part.seconds:.2f} s, {part.seconds * rate:.1f} "
                     f"frames at {rate:.0f} per second: that it happened may be told, but not how "
                     f"fast, how often or when exactly, which wants {part.least_hz:.0f} per second"
                 )
-            if told:
-                found[word] = "; ".join(told)
+            if reasons:
+                found[word] = "; ".join(reasons)
         return found
 
     def name(self, track: Track, wall_mm: Array | None = None) -> str:
@@ -362,7 +362,7 @@ class TimelineModel:
 
         Args:
             track: the sequence, n frames.
-            wall_mm: (n,) distance of the animal from the nearest wall, mm; None where nobody knows.
+            wall_mm: (n,) distance of the animal from the nearest wall, mm; None if unknown.
 
         Returns:
             A word; `UNLABELLED` only where nothing was measured.
@@ -380,7 +380,7 @@ class TimelineModel:
 
 @dataclass(frozen=True)
 class Recognised:
-    """What a recogniser says of a recording.
+    """The result of recognising a recording.
 
     Attributes:
         ethogram: the bouts.
@@ -460,31 +460,31 @@ def gather(tracks: Sequence[LabelledTrack], words: Sequence[str], clock_hz: floa
     """
     ticks = []
     runs = []
-    place = {word: k for k, word in enumerate(words)}
+    index = {word: k for k, word in enumerate(words)}
     for k, one in enumerate(tracks):
         names = channel_names(one.track.skeleton)
         time_s = (one.track.times_ns - one.track.times_ns[:1]) * 1e-9
-        code = np.array([place[str(word)] for word in one.words], np.int64)
+        code = np.array([index[str(word)] for word in one.words], np.int64)
         for segment in segments_of(one.track, clock_hz, one.wall_mm):
             row = np.clip(
                 np.searchsorted(time_s, segment.times_s - 0.5 / clock_hz), 0, len(time_s) - 1
             )
             speed = steady_speed(segment, names)
             ticks.append((window_features(segment, names), code[row], speed, np.full(len(row), k)))
-        runs.append(_runs(one.words, one.track.times_ns, place))
+        runs.append(_runs(one.words, one.track.times_ns, index))
     columns: list[Any] = [np.concatenate(column) for column in zip(*ticks, strict=True)]
     return Examples(*columns, runs)
 
 
 def _runs(
-    words: NDArray[np.str_], times_ns: NDArray[np.int64], place: dict[str, int]
+    words: NDArray[np.str_], times_ns: NDArray[np.int64], index: dict[str, int]
 ) -> list[tuple[int, float]]:
     """The bouts (word, s) of a recording, those without a name among them."""
     if not len(words):
         return []
     ends = frame_stops(times_ns)
     return [
-        (place[str(word)], float(ends[b - 1] - times_ns[a]) * 1e-9)
+        (index[str(word)], float(ends[b - 1] - times_ns[a]) * 1e-9)
         for a, b, word in zip(*runs_of(words), strict=True)
     ]
 

@@ -111,13 +111,13 @@ def time_named(
         n: number of intervals.
     """
     time_s = kinematics["time_s"].to_numpy(float)
-    place = {word: k for k, word in enumerate(words, 1)}
+    index = {word: k for k, word in enumerate(words, 1)}
     code = np.zeros(len(time_s), np.int64)
     # a frame at a bout's start belongs to it, one at its stop does not, however seconds are rounded
     spans = np.searchsorted(time_s, bouts[["start_s", "stop_s"]].to_numpy(float) - 1e-6)
     for (start, stop), word in zip(spans, bouts["action"], strict=True):
-        code[start:stop] = place.get(word, 0)
-    width = len(place) + 1
+        code[start:stop] = index.get(word, 0)
+    width = len(index) + 1
     spent = np.bincount(row * width + code, observed_hold(kinematics), n * width)
     return np.asarray(spent.reshape(n, width))
 
@@ -188,8 +188,8 @@ def count_transitions(
         gaps: the table `gaps`.
         longest_pause_s: longest time between two bouts that follow each other, s.
     """
-    place = {word: k for k, word in enumerate(words)}
-    code = np.array([place[word] for word in bouts["action"]], np.int64)
+    index = {word: k for k, word in enumerate(words)}
+    code = np.array([index[word] for word in bouts["action"]], np.int64)
     start = bouts["start_s"].to_numpy(float)
     stop = bouts["stop_s"].to_numpy(float)
     counts = np.zeros((len(words), len(words)), np.int64)
@@ -262,7 +262,7 @@ def _first(table: pd.DataFrame, name: str) -> str:
 BEFORE_S = 1.0
 AFTER_S = 2.0
 _STEPS = 61
-_FEWEST = 5  # bouts; of fewer no quartiles are told
+_FEWEST = 5  # bouts; of fewer there are no quartiles
 
 
 @dataclass(frozen=True)

@@ -234,9 +234,9 @@ def _sized(found: Estimate, rows: pd.DataFrame, groups: tuple[str, str]) -> dict
     animal = (
         pd.factorize(rows["subject_id"])[0] * 2 + second
     )  # one that was in both groups counts in both
-    places, number = np.unique(animal, return_inverse=True)
+    subjects, number = np.unique(animal, return_inverse=True)
     sd, correction = spread_of_animals(
-        animal_means(rows["value"].to_numpy(float), number), places % 2 == 1
+        animal_means(rows["value"].to_numpy(float), number), subjects % 2 == 1
     )
     values = (found.difference, found.low, found.high)
     effects = (correction * value / sd if sd > 0 else np.nan for value in values)

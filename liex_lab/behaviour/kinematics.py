@@ -130,7 +130,7 @@ def kinematics(
         half_window_s: derivatives use neighbours this far before and after, s.
         impossible_above_mm_s: a faster speed is a tracking error and left empty, mm/s.
         surface_z_mm: height of the water's surface above the floor, mm, for an animal that swims;
-            None where it is not known.
+            None if unknown.
         seams: frames (of `frame_index`) that begin a stretch of their own, see `Surroundings`.
         allocate: makes the arrays of the columns (an allocator, as `np.empty`).
 

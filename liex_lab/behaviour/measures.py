@@ -40,7 +40,7 @@ class BoutReader:
         self.hold_s = stop_times(self.time_s) - self.time_s
         step = median_step(self.time_s)
         self.fps = 1.0 / step if step > 0 else 0.0
-        self.place = kinematics[["x_mm", "y_mm", "z_mm"]].to_numpy(float)
+        self.position = kinematics[["x_mm", "y_mm", "z_mm"]].to_numpy(float)
         self.kind = kind_of(kinematics)
         self._columns = {
             str(name): values.to_numpy(float)
@@ -88,7 +88,7 @@ class BoutReader:
             bouts: the table `bouts`, in order of time.
             spans: the rows of the n bouts, see `rows_of`.
         """
-        number = segments(self.time_s, np.isfinite(self.place[:, 0]))
+        number = segments(self.time_s, np.isfinite(self.position[:, 0]))
         start, stop = np.array(spans, np.int64).reshape(-1, 2).T
         ends = {"action": bouts["action"].to_numpy(), "stop_s": bouts["stop_s"].to_numpy(float)}
         last = pd.DataFrame({**ends, "number": number[stop - 1]}).groupby("action").shift()
@@ -126,9 +126,11 @@ class BoutReader:
         known = np.flatnonzero(np.isfinite(speed))
         path = float(np.nansum(step))
         timed = float(self.hold_s[start:stop][known].sum())
-        seen = start + np.flatnonzero(np.isfinite(self.place[start:stop, 0]))
+        observed = start + np.flatnonzero(np.isfinite(self.position[start:stop, 0]))
         displacement = (
-            self.place[seen[-1]] - self.place[seen[0]] if len(seen) else np.full(3, np.nan)
+            self.position[observed[-1]] - self.position[observed[0]]
+            if len(observed)
+            else np.full(3, np.nan)
         )
         top = _top(speed)
         return {
@@ -306,7 +308,7 @@ _READ: dict[str, Reading] = {
 
 
 class BoutCheck:
-    """Says of a bout what of its printed definition does not hold.
+    """Finds which parts of its printed definition a bout contradicts.
 
     Args:
         bouts: reads the measures of bouts.
@@ -326,10 +328,10 @@ class BoutCheck:
             stop: row after its last.
             word: its name.
         """
-        told = (self._told(limit, start, stop) for limit in self._limits.get(word, ()))
-        return "; ".join(filter(None, told))
+        broken = (self._contradiction(limit, start, stop) for limit in self._limits.get(word, ()))
+        return "; ".join(filter(None, broken))
 
-    def _told(self, limit: Limit, start: int, stop: int) -> str:
+    def _contradiction(self, limit: Limit, start: int, stop: int) -> str:
         values = _READ[limit.measure](self._bouts, start, stop)
         wrong = [value for value in values if not limit.holds(value)]
         return f"{limit.shown(wrong[0])}, not {limit.span}" if wrong else ""
@@ -347,7 +349,7 @@ def recognise(
     Args:
         recogniser: names the track.
         track: one animal's track of n frames.
-        wall_mm: (n,) distance of the animal from the nearest wall, mm; None where nobody knows.
+        wall_mm: (n,) distance of the animal from the nearest wall, mm; None if unknown.
         moved: the table `kinematics` of the track; None makes it with the default settings.
         allocate: allocator of large intermediate arrays and of the probabilities.
     """

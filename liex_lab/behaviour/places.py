@@ -35,7 +35,7 @@ class Surroundings:
     Attributes:
         arena: shape of the arena.
         zones: names of the zones.
-        surface_z_mm: height of the water's surface above the floor, mm; None where there is none or
+        surface_z_mm: height of the water's surface above the floor, mm; None if absent or
             it is not known.
         seams: frames (the camera's count) at which a person's exchange of head and tail begins or
             ends; nothing is measured across one, as across a gap.
@@ -48,7 +48,7 @@ class Surroundings:
 
 
 def surface_height_mm(floor_distance_mm: float, optics: dict[str, object]) -> float | None:
-    """Height of the water's surface above the floor, mm, from what session.json says.
+    """Height of the water's surface above the floor, mm, from session.json.
 
     Args:
         floor_distance_mm: distance of the camera from the floor, mm.
@@ -178,7 +178,7 @@ def depth_measures(
     Args:
         kinematics: the table `kinematics` of n frames.
         hold: (n,) how long each observed frame counts, s; 0 for the others.
-        surface_z_mm: height of the water's surface above the floor, mm; None where it is not known,
+        surface_z_mm: height of the water's surface above the floor, mm; None if unknown,
             and only the mean height is given.
 
     Returns:

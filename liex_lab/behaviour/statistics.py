@@ -3,7 +3,7 @@
 All of them take the units of a design (`design.Units`: cages, animals or an animal's own
 difference), never sessions or bouts.
 
-- Permutation test (Fisher 1935, Pitman 1937): the groups are given anew to the units as the design
+- Permutation test (Fisher 1935, Pitman 1937): the groups are reassigned to the units as the design
   allows, p = share of the arrangements with |difference| >= the observed one; exact up to
   `MOST_EXACT` arrangements, beyond that Monte Carlo with p = (1 + b) / (1 + m) (Phipson and Smyth
   2010). Paired units have their signs flipped; blocks are permuted within themselves.
@@ -86,7 +86,7 @@ def find_units(
     Raises:
         NotComparable: sessions do not name their animal, only some animals were in both groups, a
             group has fewer than two animals, cages are known for some only, an animal or cage is in
-            more than one block, or group and block cannot be told apart.
+            more than one block, or group and block cannot be distinguished.
     """
     rows = rows[rows["group"].isin(groups) & np.isfinite(rows["value"].to_numpy(float))]
     nameless = int((rows["subject_id"] == "").sum())
@@ -163,7 +163,7 @@ def _blocks(
 ) -> NDArray[np.int64]:
     """(n,) number of the block of each animal: what it may be exchanged within.
 
-    A block of one group is no use; if all are so, group and block cannot be told apart, and the
+    A block of one group is no use; if all are so, group and block cannot be distinguished, and the
     comparison is refused.
     """
     known = [
@@ -374,7 +374,7 @@ def permutation(units: Units, rng: np.random.Generator) -> float:
         rng: draws the arrangements where there are too many; unused in an exact test.
 
     Returns:
-        p, 0 to 1: how often a difference at least as large comes from giving the groups anew.
+        p, 0 to 1: how often a difference at least as large comes from reassigning the groups.
     """
     weight = _weights(units)
     observed = abs(float(weight @ units.values) if not units.paired else float(units.values.sum()))
@@ -448,7 +448,7 @@ def mixed_model(rows: pd.DataFrame, units: Units, groups: tuple[str, str]) -> Mo
 
     Returns:
         None for paired units, where nothing is nested or the units are exchanged within blocks (the
-        permutation test says it all), and where the model does not converge or its random
+        permutation test is enough), and where the model does not converge or its random
         variance lies at zero, so that its errors are not to be trusted.
     """
     from scipy.stats import t
@@ -464,7 +464,7 @@ def mixed_model(rows: pd.DataFrame, units: Units, groups: tuple[str, str]) -> Mo
         )
     clusters = data["cage" if units.unit == CAGE else "subject_id"].to_numpy(str)
     if len(np.unique(clusters)) == len(clusters) or len(np.unique(units.block)) > 1:
-        # nothing is nested, or animals are shuffled within blocks: the permutation says it all
+        # nothing is nested, or animals are shuffled within blocks: the permutation test is enough
         return None
     fitted = _fit(
         data["value"].to_numpy(float), (data["group"] == groups[1]).to_numpy(float), clusters

@@ -128,8 +128,8 @@ def measure(
         frames: the table `frames`.
         poses: the table `poses` of these frames, or its joints.
         rules: the thresholds; None takes the defaults.
-        around: arena, zones and water; None where nothing is known.
-        gaps: the table `gaps`; None where there are none.
+        around: arena, zones and water; None if unknown.
+        gaps: the table `gaps`; None if absent.
         bouts: an ethogram by a model or a person (the columns of `tables.BOUTS`); None takes the
             rules'.
         actions: its vocabulary, word -> definition; None takes the rules'. Words that occur in no
@@ -169,7 +169,7 @@ def measure_rows(
     Args:
         rows: the track with its frame counts and names.
         rules: the thresholds; None takes the defaults.
-        around: arena, zones and water; None where nothing is known.
+        around: arena, zones and water; None if unknown.
         **how: bouts, actions, moved and allocate of `measure`.
     """
     gaps = to_pandas(GAPS, rows.gaps())
@@ -220,7 +220,7 @@ def stated_by(session: SessionTables) -> tuple[MouseRules, Surroundings]:
 
 
 def measure_session(session: SessionTables, rules: MouseRules | None = None) -> Behaviour:
-    """The behaviour tables of a session made anew from its folder alone, with its own ethogram.
+    """The behaviour tables of a session, from its folder alone, with its own ethogram.
 
     Args:
         session: an opened session.
@@ -257,7 +257,7 @@ def summarise(
         bouts: the table `bouts` with its measures.
         words: actions, zones and the kind of body; None takes the rules' actions of a
             walking animal.
-        around: arena, zones and water; None where nothing is known.
+        around: arena, zones and water; None if unknown.
         rules: what is slower than their pause does not move for certain; None takes the defaults.
 
     Returns:

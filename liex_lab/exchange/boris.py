@@ -84,8 +84,8 @@ def project(session: Session, folder: Path | None = None) -> dict[str, Any]:
     }
 
 
-def _behaviour(word: str, meaning: str, place: int) -> dict[str, Any]:
-    key = _KEYS[place] if place < len(_KEYS) else ""
+def _behaviour(word: str, meaning: str, index: int) -> dict[str, Any]:
+    key = _KEYS[index] if index < len(_KEYS) else ""
     return {
         "type": "State event",
         "key": key,

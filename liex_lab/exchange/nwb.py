@@ -2,7 +2,7 @@
 
 One animal per file. There is no type for rotations in NWB: each joint's is a TimeSeries of rotation
 vectors, rad. Actions and gaps are time intervals (see `nwb_intervals`). Times are true ones, s
-since the session's beginning, which NWB wants with its time zone.
+since the session's beginning, which NWB requires with a time zone.
 
 Species, sex and age are fields of NWB's Subject. Group, cage and batch have none, in NWB or in any
 extension that archives know: the subject's description says them to people (DANDI shows it), and
@@ -140,17 +140,18 @@ def observed_spans(poses: Poses) -> NDArray[np.float64]:
     Returns:
         (m, 2) s: start and stop, exclusive, in order.
     """
-    seen = np.asarray(np.isfinite(poses.xyz_mm).all(axis=(1, 2)))
+    observed = np.asarray(np.isfinite(poses.xyz_mm).all(axis=(1, 2)))
     starts, stops = poses.time_s, stop_times(poses.time_s)
-    goes_on = np.zeros(len(seen) + 1, np.bool_)  # the span of the frame before goes on in this one
-    goes_on[1:-1] = seen[1:] & seen[:-1] & (stops[:-1] == starts[1:])
-    first = np.flatnonzero(seen & ~goes_on[:-1])
-    last = np.flatnonzero(seen & ~goes_on[1:])
+    # whether the span of the frame before continues in this one
+    continues = np.zeros(len(observed) + 1, np.bool_)
+    continues[1:-1] = observed[1:] & observed[:-1] & (stops[:-1] == starts[1:])
+    first = np.flatnonzero(observed & ~continues[:-1])
+    last = np.flatnonzero(observed & ~continues[1:])
     return np.stack([starts[first], stops[last]], axis=-1)
 
 
 _SPECIES = {"mouse": "Mus musculus", "fish": "Danio rerio", "hand": "Homo sapiens"}
-_SAID = ("group", "cage", "batch")  # what has no field of its own
+_FACTS = ("group", "cage", "batch")  # what has no field of its own
 _FRAME = (
     "the arena: z up from the floor, origin at the foot of the camera's perpendicular, x along "
     "the picture's rows; joints lie on the body's mid-axis"
@@ -240,13 +241,13 @@ def _subject(session: Session) -> Any:
     about = session.metadata["subject"]
     kind = session.metadata["animal"]["name"]
     sex = str(about.get("sex", ""))[:1].upper()
-    said = [f"{name} {about[name]}" for name in _SAID if about.get(name)]
+    facts = [f"{name} {about[name]}" for name in _FACTS if about.get(name)]
     return Subject(
         subject_id=(about.get("subject_id") or session.metadata["individual"]).replace("/", "-"),
         species=about.get("species") or _SPECIES.get(kind, kind),
         sex=sex if sex in ("M", "F", "O") else "U",
         age=about.get("age"),
-        description=", ".join([kind, *(said or ["group not stated"])]),
+        description=", ".join([kind, *(facts or ["group not stated"])]),
     )
 
 

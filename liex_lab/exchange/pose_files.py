@@ -109,7 +109,7 @@ def write_sleap(session: Session, path: Path) -> None:
     import h5py
 
     poses = session.pose_arrays()
-    seen = np.isfinite(poses.uv_px[:, :, 0])
+    observed = np.isfinite(poses.uv_px[:, :, 0])
     order = {
         "tracks": ("track", "xy", "node", "frame"),
         "point_scores": ("track", "node", "frame"),
@@ -118,14 +118,14 @@ def write_sleap(session: Session, path: Path) -> None:
         "tracking_scores": ("track", "frame"),
     }
     mean_score = np.where(
-        seen.any(axis=1), np.nanmean(np.where(seen, poses.likelihood, 0.0), axis=1), np.nan
+        observed.any(axis=1), np.nanmean(np.where(observed, poses.likelihood, 0.0), axis=1), np.nan
     )
     arrays = {
         "tracks": poses.uv_px.transpose(2, 1, 0)[None],
         "point_scores": poses.likelihood.T[None],
-        "track_occupancy": seen.any(axis=1, keepdims=True).astype(np.uint8),
+        "track_occupancy": observed.any(axis=1, keepdims=True).astype(np.uint8),
         "instance_scores": mean_score[None],
-        "tracking_scores": np.where(seen.any(axis=1), 1.0, np.nan)[None],
+        "tracking_scores": np.where(observed.any(axis=1), 1.0, np.nan)[None],
         "time_s": poses.time_s,
         "pulse_index": poses.pulse_index,
     }

@@ -1,4 +1,4 @@
-"""Every table of a session as CSV, for those who would rather not read Parquet.
+"""Every table of a session as CSV, for programs that do not read Parquet.
 
 Units are in the columns' names; columns.json describes every column.
 """
@@ -71,14 +71,14 @@ def write_xlsx(session: Session, path: Path) -> None:
 
     stored = {file.name for file in session.path.glob("*.parquet")} | set(session.log.files)
     names = sorted(name.removesuffix(".parquet") for name in stored if name.endswith(".parquet"))
-    told = [pq.read_metadata(session.file(f"{name}.parquet")) for name in names]
-    for name, one in zip(names, told, strict=True):  # before anything is written
+    footers = [pq.read_metadata(session.file(f"{name}.parquet")) for name in names]
+    for name, one in zip(names, footers, strict=True):  # before anything is written
         if one.num_rows >= MAX_ROWS:
             raise SessionError(
                 f"a sheet of Excel has at most {MAX_ROWS:,} rows and the table {name} has "
                 f"{one.num_rows + 1:,} with its headings; export it as csv"
             )
-    _check_room(sum(one.num_rows * one.num_columns for one in told))
+    _check_room(sum(one.num_rows * one.num_columns for one in footers))
     book = Workbook(write_only=True)
     if session.has("summary.csv"):
         _add(book, "summary", session.summary)

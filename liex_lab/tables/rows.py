@@ -205,13 +205,13 @@ class Rows:
         observed = self.track.observed
         flag = np.where(np.isin(self.track.flag, LOST), self.track.flag, LOST[-1])
         lost = np.where(observed, "", flag)
-        seen_at = np.flatnonzero(observed)
+        observed_rows = np.flatnonzero(observed)
         stops = stop_times(time)
         for start, stop, reason in constant_runs(lost):
             if reason:
                 span = (time[start], stops[stop - 1], int(count[start]), int(count[stop]))
-                place = self._last_place(seen_at, start) if reason == HIDDEN else _NOWHERE
-                found.append((*span, stop - start, str(reason), *place))
+                position = self._last_place(observed_rows, start) if reason == HIDDEN else _NOWHERE
+                found.append((*span, stop - start, str(reason), *position))
         found.sort()
         names = (*_SPAN_NAMES, "n_frames_missing", "reason", "x_mm", "y_mm")
         values: Iterable[Any] = zip(*found, strict=True) if found else ([] for _ in names)
@@ -262,16 +262,16 @@ class Rows:
                 found.append((*span, *known, *_NOWHERE))
         return found
 
-    def _last_place(self, seen_at: NDArray[np.int64], row: int) -> tuple[float, float]:
+    def _last_place(self, observed_rows: NDArray[np.int64], row: int) -> tuple[float, float]:
         """Where (x, y) mm the animal was seen last before a row, or first after it.
 
         Args:
-            seen_at: rows in which a pose was measured, in order.
+            observed_rows: rows in which a pose was measured, in order.
             row: the first row of a gap.
         """
-        if not len(seen_at):
+        if not len(observed_rows):
             return _NOWHERE
-        last = seen_at[max(0, int(np.searchsorted(seen_at, row)) - 1)]
+        last = observed_rows[max(0, int(np.searchsorted(observed_rows, row)) - 1)]
         x, y = self.track.centroid_mm[last, :2]
         return float(x), float(y)
 

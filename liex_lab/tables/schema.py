@@ -1,6 +1,6 @@
 """Schema of all tables (Apache Parquet): every column, its dtype, unit and meaning.
 
-Every column is one line of columns.csv. `when` says in which sessions it exists: always, once
+Every column is one line of columns.csv. `when` states in which sessions it exists: always, once
 behaviour is measured, for some kinds of body, for each action or zone, or where rears of several
 kinds are distinguished. Writers, readers, columns.json, the report and the manual read this list;
 `write_table` refuses a column without an entry.
@@ -68,7 +68,7 @@ class Column:
 
 @cache
 def _listed() -> dict[str, list[dict[str, str]]]:
-    """The lines of columns.csv by table; `when` says in which sessions a column exists."""
+    """The lines of columns.csv by table; `when` states in which sessions a column exists."""
     tables: dict[str, list[dict[str, str]]] = {}
     with Path(__file__).with_name("columns.csv").open(encoding="utf-8", newline="") as file:
         for line in csv.DictReader(file):
@@ -175,13 +175,13 @@ def dictionary(*extra: Sequence[Column]) -> list[dict[str, Any]]:
     entries = [column for rows in TABLES.values() for column in rows] + [
         column for rows in extra for column in rows
     ]
-    seen: dict[tuple[str, str], Column] = {}
+    listed: dict[tuple[str, str], Column] = {}
     for column in entries:
-        if seen.setdefault((column.table, column.name), column) != column:
+        if listed.setdefault((column.table, column.name), column) != column:
             raise SessionError(
                 f"column {column.table}.{column.name} is described twice and differently; keep one"
             )
-    return [asdict(column) for column in seen.values()]
+    return [asdict(column) for column in listed.values()]
 
 
 def arrow_schema(schema: Sequence[Column], metadata: Mapping[str, Any]) -> pa.Schema:
