@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from importlib.metadata import version
 from itertools import combinations, product
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -45,11 +46,6 @@ if TYPE_CHECKING:
 
 WHO = ("subject_id", "group", "cage", "sex", "batch")
 ENGINES = ("auto", "permutation", "mixed")
-_SOFTWARE = (
-    f"Poses, actions and statistics: liex_lab {version('liex_lab')}, after Xu et al., Lie-X: Depth "
-    "Image Based Articulated Object Pose Estimation, Tracking, and Action Recognition on Lie "
-    "Groups, International Journal of Computer Vision, 2017."
-)
 _ESTIMATES = ("estimate", "ci_low", "ci_high")
 _EFFECTS = ("effect_size", "effect_low", "effect_high")
 _USUAL = (
@@ -340,41 +336,35 @@ def methods(
     """
     if len(stats) == 0:
         return ""
-    done = stats[stats["test"] != ""]
+    from jinja2 import StrictUndefined, Template
+
+    done, refused = stats[stats["test"] != ""], stats[stats["test"] == ""]
     tests = list(dict.fromkeys(done["test"]))
-    parts = [] if table is None else [f"Groups: {'; '.join(_of_groups(table))}."]
-    parts += [one if one.endswith(".") else f"{one}." for one in said]
-    if tests:
-        unit = ", ".join(sorted(set(done["unit"])))
-        parts += [
-            f"Sessions were averaged per animal; the unit of comparison is the {unit}.",
-            f"Tests: {'; '.join(tests)}.",
-        ]
+    plain = [
+        unit != PAIRED and "model" not in test and "blocks" not in test
+        for unit, test in zip(stats["unit"], stats["test"], strict=True)
+    ]
     intervals = {
-        "Welch's t over the units": any(
-            unit != PAIRED and "model" not in test and "blocks" not in test
-            for unit, test in zip(stats["unit"], stats["test"], strict=True)
-        ),
+        "Welch's t over the units": any(plain),
         "a paired t over the animals' own differences": PAIRED in set(stats["unit"]),
         "least squares with a mean per block": any("blocks" in test for test in tests),
         "t of the mixed model": any("model" in test for test in tests),
     }
-    how = ", or ".join(name for name, used in intervals.items() if used)
-    parts.append(
-        f"Differences are given with 95 % intervals ({how}), and as Hedges' g relative to the "
-        "standard deviation between animals."
+    lines = Path(__file__).with_name("methods.j2").read_text(encoding="utf-8").split()
+    text = Template(" ".join(lines), undefined=StrictUndefined).render(
+        groups=[] if table is None else _of_groups(table),
+        notes=said,
+        units=sorted(set(done["unit"])),
+        tests=tests,
+        intervals=[name for name, used in intervals.items() if used],
+        n_done=len(done),
+        family=stats["family"].iloc[0],
+        alpha=alpha,
+        n_refused=len(refused),
+        refused=list(dict.fromkeys(refused["refused"])),
+        version=version("liex_lab"),
     )
-    if len(done):
-        parts.append(
-            "p values are two-sided and corrected by Benjamini and Hochberg's procedure over "
-            f"{len(done)} test{'s' * (len(done) > 1)} (family: {stats['family'].iloc[0]}); "
-            f"{alpha:g} was taken as the limit."
-        )
-    if n := len(stats) - len(done):
-        were = "comparison was" if n == 1 else "comparisons were"
-        reasons = "; ".join(dict.fromkeys(stats.loc[stats["test"] == "", "refused"]))
-        parts.append(f"{n} {were} not tested: {reasons}.")
-    return " ".join([*parts, _SOFTWARE])
+    return text.strip()
 
 
 def _of_groups(table: pd.DataFrame) -> list[str]:
