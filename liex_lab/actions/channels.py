@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -387,7 +388,7 @@ def window_features(segment: Segment, names: Sequence[str]) -> NDArray[np.float3
     signed = np.array([name.endswith("~") for name in names])
     start_at = np.zeros((1, x.shape[1]))
     sums, squares = (np.concatenate([start_at, np.cumsum(v, axis=0)]) for v in (x, x * x))
-    parts = [x, np.abs(x[:, signed])]
+    parts: list[NDArray[Any]] = [x, np.abs(x[:, signed])]
     for half in HALF_WINDOWS_S:
         mean, square = (_window_mean(total, -half, half, step) for total in (sums, squares))
         spread = np.sqrt(np.maximum(square - mean * mean, 0.0))

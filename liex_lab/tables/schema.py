@@ -94,7 +94,7 @@ def table_columns(
     if rears := rears_of(words):
         sums = {f"rears_{of}": " + ".join(f"{one}_{of}" for one in rears) for of in ("count", "s")}
         named["rears"] = [{"rears": " and ".join(rears), **sums}]
-    found = []
+    found: list[Column] = []
     for when, lines in groupby(_listed()[table], lambda line: line["when"]):
         once = not when or (kind and (when == "measured" or kind in when.split()))
         group = list(lines)
@@ -105,9 +105,9 @@ def table_columns(
 
 def _column(line: Mapping[str, str], names: Mapping[str, str]) -> Column:
     """The column that a line describes, with the names of an action or a zone filled in."""
-    texts = [line[one].format(across_gaps=ACROSS_GAPS, **names) for one in _TEXTS]
+    texts = {one: line[one].format(across_gaps=ACROSS_GAPS, **names) for one in _TEXTS}
     fps = line["unreliable_below_fps"]
-    return Column(line["table"], *texts, float(fps) if fps else None)
+    return Column(line["table"], **texts, unreliable_below_fps=float(fps) if fps else None)
 
 
 def rears_of(words: Sequence[str]) -> tuple[str, ...]:
