@@ -472,8 +472,9 @@ def gather(tracks: Sequence[LabelledTrack], words: Sequence[str], clock_hz: floa
             speed = steady_speed(segment, names)
             ticks.append((window_features(segment, names), code[row], speed, np.full(len(row), k)))
         runs.append(_runs(one.words, one.track.times_ns, index))
-    columns: list[Any] = [np.concatenate(column) for column in zip(*ticks, strict=True)]
-    return Examples(*columns, runs)
+    features, codes, speeds, recordings = zip(*ticks, strict=True)
+    columns = (np.concatenate(features), np.concatenate(codes), np.concatenate(speeds))
+    return Examples(*columns, np.concatenate(recordings), runs)
 
 
 def _runs(
