@@ -1,5 +1,4 @@
-"""Commands for sessions and recordings: doctor, convert, pack, compare, export, figures, show, live.
-"""
+"""Commands for sessions and recordings: compare, report, figures, export, show, convert, pack."""
 
 from __future__ import annotations
 
