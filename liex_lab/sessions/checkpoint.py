@@ -18,7 +18,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, suppress
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Annotated, Any, Literal
+from typing import IO, TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,6 +52,7 @@ RRD_HEAD = 12  # magic, version and options
 _RRD_END = 0  # kind of the message that ends a stream
 _BLOCK = 1 << 22
 _RESUMED = "resumed.rrd"
+_LOG_NAMES = r"^(session\.rrd|resumed\.rrd|session\.mcap)$"
 Clock = Callable[[], float]
 
 
@@ -71,7 +72,7 @@ class State(BaseModel):
     n_frames: NonNegativeInt = 0
     seconds: Annotated[float, Field(ge=0.0, lt=_MOST_S)] = 0.0
     interruptions: NonNegativeInt = 0
-    logs: dict[Literal["session.rrd", "resumed.rrd", "session.mcap"], NonNegativeInt] = {}
+    logs: dict[Annotated[str, Field(pattern=_LOG_NAMES)], NonNegativeInt] = {}
 
 
 class Checkpoint:

@@ -123,7 +123,8 @@ class Thumbnails:
         distance = float(np.median(near)) if len(near) else 1000.0
         spine_px = float(rows.track.spine_mm[row]) * camera.fx / distance
         half_px = int(np.ceil(max(_HALF_SPINES * spine_px, 1.3 * extent, 16.0)))
-        left, top = (int(at) - half_px for at in np.round(centre))
+        left = int(np.round(centre[0])) - half_px
+        top = int(np.round(centre[1])) - half_px
         v, u = (np.arange(first, first + 2 * half_px) for first in (top, left))
         inside = np.ix_((v >= 0) & (v < depth.shape[0]), (u >= 0) & (u < depth.shape[1]))
         square = np.zeros((2 * half_px, 2 * half_px), np.uint16)
