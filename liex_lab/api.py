@@ -571,7 +571,7 @@ def serve_dashboard(
         ) from None
     from liex_lab.dashboards.app.data import StudyData
     from liex_lab.dashboards.report.views import write_views
-    from liex_lab.pipelines.stating import StatedRegions
+    from liex_lab.pipelines.region_config import StatedRegions
     from liex_lab.pipelines.training.action_model import suggest
     from liex_lab.sessions.review import FOLDER as REVIEWS
     from liex_lab.sessions.viewer import show_replay

@@ -19,9 +19,14 @@ from typing import TYPE_CHECKING, Any
 
 from liex_lab.errors import LiexError, RecordingError
 from liex_lab.plan import Plan
+from liex_lab.plan.plan import toml_value
+from liex_lab.plan.sections import SeveralArenas
 from liex_lab.recordings.frame import DepthFrame
+from liex_lab.recordings.recording import Recording
+from liex_lab.recordings.timestamps import unwritable_times
 from liex_lab.runtime.places import inside
 from liex_lab.runtime.progress import Progress, silent
+from liex_lab.scene.region import Corners, masks_apart
 
 from .build import build_recording
 from .choice import USUAL, fit_plan
@@ -35,9 +40,6 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from liex_lab.plan.sections import SeveralArenas
-    from liex_lab.recordings.recording import Recording
-    from liex_lab.scene.region import Corners
     from liex_lab.sessions import SessionWriter
     from liex_lab.sessions.writer import BlueprintMaker, ReportMaker
 
@@ -126,9 +128,6 @@ def measure_arenas(
         PlanError: a region is none in the picture, two overlap, or none are seen.
         SessionError: a session is there already, or another process writes it.
     """
-    from liex_lab.recordings.timestamps import unwritable_times
-    from liex_lab.scene.region import masks_apart
-
     first = plan or Plan.load(USUAL).with_settings(settings)
     with build_recording(recording, first, progress) as opened:
         if told := unwritable_times(opened.times_ns):
@@ -166,8 +165,6 @@ def arena_settings(arena: SeveralArenas, name: str) -> tuple[str, ...]:
         arena: the arena.
         name: of its session.
     """
-    from liex_lab.plan.plan import toml_value
-
     told = ["arenas=", f"arena.region={toml_value(arena.region)}", f"session.name={_text(name)}"]
     for fact in _FACTS:
         if (value := getattr(arena, fact)) is not None:

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 
 from liex_lab.errors import EstimationError, LiexError, MisfitError
 from liex_lab.plan import Plan, known_plans
+from liex_lab.recordings.recording import Recording
 from liex_lab.runtime.progress import Progress, silent
 
 from .build import build_tracker
@@ -22,7 +23,6 @@ from .origin import animal_of
 
 if TYPE_CHECKING:
     from liex_lab.estimation.estimator import PoseEstimator
-    from liex_lab.recordings.recording import Recording
     from liex_lab.tracking.residual import SampleFit
     from liex_lab.tracking.tracker import FrameTracker
 
@@ -54,8 +54,8 @@ class Fitted:
 
 
 @dataclass(frozen=True)
-class Look:
-    """A plan held against a handful of frames.
+class PlanFit:
+    """How well a plan fits a handful of frames.
 
     Attributes:
         name: of the plan.
@@ -95,11 +95,11 @@ def propose_plan(recording: Recording, plan: Plan | None = None) -> Proposal:
         recording: an open recording.
         plan: the plan that was given, which is tried first; None tries the usual one.
     """
-    first = look(recording, plan or USUAL)
+    first = try_plan(recording, plan or USUAL)
     looks = [first]
     if first.misfits:
         given = plan or Plan.load(USUAL)
-        looks += [look(recording, name) for name in known_plans() if not _is(given, name)]
+        looks += [try_plan(recording, name) for name in known_plans() if not _is(given, name)]
     found = best(looks)
     if found is None or found.fit is None:
         says = ". ".join(f"{one.name}: {', '.join(one.misfits)}" for one in looks)
@@ -124,14 +124,14 @@ def propose_plan(recording: Recording, plan: Plan | None = None) -> Proposal:
     return Proposal(found.name, says, fit.n_animals, tuple(problems), given_fits)
 
 
-def _other_hand(recording: Recording, found: Look, plan: Plan | None) -> tuple[str, ...]:
+def _other_hand(recording: Recording, found: PlanFit, plan: Plan | None) -> tuple[str, ...]:
     """That a hand is a left one or its pictures mirrored, where they are; () of anything else."""
     from liex_lab.recordings.rectify import mirrored
 
     stated = plan is not None and plan.recording.mirrored is not None
     if found.name != "hand" or stated or found.fit is None:
         return ()
-    other = look(mirrored(recording, lent=True), found.name).fit
+    other = try_plan(mirrored(recording, lent=True), found.name).fit
     if other is None or other.error_mm > _MIRRORED_BELOW * found.fit.error_mm:
         return ()
     return (
@@ -183,7 +183,7 @@ def fit_plan(
     if cause is not None and accepted:
         raise cause
     progress(0, None, "looking which plan fits")
-    fitting = best([look(recording, name) for name in known_plans() if not _is(plan, name)])
+    fitting = best([try_plan(recording, name) for name in known_plans() if not _is(plan, name)])
     if fitting is not None and settings is not None:
         chosen = Plan.load(fitting.name).with_settings(settings)
         note = f"no plan was named, and {fitting.name} fits"
@@ -211,8 +211,8 @@ def _shows_an_animal(tracker: FrameTracker) -> bool:
     return scene.standing.moves or fit.covered >= _SOME_COVERED
 
 
-def look(recording: Recording, plan: Plan | str) -> Look:
-    """Hold a plan against a handful of frames.
+def try_plan(recording: Recording, plan: Plan | str) -> PlanFit:
+    """Fit a plan to a handful of frames.
 
     Args:
         recording: an open recording.
@@ -224,11 +224,11 @@ def look(recording: Recording, plan: Plan | str) -> Look:
     try:
         fit = build_tracker(recording, plan).sample_fit
     except LiexError as error:
-        return Look(name, None, (str(error).partition("; ")[0],))
-    return Look(name, fit, misfits_of(fit, plan))
+        return PlanFit(name, None, (str(error).partition("; ")[0],))
+    return PlanFit(name, fit, misfits_of(fit, plan))
 
 
-def best(looks: Sequence[Look]) -> Look | None:
+def best(looks: Sequence[PlanFit]) -> PlanFit | None:
     """The plan that fits, and of several the one with the least error for its animal's length.
 
     Args:
@@ -252,7 +252,7 @@ def misfits_of(fit: SampleFit | None, plan: Plan) -> tuple[str, ...]:
     return tuple(fit.misfits(animal.spine_min_mm, animal.spine_max_mm, stated))
 
 
-def _error_share(one: Look) -> float:
+def _error_share(one: PlanFit) -> float:
     return one.fit.error_mm / one.fit.spine_mm if one.fit is not None else float("inf")
 
 
@@ -261,7 +261,7 @@ def _is(plan: Plan, name: str) -> bool:
     return Plan.load(name).animal.skeleton == plan.animal.skeleton
 
 
-def _refusal(plan: Plan, misfits: Sequence[str], fitting: Look | None) -> str:
+def _refusal(plan: Plan, misfits: Sequence[str], fitting: PlanFit | None) -> str:
     name = animal_of(plan).name
     what = f"the recording does not fit the plan of the {name}: {', and '.join(misfits)}"
     if fitting is None or fitting.fit is None:

@@ -9,18 +9,29 @@ where asked at which plan fits, which alone needs models.
 from __future__ import annotations
 
 import math
+import shlex
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from liex_lab.errors import LiexError
-from liex_lab.optics.camera import unusual_centre, unusual_lens
+from liex_lab.errors import (
+    LiexError,
+    SeveralKindsError,
+    UnknownCameraError,
+    UnknownTimesError,
+    printable,
+)
+from liex_lab.optics.camera import SensorCard, of_size, preset, unusual_centre, unusual_lens
 from liex_lab.plan import Plan
 from liex_lab.plan.plan import arena_lines
+from liex_lab.plan.sections import SeveralArenas
 from liex_lab.recordings.frame import PLAUSIBLE_MM
+from liex_lab.recordings.recording import Recording
+from liex_lab.recordings.rectify import rectified
 from liex_lab.recordings.timestamps import (
     DROPPED,
     Gap,
@@ -29,61 +40,131 @@ from liex_lab.recordings.timestamps import (
     unwritable_times,
 )
 from liex_lab.runtime.progress import Progress, silent
+from liex_lab.runtime.text_files import read_toml
+from liex_lab.scene.background import has_noise, sample_frames, sampled, stride_for
+from liex_lab.scene.outline import Arena
+from liex_lab.scene.region import masks_apart
+from liex_lab.scene.scene import Fixture
+from liex_lab.sessions.folder import megabytes
+from liex_lab.tracking.offline import copies_told
 
-from .build import build_water
-from .choice import Proposal, propose_plan
-from .doctor_files import next_command, open_anyhow
+from .build import build_water, open_planned
+from .choice import USUAL, Proposal, propose_plan
 from .doctor_scene import SceneLook
 from .origin import animal_of, session_bytes
 from .regions import arenas_of, cut_out, propose_arenas, stated_corners
 
-if TYPE_CHECKING:
-    from liex_lab.plan.sections import SeveralArenas
-    from liex_lab.recordings.recording import Recording
+_USUAL_HZ = 30.0
+_USUAL_FOCAL = 0.9  # of a picture's width: depth cameras see 55 to 65 degrees of it
+_GUESS = ["camera.fx=1.0", "camera.fy=1.0", "camera.cx=0.0", "camera.cy=0.0"]
 
-FINDINGS: Final = {  # key of the JSON: what it says; numbers that cannot be told are None
-    "format": "how the recording is stored",
-    "n_frames": "frames that can be read",
-    "duration_s": "from the first frame to the last",
-    "rate_hz": "one over the usual step from frame to frame",
-    "jitter_ms": "standard deviation of the steps, without those across a gap",
-    "n_gaps": "places where the camera left out frames",
-    "n_missing": "frames that it left out there",
-    "n_time_faults": "stamps that were moved, for they repeat or run back, and jumps of the clock",
-    "width": "pixels in a row",
-    "height": "rows",
-    "fx": "focal length along a row, px",
-    "fy": "focal length along a column, px",
-    "cx": "column of the optical axis, px",
-    "cy": "row of the optical axis, px",
-    "intrinsics_source": "where these four come from",
-    "distortion": "of the lens, which is undone on reading; None: there is none",
-    "water": "the surface of the plan, whose refraction is undone on reading; None: there is none",
-    "depth_min_mm": "nearest reading",
-    "depth_max_mm": "farthest reading",
-    "unread_share": "of the pixels, in frames that hold any depth",
-    "floor_unread_share": "the same, of the pixels on the floor and on what stands there",
-    "noise_mm": "standard deviation of a pixel of the floor over time",
-    "floor_mm": "from the lens to the floor, perpendicular to it",
-    "floor_tilt_rad": "angle between the optical axis and the floor's perpendicular",
-    "water_depth_mm": "of the water over the floor, below the lens",
-    "arena": "shape of the floor, mm in the arena frame: see session.json",
-    "scene": "floor, region, fixtures, and how many animals move: see session.json",
-    "animal_length_mm": (
-        "of its outline from above, four standard deviations along the long axis; median"
-    ),
-    "animal_area_mm2": "seen from above",
-    "animal_share": "of the frames looked at, in which it was found",
-    "animal_sits_still": "whether it had become a part of the background",
-    "session_mb": "what a session of it takes on disk, MB, within a factor of two",
-    "arenas": "lines of a plan for several arenas in the picture; empty where one is seen",
-    "plan": "the bundled plan that fits, or the one that was named; None where none does",
-    "plan_says": "how it fits, or what contradicts each plan",
-    "n_animals": "things of the animal's size in view at once that its body fits",
-    "missing": "what the files do not say, and the lines to write; empty where they say it",
-    "problems": "what is wrong, and what to do about it",
-    "next": "the command to run next",
-}
+
+def open_anyhow(
+    path: str | Path, plan: Plan, progress: Progress = silent
+) -> tuple[Recording, list[str]]:
+    """Open a recording, with a guess for what it leaves out.
+
+    Args:
+        path: a file, folder or address of a recording.
+        plan: how it is opened.
+        progress: told while an archive is unpacked or an index made.
+
+    Returns:
+        The recording, and sentences that say what is missing and the lines to write.
+
+    Raises:
+        RecordingError: there is nothing in it that can be read.
+    """
+    missing: list[str] = []
+    guessed = plan
+    pattern = None
+    unknown_camera = False
+    for _ in range(4):  # each time one thing more is guessed
+        try:
+            recording = open_planned(path, guessed, progress, pattern)
+        except UnknownCameraError:
+            if unknown_camera:
+                raise
+            unknown_camera = True
+            guessed = guessed.with_settings(_GUESS)
+        except UnknownTimesError:
+            missing.append(
+                f"the times of the pictures are not known, and {_USUAL_HZ:g} frames/s were assumed "
+                f"here; write fps = {_USUAL_HZ:g} (your camera's rate) under [camera] in "
+                "camera.toml, or timestamps.csv with a line time_ns and then one time per picture"
+            )
+            guessed = guessed.with_settings([f"recording.fps={_USUAL_HZ}"])
+        except SeveralKindsError as error:
+            pattern = error.pattern
+            missing.append(
+                f"pictures of several kinds lie here, and {pattern} was looked at; choose with the "
+                f'line pattern = "{pattern}" under [camera] in camera.toml'
+            )
+        else:
+            break
+    else:
+        recording = open_planned(path, guessed, progress, pattern)
+    if unknown_camera:
+        missing.insert(0, _guess_camera(recording))
+    return recording, missing
+
+
+def _guess_camera(recording: Recording) -> str:
+    """Give the recording the likeliest camera for its pictures' size; returns what to write."""
+    width = recording.width
+    height = recording.height
+    names = of_size(width, height)
+    focal = preset(names[0], width, height).fx if names else round(_USUAL_FOCAL * width, 1)
+    like = f"those of a {names[0]}" if names else "those of many a depth camera"
+    cx = (width - 1) / 2
+    cy = (height - 1) / 2
+    recording.camera = replace(
+        recording.camera, fx=focal, fy=focal, cx=cx, cy=cy, source="assumed: not stated"
+    )
+    choice = f"say --set camera.preset={'|'.join(names)}, or " if names else ""
+    return (
+        f"the camera is not known, so all lengths here are guesses with {like}; {choice}write "
+        f"camera.toml with the lines [camera], fx = {focal:g}, fy = {focal:g}, cx = {cx:g}, "
+        f"cy = {cy:g} (your camera's numbers, in pixels) and unit_mm = 1.0 (millimetres per stored "
+        "step)"
+    )
+
+
+def next_command(
+    path: str | Path,
+    proposal: Proposal,
+    missing: list[str],
+    n_arenas: int = 0,
+    plan: str | None = None,
+    options: Sequence[str] = (),
+) -> str:
+    """What to type next; empty where no plan was looked for.
+
+    Args:
+        path: the recording.
+        proposal: which plan fits.
+        missing: what the files leave out, to be written first.
+        n_arenas: arenas that were seen in the picture, of which each is to be a session.
+        plan: the plan that was given, as it was typed; None where none was.
+        options: further options that were given and that a run takes, too.
+    """
+    if not proposal.says:
+        return ""
+    where = shlex.quote(str(path))
+    if missing or proposal.plan is None:
+        given = shlex.join([*(["--plan", plan] if plan else []), *options])
+        again = f"liex doctor {where} {given}".rstrip()
+        if missing:
+            return f"write what is missing, then {again}"
+        return f"{again} again, once what is said above is corrected"
+    named = plan if plan and proposal.is_given else proposal.plan
+    chosen = ["--plan", named] if plan or named != USUAL else []
+    several = ["--set", "arenas=auto"] if n_arenas > 1 else []
+    return shlex.join(["liex", "run", str(path), *chosen, *several, *options])
+
+
+_TEXT = read_toml(Path(__file__).with_name("doctor.toml"))
+FINDINGS: Final[dict[str, str]] = _TEXT["findings"]  # key of the JSON: its meaning
 # frames looked at, spread over the recording; as many as a run learns its scene from
 _N_SAMPLED = 96
 _N_RAW = 16
@@ -123,9 +204,6 @@ def examine(
     Raises:
         RecordingError: the recording cannot be opened at all.
     """
-    from liex_lab.recordings.rectify import rectified
-    from liex_lab.scene.background import sample_frames, stride_for
-
     asked = plan if named else None
     plan = _asked(plan or Plan(), fps, topic)
     water = build_water(plan)
@@ -205,8 +283,6 @@ def _session_mb(
 
 def _several(seen: Recording, plan: Plan, misplaced: list[str]) -> list[SeveralArenas]:
     """The several arenas of a picture, listed or proposed; what is wrong with them is told."""
-    from liex_lab.scene.region import masks_apart
-
     try:
         if plan.arenas is None:
             return propose_arenas(seen, plan)
@@ -232,9 +308,6 @@ def _copies_told(recording: Recording, sample: NDArray[np.float32]) -> list[str]
     """Sentences on frames that repeat the depth image before them, of a long recording in windows
     spread over it.
     """
-    from liex_lab.scene.background import has_noise, sampled
-    from liex_lab.tracking.offline import copies_told
-
     if recording.format == "synthetic":  # rendered when asked for
         return []
     n = len(recording)
@@ -285,7 +358,7 @@ def _time_problems(recording: Recording) -> list[str]:
         longest_s = max(gap.stop_ns - recording.times_ns[gap.start_frame - 1] for gap in gaps) / 1e9
         places = "1 gap" if len(gaps) == 1 else f"{len(gaps)} gaps"
         found.append(
-            f"the camera left out about {missing} frames ({share:.1%}) in {places}; the longest "
+            f"the camera dropped about {missing} frames ({share:.1%}) in {places}; the longest "
             f"time between two frames is {longest_s:.2f} s; no speed or distance is measured "
             "across a gap, but if there are many, record to a faster disk or with fewer cameras on "
             "one USB controller"
@@ -354,3 +427,69 @@ class _Depths:
 def _finite(value: float) -> float | None:
     """A number JSON can hold, or None."""
     return float(value) if math.isfinite(value) else None
+
+
+# What `liex doctor` found, as lines for a person.
+
+
+# lines that decide whether a run makes sense
+_FIRST = ("frames", "rate", "gaps", "intrinsics from", "floor", "arena", "animal", "plan")
+
+
+def print_report(findings: dict[str, Any], verbose: bool = True) -> None:
+    """Print the findings on one screen, and the problems below.
+
+    Args:
+        findings: what `examine` returns.
+        verbose: print every line, not only those that decide whether a run makes sense.
+    """
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(show_header=False, box=None, pad_edge=False)
+    for name, value in lines(findings):
+        if verbose or name in _FIRST:
+            table.add_row(name, Text(printable(value)))
+    console = Console()
+    console.print(table)
+    if not findings["problems"] and not findings["missing"]:
+        console.print("no problems found", style="green")
+    for problem in (*findings["missing"], *findings["problems"]):
+        console.print(Text(printable(f"- {problem}"), style="yellow"), soft_wrap=True)
+    if findings["arenas"]:
+        told = "several arenas are seen; lines for a plan, with subject_id and group to be added:"
+        console.print(Text(told), soft_wrap=True)
+        for line in findings["arenas"]:
+            console.print(Text(line), soft_wrap=True)
+    if findings["next"]:
+        console.print(Text(printable(f"next: {findings['next']}")), soft_wrap=True)
+
+
+def lines(findings: dict[str, Any]) -> list[tuple[str, str]]:
+    """The findings as (name, text), in the order in which they are printed.
+
+    Args:
+        findings: what `examine` returns.
+    """
+    from jinja2 import Environment
+
+    environment = Environment()  # nosec B701: plain text for a terminal
+    environment.filters |= {"unit": _in_unit, "megabytes": megabytes}
+    scene = findings["scene"] or {}
+    fixtures = [Fixture.from_dict(one) for one in scene.get("fixtures", [])]
+    values = findings | {
+        "shape": findings["arena"] and Arena.from_dict(findings["arena"]),
+        "fixtures": fixtures,
+        "passing": [one for one in fixtures if (one.since_s, one.until_s) != (None, None)],
+        "sensor": "" if scene.get("sensor") is None else SensorCard.from_dict(scene["sensor"]),
+    }
+    texts = {
+        name: " ".join(environment.from_string(template).render(values).split())
+        for name, template in _TEXT["lines"].items()
+    }
+    return [(name, text) for name, text in texts.items() if text]
+
+
+def _in_unit(value: float | None, unit: str, digits: int = 0) -> str:
+    return "unknown" if value is None else f"{value:.{digits}f} {unit}"

@@ -14,17 +14,20 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from liex_lab.body.skeleton import Skeleton
 from liex_lab.errors import EstimationError, PlanError
+from liex_lab.optics.refraction import Water
 from liex_lab.plan import Plan
+from liex_lab.recordings.recording import Recording
+from liex_lab.scene.floor import Floor, floor_patch
+from liex_lab.scene.outline import find_arena
+from liex_lab.scene.support_plane import SampledScene, find_standing
 
 from .origin import animal_of, build_zones
 from .regions import region_of, stated_floor
 
 if TYPE_CHECKING:
-    from liex_lab.optics.refraction import Water
-    from liex_lab.recordings.recording import Recording
     from liex_lab.scene.background_segmenter import BackgroundSubtraction
-    from liex_lab.scene.floor import Floor
 
 _LEVEL_RAD = math.radians(3.0)  # a tank's floor is as level as the water over it, to this
 _MUCH_UNREAD = 0.2  # share of the pixels on the floor
@@ -74,11 +77,7 @@ class SceneLook:
 
     def at_scene(self) -> None:
         """Look at floor, noise, arena, water and animal; fills facts and problems."""
-        from liex_lab.body.skeleton import Skeleton
         from liex_lab.scene.background import learn_background
-        from liex_lab.scene.floor import Floor, floor_patch
-        from liex_lab.scene.outline import find_arena
-        from liex_lab.scene.support_plane import SampledScene, find_standing
 
         grid = self.seen.camera.every(self.stride)
         try:
@@ -180,8 +179,6 @@ class SceneLook:
         """Find the animal as a run would; where none of the plan's size is, look for one of another
         size.
         """
-        from liex_lab.body.skeleton import Skeleton
-        from liex_lab.recordings.recording import Recording
         from liex_lab.scene.background import sampled
         from liex_lab.scene.background_segmenter import BackgroundSubtraction
 
@@ -222,7 +219,14 @@ class SceneLook:
             if factor == 1.0:
                 self._tell_animal(scene, background, length, float(crops.found.mean()))
             else:
-                self._tell_wrong_size(length, expected)
+                self.problems.append(
+                    f"what moves is about {length:.0f} mm long, but the plan expects an animal "
+                    f"with a spine of {expected[0]:g} to {expected[1]:g} mm; if the animal is of "
+                    "that size, the millimetres are wrong by a factor of about "
+                    f"{length / math.sqrt(expected[0] * expected[1]):.2g} (check unit_mm and the "
+                    "focal lengths), else set animal.spine_min_mm and animal.spine_max_mm or name "
+                    "another --plan"
+                )
             return
         self.problems.append(missing)
 
@@ -260,15 +264,6 @@ class SceneLook:
                 f"the animal was found in only {share:.0%} of the frames looked at; cut off the "
                 "time before it came and after it left, and check that the whole arena is in view"
             )
-
-    def _tell_wrong_size(self, length: float, expected: tuple[float, float]) -> None:
-        self.problems.append(
-            f"what moves is about {length:.0f} mm long, but the plan expects an animal with a "
-            f"spine of {expected[0]:g} to {expected[1]:g} mm; if the animal is of that size, the "
-            "millimetres are wrong by a factor of about "
-            f"{length / math.sqrt(expected[0] * expected[1]):.2g} (check unit_mm and the focal "
-            "lengths), else set animal.spine_min_mm and animal.spine_max_mm or name another --plan"
-        )
 
 
 def _noise(sample: NDArray[np.float32], where: NDArray[np.bool_]) -> float | None:

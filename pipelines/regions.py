@@ -10,8 +10,18 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from liex_lab.body.skeleton import VIEWS, Skeleton
 from liex_lab.errors import PlanError
+from liex_lab.optics.camera import Camera
 from liex_lab.plan import Plan
+from liex_lab.plan.sections import Region, SeveralArenas
+from liex_lab.recordings.frame import region_mask
+from liex_lab.recordings.recording import Recording
+from liex_lab.scene.floor import Floor
+from liex_lab.scene.multi_arena import arenas_apart
+from liex_lab.scene.region import Corners, region_corners_px
+from liex_lab.scene.scene import plane_of
+from liex_lab.scene.support_plane import SampledScene, find_standing
 
 from .origin import animal_of
 
@@ -19,12 +29,6 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from liex_lab.optics.camera import Camera
-    from liex_lab.plan.sections import Region, SeveralArenas
-    from liex_lab.recordings.recording import Recording
-    from liex_lab.scene.floor import Floor
-    from liex_lab.scene.region import Corners
-    from liex_lab.scene.support_plane import SampledScene
 
 _N_SAMPLED = 96
 
@@ -53,8 +57,6 @@ def stated_corners(recording: Recording, plan: Plan, region: Region) -> Corners:
         plan: states the floor, or the animals that stand on it.
         region: the region.
     """
-    from liex_lab.scene.region import region_corners_px
-
     floor = None if region.unit == "px" else _floor_of_picture(recording, plan)
     return region_corners_px(region, recording.camera, floor)
 
@@ -82,8 +84,6 @@ def stated_floor(camera: Camera, plan: Plan) -> Floor | None:
     Raises:
         PlanError: the floor does not face the camera.
     """
-    from liex_lab.scene.scene import plane_of
-
     floor = plan.arena.floor
     return None if isinstance(floor, str) else plane_of(floor.point, floor.normal, camera)
 
@@ -98,8 +98,6 @@ def region_of(recording: Recording, plan: Plan) -> NDArray[np.bool_] | None:
     Raises:
         PlanError: the region is none in this picture.
     """
-    from liex_lab.recordings.frame import region_mask
-
     corners = recording.region_px
     if not corners and plan.arena.region is not None:
         corners = stated_corners(recording, plan, plan.arena.region)
@@ -108,9 +106,6 @@ def region_of(recording: Recording, plan: Plan) -> NDArray[np.bool_] | None:
 
 def _floor_of_picture(recording: Recording, plan: Plan) -> Floor:
     """The floor on which animals stand in the whole picture, or the one that the plan states."""
-    from liex_lab.scene.floor import Floor
-    from liex_lab.scene.support_plane import find_standing
-
     stated = stated_floor(recording.camera, plan)
     if stated is not None:
         return stated
@@ -120,9 +115,7 @@ def _floor_of_picture(recording: Recording, plan: Plan) -> Floor:
 
 def _sampled(recording: Recording, plan: Plan) -> tuple[SampledScene, int]:
     """Frames spread over a recording with their background, and the stride of their pixels."""
-    from liex_lab.body.skeleton import Skeleton
     from liex_lab.scene.background import learn_background, sample_frames, stride_for
-    from liex_lab.scene.support_plane import SampledScene
 
     animal = animal_of(plan)
     stride = stride_for(recording, animal.spine_min_mm)
@@ -172,10 +165,6 @@ def propose_arenas(recording: Recording, plan: Plan) -> list[SeveralArenas]:
     Returns:
         Two to eight of them with a polygon each that touches no other; [] where only one is seen.
     """
-    from liex_lab.body.skeleton import VIEWS, Skeleton
-    from liex_lab.plan.sections import SeveralArenas
-    from liex_lab.scene.multi_arena import arenas_apart
-
     view = Skeleton.load(plan.animal.skeleton).view
     if view.frame != VIEWS[0] or recording.region_px:
         return []

@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from liex_lab.pipelines.study.slurm import SlurmTable
+from liex_lab.pipelines.study.cluster import SlurmTable
 
 from liex_lab.body.skeleton import PRESETS, Skeleton
 from liex_lab.body.surface import Surface

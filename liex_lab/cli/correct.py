@@ -131,25 +131,25 @@ def bout(
 @correct.command("list")
 def list_corrections(session: SessionPath) -> None:
     """List every correction: who made it, when, and whether it was taken back."""
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
     from liex_lab.sessions import Session
     from liex_lab.sessions.corrections import FOLDER, applies, read_log
 
     opened = Session.open(session, raw=True)
     log = read_log(opened.path)
-    standing = {entry.number for entry in log.standing} | set(log.undos)
-    from rich.console import Console
-    from rich.table import Table
-    from rich.text import Text
-
-    table = Table("", "what", "by", "at", "")
-    for entry in log.entries:
-        what = str(entry.what) if entry.what is not None else f"{entry.undoes} taken back"
-        gone = entry.what is not None and entry.number not in standing
-        said = (str(entry.number), what, entry.author, entry.made_at, "taken back" if gone else "")
-        table.add_row(*(Text(printable(one)) for one in said))
     if not log.entries:
         say(f"{opened.path} has no corrections")
         return
+    standing = {entry.number for entry in log.standing}
+    table = Table("", "what", "by", "at", "")
+    for entry in log.entries:
+        what = f"{entry.undoes} taken back" if entry.what is None else str(entry.what)
+        state = "" if entry.what is None or entry.number in standing else "taken back"
+        row = (str(entry.number), what, entry.author, entry.made_at, state)
+        table.add_row(*(Text(printable(one)) for one in row))
     Console().print(table)
     if log.standing and not applies(log, opened.path, opened.metadata):
         say(

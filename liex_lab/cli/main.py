@@ -209,8 +209,7 @@ def doctor(
     stated = [*asked, *([] if fps is None else [f"recording.fps={fps}"])]
     options = [] if topic is None else ["--topic", topic]
     options += [word for setting in stated for word in ("--set", setting)]
-    from liex_lab.pipelines.doctor import examine
-    from liex_lab.pipelines.doctor_text import print_report
+    from liex_lab.pipelines.doctor import examine, print_report
 
     with progress_bar() as progress:
         findings = examine(

@@ -75,7 +75,7 @@ def cohort(
     from liex_lab.api import run_study
 
     if scheduler is not None:
-        from liex_lab.pipelines.study.dask_cluster import is_encrypted
+        from liex_lab.pipelines.study.cluster import is_encrypted
 
         if not is_encrypted(scheduler):
             say(f"what goes to and from {scheduler} is not encrypted, and each side runs what the")

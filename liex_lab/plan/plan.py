@@ -34,6 +34,7 @@ from liex_lab.plan.sections import (
     Table,
     Tracking,
     WaterSurface,
+    first_twice,
 )
 from liex_lab.runtime.text_files import parse_toml, read_text
 
@@ -108,9 +109,7 @@ class Plan(Table):
             return self
         if not 1 <= len(self.arenas) <= _MOST_ARENAS:
             raise ValueError(f"[[arenas]] lists 1 to {_MOST_ARENAS} arenas, got {len(self.arenas)}")
-        names = [one.name.lower() for one in self.arenas]  # some file systems take A and a for one
-        twice = next((name for name in names if names.count(name) > 1), None)
-        if twice is not None:
+        if twice := first_twice(one.name for one in self.arenas):
             raise ValueError(f"two [[arenas]] are called {twice}; give each a name of its own")
         return self
 

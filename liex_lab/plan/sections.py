@@ -8,6 +8,8 @@ that are written.
 from __future__ import annotations
 
 import re
+from collections import Counter
+from collections.abc import Iterable
 from datetime import datetime
 from typing import Annotated, Any, Literal
 
@@ -57,6 +59,13 @@ def whole_age(age: str | None) -> str | None:
     if _DURATION.fullmatch(age.strip()):
         return age.strip()
     raise ValueError("should be an age such as 12 weeks or 84 days, or ISO 8601, as P12W")
+
+
+def first_twice(names: Iterable[str]) -> str:
+    """The first name that occurs again in whatever case, which some file systems ignore, or ''."""
+    listed = list(names)
+    counts = Counter(name.lower() for name in listed)
+    return next((name for name in listed if counts[name.lower()] > 1), "")
 
 
 class Table(BaseModel):

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import difflib
 import json
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -20,7 +21,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from liex_lab.errors import PlanError, StudyError
 from liex_lab.plan import Plan, known_plans
-from liex_lab.plan.sections import ArenaName, Region
+from liex_lab.plan.sections import ArenaName, Region, first_twice
 from liex_lab.runtime.places import named_beside
 from liex_lab.runtime.text_files import read_toml
 
@@ -142,18 +143,14 @@ class StudyTable(_Table):
 
     @model_validator(mode="after")
     def _agree(self) -> StudyTable:
-        known: set[str] = set()
-        for animal in self.animals:
-            if animal.id.lower() in known:  # some file systems take M01 and m01 for one
-                raise ValueError(f"the animal {animal.id} is listed twice; keep one")
-            known.add(animal.id.lower())
+        ids = [animal.id for animal in self.animals]
+        if twice := first_twice(ids):
+            raise ValueError(f"the animal {twice} is listed twice; keep one")
         arenas = [arena.name for arena in self.arenas]
-        if len(arenas) > len({name.lower() for name in arenas}):
+        if first_twice(arenas):
             raise ValueError("two [[arenas]] have the same name; give each its own")
-        taken: set[tuple[str, str]] = set()
-        filmed: set[tuple[str, str]] = set()
         for one in self.sessions:
-            if one.animal not in {animal.id for animal in self.animals}:
+            if one.animal not in ids:
                 raise ValueError(
                     f"the session {one.session} is of {one.animal}, an animal that is not in "
                     "[[animals]]"
@@ -163,19 +160,16 @@ class StudyTable(_Table):
                     f"the session {one.session} of {one.animal} is in the arena {one.arena}, which "
                     "is not in [[arenas]]"
                 )
-            if one.arena and (one.recording, one.arena) in filmed:
+        filmed = Counter((one.arena, one.recording) for one in self.sessions if one.arena)
+        for (arena, recording), n in filmed.items():
+            if n > 1:
                 raise ValueError(
-                    f"two sessions are of the arena {one.arena} in {one.recording}; an arena holds "
-                    "one animal"
+                    f"two sessions are of the arena {arena} in {recording}; an arena holds one "
+                    "animal"
                 )
-            filmed.add((one.recording, one.arena))
-            key = one.animal.lower(), one.session.lower()
-            if key in taken:
-                raise ValueError(
-                    f"the animal {one.animal} has two sessions {one.session}; give each its own "
-                    "name"
-                )
-            taken.add(key)
+        named = [f"{one.animal} has two sessions {one.session}" for one in self.sessions]
+        if twice := first_twice(named):
+            raise ValueError(f"the animal {twice}; give each its own name")
         return self
 
 

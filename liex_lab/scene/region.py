@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from itertools import combinations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from liex_lab.errors import PlanError
 from liex_lab.optics.camera import Camera
@@ -18,21 +19,54 @@ from liex_lab.plan.sections import Region
 from liex_lab.recordings.frame import region_mask
 from liex_lab.scene.floor import Floor
 from liex_lab.scene.outline import circle_points
-from liex_lab.scene.polygon import crossing_sides
 from liex_lab.scene.scene import Mask
 
+Array = NDArray[np.float64]
 Corners = tuple[tuple[float, float], ...]
+
+
+def crossing_sides(corners: Array) -> tuple[int, int] | None:
+    """The first two sides of a polygon that cross inside both, counted from 0.
+
+    Two lines cross where the ends of each lie on two sides of the other.
+
+    Args:
+        corners: (n, 2), in order; side k goes from corner k to the next.
+
+    Returns:
+        Their numbers, the smaller first; None where no sides cross.
+    """
+    ends = np.roll(corners, -1, axis=0)
+    n = len(corners)
+    for i in range(n - 2):
+        others = slice(i + 2, n - (i == 0))
+        a, b, c, d = corners[i], ends[i], corners[others], ends[others]
+        crossing = (_side(a, b, c) * _side(a, b, d) < 0) & (_side(c, d, a) * _side(c, d, b) < 0)
+        if crossing.any():
+            return i, i + 2 + int(np.argmax(crossing))
+    return None
+
+
+def _side(p: Array, q: Array, r: Array) -> Array:
+    """Twice the signed area of triangles p, q, r, any of them (..., 2)."""
+    return np.asarray(
+        (q[..., 0] - p[..., 0]) * (r[..., 1] - p[..., 1])
+        - (q[..., 1] - p[..., 1]) * (r[..., 0] - p[..., 0])
+    )
+
 
 _N_CORNERS = 64  # of a circle
 _DEEPEST_SHARE = 1e-3  # a place on the floor lies at least this share of its distance before it
 
 
-def region_corners_px(region: Region, camera: Camera, floor: Floor | None) -> Corners:
+def region_corners_px(
+    region: Region, camera: Camera | None = None, floor: Floor | None = None
+) -> Corners:
     """The corners of a region in the picture.
 
     Args:
         region: as a plan states it.
-        camera: the ideal pinhole camera of the recording.
+        camera: the ideal pinhole camera of the recording; needed for millimetres alone.
         floor: on which millimetres count; needed for those alone.
 
     Returns:
@@ -49,7 +83,7 @@ def region_corners_px(region: Region, camera: Camera, floor: Floor | None) -> Co
         )
     if region.unit == "px":
         return tuple((float(u), float(v)) for u, v in corners)
-    if floor is None:
+    if camera is None or floor is None:
         raise PlanError("a region in mm needs a floor; state it in pixels, or state arena.floor")
     place = np.column_stack([corners, np.zeros(len(corners))])
     seen = floor.T_arena_camera.inverse() @ place

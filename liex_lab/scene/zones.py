@@ -23,7 +23,7 @@ from liex_lab.optics.camera import Camera
 from liex_lab.runtime.text_files import read_toml
 from liex_lab.scene.floor import Floor
 from liex_lab.scene.outline import Arena, circle_points
-from liex_lab.scene.polygon import crossing_sides
+from liex_lab.scene.region import crossing_sides
 
 Array = NDArray[np.float64]
 

@@ -1,11 +1,10 @@
-"""Append-only log of human corrections to a session: flips, moved joints, edited bouts, and who
-the animal is.
+"""Append-only log of human corrections to a session: flips, joints, bouts and descriptions.
 
-A session's own files are never written again. Beside them lies the folder `corrected`:
-`corrections.json` is the log, to which entries are only ever added (one may take back another), and
-the tables are what the session's own become with the entries that stand. The log states the hashes
-of the tables that it was made on and the SHA-256 of its own content. `Session.open` reads the
-corrected tables; `Session.open(path, raw=True)` reads what was measured.
+The files of a session are never written again. The folder `corrected` beside them holds
+`corrections.json`, a log to which entries are only added (one entry may take back another), and the
+tables that follow from the corrections that stand. The log states the hashes of the tables that it
+was made on and the SHA-256 of its own content. `Session.open` reads the corrected tables;
+`Session.open(path, raw=True)` reads the measured ones.
 """
 
 from __future__ import annotations
@@ -14,13 +13,16 @@ import getpass
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, field
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, TypeAdapter
+from pydantic.dataclasses import dataclass
 
 from liex_lab.catalog import sha256
-from liex_lab.errors import SessionError
+from liex_lab.errors import SessionError, one_line
 from liex_lab.runtime.places import safe_name
 from liex_lab.sessions.verdict import ALSO, WHO
 
@@ -36,9 +38,9 @@ FACTS = {
     "refused_bouts",
     "corrections",
 }  # sections that may change
-EDITS = ("add", "rename", "recut", "delete")
 START = "session_start_time"
 DESCRIBED = (*WHO, *ALSO, START)
+_UNDO = "undo"
 
 
 @dataclass(frozen=True)
@@ -46,14 +48,13 @@ class FlipSpan:
     """Head and tail are exchanged in a span of frames.
 
     Attributes:
-        kind: the word for it in the log.
         start_frame: first frame, the camera's count.
         stop_frame: the first frame after the span.
     """
 
-    kind: ClassVar[str] = "flip"
     start_frame: int
     stop_frame: int
+    kind: Literal["flip"] = "flip"
 
     def __str__(self) -> str:
         """The sentence for a list of corrections."""
@@ -65,7 +66,6 @@ class JointMove:
     """In one frame a joint lies at another position.
 
     Attributes:
-        kind: the word for it in the log.
         frame: the frame, the camera's count.
         joint: the joint's name.
         x_mm: position in the arena frame, mm.
@@ -74,13 +74,13 @@ class JointMove:
         note: how the height was chosen, where the depth under the pixel did not give it.
     """
 
-    kind: ClassVar[str] = "joint"
     frame: int
     joint: str
     x_mm: float
     y_mm: float
     z_mm: float
-    note: str = ""
+    note: str = ""  # logs of earlier versions lack it
+    kind: Literal["joint"] = "joint"
 
     def __str__(self) -> str:
         """The sentence for a list of corrections."""
@@ -95,9 +95,8 @@ class BoutEdit:
     """In a span of time the animal does something else than the ethogram says.
 
     Attributes:
-        kind: the word for it in the log.
-        edit: a word of `EDITS`.
-        action: what the animal does; '' is nothing that has a name.
+        edit: what is done to the bout.
+        action: what the animal does; '' for nothing that has a name.
         start_ns: start on the recording's clock, ns.
         stop_ns: stop, ns, exclusive.
         was: action of the bout that is edited, for the reader.
@@ -108,17 +107,17 @@ class BoutEdit:
         ValueError: the edit is not known, or the span is empty.
     """
 
-    kind: ClassVar[str] = "bout"
-    edit: str
+    edit: Literal["add", "rename", "recut", "delete"]
     action: str
     start_ns: int
     stop_ns: int
     was: str = ""
     was_start_ns: int = 0
     was_stop_ns: int = 0
+    kind: Literal["bout"] = "bout"
 
     def __post_init__(self) -> None:
-        if self.edit not in EDITS or self.stop_ns <= self.start_ns:
+        if self.stop_ns <= self.start_ns:
             raise ValueError(f"{self.edit} from {self.start_ns} to {self.stop_ns}")
 
     def __str__(self) -> str:
@@ -128,27 +127,26 @@ class BoutEdit:
             return f"{self.was} of {seconds} is {self.action}"
         if self.edit == "delete":
             return f"no {self.was} for {seconds}"
-        return f"{self.action} for {seconds}" + (" (cut anew)" if self.edit == "recut" else "")
+        return f"{self.action} for {seconds}" + (" (new span)" if self.edit == "recut" else "")
 
 
 @dataclass(frozen=True)
 class Description:
-    """Something that is known of the animal or the session, and that nothing is measured by.
+    """A fact about the animal or the session that no measurement depends on.
 
-    It holds for every measurement of the recording.
+    It applies to every measurement of the recording.
 
     Attributes:
-        kind: the word for it in the log.
         key: one of `DESCRIBED`.
-        value: its value; '' is unknown.
+        value: its value; '' if unknown.
 
     Raises:
         ValueError: the key is not known.
     """
 
-    kind: ClassVar[str] = "description"
     key: str
     value: str
+    kind: Literal["description"] = "description"
 
     def __post_init__(self) -> None:
         if self.key not in DESCRIBED:
@@ -160,13 +158,9 @@ class Description:
 
 
 Correction = FlipSpan | JointMove | BoutEdit | Description
-_KINDS: dict[str, type[Correction]] = {
-    "flip": FlipSpan,
-    "joint": JointMove,
-    "bout": BoutEdit,
-    "description": Description,
-}
-_UNDO = "undo"
+_CORRECTION: TypeAdapter[Correction] = TypeAdapter(
+    Annotated[Correction, Field(discriminator="kind")]
+)
 
 
 @dataclass(frozen=True)
@@ -198,26 +192,15 @@ class Entry:
     def from_dict(entry: Mapping[str, Any]) -> Entry:
         """The entry that `to_dict` made into a table.
 
-        Args:
-            entry: one entry of corrections.json.
-
         Raises:
-            ValueError: a value cannot be used.
-            KeyError: a key is missing, or the kind is not known.
+            ValueError: a value cannot be used, or the kind is not known.
+            KeyError: a key is missing.
             TypeError: a value is of another type.
         """
         about = (int(entry["number"]), str(entry["author"]), str(entry["made_at"]))
         if entry["kind"] == _UNDO:
             return Entry(*about, None, int(entry["undoes"]))
-        kind = _KINDS[entry["kind"]]
-        # entries of earlier versions lack what was added since
-        values = {f.name: _typed(entry[f.name], f.type) for f in fields(kind) if f.name in entry}
-        return Entry(*about, kind(**values))
-
-
-def _typed(value: Any, kind: Any) -> Any:
-    """A value of the log with its own type; annotations are text here."""
-    return {"int": int, "float": float, "str": str}[str(kind)](value)
+        return Entry(*about, _CORRECTION.validate_python(entry))
 
 
 @dataclass(frozen=True)
@@ -229,12 +212,21 @@ class Log:
         entries: the entries in the order in which they were made.
         files: bytes and SHA-256 of each corrected table by name.
         facts: sections that session.json would have instead, a subset of `FACTS`.
+
+    Raises:
+        ValueError: a file lies outside of the folder, or a section is not one of `FACTS`.
     """
 
     made_of: str
     entries: tuple[Entry, ...] = ()
-    files: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
-    facts: Mapping[str, Any] = field(default_factory=dict)
+    files: dict[str, dict[str, Any]] = field(default_factory=dict)
+    facts: dict[str, dict[str, Any]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if any(safe_name(name) != name for name in self.files):
+            raise ValueError("files outside of its folder")
+        if not set(self.facts) <= FACTS:
+            raise ValueError(f"facts of {', '.join(sorted(set(self.facts) - FACTS))}")
 
     @property
     def standing(self) -> tuple[Entry, ...]:
@@ -266,11 +258,7 @@ class Log:
         return (number, whats[undone]) if number > max(whats, default=0) else None
 
     def corrections(self, kind: type[Any]) -> list[Any]:
-        """The standing corrections of one kind.
-
-        Args:
-            kind: `FlipSpan`, `JointMove`, `BoutEdit` or `Description`.
-        """
+        """The standing corrections of one kind."""
         return [entry.what for entry in self.standing if isinstance(entry.what, kind)]
 
     @property
@@ -302,11 +290,11 @@ class Log:
                 raise SessionError(
                     f"there is no correction {number} to take back; those that stand are {told}"
                 )
-        who = author or author_name()
+        author = author or author_name()
         now = datetime.now(UTC).isoformat(timespec="seconds")
         first = 1 + max((entry.number for entry in self.entries), default=0)
         wanted = [*((None, number) for number in dict.fromkeys(undo)), *((one, 0) for one in what)]
-        new = [Entry(number, who, now, *one) for number, one in enumerate(wanted, first)]
+        new = [Entry(number, author, now, *one) for number, one in enumerate(wanted, first)]
         return Log(self.made_of, (*self.entries, *new), self.files, self.facts)
 
     def to_json(self) -> str:
@@ -317,8 +305,8 @@ class Log:
             "schema_version": SCHEMA_VERSION if redone else 2,  # which earlier versions read
             "made_of": self.made_of,
             "entries": [entry.to_dict() for entry in self.entries],
-            "files": {name: dict(facts) for name, facts in self.files.items()},
-            "facts": dict(self.facts),
+            "files": self.files,
+            "facts": self.facts,
         }
         plain = json.loads(json.dumps(document, default=str, allow_nan=False))
         return json.dumps({**plain, "sum": _sum(plain)}, indent=1, ensure_ascii=False) + "\n"
@@ -342,11 +330,7 @@ def author_name() -> str:
 
 
 def corrected_folder(session: Path) -> Path:
-    """Folder of a session's corrections; while it is being replaced, the one that was there before.
-
-    Args:
-        session: the session folder.
-    """
+    """Folder of a session's corrections; while it is being replaced, the previous one."""
     folder = session / FOLDER
     old = session / f"{FOLDER}.old"
     return old if old.is_dir() and not folder.is_dir() else folder
@@ -357,7 +341,7 @@ def basis(session: Path, metadata: Mapping[str, Any]) -> str:
 
     Args:
         session: the session folder.
-        metadata: the content of session.json, which may state the hashes already.
+        metadata: the content of session.json, which may state the hashes.
 
     Returns:
         The first 16 hexadecimal digits of each table's SHA-256, joined by '-'.
@@ -377,9 +361,6 @@ def basis(session: Path, metadata: Mapping[str, Any]) -> str:
 def read_log(session: Path) -> Log:
     """Read the corrections of a session; an empty log where there are none.
 
-    Args:
-        session: the session folder.
-
     Raises:
         SessionError: the log is damaged or was written by a later version.
     """
@@ -397,19 +378,8 @@ def read_log(session: Path) -> Log:
         if document["sum"] != _sum(document):
             raise ValueError("its sum does not fit, so it was changed")
         entries = tuple(Entry.from_dict(entry) for entry in document["entries"])
-        files = document.get("files", {})
-        facts = document.get("facts", {})
-        if not (
-            isinstance(files, dict)
-            and isinstance(facts, dict)
-            and all(isinstance(one, dict) for one in (*files.values(), *facts.values()))
-        ):
-            raise TypeError("files and facts are tables of tables")
-        if any(safe_name(name) != name for name in files):
-            raise ValueError("files outside of its folder")
-        if not set(facts) <= FACTS:
-            raise ValueError(f"facts of {', '.join(sorted(set(facts) - FACTS))}")
-        return Log(str(document["made_of"]), entries, files, facts)
+        made_of = str(document["made_of"])
+        return Log(made_of, entries, document.get("files", {}), document.get("facts", {}))
     except (
         OSError,
         ValueError,
@@ -420,19 +390,13 @@ def read_log(session: Path) -> Log:
         RecursionError,
     ) as error:
         raise SessionError(
-            f"{path} is damaged ({type(error).__name__}: {error}); put back a copy of it, or "
-            f"remove the folder {FOLDER} to go on with what was measured"
+            f"{path} is damaged ({type(error).__name__}: {one_line(error)}); restore a copy of it, "
+            f"or remove the folder {FOLDER} to continue with what was measured"
         ) from None
 
 
 def applies(log: Log, session: Path, metadata: Mapping[str, Any]) -> bool:
-    """Whether the log has corrections that stand, and they were made on these poses and bouts.
-
-    Args:
-        log: the corrections.
-        session: the session folder.
-        metadata: the content of session.json.
-    """
+    """Whether the log has corrections that stand, and they were made on these poses and bouts."""
     return bool(log.standing) and log.made_of == basis(session, metadata)
 
 
@@ -444,9 +408,9 @@ def with_description(metadata: Mapping[str, Any], described: Mapping[str, str]) 
         described: see `Log.described`.
     """
     found = dict(metadata)
-    who = {name: value for name, value in described.items() if name != START}
-    if who:
-        subject = {**metadata.get("subject", {}), **who}
+    subject = {name: value for name, value in described.items() if name != START}
+    if subject:
+        subject = {**metadata.get("subject", {}), **subject}
         found["subject"] = {name: value for name, value in subject.items() if value}
     if START in described:
         found[START] = described[START] or None

@@ -8,24 +8,124 @@ more than three workers died of is quarantined.
 
 from __future__ import annotations
 
+import json
 import os
 import time
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from liex_lab.errors import StudyError
+from liex_lab.errors import RecordingError, StudyError
 from liex_lab.plan.study import PlannedSession
-from liex_lab.runtime.progress import Progress
-from liex_lab.sessions.folder import describe_failure
+from liex_lab.runtime.progress import Progress, silent
+from liex_lab.sessions.backups import set_outdated, taken_from
+from liex_lab.sessions.folder import describe_failure, read_failure, write_failure
+from liex_lab.sessions.verdict import read_verdict
 
-from ..workers import Done, Work
-from .one_session import RunSession, measure_one, quarantine
-from .sharing import LOOKING, LookAtSession, about
-from .status import SessionStatus
+from ..workers import Done, Work, WorkerPool
+from .sharing import LOOKING, LookAtSession, Stage, about, input_stamp
+from .status import SessionStatus, to_look_at
 
 if TYPE_CHECKING:
     from distributed import Client
+
+
+# measures a recording into a session folder, and returns it: `liex_lab.api.run_session`
+RunSession = Callable[..., Path]
+
+
+def measure_one(
+    session: PlannedSession,
+    run: RunSession,
+    progress: Progress = silent,
+    run_id: str = "",
+    pool: WorkerPool | None = None,
+) -> dict[str, Any]:
+    """Measure a session, or quarantine it, and tell how it went.
+
+    Done twice it does the same: what was interrupted goes on, and what is there is replaced when
+    the new one is whole.
+
+    Args:
+        session: what is measured, how and where to.
+        run: measures the recording.
+        progress: told frame by frame.
+        run_id: of the study's run; a session that it has ended already is not measured again.
+        pool: pool of workers for the session's shards.
+
+    Returns:
+        `id`, `state` (`done` or `failed`), `seconds`, `failure` (None where it is done),
+        `corrections_taken_from` (the outdated copy that people had corrected; "" for none), and
+        `look_at_it` (what there is to look at or to distrust although it is done; "" for nothing).
+    """
+    if run_id and (ended := _ended(session, run_id)):
+        return ended
+    began = time.perf_counter()
+    stage = Stage(progress)
+    failure = None
+    try:
+        if not session.recording_exists:
+            raise RecordingError(
+                f"there is no recording {session.recording}; correct its path, or copy it there"
+            )
+        stamp = input_stamp(session.recording)
+        run(
+            session.recording,
+            session.plan,
+            folder=session.folder,
+            overwrite=True,
+            notes={
+                "input": {"stamp": stamp},
+                "run_id": run_id,
+                **({"problems": [session.remark]} if session.remark else {}),
+            },
+            pool=pool,
+            progress=stage,
+        )
+    except Exception as error:
+        failure = describe_failure(error, stage.name, stage.frame) | {"run_id": run_id}
+        quarantine(session, failure)
+    seconds = round(time.perf_counter() - began, 3)
+    return {
+        "id": session.id,
+        "state": "failed" if failure else "done",
+        "seconds": seconds,
+        "failure": failure,
+        "corrections_taken_from": "" if failure else taken_from(session.folder),
+        "look_at_it": "" if failure else to_look_at(read_verdict(session.folder)),
+    }
+
+
+def _ended(session: PlannedSession, run_id: str) -> dict[str, Any] | None:
+    """How the session ended in this run of the study already, before its worker could tell."""
+    failure = read_failure(session.folder)
+    if failure and failure.get("run_id") == run_id:
+        return {"id": session.id, "state": "failed", "seconds": 0.0, "failure": failure}
+    try:
+        document = json.loads((session.folder / "session.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+    same = isinstance(document, dict) and document.get("run_id") == run_id
+    return {"id": session.id, "state": "done", "seconds": 0.0, "failure": None} if same else None
+
+
+def quarantine(session: PlannedSession, failure: dict[str, Any]) -> None:
+    """Leave failed.json in the session's place, with plan and input so that changes show.
+
+    Args:
+        session: the session that failed; its older results are set aside.
+        failure: what `describe_failure` tells of the error.
+    """
+    known = {
+        "session_id": session.id,
+        **failure,
+        "plan": session.plan.model_dump(exclude_none=True),
+    }
+    known["input"] = {"stamp": input_stamp(session.recording)}
+    set_outdated(session.folder)
+    write_failure(session.folder, known)
+
 
 TOPIC = "liex-progress"
 DEATHS = 3  # of workers, before a session is held to be what kills them
@@ -65,12 +165,10 @@ class Crew:
             told: is told id, pieces done, pieces in all, and what is being done.
             finished: is given each result as soon as it is there.
         """
-        self._told = told
-        count = self._n_jobs or len(self._client.nthreads())
-        shared = n_shared(len(todo), count)
-        task = partial(_on_worker, run)
+        shared = n_shared(len(todo), self._n_jobs or len(self._client.nthreads()))
         planned = [one.session for one in todo]
-        return list(_results(self._client, planned, task, _died, finished, shared))
+        task = partial(_on_worker, run)
+        return self._each(planned, task, "measuring", _quarantined, told, finished, shared)
 
     def look_at(
         self,
@@ -87,9 +185,50 @@ class Crew:
             told: is told id, pieces done, pieces in all, and what is being done.
             finished: is given each look as soon as it is there.
         """
-        self._told = told
         task = partial(_look_on_worker, look)
-        return list(_results(self._client, sessions, task, _died_looking, finished))
+        return self._each(sessions, task, LOOKING, _not_seen, told, finished)
+
+    def _each(
+        self,
+        planned: Sequence[PlannedSession],
+        task: Callable[[PlannedSession, str, bool], dict[str, Any]],
+        stage: str,
+        died: Callable[[PlannedSession, dict[str, Any]], dict[str, Any]],
+        told: Told,
+        finished: Finished,
+        shared: int = 0,
+    ) -> list[dict[str, Any]]:
+        """Results of the task of each session, or of `died` if its workers ended in this stage."""
+        from distributed import CancelledError, as_completed
+
+        self._told = told
+        run_id = f"{os.getpid()}-{time.monotonic_ns()}"
+        alone = len(planned) - shared
+        sessions = {f"{session.id}-{run_id}": session for session in planned}
+        submitted = [
+            self._client.submit(task, session, run_id, k >= alone, key=key, pure=False)
+            for k, (key, session) in enumerate(sessions.items())
+        ]
+        completed = as_completed(submitted, loop=self._client.loop)
+        del submitted
+        results = []
+        for future in completed:
+            session = sessions[future.key]
+            try:  # a result that a dying worker took with it is waited for until it is made again
+                error = future.exception()
+                result = (
+                    future.result() if error is None else died(session, _why_died(error, stage))
+                )
+            except CancelledError:  # by the client, as nobody here takes a session back
+                raise StudyError(
+                    "the Dask scheduler ended before the study did; the sessions that were "
+                    "measured are kept, and the same command goes on with the rest once a "
+                    "scheduler answers"
+                ) from None
+            future.release()  # what a worker holds would be made again if it died
+            finished(result)
+            results.append(result)
+        return results
 
 
 def n_shared(n: int, n_workers: int) -> int:
@@ -105,57 +244,13 @@ def n_shared(n: int, n_workers: int) -> int:
     return n % max(n_workers, 1)
 
 
-def _results(
-    client: Client,
-    planned: Sequence[PlannedSession],
-    task: Callable[[PlannedSession, str, bool], dict[str, Any]],
-    died: Callable[[PlannedSession, BaseException], dict[str, Any]],
-    finished: Finished,
-    shared: int = 0,
-) -> Iterator[dict[str, Any]]:
-    """What the task makes of every session, or `died` of one whose workers ended without a word."""
-    from distributed import CancelledError, as_completed
-
-    run_id = f"{os.getpid()}-{time.monotonic_ns()}"
-    submitted = [
-        client.submit(
-            task,
-            session,
-            run_id,
-            k >= len(planned) - shared,
-            key=f"{session.id}-{run_id}",
-            pure=False,
-        )
-        for k, session in enumerate(planned)
-    ]
-    sessions = {future.key: session for future, session in zip(submitted, planned, strict=True)}
-    completed = as_completed(submitted, loop=client.loop)
-    del submitted
-    for future in completed:
-        session = sessions[future.key]
-        try:  # a result that a dying worker took with it is waited for until it is made again
-            error = future.exception()
-            result = died(session, error) if error is not None else future.result()
-        except CancelledError:  # by the client, as nobody here takes a session back
-            raise StudyError(
-                "the Dask scheduler ended before the study did; the sessions that were measured "
-                "are kept, and the same command goes on with the rest once a scheduler answers"
-            ) from None
-        future.release()  # what a worker holds would be made again if it died
-        finished(result)
-        yield result
-
-
-def _died(session: PlannedSession, error: BaseException) -> dict[str, Any]:
-    """The outcome of a session whose workers ended without a word."""
-    failure = _why_died(error, "measuring")
+def _quarantined(session: PlannedSession, failure: dict[str, Any]) -> dict[str, Any]:
     quarantine(session, failure)
     return {"id": session.id, "state": "failed", "seconds": 0.0, "failure": failure}
 
 
-def _died_looking(session: PlannedSession, error: BaseException) -> dict[str, Any]:
-    """The look at a session whose workers ended without a word."""
-    return about(session) | {"failure": _why_died(error, LOOKING)}
+def _not_seen(session: PlannedSession, failure: dict[str, Any]) -> dict[str, Any]:
+    return about(session) | {"failure": failure}
 
 
 def _why_died(error: BaseException, stage: str) -> dict[str, Any]:

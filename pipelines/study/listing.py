@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 from liex_lab.errors import LiexError, StudyError
-from liex_lab.plan.study import STUDY_FILE, Study
+from liex_lab.plan.study import STUDY_FILE, PlannedSession, Study
+from liex_lab.runtime.durable import replacing, write_whole
+from liex_lab.runtime.places import unlinked_below
+from liex_lab.runtime.text_files import harmless
 from liex_lab.sessions import Session
 from liex_lab.sessions.folder import FAILED_FILE, read_failure
 from liex_lab.sessions.verdict import WHO, Entry, verdict_in
+from liex_lab.tables.schema import dictionary, table_columns, write_table
 
 from ..compare import find_sessions
 from .status import SessionStatus, standings, to_look_at
@@ -83,3 +89,107 @@ def _measured(folder: Path) -> Entry:
         return Entry(session.name, "done", reason, folder=folder, who=who)
     except LiexError as error:
         return Entry(folder.name, "failed", str(error))
+
+
+# The study's table: every session with its status, as CSV for people and Parquet for programs.
+
+
+TABLE = "study"
+STUDY_SESSIONS = table_columns(TABLE)
+
+
+def write_study_table(study: Study, standings: Sequence[SessionStatus]) -> Path:
+    """Write study.parquet, study.csv and study_columns.json of a study; returns the CSV.
+
+    Args:
+        study: the study.
+        standings: the status of its sessions.
+    """
+    import csv
+    import io
+
+    folder = study.cohort_folder
+    unlinked_below(study.results, folder).mkdir(parents=True, exist_ok=True)
+    rows = study_rows(study, standings)
+    names = [column.name for column in STUDY_SESSIONS]
+    block = {name: [row[name] for row in rows] for name in names}
+    with replacing(folder / f"{TABLE}.parquet") as part:
+        write_table(part, STUDY_SESSIONS, [block], {"study": study.name})
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(names)
+    writer.writerows([harmless(row[name]) for name in names] for row in rows)
+    write_whole(folder / f"{TABLE}.csv", text.getvalue())
+    entries = [entry for entry in dictionary(STUDY_SESSIONS) if entry["table"] == TABLE]
+    write_whole(
+        folder / f"{TABLE}_columns.json", json.dumps(entries, indent=1, ensure_ascii=False) + "\n"
+    )
+    return folder / f"{TABLE}.csv"
+
+
+def study_rows(study: Study, standings: Sequence[SessionStatus]) -> list[dict[str, Any]]:
+    """One row per session, its keys the columns of `STUDY_SESSIONS`.
+
+    Args:
+        study: the study; paths are stated from its folder.
+        standings: the status of its sessions.
+    """
+    return [_row(study, one) for one in standings]
+
+
+def _row(study: Study, one: SessionStatus) -> dict[str, Any]:
+    session = one.session
+    failure = one.failure or {}
+    document = _document(session.folder) if one.state == "done" else {}
+    counted = document.get("frames")
+    frames = counted if isinstance(counted, dict) else {}
+    return {
+        "session_id": session.id,
+        "subject_id": session.animal.id,
+        **{name: getattr(session.animal, name) for name in ("group", "cage", "sex", "batch")},
+        "state": one.state,
+        "reason": one.reason,
+        "shared": _shared(session),
+        "remedy": str(failure.get("remedy", "")),
+        "stage": str(failure.get("stage") or ""),
+        "frame": _count(failure.get("frame"), -1),
+        "n_frames": _count(frames.get("n_frames"), 0),
+        "n_frames_observed": _count(frames.get("n_observed"), 0),
+        "observed_s": _number(frames.get("observed_s")),
+        "frames_per_s": _number(document.get("frames_per_s")),
+        "peak_memory_mb": _number(document.get("peak_memory_mb")),
+        "recording": _below(study, session.recording),
+        "folder": _below(study, str(session.folder)),
+    }
+
+
+def _shared(session: PlannedSession) -> str:
+    shared = session.plan.animal.shared
+    if shared is None:
+        return session.remark
+    length = "" if shared.spine_mm is None else f"{shared.spine_mm:.1f} mm long, "
+    shape = "the average shape" if shared.shape is None else "a shape of its own"
+    return f"{length}{shape}, by {shared.by}"
+
+
+def _document(folder: Path) -> dict[str, Any]:
+    try:
+        found = json.loads((folder / "session.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError):
+        return {}
+    return found if isinstance(found, dict) else {}
+
+
+def _below(study: Study, path: str) -> str:
+    try:
+        return Path(path).relative_to(study.folder).as_posix()
+    except ValueError:
+        return path
+
+
+def _count(value: Any, otherwise: int) -> int:
+    return value if isinstance(value, int) else otherwise
+
+
+def _number(value: Any) -> float:
+    return float(value) if isinstance(value, int | float) else float("nan")

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any
 
 from liex_lab.errors import StudyError
 from liex_lab.plan.study import PlannedSession, Study
@@ -21,28 +21,14 @@ from liex_lab.runtime.progress import Board
 from liex_lab.sessions.corrections import Description
 
 from ..compiling import compile_ahead
-from ..correct import correct_session
-from .one_session import RunSession
+from .cluster import SlurmTable, crew_of, is_encrypted
+from .crew import Crew, RunSession
+from .listing import write_study_table
 from .sharing import LookAtSession, look_at, to_be_looked_at, write_look
-from .slurm import SlurmTable
 from .status import SessionStatus, standings
-from .table import write_study_table
 
-if TYPE_CHECKING:
-    from .crew import Crew
-
-
-class DescribeSession(Protocol):
-    """What writes descriptions into a session: `liex_lab.api.correct_session`."""
-
-    def __call__(self, session: str | Path, what: Sequence[Description], *, author: str) -> Path:
-        """Write them; returns the session folder.
-
-        Args:
-            session: the session folder.
-            what: the descriptions.
-            author: whose they are.
-        """
+# writes descriptions into a session, with their author: `liex_lab.api.correct_session`
+DescribeSession = Callable[..., Path]
 
 
 def run_study(
@@ -57,7 +43,7 @@ def run_study(
     only: Sequence[str],
     dry_run: bool,
     board: Callable[[int], AbstractContextManager[Board]],
-    describe: DescribeSession = correct_session,
+    describe: DescribeSession,
     look: LookAtSession = look_at,
 ) -> list[SessionStatus]:
     """Measure the sessions of a study that are to be done; returns every session's status.
@@ -86,8 +72,6 @@ def run_study(
             "the workers are found either with --scheduler or with --slurm; leave one of them out"
         )
     if scheduler:
-        from .dask_cluster import is_encrypted
-
         is_encrypted(scheduler)  # an address that is none ends here
     table = SlurmTable.load(slurm) if slurm else None
     ask = partial(standings, study, retry=retry, only=only, again=again)
@@ -131,7 +115,6 @@ def _crew(
     if not todo and not unseen:
         yield None
         return
-    from .dask_cluster import crew_of
 
     if not where["scheduler"] and not where["slurm"]:  # once, and not in every worker
         for animal in sorted({session.plan.animal.skeleton for session in [*todo, *unseen]}):

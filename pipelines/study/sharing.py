@@ -9,49 +9,159 @@ and where the lengths lie too far apart all do.
 
 from __future__ import annotations
 
+import hashlib
 import json
-from collections.abc import Mapping, Sequence
+import os
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from liex_lab.body.skeleton import Skeleton
+from liex_lab.catalog import find_model, sha256
 from liex_lab.errors import LiexError, RecordingError
+from liex_lab.estimation.session_shape import PLACES
 from liex_lab.plan import Plan
 from liex_lab.plan.sections import N_PLACES, Factor, Positive, SharedBody, SharedShape
-from liex_lab.plan.study import PlannedSession, Study
+from liex_lab.plan.study import VIRTUAL, PlannedSession, Study
 from liex_lab.runtime.durable import write_whole
 from liex_lab.runtime.places import storable_document, unlinked
 from liex_lab.runtime.progress import Progress, silent
 from liex_lab.runtime.threads import in_background
+from liex_lab.sessions.corrections import DESCRIBED
 from liex_lab.sessions.folder import describe_failure
-from liex_lab.sessions.provenance import SCHEMA_VERSION, versions
+from liex_lab.sessions.provenance import SCHEMA_VERSION, package_version, versions
+from liex_lab.tracking.own_shape import MOST_APART, Found, agree, spread_of
 
-from .changes import input_stamp, what_changed
-
-if TYPE_CHECKING:
-    from liex_lab.tracking.own_shape import Found
+from ..build import build_estimator, build_recording, open_planned, shape_labels
+from ..choice import fit_plan
+from ..origin import animal_facts
+from ..shards import MEASURING
 
 LOOK_FILE = "look.json"
 LOOKING = "looking at the animal"
 _MM_DECIMALS = 3
 _DECIMALS = 4  # of a shape, relative to the length or to the average animal's
+LookAtSession = Callable[[PlannedSession, Progress], dict[str, Any]]  # the content of look.json
+_SAYS = {
+    ".toml",
+    ".txt",
+    ".csv",
+    ".json",
+    ".yaml",
+    ".yml",
+}  # files beside a recording that say what is in it
 
 
-class LookAtSession(Protocol):
-    """What looks at a session's animal: `look_at`."""
+def what_changed(session: PlannedSession, document: dict[str, Any]) -> str:
+    """Why a stored session is not the planned one any more; '' if it is.
 
-    def __call__(self, session: PlannedSession, progress: Progress) -> dict[str, Any]:
-        """The content of look.json.
+    Args:
+        session: the planned session.
+        document: what was stored: session.json, failed.json or look.json.
 
-        Args:
-            session: the planned session.
-            progress: told what is being done.
-        """
+    Raises:
+        PlanError: the stored plan is none.
+    """
+    return (
+        _version_changed(document)
+        or plan_changed(session.plan, document.get("plan", {}))
+        or _model_changed(session.plan, document.get("model", {}))
+        or _input_changed(session, document.get("input", {}))
+    )
+
+
+def _version_changed(document: dict[str, Any]) -> str:
+    then = document.get("versions", {}).get("liex_lab", "")
+    if then != (now := package_version("liex_lab")):
+        return f"version changed: {then or 'unknown'}, now {now}"
+    schema = document.get("schema_version", SCHEMA_VERSION)
+    same = schema == SCHEMA_VERSION
+    return "" if same else f"version changed: session schema {schema}, now {SCHEMA_VERSION}"
+
+
+def plan_changed(plan: Plan, stored: dict[str, Any]) -> str:
+    """What a plan says otherwise than the one that a session was measured by, '' if nothing.
+
+    Args:
+        plan: the plan of today.
+        stored: the plan in session.json.
+    """
+    then = Plan.from_table(stored).model_dump()
+    now = plan.model_dump()
+    if plan.recording.mirrored is None:  # then it is found, and stored as it was found
+        now["recording"]["mirrored"] = then["recording"]["mirrored"]
+    if now["animal"]["shared"] != then["animal"]["shared"]:
+        shared = plan.animal.shared
+        length = "" if shared is None or shared.spine_mm is None else f", {shared.spine_mm:g} mm"
+        now["animal"]["shared"] = "nothing" if shared is None else f"by {shared.by}{length}"
+    differing = [
+        f"{section}.{key} = {now[section][key]}"
+        if isinstance(now[section], dict)
+        else f"{section} = {now[section]}"
+        for section in now
+        for key in (now[section] if isinstance(now[section], dict) else [""])
+        if (now[section][key] != then[section][key] if key else now[section] != then[section])
+        and not (section == "session" and key in DESCRIBED)
+        and section != "report"  # nothing that is measured
+    ]
+    more = f" and {len(differing) - 3} more" if len(differing) > 3 else ""
+    return f"plan changed: {', '.join(differing[:3])}{more}" if differing else ""
+
+
+def _model_changed(plan: Plan, stored: dict[str, Any]) -> str:
+    same = not stored or sha256(find_model(plan.estimation.model)) == stored.get("sha256")
+    return "" if same else "model changed"
+
+
+def _input_changed(session: PlannedSession, stored: dict[str, Any]) -> str:
+    """By the files' sizes and times; where those differ, by their content."""
+    if stored.get("stamp") == input_stamp(session.recording):
+        return ""
+    if session.recording.startswith(VIRTUAL):
+        return "input changed: another virtual recording"
+    if not stored.get("sha256"):
+        return "input changed: sizes or times of its files"
+    if not session.recording_exists:
+        return ""  # its results are all there is left of it; they are kept
+    with open_planned(session.recording, session.plan) as recording:
+        return "" if recording.digest() == stored["sha256"] else "input changed: its content"
+
+
+def input_stamp(recording: str) -> str:
+    """A short hash of names, sizes and times of a recording's files and of the notes beside them.
+
+    Cheap to look up. Notes are files such as .toml, .csv and .json.
+
+    Args:
+        recording: a path, or the address of a virtual recording, which is returned as it is.
+
+    Returns:
+        32 hexadecimal digits; '' where there is no recording.
+    """
+    if recording.startswith(VIRTUAL):
+        return recording
+    path = Path(recording)
+    if not path.exists():
+        return ""
+    folder = path if path.is_dir() else path.parent
+    entries = []
+    for inside, _, names in os.walk(folder):
+        for name in names:
+            file = Path(inside, name)
+            try:
+                found = file.stat()
+            except OSError:
+                continue
+            if path.is_dir() or file == path or file.suffix.lower() in _SAYS:
+                entries.append([str(file.relative_to(folder)), found.st_size, found.st_mtime_ns])
+        if not path.is_dir():
+            break
+    return hashlib.sha256(json.dumps(sorted(entries)).encode()).hexdigest()[:32]
 
 
 class _Part(BaseModel):
@@ -103,21 +213,17 @@ class Shared:
 
 
 def shared_sessions(study: Study) -> list[Shared]:
-    """The sessions of a study, in its order, with what they share by the looks that were kept.
+    """The sessions of a study, in its order, with what they share according to the stored looks.
 
     Args:
         study: the study.
     """
     known = {session.id: Shared(session) for session in study.sessions}
     for group in _groups(study):
-        looks = {session.id: read_look(session) for session in group}
-        missing = [id for id, look in looks.items() if look is None]
-        if missing:
-            for session in group:
-                known[session.id] = Shared(session, missing[0])
-            continue
-        seen = {id: look for id, look in looks.items() if look is not None}
-        known |= {session.id: Shared(session) for session in together(group, seen)}
+        looks: dict[str, Any] = {session.id: read_look(session) for session in group}
+        missing = next((id for id, look in looks.items() if look is None), "")
+        members = group if missing else together(group, looks)
+        known |= {session.id: Shared(session, missing) for session in members}
     return list(known.values())
 
 
@@ -165,8 +271,6 @@ def together(
         group: sessions of one animal.
         looks: of each of them, by id, as `look_at` gives it.
     """
-    from liex_lab.tracking.own_shape import MOST_APART, agree, spread_of
-
     subject = group[0].animal.id
     taking_part = {s.id: found_in(looks[s.id]) for s in group if not _why_not(looks[s.id])}
     alone = f"The sessions of {subject} do not share size and shape"
@@ -226,10 +330,6 @@ def found_in(look: Mapping[str, Any]) -> Found:
     Raises:
         ValueError: it is damaged.
     """
-    from liex_lab.tracking.own_shape import Found
-
-    from ..build import shape_labels
-
     told = _Look.model_validate(look)
     shape = told.animal.shape or _ShapeFound()
     stated = SharedShape.model_validate(shape.stated) if shape.kept else None
@@ -247,14 +347,32 @@ def found_in(look: Mapping[str, Any]) -> Found:
 
 
 def _stated(labels: Any) -> SharedShape:
-    from liex_lab.estimation.session_shape import PLACES
-
     p = len(PLACES)
     return SharedShape(
         width=np.exp(labels[-2 * p : -p]).round(_DECIMALS).tolist(),
         height=np.exp(labels[-p:]).round(_DECIMALS).tolist(),
         joints_moved=labels[: -2 * p].reshape(-1, 3).round(_DECIMALS).tolist(),
     )
+
+
+class Stage:
+    """Passes progress on, and remembers the stage and the frame for the report of a failure.
+
+    Attributes:
+        name: the stage.
+        frame: number of measured frames; None before the first one.
+    """
+
+    def __init__(self, progress: Progress) -> None:
+        self.name = "opening the recording"
+        self.frame: int | None = None
+        self._progress = progress
+
+    def __call__(self, done: int, total: int | None, what: str) -> None:
+        """Note the stage, and pass everything on."""
+        self.name = what
+        self.frame = done if what == MEASURING else self.frame
+        self._progress(done, total, what)
 
 
 def look_at(session: PlannedSession, progress: Progress = silent) -> dict[str, Any]:
@@ -270,18 +388,11 @@ def look_at(session: PlannedSession, progress: Progress = silent) -> dict[str, A
         The content of look.json: plan, model and input it goes by, and `animal`, `log_sd`,
         `n_frames`, `stated` and `misfits`, or `failure`.
     """
-    stage = "opening the recording"
-
-    def watch(done: int, total: int | None, what: str) -> None:
-        """Note the stage for a failure's report, and pass `done`, `total` and `what` on."""
-        nonlocal stage
-        stage = what
-        progress(done, total, what)
-
+    stage = Stage(progress)
     try:
-        return about(session) | _found(session, watch)
+        return about(session) | _found(session, stage)
     except Exception as error:
-        return about(session) | {"failure": describe_failure(error, stage, None)}
+        return about(session) | {"failure": describe_failure(error, stage.name, None)}
 
 
 def about(session: PlannedSession) -> dict[str, Any]:
@@ -300,12 +411,6 @@ def about(session: PlannedSession) -> dict[str, Any]:
 
 
 def _found(session: PlannedSession, progress: Progress) -> dict[str, Any]:
-    from liex_lab.catalog import find_model, sha256
-
-    from ..build import build_estimator, build_recording
-    from ..choice import fit_plan
-    from ..origin import animal_facts
-
     if not session.recording_exists:
         raise RecordingError(
             f"there is no recording {session.recording}; correct its path, or copy it there"

@@ -20,8 +20,7 @@ from liex_lab.sessions.corrections import DESCRIBED, START, read_log, with_descr
 from liex_lab.sessions.folder import read_failure
 from liex_lab.sessions.verdict import CAUTION, LOOK_AT_IT, state_in_words, verdict_in
 
-from .changes import what_changed
-from .sharing import shared_sessions
+from .sharing import shared_sessions, what_changed
 
 State = Literal["done", "failed", "new", "begun", "changed", "excluded"]
 

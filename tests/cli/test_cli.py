@@ -270,8 +270,12 @@ def test_doctor_prints_json_that_holds_no_nan(monkeypatch: pytest.MonkeyPatch) -
         "floor_mm": math.nan,
         "problems": ["a"],
     }
-    job(monkeypatch, "doctor", examine=lambda path, **options: findings)
-    job(monkeypatch, "doctor_text", print_report=lambda findings, verbose: print(verbose))
+    job(
+        monkeypatch,
+        "doctor",
+        examine=lambda path, **options: findings,
+        print_report=lambda findings, verbose: print(verbose),
+    )
     result = CliRunner().invoke(cli.app, ["doctor", "m01.mcap", "--json"])
     expected = {"format": "mcap", "n_frames": 3, "fx": 365.0, "floor_mm": None, "problems": ["a"]}
     assert json.loads(result.output) == expected
@@ -517,7 +521,7 @@ def test_errors_of_a_job_come_through(
     def examine(path: Path, **options: Any) -> dict[str, Any]:
         raise RecordingError(f"{path} holds colour [uint8], not depth")
 
-    job(monkeypatch, "doctor", examine=examine)
+    job(monkeypatch, "doctor", examine=examine, print_report=print)
     monkeypatch.setattr(sys, "argv", ["liex", "doctor", "colour.png"])
     with pytest.raises(SystemExit) as left:
         cli.main()

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 from liex_lab.pipelines import choice
-from liex_lab.pipelines.choice import Look, best, fit_plan, misfits_of
+from liex_lab.pipelines.choice import PlanFit, best, fit_plan, misfits_of
 from liex_lab.pipelines.origin import animal_of
 
 from liex_lab.errors import EstimationError, MisfitError
@@ -66,7 +66,7 @@ def test_a_plan_that_fits_is_used_and_no_other_is_looked_at(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     looks(monkeypatch, mouse=GOOD)
-    monkeypatch.setattr(choice, "look", lambda *_: pytest.fail("another plan was looked at"))
+    monkeypatch.setattr(choice, "try_plan", lambda *_: pytest.fail("another plan was looked at"))
     fitted = fit_plan(RECORDING, Plan.load("mouse"))
     assert fitted.plan == Plan.load("mouse")
     assert (fitted.misfits, fitted.notes) == ((), ())
@@ -189,10 +189,10 @@ def test_a_length_that_the_plan_states_is_not_questioned() -> None:
 
 
 def test_the_best_of_several_is_the_one_with_the_least_error_for_its_length() -> None:
-    fish = Look("fish", FISH)
-    mouse = Look("mouse", GOOD)
+    fish = PlanFit("fish", FISH)
+    mouse = PlanFit("mouse", GOOD)
     assert best([fish, mouse]) is mouse
-    assert best([fish, Look("mouse", GOOD, ("it is too long",)), Look("hand", None)]) is fish
+    assert best([fish, PlanFit("mouse", GOOD, ("it is too long",)), PlanFit("hand", None)]) is fish
     assert best([]) is None
 
 
@@ -220,7 +220,7 @@ def test_an_animal_that_is_shorter_than_the_other_is_counted_and_a_thing_is_not(
 def test_a_slim_mouse_beside_a_stout_one_of_its_length_is_counted() -> None:
     """The girth of the one that is measured says nothing of the other's."""
     recording = film("two-animals", 1003, 60, family="other")
-    fit = choice.look(recording, "mouse").fit
+    fit = choice.try_plan(recording, "mouse").fit
     assert fit is not None
     assert fit.n_animals == 2
 
@@ -245,7 +245,7 @@ def test_an_own_animal_has_its_name_and_its_limits_from_its_skeleton(
     assert not misfits_of(replace(GOOD, spine_mm=0.9 * length_mm), plan)
     far = replace(GOOD, spine_mm=3.0 * length_mm)
     assert misfits_of(far, plan)
-    monkeypatch.setattr(choice, "look", lambda _, one: Look(str(one), None, ("no",)))
+    monkeypatch.setattr(choice, "try_plan", lambda _, one: PlanFit(str(one), None, ("no",)))
     monkeypatch.setattr(
         choice, "build_tracker", lambda *_: Pretended(far, SimpleNamespace(doubts=()))
     )

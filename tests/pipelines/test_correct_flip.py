@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from liex_lab.pipelines.correct import corrected_track
 from typer.testing import CliRunner
 
 from liex_lab import cli
@@ -20,7 +21,6 @@ from liex_lab.behaviour.summary import measure_session
 from liex_lab.errors import SessionError
 from liex_lab.plan import Plan
 from liex_lab.sessions import Session, correcting
-from liex_lab.sessions.applying import corrected_track
 from liex_lab.sessions.correcting import disagreements, flip_span
 from liex_lab.sessions.corrections import Entry, FlipSpan, JointMove, Log
 from liex_lab.sessions.evidence import skeleton_of, track_of

@@ -10,8 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from liex_lab.pipelines.doctor import FINDINGS, examine
-from liex_lab.pipelines.doctor_text import lines, print_report
+from liex_lab.pipelines.doctor import FINDINGS, examine, lines, print_report
 
 from liex_lab.errors import RecordingError
 from liex_lab.optics.camera import Camera, Distortion
@@ -232,7 +231,7 @@ def test_dropped_frames_are_counted(tmp_path: Path) -> None:
     findings = examined(path)
     assert findings["n_gaps"] == 1
     assert (
-        "left out about 3 frames (20.0%) in 1 gap; the longest time between two frames is 0.13 s"
+        "dropped about 3 frames (20.0%) in 1 gap; the longest time between two frames is 0.13 s"
         in problems(path)
     )
 

@@ -12,9 +12,8 @@ import numpy as np
 import pytest
 from liex_lab.pipelines import choice
 from liex_lab.pipelines.build import open_planned
-from liex_lab.pipelines.choice import Look, Proposal, propose_plan
-from liex_lab.pipelines.doctor import examine
-from liex_lab.pipelines.doctor_files import next_command, open_anyhow
+from liex_lab.pipelines.choice import PlanFit, Proposal, propose_plan
+from liex_lab.pipelines.doctor import examine, next_command, open_anyhow
 
 from liex_lab.errors import LiexError, RecordingError
 from liex_lab.optics.camera import PRESETS, Camera, of_size, preset, unusual_centre, unusual_lens
@@ -110,24 +109,28 @@ def test_a_focal_length_that_no_known_camera_has_is_told(tmp_path: Path, factor:
 def test_doctor_proposes_the_plan_and_says_what_to_run_next(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    long = Look("mouse", replace(GOOD, spine_mm=300.0), ("it is 300 mm long",))
-    fits = {"mouse": long, "fish": Look("fish", FISH), "hand": Look("hand", None, ("no hand",))}
+    long = PlanFit("mouse", replace(GOOD, spine_mm=300.0), ("it is 300 mm long",))
+    fits = {
+        "mouse": long,
+        "fish": PlanFit("fish", FISH),
+        "hand": PlanFit("hand", None, ("no hand",)),
+    }
 
-    def look(_: object, plan: Plan | str) -> Look:
+    def try_plan(_: object, plan: Plan | str) -> PlanFit:
         return fits[plan if isinstance(plan, str) else plan.animal.name]
 
-    monkeypatch.setattr(choice, "look", look)
+    monkeypatch.setattr(choice, "try_plan", try_plan)
     unnamed = propose_plan(RECORDING)
     assert (unnamed.plan, unnamed.problems) == ("fish", ())
     assert next_command("a b.mcap", unnamed, []) == "liex run 'a b.mcap' --plan fish"
     assert next_command("a.mcap", unnamed, ["x"]).startswith("write what is missing")
     named = propose_plan(RECORDING, Plan.load("mouse"))
     assert "it is 300 mm long; say --plan fish" in named.problems[0]
-    fits["fish"] = Look("fish", None, ("no fish",))
+    fits["fish"] = PlanFit("fish", None, ("no fish",))
     none = propose_plan(RECORDING)
     assert none.plan is None
     assert none.says == "none fits. mouse: it is 300 mm long. fish: no fish. hand: no hand"
-    fits["mouse"] = Look("mouse", replace(GOOD, n_animals=2))
+    fits["mouse"] = PlanFit("mouse", replace(GOOD, n_animals=2))
     two = propose_plan(RECORDING)
     assert "2 animals are in view" in two.problems[0]
     assert next_command("a.mcap", two, []) == "liex run a.mcap"
@@ -137,10 +140,12 @@ def test_doctor_proposes_the_plan_and_says_what_to_run_next(
 def test_the_next_command_keeps_the_plan_and_the_options_that_were_given(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    fits = {"mouse": Look("mouse", GOOD), "fish": Look("fish", None, ("no fish",))}
-    fits["hand"] = Look("hand", None, ("no hand",))
+    fits = {"mouse": PlanFit("mouse", GOOD), "fish": PlanFit("fish", None, ("no fish",))}
+    fits["hand"] = PlanFit("hand", None, ("no hand",))
     monkeypatch.setattr(
-        choice, "look", lambda _, plan: fits[plan if isinstance(plan, str) else plan.animal.name]
+        choice,
+        "try_plan",
+        lambda _, plan: fits[plan if isinstance(plan, str) else plan.animal.name],
     )
     typed = ("my plans/plan.toml", ["--topic", "/depth", "--set", "recording.fps=30.0"])
     right = propose_plan(RECORDING, Plan.load("mouse"))
@@ -155,7 +160,7 @@ def test_the_next_command_keeps_the_plan_and_the_options_that_were_given(
     wrong = propose_plan(RECORDING, Plan.load("fish"))
     assert "say --plan mouse" in wrong.problems[0]
     assert next_command("a.mcap", wrong, [], 0, "fish") == "liex run a.mcap --plan mouse"
-    fits["mouse"] = Look("mouse", None, ("no mouse",))
+    fits["mouse"] = PlanFit("mouse", None, ("no mouse",))
     none = propose_plan(RECORDING, Plan.load("fish"))
     assert next_command("a.mcap", none, [], 0, "fish").startswith("liex doctor a.mcap --plan fish")
 

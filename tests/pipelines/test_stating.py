@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from liex_lab.pipelines.stating import StatedRegions
+from liex_lab.pipelines.region_config import StatedRegions
 
 from liex_lab.errors import LiexError
 from liex_lab.plan import Plan

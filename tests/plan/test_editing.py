@@ -7,10 +7,10 @@ import tomllib
 from typing import Any
 
 import pytest
+from liex_lab.pipelines.region_config import with_value
 
 from liex_lab.errors import PlanError
 from liex_lab.plan import Plan
-from liex_lab.plan.editing import with_value
 
 REGION = [[10.0, 20.5], [200.0, 20.0], [150.0, 180.0]]
 STUDY = '''\

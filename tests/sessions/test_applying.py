@@ -9,13 +9,13 @@ import pandas as pd
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from liex_lab.pipelines.correct import edited_bouts, place_joints, spliced_bouts
 
 from liex_lab.actions.ethogram import Ethogram
 from liex_lab.body.pose import Pose
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.geometry import SE3, so3
 from liex_lab.optics.camera import Camera
-from liex_lab.sessions.applying import edited_bouts, place_joints, spliced_bouts
 from liex_lab.sessions.corrections import BoutEdit, JointMove
 from liex_lab.tables.rows import bout_rows
 from liex_lab.tracking.track import Track

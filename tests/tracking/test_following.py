@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from liex_lab.pipelines.correct import place_joints
 
 from liex_lab.body.pose import Pose
 from liex_lab.geometry import SE3
-from liex_lab.sessions.applying import place_joints
 from liex_lab.sessions.corrections import JointMove
 from liex_lab.tracking.following import _smoothed, let_follow
 from liex_lab.tracking.motion_model import TrackingParameters

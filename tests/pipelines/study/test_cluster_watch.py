@@ -11,8 +11,8 @@ from typing import Any
 
 import pytest
 from distributed.core import Status
-from liex_lab.pipelines.study import cluster_watch, dask_cluster
-from liex_lab.pipelines.study.cluster_watch import KeptWorkers
+from liex_lab.pipelines.study import cluster
+from liex_lab.pipelines.study.cluster import KeptWorkers
 
 from liex_lab.errors import StudyError
 
@@ -39,7 +39,7 @@ def kept(*pids: int | None) -> tuple[Any, KeptWorkers]:
 
 
 def test_one_living_worker_is_enough(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cluster_watch, "_NONE_LEFT_S", 0.0)
+    monkeypatch.setattr(cluster, "_NONE_LEFT_S", 0.0)
     _, watch = kept(None, os.getpid())
     watch.look()
     assert watch.gave_up == ""
@@ -48,13 +48,13 @@ def test_one_living_worker_is_enough(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_worker_that_its_nanny_has_forgotten_is_started_again(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    cluster, watch = kept(None, os.getpid(), None)
-    cluster.workers[2].status = Status.closing
+    local, watch = kept(None, os.getpid(), None)
+    local.workers[2].status = Status.closing
     watch.look()
-    assert [nanny.started for nanny in cluster.workers.values()] == [0, 0, 0]
-    monkeypatch.setattr(cluster_watch, "_FORGOTTEN_S", 0.0)
+    assert [nanny.started for nanny in local.workers.values()] == [0, 0, 0]
+    monkeypatch.setattr(cluster, "_FORGOTTEN_S", 0.0)
     watch.look()
-    assert [nanny.started for nanny in cluster.workers.values()] == [1, 0, 0]
+    assert [nanny.started for nanny in local.workers.values()] == [1, 0, 0]
 
 
 def test_workers_that_come_again_in_time_are_waited_for() -> None:
@@ -70,7 +70,7 @@ def test_workers_that_come_again_in_time_are_waited_for() -> None:
 def test_a_process_that_has_ended_and_is_not_fetched_yet_is_none(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(cluster_watch, "_NONE_LEFT_S", 0.0)
+    monkeypatch.setattr(cluster, "_NONE_LEFT_S", 0.0)
     process = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"])
     _, watch = kept(process.pid)
     watch.look()
@@ -83,7 +83,7 @@ def test_a_process_that_has_ended_and_is_not_fetched_yet_is_none(
 
 
 def test_a_study_whose_workers_are_gone_for_good_ends(monkeypatch: pytest.MonkeyPatch) -> None:
-    begin = dask_cluster.local_cluster
+    begin = cluster.local_cluster
 
     def gone(*given: Any) -> Any:
         cluster: Any = begin(*given)
@@ -92,9 +92,9 @@ def test_a_study_whose_workers_are_gone_for_good_ends(monkeypatch: pytest.Monkey
             os.kill(nanny.pid, signal.SIGKILL)
         return cluster
 
-    monkeypatch.setattr(dask_cluster, "local_cluster", gone)
-    monkeypatch.setattr(cluster_watch, "_NONE_LEFT_S", 1.0)
-    monkeypatch.setattr(dask_cluster, "KeptWorkers", lambda *given: KeptWorkers(*given, 0.2))
+    monkeypatch.setattr(cluster, "local_cluster", gone)
+    monkeypatch.setattr(cluster, "_NONE_LEFT_S", 1.0)
+    monkeypatch.setattr(cluster, "KeptWorkers", lambda *given: KeptWorkers(*given, 0.2))
     planned: Any = [SimpleNamespace(session=SimpleNamespace(id=name)) for name in ("a", "b")]
     with pytest.raises(StudyError, match="worker processes have ended"):
-        dask_cluster.measure_cohort(planned, print, workers=2)
+        cluster.measure_cohort(planned, print, workers=2)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from liex_lab.pipelines.correct import correct_session
-from liex_lab.pipelines.study.one_session import measure_one
+from liex_lab.pipelines.study.crew import measure_one
 from liex_lab.pipelines.study.status import standing
 
 from liex_lab.errors import RecordingError

@@ -14,7 +14,7 @@ from urllib.error import HTTPError
 from urllib.request import urlopen
 
 import pytest
-from liex_lab.pipelines.study import dask_cluster
+from liex_lab.pipelines.study import cluster
 
 from liex_lab.errors import StudyError
 
@@ -22,7 +22,7 @@ _PAGES = ("/", "/json/identity.json", "/info/main/workers.html", "/health", "/me
 
 
 def test_its_pages_tell_other_accounts_of_this_machine_nothing() -> None:
-    with dask_cluster._client(1, 1, 1, None, None) as client:
+    with cluster._client(1, 1, 1, None, None) as client:
         about: dict[str, Any] = client.scheduler_info()
         assert about["address"].startswith("tls://127.0.0.1:")
         ports = [about["services"]["dashboard"]] + [
@@ -40,13 +40,13 @@ def test_its_pages_tell_other_accounts_of_this_machine_nothing() -> None:
 @pytest.mark.parametrize("address", ["http://x", "tcp://", "x://10.0.0.1:8786"])
 def test_an_address_of_no_scheduler_is_refused_at_once(address: str) -> None:
     with pytest.raises(StudyError, match="is no address of a Dask scheduler"):
-        dask_cluster.is_encrypted(address)
+        cluster.is_encrypted(address)
 
 
 def test_what_is_encrypted_is_known_from_the_address() -> None:
-    assert dask_cluster.is_encrypted("tls://10.0.0.1:8786")
-    assert not dask_cluster.is_encrypted("tcp://10.0.0.1:8786")
-    assert not dask_cluster.is_encrypted("10.0.0.1:8786")
+    assert cluster.is_encrypted("tls://10.0.0.1:8786")
+    assert not cluster.is_encrypted("tcp://10.0.0.1:8786")
+    assert not cluster.is_encrypted("10.0.0.1:8786")
 
 
 def test_a_scheduler_that_ends_before_the_study_is_a_sentence(tmp_path: Path) -> None:
@@ -62,7 +62,7 @@ def test_a_scheduler_that_ends_before_the_study_is_a_sentence(tmp_path: Path) ->
         planned: Any = [SimpleNamespace(session=SimpleNamespace(id=name)) for name in ("a", "b")]
         threading.Timer(2.0, scheduler.kill).start()  # no worker: the sessions wait
         with pytest.raises(StudyError, match="scheduler ended before the study did"):
-            dask_cluster.measure_cohort(planned, print, scheduler=f"tcp://127.0.0.1:{port}")
+            cluster.measure_cohort(planned, print, scheduler=f"tcp://127.0.0.1:{port}")
     finally:
         scheduler.kill()
         scheduler.wait()

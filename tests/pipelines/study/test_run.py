@@ -11,14 +11,12 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
-from liex_lab.pipelines.study import dask_cluster
-from liex_lab.pipelines.study.changes import plan_changed
-from liex_lab.pipelines.study.crew import n_shared
-from liex_lab.pipelines.study.listing import list_sessions
-from liex_lab.pipelines.study.one_session import measure_one
-from liex_lab.pipelines.study.slurm import SlurmTable
+from liex_lab.pipelines.study import cluster
+from liex_lab.pipelines.study.cluster import SlurmTable
+from liex_lab.pipelines.study.crew import measure_one, n_shared
+from liex_lab.pipelines.study.listing import list_sessions, write_study_table
+from liex_lab.pipelines.study.sharing import plan_changed
 from liex_lab.pipelines.study.status import standing, standings
-from liex_lab.pipelines.study.table import write_study_table
 from typer.testing import CliRunner
 
 from liex_lab import api, cli
@@ -155,7 +153,7 @@ def test_sessions_are_shared_by_all_workers_where_there_are_fewer_than_these(
 
 
 def test_all_workers_share_the_stretches_of_one_session() -> None:
-    with dask_cluster._client(2, 2, 1, None, None) as client:
+    with cluster._client(2, 2, 1, None, None) as client:
         found = client.submit(shared_task, 6, pure=False).result(timeout=120)
     assert sorted(number for number, _ in found) == list(range(6))
     assert len({process for _, process in found}) == 2, "the worker that steps aside does its share"
@@ -182,18 +180,20 @@ def test_a_session_is_done_again_only_when_input_plan_or_version_changed(
     file.write_text(text + "set = { behaviour.rear_height_mm = 41.0 }\n")
     assert why(file) == ("changed", "plan changed: behaviour.rear_height_mm = 41.0")
     file.write_text(text)
-    monkeypatch.setattr("liex_lab.pipelines.study.changes.package_version", lambda name: "9.9")
+    monkeypatch.setattr("liex_lab.pipelines.study.sharing.package_version", lambda name: "9.9")
     assert why(file)[1].startswith("version changed: ")
     monkeypatch.undo()
     assert why(file) == ("done", "")
     recording = tmp_path / "rawdata" / "good.mcap"
     recording.write_bytes(b"other bytes")
-    monkeypatch.setattr("liex_lab.pipelines.build.open_planned", lambda *_: _Digest("0" * 64))
+    monkeypatch.setattr(
+        "liex_lab.pipelines.study.sharing.open_planned", lambda *_: _Digest("0" * 64)
+    )
     assert why(file) == ("changed", "input changed: its content")
     stored = json.loads((Study.load(file).sessions[0].folder / "session.json").read_text())[
         "input"
     ]["sha256"]
-    monkeypatch.setattr("liex_lab.pipelines.build.open_planned", lambda *_: _Digest(stored))
+    monkeypatch.setattr("liex_lab.pipelines.study.sharing.open_planned", lambda *_: _Digest(stored))
     assert why(file) == ("done", ""), "only copied to another place"
     recording.unlink()
     assert why(file) == ("done", ""), "results outlive their recording"
@@ -400,7 +400,7 @@ def test_a_table_of_nothing_is_a_table(tmp_path: Path) -> None:
 
 def test_the_job_script_for_slurm_asks_for_what_the_file_says(tmp_path: Path) -> None:
     from dask_jobqueue.slurm import SLURMJob
-    from liex_lab.pipelines.study.dask_cluster import slurm_options
+    from liex_lab.pipelines.study.cluster import slurm_options
 
     table = SlurmTable(
         partition="batch",

@@ -9,13 +9,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from liex_lab.pipelines.study import dask_cluster, sharing
-from liex_lab.pipelines.study.listing import list_sessions
-from liex_lab.pipelines.study.one_session import measure_one
+from liex_lab.pipelines.correct import correct_session
+from liex_lab.pipelines.study import sharing
+from liex_lab.pipelines.study.crew import measure_one
+from liex_lab.pipelines.study.listing import list_sessions, study_rows
 from liex_lab.pipelines.study.run import run_study
 from liex_lab.pipelines.study.sharing import shared_sessions, to_be_looked_at
 from liex_lab.pipelines.study.status import SessionStatus, standings
-from liex_lab.pipelines.study.table import study_rows
 
 from liex_lab.errors import LiexError, PlanError, StudyError
 from liex_lab.plan import Plan
@@ -45,7 +45,7 @@ def here(monkeypatch: pytest.MonkeyPatch) -> None:
         assert n_tasks > 0
         yield Here()
 
-    monkeypatch.setattr(dask_cluster, "crew_of", crew_of)
+    monkeypatch.setattr("liex_lab.pipelines.study.run.crew_of", crew_of)
     monkeypatch.setattr("liex_lab.pipelines.study.run.compile_ahead", lambda _: None)
 
 
@@ -76,6 +76,7 @@ def run(file: Path, **more: Any) -> dict[str, SessionStatus]:
         "only": (),
         "dry_run": False,
         "board": lambda n: nullcontext(Board(n, lambda _: None)),
+        "describe": correct_session,
         "look": pretended_look,
     }
     found = run_study(Study.load(file), pretended_run, **(settings | more))

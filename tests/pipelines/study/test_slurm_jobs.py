@@ -6,7 +6,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from liex_lab.pipelines.study.slurm_jobs import MOST_IN_VAIN, KeptJobs, queued
+from liex_lab.pipelines.study.cluster import MOST_IN_VAIN, KeptJobs, queued
 
 from liex_lab.errors import StudyError
 

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from liex_lab.pipelines.correct import edited_bouts
 from liex_lab.pipelines.training.action_model import (
     labelled_sessions,
     read_any_labels,
@@ -21,7 +22,6 @@ from liex_lab.errors import LiexError
 from liex_lab.exchange import export
 from liex_lab.exchange.boris import read_boris_project
 from liex_lab.sessions import Session
-from liex_lab.sessions.applying import edited_bouts
 from liex_lab.sessions.correcting import labelled_bouts
 from liex_lab.sessions.evidence import track_of, wall_of
 from liex_lab.simulation.agents import fish

@@ -2,35 +2,132 @@
 
 Of a study it may stand in the study's file (of all recordings, of an animal, of an arena, of one
 recording) or in a plan that it names; of a session outside of a study a plan is written beside it.
-A file is changed in place, with every comment kept (`liex_lab.plan.editing`), after all that it
-would say was read as a run reads it, and is put in place whole.
+A file is changed in place, with every comment kept, after its new content was read as a run reads
+it, and is replaced as a whole.
 """
 
 from __future__ import annotations
 
 import math
+import re
 import shlex
 import shutil
 import threading
-from collections.abc import Sequence
+import tomllib
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from liex_lab.errors import LiexError, PlanError, StudyError, one_line
+from liex_lab.optics.camera import Camera
 from liex_lab.plan import Plan, known_plans
-from liex_lab.plan.editing import with_value
+from liex_lab.plan.plan import toml_value
+from liex_lab.plan.sections import Region
 from liex_lab.plan.study import STUDY_FILE, PlannedSession, Study
+from liex_lab.recordings.frame import region_mask
+from liex_lab.runtime.durable import replacing
 from liex_lab.runtime.text_files import decoded, parse_toml, read_toml
+from liex_lab.scene.background import sample_frames, usual_depth
+from liex_lab.scene.floor import Floor
+from liex_lab.scene.region import region_corners_px
+from liex_lab.sessions import Session
+from liex_lab.sessions.evidence import linked_recording
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
+from .build import build_recording
 
-    from liex_lab.optics.camera import Camera
-    from liex_lab.plan.sections import Region
-    from liex_lab.sessions import Session
+Keys = tuple[str | int, ...]  # keys, and the numbers of tables in lists
+
+
+def with_value(text: str, path: Keys, value: Any, origin: str = "the file") -> str:
+    """A TOML text with one value changed, added or removed.
+
+    Args:
+        text: the text.
+        path: keys, and numbers from 0 for tables in lists, as in ("sessions", 2, "set", "arena",
+            "region").
+        value: a table, list, text, number or bool; None removes it.
+        origin: names the file in errors.
+
+    Raises:
+        PlanError: the text is not TOML, or it is written in a way that cannot be changed in place.
+    """
+    try:
+        wanted = tomllib.loads(text)
+    except (tomllib.TOMLDecodeError, RecursionError) as error:
+        raise PlanError(f"{origin} should be a TOML file, but: {error}; correct it") from None
+    try:
+        _set(wanted, path, value)
+    except (IndexError, TypeError, AttributeError):
+        table = ".".join(map(str, path[:-1]))
+        raise PlanError(f"there is no table {table} to change") from None
+    _drop_empty(wanted, path[:-1])
+    for made in _candidates(text, path, value):
+        with suppress(tomllib.TOMLDecodeError, RecursionError):
+            found = tomllib.loads(made)
+            _drop_empty(found, path[:-1])
+            if found == wanted:
+                return made
+    dotted = ".".join(str(part) for part in path if isinstance(part, str))
+    what = f"removing {dotted}" if value is None else f"{dotted} = {toml_value(value)}"
+    raise PlanError(
+        f"{origin} is written in a way that cannot be changed without losing something of it; "
+        f"change it by hand: {what}"
+    )
+
+
+def _set(table: Any, path: Keys, value: Any) -> None:
+    """Set a value of a nested table in place; None removes it."""
+    for part in path[:-1]:
+        if isinstance(part, str) and part not in table:
+            if value is None:
+                return
+            table[part] = {}
+        table = table[part]
+    if value is None:
+        table.pop(path[-1], None)
+        return
+    # tomlkit counts the comments above the next header to the table before them
+    body = getattr(getattr(table, "value", None), "body", [])
+    trailing: list[Any] = []
+    while path[-1] not in table and body and body[-1][0] is None:
+        trailing.insert(0, body.pop())
+    table[path[-1]] = value
+    body.extend(trailing)
+
+
+def _drop_empty(table: Any, path: Keys) -> None:
+    """Remove the empty tables on a path: they state nothing."""
+    if path and (isinstance(path[0], int) or path[0] in table):
+        _drop_empty(table[path[0]], path[1:])
+        if table[path[0]] == {} and isinstance(table, dict):
+            del table[path[0]]
+
+
+def _candidates(text: str, path: Keys, value: Any) -> Iterator[str]:
+    """Texts that may state the value, the one with the smallest change first."""
+    import tomlkit
+    from tomlkit.exceptions import TOMLKitError
+
+    told = None if value is None else toml_value(value)
+    if told is not None:  # `Plan.to_toml` writes `# key =` for what is not set
+        header, key = (re.escape(name) for name in (".".join(map(str, path[:-1])), str(path[-1])))
+        unset = rf"(^\[{header}\](?:(?!^\[).)*?^)# {key} =[ \t]*(?=\r?$)"
+        stated = f"{path[-1]} = {told}"
+        yield re.sub(unset, lambda found: found[1] + stated, text, count=1, flags=re.M | re.S)
+    for clear in (False, True):  # a table in several lines is removed first
+        with suppress(TOMLKitError, LookupError, TypeError, ValueError, AttributeError):
+            document = tomlkit.parse(text)
+            if clear:
+                _set(document, path, None)
+            _set(document, path, told and tomlkit.value(told))
+            made = tomlkit.dumps(document)
+            yield re.sub(r"(?<!\r)\n", "\r\n", made) if "\r\n" in text else made
+
 
 _MOST_CORNERS = 200
 _REGION = ("arena", "region")
@@ -168,7 +265,6 @@ class StatedRegions:
             return self._seen_whole(key)
 
     def _seen_whole(self, key: str) -> tuple[NDArray[np.uint16], Camera]:
-        from .build import build_recording
 
         planned = self._planned(key)[1]
         if key not in self._seen:
@@ -195,48 +291,37 @@ class StatedRegions:
             raise StudyError(f"there is no session {key}")
         file = session.path.with_name(f"{session.path.stem}.plan.toml")
         stated = None
-        if file.is_file():
-            stated = _at(_table(file), _REGION)
-        else:
-            try:
-                stated = _at(parse_toml(session.plan), _REGION)
-            except ValueError:
-                stated = None
+        with suppress(ValueError):
+            stated = _at(_table(file) if file.is_file() else parse_toml(session.plan), _REGION)
         return [Place("beside", "this recording, in a plan beside it", file, _REGION, stated)]
 
     def _shown(self, place: Place, session: Session | None) -> list[list[float]] | None:
         """The corners of what is stated, px."""
-        from liex_lab.scene.floor import Floor
-        from liex_lab.scene.region import region_corners_px
-
         if place.stated is None:
             return None
         region = _region(place.stated)
-        if session is not None:
-            normal = -np.asarray(session.T_arena_camera.rotation)[2]
-            height_mm = float(session.T_arena_camera.translation[2])
-            floor = Floor.from_plane(normal, height_mm, session.camera)
-            return _plain(region_corners_px(region, session.camera, floor))
-        if region.unit == "mm":
+        if region.unit == "px":
+            return _plain(region_corners_px(region))
+        if session is None:
             raise PlanError(
                 "a region is stated in millimetres on the floor; it can be shown once the "
                 "recording is measured, and one that is drawn now replaces it"
             )
-        return _plain(_px(region))
+        normal = -np.asarray(session.T_arena_camera.rotation)[2]
+        height_mm = float(session.T_arena_camera.translation[2])
+        floor = Floor.from_plane(normal, height_mm, session.camera)
+        return _plain(region_corners_px(region, session.camera, floor))
 
     def _checked(
         self, key: str, session: Session | None, corners: Sequence[Any]
     ) -> list[list[float]]:
         """The corners as they are written, if they are a region of the picture."""
-        from liex_lab.recordings.frame import region_mask
-        from liex_lab.scene.region import region_corners_px
-
         if not isinstance(corners, list) or len(corners) > _MOST_CORNERS:
             raise PlanError(f"a region is a list of at most {_MOST_CORNERS} corners [x, y]")
         region = _region(corners)
         camera = self._seen_whole(key)[1] if session is None else session.camera
         # says what is wrong where it is none
-        region_mask(region_corners_px(region, camera, None), camera.width, camera.height)
+        region_mask(region_corners_px(region), camera.width, camera.height)
         return [[round(float(value), 1) for value in corner] for corner in region.polygon or ()]
 
     def _text(self, place: Place, session: Session | None) -> str:
@@ -258,8 +343,6 @@ class StatedRegions:
 
     def _recording(self, key: str, session: Session | None) -> str:
         """The recording as a command names it."""
-        from liex_lab.sessions.evidence import linked_recording
-
         if self._study is not None:
             return shlex.quote(self._planned(key)[1].recording)
         linked = linked_recording(session) if session is not None else None
@@ -313,13 +396,6 @@ def _region(stated: Any) -> Region:
     return region
 
 
-def _px(region: Region) -> Any:
-    from liex_lab.optics.camera import Camera
-    from liex_lab.scene.region import region_corners_px
-
-    return region_corners_px(region, Camera(1.0, 1.0, 0.0, 0.0, 1, 1), None)
-
-
 def _plain(corners: Any) -> list[list[float]]:
     return [[round(float(u), 1), round(float(v), 1)] for u, v in corners if math.isfinite(u + v)]
 
@@ -339,8 +415,6 @@ def _table(file: Path) -> dict[str, Any]:
 
 def _usual(recording: Any) -> NDArray[np.uint16]:
     """Each pixel's median over frames of a whole recording, of those that read it."""
-    from liex_lab.scene.background import sample_frames, usual_depth
-
     sample = sample_frames(recording, _N_PICTURES)
     return usual_depth(np.clip(np.rint(sample), 0, 65_535).astype(np.uint16))
 
@@ -351,8 +425,6 @@ def _write(file: Path, text: str) -> None:
     Raises:
         PlanError: it cannot be.
     """
-    from liex_lab.runtime.durable import replacing
-
     try:
         with replacing(file) as part:
             part.write_bytes(text.encode("utf-8"))

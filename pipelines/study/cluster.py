@@ -1,0 +1,527 @@
+"""The Dask cluster of a study: processes of this machine, a running scheduler, or Slurm jobs.
+
+Dask is imported here and in `crew` alone.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import subprocess
+import threading
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, closing, contextmanager, suppress
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING, Annotated, Any, Self
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from liex_lab.errors import MissingPackageError, StudyError, how_to_install
+from liex_lab.plan import plans_folder
+from liex_lab.runtime.durable import Scratch
+from liex_lab.runtime.text_files import read_toml
+
+from ..workers import n_cores, worker_environment
+from .crew import DEATHS, Crew, Finished, RunSession, Told
+from .status import SessionStatus
+
+if TYPE_CHECKING:
+    from distributed import Client
+    from distributed.deploy.cluster import Cluster
+
+
+_FORGOTTEN_S = 8.0  # a nanny whose process has been gone for so long starts no other by itself
+_NONE_LEFT_S = 60.0  # and so long none of a study's worker processes was there at all
+_CLOSING = ("closing", "closed", "closing_gracefully")
+
+
+class Watch(ABC):
+    """Within the block, a look at the cluster every so often, by a thread.
+
+    Attributes:
+        gave_up: why the study is ended; empty while there is no reason.
+    """
+
+    def __init__(self, client: Client, every_s: float) -> None:
+        """Nothing is looked at yet.
+
+        Args:
+            client: of the cluster; its pending futures are the sessions that are left.
+            every_s: between two looks, s.
+        """
+        self.gave_up = ""
+        self._client, self._every_s = client, every_s
+        self._over = threading.Event()
+        self._thread = threading.Thread(target=self._watch, name="cluster watch", daemon=True)
+
+    @abstractmethod
+    def look(self) -> None:
+        """Look once: mend what can be mended, or state in `gave_up` why nothing can."""
+
+    def __enter__(self) -> Self:
+        """Begin to look."""
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        tb: TracebackType | None,
+    ) -> None:
+        """No more looking.
+
+        Raises:
+            StudyError: the study was ended by this.
+        """
+        self._over.set()
+        self._thread.join()
+        if self.gave_up and isinstance(error, StudyError):
+            raise StudyError(self.gave_up) from None
+
+    def _watch(self) -> None:
+        from distributed import Future
+
+        while not self._over.wait(self._every_s):
+            self.look()
+            if self.gave_up:
+                self._client.cancel([Future(key, self._client) for key in self._client.futures])
+                return
+
+
+class KeptWorkers(Watch):
+    """Worker processes of this machine.
+
+    Its nanny starts a worker again when it has died, but for one that died while it was started.
+    """
+
+    def __init__(self, client: Client, cluster: Any, every_s: float = 5.0) -> None:
+        """Look at the workers of a cluster.
+
+        Args:
+            client: of the cluster.
+            cluster: a `distributed.LocalCluster`.
+            every_s: between two looks, s.
+        """
+        super().__init__(client, every_s)
+        self._cluster = cluster
+        self._gone_since: dict[Any, float] = {}  # by nanny
+
+    def look(self) -> None:
+        """Start workers again that nobody does, and give up where none comes for a minute."""
+        nannies = list(self._cluster.workers.values())
+        now = time.monotonic()
+        gone = [nanny for nanny in nannies if not _is_alive(nanny)]
+        self._gone_since = {nanny: self._gone_since.get(nanny, now) for nanny in gone}
+        waited = {nanny: now - since for nanny, since in self._gone_since.items()}
+        for nanny, seconds in waited.items():
+            if seconds >= _FORGOTTEN_S and nanny.status.name not in _CLOSING:
+                self._cluster.loop.add_callback(nanny.instantiate)
+        if len(gone) == len(nannies) and min(waited.values(), default=_NONE_LEFT_S) >= _NONE_LEFT_S:
+            self.gave_up = (
+                "the study's worker processes have ended and could not be started again; see "
+                "whether the machine has memory left, or use fewer workers; the sessions that were "
+                "measured are kept, and the same command goes on with the rest"
+            )
+
+
+def _is_alive(nanny: Any) -> bool:
+    """Whether the process that a nanny of Dask looks after is there."""
+    import psutil
+
+    pid = nanny.pid
+    if not pid:
+        return False
+    try:
+        return bool(psutil.Process(pid).status() != psutil.STATUS_ZOMBIE)
+    except psutil.Error:
+        return False
+
+
+# Settings for workers on Slurm: a small TOML file, `pipelines/plans/slurm.toml` to begin from.
+
+
+# one line of a job script each: nothing in the file may begin another line
+Line = Annotated[str, Field(pattern=r"^[^\r\n\x00]*$", max_length=1000)]
+Word = Annotated[str, Field(pattern=r"^[A-Za-z0-9_.:/@+-]+$", max_length=200)]
+
+
+class SlurmTable(BaseModel):
+    """Every setting of the file; the comments in slurm.toml say what each is for.
+
+    Attributes:
+        jobs: jobs at most; each measures one session after the other.
+        cores_per_job: cores of a job.
+        memory: memory of a job, as Slurm writes it.
+        walltime: time after which Slurm ends a job, HH:MM:SS.
+        partition: the partition, if one is to be named.
+        account: the account, if one is to be named.
+        interface: network interface on which jobs and the command see each other.
+        shared_folder: folder that all nodes see; keys made for this run go there.
+        local_folder: folder on the nodes for temporary files.
+        log_folder: folder for the jobs' own logs.
+        prologue: lines of the job script before the worker starts.
+        directives: further #SBATCH lines.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+
+    jobs: int = Field(8, ge=1, le=10_000)
+    cores_per_job: int = Field(2, ge=1, le=256)
+    memory: Word = "4GB"
+    walltime: Word = "12:00:00"
+    partition: Word | None = None
+    account: Word | None = None
+    interface: Word | None = None
+    shared_folder: Line = "~/.liex_lab"
+    local_folder: Line | None = None
+    log_folder: Line | None = None
+    prologue: list[Line] = []
+    directives: list[Line] = []
+
+    @staticmethod
+    def load(path: str | Path) -> SlurmTable:
+        """The settings in a TOML file.
+
+        Args:
+            path: the file; `slurm` is the bundled one.
+
+        Raises:
+            StudyError: there is no such file, or something in it cannot be used.
+        """
+        file = plans_folder() / "slurm.toml" if str(path) == "slurm" else Path(path)
+        if not file.is_file():
+            raise StudyError(
+                f"there is no file {file}; copy {plans_folder() / 'slurm.toml'} and change the copy"
+            )
+        try:
+            return SlurmTable.model_validate(read_toml(file))
+        except ValidationError as error:  # which is a ValueError, too
+            first = error.errors(include_url=False)[0]
+            where = ".".join(str(part) for part in first["loc"])
+            raise StudyError(
+                f"{file}: {where}: {first['msg']}; compare it with the bundled slurm.toml"
+            ) from None
+        except ValueError as error:
+            raise StudyError(f"{file} should be a TOML file, but: {error}; correct it") from None
+
+
+# Jobs of a Slurm cluster, asked for anew where one has ended before the study has.
+
+
+# between two looks: longer than the 15 s after which Dask forgets a worker that is gone, so that a
+# new job never bears the name of one that is still being forgotten
+EVERY_S = 20.0
+# jobs that end before their worker has answered, for each that was asked for: something is wrong
+MOST_IN_VAIN = 3
+
+
+def queued() -> set[str] | None:
+    """Numbers of this account's jobs that wait or run; None where Slurm does not say."""
+    try:
+        told = subprocess.run(  # nosec B607: Slurm is where the cluster put it
+            ["squeue", "--me", "--noheader", "--format=%A"],
+            capture_output=True,
+            text=True,
+            timeout=60,
+            check=True,
+        )
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return set(told.stdout.split())
+
+
+class KeptJobs(Watch):
+    """Within the block, as many jobs as sessions are left, but not more than were asked for."""
+
+    def __init__(
+        self,
+        client: Client,
+        cluster: Any,
+        n_jobs: int,
+        log_folder: str | None,
+        ask: Callable[[], set[str] | None] = queued,
+    ) -> None:
+        """Look at the jobs of a cluster.
+
+        Args:
+            client: of the cluster; its pending futures are the sessions that are left.
+            cluster: a `dask_jobqueue.SLURMCluster`.
+            n_jobs: how many jobs it was asked for.
+            log_folder: where the jobs' logs are, if a folder was named.
+            ask: what tells the jobs that wait or run.
+        """
+        super().__init__(client, EVERY_S)
+        self._cluster, self._n_jobs = cluster, n_jobs
+        self._logs = log_folder or "the folder where the command was started"
+        self._ask = ask
+        self._missing: set[str] = set()  # jobs that were in no queue at the last look
+        self._in_vain = 0
+
+    def look(self) -> None:
+        """Forget jobs that have ended without a word, and ask for others where some are wanted."""
+        cluster = self._cluster
+        there = self._ask()
+        if there is None:
+            return
+        if cluster.scheduler_info["workers"]:
+            self._in_vain = 0
+        numbers = {name: str(job.job_id) for name, job in dict(cluster.workers).items()}
+        gone = {name for name, number in numbers.items() if number not in there}
+        # one whose worker was connected is forgotten by Dask between two looks
+        silent = gone & self._missing
+        self._missing = gone - silent
+        self._in_vain += len(silent)
+        for name in silent:
+            cluster.loop.add_callback(cluster.workers.pop, name, None)
+        if self._in_vain > MOST_IN_VAIN * self._n_jobs:
+            self.gave_up = (
+                f"{self._in_vain} jobs of Slurm ended before they measured anything; their logs "
+                f"are in {self._logs}; the sessions that were measured are kept, and the same "
+                "command goes on with the rest"
+            )
+            return
+        left = sum(state.status == "pending" for state in dict(self._client.futures).values())
+        if len(numbers) - len(silent) < min(self._n_jobs, left):
+            cluster.scale(self._n_jobs)
+
+
+_ENCRYPTED, _OPEN = ("tls", "wss"), ("tcp", "ws", "ucx")  # how a scheduler can be spoken to
+
+
+def measure_cohort(
+    todo: Sequence[SessionStatus],
+    run: RunSession,
+    *,
+    workers: int = 0,
+    threads: int = 0,
+    scheduler: str | None = None,
+    slurm: SlurmTable | None = None,
+    told: Told = lambda *_: None,
+    finished: Finished = lambda _: None,
+) -> list[dict[str, Any]]:
+    """Measure the sessions of a study; returns how each went, as `measure_one` does.
+
+    Args:
+        todo: the sessions that are to be measured.
+        run: measures a recording, `liex_lab.api.run_session`.
+        workers: processes on this machine; 0 takes one for every two cores.
+        threads: cores of each; 0 takes an equal share.
+        scheduler: address of a running Dask scheduler.
+        slurm: how to ask a Slurm cluster for workers.
+        told: is told id, pieces done, pieces in all, and what is being done.
+        finished: is given each result as soon as it is there.
+
+    Raises:
+        StudyError: no scheduler answers, or it ends before the study does.
+        MissingPackageError: Slurm is asked for and dask-jobqueue is not installed.
+    """
+    if not todo:
+        return []
+    with crew_of(len(todo), workers=workers, threads=threads, scheduler=scheduler, slurm=slurm) as (
+        crew
+    ):
+        return crew.measure(todo, run, told, finished)
+
+
+@contextmanager
+def crew_of(
+    n_tasks: int,
+    *,
+    workers: int = 0,
+    threads: int = 0,
+    scheduler: str | None = None,
+    slurm: SlurmTable | None = None,
+) -> Iterator[Crew]:
+    """Workers for the sessions of a study, within the block.
+
+    Args:
+        n_tasks: the most sessions that there are to do at once.
+        workers: processes on this machine; 0 takes one for every two cores.
+        threads: cores of each; 0 takes an equal share.
+        scheduler: address of a running Dask scheduler.
+        slurm: how to ask a Slurm cluster for workers.
+
+    Raises:
+        StudyError: no scheduler answers, or it ends before the study does.
+        MissingPackageError: Slurm is asked for and dask-jobqueue is not installed.
+    """
+    with _client(n_tasks, workers, threads, scheduler, slurm) as client:
+        yield Crew(client, slurm.jobs if slurm else 0)
+
+
+def is_encrypted(scheduler: str) -> bool:
+    """Whether what is sent to a scheduler is encrypted.
+
+    Args:
+        scheduler: its address, as in tcp://10.0.0.1:8786.
+
+    Raises:
+        StudyError: it is no address of a scheduler.
+    """
+    kind, found, place = scheduler.rpartition("://")  # tcp where it says nothing
+    if not place or (found and kind not in _ENCRYPTED + _OPEN):
+        raise StudyError(
+            f"{scheduler!r} is no address of a Dask scheduler; expected one as in "
+            "tcp://10.0.0.1:8786 or tls://10.0.0.1:8786, which `dask scheduler` prints"
+        )
+    return kind in _ENCRYPTED
+
+
+@contextmanager
+def _client(
+    n_tasks: int, workers: int, threads: int, scheduler: str | None, slurm: SlurmTable | None
+) -> Iterator[Client]:
+    """A client of the cluster that was asked for."""
+    import dask
+    from distributed import Client
+
+    logging.getLogger("distributed.client").setLevel(logging.CRITICAL)  # we say what is lost
+    # one session at a worker at a time: what waits there is held to have killed it, too
+    settings = {
+        "distributed.scheduler.allowed-failures": DEATHS,
+        "distributed.scheduler.worker-saturation": 1.0,
+        "distributed.logging.distributed": "critical",
+        "distributed.worker.memory.terminate": False,
+        # a machine that is busy or was put to sleep is not a dead one
+        "distributed.scheduler.worker-ttl": "3600s",
+        "distributed.comm.timeouts.connect": "120s",
+        # plain HTTP that would tell ids and paths to every account of the machine
+        "distributed.scheduler.http.routes": [],
+        "distributed.worker.http.routes": [],
+    }
+    with ExitStack() as stack:
+        stack.enter_context(dask.config.set(settings))
+        if scheduler is not None:
+            try:
+                yield stack.enter_context(Client(scheduler, timeout="20s", set_as_default=False))
+            except (OSError, ValueError, TypeError) as error:
+                raise StudyError(
+                    f"no Dask scheduler answers at {scheduler} ({error}); start one with `dask "
+                    "scheduler`, or leave --scheduler out"
+                ) from None
+            return
+        scratch = str(stack.enter_context(closing(Scratch())).folder)
+        stack.enter_context(dask.config.set({"temporary-directory": scratch}))
+        cluster = (
+            slurm_cluster(slurm, scratch)
+            if slurm
+            else local_cluster(n_tasks, workers, threads, scratch)
+        )
+        stack.enter_context(cluster)
+        client = stack.enter_context(Client(cluster, set_as_default=False))
+        if not slurm:
+            stack.enter_context(KeptWorkers(client, cluster))
+        else:
+            n_jobs = min(slurm.jobs, n_tasks)  # a job is one worker
+            cluster.scale(n_jobs)
+            stack.enter_context(KeptJobs(client, cluster, n_jobs, slurm.log_folder))
+        try:
+            yield client
+        except BaseException:
+            if not slurm:
+                _end_workers(cluster)
+            raise
+
+
+def _end_workers(cluster: Any) -> None:
+    """Kill the worker processes of this machine: asked to end, they would first finish a kernel,
+    and a session goes on from its checkpoint either way.
+    """
+    for nanny in cluster.workers.values():
+        nanny.close_gracefully()  # or it would start another one
+        if nanny.pid:
+            with suppress(ProcessLookupError):
+                os.kill(nanny.pid, signal.SIGKILL)
+
+
+def local_cluster(n_tasks: int, workers: int, threads: int, scratch: str) -> Cluster:
+    """Worker processes on this machine, reached through this machine alone, with keys for this run.
+
+    Args:
+        n_tasks: sessions to measure; there are no more workers than that.
+        workers: processes; 0 takes one for every two cores.
+        threads: cores of each; 0 takes an equal share.
+        scratch: folder for temporary files.
+    """
+    from distributed import LocalCluster, Security
+
+    cores = n_cores()
+    count = max(1, min(workers or (cores + 1) // 2, n_tasks))
+    return LocalCluster(
+        n_workers=count,
+        threads_per_worker=1,
+        processes=True,
+        host="127.0.0.1",
+        dashboard_address=None,
+        scheduler_kwargs={
+            "dashboard": False,
+            "dashboard_address": "127.0.0.1:0",  # any port: another study's may have the usual one
+        },
+        memory_limit=0,
+        local_directory=scratch,
+        silence_logs=50,
+        security=Security.temporary(),
+        env=worker_environment(threads or max(1, cores // count)),
+    )
+
+
+def slurm_cluster(table: SlurmTable, scratch: str) -> Any:
+    """A cluster whose workers are jobs of Slurm; the scheduler is this process.
+
+    Args:
+        table: how to ask for jobs.
+        scratch: folder for temporary files where the table names none.
+
+    Raises:
+        MissingPackageError: dask-jobqueue is not installed.
+    """
+    try:
+        from dask_jobqueue import SLURMCluster
+    except ImportError:
+        raise MissingPackageError(
+            f"workers on Slurm need the package dask-jobqueue; {how_to_install('slurm')}"
+        ) from None
+    from distributed import Security
+
+    shared = Path(table.shared_folder).expanduser()
+    shared.mkdir(mode=0o700, parents=True, exist_ok=True)
+    return SLURMCluster(
+        **slurm_options(table, scratch),
+        scheduler_options={"dashboard": False, "dashboard_address": None},
+        security=Security.temporary(),
+        shared_temp_directory=str(shared),
+        silence_logs=50,
+    )
+
+
+def slurm_options(table: SlurmTable, scratch: str) -> dict[str, Any]:
+    """The options of one job: a worker that measures a session at a time on all its cores.
+
+    Args:
+        table: how to ask for jobs.
+        scratch: folder for temporary files where the table names none.
+    """
+    exports = [
+        f"export {name}={value}" for name, value in worker_environment(table.cores_per_job).items()
+    ]
+    exports.append("export DASK_DISTRIBUTED__WORKER__HTTP__ROUTES='[]'")
+    return {
+        "queue": table.partition,
+        "account": table.account,
+        "cores": 1,
+        "processes": 1,
+        "memory": table.memory,
+        "job_cpu": table.cores_per_job,
+        "walltime": table.walltime,
+        "interface": table.interface,
+        "job_script_prologue": [*table.prologue, *exports],
+        "job_extra_directives": list(table.directives),
+        "local_directory": table.local_folder or scratch,
+        "log_directory": table.log_folder,
+        "worker_extra_args": ["--no-dashboard"],
+    }
