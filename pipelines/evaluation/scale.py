@@ -299,8 +299,7 @@ def _decode_and_write(session: Any, recording: Path, plan: Plan, place: Path) ->
 
 def _workers(run: RunSession, recordings: list[Path], folder: Path) -> dict[str, Any]:
     """The same sessions on one worker and on two, by the wall clock."""
-    from liex_lab.pipelines.study.cluster import measure_cohort
-
+    from ..study.cluster import measure_cohort
     from ..study.status import standings
 
     table = {
