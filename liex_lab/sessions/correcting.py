@@ -87,7 +87,7 @@ def parse_correction(
     try:
         match shlex.split(sentence) if isinstance(sentence, str) else list(sentence):
             case ["rename", at, action, *new] if new in ([], ["new"]):
-                return rename_bout(session, *numbers(at), str(action), new_word=bool(new))
+                return rename_bout(session, numbers(at)[0], str(action), new_word=bool(new))
             case ["add", action, start, stop, *new] if new in ([], ["new"]):
                 return add_bout(session, str(action), *numbers(start, stop), new_word=bool(new))
             case ["recut", at, start, stop]:

@@ -63,7 +63,7 @@ _ERROR_SCHEMA: dict[str, Any] = {
     "properties": {"timestamp": _TIME, "predicted_error_mm": {"type": "number"}},
 }
 _DEPTH = "/camera/depth"
-_PROTOBUF = {
+_PROTOBUF: dict[str, Any] = {
     "/camera/calibration": messages.CameraCalibration,
     "/tf": messages.FrameTransforms,
     _DEPTH: messages.RawImage,

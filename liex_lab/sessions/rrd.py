@@ -351,9 +351,9 @@ class ReplayWriter:
         kind = rr.ClassDescription(info=whole, keypoint_annotations=names)
         dot_m = dot_mm(skeleton) / MM_PER_UNIT
         pt = dot_pt(skeleton)
-        dot = {"colors": JOINT_COLOUR, "show_labels": False}
+        dot: dict[str, Any] = {"colors": JOINT_COLOUR, "show_labels": False}
         thick, thin = rr.Radius.ui_points(pt), rr.Radius.ui_points(pt / 3.0)
-        looks = {
+        looks: dict[str, rr.AsComponents] = {
             SKELETON: rr.AnnotationContext([kind]),
             f"{SKELETON}/joints": rr.Points3D.from_fields(radii=dot_m, **dot),
             f"{SKELETON}/bones": rr.LineStrips3D.from_fields(radii=dot_m / 2.0, colors=BONE_COLOUR),
@@ -369,8 +369,8 @@ class ReplayWriter:
         for h, colour in zip(range(n_candidates), cycle(PALETTE), strict=False):
             look = rr.LineStrips3D.from_fields(radii=0.0008, colors=rgba([colour]))
             looks[f"{CANDIDATES}/{h + 1}"] = look
-        for entity, look in looks.items():
-            self._stream.log(entity, look, static=True)
+        for entity, archetype in looks.items():
+            self._stream.log(entity, archetype, static=True)
         animal = self._origin.animal_size
         return log_body(self._stream, skeleton, animal) if skeleton.surface else []
 

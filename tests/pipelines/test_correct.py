@@ -400,7 +400,7 @@ def test_a_sentence_makes_the_same_correction_as_its_function(measured: Session)
     x, y, z = np.round(measured.poses.loc[24, ["x_mm", "y_mm", "z_mm"]].to_numpy(float) + 4.0, 3)
     u, v = measured.poses.loc[24, ["u_px", "v_px"]].to_numpy(float)
     time_s = measured.frames["time_s"].iloc[4]
-    nose = correcting.joint_move_at_pixel(measured, 4, "nose", u, v)
+    nose = correcting.joint_move_at_pixel(measured, 4, "nose", float(u), float(v))
     same = {
         "flip 1.0 1.5": correcting.flip_span(measured, 1.0, 1.5),
         f"joint nose 4 {u} {v}": nose,
