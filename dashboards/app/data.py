@@ -33,7 +33,7 @@ DONE = ("done", "changed")  # states in which there is a session to look at
 NO_POSE = "no pose or no frame"
 OTHER = "other actions"
 GREY = "#a3a39b"
-VOID = "#ffffff"
+NO_POSE_COLOUR = "#3a3f45"
 _READERS = 4  # threads; most of the time goes into opening files
 _HELD = 6  # sessions whose tables stay in memory
 
@@ -77,6 +77,7 @@ class StudyData:
         self._lock = threading.RLock()
         self._kept: dict[tuple[str, str], tuple[Any, Any]] = {}
         self._stats: dict[Any, pd.DataFrame] = {}
+        self._whole: tuple[Any, pd.DataFrame] | None = None
         self._open: dict[str, tuple[Any, Session]] = {}
         self.entries: dict[str, Entry] = {}
         self.refresh()
@@ -209,15 +210,25 @@ class StudyData:
         import pandas as pd
 
         done = self.done
+        found = self._of_all("summary", _summary)
+        state = [
+            (id(table), entry.key, *entry.who.items())
+            for entry, table in zip(done, found, strict=True)
+        ]
+        with self._lock:
+            if self._whole is not None and self._whole[0] == state:
+                return self._whole[1]
         tables = []
-        for entry, table in zip(done, self._of_all("summary", _summary), strict=True):
+        for entry, table in zip(done, found, strict=True):
             if isinstance(table, pd.DataFrame):
                 stated = {name: value for name, value in entry.who.items() if value}
                 tables.append(table.assign(key=entry.key, **stated))
-        if not tables:
-            return pd.DataFrame(columns=["key", "session_id", *WHO])
-        whole, notes = cohort.unified(pd.concat(tables, ignore_index=True))
-        whole.attrs["check"] = notes
+        whole, notes = pd.DataFrame(columns=["key", "session_id", *WHO]), []
+        if tables:
+            whole, notes = cohort.unified(pd.concat(tables, ignore_index=True))
+            whole.attrs["check"] = notes
+        with self._lock:
+            self._whole = (state, whole)
         return whole
 
     def to_check(self) -> list[str]:

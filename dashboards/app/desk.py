@@ -59,28 +59,28 @@ class Desk:
         self.key = key
         self.session = session
         self._frames = frames
-        self._seen = animals(session)
+        self.seen = animals(session)
 
     @cached_property
     def time_s(self) -> Array:
         """(n,) times of the frames, s."""
-        return self._seen[0].frames["time_s"].to_numpy(float)
+        return self.seen[0].frames["time_s"].to_numpy(float)
 
     @cached_property
     def _numbers(self) -> dict[str, Any]:
         """Columns of `frames` that are told for every frame."""
         names = ["flag", "predicted_error_mm", "p_flip", "frame_index"]
-        if len(self._seen) > 1:
+        if len(self.seen) > 1:
             names.append("individual")
         table = self.session.table("frames", names)
-        if len(self._seen) > 1:
-            table = table[table["individual"].astype(str) == self._seen[0].individual]
+        if len(self.seen) > 1:
+            table = table[table["individual"].astype(str) == self.seen[0].individual]
         return {name: table[name].to_numpy() for name in names}
 
     @cached_property
     def uv(self) -> list[Array]:
         """Of each animal the joints (n, J, 2), px; NaN without a pose."""
-        return joints_in_picture(self._seen, len(self.time_s))
+        return joints_in_picture(self.seen, len(self.time_s))
 
     @cached_property
     def _ways(self) -> list[tuple[Array, int]]:
@@ -128,7 +128,7 @@ class Desk:
             "bones": [[int(a), int(b)] for a, b in animal["bones"]],
             "animals": [
                 {"name": seen.who, "half_px": half}
-                for seen, (_, half) in zip(self._seen, self._ways, strict=True)
+                for seen, (_, half) in zip(self.seen, self._ways, strict=True)
             ],
             "actions": [
                 {"word": word, "title": word.replace("_", " "), "colour": colours[word]}
@@ -162,7 +162,7 @@ class Desk:
     def bouts(self) -> list[dict[str, Any]]:
         """Every bout: action, start_s, stop_s, source and score."""
         names = ("action", "start_s", "stop_s", "source", "score")
-        table = self._seen[0].bouts
+        table = self.seen[0].bouts
         columns = [table[name].tolist() for name in names]
         return [
             {
@@ -195,7 +195,7 @@ class Desk:
 
     def crossings(self) -> list[dict[str, Any]]:
         """Where ends or animals may have been taken for one another, see `crossings.Crossing`."""
-        return crossings(self.session, self._seen)
+        return crossings(self.session, self.seen)
 
     def _doubtful_runs(self) -> list[tuple[float, float, float]]:
         """Start, stop (s) and largest predicted error (mm) of the runs of doubtful frames."""
@@ -220,6 +220,11 @@ class Desk:
             }
             for entry in read_log(self.session.path).standing
         ]
+
+    def redo(self) -> str:
+        """What was taken back last and can be made again; "" if nothing."""
+        redoable = read_log(self.session.path).redoable
+        return "" if redoable is None else str(redoable[1])
 
     def picture(self, row: int, box: Sequence[int]) -> bytes:
         """PNG of a part of a frame as relief: height above the floor in colours, with shading.

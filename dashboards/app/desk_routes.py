@@ -15,7 +15,7 @@ from flask import Flask, Response, jsonify, make_response, request
 
 from liex_lab.errors import LiexError, SessionError
 from liex_lab.sessions import correcting
-from liex_lab.sessions.corrections import BoutEdit, Correction, FlipSpan, JointMove, read_log
+from liex_lab.sessions.corrections import Correction, read_log
 
 from .desk import Desk, Desks
 from .saver import Saver, Ticket
@@ -39,24 +39,25 @@ class Clerk:
         self._tickets: dict[int, tuple[str, Ticket]] = {}
 
     def take(self, key: str, asked: dict[str, Any]) -> dict[str, Any]:
-        """Check what the page asks for and queue it; returns its ticket and what it says.
+        """Check what the page asks for and queue it; returns its ticket and what it does.
 
         A joint that is only tried, while it is dragged, is checked and not queued.
 
         Args:
             key: the session's name in the study.
-            asked: what (joint, action, flip, nothing, undo, redo) with its numbers, and by.
+            asked: by, at_s (the moment that is shown), and one of: sentence, perhaps with try; undo
+                with a number or a ticket; redo.
 
         Raises:
             LiexError: it cannot be done.
         """
         desk = self._desks.of(key)
         author = _text(asked, "by")
-        if asked.get("what") == "undo":
+        if asked.get("undo"):
             return self._undo(key, desk, asked, author)
-        if asked.get("what") == "redo":
+        if asked.get("redo"):
             return self._redo(key, desk, author)
-        what = asked_correction(desk, asked)
+        what = correction_in(desk, _text(asked, "sentence"), _number(asked, "at_s"))
         if asked.get("try"):
             return {"ticket": None, "said": str(what), **vars(what)}
         return self._kept(key, self._saver.add(desk.session.path, what, author))
@@ -82,6 +83,7 @@ class Clerk:
                 for n, one in ours.items()
             },
             "log": desk.log(),
+            "redo": desk.redo(),
             "notes": desk.notes,
         }
 
@@ -122,71 +124,29 @@ class Clerk:
         return {"ticket": number, "said": ticket.said}
 
 
-def asked_correction(desk: Desk, asked: dict[str, Any]) -> Correction:
-    """The correction that a key or the mouse asks for.
+def correction_in(desk: Desk, sentence: str, at_s: float) -> Correction:
+    """The correction in a sentence, see `correcting.parse_correction`.
+
+    `flip` alone exchanges head and tail in the doubtful stretch at the moment, else in its frame.
 
     Args:
         desk: the session as it is.
-        asked: what: joint (with row, joint, u, v), action (word, at_s, perhaps new), nothing (at_s)
-            or flip (at_s); the latter three with from_s and to_s where a span is marked.
+        sentence: the sentence.
+        at_s: the moment that is shown, s since the first frame.
 
     Raises:
         LiexError: it cannot be done.
     """
-    what = asked.get("what")
-    if what == "joint":
-        return _joint(desk, asked)
-    marked = ("from_s" in asked and "to_s" in asked) or None
-    span = marked and (_number(asked, "from_s"), _number(asked, "to_s"))
-    at_s = _number(asked, "at_s")
-    if what == "flip":
-        return _flip(desk, at_s, span)
-    if what == "nothing":
-        return correcting.delete_bout(desk.session, at_s)
-    if what == "action":
-        return _action(desk, at_s, span, _text(asked, "word"), bool(asked.get("new")))
-    raise SessionError(
-        f"a correction is of a joint, an action, nothing, a flip, or an undo; got {what!r}"
-    )
-
-
-def _joint(desk: Desk, asked: dict[str, Any]) -> JointMove:
-    """A joint under a pixel."""
-    row = _number(asked, "row")
-    if not (row == int(row) and 0 <= row < len(desk.time_s)):
-        raise SessionError(f"there is no frame in row {row:g}; the session has {len(desk.time_s)}")
-    frame = int(desk.session.frames["frame_index"].iloc[int(row)])
-    pixel = _number(asked, "u"), _number(asked, "v")
-    return correcting.joint_move_at_pixel(desk.session, frame, _text(asked, "joint"), *pixel)
-
-
-def _action(
-    desk: Desk, at_s: float, span: tuple[float, float] | None, word: str, new: bool
-) -> BoutEdit:
-    """An action for the marked span, or else for the bout at the moment."""
-    if span is not None:
-        return correcting.add_bout(desk.session, word, *span, new_word=new)
-    try:
-        return correcting.rename_bout(desk.session, at_s, word, new_word=new)
-    except SessionError as error:
-        if "no bout holds" not in str(error):
-            raise
-        raise SessionError(
-            f"nothing is named at {at_s:.2f} s; mark the span with [ and ], then press the number"
-        ) from None
-
-
-def _flip(desk: Desk, at_s: float, span: tuple[float, float] | None) -> FlipSpan:
-    """Head and tail exchanged in the marked span, else in the doubtful one here, else here."""
-    if span is None:
-        flips = desk.session.flips
-        here = flips[(flips["start_s"] <= at_s) & (at_s <= flips["stop_s"])]
-        row = desk.row_at(at_s)
-        after = desk.time_s[row + 1] if row + 1 < len(desk.time_s) else desk.time_s[row] + 1.0
-        span = (float(desk.time_s[row]), float(after))
-        if len(here):
-            span = (float(here["start_s"].iloc[0]), max(float(here["stop_s"].iloc[0]), span[1]))
-    return correcting.flip_span(desk.session, *span)
+    if sentence != "flip":
+        return correcting.parse_correction(desk.session, sentence, at_s)
+    row = desk.row_at(at_s)
+    after_s = desk.time_s[row + 1] if row + 1 < len(desk.time_s) else desk.time_s[row] + 1.0
+    start_s, stop_s = float(desk.time_s[row]), float(after_s)
+    flips = desk.session.flips
+    here = flips[(flips["start_s"] <= at_s) & (at_s <= flips["stop_s"])]
+    if len(here):
+        start_s, stop_s = float(here["start_s"].iloc[0]), max(float(here["stop_s"].iloc[0]), stop_s)
+    return correcting.flip_span(desk.session, start_s, stop_s)
 
 
 def add_routes(server: Flask, desks: Desks, clerk: Clerk | None) -> None:

@@ -26,11 +26,16 @@ if TYPE_CHECKING:
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
 MOST_BYTES = 4 << 20  # of what a visitor sends: corrections are some hundred bytes each
 _COOKIE = "liex_dashboard"
+_POLICY = (
+    "default-src 'none'; script-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' data: "
+    "blob:; connect-src 'self'; font-src 'self' data:; base-uri 'none'; form-action 'self'; "
+    "frame-ancestors 'none'"
+)
 # a report needs no script, so it has none
 _REPORT = "default-src 'none'; style-src 'unsafe-inline'; img-src data:"
 
 
-def guard(server: Flask, token: str, page_policy: Callable[[], str], *, alone: bool = True) -> None:
+def guard(server: Flask, token: str, *, alone: bool = True) -> None:
     """Refuse requests of others, and set the security headers of every answer.
 
     Those are refused that do not know the token: other accounts of this machine reach its loopback
@@ -41,7 +46,6 @@ def guard(server: Flask, token: str, page_policy: Callable[[], str], *, alone: b
     Args:
         server: the Flask server of the dashboard.
         token: what every visitor has to know; empty asks for none.
-        page_policy: makes the content security policy of the pages.
         alone: only this machine is answered.
     """
     server.config["MAX_CONTENT_LENGTH"] = MOST_BYTES
@@ -77,7 +81,7 @@ def guard(server: Flask, token: str, page_policy: Callable[[], str], *, alone: b
     @server.after_request
     def policies(response: Response) -> Response:
         """Set the security headers of a `response`; a content policy of its own stays."""
-        response.headers.setdefault("Content-Security-Policy", page_policy())
+        response.headers.setdefault("Content-Security-Policy", _POLICY)
         response.headers["X-Content-Type-Options"] = "nosniff"
         response.headers["Referrer-Policy"] = "no-referrer"
         return response

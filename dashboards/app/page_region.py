@@ -1,4 +1,4 @@
-"""The dashboard's pictures of a scene, and the page on which a region is drawn into the plan.
+"""The dashboard's images of a scene, and the addresses of the page on which a region is drawn.
 
 The page's script draws; what it asks for is told here as JSON and pictures, and what it saves is
 checked and written by whoever knows the plans (`Regions`).
@@ -8,10 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, Protocol
-from urllib.parse import quote
 
 import numpy as np
-from dash import ClientsideFunction, Dash, Input, Output, dcc, html
 from flask import Flask, Response, jsonify, request
 from numpy.typing import NDArray
 
@@ -20,10 +18,9 @@ from liex_lab.scene.background import usual_depth
 from liex_lab.sessions import Session
 
 from ..report.contact_sheet import png_uri, shade
-from ..report.scene_marks import WORDS, Mark, scene_marks, svg_marks
+from ..report.scene_marks import Mark, scene_marks, svg_marks
 from .data import StudyData
 from .frames import Frames
-from .parts import aria
 
 if TYPE_CHECKING:
     from liex_lab.optics.camera import Camera
@@ -54,82 +51,6 @@ class Regions(Protocol):
 
     def picture(self, key: str) -> tuple[NDArray[np.uint16], Camera]:
         """The usual depth (mm) of every pixel of the recording `key`, and its camera."""
-
-
-def arena_address(key: str) -> str:
-    """Address of the page on which the region of a recording is drawn.
-
-    Args:
-        key: its name in the study.
-    """
-    return f"/arena/{quote(key, safe='')}"
-
-
-def scene_panel(key: str, session: Session) -> list[Any]:
-    """The scene over the depth picture, as a session's page shows it.
-
-    Args:
-        key: the session's name in the study.
-        session: the opened session.
-    """
-    kinds = dict.fromkeys(mark.kind for mark in scene_marks(session))
-    words = [html.Li([html.I(className=f"mark is-{kind}"), WORDS[kind]]) for kind in kinds]
-    return [
-        html.H2("The scene"),
-        html.Img(
-            src=f"/region/{quote(key, safe='')}/scene.svg",
-            className="scene",
-            alt="depth picture with " + (", ".join(kinds) or "nothing that stands still"),
-        ),
-        html.Ul(words, className="key"),
-        html.P(dcc.Link("Draw the region of the arena", href=arena_address(key))),
-    ]
-
-
-def not_measured(data: StudyData, key: str) -> list[Any]:
-    """What a recording's page says of its region while it was not measured.
-
-    Args:
-        data: the study.
-        key: the recording's name in the study.
-    """
-    if key not in data.entries:
-        return []
-    return [html.P(dcc.Link("Draw the region of the arena", href=arena_address(key)))]
-
-
-def arena_page(data: StudyData, key: str) -> list[Any]:
-    """Content of the page on which a region is drawn; its script fills it.
-
-    Args:
-        data: the study.
-        key: the recording's name in the study.
-    """
-    back = dcc.Link(key, href=f"/session/{quote(key, safe='')}") if key in data.entries else key
-    return [
-        html.P([dcc.Link("Sessions", href="/"), " / ", back], className="kind"),
-        html.H1("Region of the arena"),
-        html.P(
-            "Draw a polygon around the arena: outside of it nothing is looked at. It is saved as "
-            "arena.region, which liex doctor and liex run take.",
-            className="muted",
-        ),
-        dcc.Store(id="region-key", data=key),
-        html.Div(id="region", className="region", role="region", **aria(label="draw a region")),
-    ]
-
-
-def register(app: Dash) -> None:
-    """Let the page's script begin when the page is opened.
-
-    Args:
-        app: the dashboard.
-    """
-    app.clientside_callback(
-        ClientsideFunction("liex", "region"),
-        Output("region", "className"),
-        Input("region-key", "data"),
-    )
 
 
 class _Scenes:

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from dash import ClientsideFunction, Dash, Input, Output, dcc, html
 from flask import Flask, Response, jsonify, request
 
 from liex_lab.actions.vocabulary import action_colours
@@ -30,42 +29,8 @@ from liex_lab.sessions.review import (
 
 from .data import StudyData
 from .desk import Desk, Desks
-from .parts import aria
 
 _PICTURE_S = 600
-
-
-def review_page(data: StudyData) -> list[Any]:
-    """Content of the page; its script fills it.
-
-    Args:
-        data: the study.
-    """
-    return [
-        html.P("Study", className="kind"),
-        html.H1("Blinded review"),
-        html.P(
-            "Name what an animal does in clips of all sessions, drawn and shuffled by a seed. "
-            "Session, animal and group are not shown, nor what the program or others say, until "
-            "the last clip is named. Every answer is kept at once: leave when you like.",
-            className="muted",
-        ),
-        dcc.Store(id="review-study", data=data.name),
-        html.Div(id="review", className="review", role="region", **aria(label="blinded review")),
-    ]
-
-
-def register(app: Dash) -> None:
-    """Let the page's script begin when the page is opened.
-
-    Args:
-        app: the dashboard.
-    """
-    app.clientside_callback(
-        ClientsideFunction("liex", "review"),
-        Output("review", "className"),
-        Input("review-study", "data"),
-    )
 
 
 class Reviews:

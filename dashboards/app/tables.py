@@ -5,7 +5,6 @@ Cells of a CSV that a spreadsheet would take for a formula are made harmless.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -13,7 +12,6 @@ from urllib.parse import quote
 
 import numpy as np
 import pandas as pd
-from dash import dcc, html
 
 from liex_lab.errors import SessionError
 from liex_lab.runtime.text_files import harmless_table
@@ -22,7 +20,6 @@ from liex_lab.sessions.verdict import state_in_words
 from ..units import counted, read_as
 from ..units import shown as as_read
 from .data import DONE, StudyData
-from .parts import aria, download
 
 MOST_ROWS = 400  # on a page; the file has them all
 _BATCH = 20_000  # rows of a long table that are in memory at once
@@ -174,43 +171,6 @@ def _searched(value: Any) -> str:
     return f"{value} {STATES.get(str(value), '')}".lower()
 
 
-def block(name: str, caption: str, *, searched: bool = True) -> html.Div:
-    """A table with its filter and its download; `fill` makes what comes into it.
-
-    Args:
-        name: the table's name, see `find`.
-        caption: what it holds, for a screen reader.
-        searched: whether there is a field to filter by.
-    """
-    words = dcc.Input(
-        id={"part": "filter", "table": name},
-        type="text" if searched else "hidden",
-        value="",
-        debounce=0.25,
-        placeholder="any word",
-        className="filter",
-    )
-    tools = [
-        html.Label([html.Span("Filter "), words]) if searched else words,
-        download("Download CSV", csv_address(name)),
-    ]
-    return html.Div(
-        className="table-block",
-        children=[
-            html.Div(tools, className="tools"),
-            dcc.Store(id={"part": "order", "table": name}, data={"column": "", "down": False}),
-            dcc.Store(id={"part": "cells", "table": name}),
-            html.Div(
-                id={"part": "rows", "table": name},
-                className="scroll",
-                role="region",
-                tabIndex="0",
-                **aria(label=caption),
-            ),
-        ],
-    )
-
-
 def csv_address(name: str) -> str:
     """Address at which a table is had as CSV.
 
@@ -220,25 +180,22 @@ def csv_address(name: str) -> str:
     return f"/csv/{quote(name, safe='')}.csv"
 
 
-def fill(name: str, table: Table, words: str, order: dict[str, Any]) -> dict[str, Any]:
-    """What the page's script draws: headings that sort, cells as texts, and the number of rows.
+def fill(table: Table, words: str = "", sorted_by: str = "", down: bool = False) -> dict[str, Any]:
+    """What the template `table.html` shows: heads, rows (at most `MOST_ROWS`), and how many.
 
     Args:
-        name: the table's name, see `find`.
-        table: the table itself.
-        words: what every shown row must hold, see `arranged`.
-        order: column, the column to sort by, and down, whether the largest comes first.
-
-    Returns:
-        JSON: name, place (the element's id), heads, said (a sentence on the number of rows), and
-        rows, at most `MOST_ROWS`.
+        table: the table.
+        words: what every shown row must contain, see `arranged`.
+        sorted_by: the column to sort by.
+        down: whether the largest comes first.
     """
-    rows = arranged(table, words, order["column"], order["down"])
+    rows = arranged(table, words, sorted_by, down)
+    sort = "descending" if down else "ascending"
     heads = [
         {
             "column": column,
             "title": title,
-            "sort": _sorted(column, order),
+            "sort": sort if column == sorted_by else "none",
             "numeric": column in table.rows and table.rows[column].dtype.kind in "iuf",
         }
         for column, title in table.shown.items()
@@ -248,8 +205,6 @@ def fill(name: str, table: Table, words: str, order: dict[str, Any]) -> dict[str
     said = counted(n, "row") if n == total else f"{n:,} of {total:,} rows"
     said += f"; the first {MOST_ROWS} are shown, the CSV has all" if n > MOST_ROWS else ""
     return {
-        "name": name,
-        "place": _place(name),
         "heads": heads,
         "said": said,
         "rows": [
@@ -257,23 +212,6 @@ def fill(name: str, table: Table, words: str, order: dict[str, Any]) -> dict[str
             for row in records(rows.head(MOST_ROWS))
         ],
     }
-
-
-def sentence(name: str, text: str) -> dict[str, Any]:
-    """In place of a table, why there is none; JSON as of `fill`.
-
-    Args:
-        name: the table's name, see `find`.
-        text: why.
-    """
-    return {"name": name, "place": _place(name), "heads": [], "rows": [], "said": text}
-
-
-def _place(name: str) -> str:
-    """The id of a table's element on the page, as Dash writes it."""
-    return json.dumps(
-        {"part": "rows", "table": name}, sort_keys=True, separators=(",", ":"), ensure_ascii=False
-    )
 
 
 def as_csv(table: pd.DataFrame) -> Iterator[str]:
@@ -385,7 +323,7 @@ def _cell(
     value = row.get(column, "")
     about = str(row.get("measure", ""))
     if column == "measure":
-        return {"text": read_as(about, table.units.get(about, ""))}
+        return {"kind": "", "text": read_as(about, table.units.get(about, ""))}
     if unit := table.units.get(about if column in _ESTIMATES else column, ""):
         value = as_read(value, unit)[0]
     if column == "state":
@@ -408,11 +346,7 @@ def _cell(
         return {"kind": "moment", "text": known, "to": round(float(value), 4)}
     if column == table.link and row.get("state", "done") in DONE:
         return {"kind": "link", "text": known, "to": session_address(str(value))}
-    return {"text": known}
-
-
-def _sorted(column: str, order: dict[str, Any]) -> str:
-    return "none" if order["column"] != column else "descending" if order["down"] else "ascending"
+    return {"kind": "", "text": known}
 
 
 def columns_of(data: StudyData) -> Sequence[str]:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
+from urllib.parse import quote
 
 import numpy as np
 import pandas as pd
@@ -244,7 +245,12 @@ def distance_by_group(all_seen: Sequence[Seen]) -> Figure | None:
 
 
 def comparison(
-    table: pd.DataFrame, stats: pd.DataFrame, measure: str, unit: str, accounted: str = ""
+    table: pd.DataFrame,
+    stats: pd.DataFrame,
+    measure: str,
+    unit: str,
+    accounted: str = "",
+    link: Callable[[str], str] | None = None,
 ) -> Figure | None:
     """A measure by group: every session and animal, and the differences with 95 % intervals.
 
@@ -255,6 +261,8 @@ def comparison(
         measure: the column that is drawn.
         unit: its unit in the table; "" for none.
         accounted: a sentence below the figure that accounts for every session.
+        link: the address of a session by its `key`, a column of the table, which its mark leads to;
+            a description follows after #. None makes no links.
 
     Returns:
         The figure; None where no session has a value.
@@ -278,7 +286,7 @@ def comparison(
     for k, name in enumerate(names):
         rows = known[known["group"] == name]
         n = rows["subject_id"].nunique()
-        _strip(left, k, rows, factor * rows[measure].to_numpy(float), name, names)
+        _strip(left, k, rows, factor * rows[measure].to_numpy(float), name, names, link)
         n_animals.append(f"{n} {name}")
         counts.append(f"{name}\n{counted(n, 'animal')}, {counted(len(rows), 'session')}")
     left.set_xticks(range(len(names)), counts)
@@ -324,24 +332,34 @@ def effects(stats: pd.DataFrame, units: Mapping[str, str]) -> Figure | None:
 
 
 def _strip(
-    axes: Axes, k: int, rows: pd.DataFrame, values: Array, name: str, names: Sequence[str]
+    axes: Axes,
+    k: int,
+    rows: pd.DataFrame,
+    values: Array,
+    name: str,
+    names: Sequence[str],
+    link: Callable[[str], str] | None = None,
 ) -> None:
     """One group: a small mark per session, a large one per animal, a line for the animals' mean."""
     animal, animals = pd.factorize(rows["subject_id"].astype(str))
     means = animal_means(values, animal)
     beside = np.linspace(-0.2, 0.2, len(animals)) if len(animals) > 1 else np.zeros(1)
     colour, mark = group_colour(name, names), GROUP_MARKS[k % len(GROUP_MARKS)]
+    gid = f"animals {name}"
+    large = axes.scatter(k + beside, means, 20.0, colour, marker=mark, gid=gid, zorder=3)
+    small = None
     if len(values) > len(animals):  # else the sessions are the animals
-        axes.plot(k + beside[animal] + 0.03, values, mark, color=colour, markersize=2.0, alpha=0.5)
-    axes.plot(
-        k + beside,
-        means,
-        mark,
-        color=colour,
-        markersize=4.5,
-        linestyle="none",
-        gid=f"animals {name}",
-    )
+        at = k + beside[animal] + 0.03
+        small = axes.scatter(at, values, 4.0, colour, marker=mark, alpha=0.5, zorder=2)
+    if link is not None:
+        keys = rows["key"].astype(str)
+        sizes = [counted(int(n), "session") for n in np.bincount(animal)]
+        of_animals = zip(keys.groupby(animal).first(), animals, sizes, means, strict=True)
+        said = [(key, f"#animal {who}, {n}: {mean:.4g}") for key, who, n, mean in of_animals]
+        large.set_urls([link(key) + quote(text, "#") for key, text in said])
+        if small is not None:
+            each = [(key, f"#{key}: {value:.4g}") for key, value in zip(keys, values, strict=True)]
+            small.set_urls([link(key) + quote(text, "#") for key, text in each])
     axes.plot([k - 0.3, k + 0.3], [means.mean()] * 2, color=INK, linewidth=1.2, gid=f"mean {name}")
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import io
 import re
+import threading
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -42,6 +43,7 @@ _FACE = "'DejaVu Sans'"  # comes with matplotlib: the same figure on every machi
 _FACES = "Arial, Helvetica, 'DejaVu Sans', sans-serif"  # narrower ones fit, too
 _KEYS = 6  # actions of a row of the key
 _BARS_MM = (10.0, 20.0, 50.0, 100.0, 200.0, 500.0, 1000.0)
+_ONE_AT_A_TIME = threading.RLock()  # matplotlib's settings are the process's
 _STYLE: dict[str, Any] = {
     "font.family": ["DejaVu Sans"],
     "font.size": 6.5,
@@ -95,7 +97,7 @@ def drawing() -> Iterator[None]:
     from matplotlib import rc_context
 
     style: Any = _STYLE  # matplotlib lists every name that a setting can have
-    with rc_context(style), warnings.catch_warnings():
+    with _ONE_AT_A_TIME, rc_context(style), warnings.catch_warnings():
         warnings.filterwarnings("ignore", "Glyph .* missing from", UserWarning)
         yield
 

@@ -37,7 +37,12 @@ if TYPE_CHECKING:
 _MOST_COLUMNS = 1200  # of a curve; more points than that cannot be told apart on a page
 _LANE_MM = 4.0
 _CURVE_MM = 17.0
+_MOST_DOTS = 600  # frames of a stretch whose values have a mark each
+_BESIDE_S = 0.2  # of a stretch: its curves run to its ends
 _HAIR_MM = 0.05  # bouts nearer than that are one bar on paper
+
+
+Span = tuple[float, float]
 
 
 def drawn_curves(seen: Seen) -> list[Curve]:
@@ -52,12 +57,14 @@ def drawn_curves(seen: Seen) -> list[Curve]:
     return [one for one in curves_of(seen.session.metadata["animal"]) if one.column in moved]
 
 
-def ethogram(seen: Seen) -> Figure | None:
-    """A lane for each action, hatched where there is no pose; None where there is nothing to say.
+def ethogram(seen: Seen, span_s: Span | None = None) -> Figure | None:
+    """A lane for each action, hatched where there is no pose; None without actions and losses.
 
     Args:
         seen: the animal.
+        span_s: the stretch that is shown, s; None shows the whole session.
     """
+    first_s, last_s = span_s or (0.0, seen.duration_s)
     words = seen.words
     if not words and not len(seen.lost_s):
         return None
@@ -69,11 +76,15 @@ def ethogram(seen: Seen) -> Figure | None:
     axes.set_title(
         f"Ethogram, {seen.who}, n = {counted(len(bouts), 'bout')}; hatched: no pose or no frame"
     )
-    _, size = time_unit(seen.duration_s)
-    least = _HAIR_MM * seen.duration_s / width
-    spans = [(float(a), float(b)) for a, b in seen.lost_s]
+    _, size = time_unit(last_s - first_s)
+    least = _HAIR_MM * (last_s - first_s) / width
+
+    def within(spans: Array) -> list[Span]:
+        near = spans[(spans[:, 1] >= first_s) & (spans[:, 0] <= last_s)]
+        return joined([(float(a), float(b)) for a, b in near], least)
+
     axes.broken_barh(
-        [(a / size, (b - a) / size) for a, b in joined(spans, least)],
+        [(a / size, (b - a) / size) for a, b in within(seen.lost_s)],
         (-0.5, max(len(words), 1)),
         facecolor=PAPER,  # over the bars: a bout that continues across a gap has none there
         edgecolor=MUTED,
@@ -84,9 +95,8 @@ def ethogram(seen: Seen) -> Figure | None:
     )
     for k, (word, colour) in enumerate(action_colours(words).items()):
         own = bouts.loc[bouts["action"] == word, ["start_s", "stop_s"]].to_numpy(float)
-        bars = joined([(float(a), float(b)) for a, b in own], least)
         axes.broken_barh(
-            [(a / size, max(b - a, least) / size) for a, b in bars],
+            [(a / size, max(b - a, least) / size) for a, b in within(own)],
             (k - 0.38, 0.76),
             facecolor=colour,
             gid=f"bouts of {word}",
@@ -94,16 +104,21 @@ def ethogram(seen: Seen) -> Figure | None:
     axes.set_ylim(max(len(words), 1) - 0.5, -0.5)
     axes.set_yticks(range(len(words)), [word.replace("_", " ") for word in words])
     axes.tick_params(axis="y", length=0)
-    _clock(axes, seen.duration_s)
+    _clock(axes, (first_s, last_s))
     return figure
 
 
-def curves(seen: Seen) -> Figure | None:
-    """What the body did, and the error to be expected, over time; None without any pose.
+def curves(
+    seen: Seen, span_s: Span | None = None, width_mm: float = TWO_COLUMNS_MM
+) -> Figure | None:
+    """What the body did, and the expected error, over time; None without any pose.
 
     Args:
         seen: the animal.
+        span_s: the stretch that is shown, s; None shows the whole session.
+        width_mm: width of the figure, mm.
     """
+    first_s, last_s = span_s or (0.0, seen.duration_s)
     error = seen.broken(seen.frames["predicted_error_mm"])
     n = int(seen.frames["predicted_error_mm"].notna().sum())
     rows: list[tuple[str, str, Array, str, bool]] = []
@@ -114,10 +129,11 @@ def curves(seen: Seen) -> Figure | None:
     if not any(np.isfinite(values).any() for _, _, values, _, _ in rows):
         return None
     step = _CURVE_MM + 6.0
-    figure = sheet(TWO_COLUMNS_MM, len(rows) * step + 8.0)
-    width = TWO_COLUMNS_MM - LEFT_MM - RIGHT_MM
+    figure = sheet(width_mm, len(rows) * step + 8.0)
+    width = width_mm - LEFT_MM - RIGHT_MM
     time_s = seen.frames["time_s"].to_numpy(float)
-    _, size = time_unit(seen.duration_s)
+    near = slice(*np.searchsorted(time_s, [first_s - _BESIDE_S, last_s + _BESIDE_S]))
+    _, size = time_unit(last_s - first_s)
     rearing = seen.bouts["action"].astype(str).str.startswith("rear")
     rears = seen.bouts.loc[rearing, ["start_s", "stop_s", "action"]].to_numpy()
     colours = action_colours(seen.words)
@@ -131,11 +147,12 @@ def curves(seen: Seen) -> Figure | None:
         axes.set_title(
             f"{title}, {seen.who}, n = {counted(n, 'frame')}" if k == 0 else title, size=6.5
         )
-        kept = kept_rows(values, _MOST_COLUMNS)
-        axes.plot(time_s[kept] / size, values[kept], color=colour)
+        kept = kept_rows(values[near], _MOST_COLUMNS)
+        dots = {} if span_s is None or len(kept) > _MOST_DOTS else {"marker": "o", "markersize": 1}
+        axes.plot(time_s[near][kept] / size, values[near][kept], color=colour, **dots)
         axes.set_ylabel(unit)
         axes.grid(axis="y", color=LINE, linewidth=0.4)
-        _clock(axes, seen.duration_s, last=k == len(rows) - 1)
+        _clock(axes, (first_s, last_s), last=k == len(rows) - 1)
         if from_zero:
             axes.set_ylim(bottom=float(np.nanmin(values, initial=0.0)))
     return figure
@@ -161,7 +178,7 @@ def cumulative_distance(seen: Seen) -> Figure | None:
     axes.plot(time_s[rows] / size, metres[rows], color=BLUE, linewidth=1.0)
     axes.set_ylabel("distance, m")
     axes.set_ylim(bottom=0.0)
-    _clock(axes, seen.duration_s)
+    _clock(axes, (0.0, seen.duration_s))
     return figure
 
 
@@ -292,10 +309,11 @@ def kept_rows(y: Array, n_columns: int) -> NDArray[np.int64]:
     return np.array(rows, np.int64)
 
 
-def _clock(axes: Axes, duration_s: float, last: bool = True) -> None:
+def _clock(axes: Axes, span_s: Span, last: bool = True) -> None:
     """The axis of time, the same for all figures of a session; its numbers below the last one."""
-    unit, size = time_unit(duration_s)
-    axes.set_xlim(0.0, max(duration_s, 1e-3) / size)
+    first_s, last_s = span_s
+    unit, size = time_unit(last_s - first_s)
+    axes.set_xlim(first_s / size, max(last_s, first_s + 1e-3) / size)
     axes.grid(axis="x", color=LINE, linewidth=0.4)
     axes.set_axisbelow(True)
     if last:

@@ -10,6 +10,7 @@ import shutil
 import socket
 import sys
 import threading
+import time
 from pathlib import Path
 from types import SimpleNamespace
 from urllib.request import urlopen
@@ -19,17 +20,16 @@ import pandas as pd
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from liex_lab.dashboards.app import plots, tables
+from liex_lab.dashboards.app import tables
 from liex_lab.dashboards.app.data import GREY, NO_POSE, Ethogram, StudyData, colours_of, raster
 from liex_lab.dashboards.app.guard import MOST_BYTES
-from liex_lab.dashboards.app.listener import MOST, Handler, Listener
-from liex_lab.dashboards.app.page_session import moved_to
-from liex_lab.dashboards.app.server import address, make_app
+from liex_lab.dashboards.app.pages import ethogram_rows, moved_to
+from liex_lab.dashboards.app.server import address, make_app, serve
 from liex_lab.pipelines.study.listing import list_sessions
 from typer.testing import CliRunner
 
 from liex_lab import api, cli
-from liex_lab.actions.vocabulary import PALETTE, UNLABELLED, action_colours
+from liex_lab.actions.vocabulary import PALETTE, action_colours
 from liex_lab.errors import LiexError, SessionError
 from liex_lab.sessions import Session
 from liex_lab.sessions.verdict import Entry
@@ -112,27 +112,30 @@ def test_each_part_of_the_time_has_the_colour_of_what_fills_most_of_it(
             assert seconds[place] >= max(seconds.values()) - 1e-9
 
 
-def test_rows_of_ethograms_and_budgets_name_their_group_once_and_every_grey_has_a_meaning() -> None:
+def test_ethograms_and_budgets_name_a_group_once_and_every_colour_has_a_meaning(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    entries = [
+        Entry(key, "done", folder=tmp_path, who={"group": group})
+        for key, group in (("a", "drug"), ("b", "drug"), ("c", "vehicle"))
+    ]
+    shown = StudyData("x", lambda: entries)
     ones = {
         key: Ethogram(np.array([[0.0, 2.0]]), ["walk"], np.array([[3.0, 4.0]]), end_s, ("walk",))
         for key, end_s in (("a", 4.0), ("b", 5.0), ("c", 4.0))
     }
-    groups = ["drug", "drug", "vehicle"]
-    drawn = plots.ethograms(ones, {"walk": "#4477aa"}, groups)
-    shares = pd.DataFrame(
-        {"key": list(ones), "walk_share": 0.5, "walk_s": 2.0}
-        | {"unlabelled_share": 0.3, "unlabelled_s": 1.0, "sit_share": 0.2, "sit_s": 1.0}
-    )
-    budget = plots.time_budgets(shares, {"walk": "#4477aa"}, ["walk", "sit"], groups)
-    for figure in (drawn, budget):
-        assert figure["layout"]["yaxis"]["ticktext"] == ["<b>drug</b>  a", "b", "<b>vehicle</b>  c"]
-    parts = {part["name"]: part["marker"]["color"] for part in budget["data"]}
-    assert parts == {"walk": "#4477aa", "other actions": GREY, "unlabelled": UNLABELLED}
-    (rows,) = drawn["data"]
-    texts = np.array(rows["text"])
-    painted = {text: set(rows["z"][texts == text]) for text in ("walk", NO_POSE)}
-    assert painted == {"walk": {3.0}, NO_POSE: {0.0}}
-    assert np.isnan(rows["z"][0][-100:]).all(), "nothing is painted after a session's end"
+    shares = {"walk_share": 0.5, "unlabelled_share": 0.3, "sit_share": 0.2}
+    monkeypatch.setattr(shown, "ethograms", lambda keys: ones)
+    monkeypatch.setattr(shown, "collected", lambda: pd.DataFrame({"key": list(ones)} | shares))
+    with make_app(shown).test_request_context("/ethograms"):
+        page = ethogram_rows(shown)
+    rows = page["entries"]
+    assert [row["group"] for row in rows] == ["drug", "", "vehicle"]
+    bars = [(bar["word"], bar["at"], bar["at"] + bar["width"]) for bar in rows[0]["bars"]]
+    assert bars == [("walk", 0, 40.0), ("unlabelled", 40.0, 60.0), (NO_POSE, 60.0, 80.0)]
+    budget = {part["word"]: part["width"] for part in rows[0]["shares"]}
+    assert budget == pytest.approx({"walk": 50.0, "unlabelled": 30.0})
+    assert set(page["legend"]) == {"walk", "unlabelled", NO_POSE}
 
 
 @pytest.mark.parametrize(
@@ -146,7 +149,7 @@ def test_rows_of_ethograms_and_budgets_name_their_group_once_and_every_grey_has_
 )
 def test_numbers_of_a_column_have_the_same_digits(values: list[float], shown: list[str]) -> None:
     table = tables.Table(pd.DataFrame({"a": values}), {"a": "a"})
-    filled = tables.fill("bouts", table, "", {"column": "", "down": False})
+    filled = tables.fill(table)
     assert [row[0]["text"] for row in filled["rows"]] == shown
 
 
@@ -163,30 +166,14 @@ def test_no_two_actions_share_a_colour_but_the_grey_ones() -> None:
     }
 
 
-def test_names_are_text_in_every_figure(data: StudyData) -> None:
-    table = data.collected()
-    ones = {
-        key: Ethogram(np.array([[0.0, 1.0]]), ["<i>x"], np.zeros((0, 2)), 2.0) for key in ("<b>s",)
-    }
-    shares = pd.DataFrame({"key": ["<b>s"], "<i>x_share": [0.5], "<i>x_s": [1.0]})
-    figures = [
-        plots.groups(table, "mean_speed_mm_s", "<u>"),
-        plots.ethograms(ones, {"<i>x": "#000"}),
-        plots.differences(data.stats("mean_speed_mm_s"), "<u>"),
-        plots.time_budgets(shares, {"<i>x": "#000"}, ["<i>x"]),
-        plots.whole_session(
-            ones["<b>s"], {"<i>x": "#000"}, [("<u>", np.arange(3.0), np.arange(3.0), "#000")], 0.5
-        ),
-    ]
-    for figure in figures:
-        for item in figure["data"]:
-            item.pop("customdata", None)  # a key, which nobody shows
-        text = json.dumps(figure, default=lambda value: np.asarray(value).tolist())
-        assert not any(markup in text for markup in ("<b>", "<i>", "<u>", "drug</b>"))
-        assert (
-            "drug&lt;/b&gt; %{y}"
-            not in text.partition("hovertemplate")[2].partition('"')[2].partition('"')[0]
-        )
+def test_names_are_text_on_every_page(data: StudyData) -> None:
+    browser = make_app(data).test_client()
+    for path in ("/", "/ethograms", "/groups?measure=mean_speed_mm_s", f"/session/{KEY}"):
+        page = browser.get(path).text
+        assert "drug&lt;/b&gt; %{y}" in page
+        assert "<b>drug" not in page
+    sentence = browser.get("/table?name=<i>x").text
+    assert "&lt;i&gt;x" in sentence
 
 
 def test_the_groups_are_compared_as_liex_compare_does(data: StudyData) -> None:
@@ -222,7 +209,7 @@ def test_a_table_in_a_spreadsheet_computes_nothing_and_is_whole() -> None:
 
 
 def test_every_table_of_a_session_can_be_had(data: StudyData) -> None:
-    browser = make_app(data).server.test_client()
+    browser = make_app(data).test_client()
     session = data.session(KEY)
     for name in tables.session_tables(data, KEY):
         answer = browser.get(f"/session-csv/{KEY}/{name}.csv")
@@ -248,11 +235,11 @@ def test_steps_go_to_the_next_frame_bout_and_flag(data: StudyData) -> None:
 
 
 def test_this_machine_alone_may_ask_and_no_other_site(data: StudyData) -> None:
-    browser = make_app(data).server.test_client()
+    browser = make_app(data).test_client()
     assert browser.get("/", headers={"Host": "127.0.0.1:8050"}).status_code == 200
     assert browser.get("/", headers={"Host": "evil.example:8050"}).status_code == 403
     sent = {"Host": "127.0.0.1:8050", "Origin": "http://evil.example"}
-    assert browser.post("/_dash-update-component", headers=sent, json={}).status_code == 403
+    assert browser.post("/refresh", headers=sent).status_code == 403
     policy = browser.get("/").headers["Content-Security-Policy"]
     assert "default-src 'none'" in policy
     assert "http" not in policy
@@ -260,8 +247,8 @@ def test_this_machine_alone_may_ask_and_no_other_site(data: StudyData) -> None:
 
 def test_on_another_address_a_token_is_asked_for(data: StudyData) -> None:
     app = make_app(data, token="right", alone=False)
-    browser = app.server.test_client()
-    for path in ("/", "/csv/sessions.csv", "/_dash-layout", "/?token=wrong"):
+    browser = app.test_client()
+    for path in ("/", "/csv/sessions.csv", "/table?name=sessions", "/?token=wrong"):
         assert browser.get(path, headers={"Host": "lab:1"}).status_code == 401
     let_in = browser.get("/session/a?token=right&t=1.5", headers={"Host": "lab:1"})
     assert let_in.status_code == 302
@@ -274,11 +261,11 @@ def test_on_another_address_a_token_is_asked_for(data: StudyData) -> None:
 
 
 def test_another_account_of_this_machine_neither_reads_nor_corrects(data: StudyData) -> None:
-    browser = make_app(data, token="right").server.test_client()
+    browser = make_app(data, token="right").test_client()
     here = {"Host": "127.0.0.1:8050"}
-    for path in ("/", "/csv/sessions.csv", "/_dash-layout", "/assets/desk.mjs", "/review"):
+    for path in ("/", "/csv/sessions.csv", "/table?name=sessions", "/assets/desk.mjs", "/review"):
         assert browser.get(path, headers=here).status_code == 401
-    assert browser.post("/_dash-update-component", headers=here, json={}).status_code == 401
+    assert browser.post("/refresh", headers=here).status_code == 401
     known = {"Host": "evil.example:8050"}  # an address that was bent to this machine
     assert browser.get("/?token=right", headers=known).status_code == 403
     assert browser.get("/?token=right", headers=here).status_code == 302
@@ -288,44 +275,76 @@ def test_another_account_of_this_machine_neither_reads_nor_corrects(data: StudyD
 def test_what_no_page_sends_is_answered_with_a_sentence_and_no_traceback(
     data: StudyData, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    browser = make_app(data).server.test_client()
-    large = browser.post(
-        "/_dash-update-component",
-        data=b"0" * (MOST_BYTES + 1),
-        content_type="application/json",
-    )
+    corrections: list[object] = []
+    app = make_app(data, correct=lambda *asked: corrections.append(asked))
+
+    @app.get("/broken")
+    def broken() -> str:
+        raise ZeroDivisionError
+
+    browser, address = app.test_client(), f"/desk/{KEY}/correct"
+    large = browser.post(address, data=b"0" * (MOST_BYTES + 1), content_type="application/json")
     assert large.status_code == 413
     assert "at most 4 MB" in large.text
-    for body in (b"{", b"[]", b"null", b'{"output": 3}', b'{"output": "page.children"}', b"\xff"):
-        answer = browser.post("/_dash-update-component", data=body, content_type="application/json")
-        assert 400 <= answer.status_code <= 500
+    for body in (b"{", b"[]", b"null", b'{"sentence": 3, "at_s": 1}', b'{"by": "me"}', b"\xff"):
+        answer = browser.post(address, data=body, content_type="application/json")
+        assert answer.status_code == 400
         assert "Traceback" not in answer.text
+    assert corrections == []
+    assert browser.get("/broken").status_code == 500
     told = capsys.readouterr()
     assert "Traceback" not in told.err + told.out
-    assert "dashboard: /_dash-update-component could not be answered" in told.err
+    assert "dashboard: /broken could not be answered (ZeroDivisionError" in told.err
 
 
-def test_connections_that_say_nothing_are_closed_and_there_are_not_more_than_so_many(
+def test_silent_connections_are_closed_and_keep_nobody_from_being_answered(
     data: StudyData, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(Handler, "timeout", 1.0)
-    server = Listener("127.0.0.1", 0, make_app(data).server)
-    threading.Thread(target=server.serve_forever, daemon=True).start()
+    monkeypatch.setattr("liex_lab.dashboards.app.server._IDLE_S", 1)
+    ports: list[int] = []
+    ready = threading.Event()
+
+    def told(port: int) -> None:
+        ports.append(port)
+        ready.set()
+
+    serving = (make_app(data), "127.0.0.1", 0, told)
+    threading.Thread(target=serve, args=serving, daemon=True).start()
+    assert ready.wait(20)
     before = threading.active_count()
-    silent = [socket.create_connection(("127.0.0.1", server.port)) for _ in range(MOST + 30)]
+    silent = [socket.create_connection(("127.0.0.1", ports[0])) for _ in range(120)]
     try:
+        with urlopen(f"http://127.0.0.1:{ports[0]}/assets/tables.mjs", timeout=30) as answer:
+            assert answer.status == 200
+        assert threading.active_count() <= before + 1
         for one in silent:
             one.settimeout(30.0)
-        assert [one.recv(1) for one in silent[-30:]] == [b""] * 30  # closed at once
-        assert threading.active_count() <= before + MOST
-        assert [one.recv(1) for one in silent[:-30]] == [b""] * MOST  # closed after their time
-        with urlopen(f"http://127.0.0.1:{server.port}/_favicon.ico", timeout=30) as answer:
-            assert answer.status == 200
+        assert [one.recv(1) for one in silent] == [b""] * 120
     finally:
         for one in silent:
             one.close()
-        server.shutdown()
-        server.server_close()
+
+
+def test_what_is_being_answered_is_waited_for_when_the_server_ends(
+    data: StudyData, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    app, began, done = make_app(data), threading.Event(), threading.Event()
+
+    @app.get("/slow")
+    def slow() -> str:
+        began.set()
+        time.sleep(0.5)
+        done.set()
+        return "done"
+
+    def interrupt(port: int) -> None:
+        asking = f"http://127.0.0.1:{port}/slow"
+        threading.Thread(target=lambda: urlopen(asking).read(), daemon=True).start()
+        assert began.wait(10)
+        raise KeyboardInterrupt
+
+    serve(app, "127.0.0.1", 0, interrupt)
+    assert done.is_set()
 
 
 def test_the_token_is_new_each_time_on_this_machine_as_elsewhere(
@@ -350,10 +369,10 @@ def test_the_token_is_new_each_time_on_this_machine_as_elsewhere(
     assert said[1].endswith(str(made[1]["token"]))
 
 
-def test_without_dash_a_sentence_says_what_to_install(
+def test_without_flask_a_sentence_says_what_to_install(
     study: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setitem(sys.modules, "dash", None)
+    monkeypatch.setitem(sys.modules, "waitress.server", None)
     for name in [name for name in sys.modules if name.startswith("liex_lab.dashboards.app.server")]:
         monkeypatch.delitem(sys.modules, name)
     ran = CliRunner().invoke(cli.app, ["dashboard", str(study)])
@@ -415,7 +434,7 @@ def test_an_origin_that_is_no_address_is_refused(origin: str) -> None:
     from liex_lab.dashboards.app.guard import guard
 
     server = Flask("test")
-    guard(server, "", lambda: "default-src 'none'")
+    guard(server, "")
     answer = server.test_client().get("/", headers={"Origin": origin, "Host": "127.0.0.1"})
     assert answer.status_code == 403
 

@@ -78,17 +78,22 @@ def test_the_page_that_open_writes_leads_into_a_dashboard_with_a_token(
     expect(page.locator("tbody tr")).to_have_count(2)
     assert page.url == f"{served.address}/"  # the token is in no history
     page.get_by_role("link", name="Ethograms").click()
-    page.wait_for_selector("#ethograms image")
+    expect(page.locator("#ethograms .row")).to_have_count(0)  # both sessions are the undone ones
     watched.nothing_went_wrong()
 
 
 def test_an_ethogram_leads_to_the_frame_and_its_replay(served: Served, watched: Watched) -> None:
     page = watched.page
     page.goto(f"{served.address}/ethograms")
-    page.wait_for_selector("#ethograms .hm image, #ethograms image")
-    plot = page.locator("#ethograms .nsewdrag").bounding_box()
-    assert plot is not None
-    page.mouse.click(plot["x"] + plot["width"] * 0.5, plot["y"] + 6)
+    row = page.locator("#ethograms .row").first
+    box = row.bounding_box()
+    assert box is not None
+    page.mouse.move(box["x"] + box["width"] * 0.25, box["y"] + 6)
+    page.mouse.down()
+    page.mouse.move(box["x"] + box["width"] * 0.75, box["y"] + 6, steps=3)
+    page.mouse.up()
+    page.wait_for_url(re.compile("from=1.5.*to=4.5"))  # enlarged
+    page.mouse.click(box["x"] + box["width"] * 0.5, box["y"] + 6)
     page.wait_for_selector("#frame-facts dd")
     assert page.url.startswith(f"{served.address}/session/sub-m")
     moment = page.locator("#moment").input_value()
@@ -105,108 +110,81 @@ def test_an_ethogram_leads_to_the_frame_and_its_replay(served: Served, watched: 
     assert replay.name == "session.rrd"
     assert shown_s == pytest.approx(float(page.locator("#moment").input_value()))
     assert f"--at {shown_s:.3f}" in page.locator("#replay-command").inner_text()
-    tools = page.locator(".modebar-btn").evaluate_all(
-        "buttons => buttons.map(one => one.dataset.title)"
-    )
-    assert "Download plot as a PNG" in tools
-    assert not any("hare" in tool or "loud" in tool for tool in tools), (
-        tools
-    )  # it would send the figure away
+    with page.expect_download() as waiting:
+        page.get_by_role("link", name="trajectory.svg").click()
+    assert "Trajectory" in Path(waiting.value.path()).read_text(encoding="utf-8")
     watched.nothing_went_wrong()
 
 
 def line_s(page: Page) -> float:
-    """Where the line through the curves of the whole session stands, s."""
-    plot = page.locator("#whole .js-plotly-plot")
-    return float(plot.evaluate("plot => plot.layout.shapes[0].x0"))
+    """Where the line through the curves of the whole session is, s."""
+    return float(page.locator("#whole .cursor").get_attribute("data-at") or "nan")
 
 
-def test_the_line_through_the_whole_session_goes_along_with_the_moment(
+def test_the_line_through_the_whole_session_follows_the_moment_and_a_drag_enlarges(
     served: Served, watched: Watched
 ) -> None:
     page = watched.page
     held: list[Route] = []
-
-    def hold_figures(route: Route) -> None:
-        if "session-figures.children" in (route.request.post_data or ""):
-            held.append(route)
-        else:
-            route.fallback()
-
-    page.route("**/_dash-update-component*", hold_figures)
+    page.route("**/whole/*", lambda route: held.append(route))
     page.goto(f"{served.address}/session/{KEY}?t=2.5")
     page.wait_for_selector("#desk.is-open")
     page.locator("#moment").fill("1.5")  # before there are figures
     page.locator("#moment").blur()
     expect(page.locator("#moment-link a")).to_have_attribute("href", re.compile("t=1.5"))
     assert len(held) == 1
+    page.unroute("**/whole/*")
     held[0].continue_()
     page.wait_for_selector("#frame-facts dd")
-    at_s = page.locator("#moment").input_value()
-    assert float(at_s) == pytest.approx(1.5, abs=0.05)  # the frame that is nearest
-    until(page, lambda: line_s(page) == pytest.approx(float(at_s)))
+    at_s = float(page.locator("#moment").input_value())
+    assert at_s == pytest.approx(1.5, abs=0.05)  # the frame that is nearest
+    until(page, lambda: line_s(page) == pytest.approx(at_s))
     page.get_by_role("button", name="bout ▶").click()
-    expect(page.locator("#moment")).not_to_have_value(at_s)
-    expect(page.locator("#replay-command")).not_to_contain_text(f"--at {float(at_s):.3f}")
+    expect(page.locator("#moment")).not_to_have_value(str(at_s))
+    expect(page.locator("#replay-command")).not_to_contain_text(f"--at {at_s:.3f}")
     now_s = float(page.locator("#moment").input_value())
     until(page, lambda: line_s(page) == pytest.approx(now_s))
+    box = page.locator("#whole svg").first.bounding_box()
+    assert box is not None
+    x, y = box["x"] + box["width"] * 0.5625, box["y"] + 20  # the middle of the axis
+    page.mouse.move(x, y)
+    page.mouse.down()
+    page.mouse.move(x + 100, y, steps=3)
+    with page.expect_response("**/whole/*from=*") as answered:
+        page.mouse.up()
+    enlarged = answered.value.json()
+    assert enlarged["from_s"] == pytest.approx(3.0, abs=0.05)
+    assert enlarged["to_s"] - enlarged["from_s"] < 1.0
     watched.nothing_went_wrong()
 
 
-_HELD_ANSWERS = """
-window.held = {numbers: [], page: []};
-const plain = window.fetch;
-window.fetch = async (address, more) => {
-  const answer = await plain(address, more), asked = String(more && more.body);
-  const kind = asked.includes("frame-facts.children") ? "numbers"
-    : window.leaving && asked.includes("page.children") ? "page" : null;
-  if (kind) await new Promise((go) => {
-    window.held[kind].push(go);
-    document.documentElement.classList.add(`held-${kind}`);
-  });
-  return answer;
-};
-"""
-
-
-def test_a_page_that_is_left_as_its_numbers_come_complains_of_nothing(
-    served: Served, watched: Watched
-) -> None:
-    page = watched.page
-    page.add_init_script(_HELD_ANSWERS)
-    page.goto(f"{served.address}/session/{KEY}")
-    page.wait_for_selector("#whole .js-plotly-plot")
-    page.wait_for_selector("html.held-numbers")
-    page.evaluate("window.leaving = true")
-    page.get_by_role("link", name="Draw the region of the arena").click()
-    page.wait_for_selector("html.held-page")
-    page.evaluate("[...held.page, ...held.numbers].forEach((go) => go())")
-    page.wait_for_selector("#region.is-open")
-    page.wait_for_load_state("networkidle")
-    watched.nothing_went_wrong()
-
-
-def test_a_person_moves_a_joint_renames_a_bout_and_takes_it_back(
+def test_a_person_corrects_by_sentences_and_takes_one_back(
     served: Served, watched: Watched
 ) -> None:
     page, key = watched.page, "sub-m004_ses-01"
     page.goto(f"{served.address}/session/{key}?t=2.5")
-    page.wait_for_selector("#frame-facts dd")  # what comes after the picture is there
-    page.get_by_text("Correct by numbers").click()
-    page.locator("#correct-joint").click()
-    page.get_by_role("option", name="nose").click()
-    page.locator(".desk-stage").scroll_into_view_if_needed()
-    picture = page.locator(".desk-stage").bounding_box()
-    assert picture is not None
-    page.mouse.click(picture["x"] + picture["width"] * 0.5, picture["y"] + picture["height"] * 0.4)
-    expect(page.locator("#correct-u")).not_to_have_value("")
-    u, v = (float(page.locator(f"#correct-{name}").input_value()) for name in "uv")
-    page.get_by_role("button", name="Put it under the pixel").click()
-    page.get_by_text("1: nose of frame").wait_for()
-    page.locator("#correct-action").click()
-    page.get_by_role("option", name="pause").click()
-    page.get_by_role("button", name="Rename the bout").click()
-    page.get_by_text("is pause").wait_for()
+    page.wait_for_selector("#desk.is-open")
+    page.get_by_text("Correct by a sentence").click()
+    sentence, said = page.locator("#correct-sentence"), page.locator(".desk-said")
+    made = page.locator("#correct-made li")
+
+    def correct(words: str, n: int) -> None:
+        sentence.fill(words)
+        sentence.press("Enter")
+        expect(made).to_have_count(n)
+        expect(sentence).to_have_value("")
+
+    sentence.fill("joint nose here")
+    stage = page.locator(".desk-stage")
+    stage.scroll_into_view_if_needed()
+    box = stage.bounding_box()
+    assert box is not None
+    stage.click(position={"x": box["width"] * 0.5, "y": box["height"] * 0.4})
+    expect(sentence).not_to_have_value("joint nose here")  # the pixel that was clicked
+    words = sentence.input_value()
+    u, v = (float(word) for word in words.split()[3:])
+    correct(words, 1)
+    correct("rename here pause", 2)
     folder = next(served.study.parent.rglob("sub-m004/ses-01/behav"))
     session = Session.open(folder)
     row = int((session.frames["time_s"] - 2.5).abs().to_numpy().argmin())
@@ -215,22 +193,20 @@ def test_a_person_moves_a_joint_renames_a_bout_and_takes_it_back(
     )
     assert (poses.loc["nose", "u_px"], poses.loc["nose", "v_px"]) == pytest.approx((u, v), abs=1.5)
     assert "pause" in set(session.bouts["action"])
-    page.locator("#correct-made").get_by_role("button", name="Take back").last.click()
-    expect(page.locator("#correct-made").get_by_role("button", name="Take back")).to_have_count(1)
+    made.last.get_by_role("button", name="Take back").click()
+    expect(made).to_have_count(1)
     assert "pause" not in set(Session.open(folder).bouts["action"])
     assert len(read_log(folder).entries) == 3
-    page.locator("#correct-new").fill("tail rattle")
-    page.get_by_role("button", name="Rename the bout").click()
-    page.get_by_text("is tail rattle").wait_for()
+    correct("rename here 'tail rattle' new", 2)
+    expect(made.last).to_contain_text("is tail rattle")
     assert "tail rattle" in set(Session.open(folder).bouts["action"])
-    page.locator("#correct-action").click()
-    page.get_by_role("option", name="tail rattle").click()  # no longer new
-    page.locator("#correct-new").fill("hop")
-    page.get_by_role("button", name="Rename the bout").click()
-    expect(page.get_by_role("alert")).to_contain_text("got tail rattle and the new word hop")
-    page.get_by_role("button", name="Cut that bout to the span").click()
-    expect(page.get_by_role("alert")).to_contain_text("fill in from, to")
     watched.nothing_went_wrong()
+    sentence.fill("rename here hop")
+    sentence.press("Enter")
+    expect(said).to_contain_text("the ethogram has no word 'hop'")
+    sentence.fill("cut it here")
+    sentence.press("Enter")
+    expect(said).to_contain_text("a correction is written as one of: flip FROM TO")
 
 
 def test_a_measure_is_chosen_and_its_groups_compared_with_names_as_text(
@@ -239,15 +215,19 @@ def test_a_measure_is_chosen_and_its_groups_compared_with_names_as_text(
     page = watched.page
     page.goto(f"{served.address}/groups")
     page.wait_for_selector(".verdict")
-    page.locator("#measure").click()
-    page.get_by_role("option", name="mean speed", exact=True).click()
+    page.locator("#measure").select_option("mean_speed_mm_s")
     expect(page.locator("#measure-meaning")).to_contain_text("mean speed")
     expect(page.locator(".verdict")).to_contain_text("cm/s")
     verdict = page.locator(".verdict").inner_text()
     assert "Hedges' g" in verdict
     assert "100 animals" in verdict
     assert "<b>drug</b> %{y} - control" in verdict
-    assert page.locator(".js-plotly-plot b, .js-plotly-plot tspan[style*='bold']").count() == 0
+    assert "<b>drug</b> %{y}" in page.locator("#group-figure svg").text_content()
+    assert page.locator("#group-figure b").count() == 0
+    mark = page.locator("#group-figure a").first
+    assert "session" in mark.locator("title").text_content()
+    mark.click()
+    page.wait_for_url(f"{served.address}/session/sub-m*")
     watched.nothing_went_wrong()
 
 
@@ -256,8 +236,7 @@ def test_every_page_fits_a_phone(served: Served, watched: Watched, path: str) ->
     page = watched.page
     page.set_viewport_size({"width": 390, "height": 800})
     page.goto(f"{served.address}{path}")
-    page.wait_for_selector("h1")
-    page.wait_for_load_state("networkidle")
+    page.wait_for_load_state("networkidle" if "session" in path else "load")
     assert page.evaluate("document.documentElement.scrollWidth") <= 390
     watched.nothing_went_wrong()
 
@@ -274,9 +253,7 @@ def test_everything_can_be_reached_with_the_keyboard_and_is_seen_when_it_is(
         page.keyboard.press("Tab")
         about = page.evaluate("""() => {
             const one = document.activeElement, style = getComputedStyle(one);
-            const outer = one.closest('.dash-input-container');
-            const ring = [style, ...(outer ? [getComputedStyle(outer)] : [])].some(
-                s => parseFloat(s.outlineWidth) >= 2 && s.outlineStyle !== 'none');
+            const ring = parseFloat(style.outlineWidth) >= 2 && style.outlineStyle !== 'none';
             const name = one.innerText || one.getAttribute('aria-label') || one.id || one.tagName;
             return [name, ring || one.type]; }""")
         named.append(str(about[0]))

@@ -1,40 +1,30 @@
 // The page to correct in: picture, bands of time and panel, keys and mouse. Every text is set as text, never as markup.
 
-import { sourceOf } from "./desk_ahead.mjs";
 import { Clerk } from "./desk_clerk.mjs";
 import { Crossings } from "./desk_crossings.mjs";
 import { Doubts } from "./desk_doubts.mjs";
 import { KEYS, actOf, keyOf, typing } from "./desk_keys.mjs";
-import { button, make, set } from "./desk_parts.mjs";
+import { button, make } from "./desk_parts.mjs";
 import { Player, SPEEDS } from "./desk_player.mjs";
-import { json } from "./desk_source.mjs";
+import { Source, json } from "./desk_source.mjs";
 import { Stage } from "./desk_stage.mjs";
 import { Strip } from "./desk_strip.mjs";
 
 const TOLD_MS = 160;  // the page's other figures follow when the moment has stood so long
 
+const WHOLE = [0, 0, 1 << 16, 1 << 16];  // is cut to the picture
+
 let open = null;
 
-export async function start(key, at) {  // the page of a session has been opened
-  const before = open;
-  if (open) open.close();
-  const place = document.getElementById("desk");
-  if (!place) return;
-  const desk = open = new Desk(place, key);
+export async function start(key, at, page) {  // the desk; page.moment and page.corrected are told what happens on it
+  const place = document.getElementById("desk"), desk = open = new Desk(place, key, page);
   try {
     await desk.begin(at);
-    if (before && before.said && before.key === key) desk.say(before.said.textContent);  // it is not to vanish
+    place.classList.add("is-open");
   } catch (error) {
     place.replaceChildren(make("p", { class: "problems", role: "alert" }, error.message));
   }
-}
-
-export function moment(at) {  // somebody chose another moment elsewhere on the page
-  if (open && open.player && at !== null && at !== undefined) open.hear(Number(at));
-}
-
-export function again(made) {  // something was corrected in the form below
-  if (open && open.player && open.clerk.made !== made) open.refresh();
+  return desk;
 }
 
 export function drawn(row, joint, scale = false) {  // where a joint is on the canvas, CSS pixels; or pixels for one of the picture
@@ -45,10 +35,11 @@ export function drawn(row, joint, scale = false) {  // where a joint is on the c
 }
 
 class Desk {
-  constructor(place, key) {
+  constructor(place, key, page) {
     this.key = key;
     this.place = place;
-    this.source = sourceOf(key);
+    this.page = page;
+    this.source = new Source(`/desk/${encodeURIComponent(key)}`);
     this.span = [null, null];
     this.bouts = [];
     this.clerk = new Clerk(this);
@@ -58,15 +49,15 @@ class Desk {
     this.leave = (event) => { if (this.clerk.unsaved) event.preventDefault(); };
   }
 
-  close() {
-    document.removeEventListener("keydown", this.press);
-    window.removeEventListener("beforeunload", this.leave);
-    if (this.player) this.player.closed = true;
-    this.clerk.close();
-  }
-
   async begin(at) {
-    const about = await this.source.open();
+    const opening = this.source.open();
+    await this.source.timed;
+    if (this.source.times.length) {  // the first picture is asked for before all else is known
+      const row = this.source.rowAt(at);
+      this.source.want(row, WHOLE);
+      this.source.load(this.source.chunkOf(row));
+    }
+    const about = await opening;
     this.about = about;
     this.actions = about.actions;
     this.build();
@@ -75,7 +66,7 @@ class Desk {
     this.stage.onPlaceable = () => about.may_correct;
     this.stage.onPlace = (row, joint, to) => this.placeJoint(row, joint, to);
     this.stage.onDrag = (dragged) => this.tryJoint(dragged);
-    this.stage.onPick = (pixel) => ["u", "v"].forEach((name, k) => set(`correct-${name}`, { value: Math.round(pixel[k] * 100) / 100 }));
+    this.stage.onPick = (pixel) => this.clerk.addPixel(pixel);
     this.player.shown = (row) => this.show(row);
     this.player.stopped = () => this.tell();
     this.strips.forEach((strip) => {
@@ -165,11 +156,12 @@ class Desk {
     this.telling = setTimeout(() => {
       if (this.player.playing || this.player.closed) return;
       this.heard = Number(this.time().toFixed(4));
-      set("moment", { value: this.heard });
+      this.page.moment(this.heard);
     }, TOLD_MS);
   }
 
-  hear(at) {
+  moment(at) {  // another moment was chosen elsewhere on the page
+    if (!this.player) return;
     if (this.heard !== undefined && Math.abs(at - this.heard) < 1e-6) return;
     clearTimeout(this.telling);
     this.player.play(false);
@@ -206,19 +198,17 @@ class Desk {
   markSpan(from, to) {
     this.span = [from, to];
     this.strips.forEach((strip) => { strip.span = this.span; strip.paint(); });
-    const told = (value) => (value === null ? null : Math.round(value * 1000) / 1000);
-    set("correct-from", { value: told(from) });
-    set("correct-to", { value: told(to) });
     if (from !== null && to !== null) this.say(`marked ${from.toFixed(2)} to ${to.toFixed(2)} s`);
     else if (from !== null || to !== null) this.say(`marked ${from !== null ? `from ${from.toFixed(2)}` : `to ${to.toFixed(2)}`} s`);
   }
 
-  marked() {
-    const [from, to] = this.span;
-    return from !== null && to !== null ? { from_s: Number(from.toFixed(4)), to_s: Number(to.toFixed(4)) } : {};
+  async name(word) {
+    const [from, to] = this.span, time = this.time();
+    if (from !== null && to !== null) return this.clerk.correct(`add ${quoted(word)} ${from.toFixed(4)} ${to.toFixed(4)}`);
+    if (this.boutAt(time)) return this.clerk.correct(`rename ${time} ${quoted(word)}`);
+    this.say(`nothing is named at ${time.toFixed(2)} s; mark the span with [ and ], then press the number`, true);
+    return null;
   }
-
-  name(word) { return this.clerk.correct({ what: "action", word, at_s: this.time(), ...this.marked() }); }
 
   number(k) {
     const action = this.actions[k];
@@ -227,14 +217,22 @@ class Desk {
     return null;
   }
 
-  unname() { return this.clerk.correct({ what: "nothing", at_s: this.time() }); }
+  unname() { return this.clerk.correct(`delete ${this.time()}`); }
 
-  flip() { return this.clerk.correct({ what: "flip", at_s: this.time(), ...this.marked() }); }
+  flip() {
+    const [from, to] = this.span;
+    return this.clerk.correct(from !== null && to !== null ? `flip ${from.toFixed(4)} ${to.toFixed(4)}` : "flip");
+  }
+
+  moved(row, joint, to) {  // in words
+    const seen = this.source.at(row);
+    return `joint ${quoted(this.about.joints[joint])} ${seen.frame} ${to[0].toFixed(3)} ${to[1].toFixed(3)}`;
+  }
 
   placeJoint(row, joint, to) {
     const known = `${row}/${joint}`;
     this.stage.placed.set(known, to);
-    return this.clerk.correct({ what: "joint", row, joint: this.about.joints[joint], u: to[0], v: to[1] }, known);
+    return this.clerk.correct(this.moved(row, joint, to), known);
   }
 
   async tryJoint(dragged) {  // where the joint would be, height included: one question at a time
@@ -242,10 +240,10 @@ class Desk {
     if (this.trying) return;
     this.trying = true;
     while (dragged.asked && this.stage.dragged === dragged) {
-      const [u, v] = dragged.asked;
+      const sentence = this.moved(dragged.row, dragged.joint, dragged.asked);
       dragged.asked = null;
       try {
-        const told = await this.clerk.post({ what: "joint", try: true, row: dragged.row, joint: this.about.joints[dragged.joint], u, v });
+        const told = await this.clerk.post({ sentence, try: true });
         dragged.said = `z ${told.z_mm.toFixed(1)} mm${told.note ? ", height kept" : ""}`;
         if (this.stage.dragged === dragged) this.say(told.said);
       } catch (error) {
@@ -270,7 +268,6 @@ class Desk {
   }
 
   key_(event) {
-    if (!this.canvas.isConnected) { this.close(); return; }
     if (typing(event)) return;
     const act = actOf(this, event);
     if (!act || (event.repeat && !["ArrowLeft", "ArrowRight"].includes(event.key))) return;
@@ -279,3 +276,5 @@ class Desk {
     this.player.wake();
   }
 }
+
+function quoted(word) { return `'${word.replaceAll("'", `'"'"'`)}'`; }  // one word of a sentence, as a shell has it

@@ -1,7 +1,7 @@
 // Corrections on their way: taken, saved, taken back; what is not saved yet, and what went wrong.
 
 import { json } from "./desk_source.mjs";
-import { make, set } from "./desk_parts.mjs";
+import { button, make } from "./desk_parts.mjs";
 
 const ASK_MS = 250;  // how often it is asked whether all is saved
 const REPORT_MS = 1500;
@@ -13,17 +13,28 @@ export class Clerk {
     this.mine = [];  // what this visit did, to be taken back by U
     this.unsaved = 0;
     this.told = make("p", { class: "muted desk-saved", role: "status" });
+    this.list = document.getElementById("correct-made");  // none where nothing may be corrected
+    this.sentence = document.getElementById("correct-sentence");
+    if (!this.sentence) return;
+    this.sentence.form.addEventListener("submit", async (event) => {
+      event.preventDefault();
+      if (await this.correct(this.sentence.value)) this.sentence.value = "";
+    });
   }
 
-  close() { clearTimeout(this.asking); }
+  addPixel(pixel) {  // to a sentence that is being written
+    if (!this.sentence || !this.sentence.value.trim()) return;
+    this.sentence.value = `${this.sentence.value.trim()} ${pixel.map((one) => one.toFixed(2)).join(" ")}`;
+  }
 
-  async correct(asked, placed) {
+  async correct(sentence, placed) {  // true once it is taken
     const { desk } = this;
-    if (!desk.about.may_correct) return;
-    const by = document.getElementById("correct-by");
+    if (!desk.about.may_correct) return false;
     const { here } = desk.doubts;
+    let taken = false;
     try {
-      const told = await this.post({ ...asked, by: by ? by.value : "" });
+      const told = await this.post({ sentence });
+      taken = true;
       this.tickets.push({ ticket: told.ticket, placed });
       this.mine.push({ ticket: told.ticket });
       desk.say(told.said);
@@ -35,6 +46,7 @@ export class Clerk {
       desk.player.wake();
     }
     this.soon();
+    return taken;
   }
 
   async undo() {
@@ -43,20 +55,20 @@ export class Clerk {
       desk.say("nothing of this visit is left to take back; the list of corrections below has those of before");
       return;
     }
-    await this.change("taking back …", { what: "undo", ...last });
+    await this.change("taking back …", { undo: true, ...last });
   }
 
   async redo() {  // what was taken back last, in this visit or before
-    const told = await this.change("making again …", { what: "redo" });
+    const told = await this.change("making again …", { redo: true });
     if (told) this.mine.push({ number: told.number });
   }
 
   async change(doing, asked) {
-    const { desk } = this, by = document.getElementById("correct-by");
+    const { desk } = this;
     let told = null;
     desk.say(doing);
     try {
-      told = await this.post({ ...asked, by: by ? by.value : "" });
+      told = await this.post(asked);
       this.tickets.push({ ticket: told.ticket });
       desk.say(told.said);
     } catch (error) {
@@ -67,8 +79,9 @@ export class Clerk {
   }
 
   post(asked) {
+    const by = document.getElementById("correct-by"), at_s = this.desk.player ? this.desk.time() : 0;
     return json(`${this.desk.source.base}/correct`,
-      { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(asked) });
+      { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify({ ...asked, at_s, by: by ? by.value : "" }) });
   }
 
   soon() {
@@ -80,11 +93,11 @@ export class Clerk {
 
   async ask() {  // how far the corrections are
     const { desk } = this, state = await json(`${desk.source.base}/state`);
-    if (desk.player.closed) return;
     const done = this.tickets.filter((one) => ["saved", "failed"].includes((state.tickets[one.ticket] || { state: "failed" }).state));
     this.tickets = this.tickets.filter((one) => !done.includes(one));
     this.unsaved = state.unsaved;
     const n = state.log.length;
+    this.show(state);
     this.reported ||= state.report_old;
     const report = state.report_old ? "; writing the report …" : this.reported ? "; the report is up to date" : "";
     this.told.textContent = state.unsaved ? `saving ${state.unsaved} …`
@@ -95,11 +108,18 @@ export class Clerk {
       await desk.refresh();
       done.forEach((one) => one.placed && desk.stage.placed.delete(one.placed));
       desk.player.wake();
-      this.made = `${n}-${Date.now()}`;
-      set("corrections-made", { data: this.made });
+      desk.page.corrected();
       if (state.notes.length && !failed) desk.say(state.notes[state.notes.length - 1], true);
     }
     if (this.tickets.length || state.unsaved) this.soon();
     else if (state.report_old) this.asking = setTimeout(() => this.ask().catch(() => {}), REPORT_MS);
+  }
+
+  show({ log, redo }) {  // the corrections that stand, each with a button that takes it back
+    if (!this.list) return;
+    const back = (number) => button("Take back", "", () => this.change("taking back …", { undo: true, number }));
+    const lines = log.map((one) => make("li", {}, `${one.number}: ${one.said} (${one.author}, ${one.made_at}) `, back(one.number)));
+    this.list.replaceChildren(log.length ? make("ul", { class: "made" }, ...lines) : make("p", { class: "muted" }, "No corrections so far."),
+      ...(redo ? [button(`Redo: ${redo}`, "", () => this.redo())] : []));
   }
 }

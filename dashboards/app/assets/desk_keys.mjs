@@ -12,7 +12,7 @@ export const KEYS = [
 export function typing(event) {  // a key that belongs to a field or a list, not to the page
   const at = event.target;
   if (event.ctrlKey || event.metaKey || event.altKey || event.defaultPrevented) return true;
-  if (at.closest && at.closest("input, textarea, select, [contenteditable], [role=listbox], [role=combobox], .dash-dropdown, .js-plotly-plot")) return true;
+  if (at.closest && at.closest("input, textarea, select, [contenteditable]")) return true;
   return [" ", "Enter"].includes(event.key) && Boolean(at.closest && at.closest("button, a, summary"));
 }
 

@@ -14,10 +14,6 @@ export function button(text, title, act, more) {
   return make("button", { type: "button", title, onclick: act, ...more }, text);
 }
 
-export function set(id, values) {  // a property of the page around, where it has such a part
-  if (document.getElementById(id) || id === "corrections-made") window.dash_clientside.set_props(id, values);
-}
-
 export function kept(name, value) {  // a browser that keeps nothing still works
   try {
     if (value === undefined) return window.localStorage.getItem(name);

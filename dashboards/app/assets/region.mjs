@@ -13,22 +13,6 @@ const KEYS = [
   ["Enter", "a corner at the cross"], ["C", "close the polygon"], ["N P", "choose the next, the previous corner; Esc none"],
   ["Del", "take the chosen corner out, else the last"], ["U", "undo"],
 ];
-let open = null;
-
-export async function start(key) {
-  if (open) open.close();
-  const place = document.getElementById("region");
-  if (!place) return;
-  const page = open = new Region(place, key);
-  try {
-    await page.begin();
-  } catch (error) {
-    place.replaceChildren(make("p", { class: "problems", role: "alert" }, error.message));
-  }
-}
-
-export function drawn() { return open && open.shape.corners; }  // for tests
-
 function shape(name, attributes) {
   const made = document.createElementNS(SVG, name);
   Object.entries(attributes).forEach(([at, value]) => made.setAttribute(at, value));
@@ -44,11 +28,8 @@ class Region {
     this.chosen = null;
     this.held = null;
     this.cross = null;
-    this.resized = () => this.paint();
-    window.addEventListener("resize", this.resized);
+    window.addEventListener("resize", () => this.paint());
   }
-
-  close() { window.removeEventListener("resize", this.resized); }
 
   async begin() {
     this.place.replaceChildren(make("p", { class: "muted" }, "Reading the picture ..."));
@@ -373,3 +354,8 @@ class Region {
     this.said.classList.toggle("is-wrong", wrong);
   }
 }
+
+const place = document.getElementById("region");
+new Region(place, place.dataset.key).begin().catch((error) => {
+  place.replaceChildren(make("p", { class: "problems", role: "alert" }, error.message));
+});

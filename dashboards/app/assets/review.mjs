@@ -7,26 +7,11 @@ import { Source, json } from "./desk_source.mjs";
 import { Stage } from "./desk_stage.mjs";
 
 const LIT_S = 0.12;  // so near to the moment that is to be named the picture has a frame
-let open = null;
-
-export async function start() {
-  if (open) open.close();
-  const place = document.getElementById("review");
-  if (!place) return;
-  open = new Review(place);
-  await open.ask();
-}
-
 class Review {
   constructor(place) {
     this.place = place;
     this.press = (event) => this.key(event);
     document.addEventListener("keydown", this.press);
-  }
-
-  close() {
-    document.removeEventListener("keydown", this.press);
-    if (this.player) this.player.closed = true;
   }
 
   async ask() {
@@ -156,7 +141,6 @@ class Review {
   }
 
   key(event) {
-    if (!this.place.isConnected) { this.close(); return; }
     if (!this.player || !this.ready || typing(event)) return;
     const acts = {
       " ": () => this.player.play(!this.player.playing), ",": () => this.player.faster(-1), ".": () => this.player.faster(1),
@@ -173,3 +157,5 @@ class Review {
     this.player.wake();
   }
 }
+
+new Review(document.getElementById("review")).ask();

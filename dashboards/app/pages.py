@@ -1,0 +1,574 @@
+"""The dashboard's pages: list of sessions, ethograms side by side, groups compared, one session.
+
+The statistics are those of `liex_lab.behaviour.cohort`, the figures those of `..figures`.
+"""
+
+from __future__ import annotations
+
+import re
+import shlex
+from collections.abc import Callable, Mapping, Sequence
+from itertools import pairwise
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+from urllib.parse import quote, unquote
+
+import numpy as np
+from flask import Flask, Response, jsonify, redirect, render_template, request
+from markupsafe import Markup
+from werkzeug.exceptions import NotFound
+
+from liex_lab.actions.vocabulary import PALETTE, UNLABELLED
+from liex_lab.behaviour import cohort
+from liex_lab.behaviour.body import logged_of
+from liex_lab.errors import LiexError, SessionError
+from liex_lab.plan.subject import references_first
+from liex_lab.sessions import correcting
+from liex_lab.sessions.corrections import author_name
+
+from ..figures import groups, sets, times
+from ..figures.style import (
+    LEFT_MM,
+    ONE_COLUMN_MM,
+    RIGHT_MM,
+    TWO_COLUMNS_MM,
+    drawing,
+    image_bytes,
+    on_page,
+    time_unit,
+)
+from ..report.quality import warnings
+from ..report.scene_marks import WORDS, scene_marks
+from ..units import shown, titled
+from . import tables
+from .data import (
+    GREY,
+    NO_POSE,
+    NO_POSE_COLOUR,
+    OTHER,
+    Ethogram,
+    StudyData,
+    colours_of,
+    raster,
+    shown_words,
+    vocabulary_of,
+)
+from .tables import number, records, session_address
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from liex_lab.sessions import Session
+
+    from .desk import Desks
+
+ShowReplay = Callable[[Path, float], object]
+_ASSETS = Path(__file__).parent / "assets"
+_COLUMNS = 800  # parts of the time that a row of an ethogram shows
+_MOST_PARTS = 40_000  # of all rows together
+_STEPS = (
+    ("frame", -1, "◀ frame"),
+    ("frame", 1, "frame ▶"),
+    ("bout", -1, "◀ bout"),
+    ("bout", 1, "bout ▶"),
+    ("flag", -1, "◀ flagged"),
+    ("flag", 1, "flagged ▶"),
+)
+_HALF_S = 4.0  # of the curves around a moment
+_AROUND_MM = 1.2 * ONE_COLUMN_MM
+_FACTS = (
+    ("frame_index", "frame", ""),
+    ("time_s", "time", "s"),
+    ("flag", "flag", ""),
+    ("predicted_error_mm", "expected error", "mm"),
+    ("p_flip", "head and tail exchanged, p", ""),
+    ("gap_before", "frames missing before", ""),
+    ("zone", "zone", ""),
+)
+_MOVED = (("heading_rad", "heading", "rad"), ("length_mm", "length", "mm"))
+
+
+def add_pages(
+    app: Flask,
+    data: StudyData,
+    desks: Desks,
+    show_replay: ShowReplay | None,
+    *,
+    may_correct: bool,
+    of_recordings: bool,
+) -> None:
+    """Add the pages, and the addresses that their scripts ask.
+
+    Args:
+        app: the dashboard.
+        data: the study.
+        desks: its sessions.
+        show_replay: opens the replay of a .rrd at a time (s); None only shows the command.
+        may_correct: whether corrections are saved.
+        of_recordings: whether a region can be drawn for recordings that were not measured.
+    """
+
+    def table(name: str, **how: Any) -> Markup:
+        try:
+            filled = tables.fill(tables.find(data, name), **how)
+        except LiexError as error:
+            filled = {"sentence": str(error)}
+        return Markup(render_template("table.html", **filled))  # nosec B704: a rendered template
+
+    @app.context_processor
+    def shared() -> dict[str, Any]:
+        path = request.path
+        here = "/" if path.startswith(("/session", "/arena")) else path
+        functions = {"csv_address": tables.csv_address, "session_address": session_address}
+        return {"study": data.name, "here": here, "grey": GREY, "table": table, **functions}
+
+    @app.errorhandler(LiexError)
+    def refused(error: LiexError) -> Any:
+        if request.accept_mimetypes.best == "text/html":  # a page, not one of its scripts
+            return render_template("sentence.html", title="This cannot be shown", said=str(error))
+        return {"said": str(error)}, 400
+
+    @app.errorhandler(404)
+    def absent(_: NotFound) -> Any:
+        return render_template("sentence.html", title="No such page", said=""), 404
+
+    @app.get("/")
+    def sessions_page() -> str:
+        states = [entry.state for entry in data.entries.values()]
+        counts = [
+            (state, title, f"{states.count(state):,}")
+            for state, title in tables.STATES.items()
+            if state in states
+        ]
+        return render_template("sessions.html", counts=counts)
+
+    @app.post("/refresh")
+    def refresh() -> Any:
+        data.refresh()
+        return redirect("/", 303)
+
+    @app.get("/table")
+    def table_rows() -> Markup:
+        asked = request.args
+        return table(
+            asked.get("name", ""),
+            words=asked.get("words", ""),
+            sorted_by=asked.get("column", ""),
+            down=asked.get("down") == "1",
+        )
+
+    @app.get("/ethograms")
+    def ethograms_page() -> str:
+        return render_template("ethograms.html", **ethogram_rows(data))
+
+    @app.get("/groups")
+    def groups_page() -> str:
+        return render_template("groups.html", **compared_groups(data))
+
+    @app.get("/group-figure/<path:measure>.svg")
+    def group_figure(measure: str) -> Response:
+        with drawing():
+            figure = _comparison(data, measure, request.args.get("reference", ""))
+            return _download(None if figure is None else image_bytes(figure, "svg"))
+
+    @app.get("/review")
+    def review_page() -> str:
+        return render_template("review.html")
+
+    @app.get("/arena/<path:key>")
+    def arena_page(key: str) -> str:
+        return render_template("arena.html", key=key, known=key in data.entries)
+
+    @app.get("/session/<path:key>")
+    def session_page(key: str) -> Any:
+        entry = data.entries.get(key)
+        if entry is None:
+            said = "The study has no session of this name."
+            return render_template("sentence.html", title="No such session", said=said), 404
+        if entry not in data.done:
+            said = "; ".join(filter(None, (entry.reason, entry.remedy)))
+            more = {"arena": f"/arena/{quote(key, safe='')}"} if of_recordings else {}
+            said = said or "it has not been measured yet"
+            what = {"kind": "session", "title": key, "state": entry.state, "said": said}
+            return render_template("sentence.html", **what, **more)
+        return render_template(
+            "session.html",
+            **session_facts(data, key),
+            at_s=_moment(),
+            steps=_STEPS,
+            may_show=show_replay is not None,
+            sentences=correcting.SENTENCES if may_correct else (),
+            modules=sorted(path.name for path in _ASSETS.glob("desk*.mjs")),
+        )
+
+    @app.get("/whole/<path:key>")
+    def whole(key: str) -> Response:
+        """The ethogram and the curves of a session, or of its stretch from ?from= to ?to= (s)."""
+        seen = desks.of(key).seen
+        span = _span(seen[0].duration_s)
+        part = span if "from" in request.args else None
+        with drawing():
+            drawn = [draw(one, part) for one in seen for draw in (times.ethogram, times.curves)]
+            figures = [figure for figure in drawn if figure is not None]
+            return _timed("whole", figures, span, TWO_COLUMNS_MM)
+
+    @app.get("/moment/<path:key>")
+    def moment(key: str) -> Response:
+        """The curves around ?t= (s), the numbers of its frame, and the command of its replay."""
+        at_s = _moment()
+        span = (at_s - _HALF_S, at_s + _HALF_S)
+        with drawing():
+            figure = times.curves(desks.of(key).seen[0], span, _AROUND_MM)
+            more = data.read(
+                key,
+                lambda session: {
+                    "facts": facts(session, nearest_row(session, at_s)),
+                    "command": f"liex show {shlex.quote(str(session.path))} --at {at_s:.3f}",
+                },
+            )
+            figures = [] if figure is None else [figure]
+            return _timed("around", figures, span, _AROUND_MM, **more)
+
+    @app.get("/step/<path:key>")
+    def step(key: str) -> Response:
+        to = 1 if request.args.get("to") == "1" else -1
+        session = data.session(key)
+        return jsonify(round(moved_to(session, _moment(), request.args.get("by", ""), to), 4))
+
+    @app.post("/replay/<path:key>")
+    def replay(key: str) -> Any:
+        asked = request.get_json(silent=True)  # a form of another site cannot send JSON
+        at_s = asked.get("at_s") if isinstance(asked, dict) else None
+        if show_replay is None or not isinstance(at_s, int | float):
+            return {"said": "no replay is opened here"}, 403
+        show_replay(data.session(key).path / "session.rrd", float(at_s))
+        return {"said": f"Rerun shows the replay at {at_s:.3f} s."}
+
+    @app.get("/figure/<path:key>/<name>.svg")
+    def figure(key: str, name: str) -> Response:
+        if name not in sets.OF_SESSION:
+            raise NotFound
+        with drawing():
+            drawn = next(sets.session_figures(data.session(key), [name])).figure
+            return _download(None if drawn is None else image_bytes(drawn, "svg"))
+
+
+def ethogram_rows(data: StudyData) -> dict[str, Any]:
+    """What the page of ethograms shows of the groups and sessions that are asked for.
+
+    Args:
+        data: the study.
+    """
+    names = request.args.getlist("group")
+    chosen = request.args.getlist("session")
+    ones = data.ethograms(chosen_keys(data, names, chosen))
+    words = shown_words(ones.values())
+    coloured = colours_of(words[: len(PALETTE)], vocabulary_of(ones.values()))
+    colours = {**coloured, "unlabelled": UNLABELLED, NO_POSE: NO_POSE_COLOUR}
+    if len(words) > len(PALETTE):
+        colours[OTHER] = GREY
+    start_s, stop_s = _span(max((one.duration_s for one in ones.values()), default=0.0))
+    unit, size = time_unit(stop_s - start_s)
+    summaries = data.collected().set_index("key")
+    entries: list[dict[str, Any]] = []
+    before = None
+    for key, one in ones.items():
+        group = data.entries[key].who.get("group", "")
+        entries.append(
+            {
+                "key": key,
+                "group": group if group != before else "",
+                "bars": _bars(one, words, (start_s, stop_s), len(ones), (unit, size)),
+                "shares": _shares(summaries.loc[key], [*words, "unlabelled"], coloured),
+            }
+        )
+        before = group
+    groups_there = sorted({entry.who.get("group", "") for entry in data.done} - {""})
+    keys = [entry.key for entry in data.done]
+    choices = [("group", "Groups", groups_there, names), ("session", "Sessions", keys, chosen)]
+    return {
+        "choices": choices,
+        "legend": colours,
+        "colours": colours,
+        "entries": entries,
+        "start_s": start_s,
+        "stop_s": stop_s,
+        "unit": unit,
+        "time_ticks": _ticks(start_s / size, stop_s / size),
+        "share_ticks": _ticks(0.0, 100.0),
+    }
+
+
+def chosen_keys(data: StudyData, names: Sequence[str], sessions: Sequence[str]) -> list[str]:
+    """Keys of the sessions that are named, or of those of the groups, or of all, by group.
+
+    Args:
+        data: the study.
+        names: names of groups; empty means all.
+        sessions: names of sessions, which take precedence over groups.
+    """
+    if sessions:
+        return [entry.key for entry in data.done if entry.key in set(sessions)]
+    within = [entry for entry in data.done if not names or entry.who.get("group", "") in names]
+    return [entry.key for entry in sorted(within, key=lambda entry: entry.who.get("group", ""))]
+
+
+def _bars(
+    one: Ethogram,
+    words: Sequence[str],
+    span_s: tuple[float, float],
+    n_rows: int,
+    unit: tuple[str, float],
+) -> list[dict[str, Any]]:
+    """The runs of one row of the ethograms, in % of the span; nothing after the session's end."""
+    n = min(_COLUMNS, max(120, _MOST_PARTS // n_rows))
+    start_s, stop_s = span_s
+    codes = raster(one, words, start_s, stop_s, n)
+    end = int(np.ceil(n * np.clip((one.duration_s - start_s) / (stop_s - start_s), 0.0, 1.0)))
+    edges = [0, *(np.flatnonzero(np.diff(codes[:end])) + 1).tolist(), end]
+    named = [*words, NO_POSE, "unlabelled"]  # codes -2 and -1 count from the end
+    bars = []
+    for a, b in pairwise(edges):
+        word = named[codes[a]] if b > a else ""
+        at = (start_s + a * (stop_s - start_s) / n) / unit[1]
+        said = f"{at:.2f} {unit[0]}: {word.replace('_', ' ')}"
+        bars.append({"at": 100.0 * a / n, "width": 100.0 * (b - a) / n, "word": word, "said": said})
+    return bars
+
+
+def _shares(
+    row: pd.Series[float], words: Sequence[str], coloured: Mapping[str, str]
+) -> list[dict[str, Any]]:
+    """One row of the time budget, in %; actions without a colour of their own are one part."""
+    shares = {word: float(row.get(f"{word}_share", np.nan)) for word in words}
+    parts: dict[str, float] = {}
+    for word, share in shares.items():
+        if share > 0.0:  # NaN where it is not known
+            name = word if word in coloured or word == "unlabelled" else OTHER
+            parts[name] = parts.get(name, 0.0) + 100.0 * share
+    ends = np.cumsum([0.0, *parts.values()])
+    return [
+        {"at": at, "width": share, "word": word, "said": f"{word.replace('_', ' ')}: {share:.1f} %"}
+        for (word, share), at in zip(parts.items(), ends, strict=False)
+    ]
+
+
+def _ticks(low: float, high: float) -> list[tuple[float, str]]:
+    """Round numbers of an axis, each with its place in %."""
+    from matplotlib.ticker import MaxNLocator
+
+    ticks = MaxNLocator(8, steps=[1, 2, 5, 10]).tick_values(low, high)
+    inside = [tick for tick in ticks if low <= tick <= high]
+    return [(100.0 * (tick - low) / max(high - low, 1e-9), f"{tick:g}") for tick in inside]
+
+
+def compared_groups(data: StudyData) -> dict[str, Any]:
+    """What the page of groups shows of the measure and reference that are asked for.
+
+    Args:
+        data: the study.
+    """
+    table = data.collected()
+    measures = list(tables.columns_of(data))
+    usual = [name for name in cohort.usual_measures(table) if name in measures]
+    ordered = [*usual, *(name for name in measures if name not in usual)]
+    units = data.units()
+    names = references_first({str(name) for name in table["group"].fillna("")} - {""})
+    if not ordered or len(names) < 2:
+        return {"refused": f"{len(table)} measured sessions have {', '.join(names) or 'no group'}"}
+    measure = request.args.get("measure", "")
+    measure = measure if measure in ordered else ordered[0]
+    reference = request.args.get("reference", "")
+    reference = reference if reference in names else ""
+    unit, meaning = data.described(measure)
+    page: dict[str, Any] = {
+        "notes": data.to_check(),
+        "measures": [(name, titled(name, units.get(name, ""))) for name in ordered],
+        "names": names,
+        "measure": measure,
+        "reference": reference,
+        "meaning": meaning,
+        "problem": "",
+    }
+    try:
+        stats = data.stats(measure, reference or None)
+    except LiexError as error:
+        return page | {"problem": str(error)}
+    with drawing():
+        drawn = _comparison(data, measure, reference)
+        svg = "" if drawn is None else on_page(image_bytes(drawn, "svg"), "groups", measure)
+    own = records(stats[stats["measure"] == measure])
+    return page | {
+        "figure": Markup(_titled_links(svg)),  # nosec B704: matplotlib escapes every text
+        "verdicts": [_verdict(row, unit) for row in own],
+        "methods": cohort.methods(stats, table, [f"{note}." for note in data.to_check()]),
+    }
+
+
+def _comparison(data: StudyData, measure: str, reference: str) -> Any:
+    """The figure of a measure by group, whose marks are links to their sessions."""
+    stats = data.stats(measure, reference or None)
+    unit, _ = data.described(measure)
+    return groups.comparison(data.collected(), stats, measure, unit, link=session_address)
+
+
+def _titled_links(svg: str) -> str:
+    """Links of a figure as the page has them: what follows the # is told where a pointer rests."""
+    return re.sub(
+        r'<a href="(/session/[^"#]*)#([^"]*)"([^>]*)>',
+        lambda found: f'<a href="{found[1]}"><title>{Markup.escape(unquote(found[2]))}</title>',
+        svg,
+    )
+
+
+def _verdict(row: dict[str, Any], unit: str) -> dict[str, Any]:
+    """One contrast in words: what was found, how sure, of how many."""
+    cages = f"{row['n_cages']} cages, " if row["n_cages"] else ""
+    counts = (
+        f"{cohort.counted_units(row)}; {row['n_animals']} animals, {cages}{row['n_sessions']} "
+        f"sessions, {row['n_bouts']:,} bouts, {number(row['observed_min'])} min; "
+        f"{row['n_without_value']} sessions without a value."
+    )
+    result = cohort.result(row, unit)
+    tested = bool(row["test"])
+    return {"contrast": row["contrast"], "result": result, "counts": counts, "tested": tested}
+
+
+def session_facts(data: StudyData, key: str) -> dict[str, Any]:
+    """What the page of a session shows before its script asks for more.
+
+    Args:
+        data: the study.
+        key: the session's name in the study.
+
+    Raises:
+        SessionError: the session cannot be opened.
+    """
+    session = data.session(key)
+    who = data.entries[key].who
+    frames = session.metadata["frames"]
+    said = [f"{name.replace('_', ' ')} {value}" for name, value in who.items() if value]
+    extent = f"{frames['n_frames']:,} frames, {frames['duration_s']:.1f} s"
+    path = quote(key, safe="")
+    kinds = dict.fromkeys(mark.kind for mark in scene_marks(session))
+    files = [
+        (f"{name}.csv", f"/session-csv/{path}/{name}.csv")
+        for name in tables.session_tables(data, key)
+    ]
+    files += [(f"{name}.svg", f"/figure/{path}/{name}.svg") for name in sets.OF_SESSION]
+    return {
+        "key": key,
+        "group": who.get("group", ""),
+        "headline": f"{', '.join(said)} · {extent}" if said else extent,
+        "warnings": warnings(session),
+        "author": author_name(),
+        "scene": [(kind, WORDS[kind]) for kind in kinds],
+        "arena": f"/arena/{path}",
+        "report": f"/report/{path}" if session.has("report.html") else "",
+        "files": files,
+    }
+
+
+def nearest_row(session: Session, at_s: float) -> int:
+    """Row of the frame whose time is nearest.
+
+    Args:
+        session: the opened session.
+        at_s: the moment, s since its first frame.
+    """
+    return int(np.abs(session.frames["time_s"].to_numpy(float) - at_s).argmin())
+
+
+def moved_to(session: Session, at_s: float, by: str, to: int) -> float:
+    """Time of the next or previous frame, bout or flagged frame, s; `at_s` if there is none.
+
+    Args:
+        session: the opened session.
+        at_s: the moment, s since its first frame.
+        by: frame, bout or flag.
+        to: 1 for the next, -1 for the previous.
+    """
+    time_s = session.frames["time_s"].to_numpy(float)
+    if by == "frame":
+        row = nearest_row(session, at_s) + to
+        return float(time_s[min(max(row, 0), len(time_s) - 1)])
+    places = (
+        session.bouts["start_s"].to_numpy(float)
+        if by == "bout"
+        else time_s[(session.frames["flag"].fillna("") != "").to_numpy()]
+    )
+    beyond = places[places > at_s + 1e-4] if to > 0 else places[places < at_s - 1e-4]
+    return at_s if not len(beyond) else float(beyond.min() if to > 0 else beyond.max())
+
+
+def facts(session: Session, row: int) -> list[tuple[str, str]]:
+    """The numbers of one frame: (what, how much).
+
+    Args:
+        session: the opened session.
+        row: the frame's row in the table `frames`.
+    """
+    frame = session.frames.iloc[row]
+    found = [(title, frame[name], unit) for name, title, unit in _FACTS if name in frame]
+    if session.has("kinematics.parquet"):
+        moved = session.kinematics.iloc[row]
+        measured = [
+            (one.column, one.title.lower(), one.unit)
+            for one in logged_of(session.metadata["animal"])
+        ]
+        found += [
+            (title, *shown(moved[name], unit))
+            for name, title, unit in (*measured, *_MOVED)
+            if name in moved
+        ]
+    bouts = session.bouts
+    now = bouts[(bouts["start_s"] <= frame["time_s"]) & (frame["time_s"] < bouts["stop_s"])]
+    words = ", ".join(str(word).replace("_", " ") for word in now["action"])
+    texts = [("action", words or "unlabelled")]
+    for title, value, unit in found:
+        text = f"{value:.3f}" if title == "time" else number(value)
+        if text not in ("", "nan"):
+            texts.append((title, f"{text} {unit if text != '–' else ''}".strip()))
+    return texts
+
+
+def _timed(
+    name: str, figures: Sequence[Any], span_s: tuple[float, float], width_mm: float, **more: Any
+) -> Response:
+    """Figures over time as JSON: SVG, and where on it the axis of time begins and ends."""
+    svgs = [
+        on_page(image_bytes(one, "svg"), f"{name}{k}", "over time") for k, one in enumerate(figures)
+    ]
+    axis = {
+        "left": LEFT_MM / width_mm,
+        "right": 1.0 - RIGHT_MM / width_mm,
+        "from_s": span_s[0],
+        "to_s": span_s[1],
+    }
+    return jsonify({"svg": "".join(svgs), **axis, **more})
+
+
+def _download(svg: bytes | None) -> Response:
+    if svg is None:
+        raise SessionError("there is nothing to draw: no value is known")
+    return Response(svg, mimetype="image/svg+xml")
+
+
+def _moment() -> float:
+    """The moment ?t= that a page is asked for, s; 0 without a usable one."""
+    try:
+        at_s = float(request.args.get("t", "0"))
+    except ValueError:
+        return 0.0
+    return at_s if 0.0 <= at_s < 1e9 else 0.0
+
+
+def _span(duration_s: float) -> tuple[float, float]:
+    """The stretch from ?from= to ?to= (s) that is asked for; the whole duration without one."""
+    stop_s = max(duration_s, 1e-3)
+    try:
+        low, high = (float(request.args[name]) for name in ("from", "to"))
+    except (KeyError, ValueError):
+        return 0.0, stop_s
+    low, high = max(low, 0.0), min(high, stop_s)
+    return (low, high) if high - low > 1e-3 else (0.0, stop_s)
