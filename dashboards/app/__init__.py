@@ -1,1 +1,1 @@
-"""`liex dashboard`: a study's pages in the browser (Dash and plotly)."""
+"""`liex dashboard`: a study's pages in the browser (Flask, Jinja and ES modules)."""
