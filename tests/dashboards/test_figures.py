@@ -392,9 +392,9 @@ def test_a_comparison_draws_every_animal_and_the_interval_of_the_table(study, tm
     assert figure is not None
     left, right = figure.axes
     for group in ("control", "drug"):
-        (marks,) = [line for line in left.get_lines() if line.get_gid() == f"animals {group}"]
+        (marks,) = [one for one in left.collections if one.get_gid() == f"animals {group}"]
         own = table.loc[table["group"] == group, "mean_speed_mm_s"]
-        np.testing.assert_allclose(sorted(marks.get_ydata()), sorted(0.1 * own))  # cm/s
+        np.testing.assert_allclose(sorted(marks.get_offsets()[:, 1]), sorted(0.1 * own))  # cm/s
     (interval,) = [line for line in right.get_lines() if line.get_gid() == "interval 0"]
     row = stats[stats["measure"] == "mean_speed_mm_s"].iloc[0]
     np.testing.assert_allclose(interval.get_xdata(), [0.1 * row["ci_low"], 0.1 * row["ci_high"]])
