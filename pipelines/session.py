@@ -9,7 +9,9 @@ made of all frames at once.
 from __future__ import annotations
 
 import time
+from collections import deque
 from collections.abc import Generator, Iterable, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import partial
@@ -25,7 +27,7 @@ from liex_lab.recordings.timestamps import JUMPED, PULSES_UNKNOWN
 from liex_lab.runtime.memory import Allocator, rest
 from liex_lab.runtime.places import inside
 from liex_lab.runtime.progress import Progress, silent
-from liex_lab.runtime.threads import in_background, prefetch
+from liex_lab.runtime.threads import in_background, prefetch, serial_products
 
 from .build import (
     build_estimator,
@@ -37,8 +39,6 @@ from .build import (
 )
 from .choice import USUAL, Fitted, fit_plan
 from .compiling import compile_ahead
-from .hashing import hashed_ahead
-from .observing import observed
 from .origin import build_provenance, build_surroundings, session_bytes
 from .regions import pinned
 from .shards import CHUNK, LENGTH, MEASURING, Shard, measure_shards
@@ -56,6 +56,69 @@ if TYPE_CHECKING:
     from liex_lab.sessions.verdict import Verdict
     from liex_lab.sessions.writer import BlueprintMaker, ReportMaker
     from liex_lab.tables.rows import Rows
+    from liex_lab.tracking.observations import Observations
+    from liex_lab.tracking.tracker import FrameTracker
+
+
+_AT_ONCE = 2
+Observed = tuple["list[DepthFrame]", "Observations"]
+
+
+def observed(
+    tracker: FrameTracker, stretches: Iterable[list[DepthFrame]]
+) -> Generator[Observed, None, None]:
+    """Stretches of frames with what single frames say, in their order.
+
+    Args:
+        tracker: prepared for their recording.
+        stretches: consecutive frames; so many are taken ahead as are looked at at once.
+
+    Yields:
+        Each stretch with its observations; what goes wrong with one is raised in its turn.
+    """
+    import numba
+
+    n_threads = numba.get_num_threads()
+    if n_threads < _AT_ONCE or not _may_share():
+        for frames in stretches:
+            yield frames, tracker.observe(frames)
+        return
+    waiting: deque[tuple[list[DepthFrame], Future[Observations]]] = deque()
+    # products are serial all the while: the limit is one of the process, not of a thread
+    with (
+        serial_products(),
+        ThreadPoolExecutor(
+            _AT_ONCE, initializer=numba.set_num_threads, initargs=(n_threads // _AT_ONCE,)
+        ) as pool,
+    ):
+        try:
+            for frames in stretches:
+                waiting.append((frames, pool.submit(tracker.observe, frames)))
+                if len(waiting) > _AT_ONCE:
+                    yield _first(waiting)
+            while waiting:
+                yield _first(waiting)
+        finally:
+            for _, coming in waiting:
+                coming.cancel()
+
+
+def _first(waiting: deque[tuple[list[DepthFrame], Future[Observations]]]) -> Observed:
+    """The stretch that was taken first, once it has been looked at."""
+    frames, coming = waiting.popleft()
+    return frames, coming.result()
+
+
+def _may_share() -> bool:
+    """Whether several threads may run parallel kernels at once: numba's own layer ends a process
+    in which they do. False where none has been run yet.
+    """
+    import numba
+
+    try:
+        return numba.threading_layer() in ("omp", "tbb")
+    except ValueError:
+        return False
 
 
 def measure_session(
@@ -116,7 +179,6 @@ def measure_session(
     ):
         from liex_lab.recordings.timestamps import unwritable_times
         from liex_lab.sessions import SessionWriter
-        from liex_lab.sessions.folder import part_folder
 
         folder = folder or inside(Path(out), first.session.name or opened.name, ".liex")
         if told := unwritable_times(opened.times_ns):
@@ -126,12 +188,10 @@ def measure_session(
             whose = _check_subject(opened, Path(recording), first)
         check_unused(folder, overwrite)
         unnamed = None if plan else settings
-        with hashed_ahead(opened, part_folder(folder), progress) as hashed:
-            compile_ahead(first.animal.skeleton, progress)
-            progress(0, None, "learning the background, the floor and the animal's size")
-            fitted = fit_plan(opened, first, estimator, settings=unnamed, progress=progress)
-            fitted = replace(fitted, notes=(*fitted.notes, *whose))
-            hashed()
+        compile_ahead(first.animal.skeleton, progress)
+        progress(0, None, "learning the background, the floor and the animal's size")
+        fitted = fit_plan(opened, first, estimator, settings=unnamed, progress=progress)
+        fitted = replace(fitted, notes=(*fitted.notes, *whose))
         prepared = prepare(fitted, folder, started, progress)
         if pool is not None and isinstance(recording, str | Path):
             prepared.measure_by(pool, recording, progress)

@@ -10,9 +10,9 @@ from typing import Any
 import numba
 import numpy as np
 import pytest
-from liex_lab.pipelines import observing
+from liex_lab.pipelines import session
 from liex_lab.pipelines.build import build_tracker, plan_of
-from liex_lab.pipelines.observing import observed
+from liex_lab.pipelines.session import observed
 
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.errors import RecordingError
@@ -49,7 +49,7 @@ class Slow:
 
 @pytest.fixture(autouse=True)
 def _shared(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(observing, "_may_share", lambda: True)
+    monkeypatch.setattr(session, "_may_share", lambda: True)
 
 
 def told(tracker: Any, n: int) -> list[Any]:
@@ -70,7 +70,7 @@ def test_on_one_thread_or_where_threads_may_not_share_each_is_looked_at_alone(
     tracker = Slow()
     with threads(False):
         assert [seen[0] for _, seen in told(tracker, 3)] == [0, 10, 20]
-    monkeypatch.setattr(observing, "_may_share", lambda: False)
+    monkeypatch.setattr(session, "_may_share", lambda: False)
     assert [seen[0] for _, seen in told(tracker, 3)] == [0, 10, 20]
     assert tracker.most == 1
 
