@@ -206,9 +206,9 @@ def _shows_an_animal(tracker: FrameTracker) -> bool:
 
     scene = tracker.scene
     fit = tracker.sample_fit
-    if not isinstance(scene, BackgroundSubtraction) or scene.standing is None or fit is None:
+    if not isinstance(scene, BackgroundSubtraction) or scene.support_plane is None or fit is None:
         return True
-    return scene.standing.moves or fit.covered >= _SOME_COVERED
+    return scene.support_plane.moves or fit.covered >= _SOME_COVERED
 
 
 def try_plan(recording: Recording, plan: Plan | str) -> PlanFit:

@@ -429,7 +429,7 @@ def _region(
                 "whole images are kept, for the measurement uses all of them, not only the arena; "
                 "name the region to be kept with --region"
             ]
-        if learned.scene.standing.n_together > 1:  # type: ignore[attr-defined]
+        if learned.scene.support_plane.n_together > 1:  # type: ignore[attr-defined]
             return None, [
                 "whole pictures are kept, for more than one thing moves in them; name what is to "
                 "be kept with --region"
@@ -457,11 +457,11 @@ def _stated(opened: Recording, plan: Plan) -> Corners:
 
 def _found_region(tracker: FrameTracker, width: int, height: int) -> Mask | None:
     """The pixels (H, W) that are looked at; None for all."""
-    standing = getattr(tracker.scene, "standing", None)
-    if standing is None or standing.region is None:
+    support_plane = getattr(tracker.scene, "support_plane", None)
+    if support_plane is None or support_plane.region is None:
         return None
     stride = int(getattr(tracker.scene, "stride", 1))
-    mask = np.repeat(np.repeat(standing.region, stride, axis=0), stride, axis=1)
+    mask = np.repeat(np.repeat(support_plane.region, stride, axis=0), stride, axis=1)
     found = np.asarray(mask[:height, :width], np.bool_)
     return None if found.all() else found
 
@@ -486,7 +486,7 @@ def _within(mask: Mask | None) -> Callable[[Depth], Depth]:
 def _alike(one: FrameTracker, other: FrameTracker) -> bool:
     """Whether two trackers were learned alike, bit for bit."""
     own = [field.name for field in fields(one) if field.name not in ("estimator", "scene", "body")]
-    scene = [field.name for field in fields(one.scene) if field.name != "standing"]  # type: ignore[arg-type]
+    scene = [field.name for field in fields(one.scene) if field.name != "support_plane"]  # type: ignore[arg-type]
     pairs = [(getattr(one, name), getattr(other, name)) for name in own]
     pairs += [(getattr(one.scene, name), getattr(other.scene, name)) for name in scene]
     pairs.append((one.body.girth, other.body.girth))

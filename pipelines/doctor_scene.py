@@ -21,7 +21,7 @@ from liex_lab.plan import Plan
 from liex_lab.recordings.recording import Recording
 from liex_lab.scene.floor import Floor, floor_patch
 from liex_lab.scene.outline import find_arena
-from liex_lab.scene.support_plane import SampledScene, find_standing
+from liex_lab.scene.support_plane import SampledScene, find_support_plane
 
 from .origin import animal_of, build_zones
 from .regions import region_of, stated_floor
@@ -102,7 +102,7 @@ class SceneLook:
                 self.plan.foreground.min_height_mm,
                 Skeleton.load(animal.skeleton).view,
             )
-            standing = find_standing(
+            support_plane = find_support_plane(
                 scene,
                 None
                 if stated is None
@@ -111,14 +111,14 @@ class SceneLook:
         except EstimationError as error:
             self.problems.append(f"no floor: {error}")
             return
-        if standing.doubt:
-            self.problems.append(standing.doubt)
-        if standing.region is not None:
-            background = np.where(standing.region, background, np.float32(0))
-        floor = standing.floor
+        if support_plane.doubt:
+            self.problems.append(support_plane.doubt)
+        if support_plane.region is not None:
+            background = np.where(support_plane.region, background, np.float32(0))
+        floor = support_plane.floor
         patch = floor_patch(background, floor.depth(grid.width, grid.height))
         noise = _noise(self.sample, patch)
-        on_floor = standing.on_floor
+        on_floor = support_plane.on_floor
         read = [frame[on_floor] > 0 for frame in self.sample if frame.any()]
         unread = 1.0 - float(np.mean(read))
         self.facts |= {"noise_mm": noise, "floor_unread_share": unread}
@@ -212,7 +212,7 @@ class SceneLook:
             if factor == 1.0:
                 self.facts["scene"] = scene.described().to_dict()
                 self.problems.extend(scene.doubts)
-            elif scene.standing is not None and not scene.standing.moves:
+            elif scene.support_plane is not None and not scene.support_plane.moves:
                 continue  # a thing of another size that keeps still is a thing
             crops = scene.extract(sample, 1.0)
             length = 4.0 * float(np.median(crops.blobs.sd_along[crops.found]))

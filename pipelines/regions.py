@@ -21,7 +21,7 @@ from liex_lab.scene.floor import Floor
 from liex_lab.scene.multi_arena import arenas_apart
 from liex_lab.scene.region import Corners, region_corners_px
 from liex_lab.scene.scene import plane_of
-from liex_lab.scene.support_plane import SampledScene, find_standing
+from liex_lab.scene.support_plane import SampledScene, find_support_plane
 
 from .origin import animal_of
 
@@ -109,7 +109,7 @@ def _floor_of_picture(recording: Recording, plan: Plan) -> Floor:
     stated = stated_floor(recording.camera, plan)
     if stated is not None:
         return stated
-    found = find_standing(_sampled(recording, plan)[0]).floor
+    found = find_support_plane(_sampled(recording, plan)[0]).floor
     return Floor.from_plane(found.normal, found.distance_mm, recording.camera)
 
 

@@ -1,4 +1,4 @@
-"""Z-buffer rasteriser of triangle meshes: depth pictures, one or a batch.
+"""Z-buffer rasteriser of triangle meshes: depth images, one or a batch.
 
 Pinhole projection u = fx x / z + cx, v = fy y / z + cy; inside a triangle, by barycentric
 coordinates, the inverse depth 1 / z is interpolated, which is linear in the pixel for a plane and
@@ -19,7 +19,7 @@ NEAR_MM = 1.0
 
 @njit(cache=True)
 def draw(vertices, faces, rotation, translation, fx, fy, cx, cy, u0, v0, inverse):
-    """Draw triangles into a picture of inverse depth.
+    """Draw triangles into an image of inverse depth.
 
     Keeps the largest 1 / z under each pixel's centre. Triangles that reach behind NEAR_MM are left
     out.
@@ -33,8 +33,8 @@ def draw(vertices, faces, rotation, translation, fx, fy, cx, cy, u0, v0, inverse
         fy: focal length, px.
         cx: principal point, px.
         cy: principal point, px.
-        u0: the picture's column that `inverse[0, 0]` shows.
-        v0: the picture's row that `inverse[0, 0]` shows.
+        u0: the image's column that `inverse[0, 0]` shows.
+        v0: the image's row that `inverse[0, 0]` shows.
         inverse: (H, W) 1/mm, changed in place; 0 where nothing was drawn.
     """
     projected = np.empty((vertices.shape[0], 3))
@@ -112,7 +112,7 @@ def to_depth(inverse, depth):
 
 @njit(cache=True)
 def draw_batch(vertices, faces, rotation, translation, intrinsics, origin, depth):
-    """Depth pictures of n meshes, one after the other; see `draw`.
+    """Depth images of n meshes, one after the other; see `draw`.
 
     Args:
         vertices: (n, V, 3) mm.
@@ -120,7 +120,7 @@ def draw_batch(vertices, faces, rotation, translation, intrinsics, origin, depth
         rotation: (n, 3, 3).
         translation: (n, 3) mm.
         intrinsics: (n, 4) fx, fy, cx, cy px.
-        origin: (n, 2) the picture's pixel (u, v) at the window's top left.
+        origin: (n, 2) the image's pixel (u, v) at the window's top left.
         depth: (n, H, W) mm, out; 0 where nothing was drawn.
     """
     inverse = np.empty(depth.shape[1:])
@@ -144,7 +144,7 @@ def draw_batch(vertices, faces, rotation, translation, intrinsics, origin, depth
 
 @njit(cache=True, parallel=True, nogil=True)
 def draw_batch_parallel(vertices, faces, rotation, translation, intrinsics, origin, depth):
-    """Depth pictures of n meshes on all threads; see `draw`.
+    """Depth images of n meshes on all threads; see `draw`.
 
     Args:
         vertices: (n, V, 3) mm.
@@ -152,7 +152,7 @@ def draw_batch_parallel(vertices, faces, rotation, translation, intrinsics, orig
         rotation: (n, 3, 3).
         translation: (n, 3) mm.
         intrinsics: (n, 4) fx, fy, cx, cy px.
-        origin: (n, 2) the picture's pixel (u, v) at the window's top left.
+        origin: (n, 2) the image's pixel (u, v) at the window's top left.
         depth: (n, H, W) mm, out; 0 where nothing was drawn.
     """
     for i in prange(len(vertices)):

@@ -21,7 +21,7 @@ _FEWEST_FACES = 4
 def read_mesh(path: Path, unit_mm: float, origin: str) -> dict[str, Any]:
     """The entries of a [surface] table for the mesh of a file.
 
-    Thinned out to what a depth picture shows: at most 4000 triangles; vertices are rounded to a
+    Thinned out to what a depth image shows: at most 4000 triangles; vertices are rounded to a
     thousandth of a mm.
 
     Args:

@@ -1,4 +1,4 @@
-"""The surface around a skeleton as a triangle mesh, and its depth picture.
+"""The surface around a skeleton as a triangle mesh, and its depth image.
 
 A skeleton's [surface] table says which kind it is: `stations` with half widths and heights make a
 tube along one chain of joints, a generalised cylinder with superelliptic cross-sections (the
@@ -30,7 +30,7 @@ from liex_lab.runtime.threads import threads
 Array = NDArray[np.float64]
 Body = BodyShape | Capsules | MeshBody
 Window = tuple[int, int, int, int]
-# a silhouette is seen from so many times its reach, in a picture of so many pixels
+# a silhouette is seen from so many times its reach, in an image of so many pixels
 _FAR = 50.0
 _SILHOUETTE_PX = 400
 
@@ -144,7 +144,7 @@ class Surface:
         )
 
     def _silhouette_mm2(self) -> float:
-        """The area of the home pose from straight above, counted in a picture from very far
+        """The area of the home pose from straight above, counted in an image from very far
         away.
         """
         mesh = self.vertices(Pose.home(self.skeleton))
@@ -240,12 +240,12 @@ class Surface:
         T_camera_pose: SE3 | None = None,
         **skinning: Array | float | None,
     ) -> NDArray[np.float32]:
-        """Depth picture of one pose alone; see `vertices` and `render_mesh`.
+        """Depth image of one pose alone; see `vertices` and `render_mesh`.
 
         Args:
             pose: one pose.
             camera: the ideal pinhole camera.
-            window: (u0, v0, width, height) px of the picture; None the whole of it.
+            window: (u0, v0, width, height) px of the image; None the whole of it.
             shape: the animal; None is the default animal without ears, feet and tail.
             T_camera_pose: carries the pose's frame into the camera's; None where they are the same.
             **skinning: girth, bends and parallel of `vertices`.
@@ -264,13 +264,13 @@ def render_mesh(
     window: Window | None = None,
     T_camera_mesh: SE3 | None = None,
 ) -> NDArray[np.float32]:
-    """Depth picture of one closed mesh, by z-buffer.
+    """Depth image of one closed mesh, by z-buffer.
 
     Args:
         vertices: (V, 3) mm, in the camera frame or in one that T_camera_mesh carries there.
         faces: (F, 3) int32.
         camera: the ideal pinhole camera.
-        window: (u0, v0, width, height) px of the picture; None the whole of it.
+        window: (u0, v0, width, height) px of the image; None the whole of it.
         T_camera_mesh: carries the mesh's frame into the camera's; None where they are the same.
 
     Returns:
@@ -308,14 +308,14 @@ def render_meshes(
     size: tuple[int, int],
     parallel: bool = True,
 ) -> NDArray[np.float32]:
-    """Depth pictures of many meshes, each seen by its own camera in its own window.
+    """Depth images of many meshes, each seen by its own camera in its own window.
 
     Args:
         vertices: (n, V, 3) mm.
         faces: (F, 3) int32, shared.
         T_camera_mesh: (n) transforms from the meshes' frames into the cameras'.
         intrinsics: (n, 4) fx, fy, cx, cy px.
-        origin: (n, 2) the picture's pixel (u, v) at the window's top left.
+        origin: (n, 2) the image's pixel (u, v) at the window's top left.
         size: (width, height) px of the windows.
         parallel: whether to use all threads, else one.
 

@@ -280,7 +280,7 @@ class Cascade:
         """Features of finished candidates, as the learned metric sees them.
 
         They are taken from all joints; where the method asks, the residuals of the posed body
-        against the height map are appended to the scalars (METHOD lesson 4).
+        against the height map are appended to the scalars.
 
         Args:
             images: the images that the candidates lie on.
@@ -346,7 +346,7 @@ class Cascade:
 
         Base: log(g_est^-1 g_true) (Eq. 11) with lengths at home size and, where the method asks,
         the logarithm of the ratio of scales. Other joints: the rotation about the free axes that
-        remains, or the one that aims the bone at the true next joint (METHOD lesson 7).
+        remains, or the one that aims the bone at the true next joint.
 
         Args:
             candidates: n candidates with the joint in place.
@@ -355,7 +355,7 @@ class Cascade:
 
         Returns:
             (n, n_values) labels, rotations and log scale times their lever arms, and (n,) bool, the
-            samples that lie near enough to the truth to be worth learning from (METHOD lesson 1).
+            samples that lie near enough to the truth to be worth learning from.
         """
         method = self.method
         i = candidates.image

@@ -7,7 +7,7 @@ exponential map of SE(3),
     g_{1:j} <- g_{1:j} exp(r)                                                       (Eq. 10);
 
 a learned metric scores the resulting candidates. Where the paper returns the candidate with the
-lowest score, the default method returns a weighted mean of the best ones (METHOD lesson 3),
+lowest score, the default method returns a weighted mean of the best ones,
 followed by a forest correction, a ridge correction or a Gauss-Newton refinement as the method asks.
 `PoseEstimator` is the class that users hold.
 """

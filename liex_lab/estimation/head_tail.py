@@ -24,7 +24,7 @@ from liex_lab.runtime.shapes import check_shapes
 
 Array = NDArray[np.float64]
 
-# at the reference length: how far the picture reaches along and across the animal, and its step
+# at the reference length: how far the image reaches along and across the animal, and its step
 _ALONG_MM = 50.0
 _ACROSS_MM = 25.0
 _STEP_MM = 2.5
@@ -46,7 +46,7 @@ class HeadTailClassifier:
 
     Attributes:
         skeleton: the animal's skeleton.
-        network: the trained network on pictures from `laid_along`.
+        network: the trained network on images from `laid_along`.
     """
 
     skeleton: Skeleton
@@ -56,11 +56,11 @@ class HeadTailClassifier:
     def fit(pictures: NDArray[np.float32], right: NDArray[np.bool_], seed: int) -> Network:
         """Train the network.
 
-        Pictures are also learned from in the mirror. Weights are rounded to what the model file
+        Depth images are also learned from in the mirror. Weights are rounded to what the model file
         holds.
 
         Args:
-            pictures: (m, A, B) float32 pictures from `laid_along`.
+            images: (m, A, B) float32 images from `laid_along`.
             right: (m,) bool, whether the poses point in the right direction.
             seed: of the network's training.
         """
@@ -88,7 +88,7 @@ class HeadTailClassifier:
     def logits(self, images: ImageSet, joints: Array, size: float) -> Array:
         """Log odds that poses point in the right direction.
 
-        They are the mean over the picture and its mirror image, computed in double precision and
+        They are the mean over the image and its mirror image, computed in double precision and
         then rounded: the last bits of a product depend on how many frames are asked about at once,
         and a frame's pose must not.
 
@@ -198,7 +198,7 @@ def laid_along(
 
 
 def _flat(pictures: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Pictures (n, A, B) as rows (n, A B)."""
+    """Depth images (n, A, B) as rows (n, A B)."""
     return np.ascontiguousarray(pictures).reshape(len(pictures), -1)
 
 

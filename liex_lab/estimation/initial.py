@@ -71,7 +71,7 @@ def start_poses(
     """Base poses of K candidates for each of n animals.
 
     Along the long axis, every other start points the other way, and the headings are the more
-    spread out the rounder the animal looks (METHOD lesson 8). The paper's start has any heading in
+    spread out the rounder the animal looks. The paper's start has any heading in
     (-pi, pi), the base at the centroid and at the animal's mean height, and bones scaled by a
     factor uniform in [0.9, 1.1].
 

@@ -118,7 +118,7 @@ class Method:
     proposal_reach_mm: float = 0.0
     # rounds of the base joint where they are not as many as the others'; 0: as many
     base_rounds: int = 0
-    refine_steps: int = 0  # of taking a pose into the picture
+    refine_steps: int = 0  # of taking a pose into the image
     # candidates that are taken there beside the mean of the best; the one that fits is chosen
     refined: int = 0
     explains: bool = False  # the metric also knows what the posed body leaves unexplained [4]

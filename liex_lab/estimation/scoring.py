@@ -1,7 +1,7 @@
 """Candidate selection: weighted mean of the best-scored poses on the manifold; expected error.
 
 Lie-X Algorithm 1 returns the candidate with the lowest score of the learned metric. Here the best k
-candidates near that one are averaged (METHOD lesson 3) with weights
+candidates near that one are averaged with weights
 
     w_i ~ exp(-(score_i - score_best) / tau);
 
@@ -106,7 +106,7 @@ def choose(
     """Average the best candidates of each frame on the manifold.
 
     The `top_k` candidates with the lowest predicted error that lie near the best one are averaged
-    with weights exp(-(score - best) / tau) (METHOD lesson 3). In an unbranched skeleton each bone
+    with weights exp(-(score - best) / tau). In an unbranched skeleton each bone
     then turns by the smallest rotation onto its mean direction, and the scale follows from the
     total length; a branched one is averaged joint by joint, see `mean_pose`.
 

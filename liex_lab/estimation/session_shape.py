@@ -138,7 +138,7 @@ def _grouped(values: Array, weight: Array, n: int) -> Array:
 
 
 def _stations(skeleton: Skeleton, joints: Array) -> tuple[Array, Array]:
-    """Points (n, S, 3) on the mid-axis, and unit vectors (n, S, 2) across it in the picture."""
+    """Points (n, S, 3) on the mid-axis, and unit vectors (n, S, 2) across it in the image."""
     reach = joint_reaches(skeleton)
     at = np.linspace(_FROM, _TO, N_STATIONS)
     bone = np.clip(np.searchsorted(reach, at, side="right") - 1, 0, len(reach) - 2)

@@ -3,7 +3,7 @@
 Each forest is trained on the state that its predecessors left: after round c of joint j its
 prediction moves all training candidates, and the label of the next round is again log(g_est^-1
 g_true) (Eq. 11). Where the method says so, a candidate is moved only by trees that were not grown
-on its image (METHOD lesson 6).
+on its image.
 
 The learned metric R_m (section 4.1) is a forest that predicts the mean joint error of a pose
 without the truth. The paper trains it on perturbed true poses; the default method trains it on the

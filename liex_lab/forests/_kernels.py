@@ -12,7 +12,7 @@ A node is four int32, 16 bytes, one quarter of a cache line:
 
 Tests compare a response with the threshold and go right when it is at least as large:
     TWO_PROBES  height under x + g(u) minus height under x + g(v)         (Lie-X Eq. 15)
-    ONE_PROBE   height under x + g(u) minus the joint's own height        (METHOD lesson 2)
+    ONE_PROBE   height under x + g(u) minus the joint's own height
     SCALAR      a number that describes the whole animal from the joint's point of view
 Heights are 1/16 mm of an animal of home size, so one forest serves animals of every size.
 

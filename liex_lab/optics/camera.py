@@ -38,7 +38,7 @@ _WIDEST = 8.0  # tangent of the largest angle from the optical axis that is cons
 class Distortion:
     """How a lens bends rays.
 
-    An ideal pinhole's ray (x, y, 1) meets the picture where (x', y', 1) should.
+    An ideal pinhole's ray (x, y, 1) meets the image where (x', y', 1) should.
 
     `of` makes one from what a file states.
 
@@ -105,7 +105,7 @@ class Distortion:
         return float(r[turned[0]]) if len(turned) else _WIDEST
 
     def _radius(self, r: Array) -> Array:
-        """Where a ray at radius r (...) of the ideal picture meets the real one, without the
+        """Where a ray at radius r (...) of the ideal image meets the real one, without the
         tangential part.
         """
         k = self.coefficients
@@ -146,7 +146,7 @@ class Distortion:
         )
 
     def undistort(self, xy: ArrayLike) -> Array:
-        """The ideal rays that met the picture at given points; NaN where none within `limit` does.
+        """The ideal rays that met the image at given points; NaN where none within `limit` does.
 
         The radius by bisection of the radial part, which increases, then Newton's steps for the
         small tangential one.
@@ -197,7 +197,7 @@ class Distortion:
 
 @dataclass(frozen=True)
 class Lens:
-    """The intrinsics of a camera, stated without the size of its pictures.
+    """The intrinsics of a camera, stated without the size of its images.
 
     Attributes:
         fx: focal length along rows, px.
@@ -229,10 +229,10 @@ class Lens:
 
 @dataclass(frozen=True)
 class Camera(Lens):
-    """A depth camera: pinhole intrinsics, lens distortion, and the size of its pictures.
+    """A depth camera: pinhole intrinsics, lens distortion, and the size of its images.
 
     Pixels; (0, 0) is the centre of the top-left pixel. Camera frame: x right, y down, z away from
-    the lens, mm. Only a recording as it was opened may have a distortion; what looks at pictures
+    the lens, mm. Only a recording as it was opened may have a distortion; what looks at images
     wants an ideal pinhole and gets it from `recordings.rectify`.
 
     Attributes:
@@ -241,7 +241,7 @@ class Camera(Lens):
         source: names where the intrinsics come from.
 
     Raises:
-        LiexError: a picture without pixels, or intrinsics that `Lens` refuses.
+        LiexError: an image without pixels, or intrinsics that `Lens` refuses.
     """
 
     width: int
@@ -293,7 +293,7 @@ class Camera(Lens):
         return np.stack([x * z, y * z, z * np.ones_like(u)], axis=-1)
 
     def every(self, stride: int) -> Camera:
-        """The camera whose picture is every `stride`-th row and column of this one's.
+        """The camera whose image is every `stride`-th row and column of this one's.
 
         Args:
             stride: pixels from one to the next, at least 1.
@@ -358,7 +358,7 @@ _AZURE = Distortion(
 _FEMTO = Distortion(
     BROWN_CONRADY, (8.68957, 4.46817, 0.0, 0.0, 0.172922, 9.01699, 7.37854, 1.05598)
 )
-# of each name, one camera for each size of its pictures
+# of each name, one camera for each size of its images
 PRESETS = {
     "kinect-v2": (KINECT_V2,),
     "primesense": (PRIMESENSE, PRIMESENSE_QVGA),
@@ -373,21 +373,21 @@ PRESETS = {
     "raytrix-r5": (RAYTRIX_R5,),
 }
 
-_LIKE = 0.1  # units of a make, and pictures mapped onto another lens, differ by less than this
+_LIKE = 0.1  # units of a make, and images mapped onto another lens, differ by less than this
 # sizes that few kinds of camera have; of others there are too many to call a lens unusual
 _TELLING = ((640, 480), (512, 424), (320, 240), (640, 576))
 
 
 def preset(name: str, width: int, height: int) -> Camera:
-    """The camera of a name, for pictures of a size.
+    """The camera of a name, for images of a size.
 
     Args:
         name: a key of `PRESETS`.
-        width: columns of the pictures, px.
-        height: rows of the pictures, px.
+        width: columns of the images, px.
+        height: rows of the images, px.
 
     Raises:
-        LiexError: there is no such name, or that camera takes no pictures of this size.
+        LiexError: there is no such name, or that camera takes no images of this size.
     """
     cameras = PRESETS.get(name)
     if cameras is None:
@@ -415,11 +415,11 @@ def preset(name: str, width: int, height: int) -> Camera:
 
 
 def of_size(width: int, height: int) -> list[str]:
-    """Names of the cameras that take pictures of a size.
+    """Names of the cameras that take images of a size.
 
     Args:
-        width: columns of the pictures, px.
-        height: rows of the pictures, px.
+        width: columns of the images, px.
+        height: rows of the images, px.
     """
     return [
         name
@@ -429,13 +429,13 @@ def of_size(width: int, height: int) -> list[str]:
 
 
 def unusual_lens(camera: Camera) -> str:
-    """That a focal length is unlike that of every known camera with such pictures; "" if it is not.
+    """That a focal length is unlike that of every known camera with such images; "" if it is not.
 
-    A focal length that is wrong makes every length across the picture wrong by as much, and the
+    A focal length that is wrong makes every length across the image wrong by as much, and the
     animal another one of the same look: nothing else in a recording tells.
 
     Args:
-        camera: as the recording or the plan states it, of pictures above no water.
+        camera: as the recording or the plan states it, of images above no water.
     """
     size = (camera.width, camera.height)
     known = {
@@ -455,13 +455,13 @@ def unusual_lens(camera: Camera) -> str:
 
 
 def is_central(cx: float, cy: float, width: int, height: int, share: float = 0.4) -> bool:
-    """Whether a principal point lies in the middle of a picture.
+    """Whether a principal point lies in the middle of an image.
 
     Args:
         cx: its column, px.
         cy: its row, px.
-        width: columns of the picture, px.
-        height: rows of the picture, px.
+        width: columns of the image, px.
+        height: rows of the image, px.
         share: how much of the width and height the middle is.
     """
     off = max(abs((cx + 0.5) / width - 0.5), abs((cy + 0.5) / height - 0.5))
@@ -469,7 +469,7 @@ def is_central(cx: float, cy: float, width: int, height: int, share: float = 0.4
 
 
 def unusual_centre(camera: Camera) -> tuple[str, bool]:
-    """That a principal point lies far from the middle of the picture, and whether at its edge.
+    """That a principal point lies far from the middle of the image, and whether at its edge.
 
     Args:
         camera: as the recording or the plan states it.

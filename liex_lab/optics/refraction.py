@@ -6,7 +6,7 @@ put right by following the camera's ray down. Which depth the camera reports, th
 depends on how it measures:
 
 - `light_field` (plenoptic cameras, many small views in all directions) and `structured_light` (also
-  stereo; two views side by side along the picture's rows) triangulate: the apparent point is where
+  stereo; two views side by side along the image's rows) triangulate: the apparent point is where
   the back-traced rays of neighbouring views intersect. Seen straight down that is at depth / n
   below the surface. Obliquely the rays of a point meet in two places (refraction at a plane is
   astigmatic): views displaced within the plane of incidence see it at d cos^3(i) / (n cos^3(r)),
@@ -44,8 +44,8 @@ class Water:
     Attributes:
         height_mm: of the lens above the surface, along the perpendicular.
         refractive_index: of water over air, at least 1.
-        tilt_x_rad: how the surface recedes from the camera towards the right of the picture.
-        tilt_y_rad: how it recedes towards the lower edge of the picture.
+        tilt_x_rad: how the surface recedes from the camera towards the right of the image.
+        tilt_y_rad: how it recedes towards the lower edge of the image.
         ranging: one of `RANGINGS`, see the module.
 
     Raises:
@@ -186,7 +186,7 @@ class Water:
         across = np.zeros_like(cos_air)
         for k in (
             axes
-        ):  # the disparity of a displacement along one picture axis is measured along that axis
+        ):  # the disparity of a displacement along one image axis is measured along that axis
             slope = ray[..., k] / ray[..., 2]
             within += (along[..., k] - slope * along[..., 2]) * along[..., k]
             across += (side[..., k] - slope * side[..., 2]) * side[..., k]

@@ -16,10 +16,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numba import njit
 
-BLOCK = 4  # pixels a side; blobs are connected in blocks
-# every other row is looked at: reading a picture takes longer than anything that is done with it
+BLOCK = 4  # pixels per side; blobs are connected in blocks
+# only every other row is read: reading an image takes longer than processing it
 _ROW_STEP = 2
-_MIN_IN_BLOCK = 3  # of the 8 pixels looked at
+_MIN_IN_BLOCK = 3  # of the 8 inspected pixels
 MAX_BLOBS = 32
 _MIN_UNREAD = 9  # of 16 pixels
 _SLOPE_PASSES = 5
@@ -27,7 +27,7 @@ _LEVEL_PASSES = 3
 
 
 class Blob(NamedTuple):
-    """The counts of one component, in the order in which they are packed.
+    """The counts of one component, in packing order.
 
     Attributes:
         n_px: foreground pixels.
@@ -36,7 +36,7 @@ class Blob(NamedTuple):
         first_column: first column of blocks.
         last_column: last column of blocks.
         depth_sum: sum of the depths of its pixels, mm.
-        n_on_floor: how many of its pixels lie on the floor.
+        n_on_floor: its pixels on the floor.
     """
 
     n_px: Any
@@ -53,7 +53,7 @@ _BLOB_N_PX = Blob._fields.index("n_px")
 
 
 class BlobMoments(NamedTuple):
-    """The moments of one component, or columns (n,) of many, in the order in which they are packed.
+    """The moments of one component, or columns (n,) of many, in packing order.
 
     Attributes:
         n_px: readings on the animal, pixels of the height map.
@@ -64,7 +64,7 @@ class BlobMoments(NamedTuple):
         angle: direction of the long axis, rad, modulo pi.
         sd_along: standard deviation along the long axis, mm.
         sd_across: standard deviation across it, mm.
-        slope: how steeply the back rises along it; 0 where it is not measured.
+        slope: slope of the back along it; 0 if not measured.
     """
 
     n_px: Any
@@ -128,19 +128,19 @@ def unpack_moments(packed):
 def label_blobs(depth, limit, on_floor, bridge, labels, blobs):
     """Connected components of the pixels nearer than a limit, in blocks.
 
-    Every other row is looked at; a block counts where 3 of the 8 pixels do. Up to `bridge` blocks
-    without readings do not part a component.
+    Every other row is read; a block counts if 3 of its 8 pixels do. Up to `bridge` unread blocks do
+    not split a component.
 
     Args:
         depth: (H, W) mm, 0 where unread.
         limit: (H, W) mm; a reading below it is foreground.
         on_floor: (H, W) bool, the floor.
-        bridge: blocks without readings that may lie between the parts of one component.
+        bridge: unread blocks allowed between the parts of one component.
         labels: (H // BLOCK, W // BLOCK) int32, out: the component of each block, -1 for none.
         blobs: (MAX_BLOBS, N_BLOB), out: a packed `Blob` for each component.
 
     Returns:
-        The number of components, the largest ones where there are more than fit.
+        The number of components; the largest ones if there are more than fit.
     """
     n_rows, n_columns = labels.shape
     hits = np.empty(n_columns * BLOCK, np.uint8)
@@ -176,10 +176,10 @@ def label_blobs(depth, limit, on_floor, bridge, labels, blobs):
 
 @njit(cache=True)
 def layers(depth, limit, labels, slot, blob, apart):
-    """The depth that parts a component into a near and a far layer, and the extent of both.
+    """The depth that separates a component into a near and a far layer, and the extent of both.
 
-    The largest gap in the sorted depths of its blocks that is wider than `apart`. Blocks count with
-    their middle depth: one that an edge goes through belongs to one side of it.
+    The largest gap in the sorted depths of its blocks that is wider than `apart`. A block counts
+    with its middle depth, so one on an edge belongs to one side of it.
 
     Args:
         depth: (H, W) mm, 0 where unread.
@@ -226,7 +226,7 @@ def layers(depth, limit, labels, slot, blob, apart):
 
 @njit(cache=True)
 def forget(labels, slot):
-    """Make background, -1, of the blocks labelled `slot` in labels (h, w)."""
+    """Turn the blocks labelled `slot` in labels (h, w) into background, -1."""
     for i in range(labels.shape[0]):
         for j in range(labels.shape[1]):
             if labels[i, j] == slot:
@@ -318,9 +318,9 @@ def is_animal_block(labels, row, column, slot):
 def cut_heights(depth, limit, labels, slot, plane, distance, origin, step, raw):
     """Heights above a plane of a component's pixels, on a crop.
 
-    A point at depth z seen at (u, v) is `distance * (1 - z (a u + b v + c))` high. Crop pixel (r,
-    c) is picture pixel origin + step * (c, r). The outermost ring stays background, so a probe
-    clamped to the border reads what lies outside.
+    The height of a point at depth z in pixel (u, v) is `distance * (1 - z (a u + b v + c))`. Crop
+    pixel (r, c) is image pixel origin + step * (c, r). The outermost ring stays background, so a
+    probe clamped to the border reads background.
 
     Args:
         depth: (H, W) mm, 0 where unread.
@@ -329,9 +329,9 @@ def cut_heights(depth, limit, labels, slot, plane, distance, origin, step, raw):
         slot: the component.
         plane: (3,) a, b, c of the plane, 1 / z = a u + b v + c.
         distance: of the camera from it, mm.
-        origin: (2,) int32, picture pixel (u, v) of crop pixel (0, 0).
-        step: picture pixels a crop pixel.
-        raw: (S, S) float32 mm, out: heights, -1 background, -2 without a reading.
+        origin: (2,) int32, image pixel (u, v) of crop pixel (0, 0).
+        step: image pixels per crop pixel.
+        raw: (S, S) float32 mm, out: heights, -1 background, -2 unread.
     """
     size = raw.shape[0]
     height, width = depth.shape
@@ -369,11 +369,11 @@ def find_root(parent, k):
 
 @njit(cache=True)
 def keep_largest(raw, runs):
-    """Erase all pixels of a crop but the largest group, in which no gap is wider than a pixel.
+    """Erase all pixels of a crop except the largest group, in which no gap is wider than a pixel.
 
-    Blocks join what is a few pixels apart; pixel by pixel a neighbour is told from the animal. Rows
-    are taken as runs of pixels, and union-find joins the runs that touch, or nearly, those in the
-    two rows above.
+    Blocks connect what is a few pixels apart; this separates a neighbour from the animal pixel by
+    pixel. Rows are split into runs of pixels, and union-find joins the runs that touch, or nearly
+    touch, those in the two rows above.
 
     Args:
         raw: (S, S) float32, -1 background; changed in place.
@@ -424,16 +424,16 @@ def keep_largest(raw, runs):
 
 @njit(cache=True)
 def level_heights(raw, behind_mm):
-    """Lift all heights so that their mean becomes behind_mm, and erase what is then not above 0.
+    """Shift all heights so that their mean becomes behind_mm, and erase those not above 0.
 
-    The mean leaves out what lies farther than behind_mm from it (three passes).
+    The mean excludes heights farther than behind_mm from it (three passes).
 
     Args:
         raw: (S, S) float32 mm; changed in place.
         behind_mm: height of the mean.
 
     Returns:
-        The lift, mm.
+        The shift, mm.
     """
     mean = 0.0
     reach = np.inf
@@ -459,15 +459,15 @@ def level_heights(raw, behind_mm):
 
 @njit(cache=True)
 def smooth_heights(raw, radius, out):
-    """Box-filtered heights, with holes filled from what surrounds them.
+    """Box-filtered heights, with holes filled from their surroundings.
 
-    A pixel of the animal becomes the mean of the animal's pixels within `radius`; a pixel without
-    reading becomes that mean within one pixel more where at least 5 of the pixels there are the
-    animal and more than twice as many of them as are background. Sums over boxes are differences of
-    running sums (a summed-area table).
+    A pixel of the animal becomes the mean of the animal's pixels within `radius`; an unread pixel
+    becomes that mean within one pixel more if at least 5 of the pixels there are the animal and
+    more than twice as many of them as are background. Sums over boxes are differences of running
+    sums (a summed-area table).
 
     Args:
-        raw: (S, S) float32 mm, -1 background, -2 without a reading.
+        raw: (S, S) float32 mm, -1 background, -2 unread.
         radius: of the box, px; its side is 2 radius + 1.
         out: (S, S) int16, 1/16 mm, out: 0 background, at most 32000.
     """
@@ -519,15 +519,15 @@ def blob_moments(heights, origin, step, plane, intrinsics, rotation, distance, m
 
     Args:
         heights: (S, S) int16, 1/16 mm, 0 background.
-        origin: (2,) int32, picture pixel (u, v) of crop pixel (0, 0).
-        step: picture pixels a crop pixel.
+        origin: (2,) int32, image pixel (u, v) of crop pixel (0, 0).
+        step: image pixels per crop pixel.
         plane: (3,) a, b, c of the reference plane, 1 / z = a u + b v + c.
         intrinsics: (4,) fx, fy, cx, cy px.
         rotation: (3, 3) of T_view_camera, whose translation is (0, 0, distance).
         distance: of the camera from the plane, mm.
         moments: (N_MOMENTS,), out: pixels, area mm^2 (seen from the camera), volume mm^3, x, y mm
             of the centroid, angle rad of the long axis (mod pi), the standard deviations mm along
-            and across it, and 0, where `back_slope` may go. All 0 for an empty map.
+            and across it, and 0, reserved for `back_slope`. All 0 for an empty map.
     """
     n = 0
     area = 0.0
@@ -586,21 +586,21 @@ def blob_moments(heights, origin, step, plane, intrinsics, rotation, distance, m
 
 @njit(cache=True)
 def back_slope(heights, origin, step, intrinsics, distance, moments):
-    """How steeply the back rises along the long axis, in a height map cut along the optical axis.
+    """Slope of the back along the long axis, in a height map cut along the optical axis.
 
-    A straight line through the heights, in which readings far off it count less with every pass
-    (Geman and McClure's weights), for a light field errs grossly in patches.
+    A line fit to the heights that downweights outliers with every pass (Geman and McClure's
+    weights), as light fields have large errors in patches.
 
     Args:
         heights: (S, S) int16, 1/16 mm, 0 background.
-        origin: (2,) int32, picture pixel (u, v) of crop pixel (0, 0).
-        step: picture pixels a crop pixel.
+        origin: (2,) int32, image pixel (u, v) of crop pixel (0, 0).
+        step: image pixels per crop pixel.
         intrinsics: (4,) fx, fy, cx, cy px.
         distance: of the camera from the reference plane, mm.
         moments: (N_MOMENTS,) of the map, see `blob_moments`.
 
     Returns:
-        Height mm a mm along the axis.
+        Height mm per mm along the axis.
     """
     size = heights.shape[0]
     along = np.empty(size * size)

@@ -1,15 +1,16 @@
-"""Kernels of geodesic extrema: where surfaces end that come into the picture, as an arm in a hand.
+"""Kernels of geodesic extrema: the ends of surfaces that enter the image, such as the hand of an
+arm.
 
-The geodesic distance from where a surface leaves the picture is found by breadth-first search over
+The geodesic distance from where a surface leaves the image is found by breadth-first search over
 its blocks; its maxima are the extrema (accumulative geodesic extrema, Plagemann et al., ICRA 2010).
-A maximum counts by its persistence (Edelsbrunner et al. 2002): added from the far end inwards,
-blocks make islands that a union-find merges, and the lower of two islands that meet has stuck out
-by the difference.
+A maximum is rated by its persistence (Edelsbrunner et al. 2002): blocks are added from the far end
+inwards and form islands that a union-find merges; when two islands meet, the lower one has
+protruded by the difference.
 
-Arrays that all kernels share: blocks (h, w) float32, the depth in mm of what is nearest in every
-block of BLOCK x BLOCK pixels, 0 for nothing within range; labels (h, w) int32, which surface a
-block belongs to, -1 none. The blocks of one surface are also listed (`Surface`), for most of a
-picture is none.
+Arrays shared by all kernels: blocks (h, w) float32, the nearest depth in mm in every block of BLOCK
+x BLOCK pixels, 0 for nothing within range; labels (h, w) int32, the surface of each block, -1 for
+none. The blocks of one surface are also listed (`SurfaceBlocks`), as most of an image belongs to
+none.
 """
 
 from __future__ import annotations
@@ -24,20 +25,20 @@ from liex_lab.scene._blob_kernels import BLOCK, find_root
 
 MAX_SURFACES = 24
 MAX_TIPS = 256
-# of a home-sized hand: how far its points and the beginning of its arm lie from its middle
+# of a home-sized hand: distance of its points and of the start of its arm from its middle
 AROUND_MM = 190.0
 _MIN_IN_BLOCK = 5
-_THICK_MM = 25.0  # readings of one block this far behind its nearest belong to something else
+_THICK_MM = 25.0  # readings this far behind the nearest of a block belong to another surface
 _JUMP_MM = 50.0  # neighbouring blocks differ by less on one surface
-# of a home-sized hand: an end of a surface stands out by this, which an elbow does not
+# of a home-sized hand: least persistence of an end, which an elbow does not reach
 _STICKS_OUT_MM = 90.0
-# sticking out once more as far is worth being nearer by this, up to so often
+# each further multiple of that persistence counts as being nearer by this, up to a maximum
 _WORTH_MM = 60.0
 _MOST_OUT = 3.0
-_APART = 0.6  # of that radius: ends that lie nearer to each other show the same hand
-_MARGIN = 2  # blocks: many cameras read nothing along the borders of their pictures
-# columns of a geodesic extremum: depth mm, less for what sticks out far, by which they are ranked;
-# block row; block column; depth mm
+_APART = 0.6  # of that radius: ends nearer to each other are the same hand
+_MARGIN = 2  # blocks: many cameras have no readings along the image border
+# columns of a geodesic extremum: rank (depth mm, reduced for large persistence); block row; block
+# column; depth mm
 N_END = 4
 END_RANK = 0
 END_ROW = 1
@@ -45,7 +46,7 @@ END_COLUMN = 2
 END_DEPTH = 3
 
 
-class Surface(NamedTuple):
+class SurfaceBlocks(NamedTuple):
     """The n blocks of a surface, row by row.
 
     Attributes:
@@ -61,15 +62,15 @@ class Surface(NamedTuple):
 
 @njit(cache=True)
 def block_depths(depth, near, far, blocks):
-    """The depth of what is nearest in every block.
+    """The nearest depth in every block.
 
     The mean of the readings up to 25 mm behind the block's second nearest.
 
     Args:
         depth: (H, W) mm, 0 where unread.
-        near: nearer than this nothing counts, mm.
-        far: farther than this nothing counts, mm.
-        blocks: (h, w) float32 mm, out; 0 where fewer than 5 readings agree.
+        near: nearer readings are ignored, mm.
+        far: farther readings are ignored, mm.
+        blocks: (h, w) float32 mm, out; 0 if fewer than 5 readings agree.
     """
     nothing = np.float32(1e9)
     for i in range(blocks.shape[0]):
@@ -82,7 +83,7 @@ def block_depths(depth, near, far, blocks):
                     z = z if near < z < far else nothing
                     second = min(
                         second, max(first, z)
-                    )  # no branches: what comes next cannot be foretold
+                    )  # branch-free, as branches would be unpredictable
                     first = min(first, z)
             total = 0.0
             n = 0
@@ -100,11 +101,11 @@ def block_depths(depth, near, far, blocks):
 def label_surfaces(blocks, labels, focal2, least_mm2, areas):
     """Connected surfaces: flood fill over blocks whose depths differ by less than 50 mm.
 
-    Where there are more than fit, the largest are kept.
+    If there are more than fit, the largest are kept.
 
     Args:
         blocks: (h, w) float32 mm.
-        labels: (h, w) int32, out: the surface of each block, -1 none.
+        labels: (h, w) int32, out: the surface of each block, -1 for none.
         focal2: fx * fy, px^2.
         least_mm2: smaller surfaces are dropped.
         areas: (MAX_SURFACES,) mm^2, out.
@@ -164,11 +165,11 @@ def list_surfaces(blocks, labels, n_surfaces, intrinsics):
     Args:
         blocks: (h, w) float32 mm.
         labels: (h, w) int32.
-        n_surfaces: surfaces that are labelled.
+        n_surfaces: labelled surfaces.
         intrinsics: (4,) fx, fy, cx, cy px.
 
     Returns:
-        A `Surface` of each.
+        A `SurfaceBlocks` for each.
     """
     starts = np.zeros(n_surfaces + 1, np.int64)
     for i in range(labels.shape[0]):
@@ -191,7 +192,7 @@ def list_surfaces(blocks, labels, n_surfaces, intrinsics):
                     blocks, i, j, intrinsics
                 )
     return [
-        Surface(
+        SurfaceBlocks(
             slot,
             cells[starts[slot] : starts[slot + 1]],
             points[starts[slot] : starts[slot + 1]],
@@ -202,17 +203,17 @@ def list_surfaces(blocks, labels, n_surfaces, intrinsics):
 
 @njit(cache=True)
 def walk(blocks, labels, surface, position, order, hops):
-    """All blocks of a surface by geodesic distance from where it leaves the picture.
+    """All blocks of a surface by geodesic distance from where it leaves the image.
 
-    Breadth-first search in steps of one block. Of the border, only the farther part counts as the
-    arm, since a hand may touch it, too. A surface that does not leave the picture is walked from
+    Breadth-first search in steps of one block. Only the farther part of the border counts as the
+    arm, since a hand may touch it, too. If a surface does not leave the image, the search starts at
     its farthest block.
 
     Args:
         blocks: (h, w) float32 mm.
         labels: (h, w) int32.
-        surface: the `Surface`.
-        position: (h, w) int32, out: where in the order a block is; comes in as -1.
+        surface: the `SurfaceBlocks`.
+        position: (h, w) int32, out: index of each block in the order; -1 on entry.
         order: (n_blocks, 2) int32, out: row and column of the blocks.
         hops: (n_blocks,) int32, out: their distances in blocks.
 
@@ -264,7 +265,7 @@ def walk_from(blocks, labels, slot, i, j, position, order, hops):
         slot: the surface.
         i: row of the block.
         j: column of the block.
-        position: (h, w) int32, out; comes in as -1.
+        position: (h, w) int32, out; -1 on entry.
         order: (n_blocks, 2) int32, out.
         hops: (n_blocks,) int32, out.
 
@@ -280,7 +281,7 @@ def walk_from(blocks, labels, slot, i, j, position, order, hops):
 
 @njit(cache=True)
 def _spread(blocks, labels, slot, n, position, order, hops):
-    """Breadth-first search from the first n blocks; returns how many there are in the end."""
+    """Breadth-first search from the first n blocks; returns the final number of blocks."""
     at = 0
     while at < n:
         i = order[at, 0]
@@ -301,22 +302,21 @@ def _spread(blocks, labels, slot, n, position, order, hops):
 
 @njit(cache=True)
 def ends(blocks, order, hops, position, n, focal, least_mm, tips, n_tips):
-    """The geodesic extrema of a walked surface whose persistence is at least `least_mm`.
+    """The geodesic extrema of a traversed surface whose persistence is at least `least_mm`.
 
-    From the far end of the walk inwards, islands appear and grow together; the lower of two islands
-    that meet has stuck out by the difference (its persistence). The farthest block of the walk is
-    an extremum in any case.
+    From the far end inwards, islands appear and grow together; when two islands meet, the lower one
+    has protruded by the difference (its persistence). The farthest block is always an extremum.
 
     Args:
         blocks: (h, w) float32 mm.
-        order: (n, 2) int32, blocks in the order of the walk.
+        order: (n, 2) int32, blocks in the order of the search.
         hops: (n,) int32, their distances in blocks.
-        position: (h, w) int32, where in the order a block is.
-        n: blocks of the walk.
+        position: (h, w) int32, index of each block in the order.
+        n: blocks reached.
         focal: px.
-        least_mm: by how much an extremum stands out, mm.
+        least_mm: least persistence, mm.
         tips: (MAX_TIPS, N_END), out: the extrema, columns END_RANK to END_DEPTH.
-        n_tips: rows that are filled already.
+        n_tips: rows filled so far.
 
     Returns:
         The number of rows filled now.
@@ -336,7 +336,7 @@ def ends(blocks, order, hops, position, n, focal, least_mm, tips, n_tips):
                 theirs = find_root(parent, other)
                 if mine == theirs:
                     continue
-                # an island is known by its outermost block, which comes last in the order
+                # an island is identified by its outermost block, which is last in the order
                 low = min(mine, theirs)
                 high = max(mine, theirs)
                 parent[low] = high
@@ -358,7 +358,7 @@ def ends(blocks, order, hops, position, n, focal, least_mm, tips, n_tips):
 
 @njit(cache=True)
 def _note(tips, n_tips, z, out, block):
-    """Add an extremum at depth z mm that sticks out `out` times as far as one must."""
+    """Add an extremum at depth z mm whose persistence is `out` times the required one."""
     if n_tips == MAX_TIPS:
         return n_tips
     tips[n_tips, END_RANK] = z - _WORTH_MM * min(out, _MOST_OUT)
@@ -370,16 +370,16 @@ def _note(tips, n_tips, z, out, block):
 
 @njit(cache=True)
 def nearest_ends(blocks, labels, surfaces, size, intrinsics, chosen):
-    """Positions where a hand may be, the nearest first, no two alike.
+    """Candidate positions of a hand, nearest first and distinct.
 
-    A surface is walked twice: from where it leaves the picture, and from the extremum that lies
-    farthest from there, as it may be the hand that lies at the border. What of it is nearest may be
-    a hand before a body that it touches.
+    A surface is searched twice: from where it leaves the image, and from the extremum farthest from
+    there, as the hand itself may touch the border. The nearest point of a surface is a candidate,
+    too: a hand may be in front of a body that it touches.
 
     Args:
         blocks: (h, w) float32 mm.
         labels: (h, w) int32.
-        surfaces: a `Surface` of each.
+        surfaces: a `SurfaceBlocks` for each.
         size: the hand's length over the skeleton's home length.
         intrinsics: (4,) fx, fy, cx, cy px.
         chosen: (m, N_END), out: rows as in `ends`, at least 0.6 of the hand's sphere apart.
@@ -439,7 +439,7 @@ def point_of_block(blocks, i, j, intrinsics):
         intrinsics: (4,) fx, fy, cx, cy px.
 
     Returns:
-        x, y and z, mm, camera frame: three numbers, for an array would be made anew for each block.
+        x, y and z, mm, camera frame: three numbers, to avoid allocating an array for each block.
     """
     z = np.float64(blocks[i, j])
     x = (j * BLOCK + 0.5 * (BLOCK - 1) - intrinsics[2]) / intrinsics[0] * z
@@ -449,11 +449,11 @@ def point_of_block(blocks, i, j, intrinsics):
 
 @njit(cache=True)
 def relabel(labels, surface):
-    """Give all blocks of a surface its own label again.
+    """Restore the label of all blocks of a surface.
 
     Args:
         labels: (h, w) int32; changed in place.
-        surface: the `Surface`.
+        surface: the `SurfaceBlocks`.
     """
     cells = surface.cells
     for k in range(len(cells)):

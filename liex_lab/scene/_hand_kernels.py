@@ -1,9 +1,9 @@
-"""Kernels that segment the hand at a geodesic extremum and cut its height map from the picture.
+"""Kernels that segment the hand at a geodesic extremum and cut its height map from the image.
 
 At an extremum a step of mean shift with a flat kernel of 60 mm (Fukunaga and Hostetler 1975) finds
-the middle of its end; a sphere of 190 mm is centred on the hand in three passes, in which what
-leaves the sphere tells the direction of the arm, and the surface is cut across it a hand's length
-(185 mm) behind the fingertips. All lengths are those of a home-sized hand.
+the middle of its end; a sphere of 190 mm is centred on the hand in three passes, in which the part
+that leaves the sphere gives the direction of the arm, and the surface is cut across it a hand's
+length (185 mm) behind the fingertips. All lengths are those of a home-sized hand.
 
 blocks and labels are those of `_geodesic_kernels`.
 """
@@ -31,12 +31,12 @@ from liex_lab.scene._geodesic_kernels import (
     relabel,
 )
 
-# what tells rendered hands from elbows, chests and heads by logistic regression, in units of the
+# separates rendered hands from elbows, chests and heads by logistic regression, in units of the
 # first: the logarithm of circumference^2 over area, which fingers make large
 _AREA_LOG_MM2 = 9.55  # of a home-sized hand
-_PER_AREA = 0.55  # what the square of the difference counts
-_PER_BORDER = 0.6  # the share that lies along the border of the picture
-# how wide it goes on behind the cut
+_PER_AREA = 0.55  # weight of the squared difference
+_PER_BORDER = 0.6  # weight of the share along the image border
+# weight of its width behind the cut
 _WRIST_MM = 50.0
 _WIDE_MM = 100.0
 _PER_WIDTH = 0.25
@@ -46,13 +46,13 @@ _ACROSS = ((-1, 0), (1, 0), (0, -1), (0, 1))
 
 
 class HandFind(NamedTuple):
-    """Where a hand is, camera frame.
+    """Position of a hand, camera frame.
 
     Attributes:
         middle: (3,) mm.
         fingers: (3,) direction of the fingers, 0 without an arm.
-        cut: where along `fingers` the arm is cut, mm from the camera.
-        area_mm2: area of what lies beyond the cut, mm^2.
+        cut: position along `fingers` of the cut through the arm, mm from the camera.
+        area_mm2: area beyond the cut, mm^2.
     """
 
     middle: Any
@@ -67,15 +67,15 @@ def unlikeness(blocks, labels, surface, mark, found, size, intrinsics):
 
     Args:
         blocks: (h, w) float32 mm.
-        labels: (h, w) int32; the blocks get the label of their surface back.
-        surface: the `Surface` that they are of.
+        labels: (h, w) int32; the blocks' own label is restored.
+        surface: their `SurfaceBlocks`.
         mark: the label of the blocks.
         found: `HandFind` of the hand.
         size: the hand's length over the skeleton's home length.
         intrinsics: (4,) fx, fy, cx, cy px.
 
     Returns:
-        The mean depth, mm, and the score: the less, the more alike.
+        The mean depth, mm, and the score: lower is more hand-like.
     """
     n_rows, n_columns = labels.shape
     focal = np.sqrt(intrinsics[0] * intrinsics[1])
@@ -115,7 +115,7 @@ def unlikeness(blocks, labels, surface, mark, found, size, intrinsics):
 
 @njit(cache=True)
 def _side(depth, focal):
-    """The side of a block, mm, at this depth."""
+    """The side of a block at this depth, mm."""
     return BLOCK * depth / focal
 
 
@@ -132,20 +132,20 @@ def _behind_cut(point, found, size):
     return -_WRIST_MM * size < along <= 0.0 and off < (1.4 * AROUND_MM * size) ** 2
 
 
-# of a home-sized hand: this much of the end of a surface is where it is first taken to be
+# of a home-sized hand: radius of the first estimate at the end of a surface
 _TIP_MM = 60.0
-_MOST_ENDS = 8  # that are looked at
-# what it counts to be farther away than another end, in `unlikeness`
+_MOST_ENDS = 8  # inspected ends
+# penalty for being farther away than another end, in `unlikeness`
 _PER_MM_BEHIND = 0.012
 _MOST_BEHIND_MM = 800.0
-# a second end is worth a look while it is not more unlike a hand than the first by this
+# largest excess in unlikeness of a second candidate
 _AS_LIKE = 1.0
 _LEAST_MM2 = 2500.0  # no hand is smaller
 _LENGTH_MM = 185.0  # of a home-sized hand
 _SHELL = 0.75  # the outer part of the sphere around it, where only the arm is
 _SHELL_MM2 = 900.0
 _BIN_MM = 5.0
-_RIM_MM = 45.0  # pixels beside a block of the hand belong to it within this depth
+_RIM_MM = 45.0  # pixels next to a block of the hand belong to it within this depth
 
 
 # columns of a point of a surface: x, y, z mm, distance from the middle mm, block row, block column
@@ -159,13 +159,13 @@ _N_POINT = 6
 
 
 class HandSight(NamedTuple):
-    """How a camera looks at a hand, and how heights of it are measured.
+    """How a camera views a hand, and how its heights are measured.
 
     Attributes:
-        near: least depth at which a hand is looked for, mm.
-        far: largest depth at which a hand is looked for, mm.
+        near: least depth of a hand, mm.
+        far: largest depth of a hand, mm.
         size: the hand's length over the skeleton's home length.
-        behind: of the reference plane behind the hand's middle, mm.
+        behind: distance of the reference plane behind the hand's middle, mm.
         smooth: width over which heights are averaged, mm.
         intrinsics: (4,) fx, fy, cx, cy px.
         along_axis: whether heights are measured along the optical axis, else along the line of
@@ -183,15 +183,15 @@ class HandSight(NamedTuple):
 
 @njit(cache=True)
 def locate(blocks, labels, surface, tip, size, intrinsics):
-    """Where the hand at an extremum of a surface is; its blocks get the label MAX_SURFACES.
+    """Locate the hand at an extremum of a surface; its blocks get the label MAX_SURFACES.
 
-    What leaves the sphere around it is the arm; the hand is what lies at the other end, one hand's
+    The part that leaves the sphere around it is the arm; the hand is at the other end, one hand's
     length long.
 
     Args:
         blocks: (h, w) float32 mm.
         labels: (h, w) int32; the hand's blocks are marked in it.
-        surface: the `Surface`.
+        surface: the `SurfaceBlocks`.
         tip: (N_END,) the extremum, a row of `_geodesic_kernels.ends`.
         size: the hand's length over the skeleton's home length.
         intrinsics: (4,) fx, fy, cx, cy px.
@@ -209,7 +209,7 @@ def locate(blocks, labels, surface, tip, size, intrinsics):
     area = 0.0
     base = 0.0
     near = np.empty((len(surface.cells), _N_POINT))
-    # the step of mean shift: nothing is cut off yet
+    # the step of mean shift, before any cut
     tips = near[: _within(surface, _TIP_MM * size, middle, near)]
     _beyond(tips, middle, fingers, cut, labels, False)
     for step in range(3):
@@ -223,8 +223,8 @@ def locate(blocks, labels, surface, tip, size, intrinsics):
 
 @njit(cache=True)
 def _within(surface, radius, middle, near):
-    """The points of a surface within `radius` mm of the middle, into rows of x, y, z, distance,
-    block row, block column; how many there are.
+    """Copy the points of a surface within `radius` mm of the middle into rows of x, y, z, distance,
+    block row, block column; returns their number.
     """
     points = surface.points
     n = 0
@@ -246,8 +246,8 @@ def _within(surface, radius, middle, near):
 
 @njit(cache=True)
 def _away_from_arm(points, size, focal2, middle, fingers):
-    """The direction (3,) from the arm to the middle of the hand; False, and zeros, where no arm
-    leaves the sphere.
+    """The direction (3,) from the arm to the middle of the hand; False, and zeros, if no arm leaves
+    the sphere.
     """
     shell = 0.0
     for k in range(3):
@@ -268,8 +268,8 @@ def _away_from_arm(points, size, focal2, middle, fingers):
 
 @njit(cache=True)
 def _wrist(points, size, focal2, middle, fingers):
-    """How far along `fingers` (3,) from the middle the arm is cut, mm: a hand's length behind the
-    fingertips.
+    """Position of the cut through the arm along `fingers` (3,) from the middle, mm: a hand's length
+    behind the fingertips.
     """
     around = AROUND_MM * size
     along = np.zeros(int(2.0 * around / _BIN_MM) + 2)
@@ -288,8 +288,8 @@ def _wrist(points, size, focal2, middle, fingers):
 
 @njit(cache=True)
 def _beyond(points, middle, fingers, cut, labels, mark):
-    """Move `middle` (3,) to the middle of what lies beyond the cut, marked in labels if so asked;
-    its sum of z^2.
+    """Move `middle` (3,) to the middle of the blocks beyond the cut, optionally marked in labels;
+    returns the sum of z^2.
     """
     total = 0.0
     x = 0.0
@@ -313,7 +313,7 @@ def _beyond(points, middle, fingers, cut, labels, mark):
 
 @njit(cache=True)
 def _along(p, middle, fingers):
-    """How far p (3,) lies from `middle` along `fingers`."""
+    """Distance of p (3,) from `middle` along `fingers`."""
     return (
         (p[0] - middle[0]) * fingers[0]
         + (p[1] - middle[1]) * fingers[1]
@@ -323,19 +323,18 @@ def _along(p, middle, fingers):
 
 @njit(cache=True)
 def compare_ends(blocks, labels, surfaces, ends, size, intrinsics, unlike):
-    """How unlike a hand what would be cut at each of the extrema is.
+    """How unlike a hand the segmentation at each extremum is.
 
-    The score of `unlikeness`, and 0.012 for every mm by which one lies behind the nearest (up to
-    800 mm).
+    The score of `unlikeness`, and 0.012 for every mm behind the nearest one (up to 800 mm).
 
     Args:
         blocks: (h, w) float32 mm.
-        labels: (h, w) int32; comes back as it was.
-        surfaces: a `Surface` of each.
+        labels: (h, w) int32; restored on return.
+        surfaces: a `SurfaceBlocks` for each.
         ends: (n, N_END) rows of `_geodesic_kernels.ends`.
         size: the hand's length over the skeleton's home length.
         intrinsics: (4,) fx, fy, cx, cy px.
-        unlike: (n,), out: the less, the more alike.
+        unlike: (n,), out: lower is more hand-like.
     """
     depth = np.empty(len(unlike))
     nearest = 1e9
@@ -356,7 +355,7 @@ def box_of(labels, surface, mark, box):
 
     Args:
         labels: (h, w) int32.
-        surface: the `Surface`.
+        surface: the `SurfaceBlocks`.
         mark: the label.
         box: (4,) int64, out: first and last row, first and last column; first beyond last for none.
     """
@@ -404,8 +403,8 @@ def cut_heights(
 ):
     """Heights of the hand's pixels above the plane behind it, on a crop.
 
-    A pixel belongs to the hand where a block of the hand lies at or beside it, where it is no more
-    than 45 mm farther than that, and where it lies beyond the cut through the arm.
+    A pixel belongs to the hand if a block of the hand is at or next to it, if it is at most 45 mm
+    farther than that block, and if it is beyond the cut through the arm.
 
     Args:
         depth: (H, W) mm, 0 where unread.
@@ -415,11 +414,11 @@ def cut_heights(
         plane: (3,) a, b, c of the plane behind the hand, 1 / z = a u + b v + c.
         distance: of the camera from it, mm.
         intrinsics: (4,) fx, fy, cx, cy px.
-        origin: (2,) int32, picture pixel (u, v) of crop pixel (0, 0).
-        step: picture pixels a crop pixel.
-        near: nearer than this counts as unread, mm.
-        far: farther than this nothing is the hand, mm.
-        raw: (S, S) float32 mm, out: heights, -1 background, -2 without a reading.
+        origin: (2,) int32, image pixel (u, v) of crop pixel (0, 0).
+        step: image pixels per crop pixel.
+        near: nearer readings count as unread, mm.
+        far: farther readings are not the hand, mm.
+        raw: (S, S) float32 mm, out: heights, -1 background, -2 unread.
     """
     size = raw.shape[0]
     reaches = np.full((labels.shape[0] + 1, labels.shape[1] + 1), -1.0, np.float32)
@@ -457,8 +456,8 @@ def cut_heights(
 
 @njit(cache=True)
 def _reach(blocks, labels, row, column):
-    """How far, mm, a pixel of this block may be to belong to the hand; 0 where no block near it
-    does.
+    """Largest depth of a pixel of the hand in this block, mm; 0 if no block near it belongs to the
+    hand.
     """
     farthest = np.float32(0.0)
     for a in range(max(row - 1, 0), min(row + 2, labels.shape[0])):
@@ -469,18 +468,17 @@ def _reach(blocks, labels, row, column):
 
 
 @njit(cache=True)
-def extract_one(depth, n_things, sight, crops, k):
+def extract_one(depth, n_candidates, sight, crops, k):
     """Find the hand in one frame and fill its row of the batch; see `HandSegmenter.extract`.
 
-    Where n_things is 2, the batch has twice as many rows as there are frames, and the second half
-    gets what may be a hand as well: a second extremum that is not more unlike a hand than the first
-    by 1.
+    With n_candidates 2, the batch has two rows per frame, and its second half receives the second
+    candidate: an extremum whose unlikeness exceeds that of the first by at most 1.
 
     Args:
         depth: (H, W) mm, 0 where unread.
-        n_things: candidates a frame, 1 or 2.
-        sight: `HandSight` of the picture.
-        crops: `CropRows`, out; the long axis points away from the arm where one is seen.
+        n_candidates: per frame, 1 or 2.
+        sight: `HandSight` of the image.
+        crops: `CropRows`, out; the long axis points away from the arm, if visible.
         k: the frame's row.
     """
     size = sight.size
@@ -500,8 +498,8 @@ def extract_one(depth, n_things, sight, crops, k):
     n_alike = min(n_ends, 2)
     if n_ends > 1 and unlike[ranked[1]] > unlike[ranked[0]] + _AS_LIKE:
         n_alike = 1
-    for rank in range(n_things):
-        row = k + rank * (len(crops.n_px) // n_things)
+    for rank in range(n_candidates):
+        row = k + rank * (len(crops.n_px) // n_candidates)
         crops.n_blobs[row] = n_alike
         if rank < n_alike:
             end = ends[ranked[rank]]
@@ -511,15 +509,15 @@ def extract_one(depth, n_things, sight, crops, k):
 
 @njit(cache=True)
 def cut_end(depth, blocks, labels, surface, end, sight, crops, k):
-    """The height map of the hand at an extremum, and its moments; labels stay as they are.
+    """The height map of the hand at an extremum, and its moments; labels are preserved.
 
     Args:
         depth: (H, W) mm, 0 where unread.
         blocks: (h, w) float32 mm.
         labels: (h, w) int32.
-        surface: the `Surface` of the extremum.
+        surface: the `SurfaceBlocks` of the extremum.
         end: (N_END,) the extremum.
-        sight: `HandSight` of the picture.
+        sight: `HandSight` of the image.
         crops: `CropRows`, out.
         k: the row.
     """
@@ -571,7 +569,7 @@ def cut_end(depth, blocks, labels, surface, end, sight, crops, k):
     radius = min(3, max(1, int(sight.smooth / mm_per_px + 0.5)))
     blob_kernels.smooth_heights(raw, radius, heights)
     blob_kernels.blob_moments(heights, origin, step, plane, intrinsics, rotation, distance, moments)
-    # the arm tells which way along the long axis the fingers point
+    # the arm decides the direction of the fingers along the long axis
     along = rotation @ found.fingers
     angle = moments[blob_kernels.ANGLE]
     if along[0] * np.cos(angle) + along[1] * np.sin(angle) < 0.0:
@@ -584,8 +582,8 @@ def view_axis(origin, step, crop, intrinsics, along_axis):
     """Direction of the view's axis: through the middle of the crop, or the optical axis.
 
     Args:
-        origin: (2,) picture pixel (u, v) of crop pixel (0, 0).
-        step: picture pixels a crop pixel.
+        origin: (2,) image pixel (u, v) of crop pixel (0, 0).
+        step: image pixels per crop pixel.
         crop: side of the crop, px.
         intrinsics: (4,) fx, fy, cx, cy px.
         along_axis: whether along the optical axis.
@@ -603,7 +601,7 @@ def view_axis(origin, step, crop, intrinsics, along_axis):
 
 @njit(cache=True)
 def view_plane(rotation, distance, intrinsics):
-    """Coefficients (3,) a, b, c of the plane that a view measures from: 1 / z = a u + b v + c.
+    """Coefficients (3,) a, b, c of a view's reference plane: 1 / z = a u + b v + c.
 
     Args:
         rotation: (3, 3) of T_view_camera.
@@ -616,13 +614,13 @@ def view_plane(rotation, distance, intrinsics):
 
 
 @njit(cache=True, parallel=True)
-def extract_all(depths, n_things, sights, crops):
-    """Find the hand in every picture and fill the batch, pictures in parallel.
+def extract_all(depths, n_candidates, sights, crops):
+    """Find the hand in every image and fill the batch, images in parallel.
 
     Args:
         depths: (n, H, W) mm, 0 where unread.
-        n_things: candidates a picture; the batch has N = n_things n rows, best candidates first.
-        sights: `HandSight` of the pictures: size, behind, smooth and intrinsics with a leading axis
+        n_candidates: per image; the batch has N = n_candidates n rows, best candidates first.
+        sights: `HandSight` of the images: size, behind, smooth and intrinsics with a leading axis
             (n,).
         crops: `CropRows`, out.
     """
@@ -636,8 +634,8 @@ def extract_all(depths, n_things, sights, crops):
             sights.intrinsics[k],
             sights.along_axis,
         )
-        # of one type: the loop's own number has two on the way, and all would be compiled twice
-        extract_one(depths[k], n_things, sight, crops, np.int64(k))
+        # of one type: the loop variable has two, and everything would be compiled twice
+        extract_one(depths[k], n_candidates, sight, crops, np.int64(k))
 
 
 @njit(cache=True)
@@ -646,8 +644,8 @@ def fill_rotations(intrinsics, origin, step, crop, along_axis, rotations):
 
     Args:
         intrinsics: (n, 4) fx, fy, cx, cy px.
-        origin: (n, 2) picture pixel (u, v) of crop pixel (0, 0).
-        step: (n,) picture pixels a crop pixel.
+        origin: (n, 2) image pixel (u, v) of crop pixel (0, 0).
+        step: (n,) image pixels per crop pixel.
         crop: side of the crops, px.
         along_axis: whether along the optical axis instead.
         rotations: (n, 3, 3), out.

@@ -1,9 +1,9 @@
-"""Kernels that choose the animal among connected components and cut its height map, frame by frame.
+"""Kernels that select the animal among connected components and cut its height map, frame by frame.
 
-Every frame: `label_blobs` joins foreground pixels to components; the component whose area in mm^2
-(pixels times the squared mean depth over fx fy) is nearest to the animal's on a logarithmic scale
-is the animal; `cut_heights`, `keep_largest`, `smooth_heights` and `blob_moments` make its height
-map. In camera view, what merely hangs together with the animal in the picture is told apart by the
+Every frame: `label_blobs` connects foreground pixels to components; the component whose area in
+mm^2 (pixels times the squared mean depth over fx fy) is nearest to the animal's on a logarithmic
+scale is the animal; `cut_heights`, `keep_largest`, `smooth_heights` and `blob_moments` make its
+height map. In camera view, objects that merely overlap the animal in the image are separated by the
 largest gap in depth.
 """
 
@@ -18,22 +18,22 @@ from liex_lab.scene import _blob_kernels as blob_kernels
 
 AREA_FACTOR = 4.0  # a blob this many times larger or smaller than the animal is not the animal
 BRIDGE = 4  # blocks without readings that may lie between the parts of an animal of the camera view
-_MORE = 1.3  # times the area of the animal: there may be something with it
-_APART = 2.0  # roots of the animal's area: what lies farther before the animal is not a part of it
-_LAYERS = 3  # so often: before the animal a bar, behind it a speck
+_MORE = 1.3  # a component with more than this many areas of the animal may contain another object
+_APART = 2.0  # in roots of the animal's area: a larger gap in depth separates objects
+_LAYERS = 3  # passes: a bar in front of the animal, a speck behind it
 _FAR = 65_535  # mm: behind everything
-_ON_FLOOR_SHARE = 0.3  # of an animal that leans out over the edge of the floor still covers it
+_ON_FLOOR_SHARE = 0.3  # least share on the floor of an animal that leans over its edge
 
 
 class Sight(NamedTuple):
-    """How a camera looks at the floor, and how heights above it are measured.
+    """How a camera views the floor, and how heights above it are measured.
 
     Attributes:
         intrinsics: (4,) fx, fy, cx, cy px.
         plane: (3,) the floor, 1 / z = a u + b v + c.
         rotation: (3, 3) of T_view_camera.
-        behind_mm: 0 measures heights above the floor, else along the optical axis from so far
-            behind the mean depth.
+        behind_mm: 0 measures heights above the floor, else along the optical axis from this
+            distance behind the mean depth.
         smooth_mm: width over which heights are averaged, mm.
     """
 
@@ -52,9 +52,9 @@ def blob_areas(depths, limit, on_floor, bridge, mm2_per_px, areas):
         depths: (n, H, W) mm, 0 where unread.
         limit: (H, W) mm; a reading below it is foreground.
         on_floor: (H, W) bool, the floor; a component stands on it with 30 % of its pixels.
-        bridge: blocks without readings that may lie between the parts of one component.
+        bridge: unread blocks allowed between the parts of one component.
         mm2_per_px: 1 / (fx fy).
-        areas: (n, MAX_BLOBS) mm^2, out; comes in as 0.
+        areas: (n, MAX_BLOBS) mm^2, out; 0 on entry.
     """
     for k in prange(depths.shape[0]):
         labels = np.empty(
@@ -82,13 +82,14 @@ def blob_area(blob, mm2_per_px):
 
 @njit(cache=True)
 def order_blobs(blobs, n_blobs, area, mm2_per_px):
-    """The components in the order in which their areas come near to the animal's, and how many do.
+    """Order the components by similarity of their areas to the animal's, and count the similar
+    ones.
 
-    While `area` is 0 the largest comes first.
+    While `area` is 0 the largest is first.
 
     Args:
         blobs: (MAX_BLOBS, N_BLOB) as `label_blobs` fills it.
-        n_blobs: how many of the rows are filled.
+        n_blobs: filled rows.
         area: the animal's usual area, mm^2, 0 while unknown.
         mm2_per_px: 1 / (fx fy).
 
@@ -120,12 +121,12 @@ def order_blobs(blobs, n_blobs, area, mm2_per_px):
 
 @njit(cache=True)
 def parted(depth, limit, labels, blobs, area, mm2_per_px):
-    """The picture without what hangs together with the animal in it alone, by the gap in depth.
+    """The image without objects that merely overlap the animal in it, separated by a gap in depth.
 
-    Of two layers far from one another the animal is the one whose area is nearer to its own. What
-    lies before it hides parts of it, and is taken for unread; what lies behind it there is
-    background. Elsewhere nothing is: of a bar and some specks the bar is likest to the animal,
-    which may swim beside them.
+    Of two layers far apart, the animal is the one whose area is nearer to its own. A layer in front
+    hides parts of the animal and is set to unread; a layer behind becomes background. Elsewhere the
+    image is unchanged: among a bar and some specks the bar resembles the animal most, which may
+    swim next to them.
 
     Args:
         depth: (H, W) mm, 0 where unread.
@@ -136,7 +137,7 @@ def parted(depth, limit, labels, blobs, area, mm2_per_px):
         mm2_per_px: 1 / (fx fy).
 
     Returns:
-        The picture, a copy where it changed, and whether it did.
+        The image, a copy if changed, and whether it changed.
     """
     for slot in range(len(blobs)):
         blob = blob_kernels.unpack_blob(blobs[slot])
@@ -162,7 +163,7 @@ def parted(depth, limit, labels, blobs, area, mm2_per_px):
 
 @njit(cache=True)
 def _push_back(depth, labels, slot, cut):
-    """Make background of what lies farther than `cut` mm in a component and at its border."""
+    """Turn pixels farther than `cut` mm in a component and at its border into background."""
     for i in range(labels.shape[0]):
         for j in range(labels.shape[1]):
             if blob_kernels.is_animal_block(labels, i, j, slot):
@@ -173,21 +174,20 @@ def _push_back(depth, labels, slot, cut):
 
 
 @njit(cache=True)
-def extract_one(depth, limit, on_floor, area, n_things, parts, sight, crops, k):
+def extract_one(depth, limit, on_floor, area, n_candidates, parts, sight, crops, k):
     """Find the animal in one frame and fill its row of the batch.
 
-    Where n_things is 2, the batch has twice as many rows as there are frames, and the second half
-    gets what comes next near.
+    With n_candidates 2, the batch has two rows per frame, and its second half receives the second
+    best component.
 
     Args:
         depth: (H, W) mm, 0 where unread.
         limit: (H, W) mm; a reading below it is foreground.
         on_floor: (H, W) bool, the floor.
         area: the animal's usual area, mm^2, 0 while unknown.
-        n_things: candidates a frame, 1 or 2.
-        parts: whether what hangs together with the animal in the picture alone is told apart by its
-            depth, see `parted`.
-        sight: `Sight` of the picture.
+        n_candidates: per frame, 1 or 2.
+        parts: whether overlapping objects are separated by depth, see `parted`.
+        sight: `Sight` of the image.
         crops: `CropRows`, out.
         k: the frame's row.
     """
@@ -204,8 +204,8 @@ def extract_one(depth, limit, on_floor, area, n_things, parts, sight, crops, k):
             break
         n_found = blob_kernels.label_blobs(depth, limit, on_floor, bridge, labels, blobs)
     order, n_near = order_blobs(blobs, n_found, area, mm2_per_px)
-    for rank in range(n_things):
-        row = k + rank * (len(crops.n_px) // n_things)
+    for rank in range(n_candidates):
+        row = k + rank * (len(crops.n_px) // n_candidates)
         crops.n_blobs[row] = n_near
         if rank < n_near:
             slot = order[rank]
@@ -216,9 +216,9 @@ def extract_one(depth, limit, on_floor, area, n_things, parts, sight, crops, k):
 
 @njit(cache=True)
 def cut_crop(depth, limit, labels, slot, blob, sight, crops, k):
-    """The height map of one component, smoothed, and its moments, into row k of the batch.
+    """The smoothed height map of one component, and its moments, into row k of the batch.
 
-    The crop is a square around the component in steps of whole pixels. Where heights are measured
+    The crop is a square around the component in steps of whole pixels. If heights are measured
     along the optical axis, the row's distance moves to behind_mm behind the animal.
 
     Args:
@@ -227,7 +227,7 @@ def cut_crop(depth, limit, labels, slot, blob, sight, crops, k):
         labels: (H // BLOCK, W // BLOCK) int32, component of each block.
         slot: the component.
         blob: its counts.
-        sight: `Sight` of the picture.
+        sight: `Sight` of the image.
         crops: `CropRows`, out.
         k: the row.
     """
@@ -248,7 +248,7 @@ def cut_crop(depth, limit, labels, slot, blob, sight, crops, k):
     view_plane = sight.plane
     if (
         sight.behind_mm > 0.0
-    ):  # first from far behind, for the blob's mean depth is that of all that hangs together
+    ):  # first from far behind, as the blob's mean depth includes everything connected
         crops.distance[k] = mean_depth + 8.0 * sight.behind_mm
         view_plane = np.array([0.0, 0.0, 1.0 / crops.distance[k]])
     blob_kernels.cut_heights(
@@ -273,7 +273,7 @@ def cut_crop(depth, limit, labels, slot, blob, sight, crops, k):
 
 
 @njit(cache=True, parallel=True, nogil=True)
-def extract_all(depths, limit, on_floor, area, n_things, parts, sight, crops):
+def extract_all(depths, limit, on_floor, area, n_candidates, parts, sight, crops):
     """Find the animal in every frame of one camera and fill the batch, frames in parallel.
 
     Args:
@@ -281,20 +281,20 @@ def extract_all(depths, limit, on_floor, area, n_things, parts, sight, crops):
         limit: (H, W) mm; a reading below it is foreground.
         on_floor: (H, W) bool, the floor.
         area: the animal's usual area, mm^2, 0 while unknown.
-        n_things: candidates a frame; the batch has N = n_things n rows, best candidates first.
-        parts: whether layers far apart in depth are told apart, see `parted`.
-        sight: `Sight` of all pictures.
+        n_candidates: per frame; the batch has N = n_candidates n rows, best candidates first.
+        parts: whether layers far apart in depth are separated, see `parted`.
+        sight: `Sight` of all images.
         crops: `CropRows`, out.
     """
     for k in prange(depths.shape[0]):
-        # a number of one type: the loop's own has two on the way, and all would be compiled twice
+        # of one type: the loop variable has two, and everything would be compiled twice
         row = np.int64(k)
-        extract_one(depths[k], limit, on_floor, area, n_things, parts, sight, crops, row)
+        extract_one(depths[k], limit, on_floor, area, n_candidates, parts, sight, crops, row)
 
 
 @njit(cache=True, parallel=True, nogil=True)
-def extract_windows(depths, background, margin, area, n_things, sights, crops):
-    """Find the animal in patches of pictures from many cameras and fill the batch, in parallel.
+def extract_windows(depths, background, margin, area, n_candidates, sights, crops):
+    """Find the animal in image patches from many cameras and fill the batch, in parallel.
 
     The limit of each patch is its background, or the floor where that is unread, less its margin;
     all of it counts as floor.
@@ -302,9 +302,9 @@ def extract_windows(depths, background, margin, area, n_things, sights, crops):
     Args:
         depths: (n, H, W) mm, 0 where unread.
         background: (n, H, W) mm, 0 where unread.
-        margin: (n,) mm by which the animal stands out at least.
+        margin: (n,) mm, least height of the animal.
         area: (n,) usual areas of the animals, mm^2.
-        n_things: candidates a patch; the batch has N = n_things n rows, best candidates first.
+        n_candidates: per patch; the batch has N = n_candidates n rows, best candidates first.
         sights: `Sight` of the patches, each field with a leading axis (n,), in pixels of the
             patches.
         crops: `CropRows`, out.
@@ -328,7 +328,7 @@ def extract_windows(depths, background, margin, area, n_things, sights, crops):
             sights.smooth_mm[k],
         )
         row = np.int64(k)
-        extract_one(depths[k], limit, everywhere, area[k], n_things, False, sight, crops, row)
+        extract_one(depths[k], limit, everywhere, area[k], n_candidates, False, sight, crops, row)
 
 
 # Pinhole projection of a crop: points of its view frame to its pixels, and pixels back to points.
@@ -338,13 +338,13 @@ N_CROP_CAMERA = 17  # numbers of a packed crop camera
 
 
 class CropCamera(NamedTuple):
-    """The camera of one crop, or columns (n,) of many, in the order in which they are packed.
+    """The camera of one crop, or columns (n,) of many, in packing order.
 
     Attributes:
-        fx: focal length along the picture's rows, px of the whole picture.
+        fx: focal length along the image's rows, px of the full image.
         fy: focal length along its columns, px.
-        cx: principal point, px of the whole picture.
-        cy: principal point, px of the whole picture.
+        cx: principal point, px of the full image.
+        cy: principal point, px of the full image.
         r00: rotation of T_view_camera, first row; r00 to r22 row by row.
         r01: see r00.
         r02: see r00.
@@ -355,9 +355,9 @@ class CropCamera(NamedTuple):
         r21: see r00.
         r22: see r00.
         distance: z of the camera's centre in the view frame, mm.
-        u0: column of the whole picture that is the crop's first.
-        v0: row of the whole picture that is the crop's first.
-        step: pixels of the whole picture from one crop pixel to the next.
+        u0: column of the full image at the crop's first pixel.
+        v0: row of the full image at the crop's first pixel.
+        step: pixels of the full image per crop pixel.
     """
 
     fx: Any
@@ -384,8 +384,8 @@ class CropRows(NamedTuple):
 
     Attributes:
         heights: (N, S, S) int16, 1/16 mm.
-        origin: (N, 2) int32, picture pixel (u, v) of crop pixel (0, 0).
-        step: (N,) int32, picture pixels a crop pixel.
+        origin: (N, 2) int32, image pixel (u, v) of crop pixel (0, 0).
+        step: (N,) int32, image pixels per crop pixel.
         n_px: (N,) int64, readings on the animal, 0 where it was not found.
         moments: (N, N_MOMENTS), each a packed `BlobMoments`.
         distance: (N,) mm of the view's origin from the camera.
@@ -437,7 +437,7 @@ def to_camera(camera, x0, y0, z0):
 
 @njit(cache=True)
 def to_pixel(camera, x0, y0, z0):
-    """Column and row of the crop, not rounded, at which a point mm of the view frame is seen."""
+    """Column and row of the crop, not rounded, of a point mm of the view frame."""
     x, y, z = to_camera(camera, x0, y0, z0)
     column = (camera.fx * x / z + camera.cx - camera.u0) / camera.step
     row = (camera.fy * y / z + camera.cy - camera.v0) / camera.step
@@ -446,7 +446,7 @@ def to_pixel(camera, x0, y0, z0):
 
 @njit(cache=True)
 def to_point(camera, row, column, height):
-    """x, y mm of the view frame of what a crop pixel shows, `height` mm above its plane."""
+    """x, y mm of the view frame of a crop pixel, `height` mm above its plane."""
     dx = (camera.u0 + camera.step * column - camera.cx) / camera.fx
     dy = (camera.v0 + camera.step * row - camera.cy) / camera.fy
     z = (height - camera.distance) / (camera.r20 * dx + camera.r21 * dy + camera.r22)
@@ -462,14 +462,14 @@ def to_point(camera, row, column, height):
 def far_mode(values, window):
     """Depth and spread of the farthest cluster in sorted readings; (0, 0) without one.
 
-    An animal is always nearer than what it covers, so the background is the farthest depth that
-    comes back, not the most frequent: a pixel covered nine tenths of the time still shows it. A
-    cluster needs a twentieth of the readings (at least 3) within `window` mm, which lone outliers
-    beyond the floor do not reach.
+    An animal is always nearer than what it covers, so the background is the farthest recurring
+    depth, not the most frequent: a pixel covered nine tenths of the time still shows it. A cluster
+    needs a twentieth of the readings (at least 3) within `window` mm, which excludes isolated
+    outliers beyond the floor.
 
     Args:
         values: (n,) readings of one pixel, mm, ascending.
-        window: how far apart the readings of one surface lie, mm.
+        window: largest distance between readings of one surface, mm.
 
     Returns:
         The cluster's median, mm, and half of its range from 16 to 84 %, mm.
@@ -508,13 +508,13 @@ def far_modes(ordered, window_share, window_mm, near_share, depth, spread, near)
 
     Args:
         ordered: (n_pixels, n) float32 mm, each pixel's readings, ascending; 0 where unread.
-        window_share: width of a cluster, of the pixel's farthest reading.
-        window_mm: width of a cluster at least, mm.
+        window_share: width of a cluster, relative to the pixel's farthest reading.
+        window_mm: least width of a cluster, mm.
         near_share: share of a pixel's readings that are nearer than `near`.
         depth: (n_pixels,) float32 mm, out: the farthest mode, 0 without one.
         spread: (n_pixels,) float32 mm, out: its standard deviation.
-        near: (n_pixels,) float32 mm, out: the depth that only `near_share` of the readings are
-            nearer than, 0 where never read.
+        near: (n_pixels,) float32 mm, out: the `near_share` quantile of the readings, 0 where never
+            read.
     """
     for pixel in prange(ordered.shape[0]):
         first = 0

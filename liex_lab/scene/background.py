@@ -1,10 +1,10 @@
 """Per-pixel background model of a depth recording: the farthest mode of its readings over time.
 
-An animal is always nearer than what it covers, so the background of a pixel is the farthest depth
-that keeps coming back, neither its median nor its most frequent depth: a pixel that is covered nine
-tenths of the time still shows its background. A mode is a cluster of at least a twentieth of the
-pixel's readings (and at least 3) within 6 mm or 1.2 % of the depth; its median is the background,
-half of its 16 to 84 % range the standard deviation. The kernel is `far_modes`.
+An animal is always nearer than what it covers, so the background of a pixel is the farthest
+recurring depth, neither the median nor the most frequent depth: a pixel covered nine tenths of the
+time still shows its background. A mode is a cluster of at least a twentieth of the pixel's readings
+(and at least 3) within 6 mm or 1.2 % of the depth; its median is the background, half of its 16 to
+84 % range the standard deviation. The kernel is `far_modes`.
 """
 
 from __future__ import annotations
@@ -22,30 +22,31 @@ from liex_lab.recordings.recording import Recording
 from liex_lab.runtime.shapes import check_shapes
 from liex_lab.scene import _height_map_kernels as kernels
 from liex_lab.scene.floor import Floor, near_plane
-from liex_lab.scene.support_plane import SampledScene, Standing, find_standing, levelled, thing_at
+from liex_lab.scene.support_plane import (
+    SampledScene,
+    SupportPlane,
+    find_support_plane,
+    levelled,
+    still_object,
+)
 
-# readings this near to one another, of the depth or in mm, are one surface
+# readings within this distance, relative or in mm, belong to one surface
 _MODE_SHARE = 0.012
 _MODE_MM = 6.0
 _NEAR_SHARE = 0.05  # of a pixel's readings may be nearer than its nearest usual depth
-# an animal of this many pixels is looked at finely enough
+# an animal this long is resolved well enough
 _LENGTH_PX = 64.0
 _MAX_STRIDE = 4
 _ROWS = 32  # of pixels whose readings are sorted at once
-# noise changes something in this share of an image's cells, so many to a row and to a column, in
-# the median of so many pairs; a moving animal changes the few cells in which it is
+# noise changes readings in at least this share of the image's _CELLS x _CELLS cells (median over
+# _PAIRS pairs of frames); a moving animal changes only its own cells
 _EVERYWHERE = 0.8
 _CELLS = 8
 _PAIRS = 32
 
 
 def sampled(n: int, most: int) -> NDArray[np.int64]:
-    """Indices of frames spread evenly over a recording.
-
-    Args:
-        n: frames of the recording.
-        most: frames at most; all where the recording has fewer.
-    """
+    """Indices of at most `most` frames spread evenly over a recording of n."""
     return np.unique(np.linspace(0, n - 1, min(most, n)).astype(np.int64))
 
 
@@ -53,9 +54,9 @@ def sample_frames(recording: Recording, n_frames: int, stride: int = 1) -> NDArr
     """Frames spread evenly over a recording, thinned to every `stride`-th pixel.
 
     Args:
-        recording: where they are read from.
-        n_frames: frames at most; all where the recording has fewer.
-        stride: pixels from one to the next along rows and columns.
+        recording: to read from.
+        n_frames: frames at most; all of a shorter recording.
+        stride: step along rows and columns, px.
 
     Returns:
         (n, ceil(H / stride), ceil(W / stride)) float32 mm, 0 where unread.
@@ -75,9 +76,10 @@ def sample_frames(recording: Recording, n_frames: int, stride: int = 1) -> NDArr
 
 
 def has_noise(sample: NDArray[np.float32]) -> bool:
-    """Whether the sensor has noise: two depth images differ nearly everywhere, not at the animal.
+    """Whether the sensor has noise: two depth images differ nearly everywhere, not only at the
+    animal.
 
-    Where it has none, as in a rendered recording, an image of a still scene may repeat bit for bit.
+    Without noise, as in a rendered recording, images of a still scene may be identical.
 
     Args:
         sample: (n, H, W) float32 mm, 0 where unread, frames spread over the recording.
@@ -94,30 +96,27 @@ def has_noise(sample: NDArray[np.float32]) -> bool:
     return len(shares) > 0 and float(np.median(shares)) > _EVERYWHERE
 
 
-def usual_depth(pictures: NDArray[np.uint16]) -> NDArray[np.uint16]:
-    """Each pixel's median over some pictures, of those in which it was read.
+def usual_depth(depth_images: NDArray[np.uint16]) -> NDArray[np.uint16]:
+    """Median of each pixel over the images in which it was read.
 
     Args:
-        pictures: (n, H, W) uint16 mm, 0 where unread.
+        depth_images: (n, H, W) uint16 mm, 0 where unread.
 
     Returns:
-        (H, W) uint16 mm, 0 where it was read in none.
+        (H, W) uint16 mm, 0 where never read.
     """
-    ordered = np.sort(pictures, axis=0)
+    ordered = np.sort(depth_images, axis=0)
     unread = (ordered == 0).sum(axis=0)
     middle = np.minimum(unread + (len(ordered) - unread) // 2, len(ordered) - 1)
     return np.asarray(np.take_along_axis(ordered, middle[None], axis=0)[0])
 
 
 def stride_for(recording: Recording, length_mm: float) -> int:
-    """The stride at which an animal is still some pixels long: 64 or more where it is above 1.
+    """The largest stride, 1 to 4, at which the animal remains at least 64 pixels long.
 
     Args:
-        recording: its first and middle frame tell the usual depth; 1 where both are unread.
+        recording: its first and middle frame give the typical depth; 1 if both are unread.
         length_mm: of the smallest animal.
-
-    Returns:
-        Pixels from one to the next, 1 to 4.
     """
     for index in {0, len(recording) // 2}:
         depth = recording.frame(index).depth
@@ -133,12 +132,12 @@ def learn_background(
     """Background depth, its spread, and the nearest usual depth of every pixel.
 
     Args:
-        sample: (n, H, W) float32 mm, 0 where unread, or a recording, of which 96 frames are
+        sample: (n, H, W) float32 mm, 0 where unread; or a recording, of which 96 frames are
             sampled.
 
     Returns:
         Three arrays (H, W) float32 mm, 0 where never read: depth of the farthest mode, its standard
-        deviation, and the depth that a twentieth of the readings are nearer than.
+        deviation, and the 5 % quantile of the depth.
     """
     stack = sample if isinstance(sample, np.ndarray) else sample_frames(sample, 96)
     check_shapes("a sample", ("frames", stack, ("n", "H", "W")))
@@ -154,24 +153,24 @@ def learn_background(
     return found[0], found[1], found[2]
 
 
-# The floor's level while a sensor warms up: the depth of one and the same floor wanders.
+# The floor's level while a sensor warms up: the measured depth of the same floor drifts.
 
 
 Array = NDArray[np.float64]
 Depths = NDArray[np.float32]
 
 _N_PIXELS = 4096
-_REACH_MM = 15.0  # a reading farther from the middle of all is no floor
-_LEAST_READ = 0.25  # of the pixels: a frame that shows less of the floor keeps its level
-_LEAST_MM = 2.0  # of the levels' range from 5 to 95 %: less is a camera's noise
-_MOST_MM = 30.0  # more is another scene, or a camera that was pushed
-_ROUGH = 0.25  # of that range may be the step from one frame of the sample to the next
-_FIRST = 0.05  # of the sample is the beginning of the recording
+_REACH_MM = 15.0  # readings farther from the median are no floor
+_LEAST_READ = 0.25  # least share of the floor's pixels read in a frame for a level
+_LEAST_MM = 2.0  # range of the levels from 5 to 95 %: less is noise
+_MOST_MM = 30.0  # more is another scene or a displaced camera
+_ROUGH = 0.25  # largest mean step between sampled frames, as a share of that range
+_FIRST = 0.05  # share of the sample that counts as the beginning
 
 
 @dataclass(frozen=True)
 class FloorLevel:
-    """Where the floor is looked at, and what was read there at the beginning.
+    """Pixels of the floor and their initial depth, as a reference for depth drift.
 
     Attributes:
         rows: (m,) of the pixels, in the grid of the scene.
@@ -187,7 +186,7 @@ class FloorLevel:
 
     @staticmethod
     def on(background: Depths, on_floor: NDArray[np.bool_]) -> FloorLevel:
-        """The level of a background, looked at in some thousand pixels of its floor.
+        """The reference level of a background, from a few thousand pixels of its floor.
 
         Args:
             background: (H, W) float32 mm, 0 where unknown.
@@ -198,7 +197,7 @@ class FloorLevel:
         return FloorLevel(rows[some], columns[some], background[rows[some], columns[some]])
 
     def of(self, depths: Depths) -> Array:
-        """How much farther than at the beginning the floor is read in frames.
+        """Offset of the floor's depth from its initial level in each frame.
 
         Args:
             depths: (n, H, W) float32 mm, 0 where unread, in the grid of the scene.
@@ -210,20 +209,20 @@ class FloorLevel:
         levels = np.zeros(len(depths))
         for k, depth in enumerate(depths):
             read = depth[self.rows, self.columns]
-            known = read > 0
-            if known.sum() < max(1.0, _LEAST_READ * len(self.rows)):
+            valid = read > 0
+            if valid.sum() < max(1.0, _LEAST_READ * len(self.rows)):
                 continue
-            off = (read[known] - self.depth_mm[known]).astype(float)
+            off = (read[valid] - self.depth_mm[valid]).astype(float)
             off = off[np.abs(off - np.median(off)) < _REACH_MM]
-            levels[k] = off.mean() if len(off) else 0.0  # half is near, half far: no level
+            levels[k] = off.mean() if len(off) else 0.0  # no reading near the median: no level
         return levels
 
     def brought_back(self, depths: Depths, levels: Array | None = None) -> Depths:
-        """The frames with the floor where it was at the beginning.
+        """The frames with the floor corrected to its initial level.
 
         Args:
             depths: (n, H, W) float32 mm, 0 where unread, in the grid of the scene.
-            levels: (n,) mm, of the frames; None measures them.
+            levels: (n,) mm, of the frames; None to measure them.
 
         Returns:
             (n, H, W) float32 mm, 0 where unread.
@@ -232,11 +231,7 @@ class FloorLevel:
         return np.where(depths > 0, depths - off[:, None, None], np.float32(0))
 
     def every(self, step: int) -> FloorLevel:
-        """The same in pictures of every `step`-th row and column.
-
-        Args:
-            step: pixels from one to the next, at least 1.
-        """
+        """The same level for every `step`-th row and column of the image."""
         kept = (self.rows % step == 0) & (self.columns % step == 0)
         return FloorLevel(
             self.rows[kept] // step,
@@ -247,14 +242,13 @@ class FloorLevel:
 
 
 def wandering(levels: Array) -> tuple[float, float] | None:
-    """Whether the floor's level wanders slowly and by more than noise.
+    """Whether the floor's level drifts slowly and by more than noise.
 
     Args:
         levels: (n,) mm, of frames spread over a recording, in order of time.
 
     Returns:
-        The level at the beginning and the range of all from 5 to 95 %, mm; None where it is still,
-        or jumps.
+        The initial level and the range of all from 5 to 95 %, mm; None if it is constant or jumps.
     """
     if len(levels) < 2:
         return None
@@ -272,9 +266,9 @@ def wandering(levels: Array) -> tuple[float, float] | None:
 
 Mask = NDArray[np.bool_]
 
-_READ = 0.5  # of the frames: what is read less often is a hole
-_AROUND = 0.7  # of what surrounds a hole is floor
-_FLAT_MM = 15.0  # this near to the plane
+_READ = 0.5  # pixels read in fewer frames are holes
+_AROUND = 0.7  # share of a hole's surroundings that is floor
+_FLAT_MM = 15.0  # distance from the plane
 
 
 def unread_floor(
@@ -285,18 +279,18 @@ def unread_floor(
     min_height_mm: float,
     least_px: float,
 ) -> Mask:
-    """Where the floor is unread and something else was taken for it.
+    """Where the floor is unread and something else was mistaken for it.
 
     Args:
         sample: (n, H, W) float32 mm, frames spread over a recording, 0 where unread.
-        background: (H, W) float32 mm, the farthest mode of each pixel, 0 where there is none.
+        background: (H, W) float32 mm, the farthest mode of each pixel, 0 if absent.
         bare: (H, W) float32 mm, depth of the floor's plane.
-        on_floor: (H, W) bool, the floor with what stands on it.
-        min_height_mm: a background that stands out by less is the floor.
-        least_px: pixels of a hole at least; smaller ones hide no animal.
+        on_floor: (H, W) bool, the floor including objects on it.
+        min_height_mm: a background that rises less is the floor.
+        least_px: smallest hole that can hide an animal, px.
 
     Returns:
-        (H, W) bool: pixels whose background is not the floor but should be.
+        (H, W) bool: pixels whose background should be the floor but is not.
     """
     import cv2
 
@@ -318,20 +312,20 @@ def unread_floor(
     return found
 
 
-# What sampled frames say of the empty scene: background, floor, and what is nearer than both.
+# The empty scene of sampled frames: background, floor and foreground limit.
 
 
-SPREADS = 3.0  # an animal stands out by this many standard deviations of the background's own noise
+SPREADS = 3.0  # least height of an animal in standard deviations of the background
 
 
 @dataclass(frozen=True)
-class Wanted:
-    """What animal is looked for.
+class TargetAnimal:
+    """Size and view of the animal to detect.
 
     Attributes:
         spine_mm: lengths of the smallest and the largest one, mm.
-        min_height_mm: what stands out from the background by less is none.
-        view: how such animals are looked at.
+        min_height_mm: smaller heights above the background are ignored.
+        view: how such animals are viewed.
     """
 
     spine_mm: tuple[float, float]
@@ -339,95 +333,96 @@ class Wanted:
     view: View
 
     @property
-    def stands(self) -> bool:
-        """Whether it stands on the floor; one that floats may be seen before anything."""
+    def stands_on_floor(self) -> bool:
+        """Whether it stands on the floor; a floating animal may be in front of anything."""
         return self.view.frame == VIEWS[0]
 
     @property
     def smallest_mm2(self) -> float:
-        """Area of the smallest one as it is seen, mm^2."""
+        """Visible area of the smallest one, mm^2."""
         return self.view.area[0] * self.spine_mm[0] ** 2
 
     @property
     def largest_mm2(self) -> float:
-        """Area of the largest one as it is seen, mm^2."""
+        """Visible area of the largest one, mm^2."""
         return self.view.area[1] * self.spine_mm[1] ** 2
 
 
 @dataclass(frozen=True)
 class BareGround:
-    """The empty scene without what is known of its animal.
+    """The empty scene before its animal is identified.
 
     Attributes:
         background: (H, W) float32 mm, 0 where unknown.
         spread: (H, W) float32 mm, its standard deviation.
         near: (H, W) float32 mm, the nearest usual depth.
-        standing: the floor that was found.
-        camera: whose pixels these are.
-        wanted: what animal is looked for.
+        support_plane: the detected floor.
+        camera: of these pixels.
+        target: the animal to detect.
     """
 
     background: Depths
     spread: Depths
     near: Depths
-    standing: Standing
+    support_plane: SupportPlane
     camera: Camera
-    wanted: Wanted
+    target: TargetAnimal
 
     @staticmethod
     def learn(
         sample: Depths,
         camera: Camera,
-        wanted: Wanted,
+        target: TargetAnimal,
         stated: Floor | None = None,
         region: NDArray[np.bool_] | None = None,
     ) -> BareGround:
-        """The ground that a sample of frames shows.
+        """Learn the ground from a sample of frames.
 
         Args:
             sample: (n, H, W) float32 mm, frames spread over a recording.
-            camera: whose pixels these are.
-            wanted: what animal is looked for.
-            stated: the floor where a person states it, in the pixels of the camera.
-            region: (H, W) bool, where it is looked at; None everywhere.
+            camera: of these pixels.
+            target: the animal to detect.
+            stated: the floor stated in the plan, in pixels of the camera.
+            region: (H, W) bool, analysed pixels; None for all.
 
         Raises:
-            EstimationError: no depth was read, nothing comes back often enough, or no floor was
-                found.
+            EstimationError: no depth was read, no depth recurs often enough, or no floor was found.
         """
         background, spread, near = learn_background(sample)
         _check_background(sample, background)
-        seen = SampledScene(
-            sample, background, spread, camera, wanted.spine_mm, wanted.min_height_mm, wanted.view
+        sampled_scene = SampledScene(
+            sample, background, spread, camera, target.spine_mm, target.min_height_mm, target.view
         )
-        standing = find_standing(seen, stated)
+        support_plane = find_support_plane(sampled_scene, stated)
         if region is not None:
-            standing = replace(standing, region=region, on_floor=standing.on_floor & region)
-        if standing.region is not None:  # what lies around is not looked at
-            background = np.where(standing.region, background, np.float32(0))
-            near = np.where(standing.region, near, np.float32(0))
-        return BareGround(background, spread, near, standing, camera, wanted)
+            support_plane = replace(
+                support_plane, region=region, on_floor=support_plane.on_floor & region
+            )
+        if support_plane.region is not None:  # exclude the surroundings
+            background = np.where(support_plane.region, background, np.float32(0))
+            near = np.where(support_plane.region, near, np.float32(0))
+        return BareGround(background, spread, near, support_plane, camera, target)
 
     @staticmethod
     def steady(
         sample: Depths,
         camera: Camera,
-        wanted: Wanted,
+        target: TargetAnimal,
         floor: Floor | None = None,
         region: NDArray[np.bool_] | None = None,
     ) -> tuple[BareGround, Depths, FloorLevel | None]:
-        """The same, where the floor's depth wanders from frames brought back to its beginning.
+        """The same after correcting drift of the floor's depth.
 
         Args:
             sample: (n, H, W) float32 mm, frames spread over a recording.
-            camera: whose pixels these are.
-            wanted: what animal is looked for.
-            floor: the floor where a person states it, in any camera's pixels.
-            region: (H, W) bool, where it is looked at; None everywhere.
+            camera: of these pixels.
+            target: the animal to detect.
+            floor: the floor stated in the plan, in any camera's pixels.
+            region: (H, W) bool, analysed pixels; None for all.
 
         Returns:
-            The ground, the sample at one level, and what brings frames there, None where the floor
-            is still.
+            The ground, the corrected sample, and the reference level, None if the floor does not
+            drift.
 
         Raises:
             EstimationError: as `learn`.
@@ -435,69 +430,71 @@ class BareGround:
         stated = (
             None if floor is None else Floor.from_plane(floor.normal, floor.distance_mm, camera)
         )
-        ground = BareGround.learn(sample, camera, wanted, stated, region)
+        ground = BareGround.learn(sample, camera, target, stated, region)
         level = ground.level
-        levels = level.of(sample) if wanted.stands else np.empty(0)
-        wander = wandering(levels) if wanted.stands else None
+        levels = level.of(sample) if target.stands_on_floor else np.empty(0)
+        wander = wandering(levels) if target.stands_on_floor else None
         if wander is None:
             return ground, sample, None
         first, range_mm = wander
         sample = level.brought_back(sample, levels - first)
-        ground = BareGround.learn(sample, camera, wanted, stated, region)
+        ground = BareGround.learn(sample, camera, target, stated, region)
         return ground, sample, replace(ground.level, wander_mm=range_mm)
 
     def _sampled(self, sample: Depths) -> SampledScene:
-        """A sample (n, H, W) mm, and what is known of the empty scene."""
-        wanted = self.wanted
+        """A sample (n, H, W) mm combined with the empty scene."""
+        target = self.target
         return SampledScene(
             sample,
             self.background,
             self.spread,
             self.camera,
-            wanted.spine_mm,
-            wanted.min_height_mm,
-            wanted.view,
+            target.spine_mm,
+            target.min_height_mm,
+            target.view,
         )
 
-    def under(self, sample: Depths, places: list[NDArray[np.bool_]]) -> BareGround:
-        """The same with the plane of the ground on which an animal keeps still, see `levelled`.
+    def under(self, sample: Depths, masks: list[NDArray[np.bool_]]) -> BareGround:
+        """The same with the plane fitted to the ground under a resting animal, see `levelled`.
 
         Args:
-            sample: (n, H, W) float32 mm, the frames that it was learned from.
-            places: (H, W) bool each, the animal's pixels in some frames.
+            sample: (n, H, W) float32 mm, the frames used for learning.
+            masks: (H, W) bool each, the animal's pixels in some frames.
         """
-        things = [thing_at(own, self.background, self.camera, k) for k, own in enumerate(places)]
-        return replace(self, standing=levelled(self.standing, self._sampled(sample), things))
+        movers = [still_object(own, self.background, self.camera, k) for k, own in enumerate(masks)]
+        return replace(
+            self, support_plane=levelled(self.support_plane, self._sampled(sample), movers)
+        )
 
     @property
     def level(self) -> FloorLevel:
         """The level of its bare floor."""
         return FloorLevel.on(
-            self.background, self.standing.on_floor & near_plane(self.background, self._bare)
+            self.background, self.support_plane.on_floor & near_plane(self.background, self._bare)
         )
 
     @property
     def _bare(self) -> Depths:
         """Depth (H, W) mm of the floor's plane."""
-        return self.standing.floor.depth(self.camera.width, self.camera.height)
+        return self.support_plane.floor.depth(self.camera.width, self.camera.height)
 
     def background_and_limit(self, sample: Depths) -> tuple[Depths, Depths]:
-        """The background with the floor's plane where it is unknown, and the limit before it.
+        """The background, with the floor's plane where it is unknown, and the foreground limit.
 
         Args:
-            sample: (n, H, W) float32 mm, the frames that the ground was learned from.
+            sample: (n, H, W) float32 mm, the frames used for learning.
 
         Returns:
-            Both (H, W) float32 mm; what is nearer than the limit stands out.
+            Both (H, W) float32 mm; readings below the limit are foreground.
         """
         background = self.background
         spread = self.spread
         bare = self._bare
-        on_floor = self.standing.on_floor
-        min_height_mm = self.wanted.min_height_mm
-        if self.wanted.stands:
-            px_mm2 = self.standing.floor.distance_mm**2 / (self.camera.fx * self.camera.fy)
-            least_px = self.wanted.smallest_mm2 / px_mm2
+        on_floor = self.support_plane.on_floor
+        min_height_mm = self.target.min_height_mm
+        if self.target.stands_on_floor:
+            px_mm2 = self.support_plane.floor.distance_mm**2 / (self.camera.fx * self.camera.fy)
+            least_px = self.target.smallest_mm2 / px_mm2
             dark = unread_floor(sample, background, bare, on_floor, min_height_mm, least_px)
             background = np.where(dark, np.float32(0), background)
             spread = np.where(dark, np.float32(0), spread)
@@ -508,7 +505,7 @@ class BareGround:
 
 
 def _check_background(sample: Depths, background: Depths) -> None:
-    """Refuse a sample (n, H, W) mm of frames from which no background (H, W) mm can be learned."""
+    """Refuse a sample (n, H, W) mm from which no background (H, W) mm can be learned."""
     n = len(sample)
     if not (sample > 0).any():
         raise EstimationError(
@@ -517,6 +514,6 @@ def _check_background(sample: Depths, background: Depths) -> None:
         )
     if not (background > 0).any():
         raise EstimationError(
-            f"a background is what keeps coming back, and {n} frame{'' if n == 1 else 's'} cannot "
-            "tell; record some seconds at least"
+            "the background, the depth that recurs in each pixel, cannot be learned from "
+            f"{n} frame{'' if n == 1 else 's'}; record at least a few seconds"
         )

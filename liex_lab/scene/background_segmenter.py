@@ -1,15 +1,15 @@
 """Background subtraction with a learned depth background, and choice of the animal's component.
 
-A pixel is foreground where its reading is nearer than
+A pixel is foreground if its reading is nearer than
 
     limit = background - max(min_height_mm, 3 spread),
 
 where `background` is the farthest mode of the pixel's readings over time and `spread` the standard
-deviation of that mode (see `background`); where no mode is known on the floor, the plane fitted to
-the floor takes over. Segmenter pixels are joined to 8-connected components of 4 x 4 blocks; the
-animal is the component whose area comes nearest to the one that recurs in the most frames, and its
-height map and image moments are cut by the kernels (see `height_maps`). An animal that keeps still,
-wholly or in part, and so is absorbed into the background is found by `resting`.
+deviation of that mode (see `background`); pixels of the floor without a mode use the fitted floor
+plane. Foreground pixels are connected to 8-connected components of 4 x 4 blocks; the animal is the
+component whose area is nearest to the one that recurs in the most frames. The kernels cut its
+height map and image moments (see `height_maps`). `find_resting_animal` finds an animal that is at
+rest, wholly or in part, and therefore absorbed into the background.
 """
 
 from __future__ import annotations
@@ -28,35 +28,40 @@ from liex_lab.scene.background import SPREADS as SPREADS  # models are trained w
 from liex_lab.scene.background import (
     BareGround,
     FloorLevel,
-    Wanted,
+    TargetAnimal,
     sample_frames,
     sampled,
     stride_for,
 )
 from liex_lab.scene.floor import Floor
-from liex_lab.scene.objects import at_rest, find_put_in, is_like_an_animal, with_its_still_part
+from liex_lab.scene.objects import (
+    find_resting_animal,
+    find_transient_objects,
+    is_like_an_animal,
+    with_its_still_part,
+)
 from liex_lab.scene.still_scene import SceneChange, StillScene
 from liex_lab.scene.worn import Cable, HeadStage
 
 Depths = NDArray[np.float32]
 
-_N_PIXELS = 20_000  # looked at for noise and edges, spread over the picture
-_N_FRAMES = 12  # looked at for the seam around the animal
-_LEAST_READ = 0.5  # of the frames read a pixel that tells noise
-_LEAST = 200  # pixels, readings or seam pixels below which nothing is told
-_SAME_MM = 6.0  # or of the depth: readings this near to the background are of it
+_N_PIXELS = 20_000  # inspected for noise and edges, spread over the image
+_N_FRAMES = 12  # inspected for the seam around the animal
+_LEAST_READ = 0.5  # least share of frames that read a pixel used for noise
+_LEAST = 200  # fewer pixels, readings or seam pixels give no estimate
+_SAME_MM = 6.0  # readings within this distance belong to the background
 _SAME_SHARE = 0.012
 _JUMP_MM = 60.0  # of depth within two pixels: an edge
-_MIDDLE = (0.25, 0.75)  # of the jump: what lies there is of neither side
-_REACH_PX = 4  # from the outline: the seam is looked for
-_ROUND_MM = 0.05  # a finer step is none
+_MIDDLE = (0.25, 0.75)  # of the jump: readings there belong to neither side
+_REACH_PX = 4  # largest distance of the seam from the outline
+_ROUND_MM = 0.05  # a finer step is continuous
 
 
 def read_sensor(scene: StillScene, sample: Depths) -> SensorCard:
-    """The card of the sensor that took a sample.
+    """The quality card of the sensor that recorded a sample.
 
     Args:
-        scene: the scene that was learned from it, with its animal's area.
+        scene: learned from the sample, including its animal's area.
         sample: (n, H, W) float32 mm, frames at the scene's stride, 0 where unread.
     """
     return SensorCard(
@@ -68,13 +73,13 @@ def read_sensor(scene: StillScene, sample: Depths) -> SensorCard:
 
 
 def _noise(background: Depths, sample: Depths) -> tuple[tuple[float, float], ...]:
-    """Noise by depth: of the nearest, the middle and the farthest third of the still pixels, one of
-    all where these are of one depth to a tenth.
+    """Noise by depth: of the nearest, middle and farthest third of the still pixels; a single value
+    if their depths differ by less than a tenth.
     """
-    known = np.flatnonzero(background > 0)
-    known = known[:: max(1, len(known) // _N_PIXELS)]
-    depth = background.ravel()[known]
-    off = sample.reshape(len(sample), -1)[:, known] - depth
+    valid = np.flatnonzero(background > 0)
+    valid = valid[:: max(1, len(valid) // _N_PIXELS)]
+    depth = background.ravel()[valid]
+    off = sample.reshape(len(sample), -1)[:, valid] - depth
     still = np.abs(off) < np.maximum(_SAME_MM, _SAME_SHARE * depth)
     n = still.sum(axis=0)
     steady = n >= max(3, _LEAST_READ * len(sample))
@@ -93,7 +98,7 @@ def _noise(background: Depths, sample: Depths) -> tuple[tuple[float, float], ...
 
 
 def _step(sample: Depths) -> float | None:
-    """The usual distance between neighbouring values of depth near the median one."""
+    """The usual distance between neighbouring depth values near the median."""
     read = sample[:: max(1, len(sample) // 8)]
     read = read[read > 0]
     if len(read) < _LEAST:
@@ -107,13 +112,15 @@ def _step(sample: Depths) -> float | None:
 
 
 def _seam(scene: StillScene, sample: Depths) -> float | None:
-    """How many pixels of the picture around the animal are unread, beyond those unread anyway."""
+    """Width of the unread seam around the animal, px of the image, beyond the usual share of unread
+    pixels.
+    """
     rows = np.linspace(0, len(sample) - 1, min(_N_FRAMES, len(sample))).astype(int)
     shown = sample[rows]
     crops = scene.extract(shown, 1.0)
     unread = np.zeros(_REACH_PX)
-    seen = np.zeros(_REACH_PX)
-    for i, own in zip(np.flatnonzero(crops.found), scene.places(crops), strict=True):
+    counted = np.zeros(_REACH_PX)
+    for i, own in zip(np.flatnonzero(crops.found), scene.animal_masks(crops), strict=True):
         v, u, height, width = cv2.boundingRect(own.T.astype(np.uint8))
         cut = (
             slice(max(0, v - _REACH_PX), v + height + _REACH_PX),
@@ -123,15 +130,15 @@ def _seam(scene: StillScene, sample: Depths) -> float | None:
         for k in range(_REACH_PX):
             ring = (around == k + 1) & scene.on_floor[cut]
             unread[k] += (shown[i][cut][ring] == 0).sum()
-            seen[k] += ring.sum()
-    if seen.min() < _LEAST:
+            counted[k] += ring.sum()
+    if counted.min() < _LEAST:
         return None
     anyway = float((shown[:, scene.on_floor] == 0).mean())
-    return round(scene.stride * float(np.clip(unread / seen - anyway, 0.0, 1.0).sum()), 2)
+    return round(scene.stride * float(np.clip(unread / counted - anyway, 0.0, 1.0).sum()), 2)
 
 
 def _mixed(background: Depths, sample: Depths) -> float | None:
-    """Of the readings at edges of the still scene, the share that lies between both sides."""
+    """Share of the readings at edges of the still scene that lie between both sides."""
     left, right = background[:, :-2], background[:, 2:]
     edge = (left > 0) & (right > 0) & (np.abs(left - right) > _JUMP_MM)
     rows, columns = np.nonzero(edge)
@@ -148,23 +155,23 @@ def _mixed(background: Depths, sample: Depths) -> float | None:
 
 Array = NDArray[np.float64]
 
-_OTHER = 3.0  # times larger or smaller is another thing
+_OTHER = 3.0  # ratio of areas beyond which it is another object
 
 
 @dataclass(frozen=True)
 class BackgroundSubtraction(StillScene):
-    """The empty scene of one camera as it was learned from a recording, see `StillScene`."""
+    """The empty scene of one camera as learned from a recording, see `StillScene`."""
 
     @staticmethod
     def from_floor(
         camera: Camera, floor: Floor, min_height_mm: float = 7.0
     ) -> BackgroundSubtraction:
-        """A segmenter that knows nothing but the floor; the background is the bare plane.
+        """A segmenter whose background is the bare floor plane.
 
         Args:
             camera: the ideal pinhole camera.
             floor: the floor plane in its frame.
-            min_height_mm: what stands out from the floor by less is not the animal.
+            min_height_mm: smaller heights above the floor are not the animal.
         """
         bare = floor.depth(camera.width, camera.height)
         limit = np.maximum(bare - np.float32(min_height_mm), 0).astype(np.float32)
@@ -180,35 +187,33 @@ class BackgroundSubtraction(StillScene):
         floor: Floor | None = None,
         region: NDArray[np.bool_] | None = None,
     ) -> tuple[BackgroundSubtraction, NDArray[np.float32]]:
-        """The background subtraction of a recording, learned from frames spread over it.
+        """Learn the background subtraction of a recording from frames spread over it.
 
-        The background of a pixel is the farthest depth that keeps coming back, which survives an
-        animal that covers it most of the time; where the animal never leaves its place the floor
-        plane takes over. On the rims and walls around the floor, which flicker between near and
-        far, only what is nearer than the nearest usual depth counts. Where fewer than half of the
-        frames show an animal, it perhaps sits in its own background: then the floor plane itself is
-        tried as background, and kept if more frames show one.
+        The background of a pixel is its farthest recurring depth, which remains visible although an
+        animal covers it most of the time; under an animal that never moves, the floor plane is
+        used. Rims and walls around the floor flicker between near and far, so only readings nearer
+        than the nearest usual depth are foreground there. If fewer than half of the frames show an
+        animal, it may be absorbed into its own background: the floor plane is then tried as
+        background, and kept if more frames show an animal.
 
         Args:
-            recording: an ideal pinhole's recording, see `recordings.rectify`.
-            spine_mm: lengths of the smallest and the largest animal to expect, mm.
-            n_frames: frames that are sampled, at most.
-            min_height_mm: what stands out from the background by less is not the animal.
-            view: how such animals are looked at; one that does not stand on the floor may be
-                anywhere.
-            floor: the floor where it is stated; None finds it.
-            region: (height, width) bool of the whole picture, where it is looked at; None
-                everywhere.
+            recording: of an ideal pinhole camera, see `recordings.rectify`.
+            spine_mm: lengths of the smallest and the largest expected animal, mm.
+            n_frames: sampled frames at most.
+            min_height_mm: smaller heights above the background are not the animal.
+            view: how such animals are viewed; one that does not stand on the floor may be anywhere.
+            floor: the stated floor; None to estimate it.
+            region: (height, width) bool of the full image, analysed pixels; None for all.
 
         Returns:
-            The segmenter, and the sample (n, H, W) float32 mm of frames from which it was learned,
+            The segmenter, and the sample (n, H, W) float32 mm of frames that it was learned from,
             at its stride.
 
         Raises:
-            EstimationError: no depth was read, nothing comes back often enough to be a background,
-                no floor was found, or nothing of an animal's size stands on it.
+            EstimationError: no depth was read, no depth recurs often enough to be a background, no
+                floor was found, or nothing of an animal's size stands on it.
         """
-        wanted = Wanted(spine_mm, min_height_mm, view)
+        target = TargetAnimal(spine_mm, min_height_mm, view)
         stride = stride_for(recording, spine_mm[0])
         sample = sample_frames(recording, n_frames, stride)
         cut = None
@@ -216,22 +221,28 @@ class BackgroundSubtraction(StillScene):
             cut = region[::stride, ::stride]
             sample *= cut
         ground, sample, level = BareGround.steady(
-            sample, recording.camera.every(stride), wanted, floor, cut
+            sample, recording.camera.every(stride), target, floor, cut
         )
         camera = recording.camera
         times_ns = recording.times_ns[sampled(len(recording), n_frames)]
         times_s = (times_ns - recording.times_ns[0]) * 1e-9
         whole = sample
         scene, sample = BackgroundSubtraction._of(camera, stride, ground, whole, level)
-        if wanted.stands and floor is None and not ground.standing.moves:
-            # nothing that moves has told which of two levels is the floor: what lies there does
-            under = ground.under(whole, scene.places(scene.extract(sample, 1.0)))
-            if under.standing is not ground.standing:
+        if target.stands_on_floor and floor is None and not ground.support_plane.moves:
+            # without movers, the animal at rest decides which of two levels is the floor
+            under = ground.under(whole, scene.animal_masks(scene.extract(sample, 1.0)))
+            if under.support_plane is not ground.support_plane:
                 scene, sample = BackgroundSubtraction._of(camera, stride, under, whole, level)
         changed = SceneChange.find(sample, times_s, scene.grid, scene.area_mm2)
         scene = replace(scene, volume_mm3=scene.usual_volume(sample), changed=changed)
-        put_in = find_put_in(scene, sample, times_s) if wanted.stands and changed is None else ()
-        return replace(scene, sensor=read_sensor(scene, sample), put_in=put_in), sample
+        transient_objects = (
+            find_transient_objects(scene, sample, times_s)
+            if target.stands_on_floor and changed is None
+            else ()
+        )
+        return replace(
+            scene, sensor=read_sensor(scene, sample), transient_objects=transient_objects
+        ), sample
 
     @staticmethod
     def _of(
@@ -241,13 +252,11 @@ class BackgroundSubtraction(StillScene):
         sample: NDArray[np.float32],
         level: FloorLevel | None,
     ) -> tuple[BackgroundSubtraction, NDArray[np.float32]]:
-        """The scene of a ground with its animal, and the sample without what that wears; see
-        `_empty`.
-        """
+        """The scene of a ground with its animal, and the sample without worn devices."""
         scene = BackgroundSubtraction._empty(camera, stride, ground, sample, level)
-        if ground.wanted.stands:
-            scene, sample = scene._without_worn(sample, ground.wanted)
-        return scene._with_its_animal(sample, ground.wanted), sample
+        if ground.target.stands_on_floor:
+            scene, sample = scene._without_worn(sample, ground.target)
+        return scene._with_its_animal(sample, ground.target), sample
 
     @staticmethod
     def _empty(
@@ -257,97 +266,101 @@ class BackgroundSubtraction(StillScene):
         sample: NDArray[np.float32],
         level: FloorLevel | None,
     ) -> BackgroundSubtraction:
-        """The scene of a ground, of whose animal nothing is known yet.
+        """The scene of a ground before its animal is identified.
 
         Args:
             camera: the ideal pinhole camera of the recording.
-            stride: of the pixels that are looked at.
-            ground: what was learned of the empty scene.
-            sample: (n, H, W) float32 mm, the frames that it was learned from.
-            level: brings frames to one level of the floor; None where it is still.
+            stride: of the analysed pixels.
+            ground: the empty scene.
+            sample: (n, H, W) float32 mm, the frames used for learning.
+            level: reference level of the floor; None if it does not drift.
         """
         background, limit = ground.background_and_limit(sample)
-        on_floor = ground.standing.on_floor
-        seen = ground.standing.floor
+        on_floor = ground.support_plane.on_floor
+        plane = ground.support_plane.floor
         return BackgroundSubtraction(
             camera,
-            seen if stride == 1 else Floor.from_plane(seen.normal, seen.distance_mm, camera),
+            plane if stride == 1 else Floor.from_plane(plane.normal, plane.distance_mm, camera),
             background,
             limit,
-            on_floor if ground.wanted.stands else np.ones_like(on_floor),
-            view=ground.wanted.view,
+            on_floor if ground.target.stands_on_floor else np.ones_like(on_floor),
+            view=ground.target.view,
             stride=stride,
-            standing=ground.standing,
+            support_plane=ground.support_plane,
             level=level,
         )
 
     def _without_worn(
-        self, sample: NDArray[np.float32], wanted: Wanted
+        self, sample: NDArray[np.float32], target: TargetAnimal
     ) -> tuple[BackgroundSubtraction, NDArray[np.float32]]:
-        """The scene and the sample (n, H, W) mm with cables and head stages cut out, themselves
-        where there are none.
+        """The scene and the sample (n, H, W) mm with cables and head stages removed, if there are
+        any.
         """
         scene = self
-        floor = self.grid_floor if self.standing is None else self.standing.floor
+        floor = self.grid_floor if self.support_plane is None else self.support_plane.floor
         grid = self.grid
-        cable = Cable.find(sample, self.limit, grid, floor, wanted.spine_mm[1], wanted.smallest_mm2)
+        cable = Cable.find(sample, self.limit, grid, floor, target.spine_mm[1], target.smallest_mm2)
         if cable is not None:
             whole, sample = sample, cable.cut(sample, self.limit)
             scene = replace(scene, cable=cable.with_fixed(whole, sample))
-        stage = HeadStage.find(sample, self.limit, grid, floor, wanted.smallest_mm2)
+        stage = HeadStage.find(sample, self.limit, grid, floor, target.smallest_mm2)
         if stage is not None:
             scene = replace(scene, stage=stage)
             sample = stage.cut(sample, self.limit)
         return scene, sample
 
     def _with_its_animal(
-        self, sample: NDArray[np.float32], wanted: Wanted
+        self, sample: NDArray[np.float32], target: TargetAnimal
     ) -> BackgroundSubtraction:
-        """The scene with the usual area of its animal, and the floor under one that keeps still.
+        """The scene with the usual area of its animal, and floor under an animal at rest.
 
         Args:
             sample: (n, H, W) float32 mm, frames at this scene's stride.
-            wanted: what animal is expected.
+            target: the expected animal.
 
         Raises:
             EstimationError: nothing of an animal's size stands on the floor.
         """
         scene = self
-        area, share = scene._moving_area(sample, wanted)
-        moves = share >= 0.5 or (share > 0.0 and self.standing is not None and self.standing.moves)
-        rests = at_rest(scene, sample, wanted, area, share)
+        area, share = scene._moving_area(sample, target)
+        moves = share >= 0.5 or (
+            share > 0.0 and self.support_plane is not None and self.support_plane.moves
+        )
+        rests = find_resting_animal(scene, sample, target, area, share)
         if rests is not None:
             scene, area, share = rests.scene, rests.area_mm2, rests.share
             moves = False
-        elif wanted.stands and share >= 0.5:
-            scene, area = with_its_still_part(scene, sample, wanted, area)
-        # what was not seen moving is an animal only where it is as large and as high as one
-        if wanted.stands and share > 0.0 and not moves:
-            seen_as = replace(scene, area_mm2=area)
-            share = share if is_like_an_animal(seen_as, sample, wanted) else 0.0
+        elif target.stands_on_floor and share >= 0.5:
+            scene, area = with_its_still_part(scene, sample, target, area)
+        # an object that does not move must have an animal's size and height
+        if target.stands_on_floor and share > 0.0 and not moves:
+            as_animal = replace(scene, area_mm2=area)
+            share = share if is_like_an_animal(as_animal, sample, target) else 0.0
         if share == 0.0:
             raise EstimationError(
                 f"no animal was found in {len(sample)} frames spread over the recording: nothing "
-                f"between {wanted.smallest_mm2:.0f} and {wanted.largest_mm2:.0f} mm^2 stands on "
+                f"between {target.smallest_mm2:.0f} and {target.largest_mm2:.0f} mm^2 stands on "
                 "the floor; check the depth unit, or set animal.spine_min_mm and spine_max_mm in "
                 "the plan"
             )
         return replace(scene, area_mm2=area)
 
-    def _moving_area(self, sample: NDArray[np.float32], wanted: Wanted) -> tuple[float, float]:
+    def _moving_area(
+        self, sample: NDArray[np.float32], target: TargetAnimal
+    ) -> tuple[float, float]:
         """The usual area mm^2, and the share of the frames that show it, see `usual_area`.
 
-        Where that is not the area of what was seen moving clearly, but of specks that come back in
-        more frames, as before an animal came, the area of what moves counts. What is like an animal
-        is no speck, though a larger thing comes and goes beside it.
+        If that differs clearly from the area of the moving objects, as for specks that recur in
+        more frames before the animal arrives, the area of the moving objects is used. A component
+        that resembles an animal is no speck, even if a larger object moves in and out of view.
         """
-        area, share = self.usual_area(sample, wanted.spine_mm)
-        standing = self.standing
-        if standing is None or not standing.moves or self.view.frame != VIEWS[0]:
+        area, share = self.usual_area(sample, target.spine_mm)
+        support_plane = self.support_plane
+        if support_plane is None or not support_plane.moves or self.view.frame != VIEWS[0]:
             return area, share
-        if area > 0.0 and abs(np.log(area / standing.thing_mm2)) < np.log(_OTHER):
+        if area > 0.0 and abs(np.log(area / support_plane.mover_mm2)) < np.log(_OTHER):
             return area, share
-        if share >= 0.5 and is_like_an_animal(replace(self, area_mm2=area), sample, wanted):
+        if share >= 0.5 and is_like_an_animal(replace(self, area_mm2=area), sample, target):
             return area, share
-        crops = replace(self, area_mm2=standing.thing_mm2).extract(sample, 1.0)
-        return standing.thing_mm2, float(crops.found.mean())
+        crops = replace(self, area_mm2=support_plane.mover_mm2).extract(sample, 1.0)
+        return support_plane.mover_mm2, float(crops.found.mean())

@@ -1,9 +1,9 @@
-"""Floor plane of a depth picture by RANSAC on inverse depth, and the arena frame that stands on it.
+"""Floor plane of a depth image by RANSAC on inverse depth, and the arena frame defined by it.
 
-A plane in a pinhole picture has 1 / z = a u + b v + c, linear in the pixel (u, v). `find_floor`
-tries 600 planes through three pixels each (RANSAC, Fischler and Bolles 1981), on few voters first
-and the best 20 on more, and fits the winner to its inliers (8 mm) by least squares, three rounds.
-`floor_region` says where in the picture the floor lies.
+A plane in a pinhole image has 1 / z = a u + b v + c, linear in the pixel (u, v). `find_floor` tries
+600 planes through three pixels each (RANSAC, Fischler and Bolles 1981), on few voters first and the
+best 20 on more, and fits the winner to its inliers (8 mm) by least squares in three rounds.
+`floor_region` marks the floor in the image.
 
 Arena frame: z up from the floor, origin at the foot of the camera's perpendicular, x along the
 camera's x.
@@ -29,11 +29,11 @@ _N_VOTERS = 6000
 _N_TRIALS = 600
 _N_FITTED = 60_000  # pixels that the plane is fitted to
 _INLIER_MM = 8.0  # a floor is flat to about this much, depth noise included
-_MIN_SHARE = 0.2  # of the readable pixels must lie on the floor
+_MIN_SHARE = 0.2  # least share of the readable pixels on the floor
 _MAX_TILT_DEG = 60.0
 # background this near to the plane is floor: flatness, noise and lens errors together
 _FLAT_MM = 15.0
-# what is said of a camera's place: beyond these no model has learned
+# range of camera positions in the training data
 _PLAUSIBLE_MM = (150.0, 3000.0)
 _MUCH_TILT_RAD = math.radians(15.0)
 
@@ -58,10 +58,7 @@ class Floor:
 
         Args:
             coefficients: (3,) a, b, c, 1/mm per pixel and 1/mm.
-            camera: whose pixels they count.
-
-        Returns:
-            The plane.
+            camera: of these pixels.
         """
         a, b, c = coefficients
         toward = np.array([a * camera.fx, b * camera.fy, c + a * camera.cx + b * camera.cy])
@@ -75,10 +72,7 @@ class Floor:
         Args:
             normal: (3,) pointing away from the lens, of any length.
             distance_mm: from the camera along the unit normal, mm.
-            camera: in whose pixels `inverse_depth` counts.
-
-        Returns:
-            The plane.
+            camera: of the pixels of `inverse_depth`.
         """
         n = np.asarray(normal, float) / np.linalg.norm(normal)
         a = n[0] / camera.fx / distance_mm
@@ -107,20 +101,16 @@ class Floor:
         return math.acos(min(1.0, float(self.normal[2])))
 
     def lens_distance_mm(self, lift_mm: Array | None = None) -> float:
-        """Distance of the plane from the real lens, mm.
-
-        Args:
-            lift_mm: see `unusual`.
-        """
+        """Distance of the plane from the real lens, mm; `lift_mm` as in `unusual`."""
         up = 0.0 if lift_mm is None else float(lift_mm @ self.normal)
         return self.distance_mm - up
 
     def unusual(self, lift_mm: Array | None = None) -> list[str]:
-        """What is unlike the places of cameras that models learn from, a sentence each.
+        """How the camera's position differs from those in the training data, a sentence each.
 
         Args:
-            lift_mm: (3,) from the real lens to the camera's origin, mm, where water makes an ideal
-                camera of it; None without water.
+            lift_mm: (3,) from the real lens to the camera's origin, mm, of the ideal camera above
+                water; None without water.
         """
         found = []
         distance = self.lens_distance_mm(lift_mm)
@@ -138,14 +128,8 @@ class Floor:
         return found
 
     def depth(self, width: int, height: int) -> NDArray[np.float32]:
-        """Depth of the bare floor under every pixel.
-
-        Args:
-            width: of the picture, px.
-            height: of the picture, px.
-
-        Returns:
-            (height, width) float32 mm; 0 above the horizon.
+        """Depth (height, width) float32 mm of the bare floor in every pixel; 0 above
+        the horizon.
         """
         a, b, c = self.inverse_depth
         inverse = a * np.arange(width)[None, :] + b * np.arange(height)[:, None] + c
@@ -157,21 +141,18 @@ def find_floor(background: NDArray[np.float32], camera: Camera, seed: int = 0) -
 
     Args:
         background: (H, W) float32 mm, 0 where unread.
-        camera: that took it, free of lens distortion.
+        camera: free of lens distortion.
         seed: of the random pixels.
-
-    Returns:
-        The floor.
 
     Raises:
         EstimationError: less than a fifth of the readable pixels lie on one plane that faces the
             camera (tilted by at most 60 degrees), fewer than 500 pixels are readable, or the
-            camera's distortion was not undone.
+            camera's distortion was not corrected.
     """
     if camera.distortion is not None:
         raise EstimationError(
-            "a floor is found in pictures of a straight lens, but this camera's distortion was "
-            "not undone; pass the recording through liex_lab.recordings.rectify.rectified"
+            "a floor is found in undistorted images only, but this camera's distortion was not "
+            "corrected; pass the recording through liex_lab.recordings.rectify.rectified"
         )
     rows, columns = np.nonzero(background > 0)
     if len(rows) < 500:
@@ -185,8 +166,7 @@ def find_floor(background: NDArray[np.float32], camera: Camera, seed: int = 0) -
     columns = columns[chosen]
     depth = background[rows, columns].astype(float)
     middle = np.array([background.shape[1] / 2.0, background.shape[0] / 2.0])
-    # pixels counted from the picture's middle, in units of its size: so the sums below lose no
-    # digits
+    # pixels relative to the image's middle, in units of its size, for numerical precision
     points = np.stack(
         [(columns - middle[0]) / middle[0], (rows - middle[1]) / middle[0], np.ones(len(rows))],
         axis=1,
@@ -199,17 +179,17 @@ def find_floor(background: NDArray[np.float32], camera: Camera, seed: int = 0) -
     tilt = np.degrees(np.arccos(np.clip(floor.normal[2], -1, 1)))
     if share < _MIN_SHARE or tilt > _MAX_TILT_DEG:
         raise EstimationError(
-            f"no floor was found: the largest plane holds {share:.0%} of the readable pixels and "
-            f"is tilted by {tilt:.0f} degrees; the camera should look down on a floor"
+            f"no floor was found: the largest plane contains {share:.0%} of the readable pixels "
+            f"and is tilted by {tilt:.0f} degrees; the camera should look down on a floor"
         )
     return floor
 
 
 def _largest_plane(points: Array, depth: Array, focal: float, rng: np.random.Generator) -> Array:
-    """The plane (3,), 1 / depth = points . plane, that the most points (n, 3) are on, out of many
-    through three each.
+    """The plane (3,), 1 / depth = points . plane, with the most inliers among the points (n, 3),
+    out of many planes through three points each.
 
-    Planes that do not face the camera (a wall) do not stand. All are tried on some points, the best
+    Planes that do not face the camera (walls) are discarded. All are tried on some points, the best
     few on more. focal: in the units of the points.
     """
     three = rng.integers(0, len(depth), (_N_TRIALS, 3))
@@ -233,9 +213,7 @@ def _largest_plane(points: Array, depth: Array, focal: float, rng: np.random.Gen
 
 
 def _is_near(inverse: Array, depth: Array) -> NDArray[np.bool_]:
-    """Whether points at `depth` lie within `_INLIER_MM` of a plane that has 1 / z = inverse
-    there.
-    """
+    """Whether points at `depth` lie within `_INLIER_MM` of a plane with 1 / z = inverse."""
     return np.asarray(np.abs(depth * inverse - 1.0) < _INLIER_MM * inverse)
 
 
@@ -245,7 +223,7 @@ def _in_pixels(plane: Array, middle: Array, camera: Camera) -> Floor:
 
 
 def _refit(points: Array, depth: Array, plane: Array) -> tuple[Array, float]:
-    """The plane again from every point near it, and the share of points that are."""
+    """The plane refitted to all points near it, and the share of these points."""
     near = _is_near(points @ plane, depth)
     if near.sum() < 3:
         return plane, 0.0
@@ -259,11 +237,8 @@ def fit_plane(background: NDArray[np.float32], where: NDArray[np.bool_], camera:
 
     Args:
         background: (H, W) float32 mm.
-        where: (H, W) bool, readable pixels, at least three that are in no line.
-        camera: that took it, free of lens distortion.
-
-    Returns:
-        The plane.
+        where: (H, W) bool, readable pixels, at least three that are not collinear.
+        camera: free of lens distortion.
     """
     rows, columns = np.nonzero(where)
     middle = np.array([background.shape[1] / 2.0, background.shape[0] / 2.0])
@@ -277,10 +252,10 @@ def fit_plane(background: NDArray[np.float32], where: NDArray[np.bool_], camera:
 
 
 def floor_region(background: NDArray[np.float32], bare: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """Where the floor lies: the convex hull of the largest part of the background on the plane.
+    """The convex hull of the largest connected part of the background on the plane.
 
-    Floors of arenas and tanks are convex; what stands on them or hides them leaves holes, which the
-    hull closes. Where no connected part is left, all pixels near the plane are taken.
+    Floors of arenas and tanks are convex; the hull closes holes left by objects. Without a
+    connected part, all pixels near the plane are returned.
 
     Args:
         background: (H, W) float32 mm, 0 where unread.
@@ -309,7 +284,7 @@ def floor_patch(background: NDArray[np.float32], bare: NDArray[np.float32]) -> N
         bare: (H, W) float32 mm, depth of the bare floor.
 
     Returns:
-        (H, W) bool, all False where nothing lies on it.
+        (H, W) bool, all False if nothing lies on it.
     """
     import cv2
 
@@ -322,40 +297,32 @@ def floor_patch(background: NDArray[np.float32], bare: NDArray[np.float32]) -> N
 
 
 def near_plane(background: NDArray[np.float32], bare: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """Where the background lies within 15 mm of the bare floor.
-
-    Args:
-        background: (H, W) float32 mm, 0 where unread.
-        bare: (H, W) float32 mm, depth of the bare floor.
-
-    Returns:
-        (H, W) bool.
-    """
+    """Pixels (H, W) bool whose background lies within 15 mm of the bare floor (H, W) mm."""
     return (background > 0) & (np.abs(background - bare) < _FLAT_MM)
 
 
-# Flat grounds of an empty scene: every large plane that faces the camera, and its patches.
+# Flat grounds of an empty scene: patches of every large plane that faces the camera.
 
 
-_WINDOWS = 14  # along the picture's longer side, each overlapping its neighbours by half
-_READ_SHARE = 0.5  # of a window's pixels that must be readable
-_FLAT_SHARE = 0.7  # and of those, that must lie on its plane
+_WINDOWS = 14  # along the image's longer side, each overlapping its neighbours by half
+_READ_SHARE = 0.5  # least share of a window's pixels that are readable
+_FLAT_SHARE = 0.7  # least share of those that lie on its plane
 _GROUND_FLAT_MM = 8.0
-_SIDE = 160  # pixels a side that are looked at
+_SIDE = 160  # analysed pixels per side
 _MAX_PLANES = 8
 _ROUNDS = 4
-_BEYOND_PX = 6  # so far from a patch its surroundings are looked at
-_RISE_MM = 20.0  # by which a wall rises above its floor at least
+_BEYOND_PX = 6  # width of the inspected surroundings of a patch
+_RISE_MM = 20.0  # least height of a wall above its floor
 
 
 @dataclass(frozen=True)
-class Ground:
+class FlatGround:
     """A connected flat patch of an empty scene that faces the camera.
 
     Attributes:
         floor: its plane.
-        patch: (H, W) bool, where it lies in the picture.
-        enclosed: share of its outline, 0 to 1, from which something rises.
+        patch: (H, W) bool, its pixels.
+        enclosed: share of its outline, 0 to 1, with a wall.
     """
 
     floor: Floor
@@ -363,14 +330,7 @@ class Ground:
     enclosed: float
 
     def region(self, reach_px: float) -> NDArray[np.bool_]:
-        """The ground's convex hull, and what lies around it.
-
-        Args:
-            reach_px: how far around it, px.
-
-        Returns:
-            (H, W) bool.
-        """
+        """The ground's convex hull (H, W) bool, extended by `reach_px`."""
         import cv2
 
         region = np.zeros(self.patch.shape, np.uint8)
@@ -380,16 +340,18 @@ class Ground:
         return np.asarray(away <= reach_px)
 
 
-def flat_grounds(background: NDArray[np.float32], camera: Camera, least_mm2: float) -> list[Ground]:
+def flat_grounds(
+    background: NDArray[np.float32], camera: Camera, least_mm2: float
+) -> list[FlatGround]:
     """The flat patches of an empty scene, those of the plane with the most pixels first.
 
     Args:
         background: (H, W) float32 mm, 0 where unread.
-        camera: that took it, free of lens distortion.
-        least_mm2: smaller patches are left out, mm^2.
+        camera: free of lens distortion.
+        least_mm2: area of the smallest patch, mm^2.
 
     Returns:
-        The grounds, none where nothing is flat.
+        The grounds; empty if nothing is flat.
     """
     step = max(1, max(background.shape) // _SIDE)
     rows, columns = np.mgrid[0 : background.shape[0] : step, 0 : background.shape[1] : step]
@@ -403,7 +365,7 @@ def flat_grounds(background: NDArray[np.float32], camera: Camera, least_mm2: flo
     seeds = _seeds(points, depth, camera.fx / middle[0])
     left = read.copy()
     mm2_per_px = step * step / (camera.fx * camera.fy)
-    grounds: list[Ground] = []
+    grounds: list[FlatGround] = []
     for _ in range(_MAX_PLANES):
         if not len(seeds) or not left.any():
             break
@@ -428,7 +390,7 @@ def flat_grounds(background: NDArray[np.float32], camera: Camera, least_mm2: flo
 
 
 def _seeds(points: Array, depth: Array, focal: float) -> Array:
-    """The planes (n, 3), 1 / depth = points . plane, of the picture's flat windows."""
+    """The planes (n, 3), 1 / depth = points . plane, of the image's flat windows."""
     side = max(4, max(depth.shape) // _WINDOWS)
     found = []
     for row in range(0, max(1, depth.shape[0] - side + 1), side // 2):
@@ -456,12 +418,14 @@ def _fit(points: Array, depth: Array) -> Array:
 
 
 def _on(inverse: Array, depth: Array, within_mm: float) -> NDArray[np.bool_]:
-    """Whether points at `depth` lie within so many mm of the plane that has 1 / z = inverse."""
+    """Whether points at `depth` lie within `within_mm` of the plane with 1 / z = inverse."""
     return np.asarray((depth > 0) & (np.abs(depth * inverse - 1.0) < within_mm * inverse))
 
 
 def _same(planes: Array, plane: Array, points: Array) -> NDArray[np.bool_]:
-    """Which of the planes (n, 3) differ from one by less than a floor's flatness over points."""
+    """Which of the planes (n, 3) differ from one by less than the flatness
+    tolerance over points.
+    """
     if not len(points):
         return np.zeros(len(planes), np.bool_)
     some = points[:: max(1, len(points) // 200)]
@@ -471,11 +435,10 @@ def _same(planes: Array, plane: Array, points: Array) -> NDArray[np.bool_]:
 
 def _patches(
     background: NDArray[np.float32], floor: Floor, camera: Camera, least_mm2: float
-) -> list[Ground]:
-    """The connected parts of the background on a plane, largest first, each with a plane of its
-    own.
+) -> list[FlatGround]:
+    """The connected parts of the background on a plane, largest first, each with its own plane.
 
-    Pixels without a reading between pixels of the plane count as on it: glossy floors have holes.
+    Unread pixels between pixels of the plane count as on it: glossy floors have holes.
     """
     import cv2
 
@@ -493,14 +456,14 @@ def _patches(
         if area < least_mm2:
             break
         own = _refitted(background, patch, floor, camera)
-        found.append(Ground(own, labels == k, _enclosed(background, labels == k, own, camera)))
+        found.append(FlatGround(own, labels == k, _enclosed(background, labels == k, own, camera)))
     return found
 
 
 def _refitted(
     background: NDArray[np.float32], patch: NDArray[np.bool_], floor: Floor, camera: Camera
 ) -> Floor:
-    """The plane of one patch's own pixels, from the whole plane's."""
+    """The plane of one patch's own pixels, starting from the whole plane's."""
     rows, columns = np.nonzero(patch)
     depth = background[rows, columns].astype(float)
     middle = np.array([background.shape[1] / 2.0, background.shape[0] / 2.0])
@@ -523,7 +486,7 @@ def _enclosed(
 ) -> float:
     """The share of a patch's outline just beyond which something rises above the floor.
 
-    What the picture's border cuts is not enclosed.
+    Outline along the image border is not enclosed.
     """
     import cv2
 

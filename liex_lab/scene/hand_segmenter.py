@@ -1,12 +1,12 @@
-"""Segmentation of a hand in depth pictures by geodesic extrema: no background is known.
+"""Segmentation of a hand in depth images by geodesic extrema, without a background.
 
 Nothing is nearer to the camera than the hand, and an arm leads away from it. Each surface (a
-connected component of blocks whose depths differ by less than 50 mm) is walked from where it leaves
-the picture; where the geodesic distance has a maximum that stands out (its persistence) a hand may
-be. This is the idea of accumulative geodesic extrema (Plagemann et al., ICRA 2010; Baak et al.,
-ICCV 2011). Mean shift centres a sphere on such an end, what leaves the sphere is the arm, and the
+connected component of blocks whose depths differ by less than 50 mm) is traversed from where it
+leaves the image; maxima of the geodesic distance with enough persistence are candidate hands. This
+is the idea of accumulative geodesic extrema (Plagemann et al., ICRA 2010; Baak et al., ICCV 2011).
+Mean shift centres a sphere on such an end, the part that leaves the sphere is the arm, and the
 surface is cut a hand's length behind the fingertips. A score with weights learned by logistic
-regression chooses among the ends; see the kernels.
+regression selects the best end; see the kernels.
 """
 
 from __future__ import annotations
@@ -30,27 +30,27 @@ from liex_lab.scene.segmenter import Segmenter
 
 Array = NDArray[np.float64]
 
-RANGE_MM = (250.0, 1600.0)  # nearer and farther than this nothing is a hand
-_FLAT = np.array([0.0, 0.0, 1.0])  # across the optical axis
-# of the logarithms, from posture to posture of one hand
+RANGE_MM = (250.0, 1600.0)  # least and largest depth of a hand
+_FLAT = np.array([0.0, 0.0, 1.0])  # perpendicular to the optical axis
+# standard deviations of the logarithms between postures of one hand
 _AREA_SD = 0.45
 _VOLUME_SD = 0.45
 
 
 @dataclass(frozen=True)
 class HandSegmenter(Segmenter):
-    """Segmentation of the hand in one camera's pictures.
+    """Segmentation of the hand in one camera's images.
 
     The same interface as that of `BackgroundSubtraction`.
 
     Attributes:
         camera: the ideal pinhole camera of the recording.
-        floor: a plane across the optical axis behind the hand, which stands for the arena's: z
-            points at the camera.
-        view: how hands are looked at.
-        near_mm: the least depth at which a hand is looked for.
-        far_mm: the largest depth at which a hand is looked for.
-        area_mm2: the hand's usual area as the camera sees it, mm^2; 0 while unknown.
+        floor: a plane across the optical axis behind the hand, which replaces the arena's: z points
+            at the camera.
+        view: how hands are viewed.
+        near_mm: least depth of a hand.
+        far_mm: largest depth of a hand.
+        area_mm2: the hand's usual area in the camera's view, mm^2; 0 while unknown.
         volume_mm3: the hand's usual volume above its reference plane, mm^3; 0 while unknown.
     """
 
@@ -72,13 +72,13 @@ class HandSegmenter(Segmenter):
         """The hand segmenter of a recording, with the hand's usual area, volume and depth.
 
         Args:
-            recording: an ideal pinhole's recording, see `recordings.rectify`.
-            view: how hands are looked at.
-            n_frames: frames that are sampled, at most.
-            range_mm: least and largest depth at which a hand is looked for.
+            recording: of an ideal pinhole camera, see `recordings.rectify`.
+            view: how hands are viewed.
+            n_frames: sampled frames at most.
+            range_mm: least and largest depth of a hand.
 
         Returns:
-            The segmenter, and the sample (n, H, W) float32 mm of frames from which it was learned.
+            The segmenter, and the sample (n, H, W) float32 mm of frames that it was learned from.
 
         Raises:
             EstimationError: nothing of a hand's size lies within the range.
@@ -93,20 +93,20 @@ class HandSegmenter(Segmenter):
                 f"a hand's size lies between {range_mm[0]:g} and {range_mm[1]:g} mm; check the "
                 "depth unit, foreground.near_mm and far_mm"
             )
-        seen = crops[crops.found].blobs
+        blobs = crops[crops.found].blobs
         floor = Floor.from_plane(_FLAT, float(np.median(crops.distance[crops.found])), camera)
         return replace(
             scene,
             floor=floor,
-            area_mm2=float(np.median(seen.area_mm2)),
-            volume_mm3=float(np.median(seen.volume_mm3)),
+            area_mm2=float(np.median(blobs.area_mm2)),
+            volume_mm3=float(np.median(blobs.volume_mm3)),
         ), sample
 
     def misfit(self, crops: HeightMaps) -> Array:
         """How unlike the hand each height map (n,) is in size: squared standard deviations.
 
-        The sum of ((log a - log a0) / 0.45)^2 over area and of the same over volume, from posture
-        to posture of one hand.
+        The sum of ((log a - log a0) / 0.45)^2 over area and of the same over volume, where the
+        deviations are those between postures of one hand.
 
         Args:
             crops: n height maps.
@@ -118,9 +118,7 @@ class HandSegmenter(Segmenter):
         ) ** 2
 
     def crop_cameras(self, crops: HeightMaps, camera_view: bool = False) -> Array:
-        """The crop cameras of height maps.
-
-        Each says how its map was cut: intrinsics, T_view_camera, origin and step of the crop.
+        """The crop cameras of height maps: intrinsics, T_view_camera, origin and step of each crop.
 
         Args:
             crops: n height maps.
@@ -132,14 +130,14 @@ class HandSegmenter(Segmenter):
         return crop_cameras_of(crops, self._intrinsics(len(crops.step)), camera_view)
 
     def planes(self, crops: HeightMaps, camera_view: bool = False) -> Array:
-        """The plane above which each height map is measured, across its line of sight.
+        """The reference plane of each height map, perpendicular to its line of sight.
 
         Args:
             crops: n height maps.
             camera_view: as they were extracted.
 
         Returns:
-            (n, 3) a, b, c of 1 / z = a u + b v + c, per mm, u and v in pixels of the picture.
+            (n, 3) a, b, c of 1 / z = a u + b v + c, per mm, u and v in image pixels.
         """
         camera = crop_columns(self.crop_cameras(crops, camera_view))
         a = -camera.r20 / camera.fx / camera.distance
@@ -148,7 +146,7 @@ class HandSegmenter(Segmenter):
         return np.stack([a, b, c], axis=-1)
 
     def middles(self, crops: HeightMaps, camera_view: bool = False) -> Array:
-        """The centroid (n, 3) mm of what each height map shows, in the arena frame.
+        """The centroid (n, 3) mm of each height map, in the arena frame.
 
         Args:
             crops: n height maps.
@@ -167,22 +165,12 @@ class HandSegmenter(Segmenter):
         size: float,
         parallel: bool,
         camera_view: bool,
-        n_things: int,
+        n_candidates: int,
     ) -> HeightMaps:
-        """Height maps of the likeliest hands; see `Segmenter`.
+        """Height maps of the best hands; see `Segmenter`.
 
         Heights are measured along the line of sight through the middle of the crop, from behind_mm
         (at home size) behind the hand's middle; camera_view: along the optical axis.
-
-        Args:
-            depths: (n, H, W) float32 mm, 0 where unread.
-            size: the hand's length over the skeleton's home length.
-            parallel: whether to use all threads, else one.
-            camera_view: whether heights are measured along the optical axis.
-            n_things: candidates a frame, 1 or 2.
-
-        Returns:
-            The rows (n) of the likeliest hands, and then (n_things 2) those of the next.
         """
         n = len(depths)
         with threads(parallel):
@@ -193,15 +181,11 @@ class HandSegmenter(Segmenter):
                 self.view,
                 (self.near_mm, self.far_mm),
                 camera_view,
-                n_things,
+                n_candidates,
             )
 
     def every(self, step: int) -> HandSegmenter:
-        """The same segmenter for pictures of every `step`-th row and column.
-
-        Args:
-            step: pixels from one to the next, at least 1.
-        """
+        """The same segmenter for images of every `step`-th row and column."""
         camera = self.camera.every(step)
         return replace(
             self, camera=camera, floor=Floor.from_plane(_FLAT, self.floor.distance_mm, camera)
@@ -214,13 +198,13 @@ class HandSegmenter(Segmenter):
 
 @dataclass(frozen=True)
 class HandPatches:
-    """Patches of pictures from many cameras, each around one hand; the counterpart of `Patches`.
+    """Image patches from many cameras, each around one hand; the counterpart of `Patches`.
 
     Attributes:
         depth: (n, H, W) uint16 mm, 0 where unread.
-        intrinsics: (n, 4) fx, fy, cx, cy, pixels of the whole picture.
-        origin: (n, 2) picture pixel (u, v) of each patch's first.
-        view: how hands are looked at.
+        intrinsics: (n, 4) fx, fy, cx, cy, pixels of the full image.
+        origin: (n, 2) image pixel (u, v) of each patch's first.
+        view: how hands are viewed.
     """
 
     depth: NDArray[np.uint16]
@@ -229,27 +213,25 @@ class HandPatches:
     view: View
 
     def extract(
-        self, size: Array, camera_view: bool = False, n_things: int = 1
+        self, size: Array, camera_view: bool = False, n_candidates: int = 1
     ) -> tuple[HeightMaps, Array]:
         """Height maps of the hands and their crop cameras; see `HandSegmenter`.
 
         Args:
             size: (n,) lengths of the hands over the home length.
             camera_view: whether heights are measured along the optical axis.
-            n_things: 2 gives as many rows again, of what may be a hand as well.
+            n_candidates: 2 adds as many rows again for the second best candidates.
 
         Returns:
             The height maps (n or 2 n), and their crop cameras (n or 2 n, 17) in pixels of the
             patches.
         """
         intrinsics = self.intrinsics.copy()
-        intrinsics[:, 2:] -= (
-            self.origin
-        )  # a window is the picture of a camera whose centre is shifted
+        intrinsics[:, 2:] -= self.origin  # a patch is the image of a camera with a shifted centre
         crops = cut_nearest(
-            self.depth, intrinsics, size, self.view, RANGE_MM, camera_view, n_things
+            self.depth, intrinsics, size, self.view, RANGE_MM, camera_view, n_candidates
         )
-        return crops, crop_cameras_of(crops, np.tile(intrinsics, (n_things, 1)), camera_view)
+        return crops, crop_cameras_of(crops, np.tile(intrinsics, (n_candidates, 1)), camera_view)
 
 
 def cut_nearest(
@@ -259,32 +241,32 @@ def cut_nearest(
     view: View,
     range_mm: tuple[float, float],
     camera_view: bool,
-    n_things: int,
+    n_candidates: int,
 ) -> HeightMaps:
-    """Height maps of the hands in pictures.
+    """Height maps of the hands in images.
 
-    The long axis among the moments points away from the arm, where one is seen.
+    The long axis among the moments points away from the arm, if one is visible.
 
     Args:
         depths: (n, H, W) float32 or uint16 mm, 0 where unread.
-        intrinsics: (n, 4) fx, fy, cx, cy px of each picture.
+        intrinsics: (n, 4) fx, fy, cx, cy px of each image.
         size: (n,) lengths of the hands over the home length.
-        view: how hands are looked at; its lengths hold at home size.
-        range_mm: least and largest depth at which a hand is looked for.
+        view: how hands are viewed; its lengths are those at home size.
+        range_mm: least and largest depth of a hand.
         camera_view: whether heights are measured along the optical axis, else along the line of
             sight through the middle of the crop.
-        n_things: 2 gives as many rows again, of what may be a hand as well.
+        n_candidates: 2 adds as many rows again for the second best candidates.
 
     Returns:
         n or 2 n height maps.
     """
     check_shapes(
-        "pictures of hands",
+        "images of hands",
         ("depths", depths, ("n", "H", "W")),
         ("intrinsics", intrinsics, ("n", 4)),
         ("size", size, ("n",)),
     )
-    crops = HeightMaps.blank(n_things * len(depths), 1000.0)
+    crops = HeightMaps.blank(n_candidates * len(depths), 1000.0)
     sights = kernels.HandSight(
         *range_mm,
         size=size,
@@ -293,7 +275,7 @@ def cut_nearest(
         intrinsics=intrinsics,
         along_axis=camera_view,
     )
-    kernels.extract_all(depths, n_things, sights, crops.rows)
+    kernels.extract_all(depths, n_candidates, sights, crops.rows)
     return crops
 
 
@@ -302,7 +284,7 @@ def crop_cameras_of(crops: HeightMaps, intrinsics: Array, camera_view: bool) -> 
 
     Args:
         crops: n height maps.
-        intrinsics: (n, 4) fx, fy, cx, cy px of each picture.
+        intrinsics: (n, 4) fx, fy, cx, cy px of each image.
         camera_view: as they were extracted.
     """
     n = len(crops.step)
@@ -315,11 +297,11 @@ def crop_cameras_of(crops: HeightMaps, intrinsics: Array, camera_view: bool) -> 
 def sight_rotations(p_camera: Array) -> Array:
     """Rotations (n, 3, 3) of T_view_camera for lines of sight through points.
 
-    The view's z axis points from the point to the camera, its x axis lies as near as possible to
-    the camera's.
+    The view's z axis points from the point to the camera, its x axis is as near as possible to the
+    camera's.
 
     Args:
-        p_camera: (n, 3) points before the camera, in its frame; any unit.
+        p_camera: (n, 3) points in front of the camera, in its frame; any unit.
     """
     rotations = np.empty((len(p_camera), 3, 3))
     for rotation, (x, y, z) in zip(rotations, p_camera, strict=True):

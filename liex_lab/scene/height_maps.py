@@ -1,14 +1,14 @@
 """Height maps of segmented animals: depth above a reference plane on a 96 x 96 crop, with moments.
 
 A segmenter (`BackgroundSubtraction` or `HandSegmenter`) finds the animal's connected component in
-whole pictures or in patches around it. Its pixels become heights above a plane by
+full images or in patches around it. Its pixels become heights above a plane by
 
     h = distance (1 - z (a u + b v + c)),
 
-where 1 / z = a u + b v + c is the plane in a pinhole picture (inverse depth is linear in the
-pixel). The plane is the arena's floor, or (camera_view) one across the optical axis behind the
-animal, as the depth features of Lie-X see it. Area, volume, centroid and principal axes are the
-image moments of the map (Hu 1962), taken in mm in the view frame. How a map was cut is its crop
+where 1 / z = a u + b v + c is the plane in a pinhole image (inverse depth is linear in the pixel).
+The plane is the arena's floor, or (camera_view) one perpendicular to the optical axis behind the
+animal, as in the depth features of Lie-X. Area, volume, centroid and principal axes are the image
+moments of the map (Hu 1962), measured in mm in the view frame. The geometry of a map is its crop
 camera, see `CropCamera`.
 """
 
@@ -54,11 +54,11 @@ def pack_crop_cameras(
     """Pack the cameras of n crops.
 
     Args:
-        intrinsics: (4,) or (n, 4) fx, fy, cx, cy of the whole picture, px.
+        intrinsics: (4,) or (n, 4) fx, fy, cx, cy of the full image, px.
         rotation: (3, 3) or (n, 3, 3) of T_view_camera.
         distance: (n,) z of the camera's centre in the view frame, mm.
-        origin: (n, 2) column and row of the whole picture that are the crop's first.
-        step: (n,) pixels of the whole picture from one crop pixel to the next.
+        origin: (n, 2) column and row of the full image at the crop's first pixel.
+        step: (n,) pixels of the full image per crop pixel.
 
     Returns:
         (n, 17) packed crop cameras.
@@ -76,7 +76,7 @@ def crop_columns(crop_cameras: Array) -> CropCamera:
     """The columns of packed crop cameras by name.
 
     Args:
-        crop_cameras: (n, 17) packed crop cameras.
+        crop_cameras: (n, 17).
 
     Returns:
         Views (n,) of the columns.
@@ -90,13 +90,10 @@ def _rotations(crop_cameras: Array) -> Array:
 
 
 def view_of(crop_cameras: Array) -> SE3:
-    """Where the cameras stand in the view frames of their crops.
+    """The camera's pose in the view frame of each crop: T_view_camera (n), mm.
 
     Args:
-        crop_cameras: (n, 17) packed crop cameras.
-
-    Returns:
-        T_view_camera (n), mm.
+        crop_cameras: (n, 17).
     """
     translation = np.zeros((len(crop_cameras), 3))
     translation[:, 2] = crop_columns(crop_cameras).distance
@@ -104,24 +101,21 @@ def view_of(crop_cameras: Array) -> SE3:
 
 
 def mm_per_px(crop_cameras: Array) -> Array:
-    """How many millimetres a crop pixel covers at the distance of the view frame's origin.
+    """Millimetres (n,) per crop pixel at the distance of the view frame's origin.
 
     Args:
-        crop_cameras: (n, 17) packed crop cameras.
-
-    Returns:
-        (n,) mm per crop pixel.
+        crop_cameras: (n, 17).
     """
     columns = crop_columns(crop_cameras)
     return np.asarray(columns.step * columns.distance / columns.fx)
 
 
 def in_camera_frame(points: Array, crop_cameras: Array) -> Array:
-    """Points of the view frames of crops, in their cameras' frames.
+    """Transform points from the view frames of crops to their cameras' frames.
 
     Args:
         points: (n, ..., 3) mm, view frames.
-        crop_cameras: (n, 17) packed crop cameras.
+        crop_cameras: (n, 17).
 
     Returns:
         (n, ..., 3) mm, camera frames.
@@ -135,7 +129,7 @@ def in_view_frame(points: Array, crop_cameras: Array) -> Array:
 
     Args:
         points: (n, ..., 3) mm, camera frames.
-        crop_cameras: (n, 17) packed crop cameras.
+        crop_cameras: (n, 17).
 
     Returns:
         (n, ..., 3) mm, view frames.
@@ -152,30 +146,29 @@ def _camera_centre(points: Array, crop_cameras: Array) -> Array:
     return centre
 
 
-CROP = 96  # pixels a side of a height map
+CROP = 96  # pixels per side of a height map
 
 
 @dataclass(frozen=True)
 class HeightMaps:
-    """Height maps of one animal in n frames, and how the animal's mass lies in the view frame.
+    """Height maps of one animal in n frames, with moments of its mass in the view frame.
 
-    The view frame is the arena frame, or (camera_view) an upright frame whose z axis is the optical
-    axis backwards; of a hand without camera_view, its z axis runs backwards along the line of sight
+    The view frame is the arena frame, or (camera_view) an upright frame whose z axis is the
+    reversed optical axis; for a hand without camera_view, its z axis is the reversed line of sight
     through the middle of the crop. The origin of the view frame is `distance` mm in front of the
     camera.
 
     Attributes:
-        heights: (n, CROP, CROP) int16, 1/16 mm above the reference plane, 0 where it is not the
-            animal.
-        origin: (n, 2) int32, picture pixel (u, v) of crop pixel (0, 0).
-        step: (n,) int32, picture pixels a crop pixel.
-        n_px: (n,) int64, readings on the animal, 0 where it was not found.
+        heights: (n, CROP, CROP) int16, 1/16 mm above the reference plane, 0 outside the animal.
+        origin: (n, 2) int32, image pixel (u, v) of crop pixel (0, 0).
+        step: (n,) int32, image pixels per crop pixel.
+        n_px: (n,) int64, readings on the animal, 0 if it was not found.
         moments: (n, 9): pixels, area mm^2, volume mm^3, centroid x, y mm, angle of the long axis
             rad (mod pi), the standard deviations mm along and across it, and (camera_view, else 0)
             the slope of the back along it; all in the view frame. The axis of a hand points away
-            from its arm where one is seen.
+            from its arm if one is visible.
         distance: (n,) mm from the camera to the origin of the view frame.
-        n_blobs: (n,) int64, how many components of the frame have about the animal's size.
+        n_blobs: (n,) int64, components of the frame with about the animal's size.
     """
 
     heights: NDArray[np.int16]
@@ -187,7 +180,7 @@ class HeightMaps:
     n_blobs: NDArray[np.int64]
 
     def __post_init__(self) -> None:
-        """Refuse arrays that do not fit together, for kernels do not check them."""
+        """Check that the shapes match, as kernels do not."""
         check_shapes(
             "height maps",
             ("heights", self.heights, ("n", "S", "S")),
@@ -201,7 +194,7 @@ class HeightMaps:
 
     @staticmethod
     def blank(n: int, distance_mm: Array | float) -> HeightMaps:
-        """A batch of n empty height maps, in which nothing is found yet.
+        """A batch of n empty height maps.
 
         Args:
             n: frames.
@@ -219,11 +212,7 @@ class HeightMaps:
 
     @staticmethod
     def join(parts: Sequence[HeightMaps]) -> HeightMaps:
-        """Several batches as one, in their order.
-
-        Args:
-            parts: at least one batch.
-        """
+        """Concatenate batches, at least one."""
         return HeightMaps(
             *(
                 np.concatenate([getattr(part, field.name) for part in parts])
@@ -232,26 +221,17 @@ class HeightMaps:
         )
 
     def __getitem__(self, index: NDArray[np.bool_] | NDArray[np.int64] | slice) -> HeightMaps:
-        """Some of the rows as a batch of their own.
-
-        Args:
-            index: mask (n,), row numbers, or a slice.
-        """
+        """A batch of the rows at `index`: mask (n,), row numbers, or a slice."""
         return HeightMaps(*(getattr(self, field.name)[index] for field in fields(self)))
 
     def put(self, rows: NDArray[np.int64], other: HeightMaps) -> None:
-        """Replace some rows, in place, by all rows of another batch.
-
-        Args:
-            rows: (m,) row numbers.
-            other: a batch of m rows.
-        """
+        """Replace the rows (m,), in place, by all m rows of another batch."""
         for field in fields(self):
             getattr(self, field.name)[rows] = getattr(other, field.name)
 
     @property
     def rows(self) -> CropRows:
-        """The arrays themselves, as kernels fill them."""
+        """The arrays as one record for the kernels."""
         return CropRows(*(getattr(self, field) for field in CropRows._fields))
 
     @property
@@ -285,16 +265,16 @@ def moment_columns(moments: Array) -> BlobMoments:
 
 @dataclass(frozen=True)
 class Patches:
-    """Patches of pictures from many cameras, each around one animal on a known floor.
+    """Image patches from many cameras, each around one animal on a known floor.
 
     Attributes:
         depth: (n, H, W) uint16 or float32 mm, 0 where unread.
-        background: (n, H, W) uint16 or float32 mm, 0 where unread: there the floor takes over.
-        intrinsics: (n, 4) fx, fy, cx, cy, pixels of the whole picture.
-        origin: (n, 2) picture pixel (u, v) of each patch's first.
+        background: (n, H, W) uint16 or float32 mm, 0 where unread: the floor is used there.
+        intrinsics: (n, 4) fx, fy, cx, cy, pixels of the full image.
+        origin: (n, 2) image pixel (u, v) of each patch's first.
         inverse_depth: (n, 3) a, b, c of the floor, 1 / z = a u + b v + c, per mm, in pixels of the
-            whole picture.
-        view: how such animals are looked at.
+            full image.
+        view: how such animals are viewed.
     """
 
     depth: NDArray[np.uint16] | NDArray[np.float32]
@@ -305,7 +285,7 @@ class Patches:
     view: View = MOUSE_VIEW
 
     def __post_init__(self) -> None:
-        """Refuse arrays that do not fit together, for kernels do not check them."""
+        """Check that the shapes match, as kernels do not."""
         check_shapes(
             "patches",
             ("depth", self.depth, ("n", "H", "W")),
@@ -316,11 +296,7 @@ class Patches:
         )
 
     def floor(self, k: int) -> Floor:
-        """The floor of one patch.
-
-        Args:
-            k: the patch.
-        """
+        """The floor of patch k."""
         fx, fy, cx, cy = self.intrinsics[k]
         return Floor.from_inverse_depth(self.inverse_depth[k], Camera(fx, fy, cx, cy, 1, 1))
 
@@ -330,7 +306,7 @@ class Patches:
         area_mm2: Array,
         min_height_mm: Array | float = 7.0,
         camera_view: bool = False,
-        n_things: int = 1,
+        n_candidates: int = 1,
     ) -> tuple[HeightMaps, Array]:
         """Height maps of the component of each patch whose area is nearest to the animal's.
 
@@ -340,10 +316,9 @@ class Patches:
         Args:
             size: (n,) spine lengths of the animals over the home length.
             area_mm2: (n,) usual areas of the animals.
-            min_height_mm: what is nearer than the background by less is not the animal; one or
-                (n,).
+            min_height_mm: smaller heights above the background are not the animal; one or (n,).
             camera_view: whether heights are measured along the optical axis.
-            n_things: 2 gives as many rows again, those of the next nearest components.
+            n_candidates: 2 adds as many rows again for the second best components.
 
         Returns:
             The height maps (n or 2 n), and their crop cameras (n or 2 n, 17) in pixels of the
@@ -352,30 +327,30 @@ class Patches:
         n = len(self.depth)
         check_shapes("animals", ("area_mm2", area_mm2, (n,)), ("size", size, (n,)))
         distance = np.empty(n)
-        # a window is the picture of a camera whose centre is shifted
+        # a patch is the image of a camera with a shifted centre
         intrinsics = self.intrinsics.copy()
         plane = self.inverse_depth.copy()
         intrinsics[:, 2:] -= self.origin
         plane[:, 2] += plane[:, 0] * self.origin[:, 0] + plane[:, 1] * self.origin[:, 1]
         margin = np.broadcast_to(np.asarray(min_height_mm, np.float32), (n,)).copy()
         rotation = np.empty((n, 3, 3))
-        of_whom = np.hstack([self.inverse_depth, self.intrinsics])
+        view_key = np.hstack([self.inverse_depth, self.intrinsics])
         for k in range(n):
             if (
-                not k or (of_whom[k] != of_whom[k - 1]).any()
-            ):  # many in a row are often before one camera
+                not k or (view_key[k] != view_key[k - 1]).any()
+            ):  # consecutive patches often share a camera
                 floor = self.floor(k)
             distance[k] = floor.distance_mm
             rotation[k] = (
                 np.diag([1.0, -1.0, -1.0]) if camera_view else floor.T_arena_camera.rotation
             )
-        crops = HeightMaps.blank(n_things * n, np.tile(distance, n_things))
+        crops = HeightMaps.blank(n_candidates * n, np.tile(distance, n_candidates))
         kernels.extract_windows(
             self.depth,
             self.background,
             margin,
             area_mm2,
-            n_things,
+            n_candidates,
             kernels.Sight(
                 intrinsics,
                 plane,
@@ -386,8 +361,8 @@ class Patches:
             crops.rows,
         )
         packed = pack_crop_cameras(
-            np.tile(intrinsics, (n_things, 1)),
-            np.tile(rotation, (n_things, 1, 1)),
+            np.tile(intrinsics, (n_candidates, 1)),
+            np.tile(rotation, (n_candidates, 1, 1)),
             crops.distance,
             crops.origin,
             crops.step,

@@ -1,64 +1,64 @@
-"""Several arenas in one picture: the grounds on which different animals move, kept apart.
+"""Multiple arenas in one image: separates the grounds on which different animals move.
 
-Each ground (`arena.grounds`) on which things of an animal's size are seen moving is an arena, and
-so is one of about their size that walls enclose, though its animal sleeps. An arena's region is
-what lies within a largest spine of its ground's convex hull and nearer to it than to any other (a
-Voronoi cell), so that no two regions meet.
+Each ground (`floor.flat_grounds`) with moving objects of an animal's size is an arena, and so is a
+walled one of similar size whose animal is asleep. An arena's region is within a largest spine
+length of its ground's convex hull and nearer to it than to any other (a Voronoi cell), so that no
+two regions meet.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from liex_lab.scene.floor import Ground, flat_grounds
-from liex_lab.scene.support_plane import SampledScene, things_moving
+from liex_lab.scene.floor import FlatGround, flat_grounds
+from liex_lab.scene.support_plane import SampledScene, find_movers
 
 _MOST = 8
-_LEAST_THINGS = 3  # seen moving on a ground
-_ALIKE = 2.0  # in area, of a ground on which nothing moves
-_ENCLOSED = 0.6  # of its outline must rise
+_LEAST_MOVERS = 3  # moving objects on a ground
+_ALIKE = 2.0  # largest ratio of areas for a ground without movement
+_ENCLOSED = 0.6  # least walled share of its outline
 _APART_PX = 2.0  # between two regions at least
 _SMOOTH_PX = 1.5  # by which a polygon may leave its region
 
 
 def arenas_apart(scene: SampledScene) -> list[list[tuple[int, int]]]:
-    """The outlines of several arenas.
+    """The outlines of multiple arenas.
 
     Args:
         scene: sampled frames and their background.
 
     Returns:
-        (u, v) corners of each, pixels of the scene's camera, row by row from the top left; [] where
-        there are fewer than two or more than eight.
+        (u, v) corners of each, pixels of the scene's camera, row by row from the top left; [] for
+        fewer than two or more than eight.
     """
     camera = scene.camera
-    things = things_moving(scene)
-    stood_on: list[Ground] = []
-    others: list[Ground] = []
+    movers = find_movers(scene)
+    supporting: list[FlatGround] = []
+    others: list[FlatGround] = []
     for ground in flat_grounds(scene.background, camera, scene.least_ground_mm2):
-        n = sum(thing.is_on(ground.floor, ground.patch) for thing in things)
-        (stood_on if n >= _LEAST_THINGS else others).append(ground)
-    stood_on = _one_each(stood_on)
-    if stood_on:
-        usual = float(np.median([ground.patch.sum() for ground in stood_on]))
+        n = sum(mover.is_on(ground.floor, ground.patch) for mover in movers)
+        (supporting if n >= _LEAST_MOVERS else others).append(ground)
+    supporting = _one_each(supporting)
+    if supporting:
+        usual = float(np.median([ground.patch.sum() for ground in supporting]))
         asleep = [
             ground
             for ground in others
             if ground.enclosed >= _ENCLOSED and usual / _ALIKE < ground.patch.sum() < usual * _ALIKE
         ]
-        stood_on = _one_each([*stood_on, *asleep])
-    if not 2 <= len(stood_on) <= _MOST:
+        supporting = _one_each([*supporting, *asleep])
+    if not 2 <= len(supporting) <= _MOST:
         return []
     reach = [
         scene.spine_mm[1] * float(np.sqrt(camera.fx * camera.fy)) / ground.floor.distance_mm
-        for ground in stood_on
+        for ground in supporting
     ]
-    return _outlines(stood_on, reach)
+    return _outlines(supporting, reach)
 
 
-def _one_each(grounds: list[Ground]) -> list[Ground]:
-    """The grounds whose middle lies in the hull of no other that came before."""
-    kept: list[Ground] = []
+def _one_each(grounds: list[FlatGround]) -> list[FlatGround]:
+    """The grounds, without those that overlap the hull of an earlier one."""
+    kept: list[FlatGround] = []
     for ground in grounds:
         rows, columns = np.nonzero(ground.patch)
         middle = (int(np.median(rows)), int(np.median(columns)))
@@ -72,8 +72,8 @@ def _one_each(grounds: list[Ground]) -> list[Ground]:
     return kept
 
 
-def _outlines(grounds: list[Ground], reach_px: list[float]) -> list[list[tuple[int, int]]]:
-    """The polygons of the Voronoi cells around the grounds, as far as each reaches, px."""
+def _outlines(grounds: list[FlatGround], reach_px: list[float]) -> list[list[tuple[int, int]]]:
+    """The polygons of the Voronoi cells around the grounds, within the reach of each, px."""
     import cv2
 
     away = np.stack(

@@ -1,11 +1,11 @@
-"""Things that are put in or taken out while a recording runs, as a novel object at minute ten.
+"""Transient objects, which are placed in or removed from the arena during a recording.
 
-A pixel of such a thing stands above the floor for one stretch of time and nearly never besides. Of
-the pixel's readings over time, with weights of +1/2 where it stands above the floor, -1/2 where it
-does not and 0 where it is unread, that stretch is the one of the largest sum (Kadane's maximum
-subarray). Neighbouring pixels of about the same stretch are one thing. An animal that pauses stands
-above the floor for a stretch, too: what the animal itself covers in most of it is none, nor is
-anything where two animals are in view at other times.
+A pixel of such an object is above the floor for one interval of time and hardly ever outside of it.
+With weights of +1/2 for readings above the floor, -1/2 for readings at the floor and 0 for unread
+ones, that interval is the one of the largest sum (Kadane's maximum subarray). Neighbouring pixels
+with similar intervals form one object. An animal that pauses is above the floor for an interval,
+too: an object is rejected if the animal itself covers it in most of the interval, or if two animals
+are in view at other times.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from liex_lab.scene.scene import HIGH_MM, LEAST_MM2, Fixture, fixture_at
 
 if TYPE_CHECKING:
-    from liex_lab.scene.background import Wanted
+    from liex_lab.scene.background import TargetAnimal
     from liex_lab.scene.height_maps import HeightMaps
     from liex_lab.scene.still_scene import StillScene
 
@@ -31,22 +31,24 @@ Depths = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 Rows = NDArray[np.int64]
 
-_LEAST_FRAMES = 6  # of the sample that show it, and of those that do not
-_LEAST_SHARE = 0.1  # of the recording: what is there for less is a visit
-_STANDS = 0.9  # of the readings in the stretch, and one less this in the others
-_SAME_MM = 6.0  # or of the depth: readings this near to the usual one are of the thing,
+_LEAST_FRAMES = 6  # least frames of the sample with it, and without it
+_LEAST_SHARE = 0.1  # of the recording: a shorter presence is a visit
+_HIGH_SHARE = 0.9  # least share of high readings inside the interval, and 1 - this at most outside
+_SAME_MM = 6.0  # readings within this distance of the median belong to the object
 _SAME_SHARE = 0.012
-_STILL = 0.6  # as are so many of its readings: hands and animals move
-_ALIKE = 3  # frames of the sample by which the stretches of one thing's pixels begin or end apart
+_STILL = 0.6  # least share of such readings: hands and animals move
+_ALIKE = 3  # frames by which the intervals of one object's pixels may differ
 _LEAST_PX = 8
-_MOST = 8  # things
-_OWN = 0.3  # of a thing's pixels that the animal covers: it is the animal there
+_MOST = 8  # objects
+_OWN = 0.3  # share of an object's pixels covered by the animal if it is the animal
 _OFTEN = 0.5  # of the frames
-_ASKED = 16  # frames of which that is asked
+_ASKED = 16  # frames used for that test
 
 
-def find_put_in(scene: StillScene, sample: Depths, times_s: Array) -> tuple[Fixture, ...]:
-    """The things that stand on the floor for a part of the recording, in order of time.
+def find_transient_objects(
+    scene: StillScene, sample: Depths, times_s: Array
+) -> tuple[Fixture, ...]:
+    """Find the objects that stand on the floor for a part of the recording, in order of time.
 
     Args:
         scene: the scene with its animal's area, at whose stride the frames are.
@@ -54,88 +56,89 @@ def find_put_in(scene: StillScene, sample: Depths, times_s: Array) -> tuple[Fixt
         times_s: (n,) of the frames, s since the recording's first.
 
     Returns:
-        Each with the times since when and until when it stands there, None where that is the
-        recording's beginning or end.
+        Each with its start and end times, None for the recording's beginning or end.
     """
     n = len(sample)
     if n < 2 * _LEAST_FRAMES:
         return ()
     found = []
-    for thing in _things(scene, sample):
-        fixture = fixture_at(thing.place, thing.depth, scene.grid_floor, scene.grid)
-        if fixture.area_mm2 < LEAST_MM2 or _is_an_animal(scene, sample, thing):
+    for candidate in _transient_objects(scene, sample):
+        fixture = fixture_at(candidate.mask, candidate.depth, scene.grid_floor, scene.grid)
+        if fixture.area_mm2 < LEAST_MM2 or _is_an_animal(scene, sample, candidate):
             continue
-        since = float(times_s[thing.first]) if thing.first > 0 else None
-        until = float(times_s[thing.last]) if thing.last < n else None
+        since = float(times_s[candidate.first]) if candidate.first > 0 else None
+        until = float(times_s[candidate.last]) if candidate.last < n else None
         found.append(replace(fixture, since_s=since, until_s=until))
     return tuple(sorted(found, key=lambda one: (one.since_s or 0.0, one.until_s or np.inf)))
 
 
 @dataclass(frozen=True)
-class _Thing:
-    """Pixels (H, W) that show one thing from frame `first` to before `last`, at a depth (H, W)."""
+class _TransientObject:
+    """Pixels (H, W) of one object from frame `first` to before `last`, at a depth (H, W)."""
 
     first: int
     last: int
-    place: Mask
+    mask: Mask
     depth: Depths
 
 
-def _things(scene: StillScene, sample: Depths) -> list[_Thing]:
-    """What stands still on the floor for one stretch of the frames."""
+def _transient_objects(scene: StillScene, sample: Depths) -> list[_TransientObject]:
+    """Objects at rest on the floor for one interval of the frames."""
     rows, columns, first, last = _stretches(scene, sample)
-    found: list[_Thing] = []
+    found: list[_TransientObject] = []
     left = np.ones(len(rows), np.bool_)
     while left.sum() >= _LEAST_PX and len(found) < _MOST:
-        # the stretch that most of the pixels have
+        # the most frequent interval
         pairs, counts = np.unique(np.stack([first[left], last[left]]), axis=1, return_counts=True)
         start, stop = pairs[:, np.argmax(counts)]
         one = left & (np.abs(first - start) <= _ALIKE) & (np.abs(last - stop) <= _ALIKE)
         left &= ~one
-        place = np.zeros(scene.limit.shape, np.uint8)
-        place[rows[one], columns[one]] = 1
-        count, labels, stats, _ = cv2.connectedComponentsWithStats(place)
+        mask = np.zeros(scene.limit.shape, np.uint8)
+        mask[rows[one], columns[one]] = 1
+        count, labels, stats, _ = cv2.connectedComponentsWithStats(mask)
         for k in range(1, count):
             if stats[k, cv2.CC_STAT_AREA] >= _LEAST_PX:
-                found += _standing(sample, labels == k, int(start), int(stop))
+                found += _if_still(sample, labels == k, int(start), int(stop))
     return found[:_MOST]
 
 
-def _standing(sample: Depths, place: Mask, first: int, last: int) -> list[_Thing]:
-    """The thing at a place (H, W) if it keeps still; its first frames may show who puts it in."""
-    readings = sample[first:last, place]
+def _if_still(sample: Depths, mask: Mask, first: int, last: int) -> list[_TransientObject]:
+    """The object in a mask (H, W) if it does not move; its first frames may show the person placing
+    it.
+    """
+    readings = sample[first:last, mask]
     usual = np.nanmedian(np.where(readings > 0, readings, np.nan), axis=0)
     same = np.abs(readings - usual) < np.maximum(_SAME_MM, _SAME_SHARE * usual)
     shows = np.flatnonzero(same.mean(axis=1) > 0.5)
     if same.mean() < _STILL or len(shows) < max(_LEAST_FRAMES, _LEAST_SHARE * len(sample)):
         return []
-    depth = np.zeros(place.shape, np.float32)
-    depth[place] = usual
+    depth = np.zeros(mask.shape, np.float32)
+    depth[mask] = usual
     until = last if last == len(sample) else first + int(shows[-1]) + 1
-    return [_Thing(first + int(shows[0]) if first else 0, until, place, depth)]
+    return [_TransientObject(first + int(shows[0]) if first else 0, until, mask, depth)]
 
 
-def _is_an_animal(scene: StillScene, sample: Depths, thing: _Thing) -> bool:
-    """Whether a thing is the animal, which covers its place in most of the stretch, or a second one
-    that rests there: then two are in view in most of the other frames.
+def _is_an_animal(scene: StillScene, sample: Depths, candidate: _TransientObject) -> bool:
+    """Whether a candidate is the animal, which covers it in most of the interval, or a second,
+    resting animal: then two are in view in most of the other frames.
     """
     rows = np.arange(len(sample))
-    inside = (rows >= thing.first) & (rows < thing.last)
-    own = scene.places(scene.extract(sample[_some(rows[inside])], 1.0))
-    if own and float(np.mean([one[thing.place].mean() > _OWN for one in own])) > _OFTEN:
+    inside = (rows >= candidate.first) & (rows < candidate.last)
+    own = scene.animal_masks(scene.extract(sample[_some(rows[inside])], 1.0))
+    if own and float(np.mean([one[candidate.mask].mean() > _OWN for one in own])) > _OFTEN:
         return True
     others = scene.extract(sample[_some(rows[~inside])], 1.0)
     return float((others.n_blobs > 1).mean()) > _OFTEN
 
 
 def _some(rows: Rows) -> Rows:
-    """At most so many of some frames as are asked, spread over them."""
+    """At most `_ASKED` of the rows, spread evenly."""
     return rows[np.unique(np.linspace(0, len(rows) - 1, _ASKED).astype(int))]
 
 
 def _stretches(scene: StillScene, sample: Depths) -> tuple[Rows, Rows, Rows, Rows]:
-    """Row and column (k,) of the pixels that stand above the floor for one stretch of the frames,
-    its first frame and the one after its last.
+    """Row and column (k,) of the pixels above the floor for one interval of the frames, its first
+    frame, and the frame after its last one.
     """
     n = len(sample)
     inner = cv2.erode(scene.on_floor.astype(np.uint8), np.ones((9, 9), np.uint8)).astype(bool)
@@ -152,43 +155,43 @@ def _stretches(scene: StillScene, sample: Depths) -> tuple[Rows, Rows, Rows, Row
     last = np.argmax(total - np.minimum.accumulate(total, axis=0), axis=0)
     first = np.argmin(np.where(np.arange(n + 1)[:, None] <= last, total, np.inf), axis=0)
     inside = (np.arange(n)[:, None] >= first) & (np.arange(n)[:, None] < last)
-    n_inside, n_besides = (inside & read).sum(axis=0), (~inside & read).sum(axis=0)
-    is_one = (n_inside >= _LEAST_FRAMES) & (n_besides >= _LEAST_FRAMES)
-    is_one &= (inside & high).sum(axis=0) >= _STANDS * n_inside
-    is_one &= (~inside & high).sum(axis=0) <= (1.0 - _STANDS) * n_besides
+    n_inside, n_outside = (inside & read).sum(axis=0), (~inside & read).sum(axis=0)
+    is_one = (n_inside >= _LEAST_FRAMES) & (n_outside >= _LEAST_FRAMES)
+    is_one &= (inside & high).sum(axis=0) >= _HIGH_SHARE * n_inside
+    is_one &= (~inside & high).sum(axis=0) <= (1.0 - _HIGH_SHARE) * n_outside
     return rows[is_one], columns[is_one], first[is_one], last[is_one]
 
 
-# Animals that keep still, wholly or in part, and so are taken for the scene's background.
+# Animals at rest, wholly or in part, that were absorbed into the scene's background.
 
 
 AnyScene = TypeVar("AnyScene", bound="StillScene")
 
-# of the frames: a lump that the animal touches that often is a part of it that keeps still
+# a lump touched by the animal in this share of the frames is a resting part of it
 _TOUCH_SHARE = 0.9
-_READ = 0.5  # of a lump: it is there, and not gone with what was under it unread
-# what was never seen moving is an animal only if it is no longer than so many largest spines,
-# higher than so many times what stands out at all, and larger than so many of the least areas
+_READ = 0.5  # of a lump: it is present if this share is read
+# an object that never moves is an animal only if it is shorter than _LONGEST largest spines, higher
+# than _HIGHER detection heights, and larger than _LARGER smallest areas
 _LONGEST = 2.0
 _HIGHER = 1.4
 _LARGER = 1.5
-_KINDS = 4  # areas of things that are held against an animal
-_IN_PLACE = 0.8  # of the frames must show it where it usually is
+_KINDS = 4  # candidate areas compared with an animal
+_IN_PLACE = 0.8  # least share of frames that show it near its median position
 _LEAST_LUMP_PX = 16  # of a lump
-_MOST_LUMPS = 16  # that are held against an animal
-_FREE = 0.75  # of a lump's edge is bare floor; of the foot of a wall half is
-_AROUND_PX = 4  # a lump's edge, whose readings flicker between it and the floor
+_MOST_LUMPS = 16  # compared with an animal
+_FREE = 0.75  # least share of a lump's edge that is bare floor; half for the foot of a wall
+_AROUND_PX = 4  # width of a lump's edge, which flickers between it and the floor
 
 
 @dataclass(frozen=True)
-class Resting(Generic[AnyScene]):
-    """An animal that was found at rest.
+class RestingAnimal(Generic[AnyScene]):
+    """An animal found at rest.
 
     Attributes:
-        scene: the scene with the floor under it, so that it stands out.
+        scene: the scene with the floor under the animal, so that it is foreground.
         area_mm2: its usual area, mm^2.
         share: of the frames that show it, 0 to 1.
-        is_like: whether it is like an animal, see `is_like_an_animal`.
+        is_like: whether it resembles an animal, see `is_like_an_animal`.
     """
 
     scene: AnyScene
@@ -197,171 +200,180 @@ class Resting(Generic[AnyScene]):
     is_like: bool = False
 
 
-def at_rest(
-    scene: AnyScene, sample: Depths, wanted: Wanted, area: float, share: float
-) -> Resting[AnyScene] | None:
-    """The animal that sits in its own background.
+def find_resting_animal(
+    scene: AnyScene, sample: Depths, target: TargetAnimal, area: float, share: float
+) -> RestingAnimal[AnyScene] | None:
+    """Find an animal that is part of its own background.
 
-    So it is where fewer than half of the frames show something that moves, or what most of them
-    show is no animal, as the specks of an edge that flickers.
+    This is tried if fewer than half of the frames show something moving, or if what most of them
+    show is no animal, such as specks of a flickering edge.
 
     Args:
-        scene: the scene as it was learned.
+        scene: the scene as learned.
         sample: (n, H, W) float32 mm, frames at its stride.
-        wanted: what animal is expected.
-        area: usual area of what was seen moving, mm^2.
-        share: of the frames that show that.
+        target: the expected animal.
+        area: usual area of the moving object, mm^2.
+        share: of the frames that show it.
 
     Returns:
-        What was found; None where the scene as it is is the better one.
+        The animal; None if the scene as learned is better.
     """
     moving = replace(scene, area_mm2=area)
-    if share >= 0.5 and (not wanted.stands or is_like_an_animal(moving, sample, wanted)):
+    if share >= 0.5 and (not target.stands_on_floor or is_like_an_animal(moving, sample, target)):
         return None
-    rests = _changing_lump(scene, sample, wanted) if wanted.stands else None
-    rests = rests or _on_bare_floor(scene, sample, wanted, 1 if share > 0.0 else _KINDS)
+    rests = _changing_lump(scene, sample, target) if target.stands_on_floor else None
+    rests = rests or _on_bare_floor(scene, sample, target, 1 if share > 0.0 else _KINDS)
     if rests.share <= (share if share < 0.5 else 0.0):
         return None
-    moves = wanted.stands and area > 0.0 and scene.standing is not None and scene.standing.moves
+    moves = (
+        target.stands_on_floor
+        and area > 0.0
+        and scene.support_plane is not None
+        and scene.support_plane.moves
+    )
     if (share >= 0.5 or moves) and not rests.is_like:
         return None
     resting = replace(rests.scene, area_mm2=rests.area_mm2)
-    if share < 0.5 and moves and _stays_beside(resting, moving, sample):
+    if share < 0.5 and moves and _is_separate(resting, moving, sample):
         return None
     return rests
 
 
 def with_its_still_part(
-    scene: AnyScene, sample: Depths, wanted: Wanted, area: float
+    scene: AnyScene, sample: Depths, target: TargetAnimal, area: float
 ) -> tuple[AnyScene, float]:
-    """The scene with the floor put under an animal that was partly taken for background.
+    """The scene with floor under an animal that was partly absorbed into the background.
 
-    Such a part is a lump on the floor that the moving animal touches in (nearly, nine tenths of)
-    every frame in which it is read, and together with which it is still no larger than an animal.
-    It is read in all frames, or until the animal goes and leaves floor that is never read.
+    The absorbed part is a lump on the floor that the moving animal touches in at least nine tenths
+    of the frames in which the lump is read, and that together with the animal is no larger than an
+    animal. It is read in all frames, or until the animal leaves and uncovers floor that is never
+    read.
 
     Args:
-        scene: the scene as it was learned.
+        scene: the scene as learned.
         sample: (n, H, W) float32 mm, frames at its stride.
-        wanted: what animal is expected.
+        target: the expected animal.
         area: area of the moving animal, mm^2.
 
     Returns:
-        The scene, the same where there is no such lump, and the area mm^2 of the whole animal.
+        The scene, unchanged without such a lump, and the area mm^2 of the whole animal.
     """
     crops = replace(scene, area_mm2=area).extract(sample, 1.0)
-    moving = np.array(scene.places(crops)).reshape(-1, *scene.limit.shape)
+    moving = np.array(scene.animal_masks(crops)).reshape(-1, *scene.limit.shape)
     shown = sample if crops.found.all() else sample[crops.found]
     best, best_area = scene, area
-    for lump in _lumps(scene, wanted):
+    for lump in _lumps(scene, target):
         near = _around(lump)
         box = _box(near)
         there = (shown[:, *box][:, lump[box]] > 0).mean(axis=1) > _READ
         touched = moving[there][:, *box][:, near[box]].any(axis=1)
         if not there.any() or touched.mean() < _TOUCH_SHARE:
             continue
-        whole = _with_floor_at(scene, near, wanted)
-        whole_area, share = whole.usual_area(sample, wanted.spine_mm)
+        whole = _with_floor_at(scene, near, target)
+        whole_area, share = whole.usual_area(sample, target.spine_mm)
         if share >= 0.5 and whole_area > best_area:
             best, best_area = whole, whole_area
     return best, best_area
 
 
-def is_like_an_animal(scene: StillScene, sample: Depths, wanted: Wanted) -> bool:
-    """Whether what is found is neither longer than the largest animal, nor as low as uneven floor.
+def is_like_an_animal(scene: StillScene, sample: Depths, target: TargetAnimal) -> bool:
+    """Whether the detection is neither longer than the largest animal nor as low as an uneven
+    floor.
 
     Args:
-        scene: the scene with the area of what is looked for.
+        scene: the scene with the expected area.
         sample: (n, H, W) float32 mm, frames at its stride.
-        wanted: what animal is expected.
+        target: the expected animal.
     """
-    return _is_like(_shown(scene, sample), scene.area_mm2, wanted)
+    return _is_like(_shown(scene, sample), scene.area_mm2, target)
 
 
 def _shown(scene: StillScene, sample: Depths) -> HeightMaps:
-    """The height maps of the frames of a sample (n, H, W) mm in which something is found."""
+    """Height maps of the frames of a sample (n, H, W) mm with a detection."""
     crops = scene.extract(sample, 1.0)
     return crops[crops.found]
 
 
-def _is_like(shown: HeightMaps, area_mm2: float, wanted: Wanted) -> bool:
-    """`is_like_an_animal` of what was found with such an area."""
+def _is_like(shown: HeightMaps, area_mm2: float, target: TargetAnimal) -> bool:
+    """`is_like_an_animal` for detections of such an area."""
     if not len(shown.n_px):
         return False
     blobs = shown.blobs
     length = 4.0 * float(np.median(blobs.sd_along))
     height = float(np.median(blobs.volume_mm3 / np.maximum(blobs.area_mm2, 1e-9)))
     return (
-        length < _LONGEST * wanted.spine_mm[1]
-        and height > _HIGHER * wanted.min_height_mm
-        and area_mm2 > _LARGER * wanted.smallest_mm2
+        length < _LONGEST * target.spine_mm[1]
+        and height > _HIGHER * target.min_height_mm
+        and area_mm2 > _LARGER * target.smallest_mm2
     )
 
 
-def _changing_lump(scene: AnyScene, sample: Depths, wanted: Wanted) -> Resting[AnyScene] | None:
-    """The free lump that is like an animal, keeps its place and changes most; None without one.
+def _changing_lump(
+    scene: AnyScene, sample: Depths, target: TargetAnimal
+) -> RestingAnimal[AnyScene] | None:
+    """The free lump that resembles an animal, stays in place and changes most; None without one.
 
-    A thing that lies still only flickers along its edge; an animal moves a part of itself. The foot
-    of a wall flickers as much as an animal moves, but has floor on one side only.
+    An object at rest only flickers along its edge; an animal moves a part of itself. The foot of a
+    wall flickers as much as an animal moves, but has floor on one side only.
     """
     free = []
-    for lump in _lumps(scene, wanted):
+    for lump in _lumps(scene, target):
         near = _around(lump)
-        if _free(scene, near & ~lump, wanted) >= _FREE:
-            free.append((_change(scene, sample, near, wanted), lump, near))
+        if _free(scene, near & ~lump, target) >= _FREE:
+            free.append((_change(scene, sample, near, target), lump, near))
     for _, lump, near in sorted(free, key=lambda one: -one[0])[:_MOST_LUMPS]:
-        whole = _with_floor_at(scene, near, wanted)
-        areas = _areas_at(whole, sample, lump, wanted)
-        own = (areas > wanted.smallest_mm2) & (areas < wanted.largest_mm2)
+        whole = _with_floor_at(scene, near, target)
+        areas = _areas_at(whole, sample, lump, target)
+        own = (areas > target.smallest_mm2) & (areas < target.largest_mm2)
         if own.mean() < 0.5:
             continue
         area = float(np.median(areas[own]))
         shown = _shown(replace(whole, area_mm2=area), sample)
-        if _is_like(shown, area, wanted) and _keeps_its_place(shown, area):
-            return Resting(whole, area, float(own.mean()), is_like=True)
+        if _is_like(shown, area, target) and _stays_in_place(shown, area):
+            return RestingAnimal(whole, area, float(own.mean()), is_like=True)
     return None
 
 
 def _on_bare_floor(
-    scene: AnyScene, sample: Depths, wanted: Wanted, kinds: int
-) -> Resting[AnyScene]:
-    """What stands on the floor's bare plane in most frames and is like an animal.
+    scene: AnyScene, sample: Depths, target: TargetAnimal, kinds: int
+) -> RestingAnimal[AnyScene]:
+    """The component above the floor's bare plane that is in most frames and resembles an animal.
 
-    A wall's foot or a step along the floor's edge is in every frame, too, and longer than any
-    animal; what is tried after it must also keep its place, as specks of an edge do not. Where
-    nothing is like an animal, it is what most frames show; at most `kinds` areas are tried.
+    The foot of a wall or a step along the floor's edge is in every frame, too, but longer than any
+    animal; later candidates must also stay in place, which specks of an edge do not. If nothing
+    resembles an animal, the result is what most frames show; at most `kinds` areas are tried.
     """
-    on_floor = scene.on_floor if scene.standing is None else scene.standing.on_floor
-    bare = _with_floor_at(scene, on_floor, wanted)
+    on_floor = scene.on_floor if scene.support_plane is None else scene.support_plane.on_floor
+    bare = _with_floor_at(scene, on_floor, target)
     tried: list[float] = []
-    first: Resting[AnyScene] | None = None
+    first: RestingAnimal[AnyScene] | None = None
     while len(tried) < kinds:
-        area, share = bare.usual_area(sample, wanted.spine_mm, tried)
+        area, share = bare.usual_area(sample, target.spine_mm, tried)
         if share == 0.0:
             break
         shown = _shown(replace(bare, area_mm2=area), sample)
-        found = Resting(bare, area, share, _is_like(shown, area, wanted))
-        if found.is_like and (not tried or _keeps_its_place(shown, area)):
+        found = RestingAnimal(bare, area, share, _is_like(shown, area, target))
+        if found.is_like and (not tried or _stays_in_place(shown, area)):
             return found
         first = first or found
         tried.append(area)
-    return first or Resting(bare, bare.area_mm2, 0.0)
+    return first or RestingAnimal(bare, bare.area_mm2, 0.0)
 
 
-def _lumps(scene: StillScene, wanted: Wanted) -> Iterator[Mask]:
-    """The lumps (H, W) bool of the background that stand on the floor."""
+def _lumps(scene: StillScene, target: TargetAnimal) -> Iterator[Mask]:
+    """The lumps (H, W) bool of the background on the floor."""
     above = _bare(scene) - scene.background
-    stands = scene.on_floor & (scene.background > 0) & (above > wanted.min_height_mm)
-    n, labels, stats, _ = cv2.connectedComponentsWithStats(stands.astype(np.uint8))
+    raised = scene.on_floor & (scene.background > 0) & (above > target.min_height_mm)
+    n, labels, stats, _ = cv2.connectedComponentsWithStats(raised.astype(np.uint8))
     for k in range(1, n):
         if stats[k, cv2.CC_STAT_AREA] >= _LEAST_LUMP_PX:
             yield labels == k
 
 
-def _free(scene: StillScene, edge: Mask, wanted: Wanted) -> float:
+def _free(scene: StillScene, edge: Mask, target: TargetAnimal) -> float:
     """The share of a lump's edge (H, W) that is bare floor, 0 to 1."""
     off = np.abs(_bare(scene) - scene.background)[edge]
-    return float((scene.on_floor[edge] & (off < wanted.min_height_mm)).mean())
+    return float((scene.on_floor[edge] & (off < target.min_height_mm)).mean())
 
 
 def _bare(scene: StillScene) -> Depths:
@@ -376,24 +388,26 @@ def _around(lump: Mask) -> Mask:
 
 
 def _box(mask: Mask) -> tuple[slice, slice]:
-    """The rows and columns of the picture between which a mask (H, W) lies."""
+    """The rows and columns that enclose a mask (H, W)."""
     left, top, width, height = cv2.boundingRect(mask.astype(np.uint8))
     return slice(top, top + height), slice(left, left + width)
 
 
-def _with_floor_at(scene: AnyScene, where: Mask, wanted: Wanted) -> AnyScene:
-    """The scene with the floor's bare plane as background in some of its pixels (H, W)."""
+def _with_floor_at(scene: AnyScene, where: Mask, target: TargetAnimal) -> AnyScene:
+    """The scene with the floor's bare plane as background in some pixels (H, W)."""
     bare = _bare(scene)
     there = where & scene.on_floor
-    limit = np.where(there, np.maximum(bare - np.float32(wanted.min_height_mm), 0), scene.limit)
+    limit = np.where(there, np.maximum(bare - np.float32(target.min_height_mm), 0), scene.limit)
     background = np.where(there, bare, scene.background)
     return replace(scene, background=background, limit=limit.astype(np.float32))
 
 
-def _areas_at(scene: StillScene, sample: Depths, lump: Mask, wanted: Wanted) -> NDArray[np.float64]:
-    """Area (n,) mm^2 of what stands out and touches a lump (H, W), frame by frame."""
+def _areas_at(
+    scene: StillScene, sample: Depths, lump: Mask, target: TargetAnimal
+) -> NDArray[np.float64]:
+    """Area (n,) mm^2 of the foreground that touches a lump (H, W), frame by frame."""
     rows, columns = np.nonzero(lump)
-    reach = int(wanted.spine_mm[1] * scene.grid.fx / float(np.median(scene.background[lump])))
+    reach = int(target.spine_mm[1] * scene.grid.fx / float(np.median(scene.background[lump])))
     cut = (
         slice(max(0, rows.min() - reach), rows.max() + reach + 1),
         slice(max(0, columns.min() - reach), columns.max() + reach + 1),
@@ -408,30 +422,31 @@ def _areas_at(scene: StillScene, sample: Depths, lump: Mask, wanted: Wanted) -> 
     return areas
 
 
-def _change(scene: StillScene, sample: Depths, near: Mask, wanted: Wanted) -> float:
-    """Share of the readings at some pixels (H, W) that are an animal's height off the background.
+def _change(scene: StillScene, sample: Depths, near: Mask, target: TargetAnimal) -> float:
+    """Share of the readings in some pixels (H, W) that differ from the background by an animal's
+    height.
 
-    Counted are pixels of which that is so in more than one frame of ten, so that noise adds little.
+    Only pixels that do so in more than one frame in ten count, so that noise adds little.
     """
-    off = np.abs(sample[:, near] - scene.background[near]) > wanted.min_height_mm
+    off = np.abs(sample[:, near] - scene.background[near]) > target.min_height_mm
     often = (off & (sample[:, near] > 0)).mean(axis=0)
     return float(np.where(often > 0.1, often, 0.0).mean())
 
 
-def _keeps_its_place(shown: HeightMaps, area_mm2: float) -> bool:
-    """Whether what is found with such an area lies in one place in most frames that show it."""
-    place = shown.centroid[:, :2]
-    off = np.linalg.norm(place - np.median(place, axis=0), axis=1)
+def _stays_in_place(shown: HeightMaps, area_mm2: float) -> bool:
+    """Whether detections of such an area are in one position in most frames that show them."""
+    centroid = shown.centroid[:, :2]
+    off = np.linalg.norm(centroid - np.median(centroid, axis=0), axis=1)
     return bool((off < 0.5 * np.sqrt(area_mm2)).mean() > _IN_PLACE)
 
 
-def _stays_beside(resting: StillScene, moving: StillScene, sample: Depths) -> bool:
-    """Whether what rests, in a sample (n, H, W) mm, is there beside what moves: another thing."""
+def _is_separate(resting: StillScene, moving: StillScene, sample: Depths) -> bool:
+    """Whether the resting object is visible apart from the moving one in a sample (n, H, W)."""
     mover = moving.extract(sample, 1.0)
     both = resting.extract(sample, 1.0)
-    seen = mover.found & both.found
-    if not seen.any():
+    together = mover.found & both.found
+    if not together.any():
         return True
-    apart = np.linalg.norm(mover[seen].centroid[:, :2] - both[seen].centroid[:, :2], axis=1)
-    beside = (apart > np.sqrt(resting.area_mm2)) | (both.n_blobs[seen] > 1)
-    return bool(beside.mean() > 0.5)
+    apart = np.linalg.norm(mover[together].centroid[:, :2] - both[together].centroid[:, :2], axis=1)
+    separate = (apart > np.sqrt(resting.area_mm2)) | (both.n_blobs[together] > 1)
+    return bool(separate.mean() > 0.5)

@@ -1,11 +1,11 @@
 """Shape of the arena: robust fits of a circle and a rectangle to the outline, and its walls.
 
 The circle is that of least median distance (least median of squares, Rousseeuw 1984) among those
-through three outline points each, refined by algebraic least squares (Kasa); the rectangle turns
-through a grid of angles about OpenCV's minimum-area one, its sides the medians of the points
-nearest to them. The better of the two stands if its median residual is at most the larger of 4 mm
-and 2.5 % of its size. Just beyond the outline the background says whether walls stand there or the
-floor ends in the air.
+through three outline points each, refined by algebraic least squares (Kasa). The rectangle is
+rotated through a grid of angles about OpenCV's minimum-area one; its sides are the medians of the
+points nearest to them. The better of the two is accepted if its median residual is at most the
+larger of 4 mm and 2.5 % of its size. The background just beyond the outline decides whether there
+are walls or a drop.
 """
 
 from __future__ import annotations
@@ -25,15 +25,15 @@ ROUND = "round"
 RECTANGULAR = "rectangular"
 IRREGULAR = "irregular"
 OPEN = "open"
-_BORDER_PX = 8  # an outline this near to the picture's edge is the picture's and not the floor's
-_NOTCH_PX = 3.0  # and one this far inside the convex hull is a thing on the floor
-_SEEN_SHARE = 0.6  # of the way round must be in view
-# an outline this near to a shape, of its size or in mm, has that shape
+_BORDER_PX = 8  # outline this near to the image border is not the floor's own
+_NOTCH_PX = 3.0  # outline this far inside the convex hull belongs to an object on the floor
+_VIEW_SHARE = 0.6  # least visible share of the outline
+# largest residual of a fitted shape, relative to its size or in mm
 _FIT_SHARE = 0.025
 _FIT_MM = 4.0
-_BAND_MM = 60.0  # beyond the outline, in which a wall is looked for
-_WALL_MM = 20.0  # and how high it has to be there, or how deep a drop
-_SIDE_SHARE = 0.3  # of each side of a rectangle must be in view
+_BAND_MM = 60.0  # width beyond the outline in which walls are searched for
+_WALL_MM = 20.0  # least height of a wall, or depth of a drop
+_SIDE_SHARE = 0.3  # least visible share of each side of a rectangle
 _N_CIRCLES = 150  # tried
 _MAX_POINTS = 720  # of the outline
 
@@ -45,14 +45,14 @@ class Arena:
     An irregular or open arena has no such numbers.
 
     Attributes:
-        kind: 'round', 'rectangular', 'irregular' (no shape that is known), or 'open' (the picture
-            does not show where the floor ends).
+        kind: 'round', 'rectangular', 'irregular' (neither shape fits), or 'open' (the end of the
+            floor is outside the image).
         centre_mm: x and y, mm.
         radius_mm: of a round one, mm.
         half_mm: half the lengths of a rectangular one's sides, mm.
-        yaw_rad: by which these are turned, rad.
+        yaw_rad: their rotation, rad.
         residual_mm: median distance of the outline from the shape, mm.
-        seen_share: of the outline, how much is in view.
+        seen_share: visible share of the outline.
         edge: 'wall', 'drop' (the floor ends in the air) or 'unknown'.
     """
 
@@ -96,7 +96,7 @@ class Arena:
         return np.asarray(np.array(self.centre_mm) + corners @ _turn(self.yaw_rad or 0.0).T)
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain numbers for session.json, rounded; what is unknown is left out."""
+        """Plain numbers for session.json, rounded; unknown values are omitted."""
         numbers = {
             name: value
             if isinstance(value, str)
@@ -108,23 +108,16 @@ class Arena:
 
     @staticmethod
     def from_dict(numbers: dict[str, Any]) -> Arena:
-        """The arena that `to_dict` wrote.
-
-        Args:
-            numbers: fields by name.
-
-        Returns:
-            The arena.
-        """
-        known: dict[str, Any] = {
+        """The arena that `to_dict` wrote."""
+        values: dict[str, Any] = {
             name: tuple(value) if isinstance(value, list) else value
             for name, value in numbers.items()
         }
-        return Arena(**known)
+        return Arena(**values)
 
     def __str__(self) -> str:
         """The shape and its size in words, as in 'round, radius 210 mm'."""
-        known = {
+        texts = {
             ROUND: lambda: f"round, radius {self.radius_mm:.0f} mm",
             RECTANGULAR: lambda: (
                 "rectangular, "
@@ -132,7 +125,7 @@ class Arena:
                 + " mm"
             ),
         }
-        return known.get(self.kind, lambda: self.kind)()
+        return texts.get(self.kind, lambda: self.kind)()
 
 
 UNKNOWN = Arena(OPEN)
@@ -144,15 +137,15 @@ def find_arena(background: NDArray[np.float32], floor: Floor, camera: Camera) ->
     Args:
         background: (H, W) float32 mm, 0 where unread.
         floor: the floor's plane.
-        camera: that took it.
+        camera: of these pixels.
 
     Returns:
-        The arena: 'open' where less than 60 % of the outline (of a rectangle: 30 % of any side) or
-        fewer than 40 points of it are in view, 'irregular' where neither a circle nor a rectangle
-        fits.
+        The arena: 'open' if less than 60 % of the outline (of a rectangle: 30 % of any side) or
+            fewer than 40 points of it are in view, 'irregular' if neither a circle nor a rectangle
+            fits.
     """
     points, pixels, share = _outline(background, floor, camera)
-    if share < _SEEN_SHARE or len(points) < 40:
+    if share < _VIEW_SHARE or len(points) < 40:
         return Arena(OPEN, seen_share=share)
     edge = _edge(background, floor, camera, pixels)
     centre, radius, off_circle = fit_circle(points)
@@ -162,7 +155,7 @@ def find_arena(background: NDArray[np.float32], floor: Floor, camera: Camera) ->
         return Arena(IRREGULAR, seen_share=share, edge=edge)
     if off_circle <= off_rectangle:
         return Arena(ROUND, _pair(centre), radius, None, None, off_circle, share, edge)
-    if not _all_sides_seen(points, middle, half, yaw):
+    if not _all_sides_in_view(points, middle, half, yaw):
         return Arena(OPEN, seen_share=share, edge=edge)
     return Arena(RECTANGULAR, _pair(middle), None, _pair(half), yaw, off_rectangle, share, edge)
 
@@ -170,11 +163,11 @@ def find_arena(background: NDArray[np.float32], floor: Floor, camera: Camera) ->
 def _outline(
     background: NDArray[np.float32], floor: Floor, camera: Camera
 ) -> tuple[Array, Array, float]:
-    """Where the floor ends: points (n, 2) mm in the arena frame, their pixels (n, 2), and the share
-    of it in view.
+    """The end of the floor: points (n, 2) mm in the arena frame, their pixels (n, 2), and the
+    visible share.
 
-    A point's place is that of the reading there, for the foot of a wall stands on the wall's own
-    line at any height.
+    Points are computed from the reading itself, as the foot of a wall stands on the wall's own line
+    at any height.
     """
     import cv2
 
@@ -195,14 +188,14 @@ def _outline(
     depth = background[uv[:, 1], uv[:, 0]].astype(float)
     middle = hull[:, 0].mean(axis=0)
     out = (uv - middle) / np.maximum(np.linalg.norm(uv - middle, axis=1, keepdims=True), 1e-9)
-    place = floor.T_arena_camera @ camera.unproject(
+    points = floor.T_arena_camera @ camera.unproject(
         uv + 0.5 * out, depth
-    )  # the last floor pixel ends half a pixel on
-    return place[:, :2], uv, share
+    )  # the last floor pixel ends half a pixel further out
+    return points[:, :2], uv, share
 
 
 def _share_in_view(hull: Array, width: int, height: int) -> float:
-    """The share of a convex outline (n, 2) px that is not along the picture's edge."""
+    """The share of a convex outline (n, 2) px that is not along the image's edge."""
     ends = np.roll(hull, -1, axis=0)
     length = np.linalg.norm(ends - hull, axis=1)
     limit = np.array([width, height]) - _BORDER_PX
@@ -214,7 +207,7 @@ def _share_in_view(hull: Array, width: int, height: int) -> float:
 
 
 def fit_circle(points: Array) -> tuple[Array, float, float]:
-    """The circle nearest to points, of which a third may be astray.
+    """The circle nearest to points, up to a third of which may be outliers.
 
     First, out of 150 circles through three points each, the one with the least median distance;
     then algebraic least squares on the points within three times that distance, in three rounds.
@@ -304,8 +297,8 @@ def _sides(points: Array) -> tuple[float, Array, Array]:
     return float(np.median(np.abs(gaps).min(axis=1))), low, high
 
 
-def _all_sides_seen(points: Array, centre: Array, half: Array, yaw: float) -> bool:
-    """Whether the outline (n, 2) runs along a good part of each side of the rectangle."""
+def _all_sides_in_view(points: Array, centre: Array, half: Array, yaw: float) -> bool:
+    """Whether the outline (n, 2) covers a sufficient part of each side of the rectangle."""
     local = (points - centre) @ _turn(yaw)
     for axis in (0, 1):
         for end in (-1.0, 1.0):
@@ -335,11 +328,11 @@ def _edge(background: NDArray[np.float32], floor: Floor, camera: Camera, pixels:
     height = np.where(
         depth > 0, floor.distance_mm * (1.0 - depth * (a * column + b * row + c)), np.nan
     )
-    known = np.isfinite(height).any(axis=0)
-    if known.mean() < 0.3:
+    valid = np.isfinite(height).any(axis=0)
+    if valid.mean() < 0.3:
         return "unknown"
-    highest = np.nanmax(height[:, known], axis=0)
-    lowest = np.nanmin(height[:, known], axis=0)
+    highest = np.nanmax(height[:, valid], axis=0)
+    lowest = np.nanmin(height[:, valid], axis=0)
     return (
         "wall"
         if np.median(highest) > _WALL_MM
@@ -350,20 +343,13 @@ def _edge(background: NDArray[np.float32], floor: Floor, camera: Camera, pixels:
 
 
 def circle_points(n: int) -> Array:
-    """Points of the unit circle, evenly spaced from (1, 0) on.
-
-    Args:
-        n: how many.
-
-    Returns:
-        (n, 2).
-    """
+    """N points (n, 2) of the unit circle, evenly spaced from (1, 0)."""
     angle = 2.0 * np.pi * np.arange(n) / n
     return np.stack([np.cos(angle), np.sin(angle)], axis=-1)
 
 
 def _turn(yaw: float) -> Array:
-    """Rotation (2, 2) by yaw; points @ it are turned back."""
+    """Rotation (2, 2) by yaw; points @ it are rotated back."""
     c = np.cos(yaw)
     s = np.sin(yaw)
     return np.array([[c, -s], [s, c]])

@@ -1,8 +1,8 @@
-"""Regions of a picture that a plan states: polygon, rectangle or circle, in pixels or millimetres.
+"""Regions of an image stated in a plan: polygon, rectangle or circle, in pixels or millimetres.
 
-Millimetres are those of the floor, in the arena's frame: its origin lies below the camera, x goes
-along the picture's rows and y up the picture. Each corner is carried to the picture by the pinhole
-projection of its place on the floor. What several arenas have in common is refused.
+Millimetres are measured on the floor, in the arena's frame: its origin is below the camera, x
+points along the image's rows and y up the image. Corners in millimetres are projected from the
+floor into the image. Overlapping arenas are refused.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ Corners = tuple[tuple[float, float], ...]
 def crossing_sides(corners: Array) -> tuple[int, int] | None:
     """The first two sides of a polygon that cross inside both, counted from 0.
 
-    Two lines cross where the ends of each lie on two sides of the other.
+    Two segments cross if each separates the ends of the other.
 
     Args:
-        corners: (n, 2), in order; side k goes from corner k to the next.
+        corners: (n, 2), in order; side k connects corner k to the next.
 
     Returns:
-        Their numbers, the smaller first; None where no sides cross.
+        Their numbers, the smaller first; None if no sides cross.
     """
     ends = np.roll(corners, -1, axis=0)
     n = len(corners)
@@ -56,18 +56,18 @@ def _side(p: Array, q: Array, r: Array) -> Array:
 
 
 _N_CORNERS = 64  # of a circle
-_DEEPEST_SHARE = 1e-3  # a place on the floor lies at least this share of its distance before it
+_DEEPEST_SHARE = 1e-3  # least depth of a corner, as a share of the floor's distance
 
 
 def region_corners_px(
     region: Region, camera: Camera | None = None, floor: Floor | None = None
 ) -> Corners:
-    """The corners of a region in the picture.
+    """The corners of a region in the image.
 
     Args:
-        region: as a plan states it.
-        camera: the ideal pinhole camera of the recording; needed for millimetres alone.
-        floor: on which millimetres count; needed for those alone.
+        region: as stated in a plan.
+        camera: the ideal pinhole camera of the recording; needed for millimetres only.
+        floor: likewise.
 
     Returns:
         (u, v) pixels.
@@ -79,20 +79,20 @@ def region_corners_px(
     if (crossing := crossing_sides(corners)) is not None:
         raise PlanError(
             f"arena.region: sides {crossing[0] + 1} and {crossing[1] + 1} of its polygon cross; "
-            "list the corners in the order in which they go round the arena"
+            "list the corners in order around the arena"
         )
     if region.unit == "px":
         return tuple((float(u), float(v)) for u, v in corners)
     if camera is None or floor is None:
         raise PlanError("a region in mm needs a floor; state it in pixels, or state arena.floor")
-    place = np.column_stack([corners, np.zeros(len(corners))])
-    seen = floor.T_arena_camera.inverse() @ place
-    if (seen[:, 2] < _DEEPEST_SHARE * floor.distance_mm).any():
+    on_floor = np.column_stack([corners, np.zeros(len(corners))])
+    points = floor.T_arena_camera.inverse() @ on_floor
+    if (points[:, 2] < _DEEPEST_SHARE * floor.distance_mm).any():
         raise PlanError(
-            "arena.region has corners that lie behind the camera; millimetres count from the place "
-            "on the floor below the camera"
+            "arena.region has corners that lie behind the camera; millimetres are measured from "
+            "the point of the floor below the camera"
         )
-    return tuple((float(u), float(v)) for u, v in camera.project(seen))
+    return tuple((float(u), float(v)) for u, v in camera.project(points))
 
 
 def _drawn(region: Region) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
@@ -106,18 +106,18 @@ def _drawn(region: Region) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
 
 
 def masks_apart(regions: Mapping[str, Corners], width: int, height: int) -> dict[str, Mask]:
-    """The pixels of several arenas, which have none in common.
+    """The disjoint pixel masks of multiple arenas.
 
     Args:
         regions: (u, v) corners, pixels, by the arena's name.
-        width: of the picture, px.
-        height: of the picture, px.
+        width: of the image, px.
+        height: of the image, px.
 
     Returns:
         (height, width) bool by the arena's name.
 
     Raises:
-        PlanError: a region is no polygon in the picture, or two overlap.
+        PlanError: a region is no polygon in the image, or two overlap.
     """
     masks = {}
     for name, corners in regions.items():

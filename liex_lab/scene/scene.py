@@ -1,8 +1,8 @@
-"""What a depth camera looks at, found once per session: floor, region, outline, fixtures, animals.
+"""The scene of a session: floor, region, outline, fixtures and number of animals.
 
 A `Scene` is written to session.json (`scene`). Its region of interest is a polygon in pixels of the
-rectified picture, outside of which nothing is looked at; its roughness is the spread of the ground
-about the floor's plane, its fixtures what stands still on the floor.
+rectified image; pixels outside are ignored. Its roughness is the spread of the ground about the
+floor's plane, its fixtures are objects at rest on the floor.
 """
 
 from __future__ import annotations
@@ -23,26 +23,26 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 LARGEST = "largest plane"
-STOOD_ON = "where animals stand"
+BY_SUPPORT = "where animals stand"
 WALLED = "walled ground"
 STATED = "plan"
 
-HIGH_MM = 20.0  # a fixture stands out from the floor by so much
-LEAST_MM2 = 300.0  # and is no speck
-_MOST = 32  # fixtures told
-_MOST_ROUND = 1.6  # times its own area: what goes round more is walls
+HIGH_MM = 20.0  # least height of a fixture above the floor
+LEAST_MM2 = 300.0  # smaller ones are specks
+_MOST = 32  # fixtures reported
+_MOST_ROUND = 1.6  # largest ratio of hull to area: beyond, it is the walls
 
 
 @dataclass(frozen=True)
 class Fixture:
-    """A thing that stands still on the floor.
+    """An object at rest on the floor.
 
     Attributes:
         centre_mm: x and y of its middle, mm, arena frame.
         height_mm: of its top above the floor, mm.
         area_mm2: seen from the camera, mm^2.
-        since_s: when it was put in, s since the first frame; None where it was there before.
-        until_s: when it was taken out; None where it stays.
+        since_s: when it was placed there, s since the first frame; None if from the beginning.
+        until_s: when it was removed; None if it stays.
     """
 
     centre_mm: tuple[float, float]
@@ -52,7 +52,7 @@ class Fixture:
     until_s: float | None = None
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain numbers for session.json; times only where it does not stay throughout."""
+        """Plain numbers for session.json; times only of a transient object."""
         times = {"since_s": self.since_s, "until_s": self.until_s}
         return {
             "centre_mm": [round(value, 1) for value in self.centre_mm],
@@ -62,18 +62,14 @@ class Fixture:
         }
 
     @staticmethod
-    def from_dict(known: Mapping[str, Any]) -> Fixture:
-        """The fixture that `to_dict` wrote.
-
-        Args:
-            known: an entry of `scene.fixtures` in session.json.
-        """
-        x, y = known["centre_mm"][:2]
-        times = known.get("since_s"), known.get("until_s")
-        return Fixture((x, y), known["height_mm"], known["area_mm2"], *times)
+    def from_dict(numbers: Mapping[str, Any]) -> Fixture:
+        """The fixture that `to_dict` wrote, an entry of `scene.fixtures` in session.json."""
+        x, y = numbers["centre_mm"][:2]
+        times = numbers.get("since_s"), numbers.get("until_s")
+        return Fixture((x, y), numbers["height_mm"], numbers["area_mm2"], *times)
 
     def __str__(self) -> str:
-        """Its height, and when it stands there if not always."""
+        """Its height, and its start and end times if transient."""
         since = "" if self.since_s is None else f" from {self.since_s:.1f}"
         until = "" if self.until_s is None else f" {'to' if since else 'until'} {self.until_s:.1f}"
         times = since + until
@@ -82,29 +78,29 @@ class Fixture:
 
 @dataclass(frozen=True)
 class Scene:
-    """What stands still before the camera, and how many animals move in it.
+    """The static scene of a recording, and how many animals move in it.
 
     Attributes:
-        floor: the plane on which animals stand, camera frame.
+        floor: the plane that animals stand on, camera frame.
         floor_from: how it was found: 'largest plane', 'where animals stand' (another plane than the
-            largest), 'walled ground' (nothing moved, so it is in doubt) or 'plan'.
-        floor_support: share of what was seen moving, by volume, that stands on it, 0 to 1; None
-            where too little moved to tell.
-        n_moving: things of an animal's size seen moving in the frames looked at.
-        n_animals: how many of them move in one frame; 0 where none was seen moving.
+            largest), 'walled ground' (nothing moved, so it is doubtful) or 'plan'.
+        floor_support: share of the moving objects, by volume, that stand on it, 0 to 1; None if too
+            little moved.
+        n_moving: moving objects of an animal's size in the sampled frames.
+        n_animals: how many of them move in one frame; 0 if none moved.
         roughness_mm: standard deviation of the ground, with bedding, about the floor's plane, mm;
-            None where it is not seen.
-        region_px: (u, v) corners, pixels, of the polygon outside of which nothing is looked at;
-            empty where the whole picture is.
+            None if the ground is not visible.
+        region_px: (u, v) corners, pixels, of the polygon that is analysed; empty for the full
+            image.
         outline: the shape of the arena.
-        fixtures: what stands still on the floor, largest first; then what was put in or taken out,
-            in order of time.
-        doubts: sentences about why this may be wrong.
+        fixtures: objects at rest on the floor, largest first; then transient objects in order of
+            time.
+        doubts: sentences on why the scene may be wrong.
         wander_mm: range of the floor's depth over the recording, mm, as of a sensor that warms up;
-            None where it is still.
-        thin_above: whether something thin above the animal, a cable or bars, is cut out of the
-            pictures.
-        sensor: how good the sensor's readings are; None where it is not known.
+            None without drift.
+        thin_above: whether something thin above the animal, a cable or bars, is removed from the
+            images.
+        sensor: quality of the sensor's readings; None if unknown.
     """
 
     floor: Floor
@@ -122,7 +118,7 @@ class Scene:
     sensor: SensorCard | None = None
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain numbers for session.json; the outline is there already, as `arena`."""
+        """Plain numbers for session.json, without the outline, which is stored as `arena`."""
         support = self.floor_support
         return {
             "floor": {
@@ -144,14 +140,14 @@ class Scene:
 
 
 def region_corners(region: Mask | None, stride: int) -> tuple[tuple[float, float], ...]:
-    """The convex outline of a region, in pixels of the whole picture.
+    """The convex outline of a region, in pixels of the full image.
 
     Args:
-        region: (H, W) bool of every `stride`-th pixel; None is the whole picture.
-        stride: pixels from one to the next.
+        region: (H, W) bool of every `stride`-th pixel; None for the full image.
+        stride: step, px.
 
     Returns:
-        (u, v) corners; none for the whole picture.
+        (u, v) corners; empty for the full image.
     """
     import cv2
 
@@ -163,15 +159,15 @@ def region_corners(region: Mask | None, stride: int) -> tuple[tuple[float, float
 
 
 def plane_of(point: Sequence[float], normal: Sequence[float], camera: Camera) -> Floor:
-    """The floor that a plan states, by a point of it and its normal.
+    """The floor stated in a plan by a point and a normal.
 
     Args:
         point: (3,) mm, camera frame.
         normal: (3,) of any length, towards or away from the camera.
-        camera: that looks at it.
+        camera: of the recording.
 
     Raises:
-        PlanError: the plane goes through the camera, or is seen from its side.
+        PlanError: the plane passes through the camera, or is viewed edge-on.
     """
     n = np.asarray(normal, float)
     length = float(np.linalg.norm(n))
@@ -181,8 +177,8 @@ def plane_of(point: Sequence[float], normal: Sequence[float], camera: Camera) ->
         distance = -distance
     if distance < 1.0 or n[2] / length < np.cos(np.radians(75.0)):
         raise PlanError(
-            "arena.floor should be a plane before the camera that faces it: point is a place on "
-            "it, mm in the camera's frame (x right, y down, z away), normal its perpendicular, as "
+            "arena.floor should be a plane in front of the camera that faces it: point lies on it, "
+            "mm in the camera's frame (x right, y down, z away), normal is its perpendicular, as "
             "in {point = [0, 0, 700], normal = [0, 0, 1]}"
         )
     return Floor.from_plane(n, distance, camera)
@@ -199,58 +195,58 @@ def roughness(
         on_floor: (H, W) bool, the floor.
 
     Returns:
-        The spread, which a third of the ground exceeds; None where nothing of it is read.
+        The spread, which a third of the ground exceeds; None if no ground is read.
     """
-    known = on_floor & (background > 0) & (background != bare)
-    if not known.any():
+    valid = on_floor & (background > 0) & (background != bare)
+    if not valid.any():
         return None
-    off = background[known] - bare[known]
+    off = background[valid] - bare[valid]
     return float(np.percentile(np.abs(off - np.median(off)), 68.3))
 
 
 def find_fixtures(
     background: NDArray[np.float32], floor: Floor, camera: Camera, on_floor: Mask
 ) -> tuple[Fixture, ...]:
-    """What stands still on the floor.
+    """Find objects at rest on the floor.
 
     Args:
         background: (H, W) float32 mm, 0 where unread.
-        floor: its plane, in the pixels of the camera.
-        camera: whose pixels these are.
+        floor: its plane, in pixels of the camera.
+        camera: of these pixels.
         on_floor: (H, W) bool, the floor.
 
     Returns:
-        At most 32 things, largest first.
+        At most 32, largest first.
     """
     import cv2
 
     bare = floor.depth(camera.width, camera.height)
-    # the foot of the walls is no thing on the floor
+    # the foot of the walls is no object on the floor
     inner = cv2.erode(np.pad(on_floor, 1).astype(np.uint8), np.ones((9, 9), np.uint8))[1:-1, 1:-1]
     high = (inner > 0) & (background > 0) & (bare - background > HIGH_MM)
     n, labels = cv2.connectedComponents(high.astype(np.uint8))
     found = []
     for k in range(1, n):
-        place = labels == k
-        hull = cv2.convexHull(cv2.findNonZero(place.astype(np.uint8)))
-        if cv2.contourArea(hull) > _MOST_ROUND * place.sum():
-            continue  # the walls go round the floor, and do not stand on it
-        fixture = fixture_at(place, background, floor, camera)
+        mask = labels == k
+        hull = cv2.convexHull(cv2.findNonZero(mask.astype(np.uint8)))
+        if cv2.contourArea(hull) > _MOST_ROUND * mask.sum():
+            continue  # the walls surround the floor and do not stand on it
+        fixture = fixture_at(mask, background, floor, camera)
         if fixture.area_mm2 >= LEAST_MM2:
             found.append(fixture)
     return tuple(sorted(found, key=lambda fixture: -fixture.area_mm2)[:_MOST])
 
 
-def fixture_at(place: Mask, depth: NDArray[np.float32], floor: Floor, camera: Camera) -> Fixture:
-    """The thing that some pixels show.
+def fixture_at(mask: Mask, depth: NDArray[np.float32], floor: Floor, camera: Camera) -> Fixture:
+    """The object in some pixels.
 
     Args:
-        place: (H, W) bool, its pixels, at least one.
+        mask: (H, W) bool, its pixels, at least one.
         depth: (H, W) float32 mm, of its surface there.
-        floor: its plane, in the pixels of the camera.
-        camera: whose pixels these are.
+        floor: its plane, in pixels of the camera.
+        camera: of these pixels.
     """
-    rows, columns = np.nonzero(place)
+    rows, columns = np.nonzero(mask)
     z = depth[rows, columns].astype(float)
     area = float((z**2).sum()) / (camera.fx * camera.fy)
     pixels = np.stack([columns, rows], axis=1).astype(float)

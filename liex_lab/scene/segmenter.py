@@ -1,4 +1,4 @@
-"""Segmentation: which pixels of a depth picture are the animal; the base of every method."""
+"""Segmentation of the animal in depth images: the base class of all methods."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ Array = NDArray[np.float64]
 
 
 class Segmenter(ABC):
-    """What finds the animal in the pictures of one camera, and in one pass the next candidate.
+    """Finds the animal in the images of one camera, and the next best candidate in the same pass.
 
     The base of `BackgroundSubtraction` and `HandSegmenter`.
 
     Attributes:
-        camera: the ideal pinhole camera whose pictures are segmented.
+        camera: the ideal pinhole camera of the images.
         floor: the plane from which heights in a recording's results are measured.
-        area_mm2: the animal's usual area as the camera sees it, mm^2.
+        area_mm2: the animal's usual area in the camera's view, mm^2.
     """
 
     camera: Camera
@@ -41,7 +41,7 @@ class Segmenter(ABC):
         Args:
             depths: (n, H, W) float32 mm, 0 where unread.
             size: the animal's spine length over the skeleton's home length; scales the smoothing.
-            parallel: whether to use all threads, else one.
+            parallel: whether to use all threads.
             camera_view: whether heights are measured along the optical axis, from behind the
                 animal.
 
@@ -57,39 +57,39 @@ class Segmenter(ABC):
         parallel: bool = True,
         camera_view: bool = False,
     ) -> tuple[HeightMaps, HeightMaps]:
-        """Height maps of the animal in each frame, and of the next thing that may be it after all.
+        """Height maps of the animal in each frame, and of the next best candidate.
 
         Args:
             depths: (n, H, W) float32 mm, 0 where unread.
             size: the animal's spine length over the skeleton's home length; scales the smoothing.
-            parallel: whether to use all threads, else one.
+            parallel: whether to use all threads.
             camera_view: whether heights are measured along the optical axis, from behind the
                 animal.
 
         Returns:
-            The best candidates (n rows), and the second best (n rows), found where `n_blobs` is
-            more than one.
+            The best candidates (n rows), and the second best (n rows), found if `n_blobs` is more
+            than one.
         """
         crops = self._extract(depths, size, parallel, camera_view, 2)
         n = len(depths)
         return crops[:n], crops[n:]
 
     def cleared(self, depths: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Pictures without what the animal wears, 0 there; the same where it wears nothing.
+        """Images without worn devices, 0 there; unchanged if there are none.
 
         Args:
-            depths: (n, H, W) float32 mm, whole pictures, 0 where unread.
+            depths: (n, H, W) float32 mm, full images, 0 where unread.
         """
         return depths
 
     @property
     def remarks(self) -> tuple[str, ...]:
-        """What was found in the pictures and undone, in sentences; nothing where they are clean."""
+        """Corrections applied to the images, in sentences; usually empty."""
         return ()
 
     @property
     def doubts(self) -> tuple[str, ...]:
-        """Why what is measured here may be wrong all the same, in sentences; usually none."""
+        """Remaining reasons why measurements may be wrong, in sentences; usually empty."""
         return ()
 
     @abstractmethod
@@ -103,19 +103,19 @@ class Segmenter(ABC):
 
     @abstractmethod
     def planes(self, crops: HeightMaps, camera_view: bool = False) -> Array:
-        """The plane above which each height map is measured.
+        """The reference plane of each height map.
 
         Args:
             crops: n height maps.
             camera_view: as they were extracted.
 
         Returns:
-            (n, 3) a, b, c of 1 / z = a u + b v + c, per mm, u and v in pixels of the picture.
+            (n, 3) a, b, c of 1 / z = a u + b v + c, per mm, u and v in image pixels.
         """
 
     @abstractmethod
     def middles(self, crops: HeightMaps, camera_view: bool = False) -> Array:
-        """The centroid (n, 3) mm of what each height map shows, in the arena frame.
+        """The centroid (n, 3) mm of each height map, in the arena frame.
 
         Args:
             crops: n height maps.
@@ -132,11 +132,7 @@ class Segmenter(ABC):
 
     @abstractmethod
     def every(self, step: int) -> Segmenter:
-        """The same segmenter for pictures of every `step`-th row and column.
-
-        Args:
-            step: pixels from one to the next, at least 1.
-        """
+        """The same segmenter for images of every `step`-th row and column."""
 
     @abstractmethod
     def _extract(
@@ -145,17 +141,17 @@ class Segmenter(ABC):
         size: float,
         parallel: bool,
         camera_view: bool,
-        n_things: int,
+        n_candidates: int,
     ) -> HeightMaps:
-        """Height maps of the likeliest component of each frame and, where asked, of the next.
+        """Height maps of the best component of each frame and, if requested, of the second best.
 
         Args:
             depths: (n, H, W) float32 mm, 0 where unread.
             size: the animal's spine length over the skeleton's home length.
-            parallel: whether to use all threads, else one.
+            parallel: whether to use all threads.
             camera_view: whether heights are measured along the optical axis.
-            n_things: candidates a frame, 1 or 2.
+            n_candidates: per frame, 1 or 2.
 
         Returns:
-            The rows (n) of the likeliest components, and then (n_things 2) those of the next.
+            The rows (n) of the best components, then (n_candidates 2) those of the second best.
         """

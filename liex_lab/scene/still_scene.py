@@ -1,9 +1,9 @@
-"""The empty scene of one camera, and what stands before it in a picture.
+"""The empty scene of one camera, and segmentation of the animal in front of it.
 
-A pixel is foreground where its reading is nearer than the scene's limit. Foreground pixels are
-joined to 8-connected components of 4 x 4 blocks; the animal is the component whose area comes
-nearest to the animal's usual one, and its height map and image moments are cut by the kernels (see
-`height_maps`). How the scene is learned from a recording is in `background_segmenter`.
+A pixel is foreground if its reading is nearer than the scene's limit. Foreground pixels are
+connected to 8-connected components of 4 x 4 blocks; the animal is the component whose area is
+nearest to the animal's usual one. The kernels cut its height map and image moments (see
+`height_maps`). `background_segmenter` learns the scene from a recording.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from liex_lab.scene.floor import Floor
 from liex_lab.scene.height_maps import HeightMaps, pack_crop_cameras
 from liex_lab.scene.scene import Fixture, Scene, find_fixtures, region_corners, roughness
 from liex_lab.scene.segmenter import Segmenter
-from liex_lab.scene.support_plane import Standing
+from liex_lab.scene.support_plane import SupportPlane
 from liex_lab.scene.worn import Cable, HeadStage
 
 Array = NDArray[np.float64]
@@ -35,18 +35,18 @@ Array = NDArray[np.float64]
 _N_PARTS = 4
 _LEAST_FRAMES = 8  # of a part
 _N_PIXELS = 10_000
-_ELSEWHERE_MM = 12.0  # more than a sensor's drift and noise leave in a median
-_LEAST_SHARE = 0.06  # of what is read
-_LEAST_ANIMALS = 4.0  # times the area of the animal, which leaves one place and fills another
+_ELSEWHERE_MM = 12.0  # exceeds the drift and noise that remain in a median
+_LEAST_SHARE = 0.06  # of the readings
+_LEAST_ANIMALS = 4.0  # in areas of the animal, whose own movement changes up to two
 
 
 @dataclass(frozen=True)
 class SceneChange:
-    """What still stood is elsewhere from some time on.
+    """A lasting change of the still scene.
 
     Attributes:
-        at_s: since when, s since the first frame.
-        share: of the picture that is read, how much is elsewhere.
+        at_s: when it happened, s since the first frame.
+        share: of the readable image that changed.
     """
 
     at_s: float
@@ -56,16 +56,16 @@ class SceneChange:
     def find(
         sample: NDArray[np.float32], times_s: Array, camera: Camera, area_mm2: float
     ) -> SceneChange | None:
-        """The change of a recording, from frames spread over it.
+        """Find the change of a recording from frames spread over it.
 
         Args:
             sample: (n, H, W) float32 mm, the frames, 0 where unread.
             times_s: (n,) of the frames, s since the first.
-            camera: the camera of those pixels.
+            camera: of those pixels.
             area_mm2: the animal's usual area seen from above, mm^2.
 
         Returns:
-            The change; None where the scene keeps still, or too few frames tell.
+            The change; None if the scene does not change, or too few frames are given.
         """
         check_shapes("frames", ("sample", sample, ("n", "H", "W")), ("times_s", times_s, ("n",)))
         n_parts = min(_N_PARTS, len(sample) // _LEAST_FRAMES)
@@ -77,31 +77,31 @@ class SceneChange:
         found = None
         for a, b in [*zip(range(n_parts), range(1, n_parts), strict=False), (0, n_parts - 1)]:
             read = (usual[a] > 0) & (usual[b] > 0)
-            moved = read & (np.abs(usual[b] - usual[a]) > _ELSEWHERE_MM)
-            share = float(moved.sum() / max(read.sum(), 1))
-            pixels_mm2 = (step * usual[a][moved].astype(float)) ** 2 / (camera.fx * camera.fy)
+            changed_px = read & (np.abs(usual[b] - usual[a]) > _ELSEWHERE_MM)
+            share = float(changed_px.sum() / max(read.sum(), 1))
+            pixels_mm2 = (step * usual[a][changed_px].astype(float)) ** 2 / (camera.fx * camera.fy)
             is_more = share > (found[0] if found else _LEAST_SHARE)
             if is_more and pixels_mm2.sum() > _LEAST_ANIMALS * area_mm2:
-                found = share, usual[a][moved], usual[b][moved], moved
+                found = share, usual[a][changed_px], usual[b][changed_px], changed_px
         if found is None:
             return None
-        share, before, after, moved = found
-        seen = depths[:, moved]
-        is_after = (np.abs(seen - after) < np.abs(seen - before)).mean(axis=1) > 0.5
+        share, before, after, changed_px = found
+        readings = depths[:, changed_px]
+        is_after = (np.abs(readings - after) < np.abs(readings - before)).mean(axis=1) > 0.5
         since = int(np.argmax(is_after & np.append(is_after[1:], True)))
         return SceneChange(float(times_s[since]), share)
 
     @property
     def sentence(self) -> str:
-        """What changed, in words."""
+        """The change in words."""
         return (
-            f"the camera was pushed, or its scene rearranged, at {self.at_s:.1f} s "
-            f"({self.share:.0%} of it is elsewhere from then on): cut the recording there"
+            f"the camera was displaced or its scene rearranged at {self.at_s:.1f} s "
+            f"({self.share:.0%} of the image changed): cut the recording there"
         )
 
 
 def _usual(depths: NDArray[np.float32]) -> NDArray[np.float32]:
-    """The median (P,) of what was read in frames (n, P), mm; 0 where most of it was not."""
+    """The median (P,) of the readings in frames (n, P), mm; 0 where most are unread."""
     n_read = (depths > 0).sum(axis=0)
     # unread pixels come first
     row = np.minimum(len(depths) - (n_read + 1) // 2, len(depths) - 1)
@@ -114,32 +114,31 @@ AnyNumber = TypeVar("AnyNumber", bound=np.generic)
 # of the logarithms, from posture to posture of one animal
 _AREA_SD = 0.25
 _VOLUME_SD = 0.2
-_ALIKE = np.log(1.5)  # areas that differ by less are of one thing
+_ALIKE = np.log(1.5)  # areas that differ by less belong to one object
 
 
 @dataclass(frozen=True)
 class StillScene(Segmenter):
-    """The empty scene of one camera, and the depth nearer than which a reading is the animal.
+    """The empty scene of one camera, and the depth limit of the foreground.
 
     Attributes:
         camera: the ideal pinhole camera of the recording.
         floor: the floor plane in that camera's frame.
         background: (H, W) float32 mm, depth of the empty scene, 0 where unknown.
-        limit: (H, W) float32 mm; a reading below it is in front of the background.
-        on_floor: (H, W) bool, the floor, under which nothing lies, as far as the picture shows it:
-            an animal stands on it with at least a part of its body.
+        limit: (H, W) float32 mm; a reading below it is foreground.
+        on_floor: (H, W) bool, the visible floor: an animal stands on it with at least a part of its
+            body.
         area_mm2: the animal's usual area seen from above, mm^2; 0 while unknown.
         volume_mm3: the animal's usual volume under its back, mm^3; 0 while unknown.
-        view: how such animals are looked at.
-        stride: only every so many-th row and column of the picture is looked at; H and W count
-            those.
-        standing: how the floor was found, None where it was given.
-        cable: how cables are told from the animal; None where it wears none.
-        stage: how a head stage is told from it; None where it wears none.
-        level: brings frames to one level of the floor; None where it is still.
-        changed: what is elsewhere from some time on; None where the scene keeps still.
-        sensor: how good its readings are; None where no sample told it.
-        put_in: things that stand on the floor for a part of the recording.
+        view: how such animals are viewed.
+        stride: step between analysed rows and columns of the image; H and W count those.
+        support_plane: how the floor was found; None if it was given.
+        cable: how cables are separated from the animal; None without one.
+        stage: how a head stage is separated from it; None without one.
+        level: reference level of the floor; None if it does not drift.
+        changed: a lasting change of the scene; None without one.
+        sensor: quality of its readings; None without a sample.
+        transient_objects: objects that stand on the floor for a part of the recording.
     """
 
     camera: Camera
@@ -151,61 +150,57 @@ class StillScene(Segmenter):
     volume_mm3: float = 0.0
     view: View = MOUSE_VIEW
     stride: int = 1
-    standing: Standing | None = None
+    support_plane: SupportPlane | None = None
     level: FloorLevel | None = None
     cable: Cable | None = None
     stage: HeadStage | None = None
     changed: SceneChange | None = None
     sensor: SensorCard | None = None
-    put_in: tuple[Fixture, ...] = ()
+    transient_objects: tuple[Fixture, ...] = ()
 
     @cached_property
     def grid(self) -> Camera:
-        """The camera whose pixels are looked at: every `stride`-th of the picture."""
+        """The camera of the analysed pixels: every `stride`-th of the image."""
         return self.camera.every(self.stride)
 
     @cached_property
     def grid_floor(self) -> Floor:
-        """The floor as that camera sees it."""
+        """The floor in pixels of that camera."""
         if self.stride == 1:
             return self.floor
         return Floor.from_plane(self.floor.normal, self.floor.distance_mm, self.grid)
 
     def described(self) -> Scene:
-        """The scene as it is written to session.json, without its outline."""
+        """The scene as written to session.json, without its outline."""
         floor = self.grid_floor
         bare = floor.depth(self.grid.width, self.grid.height)
-        known = Scene(
+        described = Scene(
             self.floor,
             roughness_mm=roughness(self.background, bare, self.on_floor),
             fixtures=(
                 *find_fixtures(self.background, floor, self.grid, self.on_floor),
-                *self.put_in,
+                *self.transient_objects,
             ),
             doubts=self.doubts,
             wander_mm=None if self.level is None else self.level.wander_mm,
             thin_above=self.cable is not None,
             sensor=self.sensor,
         )
-        standing = self.standing
-        if standing is None:
-            return known
+        support_plane = self.support_plane
+        if support_plane is None:
+            return described
         return replace(
-            known,
-            floor_from=standing.origin,
-            floor_support=standing.support if standing.moves else None,
-            n_moving=standing.n_things,
-            n_animals=standing.n_together,
-            region_px=region_corners(standing.region, self.stride),
-            doubts=((standing.doubt,) if standing.doubt else ()) + self.doubts,
+            described,
+            floor_from=support_plane.origin,
+            floor_support=support_plane.support if support_plane.moves else None,
+            n_moving=support_plane.n_moving,
+            n_animals=support_plane.n_together,
+            region_px=region_corners(support_plane.region, self.stride),
+            doubts=((support_plane.doubt,) if support_plane.doubt else ()) + self.doubts,
         )
 
     def every(self, step: int) -> Self:
-        """The same segmenter for pictures of every `step`-th row and column.
-
-        Args:
-            step: pixels from one to the next, at least 1.
-        """
+        """The same segmenter for images of every `step`-th row and column."""
         camera = self.camera.every(step)
         cut = (slice(None, None, step), slice(None, None, step))
         floor = Floor.from_plane(self.floor.normal, self.floor.distance_mm, camera)
@@ -225,8 +220,8 @@ class StillScene(Segmenter):
         """How unlike the animal each height map (n,) is in size: squared standard deviations.
 
         The sum of ((log a - log a0) / 0.25)^2 over area and ((log v - log v0) / 0.2)^2 over volume,
-        from posture to posture of one animal. An animal that swims or is held up is judged by its
-        area alone: what is below it is not its own.
+        where the deviations are those between postures of one animal. An animal that swims or is
+        lifted is judged by its area alone, as the space below it is not its own.
 
         Args:
             crops: n height maps.
@@ -248,14 +243,14 @@ class StillScene(Segmenter):
         return np.diag([1.0, -1.0, -1.0]) if camera_view else self.floor.T_arena_camera.rotation
 
     def planes(self, crops: HeightMaps, camera_view: bool = False) -> Array:
-        """The plane above which each height map is measured: the floor, or one behind the animal.
+        """The reference plane of each height map: the floor, or one behind the animal.
 
         Args:
             crops: n height maps.
             camera_view: as they were extracted.
 
         Returns:
-            (n, 3) a, b, c of 1 / z = a u + b v + c, per mm, u and v in pixels of the picture.
+            (n, 3) a, b, c of 1 / z = a u + b v + c, per mm, u and v in image pixels.
         """
         if not camera_view:
             return np.tile(self.floor.inverse_depth, (len(crops.step), 1))
@@ -264,7 +259,7 @@ class StillScene(Segmenter):
         return level
 
     def middles(self, crops: HeightMaps, camera_view: bool = False) -> Array:
-        """The centroid (n, 3) mm of what each height map shows, in the arena frame.
+        """The centroid (n, 3) mm of each height map, in the arena frame.
 
         Args:
             crops: n height maps.
@@ -277,9 +272,7 @@ class StillScene(Segmenter):
         return middle
 
     def crop_cameras(self, crops: HeightMaps, camera_view: bool = False) -> Array:
-        """The crop cameras of height maps.
-
-        Each says how its map was cut: intrinsics, T_view_camera, origin and step of the crop.
+        """The crop cameras of height maps: intrinsics, T_view_camera, origin and step of each crop.
 
         Args:
             crops: n height maps.
@@ -299,34 +292,33 @@ class StillScene(Segmenter):
 
     @property
     def remarks(self) -> tuple[str, ...]:
-        """What was cut out of the pictures, and by how much depth wandered."""
-        said = []
+        """Corrections applied to the images, in sentences."""
+        remarks = []
         if self.cable is not None:
-            said.append(
-                "something thin above the animal, a cable or bars, was cut out of the pictures"
+            remarks.append(
+                "something thin above the animal, a cable or bars, was removed from the images"
             )
         if self.stage is not None:
-            said.append("a head stage on the animal was cut out of the pictures")
+            remarks.append("a head stage on the animal was removed from the images")
         if self.level is not None:
-            said.append(
-                f"the depth of the floor wandered by {self.level.wander_mm:.1f} mm, as of a sensor "
-                "that warms up, and was brought back to where it was at the beginning"
+            remarks.append(
+                f"the depth of the floor drifted by {self.level.wander_mm:.1f} mm, as of a sensor "
+                "that warms up, and was corrected to its initial value"
             )
-        return tuple(said)
+        return tuple(remarks)
 
     @property
     def doubts(self) -> tuple[str, ...]:
-        """That the camera was pushed, or the scene rearranged, while it recorded."""
+        """Whether the camera was displaced or the scene rearranged during the recording."""
         return () if self.changed is None else (self.changed.sentence,)
 
     def cleared(self, depths: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Whole pictures without what the animal wears: 0 where a cable is.
+        """Full images without worn cables, 0 there.
 
-        The bars of a lid stay, for they are no cable, but what an animal is hidden by.
+        The bars of a lid remain, as they hide the animal but are not worn.
 
         Args:
-            depths: (n, H, W) float32 mm, whole pictures, or a sample of them with the scene's own
-                stride.
+            depths: (n, H, W) float32 mm, full images, or a sample at the scene's own stride.
         """
         if self.cable is None:
             return depths
@@ -334,20 +326,20 @@ class StillScene(Segmenter):
         worn = self.cable.worn(depths[:, ::step, ::step], self.limit)
         return np.where(at_every_pixel(worn, step, depths.shape[1:]), np.float32(0), depths)
 
-    def places(self, crops: HeightMaps) -> list[NDArray[np.bool_]]:
+    def animal_masks(self, crops: HeightMaps) -> list[NDArray[np.bool_]]:
         """The animal's pixels (H, W) bool in each frame that shows it.
 
         Args:
             crops: of frames at this scene's stride, see `extract`.
         """
-        places = []
+        masks = []
         for i in np.flatnonzero(crops.found):
             rows, columns = np.nonzero(crops.heights[i])
             step, (u, v) = crops.step[i] // self.stride, crops.origin[i] // self.stride
             own = np.zeros(self.limit.shape, np.bool_)
             own[v + step * rows, u + step * columns] = True
-            places.append(own)
-        return places
+            masks.append(own)
+        return masks
 
     def usual_area(
         self,
@@ -355,22 +347,22 @@ class StillScene(Segmenter):
         spine_mm: tuple[float, float],
         without_mm2: Sequence[float] = (),
     ) -> tuple[float, float]:
-        """The area that most frames have a component of, and the share of frames that do.
+        """The component area that recurs in most frames, and the share of frames that contain it.
 
-        One object of constant size is in (nearly) every frame, the animal; other things come and go
-        or differ. The mode of a kernel density over the logarithm of area, to which each frame adds
-        its nearest component with a Gaussian kernel of standard deviation 0.35.
+        The animal has nearly constant size and is in nearly every frame; other objects appear,
+        disappear or differ in size. The result is the mode of a kernel density over the logarithm
+        of area, to which each frame adds its nearest component with a Gaussian kernel of standard
+        deviation 0.35.
 
         Args:
             depths: (n, H, W) float32 mm, frames at this scene's stride.
-            spine_mm: lengths of the smallest and the largest animal to expect, mm; they bound the
+            spine_mm: lengths of the smallest and the largest expected animal, mm; they bound the
                 area.
-            without_mm2: areas that are not looked for, nor those that differ from them by less than
-                a half.
+            without_mm2: areas to exclude, with those within a factor of 1.5.
 
         Returns:
             The area, mm^2, and the share (0 to 1) of frames with a component within a factor of 4
-            of it; both 0 where no component has an animal's size.
+            of it; both 0 if no component has an animal's size.
         """
         self._check(depths)
         areas = np.zeros((len(depths), MAX_BLOBS))
@@ -396,9 +388,9 @@ class StillScene(Segmenter):
         )
 
     def usual_volume(self, depths: NDArray[np.float32]) -> float:
-        """The animal's median volume, mm^3, over frames in which nothing else has about its area.
+        """The animal's median volume, mm^3, over frames in which nothing else has a similar area.
 
-        Where fewer than 5 frames are such, all frames in which it was found count.
+        If fewer than 5 frames qualify, all frames with the animal count.
 
         Args:
             depths: (n, H, W) float32 mm, frames at this scene's stride.
@@ -413,7 +405,7 @@ class StillScene(Segmenter):
         return float(np.median(volume[alone]))
 
     def _check(self, depths: NDArray[np.float32]) -> None:
-        """Refuse frames of another size than those that the scene was learned from."""
+        """Refuse frames whose size differs from that of the scene."""
         check_shapes("frames of this scene", ("depths", depths, ("n", *self.limit.shape)))
 
     def _extract(
@@ -422,24 +414,23 @@ class StillScene(Segmenter):
         size: float,
         parallel: bool,
         camera_view: bool,
-        n_things: int,
+        n_candidates: int,
     ) -> HeightMaps:
         """Height maps of the components whose areas are nearest to the animal's own.
 
         Heights are measured above the floor, or (camera_view) from the view's behind_mm behind the
-        animal's mean depth, as the paper's features see them.
+        animal's mean depth, as in the paper's features.
 
         Args:
-            depths: (n, H, W) float32 mm, whole pictures, or a sample of them with the scene's own
-                stride.
+            depths: (n, H, W) float32 mm, full images, or a sample at the scene's own stride.
             size: the animal's spine length over the skeleton's home length; scales the smoothing.
-            parallel: whether to use all threads, else one.
+            parallel: whether to use all threads.
             camera_view: whether heights are measured along the optical axis.
-            n_things: candidates a frame, 1 or 2.
+            n_candidates: per frame, 1 or 2.
 
         Returns:
-            The rows (n) of the likeliest components, and then (n_things 2) those of the next;
-            origin, step and n_px are in pixels of the whole picture.
+            The rows (n) of the best components, then (n_candidates 2) those of the second best;
+            origin, step and n_px are in pixels of the full image.
         """
         if depths.shape[1:] != self.limit.shape:
             depths = depths[:, :: self.stride, :: self.stride]
@@ -450,7 +441,7 @@ class StillScene(Segmenter):
             depths = self.cable.cut(depths, self.limit)
         if self.stage is not None:
             depths = self.stage.cut(depths, self.limit)
-        crops = HeightMaps.blank(n_things * len(depths), self.floor.distance_mm)
+        crops = HeightMaps.blank(n_candidates * len(depths), self.floor.distance_mm)
         grid = self.grid
         with threads(parallel):
             kernels.extract_all(
@@ -458,7 +449,7 @@ class StillScene(Segmenter):
                 self.limit,
                 self.on_floor,
                 self.area_mm2,
-                n_things,
+                n_candidates,
                 camera_view,
                 kernels.Sight(
                     np.array([grid.fx, grid.fy, grid.cx, grid.cy]),
@@ -469,7 +460,7 @@ class StillScene(Segmenter):
                 ),
                 crops.rows,
             )
-        if self.stride > 1:  # told in pixels of the picture
+        if self.stride > 1:  # in pixels of the full image
             for values, factor in ((crops.origin, 1), (crops.step, 1), (crops.n_px, self.stride)):
                 values *= self.stride * factor
         return crops
@@ -478,12 +469,12 @@ class StillScene(Segmenter):
 def at_every_pixel(
     values: NDArray[AnyNumber], step: int, shape: tuple[int, ...]
 ) -> NDArray[AnyNumber]:
-    """Values of every so many-th pixel, repeated for the pixels of the whole picture.
+    """Values of every `step`-th pixel, repeated for all pixels of the image.
 
     Args:
         values: (..., h, w) of every `step`-th row and column.
-        step: pixels from one to the next, at least 1.
-        shape: (H, W) of the picture.
+        step: at least 1.
+        shape: (H, W) of the image.
 
     Returns:
         (..., H, W) the values.

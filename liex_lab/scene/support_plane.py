@@ -1,11 +1,11 @@
-"""Where animals stand: which of a scene's flat grounds is the floor, by what moves on them.
+"""Find the plane that animals stand on among a scene's flat grounds.
 
-Things of an animal's size that move are cut out of the sampled frames before any floor is known:
-pixels nearer than their own background, joined and kept by their area. Each stands on the ground
-that lies at its depth where it is not: the background under and around it. The largest plane
-(`arena.floor.find_floor`) stands as long as what moves stands on it, too; else that of the grounds
-(`arena.grounds`) on which the most of it does. Where nothing moves, a ground that walls enclose
-and that lies above the largest plane is taken, and said to be in doubt.
+Moving objects of an animal's size are segmented in the sampled frames before any floor is
+estimated: pixels nearer than their own background, connected and filtered by area. The ground under
+each object is the background under and around it. The largest plane (`floor.find_floor`) is the
+floor if enough moving objects stand on it, otherwise the flat ground (`floor.flat_grounds`) that
+supports most of them. If nothing moves, a walled ground that lies above the largest plane is used
+and flagged as doubtful.
 """
 
 from __future__ import annotations
@@ -20,79 +20,85 @@ from liex_lab.body.skeleton import VIEWS, View
 from liex_lab.errors import EstimationError
 from liex_lab.optics.camera import Camera
 from liex_lab.runtime.threads import side_by_side
-from liex_lab.scene.floor import Floor, Ground, find_floor, fit_plane, flat_grounds, floor_region
-from liex_lab.scene.scene import LARGEST, STATED, STOOD_ON, WALLED
+from liex_lab.scene.floor import (
+    FlatGround,
+    Floor,
+    find_floor,
+    fit_plane,
+    flat_grounds,
+    floor_region,
+)
+from liex_lab.scene.scene import BY_SUPPORT, LARGEST, STATED, WALLED
 from liex_lab.scene.worn import components
 
 Array = NDArray[np.float64]
 
-_AROUND_PX = 5  # the ground around a thing is looked at so far from it
-_ON_MM = 9.0  # what stands on a ground has it this near beneath, in the middle of what is read
-_ON_SHARE = 0.25  # and so much of that must be a part of it
-_MIN_THINGS = 5  # that must be seen moving before they say anything
-_SUPPORTED = 0.5  # of the things that move must stand on a floor
-_UNSUPPORTED = 0.1  # a floor that is stated is wrong where less stands on it
-_BETTER = 0.2  # by which another ground must be supported more
-_ENCLOSED = 0.6  # of a ground's outline must rise, where nothing moves
-_RAISED_MM = 30.0  # and it must lie so far above the largest plane
-_CLEARLY = 1.5  # times the least height by which an animal stands out is not noise
+_AROUND_PX = 5  # radius of the ground inspected around an object
+_ON_MM = 9.0  # largest median distance between a plane and the ground under an object on it
+_ON_SHARE = 0.25  # least share of the ground around the object that is part of the patch
+_MIN_MOVERS = 5  # fewer moving objects are no evidence
+_SUPPORTED = 0.5  # share of the movers that a floor has to support
+_UNSUPPORTED = 0.1  # a stated floor that supports less is wrong
+_BETTER = 0.2  # additional support required to prefer another ground
+_ENCLOSED = 0.6  # share of a ground's outline that must be walled if nothing moves
+_RAISED_MM = 30.0  # least height of such a ground above the largest plane
+_CLEARLY = 1.5  # multiple of the detection height that is not noise
 _LEAST_PX = 9
-_A_FRAME = 3  # things of a frame, the largest
-# the plane of a floor and of what lies a step beside it is neither's: where the ground under what
-# moves lies so far from the plane, the plane is fitted to that ground alone
+_A_FRAME = 3  # largest objects per frame
+# a plane fitted across a step matches neither side: beyond this offset of the ground under the
+# movers, the plane is fitted to that ground alone
 _STEP_MM = 2.5
-_LEVEL_MM = 3.0  # so near to it is that ground
-_EVEN_MM = 1.5  # and so near must what moves then stand
+_LEVEL_MM = 3.0  # ground within this distance is fitted
+_EVEN_MM = 1.5  # largest median offset of the movers after the fit
 _ROUNDS = 4
-_ROOM = 3.0  # times the area of an animal: a ground that it moves about on is larger
-_SMALLER = 1.0 / 3.0  # of the usual volume of the largest: less is another thing
+_ROOM = 3.0  # least area of a ground, in areas of an animal
+_SMALLER = 1.0 / 3.0  # of the median largest volume: smaller objects are something else
 
 
 @dataclass(frozen=True)
-class Standing:
-    """The floor of a scene, and how well it is known.
+class SupportPlane:
+    """The floor of a scene, and how reliable it is.
 
     Attributes:
-        floor: the plane, in the camera whose pixels were looked at.
-        on_floor: (H, W) bool, where it lies in the picture, see `arena.floor.floor_region`.
-        region: (H, W) bool, the ground and what lies around it, where it is not the largest plane
-            that stands; None where the whole picture is looked at.
-        n_things: things of an animal's size that were seen moving in the sampled frames.
-        support: share of them, by volume, that stand on this floor, 0 to 1; NaN where none were
-            seen.
-        thing_mm2: their median area seen from the camera, mm^2; NaN where none were seen.
-        n_together: how many of them move in one frame, the most that a fifth of those frames show.
-        origin: how the floor was found, see `arena.scene.Scene.floor_from`.
-        doubt: a sentence about why this floor may be wrong, empty where there is none.
+        floor: the plane, in pixels of the analysed camera.
+        on_floor: (H, W) bool, pixels of the floor, see `floor.floor_region`.
+        region: (H, W) bool, the ground and its surroundings, if another plane than the largest is
+            used; None for the full image.
+        n_moving: moving objects of an animal's size in the sampled frames.
+        support: their share, by volume, that stands on this floor, 0 to 1; NaN without any.
+        mover_mm2: their median area seen from the camera, mm^2; NaN without any.
+        n_together: how many of them move in one frame (80 % quantile).
+        origin: how the floor was found, see `scene.Scene.floor_from`.
+        doubt: a sentence on why this floor may be wrong; empty without doubt.
     """
 
     floor: Floor
     on_floor: NDArray[np.bool_]
     region: NDArray[np.bool_] | None
-    n_things: int
+    n_moving: int
     support: float
-    thing_mm2: float = float("nan")
+    mover_mm2: float = float("nan")
     n_together: int = 0
     origin: str = LARGEST
     doubt: str = ""
 
     @property
     def moves(self) -> bool:
-        """Whether enough was seen moving to say anything about it."""
-        return self.n_things >= _MIN_THINGS
+        """Whether enough objects moved to judge the floor by them."""
+        return self.n_moving >= _MIN_MOVERS
 
 
 @dataclass(frozen=True)
-class Thing:
-    """One thing that moves: where its ground is looked for, and what lies there.
+class MovingObject:
+    """A moving object in one frame, and the background around it.
 
     Attributes:
         rows: of the pixels around it.
-        columns: of the same.
+        columns: of the same pixels.
         depth: of the background there, mm.
-        area_mm2: of the thing seen from the camera.
-        volume_mm3: between it and the background.
-        frame: of the sample, in which it is seen.
+        area_mm2: of the object seen from the camera.
+        volume_mm3: between the object and the background.
+        frame: row of the sample.
     """
 
     rows: NDArray[np.int64]
@@ -103,53 +109,36 @@ class Thing:
     frame: int
 
     def stands_on(self, floor: Floor) -> bool:
-        """Whether the ground around it lies on a plane.
-
-        Args:
-            floor: the plane.
-        """
+        """Whether the ground around it lies on a plane."""
         return bool(abs(self.above(floor)) < _ON_MM)
 
     def above(self, floor: Floor) -> float:
-        """Height of the ground around it above a plane, mm, the median.
-
-        Args:
-            floor: the plane.
-        """
+        """Median height of the ground around it above a plane, mm."""
         a, b, c = floor.inverse_depth
         inverse = a * self.columns + b * self.rows + c
         return float(np.median(floor.distance_mm * (1.0 - self.depth * inverse)))
 
     def share_on(self, patch: NDArray[np.bool_]) -> float:
-        """Share of the ground around it that is a part of a patch (H, W) bool.
-
-        Args:
-            patch: where it lies in the picture.
-        """
+        """Share of the ground around it that belongs to a patch (H, W) bool."""
         return float(patch[self.rows, self.columns].mean())
 
     def is_on(self, floor: Floor, patch: NDArray[np.bool_]) -> bool:
-        """Whether it stands on a patch (H, W) bool of a floor.
-
-        Args:
-            floor: the plane.
-            patch: where it lies in the picture.
-        """
+        """Whether it stands on a patch (H, W) bool of a floor."""
         return self.stands_on(floor) and self.share_on(patch) > _ON_SHARE
 
 
 @dataclass(frozen=True)
 class SampledScene:
-    """Frames spread over a recording, what they say of the empty scene, and what is looked for.
+    """Sampled frames of a recording, their background, and the expected animals.
 
     Attributes:
         sample: (n, H, W) float32 mm, the frames, 0 where unread.
         background: (H, W) float32 mm, 0 where unknown.
         spread: (H, W) float32 mm, its standard deviation.
-        camera: whose pixels these are, free of lens distortion.
-        spine_mm: lengths of the smallest and the largest animal to expect, mm.
-        min_height_mm: what stands out from the background by less does not count.
-        view: how such animals are looked at.
+        camera: of these pixels, free of lens distortion.
+        spine_mm: lengths of the smallest and the largest expected animal, mm.
+        min_height_mm: smaller heights above the background are ignored.
+        view: how such animals are viewed.
     """
 
     sample: NDArray[np.float32]
@@ -162,7 +151,7 @@ class SampledScene:
 
     @property
     def areas_mm2(self) -> tuple[float, float]:
-        """Areas of the smallest and the largest animal as they are seen, mm^2."""
+        """Visible areas of the smallest and the largest animal, mm^2."""
         low, high = self.view.area
         return low * self.spine_mm[0] ** 2, high * self.spine_mm[1] ** 2
 
@@ -172,173 +161,168 @@ class SampledScene:
         return 4.0 * self.areas_mm2[0]
 
 
-def find_standing(scene: SampledScene, stated: Floor | None = None) -> Standing:
-    """The floor on which what moves stands.
+def find_support_plane(scene: SampledScene, stated: Floor | None = None) -> SupportPlane:
+    """Find the floor that the moving objects stand on.
 
     Args:
         scene: sampled frames and their background.
-        stated: the floor where a person states it, in the pixels of the camera; None finds it.
-
-    Returns:
-        The floor, and how well it is known.
+        stated: the floor stated in the plan, in pixels of the camera; None to estimate it.
 
     Raises:
-        EstimationError: nothing flat faces the camera, too little of the picture is readable, or
-            nothing stands on the floor that is stated.
+        EstimationError: nothing flat faces the camera, too few pixels are readable, or nothing
+            stands on the stated floor.
     """
-    things = things_moving(scene)
-    standing = (
-        levelled(_choose(scene, things), scene, things)
+    movers = find_movers(scene)
+    support_plane = (
+        levelled(_choose(scene, movers), scene, movers)
         if stated is None
-        else _as_stated(stated, scene.background, scene.camera, things)
+        else _as_stated(stated, scene.background, scene.camera, movers)
     )
-    if not things:
-        return standing
-    n_together = np.unique([thing.frame for thing in things], return_counts=True)[1]
+    if not movers:
+        return support_plane
+    n_together = np.unique([mover.frame for mover in movers], return_counts=True)[1]
     return replace(
-        standing,
-        thing_mm2=float(np.median([thing.area_mm2 for thing in things])),
+        support_plane,
+        mover_mm2=float(np.median([mover.area_mm2 for mover in movers])),
         n_together=int(np.percentile(n_together, 80, method="lower")),
     )
 
 
-def thing_at(
+def still_object(
     place: NDArray[np.bool_], background: NDArray[np.float32], camera: Camera, frame: int
-) -> Thing:
-    """A thing that keeps still, whose own depth is in the background.
+) -> MovingObject:
+    """An object at rest, whose own depth is part of the background.
 
     Args:
-        place: (H, W) bool, its pixels; the ground around them is what it stands on.
+        place: (H, W) bool, its pixels; the ground is taken from around them.
         background: (H, W) float32 mm, 0 where unknown.
-        camera: whose pixels these are.
-        frame: of the sample, in which it is seen.
+        camera: of these pixels.
+        frame: row of the sample.
     """
     import cv2
 
     own = place.astype(np.uint8)
     outer = np.ones((4 * _AROUND_PX + 1,) * 2, np.uint8)
-    inner = np.ones((2 * _AROUND_PX + 1,) * 2, np.uint8)  # its blurred edge is not ground
+    inner = np.ones((2 * _AROUND_PX + 1,) * 2, np.uint8)  # the blurred edge is not ground
     near = (cv2.dilate(own, outer) > cv2.dilate(own, inner)) & (background > 0)
     rows, columns = np.nonzero(near)
     mm2 = float((background[place].astype(float) ** 2).sum()) / (camera.fx * camera.fy)
-    return Thing(rows, columns, background[near].astype(float), mm2, 0.0, frame)
+    return MovingObject(rows, columns, background[near].astype(float), mm2, 0.0, frame)
 
 
-def things_moving(scene: SampledScene) -> list[Thing]:
-    """Things of an animal's size that move, at most three of each frame; see `find_standing`.
-
-    Args:
-        scene: sampled frames and their background.
-    """
+def find_movers(scene: SampledScene) -> list[MovingObject]:
+    """Moving objects of an animal's size, at most three per frame."""
     margin = np.maximum(np.float32(scene.min_height_mm), 3.0 * scene.spread)
     limit = scene.background - margin
     return _moving(scene.sample, scene.background, limit, scene.camera, scene.areas_mm2)
 
 
-def _choose(scene: SampledScene, things: list[Thing]) -> Standing:
-    """The largest plane, or another ground of a size to stand on where that is better."""
+def _choose(scene: SampledScene, movers: list[MovingObject]) -> SupportPlane:
+    """The largest plane, or another sufficiently large ground that supports more of the movers."""
     background = scene.background
     camera = scene.camera
-    largest = _largest(background, camera, things)
+    largest = _largest(background, camera, movers)
     if (
-        isinstance(largest, Standing)
+        isinstance(largest, SupportPlane)
         and largest.support >= _SUPPORTED
-        and len(things) >= _MIN_THINGS
+        and len(movers) >= _MIN_MOVERS
     ):
         return largest
     least_mm2 = scene.least_ground_mm2
-    if len(things) >= _MIN_THINGS:  # the back of one that keeps still is flat, and no ground
-        moving_mm2 = float(np.percentile([thing.area_mm2 for thing in things], 90))
-        usual_mm2 = float(np.sqrt(np.prod(scene.areas_mm2)))  # perhaps it moves only its head
-        least_mm2 = max(least_mm2, _ROOM * max(moving_mm2, usual_mm2))
+    if len(movers) >= _MIN_MOVERS:  # the flat back of an animal at rest is no ground
+        largest_mm2 = float(np.percentile([mover.area_mm2 for mover in movers], 90))
+        usual_mm2 = float(np.sqrt(np.prod(scene.areas_mm2)))  # it may move only its head
+        least_mm2 = max(least_mm2, _ROOM * max(largest_mm2, usual_mm2))
     grounds = flat_grounds(background, camera, least_mm2)
-    if len(things) >= _MIN_THINGS:
-        least = largest.support if isinstance(largest, Standing) else 0.0
-        chosen = _stood_on(grounds, things, least)
+    if len(movers) >= _MIN_MOVERS:
+        least = largest.support if isinstance(largest, SupportPlane) else 0.0
+        chosen = _best_supported(grounds, movers, least)
     else:
-        chosen = _enclosed(grounds, largest.floor if isinstance(largest, Standing) else None)
+        chosen = _enclosed(grounds, largest.floor if isinstance(largest, SupportPlane) else None)
     if chosen is not None:
         ground, support, doubt = chosen
-        # an animal that leans over the edge is still looked at
+        # include animals that lean over the edge
         reach = scene.spine_mm[1] * np.sqrt(camera.fx * camera.fy) / ground.floor.distance_mm
         on_floor = ground.region(0.0)
         region = ground.region(float(reach))
-        origin = WALLED if doubt else STOOD_ON
-        return Standing(
-            ground.floor, on_floor, region, len(things), support, origin=origin, doubt=doubt
+        origin = WALLED if doubt else BY_SUPPORT
+        return SupportPlane(
+            ground.floor, on_floor, region, len(movers), support, origin=origin, doubt=doubt
         )
     if isinstance(largest, EstimationError):
         raise largest
-    if len(things) < _MIN_THINGS:
+    if len(movers) < _MIN_MOVERS:
         return replace(largest, support=float("nan"))
     doubt = (
-        f"only {largest.support:.0%} of what moves stands on the floor that was found, the largest "
-        "plane, and no other ground is better; state arena.floor in the plan"
+        f"only {largest.support:.0%} of the moving objects stand on the detected floor, the "
+        "largest plane, and no other ground is better; state arena.floor in the plan"
     )
     return replace(largest, doubt=doubt)
 
 
-def levelled(standing: Standing, scene: SampledScene, things: list[Thing]) -> Standing:
-    """The same with the plane of the ground that things stand on, where a step parts it from more.
+def levelled(
+    support_plane: SupportPlane, scene: SampledScene, movers: list[MovingObject]
+) -> SupportPlane:
+    """Fit the plane to the ground under the movers only, if a step separates it from the rest.
 
-    An arena's floor is often a few millimetres higher than the bench that it lies on, and a plane
-    that is fitted to both runs between them.
+    An arena's floor is often a few millimetres higher than the bench below it, and a plane fitted
+    to both runs between them.
 
     Args:
-        standing: the floor as it was found.
+        support_plane: the floor as found.
         scene: sampled frames and their background.
-        things: what moves, or keeps still, on it.
+        movers: objects, moving or at rest, that may stand on it.
     """
-    floor = standing.floor
-    on = [thing for thing in things if thing.is_on(floor, standing.on_floor)]
-    if scene.view.frame != VIEWS[0] or len(on) < _MIN_THINGS:
-        return standing
-    step_mm = float(np.median([thing.above(floor) for thing in on]))
+    floor = support_plane.floor
+    on = [mover for mover in movers if mover.is_on(floor, support_plane.on_floor)]
+    if scene.view.frame != VIEWS[0] or len(on) < _MIN_MOVERS:
+        return support_plane
+    step_mm = float(np.median([mover.above(floor) for mover in on]))
     if abs(step_mm) < _STEP_MM:
-        return standing
+        return support_plane
     camera = scene.camera
     own = Floor.from_plane(floor.normal, floor.distance_mm - step_mm, camera)
     for _ in range(_ROUNDS):
         bare = own.depth(camera.width, camera.height)
-        ground = standing.on_floor & (scene.background > 0)
+        ground = support_plane.on_floor & (scene.background > 0)
         ground &= np.abs(scene.background - bare) < _LEVEL_MM
         if (scene.background[ground] ** 2).sum() < scene.least_ground_mm2 * camera.fx * camera.fy:
-            return standing
+            return support_plane
         own = fit_plane(scene.background, ground, camera)
-    left = np.median([abs(thing.above(own)) for thing in on])
+    left = np.median([abs(mover.above(own)) for mover in on])
     if left > _EVEN_MM:
-        return standing
+        return support_plane
     on_floor = floor_region(scene.background, own.depth(camera.width, camera.height))
-    return replace(standing, floor=own, on_floor=on_floor)
+    return replace(support_plane, floor=own, on_floor=on_floor)
 
 
 def _as_stated(
-    floor: Floor, background: NDArray[np.float32], camera: Camera, things: list[Thing]
-) -> Standing:
-    """The floor that a person states.
+    floor: Floor, background: NDArray[np.float32], camera: Camera, movers: list[MovingObject]
+) -> SupportPlane:
+    """The floor that the plan states.
 
     Raises:
-        EstimationError: what moves does not stand on it, or nothing of it is seen.
+        EstimationError: the movers do not stand on it, or none of it is visible.
     """
     bare = floor.depth(camera.width, camera.height)
     on_floor = floor_region(background, bare)
-    support = _share(things, [thing.stands_on(floor) for thing in things])
-    if not on_floor.any() or (len(things) >= _MIN_THINGS and support < _UNSUPPORTED):
+    support = _share(movers, [mover.stands_on(floor) for mover in movers])
+    if not on_floor.any() or (len(movers) >= _MIN_MOVERS and support < _UNSUPPORTED):
         raise EstimationError(
-            f"nothing stands on the floor that arena.floor states, {floor.distance_mm:.0f} mm from "
+            f"nothing stands on the floor stated by arena.floor, {floor.distance_mm:.0f} mm from "
             "the camera; correct its point and normal, or set arena.floor to 'auto'"
         )
-    known = support if len(things) >= _MIN_THINGS else float("nan")
-    return Standing(floor, on_floor, None, len(things), known, origin=STATED)
+    measured = support if len(movers) >= _MIN_MOVERS else float("nan")
+    return SupportPlane(floor, on_floor, None, len(movers), measured, origin=STATED)
 
 
 def _largest(
-    background: NDArray[np.float32], camera: Camera, things: list[Thing]
-) -> Standing | EstimationError:
-    """The largest plane as the floor, or why it is none.
+    background: NDArray[np.float32], camera: Camera, movers: list[MovingObject]
+) -> SupportPlane | EstimationError:
+    """The largest plane as the floor, or the error if there is none.
 
     Raises:
-        EstimationError: no ground can be found in such a picture.
+        EstimationError: no ground can be found in such an image.
     """
     try:
         floor = find_floor(background, camera)
@@ -347,8 +331,8 @@ def _largest(
             raise
         return error
     on_floor = floor_region(background, floor.depth(camera.width, camera.height))
-    on = [thing.is_on(floor, on_floor) for thing in things]
-    return Standing(floor, on_floor, None, len(things), _share(things, on))
+    on = [mover.is_on(floor, on_floor) for mover in movers]
+    return SupportPlane(floor, on_floor, None, len(movers), _share(movers, on))
 
 
 def _moving(
@@ -357,24 +341,25 @@ def _moving(
     limit: NDArray[np.float32],
     camera: Camera,
     areas: tuple[float, float],
-) -> list[Thing]:
-    """Things of an animal's area mm^2 in the frames (n, H, W), nearer than the limit (H, W).
+) -> list[MovingObject]:
+    """Objects of an animal's area mm^2 in the frames (n, H, W) that are nearer than the limit (H,
+    W).
 
-    The largest few of each frame; of them, those that are not much smaller than the usual largest.
+    The largest few of each frame, without those much smaller than the usual largest one.
     """
 
-    def look(frame: int) -> list[Thing]:
-        """Those of a frame, the largest first."""
-        things = _of_frame(sample, frame, background, limit, camera, areas)
-        return sorted(things, key=lambda thing: -thing.volume_mm3)
+    def inspect(frame: int) -> list[MovingObject]:
+        """Objects of one frame, the largest first."""
+        movers = _of_frame(sample, frame, background, limit, camera, areas)
+        return sorted(movers, key=lambda mover: -mover.volume_mm3)
 
     found = []
     largest = []
-    for things in side_by_side(look, range(len(sample))):
-        found += things[:_A_FRAME]
-        largest += [thing.volume_mm3 for thing in things[:1]]
+    for movers in side_by_side(inspect, range(len(sample))):
+        found += movers[:_A_FRAME]
+        largest += [mover.volume_mm3 for mover in movers[:1]]
     least = _SMALLER * float(np.median(largest)) if largest else 0.0
-    return [thing for thing in found if thing.volume_mm3 >= least]
+    return [mover for mover in found if mover.volume_mm3 >= least]
 
 
 def _of_frame(
@@ -384,8 +369,8 @@ def _of_frame(
     limit: NDArray[np.float32],
     camera: Camera,
     areas: tuple[float, float],
-) -> Iterator[Thing]:
-    """All such things of one frame."""
+) -> Iterator[MovingObject]:
+    """All such objects of one frame."""
     import cv2
 
     depth = sample[frame]
@@ -411,11 +396,11 @@ def _of_frame(
             continue
         rise = (background[cut][own] - depth[cut][own]).astype(float)
         if float(np.median(rise / (background[cut][own] - limit[cut][own]))) < _CLEARLY:
-            continue  # noise of what is far away stands out a little, an animal a lot
+            continue  # noise of distant surfaces rises little, an animal much
         near = (cv2.dilate(whole.astype(np.uint8), around) > 0) & (background[cut] > 0)
         rows, columns = np.nonzero(near)
         behind = background[cut][near].astype(float)
-        yield Thing(
+        yield MovingObject(
             rows + cut[0].start,
             columns + cut[1].start,
             behind,
@@ -425,45 +410,47 @@ def _of_frame(
         )
 
 
-def _share(things: list[Thing], chosen: list[bool]) -> float:
-    """The share, by volume, of the things that were chosen; 0 where there are none."""
-    volume = np.array([thing.volume_mm3 for thing in things])
-    return float(volume[np.array(chosen)].sum() / volume.sum()) if things else 0.0
+def _share(movers: list[MovingObject], chosen: list[bool]) -> float:
+    """The share of the movers, by volume, that is selected; 0 without movers."""
+    volume = np.array([mover.volume_mm3 for mover in movers])
+    return float(volume[np.array(chosen)].sum() / volume.sum()) if movers else 0.0
 
 
-def _stood_on(
-    grounds: list[Ground], things: list[Thing], least: float
-) -> tuple[Ground, float, str] | None:
-    """The ground that the most things stand on, its share of them, and no doubt; None where none
-    is better than what there is.
+def _best_supported(
+    grounds: list[FlatGround], movers: list[MovingObject], least: float
+) -> tuple[FlatGround, float, str] | None:
+    """The ground that supports the most movers, its share of them, and no doubt; None if none is
+    clearly better than `least`.
     """
     best = None
     most = min(least + _BETTER, _SUPPORTED)
     for ground in grounds:
-        on = [thing.is_on(ground.floor, ground.patch) for thing in things]
-        share = _share(things, on)
+        on = [mover.is_on(ground.floor, ground.patch) for mover in movers]
+        share = _share(movers, on)
         if share > most:
             best = ground
             most = share
     return None if best is None else (best, most, "")
 
 
-def _enclosed(grounds: list[Ground], largest: Floor | None) -> tuple[Ground, float, str] | None:
-    """Where nothing moves: the largest ground that walls enclose and that does not lie lower."""
+def _enclosed(
+    grounds: list[FlatGround], largest: Floor | None
+) -> tuple[FlatGround, float, str] | None:
+    """If nothing moves: the largest walled ground that is not below the largest plane."""
     for ground in sorted(grounds, key=lambda ground: -int(ground.patch.sum())):
         if ground.enclosed < _ENCLOSED:
             continue
         if largest is not None and not _is_raised(ground, largest):
             return None  # walls enclose the largest plane itself
         doubt = (
-            "nothing of an animal's size was seen moving, so the floor is taken to be the largest "
-            "ground that walls enclose; check it in the replay, or state arena.floor in the plan"
+            "no object of an animal's size moved, so the largest walled ground is used as the "
+            "floor; check it in the replay, or state arena.floor in the plan"
         )
         return ground, float("nan"), doubt
     return None
 
 
-def _is_raised(ground: Ground, floor: Floor) -> bool:
+def _is_raised(ground: FlatGround, floor: Floor) -> bool:
     """Whether a ground lies clearly above a plane."""
     rows, columns = np.nonzero(ground.patch)
     a, b, c = floor.inverse_depth

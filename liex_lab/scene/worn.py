@@ -1,4 +1,4 @@
-"""What an animal wears, such as a cable or a head stage, as one camera sees it."""
+"""Worn devices, such as a cable or a head stage, and their removal from depth images."""
 
 from __future__ import annotations
 
@@ -18,22 +18,18 @@ from liex_lab.scene.floor import Floor
 
 @dataclass(frozen=True)
 class Worn:
-    """How something that an animal wears is told from it before one camera.
+    """How a worn device is separated from the animal in one camera's images.
 
     Attributes:
-        camera: whose pixels are looked at.
-        floor: the floor as that camera sees it.
+        camera: of the analysed pixels.
+        floor: the floor in pixels of that camera.
     """
 
     camera: Camera
     floor: Floor
 
     def every(self, step: int) -> Self:
-        """The same in pictures of every `step`-th row and column.
-
-        Args:
-            step: pixels from one to the next, at least 1.
-        """
+        """The same for every `step`-th row and column of the image."""
         camera = self.camera.every(step)
         floor = Floor.from_plane(self.floor.normal, self.floor.distance_mm, camera)
         return replace(self, camera=camera, floor=floor)
@@ -44,22 +40,22 @@ class Worn:
         return self.floor.distance_mm / float(np.sqrt(self.camera.fx * self.camera.fy))
 
 
-# Heights above the floor of what stands out in a picture.
+# Heights of the foreground above the floor.
 
 
 Depths = NDArray[np.float32]
 
 
 def heights_before(depth: Depths, limit: Depths, floor: Floor) -> Depths:
-    """Heights of what is nearer than the background's limit.
+    """Heights of readings nearer than the background's limit.
 
     Args:
         depth: (H, W) float32 mm, 0 where unread.
-        limit: (H, W) float32 mm; a reading below it is in front of the background.
-        floor: the floor in the pixels of the picture.
+        limit: (H, W) float32 mm; a reading below it is foreground.
+        floor: the floor in image pixels.
 
     Returns:
-        (H, W) float32 mm above the floor's plane, 0 where nothing stands out.
+        (H, W) float32 mm above the floor's plane, 0 for background.
     """
     a, b, c = floor.inverse_depth
     rows, columns = np.nonzero((depth > 0) & (depth < limit))
@@ -70,7 +66,7 @@ def heights_before(depth: Depths, limit: Depths, floor: Floor) -> Depths:
     return height
 
 
-# Connected components of a mask, looked for in the box that holds all of it.
+# Connected components of a mask, searched in its bounding box.
 
 
 class Components(NamedTuple):
@@ -79,7 +75,7 @@ class Components(NamedTuple):
     Attributes:
         labels: (H, W) int32, 0 outside, 1 and up inside.
         stats: (n, 5) int32, row k of component k: left, top, width, height, pixels (`cv2.CC_STAT_*`
-            columns); row 0 is not filled in.
+            columns); row 0 is not filled.
     """
 
     labels: NDArray[np.int32]
@@ -87,15 +83,11 @@ class Components(NamedTuple):
 
 
 def components(mask: NDArray[np.uint8]) -> Components:
-    """The connected components of a mask.
-
-    Args:
-        mask: (H, W) uint8, nonzero inside.
-    """
+    """The connected components of a mask (H, W) uint8, nonzero inside."""
     import cv2
 
     left, top, width, height = cv2.boundingRect(mask)
-    # OpenCV numbers components as it meets them in blocks of 2 x 2 pixels: they stay where they are
+    # OpenCV numbers components in the order of 2 x 2 blocks, so the box starts at an even pixel
     box = (slice(top - top % 2, top + height), slice(left - left % 2, left + width))
     labels = np.zeros(mask.shape, np.int32)
     if not width:
@@ -107,29 +99,29 @@ def components(mask: NDArray[np.uint8]) -> Components:
     return Components(labels, np.asarray(stats, np.int32))
 
 
-# Head stages: blocks cemented to the skull, which stand out from the animal all around.
+# Head stages: blocks cemented to the skull, which protrude from the animal on all sides.
 
 
 Mask = NDArray[np.bool_]
 
 _WIDE_MM = 13.0  # a body is wider
-_NARROW_MM = 5.0  # what is narrow stands out from what is wide by so much
-_STEP_MM = 6.0  # and from the body beside it
+_NARROW_MM = 5.0  # least height of a narrow part above the wide one
+_STEP_MM = 6.0  # and above the surrounding body
 _AREA_MM2 = (30.0, 260.0)  # seen from above
 _BESIDE_PX = 2
-_ON_BODY = 0.3  # of what lies beside it is the animal, for a head ends in front of it
-_LEAST_SHARE = 0.6  # of the frames with something of an animal's size show one
-_TIMES_AREA = 2.0  # larger than usual it is something else, as a head held up
-_FOOT = 0.4  # of the step: what is higher is the block, not the head
+_ON_BODY = 0.3  # least share of animal around it, as the head ends in front
+_LEAST_SHARE = 0.6  # least share of the frames with an animal that show one
+_TIMES_AREA = 2.0  # a larger block is something else, such as a raised head
+_FOOT = 0.4  # of the step: higher pixels are the block, not the head
 
 
 @dataclass(frozen=True)
 class HeadStage(Worn):
-    """How a head stage is told from the animal before one camera.
+    """How a head stage is separated from the animal in one camera's images.
 
     Attributes:
         camera: see `Worn`.
-        floor: likewise.
+        floor: see `Worn`.
         area_mm2: its usual area seen from above, mm^2.
     """
 
@@ -139,24 +131,24 @@ class HeadStage(Worn):
     def find(
         sample: Depths, limit: Depths, camera: Camera, floor: Floor, area_mm2: float
     ) -> HeadStage | None:
-        """How the head stage of a sample's animal is told; None where it wears none.
+        """Find the head stage of a sample's animal; None if it wears none.
 
         Args:
             sample: (n, H, W) float32 mm, frames spread over a recording, 0 where unread.
-            limit: (H, W) float32 mm; a reading below it is in front of the background.
-            camera: whose pixels these are.
-            floor: the floor as it sees it.
+            limit: (H, W) float32 mm; a reading below it is foreground.
+            camera: of these pixels.
+            floor: the floor in these pixels.
             area_mm2: area of the smallest animal, mm^2.
         """
         largest = HeadStage(camera, floor, _AREA_MM2[1] / _TIMES_AREA)
 
-        def look(depth: Depths) -> tuple[bool, list[float]]:
+        def inspect(depth: Depths) -> tuple[bool, list[float]]:
             """Whether a frame shows something as large as an animal, and its blocks' areas, px."""
             height = heights_before(depth, limit, floor)
             shows = bool(np.count_nonzero(height) * largest._px_mm**2 > area_mm2)
             return shows, [float(block.sum()) for block, _ in largest._blocks(height)]
 
-        found = side_by_side(look, list(sample))
+        found = side_by_side(inspect, list(sample))
         worn = [max(areas) for _, areas in found if areas]
         if not worn or len(worn) < _LEAST_SHARE * sum(shows for shows, _ in found):
             return None
@@ -167,10 +159,11 @@ class HeadStage(Worn):
 
         Args:
             depths: (n, H, W) float32 mm, 0 where unread.
-            limit: (H, W) float32 mm; a reading below it is in front of the background.
+            limit: (H, W) float32 mm; a reading below it is foreground.
 
         Returns:
-            (n, H, W) float32 mm, a copy; where it stands, the head as the body beside it says.
+            (n, H, W) float32 mm, a copy; the head under the device is interpolated from the body
+            around it.
         """
         check_shapes("frames", ("depths", depths, ("n", *limit.shape)))
         out = depths.copy()
@@ -182,12 +175,12 @@ class HeadStage(Worn):
 
     @property
     def _side(self) -> int:
-        """Width in pixels, odd, of the square that no head stage fills."""
+        """Width in pixels, odd, of the smallest square that no head stage fills."""
         return max(3, int(_WIDE_MM / self._px_mm + 0.5) | 1)
 
     def _blocks(self, height: Depths) -> Iterator[tuple[Mask, float]]:
-        """The blocks (H, W) bool of a picture's heights (H, W) mm that stand out all around, and
-        how high the body beside each is, mm.
+        """The blocks (H, W) bool of an image's heights (H, W) mm that protrude on all sides, and
+        the height of the body around each, mm.
         """
         import cv2
 
@@ -199,7 +192,7 @@ class HeadStage(Worn):
             slice(max(0, int(rows[0]) - margin), int(rows[-1]) + margin + 1),
             slice(max(0, int(columns[0]) - margin), int(columns[-1]) + margin + 1),
         )
-        # single readings are noise, and a hole of one pixel parts no body
+        # single readings are noise, and a one-pixel hole does not split a body
         smooth = np.asarray(cv2.medianBlur(np.ascontiguousarray(height[cut]), 3))
         closed = cv2.morphologyEx(smooth, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
         wide = cv2.morphologyEx(closed, cv2.MORPH_OPEN, np.ones((self._side,) * 2, np.uint8))
@@ -224,7 +217,7 @@ class HeadStage(Worn):
                 yield out, around
 
     def _cut_one(self, depth: Depths, height: Depths, block: Mask, around: float) -> None:
-        """Cut a block out of a picture (H, W) mm, in place, and fill in the head beneath."""
+        """Remove a block from an image (H, W) mm, in place, and fill in the head beneath."""
         import cv2
 
         # the readings beside it are of both
@@ -243,34 +236,32 @@ class HeadStage(Worn):
         ).astype(np.float32)
 
 
-# Cables and fibres: thin things that rise from the animal to above anything it reaches itself.
+# Cables and fibres: thin objects that rise from the animal beyond its own reach.
 
 
 _CABLE_WIDE_MM = 10.0  # a body is wider, a cable with its blurred edges is not
-_RISE_MM = 6.0  # a cable stands out from what it lies over by so much
-_TALLER = 1.2  # times the largest animal's length: it does not reach so high
-_BACK = 95.0  # %: the height of its back, of all that is wide
-_LINK_PX = 2  # a cable that is unread for so long is still one
-_JOINED_PX = 3  # a cable this near to a body leads to it
-_LEAST_RUN_MM = 40.0  # it is so long in the picture
-_CABLE_LEAST_SHARE = (
-    0.3  # of the frames with something wide: an edge that flickers is not there so often
-)
-_FIXED = 0.5  # what is thin in so many frames is a part of the arena
-_FIXED_EDGE_PX = 2  # and so are the readings beside it, which are of both
-_NEARLY = 1.00001  # what rounding may change
+_RISE_MM = 6.0  # least height of a cable above its surroundings
+_TALLER = 1.2  # in lengths of the largest animal: beyond its reach
+_BACK = 95.0  # %: quantile of the wide parts' heights that is the back
+_LINK_PX = 2  # largest unread gap in a cable
+_JOINED_PX = 3  # largest distance of a cable from the body it leads to
+_LEAST_RUN_MM = 40.0  # least extent in the image
+_CABLE_LEAST_SHARE = 0.3  # of the frames with a body: a flickering edge is rarer
+_FIXED = 0.5  # parts that are thin in more frames belong to the arena
+_FIXED_EDGE_PX = 2  # as do the mixed readings beside them
+_NEARLY = 1.00001  # allows for rounding
 
 
 @dataclass(frozen=True)
 class Cable(Worn):
-    """How cables are told from the animal before one camera.
+    """How cables are separated from the animal in one camera's images.
 
     Attributes:
         camera: see `Worn`.
-        floor: likewise.
+        floor: see `Worn`.
         tall_mm: no animal reaches higher above the floor.
-        fixed: (H, W) bool, where the arena itself has thin parts above the floor, as a lid's bars;
-            None where nothing is known of them.
+        fixed: (H, W) bool, thin parts of the arena itself above the floor, such as a lid's bars;
+            None if unknown.
     """
 
     tall_mm: float
@@ -285,25 +276,25 @@ class Cable(Worn):
         longest_mm: float,
         area_mm2: float,
     ) -> Cable | None:
-        """How cables are told, where the animal of a sample wears one.
+        """Find the cable of a sample's animal.
 
         Args:
             sample: (n, H, W) float32 mm, frames spread over a recording, 0 where unread.
-            limit: (H, W) float32 mm; a reading below it is in front of the background.
-            camera: whose pixels these are.
-            floor: the floor as it sees it.
-            longest_mm: length of the largest animal to expect, mm.
+            limit: (H, W) float32 mm; a reading below it is foreground.
+            camera: of these pixels.
+            floor: the floor in these pixels.
+            longest_mm: length of the largest expected animal, mm.
             area_mm2: area of the smallest, mm^2.
 
         Returns:
-            None where too few frames show a cable that leads to something of an animal's size.
+            None if too few frames show a cable that leads to something of an animal's size.
         """
         cable = Cable(camera, floor, _TALLER * longest_mm)
         if not cable._rises(sample, limit):
             return None
         least_px = area_mm2 * camera.fx * camera.fy / floor.distance_mm**2
-        told = [cable._leads_to_one(depth, limit, least_px) for depth in sample]
-        with_one = [leads for leads in told if leads is not None]
+        found = [cable._leads_to_one(depth, limit, least_px) for depth in sample]
+        with_one = [leads for leads in found if leads is not None]
         return cable if with_one and np.mean(with_one) >= _CABLE_LEAST_SHARE else None
 
     def cut(self, depths: Depths, limit: Depths) -> Depths:
@@ -311,11 +302,11 @@ class Cable(Worn):
 
         Args:
             depths: (n, H, W) float32 mm, 0 where unread.
-            limit: (H, W) float32 mm; a reading below it is in front of the background.
+            limit: (H, W) float32 mm; a reading below it is foreground.
 
         Returns:
-            (n, H, W) float32 mm, a copy; where a cable was 0, or the back beneath it as the body
-            beside it says.
+            (n, H, W) float32 mm, a copy; cable pixels are 0, or the back beneath interpolated from
+            the body around it.
         """
         check_shapes("frames", ("depths", depths, ("n", *limit.shape)))
         out = depths.copy()
@@ -324,14 +315,14 @@ class Cable(Worn):
         return out
 
     def with_fixed(self, sample: Depths, cut: Depths) -> Cable:
-        """The same, knowing where the arena itself has thin parts.
+        """The same with the thin parts of the arena itself.
 
         Args:
             sample: (n, H, W) float32 mm, frames spread over a recording.
-            cut: (n, H, W) what `cut` made of them.
+            cut: (n, H, W) the result of `cut`.
 
         Returns:
-            A cable whose `fixed` says where most frames were cut.
+            A cable whose `fixed` marks the pixels that were cut in most frames.
         """
         import cv2
 
@@ -342,20 +333,16 @@ class Cable(Worn):
         return replace(self, fixed=cv2.dilate((share > _FIXED).astype(np.uint8), edge) > 0)
 
     def every(self, step: int) -> Cable:
-        """The same in pictures of every `step`-th row and column.
-
-        Args:
-            step: pixels from one to the next, at least 1.
-        """
+        """The same for every `step`-th row and column of the image."""
         fixed = None if self.fixed is None else np.ascontiguousarray(self.fixed[::step, ::step])
         return replace(super().every(step), fixed=fixed)
 
     def worn(self, depths: Depths, limit: Depths) -> Mask:
-        """Where (n, H, W) something was cut that the animal wears, and no part of the arena.
+        """Pixels (n, H, W) of worn cables, without parts of the arena.
 
         Args:
             depths: (n, H, W) float32 mm, 0 where unread.
-            limit: (H, W) float32 mm; a reading below it is in front of the background.
+            limit: (H, W) float32 mm; a reading below it is foreground.
         """
         worn = self.cut(depths, limit) != depths
         return np.asarray(worn if self.fixed is None else worn & ~self.fixed)
@@ -369,11 +356,11 @@ class Cable(Worn):
 
     @property
     def _side(self) -> int:
-        """Width in pixels, odd, of the square that no cable fills."""
+        """Width in pixels, odd, of the smallest square that no cable fills."""
         return max(3, int(_CABLE_WIDE_MM / self._px_mm + 0.5) | 1)
 
     def _rises(self, sample: Depths, limit: Depths) -> bool:
-        """Whether anything in a sample (n, H, W) perhaps reaches higher than an animal does."""
+        """Whether anything in a sample (n, H, W) may reach higher than an animal."""
         with np.errstate(divide="ignore"):
             above = (1.0 - self.tall_mm / self.floor.distance_mm) / self._inverse
         above = np.where(self._inverse > 0, _NEARLY * above, np.inf)
@@ -381,19 +368,19 @@ class Cable(Worn):
         return any(bool(((depth > 0) & (depth < nearer)).any()) for depth in sample)
 
     def _heights(self, depth: Depths, limit: Depths) -> tuple[Depths, Depths]:
-        """Heights (H, W) mm of what stands out in a picture, and of those the wide ones."""
+        """Heights (H, W) mm of the foreground of an image, and of its wide parts."""
         import cv2
 
         above = self.floor.distance_mm * (1.0 - depth * self._inverse)
         near = (depth > 0) & (depth < limit)
         height = np.where(near, np.maximum(above, 0.0), 0.0).astype(np.float32)
-        # a hole of one pixel parts no body
+        # a one-pixel hole does not split a body
         closed = cv2.morphologyEx(height, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
         wide = cv2.morphologyEx(closed, cv2.MORPH_OPEN, np.ones((self._side,) * 2, np.uint8))
         return height, np.asarray(wide, np.float32)
 
     def _cut_one(self, depth: Depths, limit: Depths) -> None:
-        """Cut cables out of a picture (H, W), in place; what they lie over is filled in."""
+        """Remove cables from an image (H, W), in place, and fill in what they cover."""
         import cv2
 
         height, wide = self._heights(depth, limit)
@@ -415,7 +402,7 @@ class Cable(Worn):
         depth[filled] = (1.0 - under[filled] / self.floor.distance_mm) / self._inverse[filled]
 
     def _parts(self, height: Depths, wide: Depths) -> Iterator[Mask]:
-        """The cables of a picture, one after the other."""
+        """The cables of an image, one at a time."""
         import cv2
 
         thin = (height - wide > _RISE_MM) | (height > self.tall_mm)
@@ -432,7 +419,7 @@ class Cable(Worn):
                 yield thin & (labels == k)
 
     def _leads_to_one(self, depth: Depths, limit: Depths, least_px: float) -> bool | None:
-        """Whether a cable leads to something wide of an animal's size; None where there is none."""
+        """Whether a cable leads to something wide of an animal's size; None without such a body."""
         import cv2
 
         height, wide = self._heights(depth, limit)

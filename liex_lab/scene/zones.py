@@ -1,8 +1,8 @@
-"""Zones of the arena that a person has drawn: named circles and polygons on the floor, from TOML.
+"""Zones of the arena drawn by the user: named circles and polygons on the floor, from TOML.
 
-Whether a point lies in a polygon is decided by the even-odd rule: how many sides a ray along x
-crosses. Zones may be drawn in pixels; the view rays of their outline are then met with the floor, 1
-/ z = a u + b v + c.
+A point is inside a polygon by the even-odd rule: the number of sides that a ray along x crosses.
+Zones may be drawn in pixels; the view rays of their outline are intersected with the floor, 1 / z =
+a u + b v + c.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class Zone:
     circle_mm: tuple[float, float, float] | None = None
     polygon_mm: tuple[tuple[float, float], ...] | None = None
 
-    def holds(self, xy_mm: ArrayLike) -> NDArray[np.bool_]:
+    def contains(self, xy_mm: ArrayLike) -> NDArray[np.bool_]:
         """Whether points lie in the zone.
 
         Args:
@@ -64,7 +64,7 @@ class Zone:
         for (x0, y0), (x1, y1) in zip(corners, np.roll(corners, -1, axis=0), strict=True):
             if y0 == y1:
                 continue
-            crosses = (y0 <= xy[:, 1]) != (y1 <= xy[:, 1])  # a ray along x meets this side
+            crosses = (y0 <= xy[:, 1]) != (y1 <= xy[:, 1])  # a ray along x crosses this side
             inside ^= crosses & (xy[:, 0] < x0 + (xy[:, 1] - y0) * (x1 - x0) / (y1 - y0))
         return inside
 
@@ -81,14 +81,7 @@ class Zone:
 
     @staticmethod
     def from_dict(numbers: dict[str, Any]) -> Zone:
-        """The zone that `to_dict` wrote.
-
-        Args:
-            numbers: fields by name.
-
-        Returns:
-            The zone.
-        """
+        """The zone that `to_dict` wrote."""
         circle = numbers.get("circle_mm")
         polygon = numbers.get("polygon_mm")
         return Zone(
@@ -99,7 +92,7 @@ class Zone:
 
 
 def zone_names(zones: Sequence[Zone], xy_mm: ArrayLike) -> list[str]:
-    """For each point the names of the zones that it lies in.
+    """The names of the zones that contain each point.
 
     Args:
         zones: the zones, which may overlap.
@@ -109,21 +102,22 @@ def zone_names(zones: Sequence[Zone], xy_mm: ArrayLike) -> list[str]:
         n strings, names joined by `SEPARATOR`; '' for none.
     """
     xy = np.asarray(xy_mm, float)
-    inside = [(zone.name, zone.holds(xy)) for zone in zones]
-    return [SEPARATOR.join(name for name, held in inside if held[k]) for k in range(len(xy))]
+    inside = [(zone.name, zone.contains(xy)) for zone in zones]
+    return [SEPARATOR.join(name for name, is_in in inside if is_in[k]) for k in range(len(xy))]
 
 
 @dataclass(frozen=True)
 class DrawnZone:
-    """A zone as it stands in a file: a circle about its only point, or a polygon.
+    """A zone as stated in a file: a circle about its only point, or a polygon.
 
     Attributes:
         name: of the zone.
         points: the circle's centre, or the polygon's corners, in `unit`.
         radius: of the circle, in `unit`; None for a polygon.
-        unit: 'mm' of the arena frame, or 'px' of the depth picture.
-        relative_to: 'centre' counts from the arena's centre, turned with it; None does not.
-        where: what errors call it.
+        unit: 'mm' of the arena frame, or 'px' of the depth image.
+        relative_to: 'centre' for coordinates relative to the arena's centre and rotation; None
+            otherwise.
+        where: its name in error messages.
     """
 
     name: str
@@ -134,17 +128,14 @@ class DrawnZone:
     where: str
 
     def placed(self, camera: Camera, floor: Floor, arena: Arena) -> Zone:
-        """The zone in the arena frame.
+        """The zone in the arena frame, mm.
 
-        A circle in pixels becomes a polygon of 64 corners, for on a tilted floor it is no circle.
+        A circle in pixels becomes a polygon of 64 corners, as it is no circle on a tilted floor.
 
         Args:
-            camera: whose pixels a zone in px counts.
+            camera: of the pixels of a zone in px.
             floor: the floor's plane.
-            arena: the outline that was found, for zones relative to its centre.
-
-        Returns:
-            The zone, in mm.
+            arena: the detected outline, for zones relative to its centre.
 
         Raises:
             PlanError: the zone is drawn above the floor's horizon, or relative to the centre of an
@@ -152,14 +143,14 @@ class DrawnZone:
         """
         points = np.array(self.points)
         if self.unit == "px":
-            if self.radius is not None:  # a circle in the picture is none on a tilted floor
+            if self.radius is not None:  # a circle in the image is no circle on a tilted floor
                 points = points + self.radius * circle_points(64)
             return Zone(self.name, polygon_mm=_pairs(self._on_floor(points, camera, floor)))
         if self.relative_to is not None:
             if arena.centre_mm is None:
                 raise PlanError(
                     f"{self.where} is relative to the arena's centre, but no walls were found; "
-                    "state it without that"
+                    "omit relative_to"
                 )
             c = np.cos(arena.yaw_rad or 0.0)
             s = np.sin(arena.yaw_rad or 0.0)
@@ -169,7 +160,7 @@ class DrawnZone:
         return Zone(self.name, circle_mm=(*_pairs(points)[0], self.radius))
 
     def _on_floor(self, uv: Array, camera: Camera, floor: Floor) -> Array:
-        """Where (n, 2) mm the view rays of pixels (n, 2) meet the floor."""
+        """Intersections (n, 2) mm of the view rays of pixels (n, 2) with the floor."""
         a, b, c = floor.inverse_depth
         inverse = a * uv[:, 0] + b * uv[:, 1] + c
         if not (inverse > 0).all():
@@ -183,9 +174,9 @@ def read_zones(path: str | Path) -> tuple[DrawnZone, ...]:
     """The zones in a TOML file.
 
     Each [[zones]] has a name, and a circle = { centre = [x, y], radius = r } or a polygon = [[x,
-    y], ...]. unit = "mm" (or left out) are millimetres of the arena frame, "px" pixels (u, v) of
-    the depth picture, whose view rays are met with the floor. relative_to = "centre" counts
-    millimetres from the centre of the arena that was found, turned with it.
+    y], ...]. unit = "mm" (the default) means millimetres of the arena frame, "px" pixels (u, v) of
+    the depth image, whose view rays are intersected with the floor. relative_to = "centre" measures
+    millimetres from the detected centre of the arena, rotated with it.
 
     Args:
         path: of the file.
@@ -194,8 +185,7 @@ def read_zones(path: str | Path) -> tuple[DrawnZone, ...]:
         The zones in the order of the file, not yet placed on a floor.
 
     Raises:
-        PlanError: the file cannot be read or is not one of zones, or a zone cannot be; one sentence
-            says what to correct.
+        PlanError: the file or a zone is invalid; the message names the correction.
     """
     file = Path(path)
     try:
@@ -211,7 +201,7 @@ def read_zones(path: str | Path) -> tuple[DrawnZone, ...]:
     entries = table.get("zones")
     if not isinstance(entries, list) or not entries or set(table) != {"zones"}:
         raise PlanError(
-            f"{file} should hold nothing but zones, each beginning with [[zones]]; as in {_EXAMPLE}"
+            f"{file} should contain only zones, each beginning with [[zones]]; as in {_EXAMPLE}"
         )
     zones = [_zone(file, number, entry) for number, entry in enumerate(entries, start=1)]
     names = [zone.name for zone in zones]
@@ -229,9 +219,7 @@ def _zone(file: Path, number: int, entry: Any) -> DrawnZone:
     for key in entry:
         if key not in _KEYS:
             near = difflib.get_close_matches(key, _KEYS, 1, cutoff=0.0)[0]
-            raise PlanError(
-                f"{where} has a key '{key}' that no zone has; the nearest one is {near}"
-            )
+            raise PlanError(f"{where} has an unknown key '{key}'; the nearest known key is {near}")
     name = entry.get("name")
     if not (isinstance(name, str) and re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name)):
         raise PlanError(
@@ -243,8 +231,8 @@ def _zone(file: Path, number: int, entry: Any) -> DrawnZone:
     relative = entry.get("relative_to")
     if unit not in ("mm", "px") or relative not in (None, "centre") or (unit == "px" and relative):
         raise PlanError(
-            f'{where} has unit = "mm" or "px", and with mm perhaps relative_to = "centre"; correct '
-            "it"
+            f'{where} should have unit = "mm" or "px", and only with mm optionally relative_to = '
+            '"centre"; correct it'
         )
     if ("circle" in entry) == ("polygon" in entry):
         raise PlanError(f"{where} should have either a circle or a polygon; as in {_EXAMPLE}")
@@ -267,7 +255,7 @@ def _zone(file: Path, number: int, entry: Any) -> DrawnZone:
 
 
 def _polygon(where: str, polygon: Any) -> Array:
-    """The corners (n, 2) of a polygon that is one."""
+    """The validated corners (n, 2) of a polygon."""
     if not isinstance(polygon, list) or len(polygon) < 3:
         raise PlanError(
             f"{where}: a polygon is a list of at least three corners [x, y], got {polygon!r}"

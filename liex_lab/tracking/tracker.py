@@ -362,7 +362,7 @@ def _count(
     size: float,
     body: BodyResidual,
     first: Agreement,
-    n_things: NDArray[np.int64],
+    n_candidates: NDArray[np.int64],
 ) -> int:
     """How many animals are in view at once in a sample (n, H, W) mm of frames with an animal.
 
@@ -370,7 +370,7 @@ def _count(
     """
     if not isinstance(scene, BackgroundSubtraction):
         return 1
-    unsure = np.flatnonzero(n_things > 1)
+    unsure = np.flatnonzero(n_candidates > 1)
     rows = unsure[np.linspace(0, len(unsure) - 1, min(len(unsure), _MOST_COUNTED)).astype(int)]
     if not len(rows):
         return 1
@@ -383,7 +383,9 @@ def _count(
             Surface.of(estimator.skeleton), pose, other.crops[there], scene, body.camera_view
         )
     second = own.agreement(pose, other.crops[there], scene)
-    n = len(n_things) * len(rows) // len(unsure)  # as many of all frames as were looked at of these
+    n = (
+        len(n_candidates) * len(rows) // len(unsure)
+    )  # as many of all frames as were looked at of these
     return count_animals(first, second, rows[there], n)
 
 

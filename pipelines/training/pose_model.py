@@ -413,7 +413,7 @@ def cut_out(skeleton: Skeleton, method: Method, windows: TrainingPatches) -> Tra
     shown = size if method.session_size else np.ones(len(size))
     if skeleton.view.foreground == FOREGROUNDS[1]:
         held = HandPatches(windows.depth, windows.intrinsics, origin, skeleton.view)
-        crops, crop_cameras = held.extract(shown, method.camera_view, n_things=2)
+        crops, crop_cameras = held.extract(shown, method.camera_view, n_candidates=2)
     else:
         depth, background = (
             picture if windows.unit_mm == 1.0 else picture * np.float32(windows.unit_mm)
@@ -423,7 +423,7 @@ def cut_out(skeleton: Skeleton, method: Method, windows: TrainingPatches) -> Tra
         area = home_area_mm2(skeleton) * size**2  # only ranks the blobs of a window
         # a scene learned from a recording knows how much its readings spread
         least = np.maximum(skeleton.view.min_height_mm, SPREADS * windows.spread_mm)
-        crops, crop_cameras = cut.extract(shown, area, least, method.camera_view, n_things=2)
+        crops, crop_cameras = cut.extract(shown, area, least, method.camera_view, n_candidates=2)
     n = len(size)
     return TrainingSet.join(
         [

@@ -101,7 +101,7 @@ BROKEN = {
     "text": "is named like an MCAP file but holds something else",
     "8 bit": "expected 16-bit depth, got an 8-bit",
     "no animal": "no animal",
-    "one frame": "1 frame cannot tell",
+    "one frame": "learned from 1 frame",
     "dark": "no depth was read",
 }
 

@@ -185,7 +185,7 @@ def test_the_long_axis_and_area_of_a_box_are_its_own():
 
 
 @pytest.mark.parametrize(
-    ("n", "depth_mm", "says"), [(1, 700, "1 frame cannot tell"), (30, 0, "no depth was read")]
+    ("n", "depth_mm", "says"), [(1, 700, "learned from 1 frame"), (30, 0, "no depth was read")]
 )
 def test_a_recording_that_shows_no_background_is_told_why(n: int, depth_mm: int, says: str) -> None:
     pictures = np.full((60, 80), depth_mm, np.float32)

@@ -85,7 +85,7 @@ def test_a_region_that_is_none_is_refused_in_one_sentence(corners, message):
 
 @pytest.mark.parametrize("normal", [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
 def test_a_plane_that_does_not_face_the_camera_is_no_floor(normal):
-    with pytest.raises(PlanError, match="a plane before the camera that faces it"):
+    with pytest.raises(PlanError, match="a plane in front of the camera that faces it"):
         plane_of([0.0, 0.0, 700.0], normal, CAMERA)
 
 

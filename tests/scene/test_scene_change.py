@@ -39,7 +39,7 @@ def test_a_camera_that_is_lifted_is_told_with_the_time() -> None:
     assert scene.changed.share > 0.9
     assert scene.changed.at_s == pytest.approx(TIMES[40], abs=0.05)
     assert scene.described().doubts[-1:] == scene.doubts
-    assert "the camera was pushed, or its scene rearranged, at 1.3 s" in scene.doubts[0]
+    assert "the camera was displaced or its scene rearranged at 1.3 s" in scene.doubts[0]
 
 
 def test_a_camera_that_reads_each_pixel_half_of_the_time_was_not_pushed() -> None:

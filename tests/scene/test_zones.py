@@ -61,7 +61,7 @@ def test_a_polygon_holds_a_point_round_which_it_winds(
     if np.abs(np.abs(turn) - np.pi).min() < 1e-6:
         return  # on a side
     winding = round(float(turn.sum()) / (2 * np.pi))
-    assert Zone("z", polygon_mm=tuple(drawn)).holds([[x, y]])[0] == (winding % 2 == 1)
+    assert Zone("z", polygon_mm=tuple(drawn)).contains([[x, y]])[0] == (winding % 2 == 1)
 
 
 def test_zones_drawn_in_the_picture_lie_on_the_floor(tmp_path: Path) -> None:
@@ -85,10 +85,10 @@ def test_zones_drawn_in_the_picture_lie_on_the_floor(tmp_path: Path) -> None:
         FLOOR.T_arena_camera @ CAMERA.unproject(uv, 1.0 / (a * uv[:, 0] + b * uv[:, 1] + c))
     )[:, :2]
     in_square = ((uv > [100, 60]) & (uv < [220, 180])).all(axis=1)
-    np.testing.assert_array_equal(square.holds(on_floor), in_square)
+    np.testing.assert_array_equal(square.contains(on_floor), in_square)
     off = np.hypot(*(uv - [160, 120]).T)
     clear = np.abs(off - 40) > 0.5
-    np.testing.assert_array_equal(disc.holds(on_floor)[clear], (off < 40)[clear])
+    np.testing.assert_array_equal(disc.contains(on_floor)[clear], (off < 40)[clear])
 
 
 def test_zones_relative_to_the_centre_turn_with_the_arena(tmp_path: Path) -> None:
@@ -113,9 +113,9 @@ def test_zones_relative_to_the_centre_turn_with_the_arena(tmp_path: Path) -> Non
 
 
 SLIPS = [
-    ("", "nothing but zones"),
-    ("[[zone]]\nname = 'a'", "nothing but zones"),
-    ("zones = 5", "nothing but zones"),
+    ("", "should contain only zones"),
+    ("[[zone]]\nname = 'a'", "should contain only zones"),
+    ("zones = 5", "should contain only zones"),
     ("zones = [5]", "should be a table with a name"),
     ("[[zones]\n", "should be a TOML file"),
     ("[[zones]]\nname = 'a'", "either a circle or a polygon"),

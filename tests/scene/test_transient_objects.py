@@ -25,7 +25,7 @@ def with_thing(frame: np.ndarray, high: float = 60.0) -> np.ndarray:
     return frame
 
 
-def put_in(frames: list[np.ndarray]) -> list[Fixture]:
+def transient_objects(frames: list[np.ndarray]) -> list[Fixture]:
     scene, _ = BackgroundSubtraction.learn(recording_of(frames), SPINES)
     return [
         one
@@ -36,7 +36,7 @@ def put_in(frames: list[np.ndarray]) -> list[Fixture]:
 
 @pytest.mark.parametrize(("start", "stop"), [(20, 60), (0, 40), (15, 45)])
 def test_a_thing_stands_there_from_when_it_is_put_in_until_it_is_taken_out(start, stop):
-    (thing,) = put_in(
+    (thing,) = transient_objects(
         [with_thing(walker(k)) if start <= k < stop else walker(k) for k in range(N_FRAMES)]
     )
     assert thing.since_s == (pytest.approx(start * 0.033) if start else None)
@@ -50,7 +50,7 @@ def test_a_hand_that_puts_something_in_is_no_thing_and_does_not_hide_it():
     frames = [with_thing(walker(k)) if k >= 30 else walker(k) for k in range(N_FRAMES)]
     for k in range(24, 32):
         frames[k][: 28 + k % 7, 110:145] = 420.0 + 15.0 * (k % 3)  # it does not keep still
-    (thing,) = put_in(frames)
+    (thing,) = transient_objects(frames)
     assert thing.since_s is not None
     assert 0.8 < thing.since_s < 1.2
     assert thing.height_mm == pytest.approx(60.0, abs=4.0)
@@ -58,7 +58,7 @@ def test_a_hand_that_puts_something_in_is_no_thing_and_does_not_hide_it():
 
 @pytest.mark.parametrize("n_rests", [20, 40])
 def test_an_animal_that_comes_to_rest_is_not_put_in(n_rests):
-    assert not put_in([walker(min(k, N_FRAMES - n_rests)) for k in range(N_FRAMES)])
+    assert not transient_objects([walker(min(k, N_FRAMES - n_rests)) for k in range(N_FRAMES)])
 
 
 def test_a_second_animal_that_comes_to_rest_is_not_put_in():
@@ -68,12 +68,12 @@ def test_a_second_animal_that_comes_to_rest_is_not_put_in():
         u = 30 + 2 * min(k, 38)
         frame[22:38, u - 12 : u + 12] -= 25.0
         frames.append(frame)
-    assert not put_in(frames)
+    assert not transient_objects(frames)
 
 
 def test_where_nothing_is_put_in_no_fixture_has_times():
-    assert not put_in([with_thing(walker(k)) for k in range(N_FRAMES)])
-    assert not put_in([walker(k) for k in range(N_FRAMES)])
+    assert not transient_objects([with_thing(walker(k)) for k in range(N_FRAMES)])
+    assert not transient_objects([walker(k) for k in range(N_FRAMES)])
 
 
 @pytest.mark.parametrize(

@@ -59,9 +59,9 @@ def test_the_floor_is_where_the_mouse_walks(name):
     mouse = walk(stage(**STAGES[name]), N_FRAMES)
     scene, sample = BackgroundSubtraction.learn(mouse, SPINES, N_FRAMES)
     check(mouse, mouse, scene, sample)
-    assert scene.standing is not None
-    assert scene.standing.support > 0.8
-    assert not scene.standing.doubt
+    assert scene.support_plane is not None
+    assert scene.support_plane.support > 0.8
+    assert not scene.support_plane.doubt
 
 
 @pytest.mark.parametrize("tilt_deg", [0.0, 20.0])
@@ -104,26 +104,26 @@ def test_in_an_ordinary_scene_the_floor_is_the_largest_plane_to_the_last_bit():
     present = find_floor(learn_background(sample)[0], mouse.camera)
     assert scene.floor.distance_mm == present.distance_mm
     np.testing.assert_array_equal(scene.floor.normal, present.normal)
-    assert scene.standing is not None
-    assert scene.standing.region is None
-    assert scene.standing.support > 0.9
+    assert scene.support_plane is not None
+    assert scene.support_plane.region is None
+    assert scene.support_plane.support > 0.9
 
 
 def test_where_nothing_moves_the_walled_ground_is_taken_and_said_to_be_in_doubt():
     from liex_lab.body.skeleton import MOUSE_VIEW
-    from liex_lab.scene.support_plane import SampledScene, Standing, find_standing
+    from liex_lab.scene.support_plane import SampledScene, SupportPlane, find_support_plane
 
-    def stood_on(frames: np.ndarray, still: np.ndarray) -> Standing:
+    def stood_on(frames: np.ndarray, still: np.ndarray) -> SupportPlane:
         spread = np.zeros_like(still)
         scene = SampledScene(frames, still, spread, mouse.camera, SPINES, 7.0, MOUSE_VIEW)
-        return find_standing(scene)
+        return find_support_plane(scene)
 
     still = stage(height_mm=700.0, raised_mm=480.0).still
     empty = np.tile(still, (6, 1, 1))
     mouse = walk(stage(height_mm=700.0, raised_mm=480.0), 2)
     found = stood_on(empty, still)
     assert found.floor.distance_mm == pytest.approx(700.0, abs=2.0)
-    assert "nothing of an animal's size was seen moving" in found.doubt
+    assert "no object of an animal's size moved" in found.doubt
     assert np.isnan(found.support)
     low = replace(mouse.scene, still=np.where(still > 900.0, np.float32(0), still)).still
     ordinary = stood_on(np.tile(low, (6, 1, 1)), low)
@@ -144,8 +144,10 @@ def test_the_back_of_a_mouse_on_unread_floor_is_no_ground(seed: int) -> None:
     """It keeps still but for its head, and all around it the glossy floor is unread."""
     recording = film("glossy", seed, 120, family="train" if seed % 2 == 0 else "other")
     scene, _ = BackgroundSubtraction.learn(recording, (40.0, 110.0))
-    assert scene.standing is not None
-    assert scene.standing.origin == LARGEST
-    assert scene.standing.floor.distance_mm == pytest.approx(recording.floor.distance_mm, abs=5.0)
+    assert scene.support_plane is not None
+    assert scene.support_plane.origin == LARGEST
+    assert scene.support_plane.floor.distance_mm == pytest.approx(
+        recording.floor.distance_mm, abs=5.0
+    )
     assert scene.level is None
     assert scene.changed is None
