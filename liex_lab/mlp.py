@@ -19,7 +19,7 @@ from liex_lab.runtime.threads import serial_products
 
 Array = NDArray[np.float64]
 
-LIMIT = 6.0  # standard deviations beyond which a feature tells nothing more
+LIMIT = 6.0  # standard deviations at which features are clipped
 
 
 @dataclass(frozen=True)
@@ -37,9 +37,7 @@ class Network:
     layers: tuple[tuple[NDArray[np.float32], NDArray[np.float32]], ...]
 
     def logits(self, features: NDArray[np.floating]) -> Array:
-        """Logits of samples.
-
-        They have the same bits on any number of cores, as products of BLAS with threads do not.
+        """Logits of samples, identical on any number of cores, unlike products of threaded BLAS.
 
         Args:
             features: (m, F) features; beyond LIMIT standard deviations they are clipped.
@@ -57,14 +55,14 @@ class Network:
 
 
 def check_layers(network: Network, n_outputs: int) -> None:
-    """Check that the layers of a network that came from a file fit to one another.
+    """Check that the layers of a network from a file match.
 
     Args:
         network: the network.
-        n_outputs: logits that it should give.
+        n_outputs: expected number of logits.
 
     Raises:
-        ValueError: what is wrong, as a part of a sentence.
+        ValueError: the error, as a part of a sentence.
     """
     before: tuple[int, ...] = np.shape(network.centre)
     sound = len(before) == 1 and np.shape(network.scale) == before and len(network.layers) > 0
@@ -101,16 +99,16 @@ def descend(
         inputs: (m, F) features.
         labels: (m,) class labels.
         hidden: neurons of each hidden layer.
-        epochs: times that every sample is seen.
+        epochs: passes over all samples.
         batch: samples of a step.
         rate: learning rate of the first epoch, less least_rate.
-        least_rate: learning rate that the schedule falls towards.
+        least_rate: final learning rate of the schedule.
         weight_decay: L2 penalty of the weights.
         seed: of the initial weights and of the order of samples.
 
     Returns:
-        (weights, bias) of each layer; the last layer has one output where there are two labels,
-        else one for each.
+        (weights, bias) of each layer; the last layer has one output for two labels, else one for
+        each label.
     """
     from sklearn.neural_network import MLPClassifier
 

@@ -36,7 +36,7 @@ def test_skeletons_transforms_and_recordings_are_one_line() -> None:
         "<Skeleton mouse: 5 joints (rump, loin, chest, neck, nose), 52.8 mm long"
     )
     assert repr(liex_lab.SE3.identity()) == (
-        "<SE3: turned by 0.0 degrees, moved by (0.0, 0.0, 0.0) mm>"
+        "<SE3: rotated by 0.0 degrees, moved by (0.0, 0.0, 0.0) mm>"
     )
     assert repr(liex_lab.SE3.identity(4, 2)) == "<SE3: a batch of 4 x 2 rigid transforms>"
     with liex_lab.open_recording(REPOSITORY / "datasets" / "mouse_walk.mcap") as recording:

@@ -1,10 +1,10 @@
 """Z-buffer rasteriser of triangle meshes: depth images, one or a batch.
 
-Pinhole projection u = fx x / z + cx, v = fy y / z + cy; inside a triangle, by barycentric
-coordinates, the inverse depth 1 / z is interpolated, which is linear in the pixel for a plane and
-so without perspective error; the buffer keeps the largest 1 / z (Catmull 1974). Both sides of a
+Pinhole projection u = fx x / z + cx, v = fy y / z + cy; inside a triangle, the inverse depth 1 / z
+is interpolated in barycentric coordinates, which is linear in the pixel for a plane and therefore
+free of perspective error; the buffer keeps the largest 1 / z (Catmull 1974). Both sides of a
 triangle are drawn: in a closed surface the nearer side hides the other anyway, and where a bent
-body folds into itself a turned triangle can be the one that is seen.
+body folds into itself the back of a triangle can be the visible side.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ NEAR_MM = 1.0
 def draw(vertices, faces, rotation, translation, fx, fy, cx, cy, u0, v0, inverse):
     """Draw triangles into an image of inverse depth.
 
-    Keeps the largest 1 / z under each pixel's centre. Triangles that reach behind NEAR_MM are left
-    out.
+    Keeps the largest 1 / z under each pixel's centre. Triangles that reach behind NEAR_MM are
+    omitted.
 
     Args:
-        vertices: (V, 3) mm in a frame that (rotation, translation) carries into the camera's.
+        vertices: (V, 3) mm in a frame that (rotation, translation) transforms to the camera's.
         faces: (F, 3) int32.
         rotation: (3, 3).
         translation: (3,) mm.
@@ -33,9 +33,9 @@ def draw(vertices, faces, rotation, translation, fx, fy, cx, cy, u0, v0, inverse
         fy: focal length, px.
         cx: principal point, px.
         cy: principal point, px.
-        u0: the image's column that `inverse[0, 0]` shows.
-        v0: the image's row that `inverse[0, 0]` shows.
-        inverse: (H, W) 1/mm, changed in place; 0 where nothing was drawn.
+        u0: image column of `inverse[0, 0]`.
+        v0: image row of `inverse[0, 0]`.
+        inverse: (H, W) 1/mm, changed in place; 0 for empty pixels.
     """
     projected = np.empty((vertices.shape[0], 3))
     for i in range(vertices.shape[0]):
@@ -83,7 +83,7 @@ def _draw_triangle(p, a, b, c, inverse):
     wc_v = (bx - ax) / area
     db = p[b, 2] - p[a, 2]
     dc = p[c, 2] - p[a, 2]
-    slack = 1e-9  # a pixel centre on a shared edge belongs to both triangles, never to none
+    slack = 1e-9  # a pixel centre on a shared edge belongs to both triangles: no gaps
     for row in range(top, bottom + 1):
         wb = wb_u * (left - ax) + wb_v * (row - ay)
         wc = wc_u * (left - ax) + wc_v * (row - ay)
@@ -98,7 +98,7 @@ def _draw_triangle(p, a, b, c, inverse):
 
 @njit(cache=True)
 def to_depth(inverse, depth):
-    """Depth from inverse depth; 0 where nothing was drawn.
+    """Depth from inverse depth; 0 for empty pixels.
 
     Args:
         inverse: (H, W) 1/mm.
@@ -112,7 +112,7 @@ def to_depth(inverse, depth):
 
 @njit(cache=True)
 def draw_batch(vertices, faces, rotation, translation, intrinsics, origin, depth):
-    """Depth images of n meshes, one after the other; see `draw`.
+    """Depth images of n meshes in sequence; see `draw`.
 
     Args:
         vertices: (n, V, 3) mm.
@@ -120,8 +120,8 @@ def draw_batch(vertices, faces, rotation, translation, intrinsics, origin, depth
         rotation: (n, 3, 3).
         translation: (n, 3) mm.
         intrinsics: (n, 4) fx, fy, cx, cy px.
-        origin: (n, 2) the image's pixel (u, v) at the window's top left.
-        depth: (n, H, W) mm, out; 0 where nothing was drawn.
+        origin: (n, 2) image pixel (u, v) at the window's top left.
+        depth: (n, H, W) mm, out; 0 for empty pixels.
     """
     inverse = np.empty(depth.shape[1:])
     for i in range(len(vertices)):
@@ -152,8 +152,8 @@ def draw_batch_parallel(vertices, faces, rotation, translation, intrinsics, orig
         rotation: (n, 3, 3).
         translation: (n, 3) mm.
         intrinsics: (n, 4) fx, fy, cx, cy px.
-        origin: (n, 2) the image's pixel (u, v) at the window's top left.
-        depth: (n, H, W) mm, out; 0 where nothing was drawn.
+        origin: (n, 2) image pixel (u, v) at the window's top left.
+        depth: (n, H, W) mm, out; 0 for empty pixels.
     """
     for i in prange(len(vertices)):
         inverse = np.zeros(depth.shape[1:])

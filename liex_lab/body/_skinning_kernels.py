@@ -1,4 +1,4 @@
-"""Kernels that lay generalised cylinders around the joints of a pose: closed triangle meshes.
+"""Kernels that build generalised cylinders around the joints of a pose: closed triangle meshes.
 
 Every part of a mesh is a *tube*: a pole, some rings, a pole. A body is one tube of superellipses
 along the spine, an ear or a foot an ellipsoid (a tube as well), a tail a thin tube, a capsule a
@@ -7,8 +7,8 @@ the joints, written as a cubic Hermite curve:
 
     c(s) = h00 p_k + h10 L m_k + h01 p_k+1 + h11 L m_k+1,
 
-with tangents m of the parabola through three joints. Lengths in mm, in the frame in which the
-joints are given; the tail needs that frame's z up and its floor at z = 0.
+with tangents m of the parabola through three joints. Lengths in mm, in the frame of the joints; the
+tail needs that frame's z up and its floor at z = 0.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ def tube_faces(n_rings: int, n_segments: int) -> NDArray[np.int32]:
 
 
 def joined_faces(tubes: list[tuple[int, int]]) -> NDArray[np.int32]:
-    """Triangles (F, 3) int32 of several tubes whose vertices follow one another.
+    """Triangles (F, 3) int32 of consecutive tubes.
 
     Args:
         tubes: (n_rings, n_segments) of each.
@@ -71,8 +71,8 @@ def joined_faces(tubes: list[tuple[int, int]]) -> NDArray[np.int32]:
 def spine_frame(joints, rotations, arc, station, out):
     """Centre, forward, left and up of the mid-axis at one station.
 
-    Between the joints runs a Catmull-Rom curve, outside it goes straight on. Up blends the joints'
-    z axes.
+    A Catmull-Rom curve between the joints, extended straight beyond them. Up interpolates the
+    joints' z axes.
 
     Args:
         joints: (J, 3) mm of a chain.
@@ -124,7 +124,7 @@ def spine_frame(joints, rotations, arc, station, out):
 
 @njit(cache=True)
 def _normalise(rows, k):
-    """Row k of `rows` (., 3) to unit length."""
+    """Scale row k of `rows` (., 3) to unit length."""
     length = math.sqrt(rows[k, 0] ** 2 + rows[k, 1] ** 2 + rows[k, 2] ** 2)
     for axis in range(3):
         rows[k, axis] /= length
@@ -132,7 +132,7 @@ def _normalise(rows, k):
 
 @njit(cache=True)
 def _cross(rows, a, b, out):
-    """Row `out` becomes the cross product of rows a and b of `rows` (., 3)."""
+    """Set row `out` to the cross product of rows a and b of `rows` (., 3)."""
     x = rows[a, 1] * rows[b, 2] - rows[a, 2] * rows[b, 1]
     y = rows[a, 2] * rows[b, 0] - rows[a, 0] * rows[b, 2]
     z = rows[a, 0] * rows[b, 1] - rows[a, 1] * rows[b, 0]
@@ -319,7 +319,7 @@ def skin_tube(
 def skin_tubes(
     joints, rotations, girth, stations, half_width, half_height, power, blobs, tail, bends, out
 ):
-    """`skin_tube` for a batch, one after the other.
+    """`skin_tube` for a batch, in sequence.
 
     Args:
         joints: (n, J, 3) mm.

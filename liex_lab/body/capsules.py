@@ -1,8 +1,8 @@
 """Body model of tapered capsules (sphere-swept segments) on a skeleton.
 
-One capsule around every bone, and more where a skeleton's [surface] table puts them. Its two ends
-are points in the frames of two joints, p_e = t_j + scale R_j offset_e, each with a radius of its
-own; the surface is a straight tube between them, round at both ends.
+One capsule around every bone, and the additional ones of a skeleton's [surface] table. The two ends
+of a capsule are points in the frames of two joints, p_e = t_j + scale R_j offset_e, each with its
+own radius; the surface is a straight tube between them, round at both ends.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class Capsules:
 
     Attributes:
         joints: (C, 2) int64, the joints that carry the two ends.
-        offsets: (..., C, 2, 3) mm, where the ends lie in these joints' frames.
+        offsets: (..., C, 2, 3) mm, the ends in these joints' frames.
         radii: (..., C, 2) mm at the ends.
         fur: (...), as in `BodyShape`.
     """
@@ -47,21 +47,13 @@ class Capsules:
         return len(self.fur)
 
     def __getitem__(self, index: int | slice | NDArray[np.int64]) -> Capsules:
-        """One body, or some, out of a batch.
-
-        Args:
-            index: a number, a slice, or row numbers.
-        """
+        """One body, or some, of a batch, by number, slice or row numbers."""
         return replace(
             self, offsets=self.offsets[index], radii=self.radii[index], fur=self.fur[index]
         )
 
     def broadcast(self, n: int) -> Capsules:
-        """A batch (n,) of this one body, or this batch.
-
-        Args:
-            n: bodies.
-        """
+        """A batch (n,) of this one body, or this batch."""
         if self.fur.ndim == 1 and len(self.fur) == n:
             return self
         offsets, radii, fur = (
@@ -71,16 +63,11 @@ class Capsules:
 
     @staticmethod
     def of(skeleton: Skeleton) -> Capsules:
-        """The body that a skeleton's [surface] describes.
-
-        From radii_mm at the joints, and the list [[surface.capsules]].
-
-        Args:
-            skeleton: with its [surface] table.
+        """The body described by a skeleton's [surface]: radii_mm at the joints, and the list
+        [[surface.capsules]].
 
         Raises:
-            LiexError: there is not one positive radius for each joint, or a capsule is stated
-                wrongly.
+            LiexError: there is not one positive radius for each joint, or a capsule is invalid.
         """
         radii = np.array(skeleton.surface.get("radii_mm", []), float)
         if radii.shape != (skeleton.n_joints,) or not (radii > 0).all():
@@ -104,11 +91,11 @@ class Capsules:
 
         Args:
             skeleton: with its [surface] table.
-            part: 'capsules', which belong to the body, or 'beyond', where something may go on that
-                does not, as an arm behind a hand.
+            part: 'capsules', which belong to the body, or 'beyond', possible extensions that do
+                not, such as an arm behind a hand.
 
         Raises:
-            LiexError: an unknown key or joint, or numbers that are not as many as they should be.
+            LiexError: an unknown key or joint, or a wrong number of values.
         """
         rows = [_parsed(table, skeleton, part) for table in skeleton.surface.get(part, [])]
         return Capsules(
@@ -119,7 +106,7 @@ class Capsules:
 
     @property
     def faces(self) -> NDArray[np.int32]:
-        """Triangles (F, 3) int32 of the vertices that `vertices` makes."""
+        """Triangles (F, 3) int32 of the vertices returned by `vertices`."""
         return skinning_kernels.joined_faces(
             [(skinning_kernels.CAPSULE_RINGS, skinning_kernels.CAPSULE_SEGMENTS)] * len(self.joints)
         )
@@ -161,7 +148,7 @@ def _parsed(
     names = [table.get("from"), table.get("to")]
     for name in names:
         if name not in skeleton.names:
-            raise LiexError(f"{where} run from a joint to a joint, but there is no joint {name!r}")
+            raise LiexError(f"{where} connect two joints, but there is no joint {name!r}")
     offsets = [table.get("from_mm", [0.0] * 3), table.get("to_mm", [0.0] * 3)]
     radii = table.get("radii_mm", [])
     if not (
@@ -195,15 +182,15 @@ _SPACING = 1.3  # radii between the middles of two balls
 class Spheres:
     """B spheres, each between two points that two joints carry. Lengths in mm at scale 1.
 
-    The first n_own spheres are the body; the others lie where something may go on that is not the
-    body, as an arm behind a hand, and what is seen there says nothing about it.
+    The first n_own spheres are the body; the others cover possible extensions that are not the
+    body, such as an arm behind a hand, where observations provide no evidence about it.
 
     Attributes:
         joints: (B, 2) int64, the joints that carry the two points.
         offsets: (B, 2, 3) mm, the points in the joints' frames.
-        share: (B,) of the line from the first point to the second, at which the centre lies.
+        share: (B,) position of the centre on the line from the first point to the second.
         radius: (B,) mm.
-        n_own: how many are the body.
+        n_own: number of spheres of the body.
     """
 
     joints: NDArray[np.int64]
@@ -214,18 +201,14 @@ class Spheres:
 
     @property
     def unit_mm(self) -> float:
-        """A tenth of the mean radius of the body's spheres at scale 1, mm.
-
-        By it distances from this body are measured.
+        """A tenth of the mean radius of the body's spheres at scale 1, mm: the unit of distances
+        from this body.
         """
         return float(self.radius[: self.n_own].mean()) / 10.0
 
     @staticmethod
     def of(skeleton: Skeleton) -> Spheres:
         """Spheres along the capsules of a body, or along the chain of a tubular one.
-
-        Args:
-            skeleton: with its [surface] table.
 
         Raises:
             LiexError: the table describes neither capsules nor a tube.
@@ -253,7 +236,7 @@ class Spheres:
 def _along(
     skeleton: Skeleton, ends: NDArray[np.int64], offsets: Array, radii: Array
 ) -> list[tuple[Any, ...]]:
-    """Spheres along capsules, so near to one another at home that they make a body."""
+    """Spheres along capsules, spaced at home closely enough to form a body."""
     home = _home(skeleton)
     rows = []
     bones = {(p, j) for p, j in skeleton.edges}
@@ -261,7 +244,7 @@ def _along(
         length = float(np.linalg.norm(home[b] + at_b - home[a] - at_a))
         is_bone = (
             (int(a), int(b)) in bones and not np.any(at_a) and not np.any(at_b)
-        )  # another ends where it begins
+        )  # it begins at the end of another capsule
         n = max(1, round(length / (_SPACING * 0.5 * (first + last))))
         rows += [
             (a, b, at_a, at_b, s, first + s * (last - first))
@@ -271,8 +254,8 @@ def _along(
 
 
 def _tube(skeleton: Skeleton) -> tuple[NDArray[np.int64], Array, Array]:
-    """Ends, offsets and radii of capsules that fill a tubular body: as thick as it is where it is
-    thinner.
+    """Ends, offsets and radii of capsules that fill a tubular body, as thick as its smaller half
+    axis.
     """
     shape = BodyShape.default(skeleton)
     stations = np.array(skeleton.surface["stations"], float)

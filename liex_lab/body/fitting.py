@@ -4,11 +4,11 @@ Levenberg-Marquardt on the manifold of poses, many poses at once. The cost of a 
 
     sum_m |x_m(pose) - y_m|^2 + (1 mm)^2 sum |angle - home|^2,
 
-where home is the angle nearest to zero within the limits: the second term decides what the points
-leave open. A step turns and moves the base by a twist on the right, T exp(xi); it changes every
-joint's free angles and the logarithm of the scale. The damping is a share of the curvature's
-diagonal (Marquardt 1963), divided by 5 after a step that helps, else multiplied by 4; a coordinate
-at its limit and pushed against it is held (projected, active set).
+where home is the angle nearest to zero within the limits: the second term determines angles that
+the points do not constrain. A step rotates and moves the base by a twist on the right, T exp(xi),
+and changes every joint's free angles and the logarithm of the scale. The damping is a share of the
+curvature's diagonal (Marquardt 1963), divided by 5 after a step that lowers the cost, else
+multiplied by 4; a coordinate pushed against its limit is fixed (projected, active set).
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ from liex_lab.geometry import SE3, so3
 
 Array = NDArray[np.float64]
 
-_DAMPING = (1e-3, 1e-9, 1e6)  # first, least and largest share of the curvature that is added to it
-# a joint bent by a radian costs as much as a point this far off: decides what the points leave open
+_DAMPING = (1e-3, 1e-9, 1e6)  # initial, least and largest damping, as a share of the curvature
+# a joint bent by a radian costs as much as a point this far off; determines unconstrained angles
 _REST_MM = 1.0
 
 
@@ -36,7 +36,7 @@ class Fit:
 
     Attributes:
         pose: (n) poses, in the points' frame.
-        residual_mm: (n, M) distance that remains at each point.
+        residual_mm: (n, M) remaining distance at each point.
     """
 
     pose: Pose
@@ -52,15 +52,15 @@ def fit_poses(
     n_steps: int = 60,
     keep_scale: bool = False,
 ) -> Fit:
-    """Poses whose points come nearest to measured ones, in the sense of least squares.
+    """Fit poses to measured points by least squares.
 
     Args:
-        skeleton: whose poses.
+        skeleton: of the poses.
         points: (n, M, 3) mm, measured, in the frame of the poses.
         points_of_joints: (M, J) each point as a weighted mean of joints.
-        start: (n) poses where the search begins; their angles should be within the limits.
-        n_steps: steps that are tried.
-        keep_scale: whether the bones stay as long as they are.
+        start: (n) initial poses; their angles should be within the limits.
+        n_steps: steps to try.
+        keep_scale: whether the bone lengths are fixed.
 
     Returns:
         The fitted poses, within the joints' limits, and their residuals.
@@ -83,15 +83,15 @@ def fit_poses(
         curvature = np.einsum("nri,nrk->nik", slope, slope)
         index = np.arange(6, 6 + len(free))
         curvature[:, index, index] += _REST_MM**2
-        held = np.zeros(gradient.shape, bool)  # at a limit and pushed against it
+        fixed = np.zeros(gradient.shape, bool)  # pushed against a limit
         for c, (j, k) in enumerate(free, start=6):
             at = pose.angles[:, j, k]
             direction = gradient[:, c]
-            held[:, c] = ((at <= lower[j, k]) & (direction > 0)) | (
+            fixed[:, c] = ((at <= lower[j, k]) & (direction > 0)) | (
                 (at >= upper[j, k]) & (direction < 0)
             )
-        step = _step(curvature, gradient, damping, held)
-        tried = _moved(pose, step, free, lower, upper)
+        step = _step(curvature, gradient, damping, fixed)
+        tried = _after_step(pose, step, free, lower, upper)
         tried_cost, tried_residual = _cost(skeleton, tried, points, points_of_joints, middle)
         better = tried_cost < cost
         pose = _chosen(better, tried, pose)
@@ -130,9 +130,7 @@ def _jacobian(
     by[..., 3:6] = rotation[:, None, 0]
     by[..., -1] = out
     below = _descendants(skeleton)
-    turns = so3.left_jacobian(
-        -pose.angles
-    )  # the right Jacobian: how a change of the rotation vector turns the joint
+    turns = so3.left_jacobian(-pose.angles)  # the right Jacobian of the rotation vector
     for c, (j, k) in enumerate(free, start=6):
         axis = np.einsum("nij,nj->ni", rotation[:, j], turns[:, j, :, k])
         by[..., c][:, below[j]] = np.cross(
@@ -142,28 +140,28 @@ def _jacobian(
 
 
 def _descendants(skeleton: Skeleton) -> list[NDArray[np.int64]]:
-    """The joints that move when a joint turns."""
+    """The joints that move when a joint rotates."""
     below: list[list[int]] = [[] for _ in range(skeleton.n_joints)]
     for j in range(skeleton.n_joints - 1, 0, -1):
         below[int(skeleton.parents[j])] += [j, *below[j]]
     return [np.array(sorted(rows), np.int64) for rows in below]
 
 
-def _step(curvature: Array, gradient: Array, damping: Array, held: NDArray[np.bool_]) -> Array:
-    """The damped Newton step (n, P); nothing along coordinates that are held."""
+def _step(curvature: Array, gradient: Array, damping: Array, fixed: NDArray[np.bool_]) -> Array:
+    """The damped Newton step (n, P); zero along fixed coordinates."""
     n_values = gradient.shape[1]
     index = np.arange(n_values)
     matrix = curvature.copy()
     matrix[:, index, index] *= 1.0 + damping[:, None]
     matrix[:, index, index] += 1e-9
-    matrix[held[:, :, None] | held[:, None, :]] = 0.0
-    matrix[:, index, index] += held
-    return -np.asarray(np.linalg.solve(matrix, np.where(held, 0.0, gradient)[..., None]), float)[
+    matrix[fixed[:, :, None] | fixed[:, None, :]] = 0.0
+    matrix[:, index, index] += fixed
+    return -np.asarray(np.linalg.solve(matrix, np.where(fixed, 0.0, gradient)[..., None]), float)[
         ..., 0
     ]
 
 
-def _moved(
+def _after_step(
     pose: Pose, step: Array, free: list[tuple[int, int]], lower: Array, upper: Array
 ) -> Pose:
     """The poses after steps (n, P)."""

@@ -2,7 +2,7 @@
 
 Log-normal factors (clipped at two standard deviations) multiply the preset's bone lengths finger by
 finger, the breadth of the palm, and the capsules' radii. A forearm, a sleeve and an upper arm are
-further capsules behind the wrist, placed from where the hand points.
+additional capsules behind the wrist, opposite to the direction of the hand.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _FINGERS = ("thumb", "index", "middle", "ring", "little")
 ARM_MM = 260.0  # from the wrist to the elbow, at scale 1
 _ELBOW = 1
 _SHOULDER = 2
-_MOST_AWAY = 0.0  # a forearm's direction points away from the camera by no more than this share
+_MOST_AWAY = 0.0  # largest component of a forearm's direction away from the camera
 N_ARM_CAPSULES = 4
 
 
@@ -37,8 +37,8 @@ class HandShape:
     Attributes:
         offsets: (n, J, 3) mm, the joints as in `Skeleton.offsets`.
         flesh: capsules, a batch (n).
-        arm: (n, 4) radii mm at wrist and elbow, how much wider than thick, and where on the forearm
-            a sleeve begins (1: none), as a share.
+        arm: (n, 4) radii mm at wrist and elbow, ratio of width to thickness, and the start of a
+            sleeve along the forearm as a share (1: no sleeve).
     """
 
     offsets: Array
@@ -50,15 +50,12 @@ class HandShape:
         return len(self.offsets)
 
     def __getitem__(self, index: slice | NDArray[np.int64]) -> HandShape:
-        """Some of the people.
-
-        Args:
-            index: a slice, or row numbers.
-        """
+        """Some of the people, by slice or row numbers."""
         return HandShape(self.offsets[index], self.flesh[index], self.arm[index])
 
     def joints(self, skeleton: Skeleton, pose: Pose) -> tuple[Array, Array]:
-        """Joints of each person's own hand in a pose: forward kinematics with own bone lengths.
+        """Joints of each person's own hand in a pose: forward kinematics with individual bone
+        lengths.
 
         Args:
             skeleton: of the hand.
@@ -81,9 +78,9 @@ def draw_hands(rng: np.random.Generator, skeleton: Skeleton, family: str, n: int
     """Draw the hands of n people of a family.
 
     Args:
-        rng: where chance comes from.
+        rng: random generator.
         skeleton: of the hand, with names that begin with a finger's and an underscore.
-        family: 'train' varies the preset as people vary, 'augmented' somewhat more; 'other' holds
+        family: 'train' varies the preset as people vary, 'augmented' somewhat more; 'other' has
             hands that no model is trained on: short and plump ones, and long and slender ones.
         n: people.
 
@@ -94,7 +91,7 @@ def draw_hands(rng: np.random.Generator, skeleton: Skeleton, family: str, n: int
         LiexError: there is no such family.
     """
     if family not in FAMILIES:
-        raise LiexError(f"there is no shape family '{family}'; known are {', '.join(FAMILIES)}")
+        raise LiexError(f"there is no shape family '{family}'; choose one of {', '.join(FAMILIES)}")
     wide = {"train": 1.0, "augmented": 1.5, "wide": 2.0, "other": 1.0}[family]
 
     def draw(sd: float, *shape: int) -> Array:
@@ -145,15 +142,15 @@ def forearms(
 ) -> tuple[Array, Array]:
     """Frames and elbows of the forearms that carry hands.
 
-    The wrist bends as wrists do, and further where the arm would otherwise come from the camera's
-    side: who holds out a hand stands behind it.
+    The wrist bends within its usual range, and further if the arm would otherwise point towards the
+    camera: a person stands behind the hand.
 
     Args:
-        rng: where chance comes from.
+        rng: random generator.
         rotations: (n, J, 3, 3) of the hands' joints, camera frame.
         positions: (n, J, 3) mm of the joints, camera frame.
         scale: (n,) of the hands.
-        bent: (n, 3) rad, the wrists' bends where they are known; None draws each.
+        bent: (n, 3) rad, the wrists' bends; None to draw them.
 
     Returns:
         Frames (n, 3, 3), x from the elbow to the wrist, and elbows (n, 3) mm, camera frame.
@@ -189,7 +186,7 @@ def arm_vertices(frame: Array, elbow: Array, shoulder: Array, scale: Array, arm:
     n = len(scale)
     wrist = elbow + (scale * ARM_MM)[:, None] * frame[:, :, 0]
     joints = np.stack([wrist, elbow, shoulder], axis=1)
-    # two tubes beside one another make an arm that is wider than thick
+    # two adjacent tubes make an arm that is wider than thick
     side = 0.5 * arm[:, 0] * (arm[:, 2] - 1.0) * 2.0
     offsets = np.zeros((n, 4, 2, 3))
     radii = np.zeros((n, 4, 2))

@@ -4,7 +4,7 @@ Lie-X section 3: with parent p, bone offset b_j, rest rotation Q_j and rotation 
 
     t_j = t_p + s R_p b_j,   R_j = R_p Q_j exp(hat(w_j)).
 
-The inverse aims one bone after the other by the smallest rotation that does it.
+The inverse aims the bones one by one with the smallest possible rotation.
 """
 
 from __future__ import annotations
@@ -50,10 +50,10 @@ def forward_kinematics(
 
 
 def aim(direction_from: Array, direction_to: Array) -> Array:
-    """The smallest rotation vectors that turn directions onto others.
+    """The smallest rotation vectors that rotate directions onto others.
 
-    The axis is a x b, the angle atan2(|a x b|, a . b). Opposite directions have no smallest
-    rotation; they turn by pi about some perpendicular axis.
+    The axis is a x b, the angle atan2(|a x b|, a . b). Opposite directions have no unique smallest
+    rotation; they rotate by pi about some perpendicular axis.
 
     Args:
         direction_from: (..., 3), any length but 0.
@@ -69,7 +69,7 @@ def aim(direction_from: Array, direction_to: Array) -> Array:
     angle = np.arctan2(sine, np.sum(a * b, axis=-1, keepdims=True))
     if np.all(sine > 1e-12):
         return cross / sine * angle
-    # any axis perpendicular to a will do when the cross product vanishes
+    # any axis perpendicular to a is valid if the cross product vanishes
     helper = np.where(np.abs(a[..., :1]) < 0.9, [1.0, 0.0, 0.0], [0.0, 1.0, 0.0])
     axis = np.where(
         sine > 1e-12, cross / np.where(sine > 1e-12, sine, 1.0), _unit(so3.cross(a, helper))
@@ -89,13 +89,13 @@ def _unit(v: Array) -> Array:
 def chain_from_joints(skeleton: Skeleton, joints: Array, up: Array) -> tuple[SE3, Array, Array]:
     """Root, angles and scale of the chain through given joint positions.
 
-    Serves skeletons of one chain (mouse, fish): every joint but the last has exactly one child.
+    For skeletons of one chain (mouse, fish): every joint but the last has exactly one child.
 
     Args:
         skeleton: one chain of joints.
         joints: (..., J, 3) mm.
-        up: (3,) or (..., 3), where the base's z axis should point as far as its bone allows; for a
-            base that points straight along it, another axis stands in.
+        up: (3,) or (..., 3), desired direction of the base's z axis; if the base's bone is parallel
+            to it, another axis is used.
 
     Returns:
         Root (...), angles (..., J, 3) rad and scale (...).
@@ -107,7 +107,7 @@ def chain_from_joints(skeleton: Skeleton, joints: Array, up: Array) -> tuple[SE3
     bone = skeleton.offsets[children[0]]
     forward = along[..., 0, :] * np.sign(bone[0])
     forward = _unit(forward)
-    # a base that points straight up or down has no yaw of its own: lean on the next axis
+    # a base that points straight up or down has no yaw: use the next axis
     up = np.broadcast_to(up, forward.shape)
     level = _length(up)
     vertical = np.abs(np.sum(forward * up, axis=-1, keepdims=True)) > 0.999 * level
@@ -126,7 +126,7 @@ def chain_from_joints(skeleton: Skeleton, joints: Array, up: Array) -> tuple[SE3
     return root, angles, scale
 
 
-# A skeleton's kinematic tree as the record of arrays that numba kernels take.
+# A skeleton's kinematic tree as a record of arrays for numba kernels.
 
 
 class KinematicTree(NamedTuple):
@@ -139,7 +139,7 @@ class KinematicTree(NamedTuple):
         axes: (J, 3) bool, the free axes.
         turning: (J,) bool, joints with a free axis.
         free: (F, 2) joint and axis of every free angle beyond the base.
-        tip: joint whose direction from the base says which way the animal lies.
+        tip: joint whose direction from the base is the animal's heading.
     """
 
     parents: NDArray[np.int64]
@@ -152,11 +152,7 @@ class KinematicTree(NamedTuple):
 
     @staticmethod
     def of(skeleton: Skeleton) -> KinematicTree:
-        """The record of a skeleton.
-
-        Args:
-            skeleton: the animal's skeleton.
-        """
+        """The record of a skeleton."""
         free = np.argwhere(skeleton.axes)
         return KinematicTree(
             skeleton.parents,

@@ -25,8 +25,8 @@ from liex_lab.runtime.shapes import check_index, check_shapes
 
 Array = NDArray[np.float64]
 
-_BONES = 2  # that a vertex follows
-_SHARPNESS = 4  # a bone's pull falls off with the distance to this power
+_BONES = 2  # bones per vertex
+_SHARPNESS = 4  # exponent of the distance in a bone's weight
 
 
 @dataclass(frozen=True)
@@ -58,19 +58,11 @@ class MeshBody:
         return len(self.fur)
 
     def __getitem__(self, index: int | slice | NDArray[np.int64]) -> MeshBody:
-        """One body, or some, out of a batch.
-
-        Args:
-            index: a number, a slice, or row numbers.
-        """
+        """One body, or some, of a batch, by number, slice or row numbers."""
         return replace(self, width=self.width[index], fur=self.fur[index])
 
     def broadcast(self, n: int) -> MeshBody:
-        """A batch (n,) of this one body, or this batch.
-
-        Args:
-            n: bodies.
-        """
+        """A batch (n,) of this one body, or this batch."""
         if self.fur.ndim == 1 and len(self.fur) == n:
             return self
         return replace(
@@ -81,13 +73,12 @@ class MeshBody:
 
     @staticmethod
     def of(skeleton: Skeleton) -> MeshBody:
-        """The mesh of a skeleton's [surface] table, bound to the bones that are nearest at home.
-
-        Args:
-            skeleton: with vertices_mm and faces in its [surface].
+        """The mesh of a skeleton's [surface] table, with vertices_mm and faces, bound to the
+        nearest bones at home.
 
         Raises:
-            LiexError: vertices or faces are not finite triples, or a face names no vertex.
+            LiexError: vertices or faces are not finite triples, or a face refers to a missing
+                vertex.
         """
         table = skeleton.surface
         vertices = np.array(table["vertices_mm"], float)

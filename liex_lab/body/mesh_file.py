@@ -1,8 +1,8 @@
 """Reading of a user's own triangle mesh: STL, OBJ, PLY or glTF, by Open3D.
 
-Open3D reads the file and thins it out by quadric edge collapse (Garland and Heckbert 1997) when a
-skeleton's TOML is loaded; from then on the mesh is part of the skeleton's table, so that a trained
-model carries its body with it and needs neither the file nor Open3D.
+Open3D reads the file and simplifies it by quadric edge collapse (Garland and Heckbert 1997) when a
+skeleton's TOML is loaded; the mesh then becomes part of the skeleton's table, so that a trained
+model includes its body and needs neither the file nor Open3D.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ _FEWEST_FACES = 4
 def read_mesh(path: Path, unit_mm: float, origin: str) -> dict[str, Any]:
     """The entries of a [surface] table for the mesh of a file.
 
-    Thinned out to what a depth image shows: at most 4000 triangles; vertices are rounded to a
+    Simplified to the resolution of a depth image: at most 4000 triangles; vertices are rounded to a
     thousandth of a mm.
 
     Args:
         path: of the file (.stl, .obj, .ply, .glb ...).
-        unit_mm: mm that one unit of the file is long.
-        origin: names the TOML in errors.
+        unit_mm: length of one unit of the file, mm.
+        origin: name of the TOML in errors.
 
     Returns:
         vertices_mm, V triples of mm, and faces, F triples of vertex numbers.
@@ -37,7 +37,7 @@ def read_mesh(path: Path, unit_mm: float, origin: str) -> dict[str, Any]:
     """
     if not path.is_file():
         raise LiexError(
-            f"{origin}: [surface] mesh should be a file beside the TOML, but there is no {path}"
+            f"{origin}: [surface] mesh should be a file next to the TOML, but there is no {path}"
         )
     try:
         import open3d
@@ -57,6 +57,6 @@ def read_mesh(path: Path, unit_mm: float, origin: str) -> dict[str, Any]:
     if len(faces) < _FEWEST_FACES or not np.isfinite(vertices).all():
         raise LiexError(
             f"{origin}: [surface] mesh should be a file with the triangles of a body, but {path} "
-            f"holds {len(faces)} of them; export it as STL, OBJ or PLY"
+            f"contains {len(faces)} of them; export it as STL, OBJ or PLY"
         )
     return {"vertices_mm": np.round(vertices, 3).tolist(), "faces": faces.tolist()}

@@ -1,7 +1,7 @@
 """A pose: root transform in SE(3), joint rotation vectors and one scale, of one animal or a batch.
 
 The kinematic chain of Lie-X section 3 in coordinates: joint j's transform relative to its parent is
-exp of a rotation vector about its free axes, behind a fixed bone; the product of these exponentials
+exp of a rotation vector about its free axes, after a fixed bone; the product of these exponentials
 along the tree gives every joint (`forward_kinematics`).
 """
 
@@ -26,7 +26,7 @@ class Pose:
     """Skeleton coordinates, one pose or a batch (...).
 
     Attributes:
-        root: T_frame_root (...), the base joint in the frame in which the pose lives, mm.
+        root: T_frame_root (...), the base joint in the pose's frame, mm.
         angles: (..., J, 3) rad, rotation vectors of each joint relative to its parent, zero at the
             base and on axes that are not free.
         scale: (...) of all bones.
@@ -38,21 +38,14 @@ class Pose:
 
     @staticmethod
     def home(skeleton: Skeleton, *batch: int) -> Pose:
-        """The straight pose at the origin, pointing along x, or a batch of it.
-
-        Args:
-            skeleton: whose pose.
-            *batch: shape of the batch; none for one pose.
-        """
+        """The straight pose at the origin, pointing along x, or a batch of the given shape."""
         return Pose(SE3.identity(*batch), np.zeros((*batch, skeleton.n_joints, 3)), np.ones(batch))
 
     def __getitem__(
         self, index: NDArray[np.bool_] | NDArray[np.int64] | slice | int | tuple[Any, ...]
     ) -> Pose:
-        """Some poses out of a batch.
-
-        Args:
-            index: a mask, row numbers, a slice, a number, or a tuple for several batch axes.
+        """Some poses of a batch, by mask, row numbers, slice, number, or a tuple for multiple batch
+        axes.
         """
         return Pose(
             SE3(self.root.rotation[index], self.root.translation[index]),
@@ -61,45 +54,29 @@ class Pose:
         )
 
     def frames(self, skeleton: Skeleton) -> SE3:
-        """T_frame_joint of every joint, a batch (..., J), mm.
-
-        Args:
-            skeleton: whose pose it is.
-        """
+        """T_frame_joint of every joint, a batch (..., J), mm."""
         rotation, position = forward_kinematics(skeleton, self.root, self.angles, self.scale)
         return SE3(rotation, position)
 
     def joints(self, skeleton: Skeleton) -> Array:
-        """Joint positions (..., J, 3) mm in the pose's frame.
-
-        Args:
-            skeleton: whose pose it is.
-        """
+        """Joint positions (..., J, 3) mm in the pose's frame."""
         return forward_kinematics(skeleton, self.root, self.angles, self.scale)[1]
 
     def placed(self, skeleton: Skeleton) -> PlacedPose:
-        """The same poses with the frames of their joints, for all who ask for these.
-
-        Args:
-            skeleton: whose pose it is.
-        """
+        """The same poses with precomputed frames of their joints."""
         return PlacedPose(self.root, self.angles, self.scale, self.frames(skeleton))
 
     def moved(self, T_new_old: SE3) -> Pose:
         """The same posture in another frame.
 
         Args:
-            T_new_old: carries the present frame into the new one; broadcasts with the batch.
+            T_new_old: transforms the present frame to the new one; broadcasts with the batch.
         """
         return Pose(T_new_old @ self.root, self.angles, self.scale)
 
     @staticmethod
     def join(parts: Sequence[Pose]) -> Pose:
-        """The poses of several batches (n), one after the other.
-
-        Args:
-            parts: at least one batch with one batch axis.
-        """
+        """Concatenate batches (n), at least one, with one batch axis each."""
         root = SE3(
             *(
                 np.concatenate([getattr(p.root, name) for p in parts])
@@ -116,9 +93,9 @@ class Pose:
     def from_joints(skeleton: Skeleton, joints: ArrayLike, up: ArrayLike) -> Pose:
         """The pose (...) whose bones point along given joint positions of one chain.
 
-        Each joint turns by the smallest rotation that aims its bone; the base's roll is chosen so
-        that its z axis lies as near to `up` as its bone allows. Bones keep their proportions; the
-        scale comes from the total length.
+        Each joint rotates by the smallest rotation that aims its bone; the base's roll is chosen so
+        that its z axis is as near to `up` as its bone allows. Bones keep their proportions; the
+        scale is computed from the total length.
 
         Args:
             skeleton: one chain of joints (mouse, fish).
@@ -133,10 +110,10 @@ class Pose:
 
 @dataclass(frozen=True)
 class PlacedPose(Pose):
-    """Poses that keep the frames of their joints: forward kinematics has been run, once.
+    """Poses with precomputed frames of their joints.
 
-    Its arrays are not written to, or the frames would be those of other poses. In another frame
-    (`moved`) it is a `Pose` again.
+    Its arrays must not be modified, as the frames would become invalid. `moved` returns a plain
+    `Pose`.
 
     Attributes:
         T_frame_joint: (..., J) frames of the joints, mm.
@@ -147,7 +124,7 @@ class PlacedPose(Pose):
     def __getitem__(
         self, index: NDArray[np.bool_] | NDArray[np.int64] | slice | int | tuple[Any, ...]
     ) -> PlacedPose:
-        """Some poses out of a batch, see `Pose`."""
+        """Some poses of a batch, see `Pose`."""
         some = super().__getitem__(index)
         placed = self.T_frame_joint
         return PlacedPose(
@@ -158,17 +135,9 @@ class PlacedPose(Pose):
         )
 
     def frames(self, skeleton: Skeleton) -> SE3:
-        """T_frame_joint of every joint, a batch (..., J), mm.
-
-        Args:
-            skeleton: whose pose it is.
-        """
+        """T_frame_joint of every joint, a batch (..., J), mm."""
         return self.T_frame_joint
 
     def joints(self, skeleton: Skeleton) -> Array:
-        """Joint positions (..., J, 3) mm in the pose's frame.
-
-        Args:
-            skeleton: whose pose it is.
-        """
+        """Joint positions (..., J, 3) mm in the pose's frame."""
         return self.T_frame_joint.translation

@@ -1,9 +1,9 @@
-"""Parametric body shapes of a tubular animal, and the random families from which animals are drawn.
+"""Parametric body shapes of a tubular animal, and random families to draw animals from.
 
 The trunk is a generalised cylinder: superellipses |x / a|^p + |y / b|^p = 1 across the mid-axis
-(Barr 1981), whose half widths a and half heights b are given at stations along the spine; ears and
-feet are ellipsoids, the tail is a thin tube. A family draws smooth random factors on the profiles,
-so that a model trained on rendered animals meets the variation of real ones (domain randomisation).
+(Barr 1981), with half widths a and half heights b at stations along the spine; ears and feet are
+ellipsoids, the tail is a thin tube. A family draws smooth random factors for the profiles, so that
+a model trained on rendered animals covers the variation of real ones (domain randomisation).
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _HULL_SHARE = 0.5  # of the wild ones
 
 @dataclass(frozen=True)
 class BodyShape:
-    """What stands around a tubular animal's mid-axis, one shape or a batch (...).
+    """The body around a tubular animal's mid-axis, one shape or a batch (...).
 
     Lengths in mm at scale 1.
 
@@ -48,10 +48,8 @@ class BodyShape:
 
     @staticmethod
     def default(skeleton: Skeleton) -> BodyShape:
-        """The animal that the skeleton's [surface] table describes.
-
-        Args:
-            skeleton: one chain of joints, with stations in its [surface].
+        """The animal described by the skeleton's [surface] table, with stations along one chain of
+        joints.
 
         Raises:
             LiexError: the joints are not one chain, or the table is incomplete.
@@ -85,10 +83,7 @@ class BodyShape:
         )
 
     def bare(self) -> BodyShape:
-        """The same trunk without ears, feet and tail.
-
-        What a model of unknown limbs should be drawn with.
-        """
+        """The same trunk without ears, feet and tail, for models of unknown limbs."""
         return replace(self, blobs=_with_radii(self.blobs, 0.0), tail=np.zeros_like(self.tail))
 
     def __len__(self) -> int:
@@ -96,19 +91,11 @@ class BodyShape:
         return len(self.fur)
 
     def __getitem__(self, index: int | slice | NDArray[np.int64]) -> BodyShape:
-        """One shape, or some, out of a batch.
-
-        Args:
-            index: a number, a slice, or row numbers.
-        """
+        """One shape, or some, of a batch, by number, slice or row numbers."""
         return BodyShape(*(getattr(self, name)[index] for name in self.__dataclass_fields__))
 
     def broadcast(self, n: int) -> BodyShape:
-        """A batch (n,) of this one shape, or this batch.
-
-        Args:
-            n: shapes.
-        """
+        """A batch (n,) of this one shape, or this batch."""
         if self.fur.ndim == 1 and len(self.fur) == n:
             return self
         return BodyShape(*(np.broadcast_to(a, (n, *a.shape)).copy() for a in vars(self).values()))
@@ -118,11 +105,11 @@ def draw_shapes(rng: np.random.Generator, skeleton: Skeleton, family: str, n: in
     """Draw n animals of a family.
 
     Args:
-        rng: where chance comes from.
+        rng: random generator.
         skeleton: one chain of joints, with stations in its [surface].
-        family: 'train' varies the default animal as mice vary; most of 'augmented' varies more than
-            mice do, so that no forest relies on one exact profile; all of 'wide' do; 'other' holds
-            bodies of another build, which no forest is trained on.
+        family: 'train' varies the default animal as mice vary; most of 'augmented' and all of
+            'wide' vary more than mice do, so that no forest relies on one exact profile; 'other'
+            has bodies of another build, which no forest is trained on.
         n: animals.
 
     Returns:
@@ -132,7 +119,7 @@ def draw_shapes(rng: np.random.Generator, skeleton: Skeleton, family: str, n: in
         LiexError: there is no such family.
     """
     if family not in FAMILIES:
-        raise LiexError(f"there is no shape family '{family}'; known are {', '.join(FAMILIES)}")
+        raise LiexError(f"there is no shape family '{family}'; choose one of {', '.join(FAMILIES)}")
     default = BodyShape.default(skeleton)
     stations = np.array(skeleton.surface["stations"], float)
     wild = (rng.random(n) < _WILD_SHARE) & (family == "augmented") | (family == "wide")
@@ -162,10 +149,10 @@ def draw_shapes(rng: np.random.Generator, skeleton: Skeleton, family: str, n: in
 
 
 def draw_tail_bends(rng: np.random.Generator, n: int) -> Array:
-    """How n tails lie: slow waves and a little of every ring's own.
+    """Bends of n tails: slow waves and small individual turns.
 
     Args:
-        rng: where chance comes from.
+        rng: random generator.
         n: tails.
 
     Returns:
@@ -192,8 +179,7 @@ def _varied(
     """Half widths and heights (n, R): the default profile, made fatter, blunter, ... by smooth
     factors.
 
-    wild (n, 1): which animals leave the range of mice, with ranges twice as wide and waves that no
-    factor names.
+    wild (n, 1): animals outside the range of mice, with ranges twice as wide and additional waves.
     """
     n = len(wild)
 
@@ -223,7 +209,7 @@ def _varied(
 def _hulls(
     rng: np.random.Generator, default: BodyShape, stations: Array, n: int
 ) -> tuple[Array, Array]:
-    """Half widths and heights (n, R) of bodies that owe the default profile nothing.
+    """Half widths and heights (n, R) of bodies independent of the default profile.
 
     Any smooth closed outline whose rear is broader than its snout, with a waist, a neck, both or
     neither: monotone cubic interpolation (PCHIP) of its square through random knots.
@@ -234,11 +220,10 @@ def _hulls(
     knots = np.array([0.0, 0.06, 0.18, 0.32, 0.46, 0.60, 0.72, 0.82, 0.92, 1.0])
     low = np.array([0.0, 0.30, 0.65, 0.80, 0.75, 0.60, 0.45, 0.35, 0.18, 0.0])
     high = np.array([0.0, 0.75, 1.00, 1.05, 1.05, 1.05, 1.00, 0.85, 0.55, 0.0])
-    # one draw for the whole body and one for each place: fat noses go with fat necks, but not
-    # always
+    # one draw for the whole body and one for each position: fat noses and necks are correlated
     whole = rng.random((n, 1))
     share = np.clip(0.6 * whole + 0.4 * rng.random((n, len(knots))), 0.0, 1.0)
-    # square roots are drawn through the knots, so that both ends close round as an ellipse does
+    # squares are interpolated, so that both ends are round as those of an ellipse
     outline = (
         np.maximum(PchipInterpolator(knots, (low + share * (high - low)) ** 2, axis=1)(u), 0.0)
         ** 0.5
@@ -252,8 +237,8 @@ def _hulls(
 
 
 def _reread(stations: Array, snout: Array, rump: Array) -> Array:
-    """Where (n, R) on the default profile a station reads: powers above 1 make a fat snout or a
-    thin rump.
+    """Positions (n, R) on the default profile to sample for each station: powers above 1 make a fat
+    snout or a thin rump.
     """
     low = stations[0]
     high = 0.10
@@ -263,7 +248,7 @@ def _reread(stations: Array, snout: Array, rump: Array) -> Array:
 
 
 def _waves(rng: np.random.Generator, stations: Array, n: int, sd: float) -> Array:
-    """Factors (n, R) around 1 that wander by about `sd` along the body, slowly."""
+    """Factors (n, R) around 1 that vary slowly by about `sd` along the body."""
     total = np.zeros((n, len(stations)))
     for cycles in (0.5, 1.0, 1.5, 2.0):
         phase = rng.uniform(0.0, 2.0 * np.pi, (n, 1))
@@ -276,12 +261,12 @@ def _waves(rng: np.random.Generator, stations: Array, n: int, sd: float) -> Arra
 def _foreign(
     rng: np.random.Generator, default: BodyShape, stations: Array, n: int
 ) -> tuple[Array, Array]:
-    """Half widths and heights (n, R) of builds that 'train' does not hold.
+    """Half widths and heights (n, R) of builds that are not in 'train'.
 
-    Every mouse is blunt behind and pointed in front; beyond that nothing is shared with 'train'.
-    Half of them are long and slim and widest at the shoulders: a blunt rump, a flank that widens
-    forward in a straight line, then a cone to the nose. The other half are obese: an egg without a
-    neck that runs into a short cone of a snout.
+    Every mouse is blunt behind and pointed in front; nothing else is shared with 'train'. Half of
+    them are long and slim and widest at the shoulders: a blunt rump, a flank that widens forward in
+    a straight line, then a cone to the nose. The other half are obese: an egg without a neck that
+    ends in a short cone of a snout.
     """
     u = (stations - stations[0]) / (stations[-1] - stations[0])
     shoulder = rng.uniform(0.42, 0.55, (n, 1))
@@ -311,7 +296,7 @@ def _vary_pair(
     family: str,
     largest_ear: Array,
 ) -> None:
-    """Ears and feet of another size, place and presence, the same on both sides."""
+    """Ears and feet with varied size, position and presence, the same on both sides."""
     n = len(blobs)
     if name == "ear":
         size = rng.uniform(1.25, 1.7, n) if family == "other" else rng.uniform(0.6, largest_ear)

@@ -1,10 +1,10 @@
 """Kinematic tree of an animal: joints, bone offsets, free axes and limits, read from a TOML file.
 
 The skeletal model of Lie-X section 3: a base joint with six degrees of freedom and, below it,
-joints that turn about one to three axes of their own frame. Bones have fixed proportions; one scale
-multiplies all of them. A skeleton is data, so an animal is added without code: the presets 'fish',
-'mouse' and 'hand' are TOML files, and a user may write one. Its [[joints]] tables make the tree,
-[view] says how the animal is looked at, [surface] what stands around the bones.
+joints that rotate about one to three axes of their own frame. Bones have fixed proportions; one
+scale multiplies all of them. A skeleton is data, so an animal is added without code: the presets
+'fish', 'mouse' and 'hand' are TOML files, and users may write their own. The [[joints]] tables
+define the tree, [view] how the animal is viewed, and [surface] the body around the bones.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ AXES = ("roll", "pitch", "yaw")  # about x (forward), y (left), z (up) of the jo
 PRESETS = Path(__file__).parent / "presets"
 _JOINT_KEYS = {"name", "parent", "offset_mm", "rest_deg", "axes", "limits_deg"}
 _ROOT_DOF = 6
-# home length of the mouse: lengths that hold for every animal are stated for it
+# home length of the mouse: lengths that apply to every animal are stated for it
 REFERENCE_MM = 52.834
 VIEWS = ("floor", "camera")
 FOREGROUNDS = ("background", "nearest")
@@ -44,19 +44,20 @@ _HUGE = 1e9  # no number of a skeleton is as large
 
 @dataclass(frozen=True)
 class View:
-    """How an animal is looked at: the [view] table of its TOML.
+    """How an animal is viewed: the [view] table of its TOML.
 
     Attributes:
         frame: 'floor', heights are measured above the floor that it stands on, or 'camera', along
-            the optical axis from behind_mm behind its mean depth, for one that swims or is held up.
-        behind_mm: how far behind the mean depth the reference plane lies; the same for all sizes of
-            an animal that swims (or the height map would tell the size for which it was cut), at
+            the optical axis from behind_mm behind its mean depth, for an animal that swims or is
+            lifted.
+        behind_mm: distance of the reference plane behind the mean depth; the same for all sizes of
+            an animal that swims (otherwise the height map would reveal the size used to cut it), at
             home size for a hand.
-        smooth_mm: readings this near to one another, at home size, are averaged.
+        smooth_mm: readings within this distance, at home size, are averaged.
         area: the smallest and the largest area seen from above, of the squared length.
-        min_height_mm: what stands out from the background by less is not the animal.
-        foreground: 'background', it stands out from a still scene, or 'nearest', nothing is nearer
-            to the camera.
+        min_height_mm: smaller heights above the background are not the animal.
+        foreground: 'background', the animal is segmented from a still scene, or 'nearest', nothing
+            is nearer to the camera.
     """
 
     frame: str = VIEWS[0]
@@ -68,23 +69,23 @@ class View:
 
     @staticmethod
     def from_table(table: dict[str, Any], relative_size: float, origin: str) -> View:
-        """The view that a TOML states; what it leaves out follows from the animal's size.
+        """The view stated in a TOML; omitted values are derived from the animal's size.
 
         Args:
-            table: the [view] table, empty where there is none.
+            table: the [view] table, may be empty.
             relative_size: home length over REFERENCE_MM.
-            origin: names the file in errors.
+            origin: name of the file in errors.
 
         Raises:
             LiexError: an unknown key, or a value out of its range.
         """
-        known = View.__annotations__
+        keys = View.__annotations__
         if not isinstance(table, dict):
             raise LiexError(f"{origin}: [view] is a table, got {table!r}")
         for key in table:
-            if key not in known:
+            if key not in keys:
                 raise LiexError(
-                    f"{origin}: [view] has an unknown key '{key}'; known are {', '.join(known)}"
+                    f"{origin}: [view] has an unknown key '{key}'; use {', '.join(keys)}"
                 )
         frame = table.get("frame", VIEWS[0])
         area = table.get("area", list(_AREA))
@@ -134,12 +135,12 @@ class Skeleton:
         name: of the animal.
         names: J names of the joints.
         parents: (J,) int64, -1 at the base.
-        offsets: (J, 3) mm, carries a joint away from its parent, in the parent's frame.
-        rest: (J, 3, 3), turns the parent's frame into the joint's at home.
-        axes: (J, 3) bool, which of roll, pitch and yaw (about x, y, z) the joint can do.
+        offsets: (J, 3) mm, from a joint's parent to the joint, in the parent's frame.
+        rest: (J, 3, 3), rotates the parent's frame to the joint's at home.
+        axes: (J, 3) bool, free rotations of the joint: roll, pitch and yaw (about x, y, z).
         limits: (J, 3, 2) rad, lowest and highest.
         surface: the [surface] table, see `Surface.of`.
-        view: how the animal is looked at.
+        view: how the animal is viewed.
         table: the whole TOML.
     """
 
@@ -162,7 +163,7 @@ class Skeleton:
 
     @staticmethod
     def load(animal: str | Path) -> Skeleton:
-        """The skeleton of a preset or of a TOML file that a user wrote.
+        """The skeleton of a preset or of a user's TOML file.
 
         Args:
             animal: 'fish', 'mouse', 'hand', or the path of a file.
@@ -174,12 +175,12 @@ class Skeleton:
         if not path.is_file():
             path = Path(animal)
         if not path.is_file():
-            known = sorted(p.stem for p in PRESETS.glob("*.toml"))
-            near = difflib.get_close_matches(str(animal), known, 1)
+            names = sorted(p.stem for p in PRESETS.glob("*.toml"))
+            near = difflib.get_close_matches(str(animal), names, 1)
             hint = (
                 f"did you mean '{near[0]}'?"
                 if near
-                else f"known are {', '.join(known)}, or give a .toml file"
+                else f"choose one of {', '.join(names)}, or give a .toml file"
             )
             raise LiexError(f"there is no skeleton '{animal}': {hint}")
         try:
@@ -193,11 +194,11 @@ class Skeleton:
         """A skeleton from the content of its TOML.
 
         Args:
-            table: what the file holds.
-            origin: names the file in errors.
+            table: content of the file.
+            origin: name of the file in errors.
 
         Raises:
-            LiexError: what is missing or wrong, and in which joint.
+            LiexError: the error, and the joint that it is in.
         """
         joints = table.get("joints")
         surface = table.get("surface", {})
@@ -249,7 +250,7 @@ class Skeleton:
 
     @property
     def is_chain(self) -> bool:
-        """Whether each joint carries the next and only that, as along a spine."""
+        """Whether each joint has only the next one as its child, as along a spine."""
         return bool(np.array_equal(self.parents, np.arange(-1, self.n_joints - 1)))
 
     @property
@@ -277,7 +278,7 @@ class Skeleton:
 
     @cached_property
     def next_joint(self) -> NDArray[np.int64]:
-        """(J,) int64, each joint's first child, at which its bone points; -1 at an end-effector."""
+        """(J,) int64, each joint's first child, which its bone points to; -1 at an end-effector."""
         first = np.full(self.n_joints, -1, np.int64)
         for parent, child in reversed(self.edges):
             first[parent] = child
@@ -285,7 +286,7 @@ class Skeleton:
 
     @cached_property
     def tip(self) -> int:
-        """The joint whose direction from the base tells in which direction the animal lies.
+        """The joint whose direction from the base is the animal's heading.
 
         The last of a chain, the base's first child in a tree.
         """
@@ -293,13 +294,13 @@ class Skeleton:
 
     @cached_property
     def solved(self) -> list[int]:
-        """The joints that move and so need a regressor, base first."""
+        """The joints that rotate and therefore need a regressor, base first."""
         return [0] + [j for j in range(1, self.n_joints) if self.axes[j].any()]
 
 
 def _with_mesh(table: dict[str, Any], path: Path) -> dict[str, Any]:
-    """The table of the TOML at `path`; where its [surface] names the file of a mesh, with the mesh
-    in its place.
+    """The table of the TOML at `path`, in which a [surface] that names a mesh file contains the
+    mesh itself.
     """
     surface = table.get("surface")
     if not isinstance(surface, dict) or "mesh" not in surface:
@@ -335,7 +336,7 @@ def _is_number(value: Any) -> bool:
 
 @dataclass(frozen=True)
 class _Joint:
-    """One [[joints]] table, checked."""
+    """One validated [[joints]] table."""
 
     name: str
     parent: str
@@ -353,8 +354,7 @@ class _Joint:
         for key in table:
             if key not in _JOINT_KEYS:
                 raise LiexError(
-                    f"{where} has an unknown key '{key}'; known are "
-                    f"{', '.join(sorted(_JOINT_KEYS))}"
+                    f"{where} has an unknown key '{key}'; use {', '.join(sorted(_JOINT_KEYS))}"
                 )
         axes = table.get("axes", [])
         if not isinstance(axes, list) or any(axis not in AXES for axis in axes):

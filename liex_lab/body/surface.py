@@ -1,10 +1,10 @@
 """The surface around a skeleton as a triangle mesh, and its depth image.
 
-A skeleton's [surface] table says which kind it is: `stations` with half widths and heights make a
-tube along one chain of joints, a generalised cylinder with superelliptic cross-sections (the
-mouse); `radii_mm` a tapered capsule around every bone and `capsules` further ones (anything else);
-`mesh` is the file of a body of one's own, moved by linear blend skinning. Depth is rendered with a
-z-buffer, see `_rasterizer_kernels`.
+A skeleton's [surface] table defines its kind: `stations` with half widths and heights make a tube
+along one chain of joints, a generalised cylinder with superelliptic cross-sections (the mouse);
+`radii_mm` a tapered capsule around every bone and `capsules` additional ones (any other animal);
+`mesh` is the file of the user's own body, deformed by linear blend skinning. Depth is rendered with
+a z-buffer, see `_rasterizer_kernels`.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from liex_lab.runtime.threads import threads
 Array = NDArray[np.float64]
 Body = BodyShape | Capsules | MeshBody
 Window = tuple[int, int, int, int]
-# a silhouette is seen from so many times its reach, in an image of so many pixels
+# distance of the silhouette's camera, in reaches of the body, and size of its image, px
 _FAR = 50.0
 _SILHOUETTE_PX = 400
 
@@ -42,7 +42,7 @@ class Surface:
     Exactly one of shape, capsules and mesh is given; the others are None.
 
     Attributes:
-        skeleton: whose poses it follows.
+        skeleton: of the poses.
         faces: (F, 3) int32, indices of the vertices (V, 3) of every pose.
         stations: (R,) along a tubular body, shares of the spine's length; empty for another.
         shape: the default animal of a tubular body.
@@ -59,13 +59,10 @@ class Surface:
 
     @staticmethod
     def of(skeleton: Skeleton) -> Surface:
-        """The surface that the skeleton's TOML describes.
-
-        Args:
-            skeleton: with its [surface] table.
+        """The surface described by the skeleton's [surface] table.
 
         Raises:
-            LiexError: the table describes none.
+            LiexError: the table describes no surface.
         """
         try:
             with np.errstate(all="raise", under="ignore"):
@@ -126,10 +123,10 @@ class Surface:
 
     @property
     def area_mm2(self) -> float:
-        """About the area of the home pose seen from above, mm^2 at scale 1.
+        """Approximate area of the home pose seen from above, mm^2 at scale 1.
 
-        Of capsules: their level lengths times the sum of their radii at the ends; of a tube: its
-        width integrated along the spine; of a mesh: its silhouette.
+        Of capsules: their horizontal lengths times the sum of their radii at the ends; of a tube:
+        its width integrated along the spine; of a mesh: its silhouette.
         """
         if self.mesh is not None:
             return self._silhouette_mm2()
@@ -144,9 +141,7 @@ class Surface:
         )
 
     def _silhouette_mm2(self) -> float:
-        """The area of the home pose from straight above, counted in an image from very far
-        away.
-        """
+        """The area of the home pose from above, counted in the image of a very distant camera."""
         mesh = self.vertices(Pose.home(self.skeleton))
         reach = float(np.abs(mesh).max())
         camera = Camera(
@@ -171,14 +166,14 @@ class Surface:
     ) -> Array:
         """Mesh vertices of poses, in the poses' frame.
 
-        A tail needs poses in the arena frame: it sinks to z = 0.
+        A tail requires poses in the arena frame: it sinks to z = 0.
 
         Args:
             pose: a batch (...).
             shape: the animal; None is the default animal without ears, feet and tail.
-            girth: (...) multiplies all lengths across the body; None takes the pose's scale.
-            bends: (n, TAIL_RINGS) rad, how the tail lies, the turn at each ring; None is straight.
-            parallel: whether to use all threads, else one.
+            girth: (...) multiplies all lengths across the body; None uses the pose's scale.
+            bends: (n, TAIL_RINGS) rad, the tail's turn at each ring; None is straight.
+            parallel: whether to use all threads.
 
         Returns:
             (..., V, 3) mm.
@@ -245,13 +240,13 @@ class Surface:
         Args:
             pose: one pose.
             camera: the ideal pinhole camera.
-            window: (u0, v0, width, height) px of the image; None the whole of it.
+            window: (u0, v0, width, height) px of the image; None for the full image.
             shape: the animal; None is the default animal without ears, feet and tail.
-            T_camera_pose: carries the pose's frame into the camera's; None where they are the same.
+            T_camera_pose: transforms the pose's frame to the camera's; None if they are the same.
             **skinning: girth, bends and parallel of `vertices`.
 
         Returns:
-            (H, W) float32 mm, 0 where the animal is not.
+            (H, W) float32 mm, 0 outside the animal.
         """
         mesh = self.vertices(pose, shape, **skinning)  # type: ignore[arg-type]
         return render_mesh(mesh, self.faces, camera, window, T_camera_pose)
@@ -267,14 +262,14 @@ def render_mesh(
     """Depth image of one closed mesh, by z-buffer.
 
     Args:
-        vertices: (V, 3) mm, in the camera frame or in one that T_camera_mesh carries there.
+        vertices: (V, 3) mm, in the frame of the mesh.
         faces: (F, 3) int32.
         camera: the ideal pinhole camera.
-        window: (u0, v0, width, height) px of the image; None the whole of it.
-        T_camera_mesh: carries the mesh's frame into the camera's; None where they are the same.
+        window: (u0, v0, width, height) px of the image; None for the full image.
+        T_camera_mesh: transforms the mesh's frame to the camera's; None if they are the same.
 
     Returns:
-        (H, W) float32 mm, 0 where the mesh is not.
+        (H, W) float32 mm, 0 outside the mesh.
     """
     T = SE3.identity() if T_camera_mesh is None else T_camera_mesh
     u0, v0, width, height = (0, 0, camera.width, camera.height) if window is None else window
@@ -308,19 +303,19 @@ def render_meshes(
     size: tuple[int, int],
     parallel: bool = True,
 ) -> NDArray[np.float32]:
-    """Depth images of many meshes, each seen by its own camera in its own window.
+    """Depth images of many meshes, each by its own camera in its own window.
 
     Args:
         vertices: (n, V, 3) mm.
         faces: (F, 3) int32, shared.
-        T_camera_mesh: (n) transforms from the meshes' frames into the cameras'.
+        T_camera_mesh: (n) transforms from the meshes' frames to the cameras'.
         intrinsics: (n, 4) fx, fy, cx, cy px.
-        origin: (n, 2) the image's pixel (u, v) at the window's top left.
+        origin: (n, 2) image pixel (u, v) at the window's top left.
         size: (width, height) px of the windows.
-        parallel: whether to use all threads, else one.
+        parallel: whether to use all threads.
 
     Returns:
-        (n, H, W) float32 mm, 0 where the mesh is not.
+        (n, H, W) float32 mm, 0 outside the mesh.
     """
     n = len(vertices)
     check_shapes(
@@ -354,25 +349,25 @@ _WAVES = (0.5, 1.0, 1.5, 2.0)  # cycles along the body
 
 
 def vary_body(rng: np.random.Generator, skeleton: Skeleton, family: str, n: int) -> Body:
-    """Draw n animals of a family around the body that a skeleton's TOML describes.
+    """Draw n animals of a family around the body described by a skeleton's TOML.
 
     Args:
-        rng: where chance comes from.
+        rng: random generator.
         skeleton: with its [surface] table.
         family: 'train' varies it as individuals vary; most of 'augmented' varies more than
-            individuals do, so that no forest relies on one exact profile; 'wide' varies it by three
-            times as much as 'train', all of them; 'other' holds builds that neither of the first
-            two reaches: far slimmer or stouter, with the mass far forward or far back.
+            individuals do, so that no forest relies on one exact profile; 'wide' varies all three
+            times as much as 'train'; 'other' has builds outside of the first two: far slimmer or
+            stouter, with the mass far forward or far back.
         n: animals.
 
     Returns:
-        A batch (n,) of the kind of body that the skeleton has.
+        A batch (n,) of the skeleton's kind of body.
 
     Raises:
         LiexError: there is no such family, or the skeleton describes no surface.
     """
     if family not in FAMILIES:
-        raise LiexError(f"there is no shape family '{family}'; known are {', '.join(FAMILIES)}")
+        raise LiexError(f"there is no shape family '{family}'; choose one of {', '.join(FAMILIES)}")
     surface = Surface.of(skeleton)
     fur = rng.uniform(0.0, 0.4, n)
     if surface.mesh is not None:
@@ -403,11 +398,7 @@ def vary_body(rng: np.random.Generator, skeleton: Skeleton, family: str, n: int)
 
 
 def joint_reaches(skeleton: Skeleton) -> Array:
-    """Path lengths (J,) from the base to each joint, as shares of the longest.
-
-    Args:
-        skeleton: with at least one bone.
-    """
+    """Path lengths (J,) from the base to each joint, as shares of the longest."""
     reach = np.zeros(skeleton.n_joints)
     for parent, child in skeleton.edges:
         reach[child] = reach[parent] + np.linalg.norm(skeleton.offsets[child])
@@ -415,7 +406,7 @@ def joint_reaches(skeleton: Skeleton) -> Array:
 
 
 def _factors(rng: np.random.Generator, along: Array, family: str, n: int) -> tuple[Array, Array]:
-    """Factors (n, R) of width and height at places `along` (R,) the body, from 0 to 1."""
+    """Factors (n, R) of width and height at positions `along` (R,) the body, from 0 to 1."""
     wild = ((rng.random(n) < _WILD_SHARE) & (family == "augmented"))[:, None]
     sign = rng.choice([-1.0, 1.0], (4, n, 1))
     size, slope, flat, belly = rng.uniform(0.0, 1.0, (4, n, 1))

@@ -1,19 +1,20 @@
 """Numba kernels of the forests: pose-indexed depth features, binary tests, descent of a tree.
 
 The feature is Lie-X Eq. 15, phi = depth(Proj(x + g(u))) - depth(Proj(x + g(v))), for offsets u, v
-that turn with the joint's frame g; it extends the two-point depth features of Shotton et al.
+that rotate with the joint's frame g; it extends the two-point depth features of Shotton et al.
 (2013). Depth is read from a height map, and the projection is linearised at the joint.
 
 A node is four int32, 16 bytes, one quarter of a cache line:
     word 0: u_x, u_y, u_z, v_x as int8, lowest byte first
     word 1: v_y, v_z as int8, then the threshold as int16
     word 2: index of the left child (the right one follows it); negative: leaf -(word 2) - 1
-    word 3: kind + 4 * channel: which test, on which view or scalar
+    word 3: kind + 4 * channel: the test, and its view or scalar
 
-Tests compare a response with the threshold and go right when it is at least as large:
+Tests compare a response with the threshold and go right if it is at least as large:
     TWO_PROBES  height under x + g(u) minus height under x + g(v)         (Lie-X Eq. 15)
     ONE_PROBE   height under x + g(u) minus the joint's own height
-    SCALAR      a number that describes the whole animal from the joint's point of view
+    SCALAR      a number that describes the whole animal relative to the joint
+
 Heights are 1/16 mm of an animal of home size, so one forest serves animals of every size.
 
 A view, 9 float32, is the linearised projection of a joint of a candidate pose into a height map:
@@ -42,8 +43,8 @@ VIEW_HEIGHT = 8
 def probe(heights, view, a, b, c):
     """Read the height map under an offset from a joint.
 
-    A probe outside the map reads its border, which is background. The arithmetic is float32, and in
-    this order, as in `_walk`: a forest then gives the same answer wherever it is asked.
+    A probe outside the map reads its border, which is background. The arithmetic is float32 in the
+    same order as in `_walk`, so that all code paths give identical answers.
 
     Args:
         heights: (S, S) int16 height map, 1/16 mm.
@@ -123,7 +124,7 @@ def descend(nodes, root, heights, inverse_size, views, scalars):
         scalars: (n,) float32 numbers that describe the animal.
 
     Returns:
-        Number of the leaf that the sample reaches.
+        Number of the leaf reached.
     """
     at = root
     child = nodes[at, 2]
@@ -188,7 +189,7 @@ def number_nodes(is_leaf, starts, nodes):
 
     Args:
         is_leaf: (n,) bool.
-        starts: (trees + 1,) where each tree's nodes begin, and the end of the last.
+        starts: (trees + 1,) index of each tree's first node, and the end of the last.
         nodes: (n, 4) int32, word 2 of which is filled.
     """
     leaf = 0

@@ -1,16 +1,16 @@
-"""SIMD descent of regression trees, sixteen samples at once: the fast twin of `_kernels.descend`.
+"""SIMD descent of regression trees, sixteen samples at once: the fast version of
+`_kernels.descend`.
 
-A test has no branch here: both probes are read, and a selection picks what the node's kind asks
-for. That alone is twice as fast as branching, which the processor cannot foresee; sixteen lanes
-make it about six times as fast. Numba's compiler does not vectorise such a loop by itself, so its
-body is written as LLVM's portable intermediate code: any processor runs it, with vectors as wide as
-it has. Arithmetic is float32 in the order of `_kernels.probe`, so that the answers are the same bit
-for bit.
+A test has no branch here: both probes are read, and the node's kind selects the result. That alone
+is twice as fast as branching, which the processor cannot predict; sixteen lanes make it about six
+times as fast. Numba does not vectorise such a loop by itself, so its body is written as LLVM's
+portable intermediate code, which runs on any processor with its own vector width. Arithmetic is
+float32 in the order of `_kernels.probe`, so that the answers are identical.
 
-Lanes read from flat arrays. `pixels` int16 holds height maps, and behind them the samples' scalars,
+Lanes read from flat arrays. `pixels` int16 contains height maps, followed by the samples' scalars,
 rounded down (a threshold is an integer, so rounding down changes no answer); `base` int32 (n,) is
-where a sample's map begins in it, `scalar_base` int32 (n,) where its scalars begin. n is a multiple
-of LANES; lanes without a sample may hold zeros.
+the start of a sample's map in it, `scalar_base` int32 (n,) the start of its scalars. n is a
+multiple of LANES; lanes without a sample may contain zeros.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ def _mask(indices: list[int]) -> str:
 
 
 class _Text:
-    """Lines of LLVM code under construction; a call appends one."""
+    """LLVM code under construction; a call appends one line."""
 
     def __init__(self) -> None:
         self.lines: list[str] = []
@@ -123,8 +123,8 @@ class _Text:
         self(f"%{name} = add {_INTS} %{name}.in, %map")
 
     def read(self, name: str, index: str) -> None:
-        """%name: the pixels at an index, as float. One by one: gathers are no faster, and few
-        processors have them.
+        """%name: the pixels at an index, as float. One by one, as gathers are no faster and rarely
+        available.
         """
         before = "undef"
         for k in range(LANES):
@@ -162,7 +162,7 @@ def _load_view(text: _Text) -> None:
 
 
 def _load_views(text: _Text) -> None:
-    """%view0 .. %view8 of the view that each lane's node asks for: views (n, V, 9)."""
+    """%view0 .. %view8 of the view selected by each lane's node: views (n, V, 9)."""
     text(f"%channel.view = select {_BITS} %is_scalar, {_INTS} zeroinitializer, {_INTS} %channel")
     before = "undef"
     for k in range(LANES):
@@ -190,12 +190,12 @@ def _middle(text: _Text) -> None:
         text(f"%middle_{axis} = fadd {_FLOATS} %view{c}, {_same('float', '0.5')}")
 
 
-def llvm_text(name: str, several: bool) -> str:
+def llvm_text(name: str, multi_view: bool) -> str:
     """The descent as an LLVM module in text form.
 
     Args:
         name: name of the function to define.
-        several: nodes choose among the samples' views (n, V, 9); otherwise each sample has one
+        multi_view: nodes choose among the samples' views (n, V, 9); otherwise each sample has one
             view, laid out (9, n).
 
     Returns:
@@ -213,7 +213,7 @@ def llvm_text(name: str, several: bool) -> str:
     ):
         text(f"%{vector}.p = getelementptr i32, ptr %{pointer}, i64 %first")
         text(f"%{vector} = load {type_}, ptr %{vector}.p, align 4")
-    if not several:
+    if not multi_view:
         _load_view(text)
         _middle(text)
     text("br label %loop")
@@ -224,7 +224,7 @@ def llvm_text(name: str, several: bool) -> str:
     text(f"%channel = ashr {_INTS} %word3, {_same('i32', 2)}")
     text(f"%is_one = icmp eq {_INTS} %kind, {_same('i32', ONE_PROBE)}")
     text(f"%is_scalar = icmp eq {_INTS} %kind, {_same('i32', SCALAR)}")
-    if several:
+    if multi_view:
         _load_views(text)
         _middle(text)
     for offset, word, byte in (
@@ -278,32 +278,32 @@ def llvm_text(name: str, several: bool) -> str:
     )
 
 
-def _emit(name: str, several: bool) -> Any:
+def _emit(name: str, multi_view: bool) -> Any:
     """The code generator of an intrinsic that links and calls the function of `llvm_text`."""
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         library = context.codegen().create_library(name)
-        library.add_llvm_module(llvm.parse_assembly(llvm_text(name, several)))
+        library.add_llvm_module(llvm.parse_assembly(llvm_text(name, multi_view)))
         library.finalize()
         context.active_code_library.add_linking_library(library)
         pointer = ir.IntType(8).as_pointer()
         i32 = ir.IntType(32)
         i64 = ir.IntType(64)
-        wanted = [pointer, i32, *[pointer] * 5, i64, i32, pointer, i64]
+        expected = [pointer, i32, *[pointer] * 5, i64, i32, pointer, i64]
         function = cgutils.get_or_insert_function(
-            builder.module, ir.FunctionType(ir.VoidType(), wanted), name
+            builder.module, ir.FunctionType(ir.VoidType(), expected), name
         )
         values = []
-        for value, kind, want in zip(args, signature.args, wanted, strict=True):
+        for value, kind, kind_out in zip(args, signature.args, expected, strict=True):
             if isinstance(kind, types.Array):
                 value = builder.bitcast(
                     context.make_array(kind)(context, builder, value).data, pointer
                 )
-            elif value.type.width != want.width:
+            elif value.type.width != kind_out.width:
                 value = (
-                    builder.trunc(value, want)
-                    if value.type.width > want.width
-                    else builder.sext(value, want)
+                    builder.trunc(value, kind_out)
+                    if value.type.width > kind_out.width
+                    else builder.sext(value, kind_out)
                 )
             values.append(value)
         builder.call(function, values)
@@ -335,9 +335,9 @@ def walk_one_view(
         typing: numba's typing context.
         nodes: (N, 4) int32 packed nodes, see `_kernels`.
         root: index of the tree's root.
-        pixels: int16 height maps, and behind them the samples' scalars.
-        base: (n,) int32 where each sample's height map begins in pixels.
-        scalar_base: (n,) int32 where each sample's scalars begin in pixels.
+        pixels: int16 height maps, followed by the samples' scalars.
+        base: (n,) int32 start of each sample's height map in pixels.
+        scalar_base: (n,) int32 start of each sample's scalars in pixels.
         inverse: (n,) float32 home size over the animal's size.
         views: (9, n) float32 linearised projections.
         stride: n, the length of a row of views.
@@ -364,7 +364,7 @@ def walk_views(
     leaf: Any,
     first: Any,
 ) -> Any:
-    """Descend one tree with LANES samples, whose nodes choose among several views of a sample.
+    """Descend one tree with LANES samples, whose nodes choose among multiple views of a sample.
 
     Arrays are contiguous; nothing is checked.
 
@@ -372,9 +372,9 @@ def walk_views(
         typing: numba's typing context.
         nodes: (N, 4) int32 packed nodes, see `_kernels`.
         root: index of the tree's root.
-        pixels: int16 height maps, and behind them the samples' scalars.
-        base: (n,) int32 where each sample's height map begins in pixels.
-        scalar_base: (n,) int32 where each sample's scalars begin in pixels.
+        pixels: int16 height maps, followed by the samples' scalars.
+        base: (n,) int32 start of each sample's height map in pixels.
+        scalar_base: (n,) int32 start of each sample's scalars in pixels.
         inverse: (n,) float32 home size over the animal's size.
         views: (n, V, 9) float32 linearised projections.
         stride: 9 V, the length of a sample's views.

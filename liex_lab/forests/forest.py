@@ -6,8 +6,8 @@ the forest predicts the mean over trees,
 
     y(x) = 1/T sum_t leaf_t(x).
 
-The paper takes the mean-shift mode of the trees' votes instead; that is done where the votes are
-used (`estimation._cascade_kernels.mode_of_votes`).
+The paper uses the mean-shift mode of the trees' votes instead, see
+`estimation._cascade_kernels.mode_of_votes`.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class Forest:
 
     @cached_property
     def reads(self) -> tuple[int, int]:
-        """How many views and how many scalars of a sample its tests read."""
+        """Number of views and of scalars of a sample that its tests read."""
         tests = self.nodes[self.nodes[:, 2] >= 0, 3]
         scalar = (tests & 3) == SCALAR
         n_views, n_scalars = (
@@ -73,13 +73,8 @@ class Forest:
 
     @staticmethod
     def join(forests: list[Forest]) -> Forest:
-        """Join several forests into one of all their trees.
-
-        Args:
-            forests: forests whose leaves have equally many values.
-
-        Returns:
-            The forest; its prediction is the mean over all the trees.
+        """Join forests, with equally many values per leaf, into one of all their trees; its
+        prediction is the mean over all the trees.
         """
         nodes = []
         roots = []
@@ -101,42 +96,42 @@ class Forest:
 
 
 def check_roots(roots: NDArray[Any], is_leaf: NDArray[np.bool_]) -> None:
-    """Check where trees begin among nodes that lie tree by tree in the order of growth.
+    """Check the roots of trees whose nodes are stored tree by tree in the order of growth.
 
-    `_kernels.number_nodes` writes wherever it is sent, so this comes before it: a binary tree of m
-    leaves has m - 1 other nodes.
+    `_kernels.number_nodes` does not check its indices, so this has to run before it: a binary tree
+    of m leaves has m - 1 other nodes.
 
     Args:
         roots: (T,) index of each tree's root.
         is_leaf: (n,) which nodes are leaves.
 
     Raises:
-        ValueError: what is wrong, as a part of a sentence.
+        ValueError: the error, as a part of a sentence.
     """
     n = len(is_leaf)
     if roots.ndim != 1 or roots.dtype.kind != "i" or not len(roots):
-        raise ValueError("its roots are no list of whole numbers")
+        raise ValueError("its roots are not a list of integers")
     starts = np.append(roots.astype(np.int64), n)
     if starts[0] != 0 or not (np.diff(starts) > 0).all():
         raise ValueError(f"its roots do not rise from 0 to its {n} nodes")
     leaves = np.add.reduceat(is_leaf, roots.astype(np.int64), dtype=np.int64)
     if not np.array_equal(2 * leaves - 1, np.diff(starts)):
-        raise ValueError("its nodes do not make whole trees")
+        raise ValueError("its nodes do not form complete trees")
 
 
 def check_forest(forest: Forest, n_views: int, n_scalars: int, n_values: int) -> None:
-    """Check every index in a forest that came from a file, before a kernel follows it.
+    """Check every index in a forest from a file, before a kernel follows it.
 
-    Children lie behind their parent, so that each descent ends.
+    Children are stored after their parent, so that each descent ends.
 
     Args:
         forest: the forest.
-        n_views: views that its samples have.
-        n_scalars: scalars that they have.
+        n_views: views of its samples.
+        n_scalars: scalars of its samples.
         n_values: values of a leaf.
 
     Raises:
-        ValueError: what is wrong, as a part of a sentence.
+        ValueError: the error, as a part of a sentence.
     """
     nodes = forest.nodes
     roots = forest.roots
@@ -155,46 +150,46 @@ def check_forest(forest: Forest, n_views: int, n_scalars: int, n_values: int) ->
     at = np.flatnonzero(word2 >= 0)
     child = word2[at]
     if (child <= at).any() or child.max(initial=-1) >= len(nodes) - 1:
-        raise ValueError("a child does not lie behind its parent among the nodes")
+        raise ValueError("a child does not follow its parent among the nodes")
     if -1 - int(word2.min()) >= len(leaves):
         raise ValueError(f"a node names a leaf beyond the {len(leaves)} there are")
     tests = nodes[at, 3]
     kind = tests & 3
     if kind.max(initial=0) > _LAST_KIND:
-        raise ValueError("a test is of no known kind")
+        raise ValueError("a test is of an unknown kind")
     scalar = kind == SCALAR
     most = [tests.max(where=each, initial=-1) >> 2 for each in (~scalar, scalar)]
     if tests.min(initial=0) < 0 or most[0] >= n_views or most[1] >= n_scalars:
         raise ValueError(
-            f"a test asks for more than the {n_views} views and {n_scalars} scalars there are"
+            f"a test reads more than the {n_views} views and {n_scalars} scalars there are"
         )
 
 
 def check_samples(forest: Forest, samples: Samples) -> None:
-    """Check that samples are as wide as the tests of a forest read.
+    """Check that samples contain all that the tests of a forest read.
 
     Args:
-        forest: the forest that is asked.
-        samples: the samples that it is asked about.
+        forest: the forest.
+        samples: its input.
 
     Raises:
-        ValueError: the samples have fewer views or scalars than a test names.
+        ValueError: the samples have fewer views or scalars than a test reads.
     """
     n_views, n_scalars = forest.reads
-    given = samples.views.shape[1], samples.scalars.shape[1]
-    if given[0] < n_views or given[1] < n_scalars:
+    width = samples.views.shape[1], samples.scalars.shape[1]
+    if width[0] < n_views or width[1] < n_scalars:
         raise ValueError(
             f"the forest reads {n_views} views and {n_scalars} scalars, but its samples have "
-            f"{given[0]} and {given[1]}; give it samples of the kind that it was grown on"
+            f"{width[0]} and {width[1]}; use samples of the kind that it was trained on"
         )
 
 
 @dataclass(frozen=True)
 class Samples:
-    """What a forest is trained on or asked about: n samples on a set of height maps.
+    """Input of a forest in training or prediction: n samples on a set of height maps.
 
     Attributes:
-        heights: (n_images, S, S) int16 height maps, 1/16 mm, 0 where there is no animal.
+        heights: (n_images, S, S) int16 height maps, 1/16 mm, 0 outside the animal.
         image: (n,) int32 index of each sample's height map.
         inverse_size: (n,) float32 home size over the animal's size.
         views: (n, V, 9) float32 linearised projections of the sample's V joints, see `_kernels`.
@@ -208,7 +203,7 @@ class Samples:
     scalars: NDArray[np.float32]
 
     def __post_init__(self) -> None:
-        """Refuse arrays that do not fit together, for kernels do not check them."""
+        """Check that the shapes match, as kernels do not."""
         check_shapes(
             "samples",
             ("heights", self.heights, ("images", "S", "S")),
@@ -224,11 +219,7 @@ class Samples:
         return len(self.image)
 
     def __getitem__(self, index: NDArray[np.int64]) -> Samples:
-        """Select samples; the height maps stay the same.
-
-        Args:
-            index: (m,) rows to take.
-        """
+        """Select rows (m,); the height maps stay the same."""
         return Samples(
             self.heights,
             self.image[index],
@@ -239,11 +230,7 @@ class Samples:
 
     @staticmethod
     def join(parts: list[Samples]) -> Samples:
-        """Concatenate several sets of samples on the same height maps.
-
-        Args:
-            parts: the sets, in order; the height maps of the first are taken.
-        """
+        """Concatenate sets of samples on the same height maps, those of the first."""
         fields = ("image", "inverse_size", "views", "scalars")
         return Samples(
             parts[0].heights,
@@ -257,11 +244,11 @@ def predict(
     """Mean leaf value of each sample.
 
     Args:
-        forest: the forest to ask.
+        forest: the forest.
         samples: n samples.
-        in_bag: (T, n_images) bool, which images each tree was grown on. Trees that were grown on a
-            sample's image are left out (out-of-bag prediction), unless all of them were (METHOD
-            lesson 6); None asks all trees.
+        in_bag: (T, n_images) bool, the images each tree was grown on. Trees grown on a sample's
+            image are excluded (out-of-bag prediction), unless all of them were: predictions on
+            training images are otherwise too good to train a next stage on. None uses all trees.
 
     Returns:
         (n, D) float32 predictions.
@@ -290,7 +277,7 @@ def predict_each(forest: Forest, samples: Samples) -> NDArray[np.float32]:
     """Leaf value of each tree for each sample.
 
     Args:
-        forest: the forest to ask.
+        forest: the forest.
         samples: n samples.
 
     Returns:

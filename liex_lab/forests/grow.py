@@ -6,9 +6,9 @@ tried, and the one with the largest gain is kept:
     I = E(S) - |S_l|/|S| E(S_l) - |S_r|/|S| E(S_r),   E(S) = 1/|S| sum_i |y_i - mean(S)|^2
 
 (plain variance reduction; the paper's E is a sum). All tests are ranked on a small subsample of the
-node, and the best few again on a larger one. Bagging is by image, without replacement (METHOD
-lesson 6). `boost_forest` grows pairs of trees on the residuals of those before them (Friedman,
-Stochastic gradient boosting, 2002).
+node, and the best few again on a larger one. Bagging is by image, without replacement, so that
+out-of-bag predictions are independent of the image. `boost_forest` grows pairs of trees on the
+residuals of those before them (Friedman, Stochastic gradient boosting, 2002).
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from liex_lab.runtime.shapes import check_shapes
 
 _N_THRESHOLDS = 20
 _TREES_A_STAGE = 2
-# samples of the first and second look at a test; tests that get the second
+# samples of the first and second ranking; tests that reach the second
 _N_FIRST = 96
 _N_SECOND = 1500
 _N_KEPT = 12
@@ -42,7 +42,7 @@ _N_KEPT = 12
 
 @dataclass(frozen=True)
 class GrowthPlan:
-    """How trees are grown.
+    """Settings of tree growth.
 
     Shares are of the tests that are tried at a node; the rest compare two probes (Eq. 15).
 
@@ -54,12 +54,11 @@ class GrowthPlan:
             ones.
         one_probe_share: share of tests that compare one probe with the joint's own height.
         scalar_share: share of tests on a number that describes the whole animal.
-        depth_share: how far offsets reach along the joint's z axis, relative to their reach across
-            it.
-        bag_share: share of the images that a tree sees, drawn without replacement, all samples of
-            an image together (1: every tree sees all).
-        max_leaf: most samples of a leaf above the deepest level: a node with more is split by
-            whatever test separates it; 0 states no such number.
+        depth_share: range of offsets along the joint's z axis, relative to that across it.
+        bag_share: share of the images used by a tree, drawn without replacement, all samples of an
+            image together (1: every tree uses all).
+        max_leaf: most samples of a leaf above the deepest level: a node with more is split by any
+            test that separates it; 0 for no limit.
     """
 
     n_trees: int
@@ -90,7 +89,7 @@ class _SampleArrays(NamedTuple):
 
 
 class _Growth(NamedTuple):
-    """What of a `GrowthPlan` the kernels read."""
+    """The part of a `GrowthPlan` that the kernels read."""
 
     max_depth: int
     min_leaf: int
@@ -102,7 +101,7 @@ class _Growth(NamedTuple):
 
 
 class _Scratch(NamedTuple):
-    """Room for the samples that tests are tried on: their rows, responses and running sums."""
+    """Buffers for the samples that tests are tried on: their rows, responses and running sums."""
 
     chosen: Any
     labels: Any
@@ -122,18 +121,18 @@ def grow_forest(
 ) -> tuple[Forest, NDArray[np.bool_]]:
     """Grow a bagged regression forest.
 
-    Trees grow in parallel from seeds that are drawn here, so the forest does not depend on the
-    number of threads.
+    Trees grow in parallel from seeds drawn in advance, so the forest does not depend on the number
+    of threads.
 
     Args:
         samples: n samples with their features.
-        labels: (n, D) float32 labels; one unit weighs the same in every component.
+        labels: (n, D) float32 labels, of the same unit in every component.
         keep: (n,) bool, the samples to learn from.
         plan: size of the forest and its tests.
         rng: source of the bags and of the trees' seeds.
 
     Returns:
-        The forest, and (T, n_images) bool, which images each tree was grown on.
+        The forest, and (T, n_images) bool, the images each tree was grown on.
     """
     n_images = len(samples.heights)
     n = len(samples)
@@ -182,16 +181,16 @@ def boost_forest(
 ) -> Forest:
     """Grow a forest by stochastic gradient boosting of the squared error.
 
-    Each pair of trees is grown in parallel, on different bags of images, on the residuals that the
-    pairs before it left (Friedman 2002, with two trees a stage); of an odd number the last tree is
-    a stage by itself. Leaves are scaled so that the mean over trees, which is how every forest
-    predicts, is the boosted sum.
+    Each pair of trees is grown in parallel, on different bags of images, on the residuals of the
+    pairs before it (Friedman 2002, with two trees per stage); the last of an odd number of trees is
+    a stage by itself. Leaves are scaled so that the mean over trees, which is the prediction of
+    every forest, is the boosted sum.
 
     Args:
-        samples: n samples with their features; all are learned from.
+        samples: n samples with their features, all used for training.
         labels: (n, D) float32 labels.
         plan: size of the forest; n_trees counts all stages.
-        shrinkage: share of a pair's prediction that is taken off the residuals, in (0, 1].
+        shrinkage: share of a pair's prediction that is subtracted from the residuals, in (0, 1].
         rng: source of the bags and of the trees' seeds.
 
     Returns:
@@ -205,7 +204,7 @@ def boost_forest(
         n = min(_TREES_A_STAGE, plan.n_trees - first)
         stage, _ = grow_forest(samples, left, everything, replace(plan, n_trees=n), rng)
         left -= shrinkage * predict(stage, samples)
-        # the mean over all trees counts this stage's with n / n_trees
+        # the mean over all trees weights this stage's with n / n_trees
         share = np.float32(shrinkage * (plan.n_trees / n))
         trees.append(Forest(stage.nodes, stage.roots, stage.leaves * share + mean))
     return Forest.join(trees)
@@ -261,7 +260,7 @@ def _best_threshold(values, n, labels, min_share, sums, result):
         labels: (n, D) labels of the samples, likewise.
         min_share: smallest share of the samples that may go to one side.
         sums: (thresholds + 1, D + 1) scratch: running sums of labels and counts.
-        result: (2,) filled with the gain, -1 where there is none, and the threshold.
+        result: (2,) filled with the gain, -1 if absent, and the threshold.
     """
     result[0] = -1.0
     result[1] = 0.0
@@ -284,7 +283,7 @@ def _best_threshold(values, n, labels, min_share, sums, result):
         sums[b, n_labels] += 1.0
         for d in range(n_labels):
             sums[b, d] += labels[i, d]
-    # thresholds between which no sample lies split alike: the first of them stands for all
+    # thresholds with no sample between them split alike: the first represents all
     before = -1
     for b in range(_N_THRESHOLDS + 1):
         if sums[b, n_labels] == 0.0:
@@ -327,7 +326,7 @@ def _response(samples, s, test):
 def _respond(samples, n, tests, scratch, values):
     """Responses (tests, n) and labels of the first n of the chosen samples, sample by sample.
 
-    A sample's height map is fetched from memory once for all tests; test by test it would be gone
+    A sample's height map is loaded from memory once for all tests; test by test it would be evicted
     from the cache each time.
     """
     for i in range(n):
@@ -346,11 +345,11 @@ def _respond(samples, n, tests, scratch, values):
 
 @njit(cache=True)
 def _find_split(samples, growth, members, state, scratch, best):
-    """Find the test that a node keeps.
+    """Find the test of a node.
 
     All tests are ranked on at most 96 of the node's samples, the best 12 of them again on at most
-    1500. Writes words 0, 1 and 3 of the node and the threshold into best (4,); returns False when
-    no test separates the samples.
+    1500. Writes words 0, 1 and 3 of the node and the threshold into best (4,); returns False if no
+    test separates the samples.
     """
     n = members.size
     n_tests = growth.n_tests
@@ -374,7 +373,7 @@ def _find_split(samples, growth, members, state, scratch, best):
         gains[k] = -result[0]
         thresholds[k] = result[1]
     ranked = np.argsort(gains)
-    if n <= _N_FIRST:  # all of the node's samples were looked at
+    if n <= _N_FIRST:  # all of the node's samples were used
         k = ranked[0]
         if gains[k] > 0.0:
             return False
@@ -406,7 +405,7 @@ def _find_split(samples, growth, members, state, scratch, best):
 
 @njit(cache=True)
 def _keep(test, threshold, best):
-    """A test (3,) and its threshold into `best` (4,), as a node holds them."""
+    """Write a test (3,) and its threshold into `best` (4,), in the layout of a node."""
     best[0] = test[0]
     best[1] = test[1]
     best[2] = test[2]
@@ -415,7 +414,7 @@ def _keep(test, threshold, best):
 
 @njit(cache=True)
 def _part(samples, members, best):
-    """Partition `members` in place so that those that go left come first; returns how many do."""
+    """Partition `members` in place so that those that go left are first; returns their number."""
     left = 0
     right = members.size - 1
     while left <= right:
@@ -431,7 +430,7 @@ def _part(samples, members, best):
 def _grow_tree(samples, growth, members, seed, nodes, leaves, counts):
     """Grow one tree on the samples `members` into nodes and leaves, depth first.
 
-    counts (2,) gets how many nodes and leaves there are. `members` is reordered.
+    counts (2,) receives the numbers of nodes and leaves. `members` is reordered.
     """
     state = np.empty(1, np.uint64)
     state[0] = seed

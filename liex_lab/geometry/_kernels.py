@@ -2,7 +2,7 @@
 
     A = L L^T,   L y = b,   L^T x = y
 
-Matrices so small (at most some dozen rows) are not worth a call of LAPACK.
+Matrices this small (at most some dozen rows) do not justify a LAPACK call.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ def cholesky(a, factor, least):
     Args:
         a: (k, k), positive definite.
         factor: (k, k), its lower half filled with L; may be `a` itself.
-        least: what a square of the diagonal is raised to where it is smaller.
+        least: smaller squares of the diagonal are raised to this.
 
     Returns:
         Whether all squares of the diagonal are larger than `least`.
@@ -43,7 +43,7 @@ def substitute(factor, x):
 
     Args:
         factor: (k, k), L in its lower half.
-        x: (k,) holds b, and the solution afterwards.
+        x: (k,) b on entry, the solution on return.
     """
     n = x.size
     for i in range(n):

@@ -26,7 +26,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class SE3:
-    """Rigid transforms, one or a batch: `T_a_b` carries points of frame b into frame a.
+    """Rigid transforms, one or a batch: `T_a_b` transforms points of frame b to frame a.
 
     A tangent vector is (wx, wy, wz, vx, vy, vz), as in the paper: radians, then millimetres.
 
@@ -45,15 +45,11 @@ class SE3:
         cosine = (np.trace(self.rotation) - 1.0) / 2.0
         angle = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
         x, y, z = self.translation
-        return f"<SE3: turned by {angle:.1f} degrees, moved by ({x:.1f}, {y:.1f}, {z:.1f}) mm>"
+        return f"<SE3: rotated by {angle:.1f} degrees, moved by ({x:.1f}, {y:.1f}, {z:.1f}) mm>"
 
     @staticmethod
     def identity(*batch: int) -> SE3:
-        """The identity, or a batch of identities.
-
-        Args:
-            *batch: shape of the batch; none for one element.
-        """
+        """The identity, or a batch of identities of the given shape."""
         return SE3(np.broadcast_to(np.eye(3), (*batch, 3, 3)).copy(), np.zeros((*batch, 3)))
 
     @staticmethod
@@ -61,7 +57,7 @@ class SE3:
         """Rigid transforms from homogeneous matrices.
 
         Args:
-            matrix: (..., 4, 4); the last row is not looked at.
+            matrix: (..., 4, 4); the last row is ignored.
         """
         m = np.asarray(matrix, float)
         return SE3(m[..., :3, :3].copy(), m[..., :3, 3].copy())
@@ -90,7 +86,7 @@ class SE3:
         return SE3(transposed, -np.einsum("...ij,...j->...i", transposed, self.translation))
 
     def adjoint(self) -> Array:
-        """Adjoint matrices (..., 6, 6), which carry a twist of frame b into frame a.
+        """Adjoint matrices (..., 6, 6), which transform a twist of frame b to frame a.
 
         `exp(Ad xi) = g exp(xi) g^-1`.
         """
@@ -128,10 +124,11 @@ class SE3:
         )
 
     def geodesic(self, other: SE3, s: ArrayLike) -> SE3:
-        """The curve from self (s = 0) to other (s = 1); rotation and translation each go straight.
+        """The curve from self (s = 0) to other (s = 1); rotation and translation follow their own
+        geodesics.
 
         R(s) = R1 exp(s log(R1^T R2)), t(s) = t1 + s (t2 - t1) (Lie-X section 3). The paper's matrix
-        multiplies the translation by A, with which the end point is missed; it is left out here.
+        multiplies the translation by A, which misses the end point; it is omitted here.
 
         Args:
             other: the end point (...).
@@ -172,7 +169,7 @@ def brownian_steps(
     """Tangent steps z_k ~ N(0, covariance).
 
     Args:
-        rng: where chance comes from.
+        rng: random generator.
         covariance: (6, 6) in rad and mm, for one unit of time.
         n_steps: steps of one path.
         *batch: shape of the batch of paths.
@@ -218,7 +215,7 @@ def brownian_path(start: SE3, steps: ArrayLike, delta: float, times: ArrayLike) 
 
 
 def brownian_ends(start: SE3, steps: ArrayLike, delta: float, time: float) -> SE3:
-    """Where many paths g(t) are at one time, by Lie-X Eq. 6 and 7.
+    """Points of many paths g(t) at one time, by Lie-X Eq. 6 and 7.
 
     Args:
         start: a batch (n,), the elements g(0).

@@ -88,7 +88,7 @@ def exp(omega: ArrayLike) -> Array:
 def quaternion(rotation: ArrayLike) -> Array:
     """Unit quaternions of rotations.
 
-    Shepperd's method (1978): of the four squared components the largest is taken as pivot, so no
+    Shepperd's method (1978): the largest of the four squared components is the pivot, so no
     division is by a small number at any angle, pi included.
 
     Args:
@@ -126,9 +126,9 @@ def quaternion(rotation: ArrayLike) -> Array:
 def log(rotation: ArrayLike) -> Array:
     """Rotation vectors of rotations: the inverse of `exp`.
 
-    Goes through the quaternion and atan2, which keeps full precision near 0 and near pi, where the
-    arc cosine of the trace loses all of it. At exactly pi the two signs are the same rotation;
-    either may come out.
+    Uses the quaternion and atan2, which keep full precision near 0 and near pi, where the arc
+    cosine of the trace loses it. At exactly pi both signs are the same rotation; either may be
+    returned.
 
     Args:
         rotation: (..., 3, 3).
@@ -209,7 +209,7 @@ def mean(rotations: ArrayLike, weights: ArrayLike | None = None) -> Array:
 
     Args:
         rotations: (n, 3, 3).
-        weights: (n,); None weighs all alike.
+        weights: (n,); None for equal weights.
 
     Returns:
         (3, 3).

@@ -25,7 +25,7 @@ Array = NDArray[np.float64]
 BROWN_CONRADY = "brown_conrady"
 KANNALA_BRANDT = "kannala_brandt"
 _N_COEFFICIENTS = {BROWN_CONRADY: 8, KANNALA_BRANDT: 4}
-_MODELS = {  # as OpenCV, ROS and Foxglove call them; an empty name is ROS's usual model
+_MODELS = {  # names of OpenCV, ROS and Foxglove; an empty name is ROS's default model
     **dict.fromkeys(
         ("", "plumb_bob", "brown_conrady", "rational_polynomial", "opencv", "radtan"), BROWN_CONRADY
     ),
@@ -36,11 +36,10 @@ _WIDEST = 8.0  # tangent of the largest angle from the optical axis that is cons
 
 @dataclass(frozen=True)
 class Distortion:
-    """How a lens bends rays.
+    """Distortion of rays by a lens.
 
-    An ideal pinhole's ray (x, y, 1) meets the image where (x', y', 1) should.
-
-    `of` makes one from what a file states.
+    The ray (x, y, 1) of an ideal pinhole becomes the real ray (x', y', 1). `of` builds it from the
+    values stated in a file.
 
     Attributes:
         model: 'brown_conrady' or 'kannala_brandt'.
@@ -49,7 +48,7 @@ class Distortion:
             fisheye lens (ROS: equidistant).
 
     Raises:
-        LiexError: an unknown model, or coefficients that are not finite or not as many as it has.
+        LiexError: an unknown model, coefficients that are not finite, or a wrong number of them.
     """
 
     model: str
@@ -66,15 +65,15 @@ class Distortion:
 
     @staticmethod
     def of(model: str, coefficients: Sequence[float]) -> Distortion | None:
-        """The distortion that a file states; None where all coefficients are zero.
+        """The distortion stated in a file; None if all coefficients are zero.
 
         Args:
-            model: as OpenCV, ROS or Foxglove call it, in any case; an empty name is plumb_bob.
-            coefficients: in OpenCV's order; those that are left out at the end are zero. OpenCV's
-                thin prism (beyond the eighth) is refused unless zero.
+            model: name of OpenCV, ROS or Foxglove, in any case; an empty name is plumb_bob.
+            coefficients: in OpenCV's order; missing trailing ones are zero. OpenCV's thin prism
+                (beyond the eighth) is refused unless zero.
 
         Raises:
-            LiexError: a model that is not known, or too many coefficients.
+            LiexError: an unknown model, or too many coefficients.
         """
         values = [float(value) for value in coefficients]
         name = model.strip().lower().replace("-", "_").replace(" ", "_")
@@ -82,32 +81,30 @@ class Distortion:
             return None
         if name not in _MODELS:
             raise LiexError(
-                f"the lens distortion model '{model}' is not known; state it as plumb_bob, "
-                "rational_polynomial or equidistant, or set all its coefficients to 0 where it "
-                "does not matter"
+                f"the lens distortion model '{model}' is not supported; state it as plumb_bob, "
+                "rational_polynomial or equidistant, or set all its coefficients to 0 if it is "
+                "negligible"
             )
         n = _N_COEFFICIENTS[_MODELS[name]]
         if any(values[n:]):
             raise LiexError(
                 f"the lens distortion model '{model}' has up to {n} coefficients here, got "
-                f"{len(values)}: {values}; calibrate the lens with fewer, or leave the others out"
+                f"{len(values)}: {values}; calibrate the lens with fewer, or omit the others"
             )
         return Distortion(_MODELS[name], tuple((values + [0.0] * n)[:n]))
 
     @cached_property
     def limit(self) -> float:
-        """The radius of (x, y) up to which what is farther out stays farther out.
+        """The radius of (x, y) up to which the distorted radius increases monotonically.
 
-        Beyond it the model is no lens any more.
+        The model is invalid beyond it.
         """
         r = np.linspace(0.0, _WIDEST, 4001)
         turned = np.flatnonzero(~(np.diff(self._radius(r)) > 0))
         return float(r[turned[0]]) if len(turned) else _WIDEST
 
     def _radius(self, r: Array) -> Array:
-        """Where a ray at radius r (...) of the ideal image meets the real one, without the
-        tangential part.
-        """
+        """The distorted radius of rays at radius r (...), without the tangential part."""
         k = self.coefficients
         if self.model == KANNALA_BRANDT:
             angle = np.arctan(r)
@@ -120,7 +117,7 @@ class Distortion:
         )
 
     def distort(self, xy: ArrayLike) -> Array:
-        """Where the lens sends ideal rays; NaN beyond `limit`.
+        """Distort ideal rays; NaN beyond `limit`.
 
         Args:
             xy: (..., 2) rays at z = 1.
@@ -146,7 +143,7 @@ class Distortion:
         )
 
     def undistort(self, xy: ArrayLike) -> Array:
-        """The ideal rays that met the image at given points; NaN where none within `limit` does.
+        """The ideal rays of distorted ones; NaN if there is none within `limit`.
 
         The radius by bisection of the radial part, which increases, then Newton's steps for the
         small tangential one.
@@ -157,8 +154,8 @@ class Distortion:
         Returns:
             (..., 2) ideal rays at z = 1.
         """
-        seen = np.asarray(xy, float)
-        target = np.linalg.norm(seen, axis=-1)
+        bent_xy = np.asarray(xy, float)
+        target = np.linalg.norm(bent_xy, axis=-1)
         low = np.zeros_like(target)
         high = np.full_like(target, self.limit)
         for _ in range(50):
@@ -166,13 +163,15 @@ class Distortion:
             below = self._radius(middle) < target
             low = np.where(below, middle, low)
             high = np.where(below, high, middle)
-        ideal = seen * (np.where(target > 1e-12, low / np.maximum(target, 1e-12), 1.0))[..., None]
+        ideal = (
+            bent_xy * (np.where(target > 1e-12, low / np.maximum(target, 1e-12), 1.0))[..., None]
+        )
         ideal = np.where(self._radius(low)[..., None] < target[..., None] - 1e-3, np.nan, ideal)
         right = np.array([1e-6, 0.0])
         down = np.array([0.0, 1e-6])
         for _ in range(8):
             bent = self.distort(ideal)
-            residual = bent - seen
+            residual = bent - bent_xy
             along_x = (self.distort(ideal + right) - bent) / 1e-6
             along_y = (self.distort(ideal + down) - bent) / 1e-6
             determinant = along_x[..., 0] * along_y[..., 1] - along_x[..., 1] * along_y[..., 0]
@@ -183,11 +182,11 @@ class Distortion:
                 along_x[..., 0] * residual[..., 1] - along_x[..., 1] * residual[..., 0]
             ) / determinant
             ideal = ideal - np.stack([move_x, move_y], axis=-1)
-        wrong = ~(np.linalg.norm(self.distort(ideal) - seen, axis=-1, keepdims=True) < 1e-9)
+        wrong = ~(np.linalg.norm(self.distort(ideal) - bent_xy, axis=-1, keepdims=True) < 1e-9)
         return np.where(wrong, np.nan, ideal)
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain numbers for session.json; `Distortion.of(**...)` makes it again."""
+        """Plain numbers for session.json, the arguments of `Distortion.of`."""
         return {"model": self.model, "coefficients": list(self.coefficients)}
 
     def __str__(self) -> str:
@@ -197,14 +196,14 @@ class Distortion:
 
 @dataclass(frozen=True)
 class Lens:
-    """The intrinsics of a camera, stated without the size of its images.
+    """The intrinsics of a camera without its image size.
 
     Attributes:
         fx: focal length along rows, px.
         fy: focal length along columns, px.
         cx: principal point, px; 0 is the centre of the first pixel.
         cy: principal point, px.
-        distortion: of the lens; None where it is straight.
+        distortion: of the lens; None without distortion.
 
     Raises:
         LiexError: a focal length that is not positive, or a number that is not finite.
@@ -229,16 +228,16 @@ class Lens:
 
 @dataclass(frozen=True)
 class Camera(Lens):
-    """A depth camera: pinhole intrinsics, lens distortion, and the size of its images.
+    """A depth camera: pinhole intrinsics, lens distortion, and image size.
 
     Pixels; (0, 0) is the centre of the top-left pixel. Camera frame: x right, y down, z away from
-    the lens, mm. Only a recording as it was opened may have a distortion; what looks at images
-    wants an ideal pinhole and gets it from `recordings.rectify`.
+    the lens, mm. Only an unprocessed recording may have a distortion; all analysis requires an
+    ideal pinhole, provided by `recordings.rectify`.
 
     Attributes:
         width: px.
         height: px.
-        source: names where the intrinsics come from.
+        source: origin of the intrinsics.
 
     Raises:
         LiexError: an image without pixels, or intrinsics that `Lens` refuses.
@@ -252,12 +251,12 @@ class Camera(Lens):
         super().__post_init__()
         if not (self.width > 0 and self.height > 0):
             raise LiexError(
-                f"a picture has at least one pixel, got {self.width} x {self.height}; correct "
+                f"an image has at least one pixel, got {self.width} x {self.height}; correct "
                 "width and height in camera.toml"
             )
 
     def project(self, p_camera: ArrayLike) -> Array:
-        """Pixels at which points are seen; NaN behind the lens.
+        """Pixels of points; NaN behind the lens.
 
         Args:
             p_camera: (..., 3) mm, camera frame.
@@ -275,7 +274,7 @@ class Camera(Lens):
         ]
 
     def unproject(self, uv: ArrayLike, depth: ArrayLike) -> Array:
-        """The points that pixels show at given depths.
+        """Points of pixels at given depths.
 
         Args:
             uv: (..., 2) px.
@@ -293,11 +292,7 @@ class Camera(Lens):
         return np.stack([x * z, y * z, z * np.ones_like(u)], axis=-1)
 
     def every(self, stride: int) -> Camera:
-        """The camera whose image is every `stride`-th row and column of this one's.
-
-        Args:
-            stride: pixels from one to the next, at least 1.
-        """
+        """The camera of every `stride`-th row and column of the image."""
         if stride == 1:
             return self
         fx, fy, cx, cy = (value / stride for value in (self.fx, self.fy, self.cx, self.cy))
@@ -324,17 +319,12 @@ class Camera(Lens):
 
     @staticmethod
     def from_dict(numbers: dict[str, Any]) -> Camera:
-        """The camera that `to_dict` wrote.
-
-        Args:
-            numbers: its intrinsics, size, source, and distortion if any; other keys are passed
-                over.
-        """
-        known = {
+        """The camera that `to_dict` wrote; other keys are ignored."""
+        values = {
             name: numbers[name] for name in ("fx", "fy", "cx", "cy", "width", "height", "source")
         }
         bent = numbers.get("distortion")
-        return Camera(**known, distortion=Distortion.of(**bent) if bent else None)
+        return Camera(**values, distortion=Distortion.of(**bent) if bent else None)
 
 
 KINECT_V2 = Camera(365.0, 365.0, 255.5, 211.5, 512, 424, source="typical Kinect v2")
@@ -349,7 +339,7 @@ RAYTRIX_R5_WIDE = Camera(1800.0, 1800.0, 511.5, 511.5, 1024, 1024, source="R5, s
 RAYTRIX_R5_LONG = Camera(2900.0, 2900.0, 639.5, 639.5, 1280, 1280, source="R5, longer lens")
 
 
-# Depth cameras by name, for recordings that do not say what took them.
+# Depth cameras by name, for recordings that do not state their camera.
 
 
 _AZURE = Distortion(
@@ -358,7 +348,7 @@ _AZURE = Distortion(
 _FEMTO = Distortion(
     BROWN_CONRADY, (8.68957, 4.46817, 0.0, 0.0, 0.172922, 9.01699, 7.37854, 1.05598)
 )
-# of each name, one camera for each size of its images
+# for each name, one camera per image size
 PRESETS = {
     "kinect-v2": (KINECT_V2,),
     "primesense": (PRIMESENSE, PRIMESENSE_QVGA),
@@ -373,13 +363,13 @@ PRESETS = {
     "raytrix-r5": (RAYTRIX_R5,),
 }
 
-_LIKE = 0.1  # units of a make, and images mapped onto another lens, differ by less than this
-# sizes that few kinds of camera have; of others there are too many to call a lens unusual
-_TELLING = ((640, 480), (512, 424), (320, 240), (640, 576))
+_LIKE = 0.1  # specimens, and images mapped to another lens, differ by less
+# sizes of few kinds of camera; for others, no lens is unusual
+_DISTINCTIVE = ((640, 480), (512, 424), (320, 240), (640, 576))
 
 
 def preset(name: str, width: int, height: int) -> Camera:
-    """The camera of a name, for images of a size.
+    """The preset camera for images of a size.
 
     Args:
         name: a key of `PRESETS`.
@@ -387,7 +377,7 @@ def preset(name: str, width: int, height: int) -> Camera:
         height: rows of the images, px.
 
     Raises:
-        LiexError: there is no such name, or that camera takes no images of this size.
+        LiexError: there is no such name, or that camera has no images of this size.
     """
     cameras = PRESETS.get(name)
     if cameras is None:
@@ -409,18 +399,13 @@ def preset(name: str, width: int, height: int) -> Camera:
             )
     sizes = " or ".join(f"{camera.width} x {camera.height}" for camera in cameras)
     raise LiexError(
-        f"the camera '{name}' takes pictures of {sizes} px, but these have {width} x {height}; "
-        "name the camera that took them, or state fx, fy, cx and cy"
+        f"the camera '{name}' has images of {sizes} px, but these have {width} x {height}; "
+        "choose the recording's camera, or state fx, fy, cx and cy"
     )
 
 
 def of_size(width: int, height: int) -> list[str]:
-    """Names of the cameras that take images of a size.
-
-    Args:
-        width: columns of the images, px.
-        height: rows of the images, px.
-    """
+    """Names of the cameras with images of this width and height, px."""
     return [
         name
         for name, cameras in PRESETS.items()
@@ -429,69 +414,70 @@ def of_size(width: int, height: int) -> list[str]:
 
 
 def unusual_lens(camera: Camera) -> str:
-    """That a focal length is unlike that of every known camera with such images; "" if it is not.
+    """A warning if the focal length differs from all preset cameras with this image size; ""
+    otherwise.
 
-    A focal length that is wrong makes every length across the image wrong by as much, and the
-    animal another one of the same look: nothing else in a recording tells.
+    A wrong focal length scales all lengths across the image, and nothing else in a recording
+    reveals it.
 
     Args:
-        camera: as the recording or the plan states it, of images above no water.
+        camera: as stated by the recording or the plan, for images without water.
     """
     size = (camera.width, camera.height)
-    known = {
+    usual_px = {
         name: one.fx
         for name, cameras in PRESETS.items()
         for one in cameras
-        if (one.width, one.height) == size and size in _TELLING
+        if (one.width, one.height) == size and size in _DISTINCTIVE
     }
-    if not known or any(abs(camera.fx / fx - 1.0) <= _LIKE for fx in known.values()):
+    if not usual_px or any(abs(camera.fx / fx - 1.0) <= _LIKE for fx in usual_px.values()):
         return ""
-    usual = ", ".join(f"{name} {fx:.0f}" for name, fx in known.items())
+    usual = ", ".join(f"{name} {fx:.0f}" for name, fx in usual_px.items())
     return (
-        f"the focal length of {camera.fx:.0f} px is unlike that of the known cameras with pictures "
-        f"of {camera.width} x {camera.height} px ({usual}); where it is wrong, every length is: "
-        "put something of known length on the floor"
+        f"the focal length of {camera.fx:.0f} px differs from all preset cameras with images of "
+        f"{camera.width} x {camera.height} px ({usual}); if it is wrong, every length is wrong: "
+        "check it with an object of known length on the floor"
     )
 
 
 def is_central(cx: float, cy: float, width: int, height: int, share: float = 0.4) -> bool:
-    """Whether a principal point lies in the middle of an image.
+    """Whether a principal point is in the middle of an image.
 
     Args:
         cx: its column, px.
         cy: its row, px.
         width: columns of the image, px.
         height: rows of the image, px.
-        share: how much of the width and height the middle is.
+        share: relative size of the middle part.
     """
     off = max(abs((cx + 0.5) / width - 0.5), abs((cy + 0.5) / height - 0.5))
     return off <= share / 2
 
 
 def unusual_centre(camera: Camera) -> tuple[str, bool]:
-    """That a principal point lies far from the middle of the image, and whether at its edge.
+    """A warning if the principal point is far from the middle of the image.
 
     Args:
-        camera: as the recording or the plan states it.
+        camera: as stated by the recording or the plan.
 
     Returns:
-        A sentence, "" where it lies in the middle 40 %; True outside of the middle 80 %.
+        A sentence, "" inside the middle 40 %; and True outside of the middle 80 %.
     """
     where = (camera.cx, camera.cy, camera.width, camera.height)
     if is_central(*where):
         return "", False
     return (
-        f"the principal point ({camera.cx:.1f}, {camera.cy:.1f}) lies far from the middle of the "
-        f"picture of {camera.width} x {camera.height} px, as if cx and cy belonged to another "
-        "picture size or to a larger picture: lengths and the tilt are wrong if they do",
+        f"the principal point ({camera.cx:.1f}, {camera.cy:.1f}) is far from the middle of the "
+        f"image of {camera.width} x {camera.height} px, as if cx and cy belonged to another "
+        "image size or to a larger image: lengths and the tilt are wrong if they do",
         not is_central(*where, 0.8),
     )
 
 
-# What a recording says of its depth sensor: noise, steps, edges that are not read, mixed pixels.
+# Quality of a recording's depth sensor: noise, steps, unread edges, mixed pixels.
 
 
-_NONE_MM = 0.05  # no sensor is so quiet
+_QUIET_MM = 0.05  # no sensor is so quiet
 
 
 @dataclass(frozen=True)
@@ -499,11 +485,11 @@ class SensorCard:
     """The depth sensor of one recording.
 
     Attributes:
-        noise: (depth mm, standard deviation mm) from near to far, () where nothing keeps still.
-        step_mm: to which depth is rounded at the usual distance; None where no step shows.
-        seam_px: width of what is not read around the animal, pixels; None without an animal.
-        mixed_share: of readings at still edges, those that lie between both sides ("flying
-            pixels"), 0 to 1; None without such edges.
+        noise: (depth mm, standard deviation mm) from near to far, () if nothing is still.
+        step_mm: rounding step of depth at the usual distance; None if continuous.
+        seam_px: width of the unread seam around the animal, pixels; None without an animal.
+        mixed_share: share of readings at still edges between both sides ("flying pixels"), 0 to 1;
+            None without such edges.
     """
 
     noise: tuple[tuple[float, float], ...] = ()
@@ -516,25 +502,21 @@ class SensorCard:
         return asdict(self) | {"noise": [list(one) for one in self.noise]}
 
     @staticmethod
-    def from_dict(known: dict[str, Any]) -> SensorCard:
-        """The card that `to_dict` wrote.
-
-        Args:
-            known: section `scene.sensor` of session.json.
-        """
-        noise = tuple((float(depth), float(sd)) for depth, sd in known["noise"])
-        return SensorCard(noise, known["step_mm"], known["seam_px"], known["mixed_share"])
+    def from_dict(numbers: dict[str, Any]) -> SensorCard:
+        """The card that `to_dict` wrote, section `scene.sensor` of session.json."""
+        noise = tuple((float(depth), float(sd)) for depth, sd in numbers["noise"])
+        return SensorCard(noise, numbers["step_mm"], numbers["seam_px"], numbers["mixed_share"])
 
     def __str__(self) -> str:
-        """A line for a person."""
+        """One readable line."""
         noise = ", ".join(f"{sd:.1f} mm at {depth / 1000:.2f} m" for depth, sd in self.noise)
-        if self.noise and max(sd for _, sd in self.noise) < _NONE_MM:
-            noise = "none, as of pictures that were filtered or put together"
+        if self.noise and max(sd for _, sd in self.noise) < _QUIET_MM:
+            noise = "none, as of filtered or composed images"
         parts = [f"noise {noise or 'unknown'}"]
         if self.step_mm is not None:
             parts.append(f"steps of {self.step_mm:.2g} mm")
         if self.seam_px is not None:
             parts.append(f"{self.seam_px:.1f} px unread around the animal")
         if self.mixed_share is not None:
-            parts.append(f"{self.mixed_share:.0%} of readings at edges lie between both sides")
+            parts.append(f"{self.mixed_share:.0%} of readings at edges are between both sides")
         return ", ".join(parts)

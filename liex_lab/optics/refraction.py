@@ -1,22 +1,22 @@
-"""Refraction at a flat water surface by Snell's law: the true position of a point seen from air.
+"""Refraction at a flat water surface by Snell's law: the true position of a point observed from
+air.
 
 n sin r = sin i, with i and r the angles between ray and perpendicular in air and in water. A camera
-above the water sees every point in a wrong direction and reports a wrong depth. The direction is
-put right by following the camera's ray down. Which depth the camera reports, the *apparent* depth,
-depends on how it measures:
+above the water observes every point in a wrong direction and reports a wrong depth. The direction
+is corrected by tracing the camera's ray down. The depth that the camera reports, the *apparent*
+depth, depends on its principle:
 
 - `light_field` (plenoptic cameras, many small views in all directions) and `structured_light` (also
-  stereo; two views side by side along the image's rows) triangulate: the apparent point is where
-  the back-traced rays of neighbouring views intersect. Seen straight down that is at depth / n
-  below the surface. Obliquely the rays of a point meet in two places (refraction at a plane is
-  astigmatic): views displaced within the plane of incidence see it at d cos^3(i) / (n cos^3(r)),
-  views displaced across it at d tan(r) / tan(i), for a point d below the surface. A camera reports
-  the depth of which the disparity is the sum of both, each with the part of the displacement along
-  it; for a light field the mean over all directions is taken.
-- `time_of_flight` cameras report half the way that the light would have gone in air: the way in
-  water counts n times, so that things seem farther, not nearer. (n is that of the group velocity,
-  and near infrared is soon absorbed.)
-- `paraxial`: depth / n below the surface at every angle, the textbook's rule; for comparison.
+stereo; two views displaced along the image's rows) triangulate: the apparent point is where the
+back-traced rays of neighbouring views intersect. Straight down, that is at depth / n below the
+surface. Obliquely the rays of a point meet at two depths (refraction at a plane is astigmatic):
+views displaced within the plane of incidence see it at d cos^3(i) / (n cos^3(r)), views displaced
+across it at d tan(r) / tan(i), for a point d below the surface. A camera reports the depth whose
+disparity is the sum of both, each weighted with the part of the displacement along it; a light
+field uses the mean over all directions. - `time_of_flight` cameras report half the path of the
+light as if in air: the path in water counts n times, so that objects seem farther, not nearer. (n
+is that of the group velocity, and near infrared is soon absorbed.) - `paraxial`: depth / n below
+the surface at every angle, the textbook rule; for comparison.
 """
 
 from __future__ import annotations
@@ -33,19 +33,19 @@ from liex_lab.optics.camera import Camera
 Array = NDArray[np.float64]
 
 RANGINGS = ("light_field", "structured_light", "time_of_flight", "paraxial")
-N_LAW = 10  # numbers that say all about one ray
+N_LAW = 10  # numbers per ray
 _STEEPEST = 0.05  # cosine between a ray and the perpendicular; flatter rays do not reach the water
 
 
 @dataclass(frozen=True)
 class Water:
-    """A flat water surface that the camera looks down through.
+    """A flat water surface below the camera.
 
     Attributes:
         height_mm: of the lens above the surface, along the perpendicular.
         refractive_index: of water over air, at least 1.
-        tilt_x_rad: how the surface recedes from the camera towards the right of the image.
-        tilt_y_rad: how it recedes towards the lower edge of the image.
+        tilt_x_rad: slope of the surface away from the camera towards the right of the image.
+        tilt_y_rad: slope away from the camera towards the lower edge of the image.
         ranging: one of `RANGINGS`, see the module.
 
     Raises:
@@ -66,7 +66,7 @@ class Water:
         )
         if not (possible and np.isfinite(numbers).all() and self.ranging in RANGINGS):
             raise LiexError(
-                "a water surface lies a positive height_mm below the lens, with a "
+                "a water surface has a positive height_mm below the lens, a "
                 "refractive_index of at least 1, tilts below 1.2 rad and ranging "
                 f"{', '.join(RANGINGS)}, got {asdict(self)}; correct [water] in the plan"
             )
@@ -86,15 +86,16 @@ class Water:
         return (self.refractive_index - 1.0) * self.height_mm * self.normal
 
     def without(self, camera: Camera) -> Camera:
-        """The ideal camera, higher up, that sees without the water what this one sees through it.
+        """The ideal camera, higher up, that without the water has the same view as this one through
+        it.
 
-        Under water the rays that meet in the lens run, near the perpendicular, as if they met n
-        times as high above the surface. An ideal camera there (see `lift_mm`), with focal lengths n
-        times as long, sees everything from the same side and in the same pixel; off the
-        perpendicular a point moves a little towards the middle.
+        Under water the rays that meet in the lens continue, near the perpendicular, as if they met
+        n times as high above the surface. An ideal camera there (see `lift_mm`), with focal lengths
+        n times as long, sees everything from the same side and in the same pixel; away from the
+        perpendicular a point moves slightly towards the middle.
 
         Args:
-            camera: the real one, with a straight lens.
+            camera: the real one, without distortion.
         """
         n = self.refractive_index
         bent = self.law(np.zeros(2))[7:]
@@ -107,14 +108,14 @@ class Water:
         )
 
     def law(self, rays: ArrayLike) -> Array:
-        """What refraction does to rays: `N_LAW` numbers for each.
+        """The effect of refraction on rays: `N_LAW` numbers for each.
 
-        (a, b, c, k, sx, sy, sz, bx, by, bz): a point reported at apparent depth z lies d below the
+        (a, b, c, k, sx, sy, sz, bx, by, bz): a point reported at apparent depth z is d below the
         surface, where
 
             a d^2 + (b - c z) d = k z - 1,   if k z > 1,
 
-        else above the water and where it seems to be; and its position is (sx, sy, sz) + d (bx, by,
+        else above the water, at its apparent position; its position is (sx, sy, sz) + d (bx, by,
         bz), mm in the camera frame: the ray's own position on the surface, and its direction down.
         Rays flatter than 0.05 (cosine to the perpendicular) do not reach the water: k = 0.
 
@@ -171,13 +172,13 @@ class Water:
         """The parts (...) of the views' displacement within and across the plane of incidence of
         unit rays (..., 3).
 
-        They weigh the disparities: cos i / z' summed over both foci, z' being how far below the
-        lens each lies.
+        They weight the disparities: cos i / z' summed over both foci, z' being the distance of each
+        below the lens.
         """
         side = np.cross(self.normal, ray)
         straight_down = (
             np.linalg.norm(side, axis=-1, keepdims=True) < 1e-9
-        )  # where both foci are one
+        )  # where both foci coincide
         side = np.where(straight_down, np.cross([0.0, 1.0, 0.0], ray), side)
         side = side / np.linalg.norm(side, axis=-1, keepdims=True)
         along = np.cross(side, ray)
@@ -194,11 +195,11 @@ class Water:
         return within * share, across * share
 
     def true_points(self, rays: ArrayLike, depth: ArrayLike) -> Array:
-        """Where points truly are that are seen along rays at an apparent depth.
+        """True positions of points observed along rays at an apparent depth.
 
         Args:
             rays: (..., 2), the x and y of (x, y, 1), camera frame.
-            depth: (...) mm, as the camera reports it.
+            depth: (...) mm, as reported by the camera.
 
         Returns:
             (..., 3) mm, camera frame.

@@ -46,7 +46,7 @@ def test_the_other_familys_hands_are_thicker_or_thinner_than_any_trained_on() ->
 
 
 def test_an_unknown_family_is_refused() -> None:
-    with pytest.raises(LiexError, match="known are train, augmented, wide, other"):
+    with pytest.raises(LiexError, match="choose one of train, augmented, wide, other"):
         draw_hands(np.random.default_rng(0), HAND, "gloves", 1)
 
 

@@ -163,5 +163,5 @@ def test_the_tail_lies_on_the_floor_behind_the_animal() -> None:
 
 
 def test_an_unknown_family_is_refused() -> None:
-    with pytest.raises(LiexError, match="known are train, augmented, wide, other"):
+    with pytest.raises(LiexError, match="choose one of train, augmented, wide, other"):
         draw_shapes(np.random.default_rng(0), MOUSE, "rats", 1)

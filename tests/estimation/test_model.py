@@ -229,7 +229,7 @@ def test_roots_that_lead_outside_of_the_forest_are_refused(tmp_path, content, wh
         changed = roots.copy()
         changed[place] = root
         said = refusal(tmp_path, with_array(content, f"{which}_roots", changed))
-        assert "roots" in said or "whole trees" in said
+        assert "roots" in said or "complete trees" in said
 
 
 @pytest.mark.parametrize("which", ["000", "003", "007"])

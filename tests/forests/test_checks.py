@@ -56,7 +56,7 @@ def test_a_sound_forest_passes():
 @pytest.mark.parametrize("second", [-1, 0, 4, 6, 8, 2**30, -(2**31)])
 def test_roots_that_do_not_begin_whole_trees_are_refused(first, second):
     for roots in ([first, 5], [0, second], [first, second]):
-        with pytest.raises(ValueError, match=r"roots|whole trees"):
+        with pytest.raises(ValueError, match=r"roots|complete trees"):
             check_roots(np.array(roots, np.int32), IS_LEAF)
 
 
@@ -64,7 +64,7 @@ def test_roots_that_do_not_begin_whole_trees_are_refused(first, second):
     "roots", [np.zeros(0, np.int32), np.zeros((1, 1), np.int32), np.array([0.0, 5.0]), ROOTS[:1]]
 )
 def test_roots_of_another_kind_are_refused(roots):
-    with pytest.raises(ValueError, match=r"roots|whole trees"):
+    with pytest.raises(ValueError, match=r"roots|complete trees"):
         check_roots(roots, IS_LEAF)
 
 

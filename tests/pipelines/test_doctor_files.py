@@ -67,7 +67,7 @@ def test_a_named_camera_makes_pictures_readable_and_its_size_is_checked(tmp_path
     with open_planned(folder, named.with_settings(["camera.fx=364.0"])) as recording:
         assert recording.camera.fx == 364.0, "what is stated goes before the preset"
     wrong = named.with_settings(["camera.preset=azure-nfov"])
-    with pytest.raises(LiexError, match="takes pictures of 640 x 576 px, but these have 512 x 424"):
+    with pytest.raises(LiexError, match="has images of 640 x 576 px, but these have 512 x 424"):
         open_planned(folder, wrong)
 
 
@@ -103,7 +103,7 @@ def test_a_focal_length_that_no_known_camera_has_is_told(tmp_path: Path, factor:
     lens = {"fx": 365.0 * factor, "fy": 365.0 * factor, "cx": 255.5, "cy": 211.5}
     stated = [*(f"camera.{name}={value!r}" for name, value in lens.items()), "recording.fps=30.0"]
     found = examine(pictures(tmp_path / "p"), Plan().with_settings(stated))
-    assert any("is unlike that of the known cameras" in one for one in found["problems"])
+    assert any("differs from all preset cameras" in one for one in found["problems"])
 
 
 def test_doctor_proposes_the_plan_and_says_what_to_run_next(

@@ -158,7 +158,7 @@ def test_a_preset_of_another_resolution_is_told_by_the_commands(command, tmp_pat
     )
     assert said.exit_code != 0
     told = " ".join(f"{said.output}{said.exception}".split())
-    assert "takes pictures of 640 x 576 px, but these have 512 x 424" in told
+    assert "has images of 640 x 576 px, but these have 512 x 424" in told
     assert "Traceback" not in told
     assert not list(tmp_path.iterdir())
 

@@ -78,8 +78,8 @@ def test_a_card_is_read_back_as_it_was_written_and_says_itself():
     assert SensorCard.from_dict(card.to_dict()) == card
     assert str(card) == (
         "noise 1.2 mm at 0.65 m, 2.5 mm at 0.90 m, steps of 2 mm, 0.4 px unread around the animal, "
-        "7% of readings at edges lie between both sides"
+        "7% of readings at edges are between both sides"
     )
     assert str(SensorCard()) == "noise unknown"
-    filtered = "noise none, as of pictures that were filtered or put together"
+    filtered = "noise none, as of filtered or composed images"
     assert str(SensorCard(((650.0, 0.0),))) == filtered
