@@ -30,7 +30,7 @@ from liex_lab.baselines.baseline import DAMAGE, Guesses, see
 from liex_lab.baselines.patches import frames_of, joints_of, patches_of, targets_of
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.errors import MissingPackageError, ModelError
-from liex_lab.estimation.training import Tell, TrainingSet
+from liex_lab.estimation.training import ProgressCallback, TrainingSet
 from liex_lab.runtime.threads import threads
 from liex_lab.scene.height_maps import HeightMaps, in_camera_frame
 from liex_lab.scene.segmenter import Segmenter
@@ -287,7 +287,11 @@ def _channels(patches: NDArray[np.float32]) -> torch.Tensor:
 
 
 def train_cnn(
-    data: TrainingSet, skeleton: Skeleton, plan: CnnPlan, rng: np.random.Generator, tell: Tell
+    data: TrainingSet,
+    skeleton: Skeleton,
+    plan: CnnPlan,
+    rng: np.random.Generator,
+    tell: ProgressCallback,
 ) -> Cnn:
     """Train the network from scratch with AdamW and a one-cycle learning rate.
 

@@ -34,7 +34,7 @@ from liex_lab.baselines.baseline import DAMAGE, Guesses, see
 from liex_lab.body.kinematics import KinematicTree, forward_kinematics
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.errors import ModelError
-from liex_lab.estimation.training import Tell, TrainingSet
+from liex_lab.estimation.training import ProgressCallback, TrainingSet
 from liex_lab.forests._kernels import VIEW
 from liex_lab.forests.forest import Forest, Samples, check_forest
 from liex_lab.forests.grow import GrowthPlan, grow_forest
@@ -305,7 +305,11 @@ def _voting(forest: Forest) -> kernels.VotingForest:
 
 
 def train_forests(
-    data: TrainingSet, skeleton: Skeleton, plan: ForestPlan, rng: np.random.Generator, tell: Tell
+    data: TrainingSet,
+    skeleton: Skeleton,
+    plan: ForestPlan,
+    rng: np.random.Generator,
+    tell: ProgressCallback,
 ) -> RegressionForest:
     """Grow F1, then F2 on where F1 puts images that its trees were not grown on.
 

@@ -43,7 +43,7 @@ _HUGE = 1e9  # no number of a skeleton is as large
 
 
 @dataclass(frozen=True)
-class View:
+class CameraView:
     """How an animal is viewed: the [view] table of its TOML.
 
     Attributes:
@@ -68,7 +68,7 @@ class View:
     foreground: str = FOREGROUNDS[0]
 
     @staticmethod
-    def from_table(table: dict[str, Any], relative_size: float, origin: str) -> View:
+    def from_table(table: dict[str, Any], relative_size: float, origin: str) -> CameraView:
         """The view stated in a TOML; omitted values are derived from the animal's size.
 
         Args:
@@ -79,7 +79,7 @@ class View:
         Raises:
             LiexError: an unknown key, or a value out of its range.
         """
-        keys = View.__annotations__
+        keys = CameraView.__annotations__
         if not isinstance(table, dict):
             raise LiexError(f"{origin}: [view] is a table, got {table!r}")
         for key in table:
@@ -116,12 +116,12 @@ class View:
             if not (_is_number(value) and value > 0):
                 raise LiexError(f"{origin}: [view] {key} is a positive number of mm, got {value!r}")
             lengths[key] = float(value)
-        return View(
+        return CameraView(
             frame=frame, area=(float(area[0]), float(area[1])), foreground=foreground, **lengths
         )
 
 
-MOUSE_VIEW = View()
+MOUSE_VIEW = CameraView()
 
 
 @dataclass(frozen=True)
@@ -152,7 +152,7 @@ class Skeleton:
     axes: NDArray[np.bool_]
     limits: Array
     surface: dict[str, Any]
-    view: View
+    view: CameraView
     table: dict[str, Any] = field(default_factory=dict, repr=False, compare=False)
 
     def __repr__(self) -> str:
@@ -239,7 +239,7 @@ class Skeleton:
             axes=axes,
             limits=np.radians([row.limits for row in rows]),
             surface=surface,
-            view=View.from_table(table.get("view", {}), relative_size, origin),
+            view=CameraView.from_table(table.get("view", {}), relative_size, origin),
             table=table,
         )
 

@@ -2,8 +2,8 @@
 
 Joint by joint, base first, and round by round, g_{1:j} <- g_{1:j} exp(r) with r from a regression
 forest (Eq. 10). A forest predicts the mean of its trees' votes or their mean-shift mode (the
-paper's Hough votes). A thread takes `FRAMES` frames at once. Their candidates walk down each tree
-together, LANES at a time, so that a tree stays in the cache and no vector register idles.
+paper's Hough votes). A thread processes `FRAMES` frames at once. Their candidates descend each tree
+together, LANES at a time, so that a tree stays in the cache and all vector registers are used.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ FRAMES = 8
 _SHIFTS = 4  # mean-shift steps; the mode of ten votes settles within these
 
 
-class SeenFrames(NamedTuple):
+class FrameBatch(NamedTuple):
     """The height maps of n frames.
 
     Attributes:
@@ -62,13 +62,13 @@ class CandidatePoses(NamedTuple):
 
 
 class Trees(NamedTuple):
-    """Several forests in one node array.
+    """Forests in one node array.
 
     Attributes:
         nodes: (N, 4) int32 packed nodes, see `forests._kernels`.
         roots: (F, T) root of each tree of each forest.
         leaves: float32 leaf values of all forests, in one row.
-        bases: (F,) where each forest's leaves begin.
+        bases: (F,) start of each forest's leaves.
         widths: (F,) number of values of a leaf.
     """
 
@@ -80,18 +80,18 @@ class Trees(NamedTuple):
 
 
 class CascadeSettings(NamedTuple):
-    """The method's numbers for the cascade.
+    """The method's settings of the cascade.
 
     Attributes:
         base_rounds: regression rounds of the base joint.
         rounds: regression rounds C of the other joints.
-        reach: (J,) how far feature offsets reach from each joint, mm at home size.
+        reach: (J,) range of feature offsets from each joint, mm at home size.
         base_lever: lever arm of the base's rotation, mm.
         joint_lever: lever arm of the other joints' rotations, mm.
         scale_lever: lever arm of the log scale, mm.
         bandwidth: of the mean shift over tree votes, regressors' and metric's, in label units; 0
-            takes the mean.
-        keep: candidates that are kept after the base joint.
+            for the mean.
+        keep: candidates kept after the base joint.
         solved: the joints with regressors, in order, base first.
     """
 
@@ -107,9 +107,9 @@ class CascadeSettings(NamedTuple):
 
 
 class _Lanes(NamedTuple):
-    """Inputs of the forests for n candidates, one to a lane, see `forests._walk`.
+    """Inputs of the forests for n candidates, one per lane, see `forests._walk`.
 
-    frame (n,) and pose (n,) say which candidate of which frame a lane holds.
+    frame (n,) and pose (n,) identify the candidate of each lane.
     """
 
     pixels: Any
@@ -171,7 +171,7 @@ def modes_of_votes(votes, bandwidth, modes):
 def _predict(trees, forest, lanes, n, n_views, side, bandwidth, out):
     """A forest's prediction for n lanes into out (n, width): mean or mean-shift mode of the votes.
 
-    n_views: number of views of a lane; 0 where all nodes use the only one.
+    n_views: views per lane; 0 if all nodes use the only one.
     """
     width = trees.widths[forest]
     leaf_base = trees.bases[forest]
@@ -236,11 +236,11 @@ def _write_scalars(lanes, k, first, scalars):
 
 
 @njit(cache=True)
-def _see(lanes, n, joint, seen, reach, candidates):
-    """Fill the lanes' only view, as seen from one joint, and their scalars."""
+def _fill_inputs(lanes, n, joint, batch, reach, candidates):
+    """Fill the lanes' only view, from one joint, and their scalars."""
     rotations = candidates.rotations
     positions = candidates.positions
-    size = seen.size
+    size = batch.size
     n_lanes = lanes.base.size
     view = np.empty(VIEW, np.float32)
     scalars = np.empty(N_SCALARS, np.float32)
@@ -250,7 +250,7 @@ def _see(lanes, n, joint, seen, reach, candidates):
         fill_view(
             rotations[i, k, joint],
             positions[i, k, joint],
-            seen.crop_cameras[i],
+            batch.crop_cameras[i],
             size,
             reach[joint],
             view,
@@ -261,7 +261,7 @@ def _see(lanes, n, joint, seen, reach, candidates):
             rotations[i, k, joint],
             positions[i, k, joint],
             candidates.scales[i, k],
-            seen.moments[i],
+            batch.moments[i],
             size,
             scalars,
         )
@@ -269,12 +269,12 @@ def _see(lanes, n, joint, seen, reach, candidates):
 
 
 @njit(cache=True)
-def _see_all(lanes, n, seen, reach, body, candidates):
+def _fill_all_inputs(lanes, n, batch, reach, body, candidates):
     """Fill the lanes' views from all joints, their scalars, and the residuals of the posed body."""
     rotations = candidates.rotations
     positions = candidates.positions
     scales = candidates.scales
-    size = seen.size
+    size = batch.size
     n_joints = positions.shape[2]
     view = np.empty(VIEW, np.float32)
     scalars = np.empty(N_SCALARS, np.float32)
@@ -286,7 +286,7 @@ def _see_all(lanes, n, seen, reach, body, candidates):
             fill_view(
                 rotations[i, k, joint],
                 positions[i, k, joint],
-                seen.crop_cameras[i],
+                batch.crop_cameras[i],
                 size,
                 reach[joint],
                 view,
@@ -294,14 +294,14 @@ def _see_all(lanes, n, seen, reach, body, candidates):
             for c in range(VIEW):
                 lanes.views[(s * n_joints + joint) * VIEW + c] = view[c]
         fill_scalars(
-            rotations[i, k, 0], positions[i, k, 0], scales[i, k], seen.moments[i], size, scalars
+            rotations[i, k, 0], positions[i, k, 0], scales[i, k], batch.moments[i], size, scalars
         )
         _write_scalars(lanes, s, 0, scalars)
         if body.radius.size > 0:
             explain_pose(
-                seen.heights[i],
-                seen.crop_cameras[i],
-                seen.moments[i, ANGLE],
+                batch.heights[i],
+                batch.crop_cameras[i],
+                batch.moments[i, ANGLE],
                 rotations[i, k],
                 positions[i, k],
                 scales[i, k],
@@ -316,7 +316,7 @@ def _see_all(lanes, n, seen, reach, body, candidates):
 def _lanes_for(heights, frames, n_poses, n_joints, size):
     """Lanes for n_poses candidates of each of the frames.
 
-    The frames' height maps lie one after the other in the lanes' pixels.
+    The frames' height maps are consecutive in the lanes' pixels.
     """
     side = heights.shape[1]
     n = frames.size * n_poses
@@ -347,10 +347,10 @@ def _lanes_for(heights, frames, n_poses, n_joints, size):
 
 @njit(cache=True)
 def choose_survivors(rotations, scores, chosen):
-    """Choose which candidates are kept after the base joint.
+    """Choose the candidates to keep after the base joint.
 
-    They are those with the lowest scores, and in any case the best one that points the other way,
-    for the whole chain tells head from tail better than the base alone.
+    They are those with the lowest scores, and always the best one in the opposite direction, as the
+    whole chain distinguishes head and tail better than the base alone.
 
     Args:
         rotations: (K, 3, 3) rotations of the base.
@@ -381,12 +381,12 @@ def choose_survivors(rotations, scores, chosen):
 
 
 @njit(cache=True)
-def _solve_joint(joint, j, tree, regressors, tuning, lanes, n, seen, candidates, values):
+def _solve_joint(joint, j, tree, regressors, tuning, lanes, n, batch, candidates, values):
     """All regression rounds of one joint, the j-th solved one, for n lanes."""
     rotations = candidates.rotations
     positions = candidates.positions
     scales = candidates.scales
-    side = seen.heights.shape[1]
+    side = batch.heights.shape[1]
     for s in range(n):
         if joint > 0:
             i = lanes.frame[s]
@@ -395,7 +395,7 @@ def _solve_joint(joint, j, tree, regressors, tuning, lanes, n, seen, candidates,
     first = 0 if j == 0 else tuning.base_rounds + (j - 1) * tuning.rounds
     for c in range(tuning.base_rounds if j == 0 else tuning.rounds):
         forest = first + c
-        _see(lanes, n, joint, seen, tuning.reach, candidates)
+        _fill_inputs(lanes, n, joint, batch, tuning.reach, candidates)
         _predict(regressors, forest, lanes, n, np.int64(0), side, tuning.bandwidth, values)
         for s in range(n):
             i = lanes.frame[s]
@@ -411,32 +411,32 @@ def _solve_joint(joint, j, tree, regressors, tuning, lanes, n, seen, candidates,
                 values[s, 6] / tuning.scale_lever if regressors.widths[forest] > 6 else 0.0
             )
             scales[i, k] = correct_base(
-                rotations[i, k, 0], positions[i, k, 0], scales[i, k], values[s], seen.size
+                rotations[i, k, 0], positions[i, k, 0], scales[i, k], values[s], batch.size
             )
 
 
 @njit(cache=True)
 def _estimate_block(
-    seen, frames, tree, regressors, pruner, metric, tuning, body, starts, poses, scores
+    batch, frames, tree, regressors, pruner, metric, tuning, body, starts, poses, scores
 ):
-    """Run the candidates of a few frames through cascade, pruner and metric.
+    """Process the candidates of a few frames by cascade, pruner and metric.
 
-    `starts` holds their bases and is changed; `poses` gets the surviving candidates and `scores`
-    theirs.
+    `starts` contains their bases and is changed; `poses` receives the surviving candidates and
+    `scores` their scores.
     """
-    heights = seen.heights
+    heights = batch.heights
     side = heights.shape[1]
     n_joints = poses.positions.shape[2]
     n_starts = starts.scales.shape[1]
-    lanes = _lanes_for(heights, frames, n_starts, 1, seen.size)
+    lanes = _lanes_for(heights, frames, n_starts, 1, batch.size)
     n = frames.size * n_starts
     values = np.empty((lanes.base.size, 7))
-    # typed as numbers: a kernel is compiled anew for every literal
+    # typed as numbers: a kernel would be compiled for every literal
     first = np.int64(0)
     no_view = np.int64(0)
-    _solve_joint(tuning.solved[0], first, tree, regressors, tuning, lanes, n, seen, starts, values)
+    _solve_joint(tuning.solved[0], first, tree, regressors, tuning, lanes, n, batch, starts, values)
     if tuning.keep < n_starts:
-        _see(lanes, n, 0, seen, tuning.reach, starts)
+        _fill_inputs(lanes, n, 0, batch, tuning.reach, starts)
         _predict(pruner, first, lanes, n, no_view, side, 0.0, values)
     chosen = np.arange(tuning.keep)
     early = np.empty(n_starts)
@@ -453,17 +453,17 @@ def _estimate_block(
                 poses.positions[i, p, 0, a] = starts.positions[i, start, 0, a]
                 for b in range(3):
                     poses.rotations[i, p, 0, a, b] = starts.rotations[i, start, 0, a, b]
-    lanes = _lanes_for(heights, frames, tuning.keep, n_joints, seen.size)
+    lanes = _lanes_for(heights, frames, tuning.keep, n_joints, batch.size)
     n = frames.size * tuning.keep
     for j in range(1, tuning.solved.size):
-        _solve_joint(tuning.solved[j], j, tree, regressors, tuning, lanes, n, seen, poses, values)
+        _solve_joint(tuning.solved[j], j, tree, regressors, tuning, lanes, n, batch, poses, values)
     for s in range(n):
         i = lanes.frame[s]
         k = lanes.pose[s]
         place_rest(
             tuning.solved, tree, poses.scales[i, k], poses.rotations[i, k], poses.positions[i, k]
         )
-    _see_all(lanes, n, seen, tuning.reach, body, poses)
+    _fill_all_inputs(lanes, n, batch, tuning.reach, body, poses)
     _predict(metric, first, lanes, n, n_joints, side, tuning.bandwidth, values)
     for s in range(n):
         scores[lanes.frame[s], lanes.pose[s]] = values[s, 0]
@@ -471,27 +471,28 @@ def _estimate_block(
 
 @njit(cache=True, parallel=True, nogil=True)
 def estimate_all(
-    seen, frames, tree, regressors, pruner, metric, tuning, body, starts, poses, scores
+    batch, frames, tree, regressors, pruner, metric, tuning, body, starts, poses, scores
 ):
-    """Run Lie-X Algorithm 1 for all frames in which an animal was found, in parallel.
+    """Run Lie-X Algorithm 1 for all frames with an animal, in parallel.
 
     Args:
-        seen: `SeenFrames`.
-        frames: (m,) the frames in which an animal was found.
+        batch: `FrameBatch`.
+        frames: (m,) the frames with an animal.
         tree: `KinematicTree` of the skeleton.
         regressors: one forest per solved joint and round, in order.
         pruner: one forest, which scores candidates by the base joint alone.
         metric: one forest, the learned metric.
-        tuning: the method's numbers.
-        body: sphere model whose residuals the metric sees; empty where it does not.
+        tuning: the method's settings.
+        body: sphere model whose residuals the metric uses; empty if it uses none.
         starts: `CandidatePoses` of the K bases alone (J = 1); changed in place.
-        poses: `CandidatePoses` of the P kept candidates; filled, except in frames not seen.
+        poses: `CandidatePoses` of the P kept candidates; filled, except in frames without an
+            animal.
         scores: (n, P) of the kept candidates; filled likewise.
     """
     n_blocks = (frames.size + FRAMES - 1) // FRAMES
     for b in prange(n_blocks):
         _estimate_block(
-            seen,
+            batch,
             frames[b * FRAMES : (b + 1) * FRAMES],
             tree,
             regressors,

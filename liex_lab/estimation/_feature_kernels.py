@@ -1,14 +1,14 @@
 """Numba kernels of the features and of the pose updates on SE(3) in the cascade.
 
-Features: the linearised pinhole projection of a joint's frame into its height map, from which Lie-X
-Eq. 15 is evaluated, and scalars of the whole animal. Updates: g <- g exp(r) (Eq. 10) by the
-exponential map of SE(3) (Eq. 4, 5) and Rodrigues' formula,
+Features: the linearised pinhole projection of a joint's frame into its height map, the input of
+Lie-X Eq. 15, and scalars of the whole animal. Updates: g <- g exp(r) (Eq. 10) by the exponential
+map of SE(3) (Eq. 4, 5) and Rodrigues' formula,
 
     exp(w^) = I + sin(th)/th w^ + (1 - cos(th))/th^2 w^^2,   th = |w|.
 
-A packed crop camera, 17 float64, states how one height map was cut: fx fy cx cy, rotation (9,
+A packed crop camera, 17 float64, is the geometry of one height map: fx fy cx cy, rotation (9,
 row-major) of T_view_camera, distance of the camera above the view's origin (its translation is (0,
-0, distance)), crop origin u v, and crop step. Candidates live in that view frame: the arena frame,
+0, distance)), crop origin u v, and crop step. Candidates are in that view frame: the arena frame,
 or the upright camera frame of the paper's variant.
 """
 
@@ -43,7 +43,7 @@ def fill_view(rotation, position, packed_camera, size, reach, view):
         position: (3,) of the joint, mm, view frame.
         packed_camera: (17,) packed crop camera.
         size: the animal's size over home size.
-        reach: how far offsets reach, mm at home size.
+        reach: range of offsets, mm at home size.
         view: (9,) float32, filled: crop pixel (column, row) of the joint, 2x3 matrix from offsets
             (1/127 of the reach) to crop pixels, and the joint's height, 1/16 mm at home size.
     """
@@ -66,11 +66,11 @@ def fill_view(rotation, position, packed_camera, size, reach, view):
 
 @njit(cache=True)
 def fill_scalars(rotation, position, scale, moments, size, scalars):
-    """Numbers that describe the whole animal as a joint sees it, at home size.
+    """Numbers that describe the whole animal relative to a joint, at home size.
 
     In order: log area, log volume, spread along and across the long axis, the centroid (x, y) in
-    the joint's frame, the joint's height, its pitch over the back's slope, its roll, the sine of
-    twice the angle to the long axis times the elongation, log scale. Lengths are 1/16 mm;
+    the joint's frame, the joint's height, its pitch relative to the back's slope, its roll, the
+    sine of twice the angle to the long axis times the elongation, log scale. Lengths are 1/16 mm;
     logarithms and sines are times 500, since thresholds are integers.
 
     Args:
@@ -96,13 +96,11 @@ def fill_scalars(rotation, position, scale, moments, size, scalars):
     c = rotation[0, 0]
     s = rotation[1, 0]
     norm = max(c * c + s * s, 1e-12)
-    # how steeply the joint rises, over the back where its slope along the long axis is known (else
-    # 0)
+    # pitch of the joint, relative to the back's slope along the long axis if measured
     rise = blob.slope * (np.cos(blob.angle) * c + np.sin(blob.angle) * s) / np.sqrt(norm)
     scalars[7] = _LOG_UNIT * (rotation[2, 0] - rise)
     scalars[8] = _LOG_UNIT * rotation[2, 1]
-    # the sine of twice the angle from the joint's heading to the long axis, without asking for the
-    # heading's angle
+    # the sine of twice the angle from the joint's heading to the long axis, without computing angles
     twice = np.sin(2.0 * blob.angle) * (c * c - s * s) - np.cos(2.0 * blob.angle) * 2.0 * s * c
     longer = blob.sd_along - blob.sd_across
     scalars[9] = _LOG_UNIT * twice / norm * longer / max(blob.sd_along + blob.sd_across, 1e-6)
@@ -191,7 +189,7 @@ def correct_joint(rotation, axes, values, lever):
 
 @njit(cache=True)
 def place_joint(j, tree, scale, rotations, positions):
-    """Put a joint where its parent carries it, at its home angle.
+    """Place a joint relative to its parent, at its home angle.
 
     Args:
         j: number of the joint.
@@ -215,10 +213,10 @@ def place_joint(j, tree, scale, rotations, positions):
 
 @njit(cache=True)
 def place_rest(solved, tree, scale, rotations, positions):
-    """Put every joint without a regressor where its parent carries it.
+    """Place every joint without a regressor relative to its parent.
 
     Args:
-        solved: the joints with regressors, which stay.
+        solved: the joints with regressors, unchanged.
         tree: `KinematicTree` of the skeleton.
         scale: of the bones.
         rotations: (J, 3, 3) joint frames, changed in place.
@@ -248,7 +246,7 @@ def place_all(j, tree, scale, rotations, positions):
 
 
 @njit(cache=True, parallel=True)
-def look_all(
+def all_features(
     joints, crop_cameras, moments, image, size, reach, rotations, positions, scale, views, scalars
 ):
     """Features of a batch of candidates: views from the given joints and scalars from the first.
@@ -259,12 +257,12 @@ def look_all(
         moments: (m, 9) moments of the height maps.
         image: (n,) index of each candidate's height map.
         size: (n,) the animals' size over home size.
-        reach: (V,) how far offsets reach from each of the joints, mm at home size.
+        reach: (V,) range of offsets from each of the joints, mm at home size.
         rotations: (n, J, 3, 3) joint frames, view frame.
         positions: (n, J, 3) joints, mm, view frame.
         scale: (n,) of the bones.
         views: (n, V, 9) float32, filled.
-        scalars: (n, N_SCALARS) float32, filled; left alone where it has no columns.
+        scalars: (n, N_SCALARS) float32, filled unless it has no columns.
     """
     for s in prange(scale.size):
         i = image[s]
@@ -330,7 +328,7 @@ def correct_joint_all(j, rotations, axes, values, lever):
 
 _WINDOW = 2  # crop pixels to each side of a joint over which the back's height is averaged
 _STEP = 0.5  # crop pixels
-# of the chain's length: beyond its ends, and back from them, the animal's end is looked for
+# of the chain's length: search range for the animal's end beyond and before the chain's ends
 _END_SHARE = 0.15
 
 
@@ -338,15 +336,15 @@ _END_SHARE = 0.15
 def back_over(heights, packed_camera, position, most, out):
     """Height of the animal's back over a joint.
 
-    It is the mean over a window of crop pixels of the readings within `most` of their median.
+    The mean over a window of crop pixels of the readings within `most` of their median.
 
     Args:
-        heights: (S, S) int16 height map, 1/16 mm, 0 where there is no animal.
+        heights: (S, S) int16 height map, 1/16 mm, 0 outside the animal.
         packed_camera: (17,) packed crop camera.
         position: (3,) the joint, mm, view frame.
-        most: readings farther than this from the median are left out, mm.
-        out: (2,) filled with the height above the joint, mm, 0 where nothing is read, and the share
-            of the window that shows the animal.
+        most: readings farther than this from the median are excluded, mm.
+        out: (2,) filled with the height above the joint, mm, 0 without readings, and the share of
+            the window that shows the animal.
     """
     last = heights.shape[0] - 1
     u, v = to_pixel(crop_camera(packed_camera), position[0], position[1], position[2])
@@ -375,17 +373,18 @@ def back_over(heights, packed_camera, position, most, out):
 
 @njit(cache=True)
 def end_past(heights, packed_camera, end, before, reach):
-    """How far the animal goes on past the end of a chain, straight on from the joint before it.
+    """Distance by which the animal extends past the end of a chain, straight on from the joint
+    before it.
 
     Args:
-        heights: (S, S) int16 height map, 1/16 mm, 0 where there is no animal.
+        heights: (S, S) int16 height map, 1/16 mm, 0 outside the animal.
         packed_camera: (17,) packed crop camera.
         end: (3,) the end joint, mm, view frame.
         before: (3,) the joint before it.
-        reach: how far to look in either direction, mm.
+        reach: search range in either direction, mm.
 
     Returns:
-        mm, at most `reach`; negative where the animal ends before the joint.
+        mm, at most `reach`; negative if the animal ends before the joint.
     """
     last = heights.shape[0] - 1
     camera = crop_camera(packed_camera)
@@ -413,17 +412,17 @@ def end_past(heights, packed_camera, end, before, reach):
 
 
 @njit(cache=True, parallel=True)
-def look_along(heights, crop_cameras, positions, length, most_share, out):
-    """Profile of each chain: the back's height over all joints, and the reach past both ends.
+def back_profiles(heights, crop_cameras, positions, length, most_share, out):
+    """Profile of each chain: the back's height over all joints, and the extent past both ends.
 
     Args:
-        heights: (n, S, S) int16 height maps, 1/16 mm, 0 where there is no animal.
+        heights: (n, S, S) int16 height maps, 1/16 mm, 0 outside the animal.
         crop_cameras: (n, 17) packed crop cameras of the height maps.
         positions: (n, J, 3) joints, mm, view frame.
         length: (n,) lengths of the animals, mm.
         most_share: of the length; see `most` of `back_over`.
-        out: (n, 2 J + 2) filled with heights (J), shares seen (J), and `end_past` of the first and
-            the last joint, mm.
+        out: (n, 2 J + 2) filled with heights (J), visible shares (J), and `end_past` of the first
+            and the last joint, mm.
     """
     m = positions.shape[1]
     for i in prange(positions.shape[0]):
@@ -445,21 +444,21 @@ def look_along(heights, crop_cameras, positions, length, most_share, out):
 
 @njit(cache=True, parallel=True)
 def lay_along(heights, crop_cameras, rump, tip, middle, size, along, across, out):
-    """Resample height maps on a grid that lies along the animals.
+    """Resample height maps on a grid aligned with the animals.
 
     Grid point (a, b) is middle + size (along[a] d + across[b] d_left), d being the unit direction
-    from base to tip in the image plane; the nearest pixel is taken.
+    from base to tip in the image plane; the nearest pixel is used.
 
     Args:
-        heights: (n, S, S) int16 height maps, 1/16 mm, 0 where there is no animal.
+        heights: (n, S, S) int16 height maps, 1/16 mm, 0 outside the animal.
         crop_cameras: (n, 17) packed crop cameras of the height maps.
         rump: (n, 3) base joints, mm, view frame.
-        tip: (n, 3) joints that the animals point at, mm, view frame.
+        tip: (n, 3) tip joints, mm, view frame.
         middle: (n, 3) centres of the grids, mm, view frame.
         size: (n,) the animals' size over home size.
         along: (A,) grid coordinates along the animal, mm at home size.
         across: (B,) grid coordinates to its left, mm at home size.
-        out: (n, A, B) filled with heights, mm; 0 beside the animal.
+        out: (n, A, B) filled with heights, mm; 0 outside the animal.
     """
     last = heights.shape[1] - 1
     for i in prange(len(middle)):
@@ -488,13 +487,13 @@ def read_across(heights, crop_cameras, points, sideways, lateral, seen, height):
     """Read height maps at distances to the left and right of points on the mid-axis.
 
     Args:
-        heights: (n, H, W) int16 height maps, 1/16 mm, 0 where there is no animal.
+        heights: (n, H, W) int16 height maps, 1/16 mm, 0 outside the animal.
         crop_cameras: (n, 17) packed crop cameras of the height maps.
         points: (n, S, 3) on the mid-axis, mm, view frame.
         sideways: (n, S, 2) unit vectors across the axis, view frame.
         lateral: (T,) distances from the axis, mm.
-        seen: (n, S, T) filled with how many of the two sides show the animal, over 2.
-        height: (n, S, T) filled with the mean height of those over the axis, mm, 0 where none does.
+        seen: (n, S, T) filled with the share of the two sides that shows the animal, 0 to 1.
+        height: (n, S, T) filled with the mean height of those over the axis, mm, 0 without any.
     """
     for i in prange(points.shape[0]):
         camera = crop_camera(crop_cameras[i])

@@ -4,8 +4,7 @@ On the pose manifold with p = (base twist, log scale, free angles), each step so
 prior) dp = -gradient with damping by Cholesky decomposition, and moves the pose by g <- g exp(dp).
 Residuals: depth readings pull the surface of the nearest sphere onto themselves, spheres in front
 of the readings are pushed behind them (both with Geman-McClure weights 1 / (1 + (d/robust)^2)^2),
-spheres beside the animal are pulled back over it, and all of it is held near the pose it began
-with.
+spheres outside the animal are pulled back onto it, and a prior keeps the pose near its start.
 """
 
 from __future__ import annotations
@@ -28,12 +27,12 @@ _MOST_TURN = 0.5
 
 
 class FreeAngles(NamedTuple):
-    """What the F free angles of a kinematic tree do.
+    """The F free angles of a kinematic tree.
 
     Attributes:
         limits: (F, 2) least and most of each angle, rad.
-        moves: (J, F) bool, which angles turn which joint.
-        turns: (B, M) the angles that move each sphere, in order, -1 where there are no more.
+        moves: (J, F) bool, which angles rotate which joint.
+        turns: (B, M) the angles that move each sphere, in order, padded with -1.
     """
 
     limits: Any
@@ -46,7 +45,7 @@ class Readings(NamedTuple):
 
     Attributes:
         points: (n, 3) every `_STRIDE`-th of them, mm, view frame.
-        nearest: (S, S, 2) int32, memory of `nearest_reading`; changed in place.
+        nearest: (S, S, 2) int32, cache of `nearest_reading`; changed in place.
     """
 
     points: Any
@@ -58,7 +57,7 @@ class ResidualWeights(NamedTuple):
 
     Attributes:
         robust: readings this far off count a quarter, mm.
-        beside: weight of a sphere beside the animal.
+        beside: weight of a sphere outside the animal.
         turn: cost of a radian of the base away from the start, squared mm.
         place: cost of a millimetre of the base away from the start, squared mm.
         growth: cost of a unit of log scale away from the start, squared mm.
@@ -75,16 +74,16 @@ class ResidualWeights(NamedTuple):
 
 @njit(cache=True)
 def nearest_reading(heights, r, c, known):
-    """Find the pixel on the animal that is nearest to a crop pixel off it.
+    """Find the pixel on the animal that is nearest to a crop pixel outside it.
 
-    Few pixels are ever asked for, so they are looked for in growing squares and remembered.
+    Only a few pixels are needed, so they are searched in growing squares and cached.
 
     Args:
-        heights: (S, S) int16 height map, 1/16 mm, 0 where there is no animal.
+        heights: (S, S) int16 height map, 1/16 mm, 0 outside the animal.
         r: row of the pixel.
         c: column of the pixel.
-        known: (S, S, 2) int32, -1 where not yet asked; known[r, c] is set to the row and column
-            found, row -2 where there is none.
+        known: (S, S, 2) int32 cache, -1 if not searched yet; known[r, c] is set to the row and
+            column found, row -2 if there is none.
     """
     if known[r, c, 0] != -1:
         return
@@ -109,7 +108,7 @@ def nearest_reading(heights, r, c, known):
 
 @njit(cache=True)
 def point_of(heights, packed_camera, r, c, out):
-    """The point (3,) mm of the view frame that crop pixel (r, c) shows, into `out`."""
+    """The point (3,) mm of the view frame of crop pixel (r, c), into `out`."""
     h = heights[r, c] / 16.0
     out[0], out[1] = to_point(crop_camera(packed_camera), r, c, h)
     out[2] = h
@@ -165,7 +164,7 @@ def forward(tree, root_rotation, root_position, angles, scale, rotations, positi
 
 @njit(cache=True)
 def turning_axes(free, angles, rotations, axes):
-    """Axes in the view frame about which the free angles turn: R J_r(w) e.
+    """Rotation axes of the free angles in the view frame: R J_r(w) e.
 
     J_r is the right Jacobian of SO(3) at the joint's rotation vector w, and e the axis of the
     angle.
@@ -298,7 +297,7 @@ def _add(row, residual, weight, gradient, curvature):
 def _solve(curvature, gradient, step):
     """Solve the positive definite system by Cholesky decomposition, given its lower half.
 
-    Returns False where it is not definite.
+    Returns False if it is not definite.
     """
     definite = cholesky(curvature, curvature, 1e-12)
     for i in range(gradient.size):
@@ -310,10 +309,10 @@ def _solve(curvature, gradient, step):
 
 @njit(cache=True)
 def _pull(points, balls, radius, slopes, robust, gradient, curvature):
-    """Residuals of readings (n, 3) mm: the surface of the nearest sphere shall pass through each.
+    """Residuals of readings (n, 3) mm: distance from the surface of the nearest sphere.
 
     slopes (n_own, 3, P) are of the body's own spheres, which come first; readings nearest to
-    another sphere are left out.
+    another sphere are excluded.
     """
     row = np.empty(gradient.size)
     gaps = np.empty(len(balls))
@@ -336,7 +335,7 @@ def _pull(points, balls, radius, slopes, robust, gradient, curvature):
 def _push(
     heights, packed_camera, known, balls, radius, slopes, robust, beside, gradient, curvature
 ):
-    """Residuals of spheres: not to stick out of the readings, nor to lie beside the animal.
+    """Residuals of spheres: in front of the readings, or outside the animal.
 
     slopes (n_own, 3, P) are of the body's own spheres, which come first.
     """
@@ -369,10 +368,10 @@ def _push(
 
 
 @njit(cache=True)
-def _hold(tree, weights, moved, growth, turned, gradient, curvature):
-    """Residuals of the prior: not to leave the start.
+def _add_prior(tree, weights, moved, growth, turned, gradient, curvature):
+    """Residuals of the prior: the distance from the start.
 
-    It is left by a twist `moved` (6,), log scale `growth` and angles `turned` (J, 3).
+    It consists of a twist `moved` (6,), log scale `growth` and angles `turned` (J, 3).
     """
     for k in range(3):
         gradient[k] += weights.turn * moved[k]
@@ -410,7 +409,7 @@ def _go(step, tree, limits, root_rotation, root_position, angles, scale):
 
 @njit(cache=True)
 def _readings(heights, packed_camera):
-    """The points (n, 3) mm of the view frame that every `_STRIDE`-th crop pixel shows."""
+    """The points (n, 3) mm of the view frame of every `_STRIDE`-th crop pixel."""
     side = heights.shape[0]
     points = np.empty((side * side // (_STRIDE * _STRIDE) + side, 3))
     n = 0
@@ -430,7 +429,7 @@ def refine_one(
     tree,
     free_angles,
     body,
-    wishes,
+    weights,
     n_steps,
     root_rotation,
     root_position,
@@ -440,14 +439,14 @@ def refine_one(
     """Refine one pose in place by Gauss-Newton steps.
 
     Args:
-        heights: (S, S) int16 height map, 1/16 mm, 0 where there is no animal.
+        heights: (S, S) int16 height map, 1/16 mm, 0 outside the animal.
         packed_camera: (17,) packed crop camera.
         readings: `Readings` of the height map.
         tree: the kinematic tree.
-        free_angles: what its free angles do.
+        free_angles: its free angles.
         body: the sphere model.
-        wishes: weights of the residuals.
-        n_steps: number of steps; fewer are taken where the system is not definite.
+        weights: of the residuals.
+        n_steps: number of steps; fewer if the system is not definite.
         root_rotation: (3, 3) of the base, changed in place.
         root_position: (3,) of the base, mm, changed in place.
         angles: (J, 3) rotation vectors of the joints, rad, changed in place.
@@ -478,7 +477,7 @@ def refine_one(
         gradient = np.zeros(n_values)
         curvature = np.zeros((n_values, n_values))
         radius = body.radius * scale
-        _pull(readings.points, balls, radius, slopes, wishes.robust, gradient, curvature)
+        _pull(readings.points, balls, radius, slopes, weights.robust, gradient, curvature)
         _push(
             heights,
             packed_camera,
@@ -486,14 +485,14 @@ def refine_one(
             balls,
             radius,
             slopes,
-            wishes.robust,
-            wishes.beside,
+            weights.robust,
+            weights.beside,
             gradient,
             curvature,
         )
-        _hold(
+        _add_prior(
             tree,
-            wishes,
+            weights,
             moved,
             np.log(scale / first_scale),
             angles - first_angles,
@@ -516,7 +515,7 @@ def refine_all(
     tree,
     free_angles,
     body,
-    wishes,
+    weights,
     n_steps,
     root_rotations,
     root_positions,
@@ -526,12 +525,12 @@ def refine_all(
     """`refine_one` for the K poses of each of n frames, in parallel.
 
     Args:
-        heights: (n, S, S) int16 height maps, 1/16 mm, 0 where there is no animal.
+        heights: (n, S, S) int16 height maps, 1/16 mm, 0 outside the animal.
         crop_cameras: (n, 17) packed crop cameras of the height maps.
         tree: the kinematic tree.
-        free_angles: what its free angles do.
+        free_angles: its free angles.
         body: the sphere model.
-        wishes: weights of the residuals.
+        weights: of the residuals.
         n_steps: number of steps.
         root_rotations: (n, K, 3, 3), changed in place.
         root_positions: (n, K, 3) mm, changed in place.
@@ -551,7 +550,7 @@ def refine_all(
                 tree,
                 free_angles,
                 body,
-                wishes,
+                weights,
                 n_steps,
                 root_rotations[i, k],
                 root_positions[i, k],

@@ -1,9 +1,10 @@
 """Numba kernels of the generative score: residuals of a posed sphere model against a height map.
 
-METHOD lesson 4 (ours): such numbers, beside the features of the learned metric, tell good
-candidates from bad ones. They measure what the posed body leaves unexplained, and where it should
-not be: signed distances d = |x - c| - r of depth readings x from the nearest sphere, and of the
-spheres' fronts from the readings under them. The body is that of `body.spheres.Spheres`.
+Together with the features of the learned metric, these numbers separate good from bad candidates
+(ours). They measure readings that the posed body does not explain, and parts of the body that
+contradict the readings: signed distances d = |x - c| - r of depth readings x from the nearest
+sphere, and of the spheres' fronts from the readings under them. The body is that of
+`body.capsules.Spheres`.
 """
 
 from __future__ import annotations
@@ -29,21 +30,19 @@ ALONG = 7
 # thresholds are integers
 SHARE_UNIT = 1000.0
 MM_UNIT = 50.0
-# in tenths of the balls' usual radius, as the next two: farther off is simply wrong
+# in tenths of the balls' usual radius, as the next two: caps larger distances
 _MOST_MM = 30.0
 _HIDDEN_MM = 12.0
 _APART_MM = 8.0
-_STRIDE = 6  # every so many crop pixels a reading is looked at
+_STRIDE = 6  # step between inspected crop pixels
 
 
 class SphereModel(NamedTuple):
-    """The sphere model that poses are compared with the height map by, see `body.spheres.Spheres`.
-
-    It may have no spheres.
+    """The sphere model compared with the height map, see `body.capsules.Spheres`; may be empty.
 
     Attributes:
         unit_mm: a tenth of the usual radius at scale 1, mm.
-        n_own: the first so many spheres are the body; the others lie where something may go on.
+        n_own: number of leading spheres that are the body; the others cover possible extensions.
         joints: (B, 2) the two joints that carry each sphere.
         offsets: (B, 2, 3) points in these joints' frames, mm at scale 1.
         share: (B,) of the distance from the first point to the second.
@@ -86,9 +85,8 @@ def place_balls(rotations, positions, scale, body, out):
 def nearest_ball(x, y, z, balls, radius, gaps):
     """Signed distance of a point from the surface of the nearest sphere.
 
-    The distances of all come first, then their least, then which it is, for each of these three
-    loops runs in vector registers, while one loop that keeps the least waits for a root with every
-    sphere.
+    The distances, their minimum and its index are computed in three loops, each of which is
+    vectorised; a single loop would wait for a square root with every sphere.
 
     Args:
         x: of the point, mm.
@@ -118,18 +116,18 @@ def nearest_ball(x, y, z, balls, radius, gaps):
 def explain(heights, packed_camera, balls, radius, n_own, size, unit_mm, out):
     """Residuals of spheres against a height map.
 
-    In order, of the body's own spheres: share beside the animal, mean distance of their fronts from
-    the readings, mean by which they stick out of them, share hidden behind them; of the readings:
+    In order, of the body's own spheres: share outside the animal, mean distance of their fronts
+    from the readings, mean distance in front of them, share hidden behind them; of the readings:
     mean distance from the nearest sphere, share far from any, mean depth inside spheres. Shares are
     in thousandths; distances are over size * unit_mm, times 50, and capped. Readings nearest to a
-    sphere that is not the body's own are left out.
+    sphere that is not the body's own are excluded.
 
     Args:
-        heights: (S, S) int16 height map, 1/16 mm, 0 where there is no animal.
+        heights: (S, S) int16 height map, 1/16 mm, 0 outside the animal.
         packed_camera: (17,) packed crop camera.
         balls: (B, 3) centres of the spheres, mm, view frame.
         radius: (B,) their radii, mm.
-        n_own: the first so many spheres are the body.
+        n_own: number of leading spheres that are the body.
         size: the animal's size over home size.
         unit_mm: as in `Spheres`, mm.
         out: (N_FIT,) float32; all but the last number are filled.
@@ -154,10 +152,10 @@ def explain(heights, packed_camera, balls, radius, n_own, size, unit_mm, out):
         off += min(abs(above), _MOST_MM)
         out_of += min(max(-above, 0.0), _MOST_MM)
         hidden += above > _HIDDEN_MM
-    seen = max(n - beside, 1.0)
+    covered = max(n - beside, 1.0)
     out[BESIDE] = SHARE_UNIT * beside / n
-    out[OFF] = MM_UNIT * off / seen
-    out[OUT_OF] = MM_UNIT * out_of / seen
+    out[OFF] = MM_UNIT * off / covered
+    out[OUT_OF] = MM_UNIT * out_of / covered
     out[HIDDEN] = SHARE_UNIT * hidden / n
     n_read = 0
     far = 0.0
@@ -168,7 +166,7 @@ def explain(heights, packed_camera, balls, radius, n_own, size, unit_mm, out):
         for c in range(_STRIDE // 2, last + 1, _STRIDE):
             if heights[r, c] == 0:
                 continue
-            # the point of the view frame that this pixel shows
+            # the point of this pixel in the view frame
             pz = heights[r, c] / 16.0
             px, py = to_point(camera, r, c, pz)
             nearest, which = nearest_ball(px, py, pz, balls, radius, gaps)

@@ -1,10 +1,11 @@
 """Stacking on held-out images: corrections, head-tail classifier and error calibration of a model.
 
-What is learned from a model's own choices needs images that no tree was grown on (stacked
+Learning from a model's own choices requires images that no tree was grown on (stacked
 generalisation, Wolpert 1992): the forest correction and the ridge correction of the chosen pose,
 the head-tail classifier, and the expectation forest, which predicts the error of a chosen pose in
 mm. The last is calibrated by cross-fitting: the 5 % and 95 % quantiles of true over predicted error
-come from predictions of folds that the forest has not seen (as in split conformal prediction).
+come from predictions for folds excluded from the forest's training (as in split conformal
+prediction).
 """
 
 from __future__ import annotations
@@ -19,8 +20,8 @@ from liex_lab.body.pose import Pose
 from liex_lab.estimation.cascade import ImageSet
 from liex_lab.estimation.estimator import PoseEstimator
 from liex_lab.estimation.forest_correction import moves_to, pose_samples
-from liex_lab.estimation.head_tail import HeadTailClassifier, both_ways, laid_along
-from liex_lab.estimation.model import Calibration, Model
+from liex_lab.estimation.head_tail import HeadTailClassifier, both_directions, laid_along
+from liex_lab.estimation.model import ErrorCalibration, Model
 from liex_lab.estimation.ridge_correction import RidgeCorrection
 from liex_lab.estimation.scoring import LEAST_MM, LOG_UNIT, Chosen, clue_samples
 from liex_lab.estimation.training import TrainingSet, quantised
@@ -30,9 +31,9 @@ from liex_lab.scene.height_maps import HeightMaps, crop_columns
 
 Array = NDArray[np.float64]
 
-_CAP_MM = 25.0  # at the reference length; a lost pose must not decide what an ordinary score means
-# how far off (log) the size of a session is once it has been estimated over many frames, where
-# poses settle, and before
+_CAP_MM = 25.0  # at the reference length; a lost pose must not dominate the calibration
+# standard deviation (log) of a session's size, estimated over many frames with the ridge
+# correction, and without
 _SIZE_SD = 0.05
 _SETTLED_SIZE_SD = 0.02
 _GUESS_SD = 0.08
@@ -49,7 +50,7 @@ _EXPECTATION = GrowthPlan(
     bag_share=0.5,
 )
 _SHRINKAGE = 0.12
-# at the reference length: what is farther off is another pose
+# at the reference length: larger errors are gross
 _CORRECTED_MM = 12.0
 _CORRECTION_SHRINKAGE = 0.1
 _FOLDS = 4
@@ -81,7 +82,7 @@ class _Group:
         images: their height maps.
         size: the guess over home size.
         chosen: the model's choices for them.
-        positions: (m, K, J, 3) candidates behind these, mm, view frame.
+        positions: (m, K, J, 3) their candidates, mm, view frame.
         scores: (m, K) scores of the candidates, mm at home size.
     """
 
@@ -98,8 +99,8 @@ def _choices(
 ) -> Iterator[_Group]:
     """Let a model choose poses for the images of animals.
 
-    They are taken in order of size, and each group of them shares one guess of the size, off by
-    `size_sd` (log).
+    In order of size; each group of images shares one guess of the size, with an error of `size_sd`
+    (log).
     """
     animals = np.flatnonzero(data.animal)
     order = animals[np.argsort(data.size[animals], kind="stable")]
@@ -129,7 +130,7 @@ def run_on(model: Model, data: TrainingSet, rng: np.random.Generator) -> Trial:
 
     Args:
         model: the model.
-        data: images with truth; those that show no animal are left out.
+        data: images with truth; those without an animal are excluded.
         rng: source of the errors of the assumed sizes.
 
     Returns:
@@ -170,12 +171,11 @@ def run_on(model: Model, data: TrainingSet, rng: np.random.Generator) -> Trial:
 def with_corrector(model: Model, data: TrainingSet, rng: np.random.Generator) -> Model:
     """Add the forest correction of chosen poses, learned on images that no tree was grown on.
 
-    Poses that are off by more than an ordinary error, as one that points the other way, teach
-    nothing and are left out. Branched skeletons have no such correction, for their poses do not
-    follow from the positions of their joints.
+    Poses with a gross error, such as the wrong direction, are excluded. Branched skeletons have no
+    such correction, as their poses are not determined by the positions of their joints.
 
     Args:
-        model: the model; returned as it is where its method has no corrector.
+        model: the model; returned unchanged if its method has no corrector.
         data: held-out images with truth.
         rng: source of size errors, bags and seeds.
     """
@@ -214,7 +214,7 @@ def with_settler(model: Model, data: TrainingSet, rng: np.random.Generator) -> M
     """Add the ridge correction of chosen poses, learned on images that no tree was grown on.
 
     Args:
-        model: the model; returned as it is where its method has no ridge correction.
+        model: the model; returned unchanged if its method has no ridge correction.
         data: held-out images with truth.
         rng: source of the errors of the assumed sizes.
     """
@@ -236,33 +236,33 @@ def with_facing(model: Model, data: TrainingSet, seed: int) -> Model:
     It learns from the best candidate of each direction.
 
     Args:
-        model: the model; returned as it is where its method has no such classifier.
+        model: the model; returned unchanged if its method has no such classifier.
         data: held-out images with truth.
         seed: of the size errors and of the network's training.
     """
     skeleton = model.skeleton
     if not model.method.tells_facing:
         return model
-    pictures = []
+    resampled = []
     right = []
     for group in _choices(model, data, np.random.default_rng(seed)):
         true = data.truth.positions[group.rows]
         along = true[:, skeleton.tip] - true[:, 0]
-        best, opposite, behind, _ = both_ways(group.positions, group.scores, skeleton.tip)
+        best, opposite, behind, _ = both_directions(group.positions, group.scores, skeleton.tip)
         for k, there in (
             (best, np.isfinite(group.scores.min(axis=1))),
             (opposite, np.isfinite(behind)),
         ):
             rows = np.flatnonzero(there)
             joints = group.positions[rows, k[rows]]
-            pictures.append(
+            resampled.append(
                 laid_along(skeleton, group.images[rows], joints, np.full(len(rows), group.size))
             )
             right.append(
                 np.einsum("nd,nd->n", joints[:, skeleton.tip] - joints[:, 0], along[rows]) > 0
             )
     return replace(
-        model, facing=HeadTailClassifier.fit(np.concatenate(pictures), np.concatenate(right), seed)
+        model, facing=HeadTailClassifier.fit(np.concatenate(resampled), np.concatenate(right), seed)
     )
 
 
@@ -282,13 +282,12 @@ def calibrate(model: Model, data: TrainingSet, rng: np.random.Generator) -> Mode
     """Add the expectation forest and the calibration, learned on held-out images.
 
     The boosted forest predicts the logarithm of the true error of the chosen pose, capped at 25 mm
-    at the reference length: errors differ by factors, and in mm the few that are lost would decide
-    what the forest looks at. The ratios of true to predicted error that bound 90 % of the images,
-    and the limit above which a pose is flagged (97 % quantile of the predictions), come from 4-fold
-    cross-fitting.
+    at the reference length: errors differ by factors, and in mm the few gross ones would dominate.
+    The ratios of true to predicted error that bound 90 % of the images, and the limit above which a
+    pose is flagged (97 % quantile of the predictions), come from 4-fold cross-fitting.
 
     Args:
-        model: the model with its corrections in place.
+        model: the model with its corrections.
         data: held-out images with truth.
         rng: source of size errors, folds, bags and seeds.
 
@@ -298,18 +297,19 @@ def calibrate(model: Model, data: TrainingSet, rng: np.random.Generator) -> Mode
     trial = run_on(model, data, rng)
     error = trial.joint_error.mean(axis=1)
     capped = np.minimum(error, _CAP_MM * model.skeleton.relative_size)
-    # errors differ by factors: in millimetres the few that are lost would decide what the forest
-    # looks at
+    # errors differ by factors: in millimetres the few gross ones would dominate
     target = (LOG_UNIT * np.log(capped))[:, None].astype(np.float32)
     n = len(error)
     fold = rng.permutation(n) % _FOLDS
     predicted = np.empty(n)
     for k in range(_FOLDS):
-        seen = np.flatnonzero(fold != k)
+        others = np.flatnonzero(fold != k)
         unseen = np.flatnonzero(fold == k)
-        forest = boost_forest(_rows(trial.clues, seen), target[seen], _EXPECTATION, _SHRINKAGE, rng)
+        forest = boost_forest(
+            _rows(trial.clues, others), target[others], _EXPECTATION, _SHRINKAGE, rng
+        )
         predicted[unseen] = np.exp(predict(forest, _rows(trial.clues, unseen))[:, 0] / LOG_UNIT)
-    gain = capped.mean() / predicted.mean()  # from the middle of what to expect to its mean
+    gain = capped.mean() / predicted.mean()  # from the median of the expected error to its mean
     predicted = np.maximum(gain * predicted, LEAST_MM * model.skeleton.relative_size)
     low, high = np.quantile(error / predicted, [0.05, 0.95])
     shifted = target + np.float32(LOG_UNIT * np.log(gain))
@@ -318,7 +318,7 @@ def calibrate(model: Model, data: TrainingSet, rng: np.random.Generator) -> Mode
     )
     design = np.stack([np.ones(n), trial.score, trial.spread], axis=1)
     line, *_ = np.linalg.lstsq(design, capped, rcond=None)
-    calibration = Calibration(
+    calibration = ErrorCalibration(
         offset=float(line[0]),
         slope=float(line[1]),
         spread_slope=float(line[2]),

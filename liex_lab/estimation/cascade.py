@@ -4,11 +4,12 @@ Lie-X Algorithms 1 and 2 (section 4.1). For joint j, base first, and round c, th
 predicts the tangent vector r from features at the current pose, and
 
     g_{1:j} <- g_{1:j} exp(r)                                                       (Eq. 10),
+
     label = log(g_est^-1 g_true)                                                    (Eq. 11),
 
-so corrections live in the joint's own frame. A joint that is not the base corrects the rotation
-about its free axes only. Estimation runs the same steps in `_cascade_kernels`; this module is used
-in training, and to watch the cascade step by step.
+so corrections are in the joint's own frame. A joint other than the base corrects the rotation about
+its free axes only. Estimation runs the same steps in `_cascade_kernels`; this module is used in
+training, and to follow the cascade step by step.
 """
 
 from __future__ import annotations
@@ -46,7 +47,7 @@ class Candidates:
         rotations: (n, J, 3, 3) joint frames, in the view frame of the image.
         positions: (n, J, 3) joints, mm, in the view frame of the image.
         scale: (n,) scale of the bones over their home lengths.
-        size: (n,) the animal's size over home size, by which features are normalised.
+        size: (n,) the animal's size over home size, which normalises features.
     """
 
     image: NDArray[np.int32]
@@ -56,7 +57,7 @@ class Candidates:
     size: Array
 
     def __post_init__(self) -> None:
-        """Refuse arrays that do not fit together, for kernels do not check them."""
+        """Check that the shapes match, as kernels do not."""
         check_shapes(
             "candidates",
             ("image", self.image, ("n",)),
@@ -75,7 +76,7 @@ class Candidates:
         scale: Array,
         size: Array,
     ) -> Candidates:
-        """Make candidates of which only the base is in place.
+        """Make candidates with only the base in place.
 
         Args:
             skeleton: the animal's skeleton.
@@ -103,7 +104,7 @@ class ImageSet:
     """Height maps with their crop cameras and moments.
 
     Attributes:
-        heights: (m, S, S) int16 height maps, 1/16 mm, 0 where there is no animal.
+        heights: (m, S, S) int16 height maps, 1/16 mm, 0 outside the animal.
         crop_cameras: (m, 17) packed crop cameras, see `CropCamera`.
         moments: (m, 9) moments of the animal's blob, see `HeightMaps`.
     """
@@ -113,7 +114,7 @@ class ImageSet:
     moments: Array
 
     def __post_init__(self) -> None:
-        """Refuse arrays that do not fit together, for kernels do not check them."""
+        """Check that the shapes match, as kernels do not."""
         check_shapes(
             "images",
             ("heights", self.heights, ("m", "S", "S")),
@@ -122,11 +123,7 @@ class ImageSet:
         )
 
     def __getitem__(self, rows: NDArray[np.int64]) -> ImageSet:
-        """Some of the images.
-
-        Args:
-            rows: (k,) rows to take.
-        """
+        """Select rows (k,) of the images."""
         return ImageSet(self.heights[rows], self.crop_cameras[rows], self.moments[rows])
 
 
@@ -138,7 +135,7 @@ class Cascade:
         skeleton: the animal's skeleton.
         method: the variant of the method.
         forests: the forests of every round of each solved joint, in order.
-        proposals: forest that proposes initial poses; None where they are drawn.
+        proposals: forest that proposes initial poses; None if they are drawn.
     """
 
     skeleton: Skeleton
@@ -160,18 +157,18 @@ class Cascade:
         return int(self.skeleton.axes[joint].sum())
 
     def _check(self, candidates: Candidates, images: ImageSet | None = None) -> None:
-        """Refuse candidates of another body, or on images that are not there."""
+        """Refuse candidates of another body, or on missing images."""
         n_joints = self.skeleton.n_joints
         check_shapes("candidates", ("positions", candidates.positions, ("n", n_joints, 3)))
         if images is not None:
             check_index("images", candidates.image, len(images.heights))
 
     def place(self, candidates: Candidates, joint: int) -> None:
-        """Put a joint where its parent carries it, at its home angle.
+        """Place a joint relative to its parent, which must be in place, at its home angle.
 
         Args:
-            candidates: the candidates, which are changed in place.
-            joint: number of the joint; its parent must be in place.
+            candidates: changed in place.
+            joint: number of the joint.
         """
         self._check(candidates)
         kernels.place_all(
@@ -183,13 +180,13 @@ class Cascade:
         )
 
     def steps(self, images: ImageSet, candidates: Candidates) -> Iterator[tuple[int, int]]:
-        """Run Algorithm 1 as it is written, one forest after the other.
+        """Run Algorithm 1 as written in the paper, one forest after the other.
 
-        Every candidate is moved by itself, without pruning. Yields after each forest.
+        Every candidate is moved independently, without pruning. Yields after each forest.
 
         Args:
-            images: the images that the candidates lie on.
-            candidates: candidates with their base in place, which are changed in place.
+            images: the candidates' images.
+            candidates: with their base in place; changed in place.
 
         Yields:
             The joint and the round of the forest that was just applied.
@@ -209,16 +206,16 @@ class Cascade:
     def predict(
         self, forest: Forest, samples: Samples, in_bag: NDArray[np.bool_] | None = None
     ) -> NDArray[np.float32]:
-        """What a forest of this method says of samples, in training as in estimation.
+        """A forest's prediction for samples, in training and in estimation.
 
-        It is the mean-shift mode of the trees' votes where the method has a bandwidth, as the
-        paper's regressors and metric have, else their mean.
+        It is the mean-shift mode of the trees' votes if the method has a bandwidth, as for the
+        paper's regressors and metric, else their mean.
 
         Args:
             forest: a regressor or the learned metric.
             samples: n samples.
-            in_bag: (T, n_images) bool, which images each tree was grown on, to leave such trees
-                out; None asks all trees, as a mode always does.
+            in_bag: (T, n_images) bool, the images each tree was grown on, to exclude such trees;
+                None uses all trees, as a mode always does.
 
         Returns:
             (n, D) float32 predictions.
@@ -231,22 +228,18 @@ class Cascade:
         return modes.astype(np.float32)
 
     def place_ends(self, candidates: Candidates) -> None:
-        """Put every joint without a regressor where its parent carries it.
-
-        Args:
-            candidates: the candidates, which are changed in place.
-        """
+        """Place every joint without a regressor relative to its parent; changes the candidates."""
         for joint in range(1, self.skeleton.n_joints):
             if joint not in self.skeleton.solved:
                 self.place(candidates, joint)
 
     def samples(self, images: ImageSet, candidates: Candidates, joints: list[int]) -> Samples:
-        """Features of the candidates, as forests see them from the given joints.
+        """Features of the candidates relative to the given joints.
 
         Args:
-            images: the images that the candidates lie on.
+            images: the candidates' images.
             candidates: n candidates.
-            joints: the joints whose views are taken; the first one gives the scalars.
+            joints: the joints of the views; the first one gives the scalars.
 
         Returns:
             n samples with one view per joint, on the height maps of the images.
@@ -255,7 +248,7 @@ class Cascade:
         n = len(candidates)
         views = np.empty((n, len(joints), VIEW), np.float32)
         scalars = np.empty((n, kernels.N_SCALARS), np.float32)
-        kernels.look_all(
+        kernels.all_features(
             np.array(joints),
             images.crop_cameras,
             images.moments,
@@ -273,17 +266,17 @@ class Cascade:
 
     @cached_property
     def balls(self) -> Spheres:
-        """The sphere model of the body that candidates are compared with the height map by."""
+        """The body's sphere model, which candidates are compared with the height map by."""
         return Spheres.of(self.skeleton)
 
     def metric_samples(self, images: ImageSet, candidates: Candidates) -> Samples:
-        """Features of finished candidates, as the learned metric sees them.
+        """Features of finished candidates for the learned metric.
 
-        They are taken from all joints; where the method asks, the residuals of the posed body
+        They are computed from all joints; if the method uses them, the residuals of the posed body
         against the height map are appended to the scalars.
 
         Args:
-            images: the images that the candidates lie on.
+            images: the candidates' images.
             candidates: n candidates with all joints in place.
 
         Returns:
@@ -311,15 +304,15 @@ class Cascade:
         """Move the candidates by a forest's prediction (Eq. 10).
 
         Args:
-            candidates: n candidates, which are changed in place.
+            candidates: n candidates, changed in place.
             joint: number of the joint to correct.
             values: (n, n_values) float32 correction, rotations times their lever arm, mm at home
                 size.
         """
         method = self.method
         self._check(candidates)
-        wanted = len(candidates), self.n_values(joint)
-        check_shapes("a correction", ("values", values, wanted))
+        shape = len(candidates), self.n_values(joint)
+        check_shapes("a correction", ("values", values, shape))
         if joint == 0:
             levers = np.array([method.base_lever_mm, method.scale_lever_mm])
             kernels.correct_base_all(
@@ -342,11 +335,11 @@ class Cascade:
     def labels(
         self, candidates: Candidates, joint: int, truth: Truth
     ) -> tuple[Array, NDArray[np.bool_]]:
-        """Corrections that lead to the truth, and which samples to learn from.
+        """Corrections from the candidates to the truth, and the samples to learn from.
 
-        Base: log(g_est^-1 g_true) (Eq. 11) with lengths at home size and, where the method asks,
-        the logarithm of the ratio of scales. Other joints: the rotation about the free axes that
-        remains, or the one that aims the bone at the true next joint.
+        Base: log(g_est^-1 g_true) (Eq. 11) with lengths at home size and, if the method corrects
+        it, the logarithm of the ratio of scales. Other joints: the remaining rotation about the
+        free axes, or the one that aims the bone at the true next joint.
 
         Args:
             candidates: n candidates with the joint in place.
@@ -355,7 +348,7 @@ class Cascade:
 
         Returns:
             (n, n_values) labels, rotations and log scale times their lever arms, and (n,) bool, the
-            samples that lie near enough to the truth to be worth learning from.
+            samples near enough to the truth to learn from.
         """
         method = self.method
         i = candidates.image
@@ -385,11 +378,7 @@ class Cascade:
 
 
 def body_of(balls: Spheres) -> residual_kernels.SphereModel:
-    """The body's spheres as the kernels want them.
-
-    Args:
-        balls: the sphere model of the body.
-    """
+    """The body's spheres as a record for the kernels."""
     return residual_kernels.SphereModel(
         balls.unit_mm, balls.n_own, balls.joints, balls.offsets, balls.share, balls.radius
     )
@@ -410,25 +399,25 @@ class Truth:
     scale: Array
 
 
-def aim_about(bone: Array, wanted: Array, axes: NDArray[np.bool_]) -> Array:
-    """Rotation vectors about free axes that turn a bone towards given directions.
+def aim_about(bone: Array, direction: Array, axes: NDArray[np.bool_]) -> Array:
+    """Rotation vectors about free axes that rotate a bone towards given directions.
 
-    A hinge turns by the angle that is seen along its axis. A joint with more axes takes the
-    smallest rotation; components about its fixed axes are for the caller to drop.
+    A hinge rotates by the angle as projected along its axis. A joint with more axes uses the
+    smallest rotation; the caller drops components about its fixed axes.
 
     Args:
         bone: (3,) the bone at home, in the joint's frame.
-        wanted: (n, 3) directions to point at, in the joint's frame.
+        direction: (n, 3) target directions, in the joint's frame.
         axes: (3,) bool, the free axes.
 
     Returns:
         (n, 3) rotation vectors, rad.
     """
     if axes.sum() > 1:
-        return aim(bone, wanted)
+        return aim(bone, direction)
     axis = axes.astype(float)
     flat_bone = bone - (bone @ axis) * axis
-    flat = wanted - (wanted @ axis)[:, None] * axis
+    flat = direction - (direction @ axis)[:, None] * axis
     angle = np.arctan2(
         np.cross(np.broadcast_to(flat_bone, flat.shape), flat) @ axis, flat @ flat_bone
     )

@@ -1,15 +1,15 @@
 """Pose estimation by a cascade of regression forests: depth frames in, poses with errors out.
 
-Lie-X Algorithm 1 (section 4.1). From several initial poses per animal, one regression forest per
+Lie-X Algorithm 1 (section 4.1). From multiple initial poses per animal, one regression forest per
 joint and round predicts a correction r in the joint's own frame, and the pose moves by the
 exponential map of SE(3),
 
     g_{1:j} <- g_{1:j} exp(r)                                                       (Eq. 10);
 
-a learned metric scores the resulting candidates. Where the paper returns the candidate with the
-lowest score, the default method returns a weighted mean of the best ones,
-followed by a forest correction, a ridge correction or a Gauss-Newton refinement as the method asks.
-`PoseEstimator` is the class that users hold.
+a learned metric scores the resulting candidates. The paper returns the candidate with the lowest
+score; the default method returns a weighted mean of the best ones, followed by a forest correction,
+a ridge correction or a Gauss-Newton refinement, depending on the method. `PoseEstimator` is the
+public class.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ from liex_lab.estimation import _cascade_kernels as kernels
 from liex_lab.estimation._residual_kernels import SphereModel
 from liex_lab.estimation.cascade import ImageSet, body_of
 from liex_lab.estimation.forest_correction import corrected
-from liex_lab.estimation.head_tail import HeadTailClassifier, both_ways
-from liex_lab.estimation.initial import N_WAYS, draw_starts, propose, start_poses
+from liex_lab.estimation.head_tail import HeadTailClassifier, both_directions
+from liex_lab.estimation.initial import N_DIRECTIONS, draw_starts, propose, start_poses
 from liex_lab.estimation.model import Model, check_model
 from liex_lab.estimation.refine import Refiner
 from liex_lab.estimation.ridge_correction import SURE_SHARE, RidgeCorrection
@@ -47,20 +47,20 @@ from liex_lab.scene.segmenter import Segmenter
 Array = NDArray[np.float64]
 
 _START_SEED = 20170125
-# of estimating the size with the size just found; each goes about a third of the way
+# passes of size estimation; each corrects about a third of the error
 _SIZE_PASSES = 8
-# what a squared standard deviation of area or volume weighs against the predicted error, at the
+# weight of a squared standard deviation of area or volume relative to the predicted error, at the
 # reference length
 _MM_PER_MISFIT = 0.5
 
 
 @dataclass(frozen=True)
 class Estimates:
-    """Poses of n frames in the camera frame; rows are NaN where no animal was found.
+    """Poses of n frames in the camera frame; rows are NaN if no animal was found.
 
     Attributes:
         chosen: the poses with their spreads, scores and expected errors, see `Chosen`.
-        found: (n,) bool, where an animal was found.
+        found: (n,) bool, whether an animal was found.
         crops: the height maps that the poses were estimated from.
     """
 
@@ -69,11 +69,7 @@ class Estimates:
     crops: HeightMaps
 
     def __getitem__(self, rows: slice) -> Estimates:
-        """Some consecutive frames.
-
-        Args:
-            rows: the frames to take.
-        """
+        """A slice of the frames."""
         return Estimates(self.chosen[rows], self.found[rows], self.crops[rows])
 
 
@@ -86,7 +82,7 @@ class Detection:
         crop_cameras: (n, 17) crop cameras of the height maps.
         rotations: (n, K, J, 3, 3) joint frames of the candidates, in the view frame.
         positions: (n, K, J, 3) joints of the candidates, mm, view frame.
-        scores: (n, K) predicted errors, mm at home size; infinite where there is no such candidate.
+        scores: (n, K) predicted errors, mm at home size; infinite for missing candidates.
     """
 
     crops: HeightMaps
@@ -96,11 +92,7 @@ class Detection:
     scores: Array
 
     def __getitem__(self, index: NDArray[np.int64] | NDArray[np.bool_] | slice) -> Detection:
-        """Some of the frames.
-
-        Args:
-            index: (m,) row numbers, (n,) bool, or a slice, which copies nothing.
-        """
+        """Some of the frames, by row numbers (m,), mask (n,), or slice, which copies nothing."""
         return Detection(
             self.crops[index],
             self.crop_cameras[index],
@@ -111,11 +103,7 @@ class Detection:
 
     @staticmethod
     def join(parts: Sequence[Detection]) -> Detection:
-        """Concatenate the detections of several batches of frames.
-
-        Args:
-            parts: the batches, in order, with equally many candidates per frame.
-        """
+        """Concatenate detections with equally many candidates per frame."""
         rest = (np.concatenate([getattr(p, name) for p in parts]) for name in _OF_SIGHT)
         return Detection(HeightMaps.join([p.crops for p in parts]), *rest)
 
@@ -125,18 +113,13 @@ class Detection:
         return self.crops.found & np.isfinite(self.scores).any(axis=1)
 
     def put(self, rows: NDArray[np.int64], other: Detection) -> None:
-        """Overwrite some rows by another detection.
-
-        Args:
-            rows: (m,) rows to overwrite.
-            other: the detection of m frames that is copied into them.
-        """
+        """Overwrite the rows (m,) by another detection of m frames."""
         self.crops.put(rows, other.crops)
         for name in _OF_SIGHT:
             getattr(self, name)[rows] = getattr(other, name)
 
     def nothing(self) -> Detection:
-        """A detection of as many frames in which nothing was found."""
+        """An empty detection of as many frames."""
         nothing = self[np.arange(len(self.crop_cameras))]
         nothing.crops.n_px[:] = 0
         nothing.scores[:] = np.inf
@@ -145,17 +128,17 @@ class Detection:
     def opposite(self, usable: NDArray[np.bool_], tip: int) -> Detection:
         """Keep only the candidates that point away from the best one, base to tip.
 
-        The best of them takes the positions of those that are left out, so that the number of
-        candidates stays.
+        Excluded candidates take the positions of the best remaining one, so that the number of
+        candidates stays the same.
 
         Args:
-            usable: (n,) bool; in other frames no candidate is left.
-            tip: the joint that the direction from the base is taken to.
+            usable: (n,) bool; other frames keep no candidate.
+            tip: the joint that defines the direction from the base.
 
         Returns:
-            The detection with scores that are infinite where no candidate points the other way.
+            The detection with infinite scores if no candidate has the opposite direction.
         """
-        _, other, _, away = both_ways(self.positions, self.scores, tip)
+        _, other, _, away = both_directions(self.positions, self.scores, tip)
         rows = np.arange(len(self.scores))
         scores = np.where(away & usable[:, None], self.scores, np.inf)
         taken = np.where(away, np.arange(scores.shape[1]), other[:, None])
@@ -178,31 +161,28 @@ class PoseEstimator:
 
     Attributes:
         model: the trained model.
-        n_candidates: initial poses per animal (Kt of the paper); 0: as the model's method says.
-        unpruned: run all candidates through the whole kinematic tree instead of pruning them after
-            the base joint.
-        n_joints: move only so many joints, to see what each costs; 0: all that can be.
-        start_seed: the initial poses are drawn from it, once for all frames.
+        n_candidates: initial poses per animal (Kt of the paper); 0: the method's number.
+        unpruned: process all candidates through the whole kinematic tree instead of pruning them
+            after the base joint.
+        n_joints: number of joints to move, to measure the cost of each; 0: all.
+        start_seed: seed of the initial poses, which are the same for all frames.
     """
 
     model: Model
-    n_candidates: int = 0  # 0: as the model's method says
+    n_candidates: int = 0
     unpruned: bool = False  # all candidates run the whole chain
-    n_joints: int = 0  # only so many joints are moved, to see what each costs; 0: all that can be
+    n_joints: int = 0
     start_seed: int = _START_SEED
 
     @staticmethod
     def load(name: str | Path = "mouse") -> PoseEstimator:
-        """Load an estimator.
+        """Load an estimator, with the number of candidates of its method.
 
         Args:
             name: name of a bundled model, or path of a model file.
 
-        Returns:
-            The estimator, with the number of candidates that its method asks for.
-
         Raises:
-            ModelError: there is no such model, or the file is not a whole model file.
+            ModelError: there is no such model, or the file is not a complete model file.
         """
         return PoseEstimator(Model.load(find_model(name)))
 
@@ -213,7 +193,7 @@ class PoseEstimator:
 
     @cached_property
     def _packed(self) -> tuple[kernels.Trees, kernels.Trees, kernels.Trees]:
-        """Regressors, pruner and metric as the kernels want them."""
+        """Regressors, pruner and metric as records for the kernels."""
         model = self.model
         try:
             check_model(model)
@@ -224,11 +204,11 @@ class PoseEstimator:
 
     @cached_property
     def _tree(self) -> KinematicTree:
-        """The kinematic tree as the kernels want it."""
+        """The kinematic tree as a record for the kernels."""
         return KinematicTree.of(self.skeleton)
 
     def _tuning(self, n_starts: int) -> kernels.CascadeSettings:
-        """The method's numbers as the kernels want them."""
+        """The method's settings as a record for the kernels."""
         method = self.model.method
         keep = method.survivors if self.model.pruner is not None and not self.unpruned else 0
         return kernels.CascadeSettings(
@@ -245,7 +225,7 @@ class PoseEstimator:
 
     @cached_property
     def _body(self) -> SphereModel:
-        """The sphere model that candidates are compared with; empty unless the method asks."""
+        """The sphere model that candidates are compared with; empty unless the method uses it."""
         if not self.model.method.explains:
             return SphereModel(
                 1.0, 0, np.zeros((0, 2), np.int64), np.zeros((0, 2, 3)), np.zeros(0), np.zeros(0)
@@ -262,16 +242,16 @@ class PoseEstimator:
         """(1, K, 4) standard numbers of the initial poses, the same for every frame."""
         k = self.n_candidates or self.model.method.n_candidates
         if self.model.cascade.proposals is not None:
-            k = N_WAYS * self.model.cascade.proposals.n_trees
+            k = N_DIRECTIONS * self.model.cascade.proposals.n_trees
         return draw_starts(np.random.default_rng(self.start_seed), 1, k)
 
     def candidates(
         self, crops: HeightMaps, crop_cameras: Array, size: float, parallel: bool = True
     ) -> tuple[Array, Array, Array, Array]:
-        """Run all initial poses through the cascade and score them (Lie-X Algorithm 1).
+        """Process all initial poses by the cascade and score them (Lie-X Algorithm 1).
 
-        Candidates are pruned after the base joint where the model has a pruner; the head-tail
-        classifier adjusts the scores where the model has one.
+        Candidates are pruned after the base joint if the model has a pruner; a head-tail
+        classifier, if present, adjusts the scores.
 
         Args:
             crops: height maps of n frames.
@@ -281,8 +261,8 @@ class PoseEstimator:
 
         Returns:
             Of the K surviving candidates of each frame, in the view frame: rotations (n, K, J, 3,
-            3), positions (n, K, J, 3) mm, scales (n, K) of the bones, and the learned metric's
-            scores (n, K), mm at home size; the scores are infinite where no animal was found.
+                3), positions (n, K, J, 3) mm, scales (n, K) of the bones, and the learned metric's
+                scores (n, K), mm at home size; the scores are infinite if no animal was found.
         """
         method = self.model.method
         skeleton = self.skeleton
@@ -318,7 +298,7 @@ class PoseEstimator:
         scores = np.full((n, tuning.keep), np.inf)
         with threads(parallel):
             kernels.estimate_all(
-                kernels.SeenFrames(crops.heights, crop_cameras, crops.moments, size),
+                kernels.FrameBatch(crops.heights, crop_cameras, crops.moments, size),
                 np.flatnonzero(crops.found),
                 self._tree,
                 *self._packed,
@@ -339,11 +319,11 @@ class PoseEstimator:
     ) -> Estimates:
         """Estimate one pose per frame.
 
-        Where two components have about the animal's size, the likelier of them is taken.
+        If two components have about the animal's size, the likelier of them is used.
 
         Args:
             depths: (n, H, W) float32 mm, 0 where unread.
-            scene: the segmenter that was fitted to the recording.
+            scene: the segmenter fitted to the recording.
             size: the animal's spine over the home length; ignored by methods of fixed size.
             parallel: use all cores rather than one.
 
@@ -351,26 +331,28 @@ class PoseEstimator:
             The poses in the camera frame, with expected errors.
         """
         size = size if self.model.method.session_size else 1.0
-        return self._estimates(self._look(depths, scene, size, parallel)[0], size, parallel)
+        return self._estimates(self._detect_both(depths, scene, size, parallel)[0], size, parallel)
 
     def hypotheses(
         self, depths: NDArray[np.float32], scene: Segmenter, size: float, parallel: bool = True
     ) -> tuple[Estimates, ...]:
-        """Estimate what else the frames may show besides the best pose.
+        """Estimate alternative poses besides the best one.
 
         Args:
             depths: (n, H, W) float32 mm, 0 where unread.
-            scene: the segmenter that was fitted to the recording.
+            scene: the segmenter fitted to the recording.
             size: the animal's spine over the home length; ignored by methods of fixed size.
             parallel: use all cores rather than one.
 
         Returns:
-            Four estimates in the camera frame: that of `estimate`, the best pose that points the
-            other way, and the same two of the second component of about the animal's size. Rows
-            without such a hypothesis are not found.
+            Four estimates in the camera frame: that of `estimate`, the best pose in the opposite
+                direction, and the same two of the second component of about the animal's size. Rows
+                without such a hypothesis are not found.
         """
         size = size if self.model.method.session_size else 1.0
-        return self._ways(self._look(depths, scene, size, parallel)[:2], size, parallel)
+        return self._both_directions(
+            self._detect_both(depths, scene, size, parallel)[:2], size, parallel
+        )
 
     def second_is_animal(
         self, depths: NDArray[np.float32], scene: Segmenter, size: float, parallel: bool = True
@@ -379,15 +361,15 @@ class PoseEstimator:
 
         Args:
             depths: (n, H, W) float32 mm, 0 where unread.
-            scene: the segmenter that was fitted to the recording.
+            scene: the segmenter fitted to the recording.
             size: the animal's spine over the home length; ignored by methods of fixed size.
             parallel: use all cores rather than one.
 
         Returns:
-            (n,) bool, of the two components that `Segmenter.extract_both` gives.
+            (n,) bool, for the two components of `Segmenter.extract_both`.
         """
         size = size if self.model.method.session_size else 1.0
-        return self._look(depths, scene, size, parallel)[2]
+        return self._detect_both(depths, scene, size, parallel)[2]
 
     def best_of(
         self, crops: HeightMaps, crop_cameras: Array, size: float, parallel: bool = True
@@ -406,10 +388,10 @@ class PoseEstimator:
         size = size if self.model.method.session_size else 1.0
         return self._estimates(self._sighted(crops, crop_cameras, size, parallel), size, parallel)
 
-    def both_ways(
+    def both_directions(
         self, crops: HeightMaps, crop_cameras: Array, size: float, parallel: bool = True
     ) -> tuple[Estimates, Estimates]:
-        """Estimate the best pose per height map, and the best one that points the other way.
+        """Estimate the best pose per height map, and the best one in the opposite direction.
 
         Args:
             crops: height maps of n frames.
@@ -422,7 +404,7 @@ class PoseEstimator:
             found.
         """
         size = size if self.model.method.session_size else 1.0
-        best, turned = self._ways(
+        best, turned = self._both_directions(
             (self._sighted(crops, crop_cameras, size, parallel),), size, parallel
         )
         return best, turned
@@ -430,37 +412,36 @@ class PoseEstimator:
     def _sighted(
         self, crops: HeightMaps, crop_cameras: Array, size: float, parallel: bool
     ) -> Detection:
-        """The component that was cut out of each frame, with its candidates."""
+        """The segmented component of each frame, with its candidates."""
         rotations, positions, _, scores = self.candidates(crops, crop_cameras, size, parallel)
         return Detection(crops, crop_cameras, rotations, positions, scores)
 
-    def _ways(
+    def _both_directions(
         self, sights: Sequence[Detection], size: float, parallel: bool
     ) -> tuple[Estimates, ...]:
-        """The chosen poses of each detection and those that point the other way, in turn.
+        """The chosen poses of each detection and those in the opposite direction, in turn.
 
-        All are chosen in one go: the poses of a live frame are few, and the cost of a step is its
-        call.
+        All are chosen in one call, as the cost of few poses is that of the call.
         """
-        both = [way for s in sights for way in (s, s.opposite(s.usable, self.skeleton.tip))]
+        both = [one for s in sights for one in (s, s.opposite(s.usable, self.skeleton.tip))]
         whole = self._estimates(Detection.join(both), size, parallel)
         n = len(both[0].crop_cameras)
         return tuple(whole[k * n : (k + 1) * n] for k in range(len(both)))
 
-    def _look(
+    def _detect_both(
         self, depths: NDArray[np.float32], scene: Segmenter, size: float, parallel: bool
     ) -> tuple[Detection, Detection, NDArray[np.bool_]]:
         """Detect the animal with its candidates, and the next likely component; see `estimate`.
 
-        Last comes whether (n,) the animal is the second component.
+        The last value is whether (n,) the animal is the second component.
         """
         camera_view = self.model.method.camera_view
         crops, others = scene.extract_both(depths, size, parallel, camera_view)
         n = len(depths)
         unsure = np.flatnonzero(crops.n_blobs > 1)
         # in one go, as a call costs as much as a frame
-        seen = HeightMaps.join([crops, others[unsure]]) if len(unsure) else crops
-        both = self._sighted(seen, scene.crop_cameras(seen, camera_view), size, parallel)
+        joined = HeightMaps.join([crops, others[unsure]]) if len(unsure) else crops
+        both = self._sighted(joined, scene.crop_cameras(joined, camera_view), size, parallel)
         first = both[:n] if len(unsure) else both
         second = first.nothing()
         turned = np.zeros(n, np.bool_)
@@ -479,9 +460,11 @@ class PoseEstimator:
         """The chosen poses of a detection, in the camera frame."""
         crops = sight.crops
         usable = sight.usable
-        seen = sight[np.flatnonzero(usable)]
-        images = ImageSet(seen.crops.heights, seen.crop_cameras, seen.crops.moments)
-        picked = self.pick(images, size, seen.rotations, seen.positions, seen.scores, parallel)
+        detected = sight[np.flatnonzero(usable)]
+        images = ImageSet(detected.crops.heights, detected.crop_cameras, detected.crops.moments)
+        picked = self.pick(
+            images, size, detected.rotations, detected.positions, detected.scores, parallel
+        )
         picked = with_expected_error(picked, self.model, images.moments, images.crop_cameras, size)
         whole = _spread_out(picked, usable, self.skeleton.n_joints)
         return Estimates(
@@ -499,12 +482,12 @@ class PoseEstimator:
         scores: Array,
         parallel: bool = True,
     ) -> Chosen:
-        """Choose one pose per height map out of its candidates, and correct it.
+        """Choose one pose per height map from its candidates, and correct it.
 
-        The best candidates are averaged on the manifold (see `choose`). Where the method refines,
-        the mean and the best candidates are fitted to the height map by Gauss-Newton steps, and the
-        one that fits best is taken. The forest correction and the ridge correction follow where the
-        model has them.
+        The best candidates are averaged on the manifold (see `choose`). If the method refines, the
+        mean and the best candidates are fitted to the height map by Gauss-Newton steps, and the
+        best fit is used. The forest correction and the ridge correction follow if the model has
+        them.
 
         Args:
             images: height maps of n frames, with their crop cameras and moments.
@@ -527,7 +510,7 @@ class PoseEstimator:
                     self.skeleton, picked.pose, method.refined, rotations, positions, scores
                 )
                 pose, fit = self._refiner.best(poses, images, size, method.refine_steps)
-                picked = replace(picked, pose=pose, fit=fit, told_scale=pose.scale)
+                picked = replace(picked, pose=pose, fit=fit, frame_scale=pose.scale)
             picked = corrected(picked, self.model, images, size)
             if self.model.settler is None or not len(scores):
                 return picked
@@ -537,8 +520,8 @@ class PoseEstimator:
         return replace(
             picked,
             pose=ridge.pose,
-            told_scale=size * np.exp(ridge.grown),
-            told_trust=ridge.clear,
+            frame_scale=size * np.exp(ridge.grown),
+            scale_trust=ridge.clear,
         )
 
     def _is_animal(
@@ -551,12 +534,11 @@ class PoseEstimator:
     ) -> NDArray[np.bool_]:
         """Whether (n,) the second of two components of about the animal's size is the animal.
 
-        The decision follows from area and volume and, where the metric has learned what is no
-        animal, from its scores.
+        Decided by area and volume and, if the metric was trained with other objects, by its scores.
         """
         weight = _MM_PER_MISFIT * self.skeleton.relative_size
         crops = first.crops, second.crops
-        if self.model.method.camera_view:  # likeness is told by what the scene's own view shows
+        if self.model.method.camera_view:  # similarity is measured in the scene's own view
             crops = scene.extract_both(depths, size)
         misfits = [weight * scene.misfit(crop) for crop in crops]
         if not self.model.method.metric_on_own:
@@ -567,14 +549,13 @@ class PoseEstimator:
         """Estimate the animal's size from a sample of frames of the recording.
 
         The area seen from above gives the first guess. The model then measures the spine in every
-        frame, and the median over the frames that it trusts most becomes the next guess; this is
-        repeated eight times, since each pass goes about a third of the way. The forest correction
-        is left out: it has learned how long animals of usual shape are and would pull this one's
-        size to theirs.
+        frame, and the median over the most reliable frames becomes the next guess; this is repeated
+        eight times, since each pass corrects about a third of the error. The forest correction is
+        not used: it has learned the usual proportions and would bias the size towards them.
 
         Args:
             sample: (n, H, W) float32 frames, mm, 0 where unread.
-            scene: the segmenter that was fitted to the recording.
+            scene: the segmenter fitted to the recording.
 
         Returns:
             The animal's spine over the home length; 1 for methods of fixed size.
@@ -585,8 +566,7 @@ class PoseEstimator:
         guess = self.size_from_area(scene.area_mm2)
         if not self.model.method.session_size:
             return 1.0
-        # the last correction has learned how long animals of usual shape are: it would pull this
-        # one's size to theirs
+        # the forest correction has learned the usual proportions and would bias the size
         uncorrected = replace(self, model=replace(self.model, corrector=None))
         for _ in range(_SIZE_PASSES):
             estimates = uncorrected.estimate(sample, scene, guess)
@@ -594,27 +574,26 @@ class PoseEstimator:
                 raise EstimationError(
                     "no animal was found in the sampled frames, so its size could not be measured"
                 )
-            guess = float(np.median(self.sizes_told(estimates)))
+            guess = float(np.median(self.sizes_by_frame(estimates)))
         return guess
 
-    def sizes_told(self, estimates: Estimates) -> Array:
-        """The animal's size over home size as single frames estimate it.
+    def sizes_by_frame(self, estimates: Estimates) -> Array:
+        """The animal's size over home size as estimated from single frames.
 
         Args:
             estimates: estimates of some frames.
 
         Returns:
-            (m,) sizes of the frames that the model trusts most: two thirds of those with an animal,
-            or one third where the ridge correction tells the size, but at least 8 if there are as
-            many.
+            (m,) sizes of the most reliable frames: two thirds of those with an animal, or one third
+            if the ridge correction estimates the size, but at least 8 if available.
         """
-        scale = estimates.chosen.told_scale
-        trust = estimates.chosen.told_trust
-        seen = np.flatnonzero(estimates.found)
+        scale = estimates.chosen.frame_scale
+        trust = estimates.chosen.scale_trust
+        found = np.flatnonzero(estimates.found)
         n_trusted = (
-            len(seen) * 2 // 3 if self.model.settler is None else round(len(seen) * SURE_SHARE)
+            len(found) * 2 // 3 if self.model.settler is None else round(len(found) * SURE_SHARE)
         )
-        return np.asarray(scale[seen[np.argsort(-trust[seen])[: max(8, n_trusted)]]])
+        return np.asarray(scale[found[np.argsort(-trust[found])[: max(8, n_trusted)]]])
 
     def size_from_area(self, area_mm2: float) -> float:
         """First guess of the animal's size over home size, the square root of a ratio of areas.
@@ -674,6 +653,6 @@ def _spread_out(picked: Chosen, usable: NDArray[np.bool_], n_joints: int) -> Cho
         rows(picked.spread),
         rows(picked.doubts, 4),
         rows(picked.fit, picked.fit.shape[1]),
-        rows(picked.told_scale),
-        rows(picked.told_trust),
+        rows(picked.frame_scale),
+        rows(picked.scale_trust),
     )

@@ -1,14 +1,12 @@
 """Boosted regression forest that corrects all joints of the chosen pose at once (ours).
 
-Candidates are moved by forests that were trained on initial poses as they come; their weighted mean
-is not one of them, and is off in ways of its own. A small forest, grown by stochastic gradient
-boosting (Friedman 2002) on chosen poses of images that no other tree was grown on, predicts the
-residual
+Candidates are moved by forests trained on initial poses; their weighted mean is none of them and
+has errors of its own. A small forest, grown by stochastic gradient boosting (Friedman 2002) on
+chosen poses of images that no other tree was grown on, predicts the residual
 
     x_j - x_j_hat        of every joint j, in the base's frame, at home size,
 
-and takes out what of it can be foretold. It asks about one pose per frame and so costs next to
-nothing.
+and corrects its predictable part. It is evaluated for one pose per frame, at negligible cost.
 """
 
 from __future__ import annotations
@@ -35,7 +33,7 @@ def corrected(chosen: Chosen, model: Model, images: ImageSet, size: float) -> Ch
 
     Args:
         chosen: n chosen poses, view frame.
-        model: the model; without a corrector the poses stay as they are.
+        model: the model; without a corrector the poses are unchanged.
         images: the n height maps.
         size: the animal's size over home size.
 
@@ -53,14 +51,14 @@ def corrected(chosen: Chosen, model: Model, images: ImageSet, size: float) -> Ch
 
 
 def pose_samples(pose: Pose, model: Model, images: ImageSet, size: float) -> Samples:
-    """Features of one pose per height map, as the corrector sees them.
+    """Features of one pose per height map for the corrector.
 
-    They are the views from all joints and, beside the scalars that every forest sees, the logarithm
-    of how many mm a pixel covers, for an outline loses about one of them all round.
+    They are the views from all joints, the scalars of every forest, and the logarithm of the size
+    of a pixel in mm, as an outline loses about a pixel on all sides.
 
     Args:
         pose: (n) poses, view frame.
-        model: gives the cascade whose features are taken.
+        model: its cascade computes the features.
         images: the n height maps.
         size: the animal's size over home size.
 

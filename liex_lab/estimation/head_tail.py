@@ -1,12 +1,14 @@
-"""Head-tail classifier: a multilayer perceptron on the height map laid along a candidate (ours).
+"""Head-tail classifier: a multilayer perceptron on the height map resampled along a candidate
+(ours).
 
-The learned metric sees two points at a time. On bodies unlike those that it has learned from, head
-and tail are what it confuses; all of the outline, the ears and the slope of the back at once tell
-them apart where it is unsure. With the log odds l of the network for the best candidate of either
-direction, the direction changes where
+The learned metric compares two points at a time, and on unfamiliar bodies it confuses head and
+tail; the whole outline, the ears and the slope of the back together separate them if the metric is
+unsure. With the log odds l of the network for the best candidate of either direction, the direction
+changes if
 
-    score_opposite - score_best + w (l_best - l_opposite) < 0,        w = 4 mm at the reference
-    length.
+    score_opposite - score_best + w (l_best - l_opposite) < 0,
+
+with w = 4 mm at the reference length.
 """
 
 from __future__ import annotations
@@ -24,13 +26,15 @@ from liex_lab.runtime.shapes import check_shapes
 
 Array = NDArray[np.float64]
 
-# at the reference length: how far the image reaches along and across the animal, and its step
+# at the reference length: extent of the image along and across the animal, and its step
 _ALONG_MM = 50.0
 _ACROSS_MM = 25.0
 _STEP_MM = 2.5
-_HEIGHT_MM = 10.0  # what stands for one in the network
-UNSURE_MM = 15.0  # scores of both ways nearer than this, at the reference length, are doubted
-_MM_PER_LOGIT = 4.0  # what the network's word weighs against scores, at the reference length
+_HEIGHT_MM = 10.0  # unit of the network's input
+UNSURE_MM = (
+    15.0  # smaller differences between both directions' scores are unsure, at the reference length
+)
+_MM_PER_LOGIT = 4.0  # weight of the network's output relative to scores, at the reference length
 _MOST_LOGIT = 6.0
 _DECIMALS = 6
 _HIDDEN = (128, 32)
@@ -42,7 +46,7 @@ _WEIGHT_DECAY = 1e-2
 
 @dataclass(frozen=True)
 class HeadTailClassifier:
-    """The head-tail classifier at work.
+    """The head-tail classifier.
 
     Attributes:
         skeleton: the animal's skeleton.
@@ -53,18 +57,16 @@ class HeadTailClassifier:
     network: Network
 
     @staticmethod
-    def fit(pictures: NDArray[np.float32], right: NDArray[np.bool_], seed: int) -> Network:
-        """Train the network.
-
-        Depth images are also learned from in the mirror. Weights are rounded to what the model file
-        holds.
+    def fit(images: NDArray[np.float32], right: NDArray[np.bool_], seed: int) -> Network:
+        """Train the network, also on mirrored images; weights are rounded to the precision of the
+        model file.
 
         Args:
             images: (m, A, B) float32 images from `laid_along`.
             right: (m,) bool, whether the poses point in the right direction.
             seed: of the network's training.
         """
-        inputs = np.concatenate([_flat(pictures), _flat(pictures[:, :, ::-1])])
+        inputs = np.concatenate([_flat(images), _flat(images[:, :, ::-1])])
         labels = np.concatenate([right, right])
         layers = descend(
             inputs,
@@ -78,7 +80,7 @@ class HeadTailClassifier:
             seed=seed,
         )
         n = inputs.shape[1]
-        # rounded to what the model file holds
+        # rounded to the precision of the model file
         return Network(
             np.zeros(n, np.float32),
             np.ones(n, np.float32),
@@ -88,9 +90,8 @@ class HeadTailClassifier:
     def logits(self, images: ImageSet, joints: Array, size: float) -> Array:
         """Log odds that poses point in the right direction.
 
-        They are the mean over the image and its mirror image, computed in double precision and
-        then rounded: the last bits of a product depend on how many frames are asked about at once,
-        and a frame's pose must not.
+        They are the mean over the image and its mirror image, computed in double precision and then
+        rounded: the last bits of a product depend on the batch size, and a frame's pose must not.
 
         Args:
             images: n height maps with their crop cameras.
@@ -98,19 +99,19 @@ class HeadTailClassifier:
             size: the animal's size over home size.
 
         Returns:
-            (n,) log odds, at most 6 either way.
+            (n,) log odds, between -6 and 6.
         """
-        pictures = laid_along(self.skeleton, images, joints, np.full(len(joints), size))
-        views = np.concatenate([pictures, pictures[:, :, ::-1]])
+        resampled = laid_along(self.skeleton, images, joints, np.full(len(joints), size))
+        views = np.concatenate([resampled, resampled[:, :, ::-1]])
         both = self.network.logits(_flat(views).astype(np.float64)).reshape(2, -1)
         return np.clip(both, -_MOST_LOGIT, _MOST_LOGIT).mean(axis=0).round(_DECIMALS)
 
     def judged(self, images: ImageSet, positions: Array, scores: Array, size: float) -> Array:
-        """Adjust the candidates' scores by the network where the metric is unsure of the direction.
+        """Adjust the candidates' scores by the network if the metric is unsure of the direction.
 
-        The metric is unsure where both directions have a candidate and their best scores are within
-        15 mm at the reference length. Where the network outweighs the difference, the candidates of
-        the direction that was ahead fall behind, by as much as it is outweighed.
+        The metric is unsure if both directions have a candidate and their best scores are within 15
+        mm at the reference length. If the network outweighs the difference, the scores of the
+        leading direction are raised by the excess.
 
         Args:
             images: n height maps with their crop cameras.
@@ -122,7 +123,7 @@ class HeadTailClassifier:
             (n, K) scores, mm at home size.
         """
         unit = self.skeleton.relative_size
-        best, opposite, ahead, away = both_ways(positions, scores, self.skeleton.tip)
+        best, opposite, ahead, away = both_directions(positions, scores, self.skeleton.tip)
         doubted = np.flatnonzero(ahead < UNSURE_MM * unit)
         if not len(doubted):
             return scores
@@ -137,20 +138,20 @@ class HeadTailClassifier:
         return judged
 
 
-def both_ways(
+def both_directions(
     positions: Array, scores: Array, tip: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], Array, NDArray[np.bool_]]:
-    """Best candidate of each frame, and the best one that points the other way.
+    """Best candidate of each frame, and the best one in the opposite direction.
 
     Args:
         positions: (n, K, J, 3) joints of the candidates, mm.
-        scores: (n, K) predicted errors; infinite where there is no such candidate.
-        tip: the joint that the direction from the base is taken to.
+        scores: (n, K) predicted errors; infinite for missing candidates.
+        tip: the joint that defines the direction from the base.
 
     Returns:
-        The index (n,) of the best candidate; the index (n,) of the best one that points the other
-        way; by how much (n,) its score is worse, infinite or NaN where there is none; and (n, K)
-        bool, which candidates point the other way.
+        The index (n,) of the best candidate; the index (n,) of the best one in the opposite
+        direction; the difference (n,) of its score, infinite or NaN if there is none; and (n, K)
+        bool, the candidates in the opposite direction.
     """
     rows = np.arange(len(scores))
     best = scores.argmin(axis=1)
@@ -174,8 +175,8 @@ def laid_along(
         size: (n,) the animals' size over home size.
 
     Returns:
-        (n, A, B) float32 heights in units of 10 mm at home size, for the reference length; 0 beside
-        the animal.
+        (n, A, B) float32 heights in units of 10 mm at home size, for the reference length; 0
+        outside the animal.
     """
     n = len(images.heights)
     check_shapes("poses", ("joints", joints, (n, skeleton.n_joints, 3)), ("size", size, (n,)))
@@ -197,9 +198,9 @@ def laid_along(
     return (out / (_HEIGHT_MM * unit * size[:, None, None])).astype(np.float32)
 
 
-def _flat(pictures: NDArray[np.float32]) -> NDArray[np.float32]:
+def _flat(images: NDArray[np.float32]) -> NDArray[np.float32]:
     """Depth images (n, A, B) as rows (n, A B)."""
-    return np.ascontiguousarray(pictures).reshape(len(pictures), -1)
+    return np.ascontiguousarray(images).reshape(len(images), -1)
 
 
 def _rounded(values: Array) -> NDArray[np.float32]:

@@ -1,10 +1,10 @@
 """Initial poses from the moments of the foreground: PCA initialisation, or the paper's.
 
 Lie-X section 4, preprocessing and initial poses. The paper places the home pose at the centroid and
-the mean depth of the foreground, turns it in the image plane by an angle uniform in (-pi, pi), and
-scales all bones by a factor uniform in [0.9, 1.1]; this is repeated Kt times. The default method
-starts along the principal axis of the foreground in both directions, with small jitter (PCA
-initialisation, METHOD lesson 8).
+the mean depth of the foreground, rotates it in the image plane by an angle uniform in (-pi, pi),
+and scales all bones by a factor uniform in [0.9, 1.1]; this is repeated Kt times. The default
+method starts along the principal axis of the foreground in both directions, with small jitter (PCA
+initialisation), which needs fewer initial poses.
 """
 
 from __future__ import annotations
@@ -26,22 +26,22 @@ from liex_lab.scene.height_maps import moment_columns
 
 Array = NDArray[np.float64]
 
-# of the body length: the base starts this far from the centroid, towards the end it belongs to
+# of the body length: initial distance of the base from the centroid, towards its own end
 _BEHIND = 0.42
-_HIGH = 0.2  # of the body length: the base starts this high above the floor
-# of the body length: the base of an animal in the camera view starts this far below its mean height
+_HIGH = 0.2  # of the body length: initial height of the base above the floor
+# of the body length: initial depth of the base below the mean height, in camera view
 _LOW = 0.05
 _JITTER = (
     0.12,
     0.7,
-)  # rad: spread of the headings of a long thin animal, and what a round one adds
+)  # rad: spread of the headings of a long thin animal, and the increase for a round one
 _JITTER_RISE = 0.03  # rad, at most
-_JITTER_MM = 2.0  # of the places, for an animal of the reference length
-_SCALED_BY = 0.1  # the paper scales all bones of a start by up to this, either way
+_JITTER_MM = 2.0  # of the positions, for an animal of the reference length
+_SCALED_BY = 0.1  # largest relative change of all bones of a start in the paper
 
 
 def draw_starts(rng: np.random.Generator, n_images: int, n_candidates: int) -> Array:
-    """Draw the standard numbers that initial poses are made from.
+    """Draw the standard numbers of initial poses.
 
     Args:
         rng: source of the numbers.
@@ -70,10 +70,10 @@ def start_poses(
 ) -> tuple[Array, Array, Array]:
     """Base poses of K candidates for each of n animals.
 
-    Along the long axis, every other start points the other way, and the headings are the more
-    spread out the rounder the animal looks. The paper's start has any heading in
-    (-pi, pi), the base at the centroid and at the animal's mean height, and bones scaled by a
-    factor uniform in [0.9, 1.1].
+    Along the long axis, every other start points in the opposite direction, and the spread of the
+    headings increases with the roundness of the animal. The paper's start has any heading in (-pi,
+    pi), the base at the centroid and at the animal's mean height, and bones scaled by a factor
+    uniform in [0.9, 1.1].
 
     Args:
         moments: (n, 9) moments of the height map, see `HeightMaps`.
@@ -83,9 +83,9 @@ def start_poses(
         base_at_front: the base joint is the animal's front; else its rear.
         axis_start: start along the long axis; else as the paper does.
         camera_view: heights are not those above a floor; such an animal, started along its axis,
-            rises or sinks as its back does.
-        home_turn: (3,) rotation vector, rad, by which the home pose lies otherwise than seen from
-            above, as a palm that is shown.
+            rises or sinks with the slope of its back.
+        home_turn: (3,) rotation vector, rad, of the home pose relative to the view from above, as
+            for a hand that shows its palm.
 
     Returns:
         Base rotation (n, K, 3, 3), base position (n, K, 3) mm and scale (n, K), view frame.
@@ -129,7 +129,7 @@ def start_poses(
             + _JITTER_RISE * starts[..., 3]
         )
         rotation = rotation @ _lifted(rise)
-        # the base lies ahead of or behind the middle of the animal
+        # the base is ahead of or behind the middle of the animal
         position[..., 2] -= behind * np.sin(rise)
     if any(home_turn):
         rotation = rotation @ so3.exp(np.array(home_turn))
@@ -150,8 +150,8 @@ def _lifted(rise: Array) -> Array:
 # Initial poses proposed by a regression forest, for an animal of any orientation (ours).
 
 
-N_WAYS = 2  # both ways along the animal's long axis
-_SIZE_SD = 0.08  # how far off (log) a session's estimated size may be
+N_DIRECTIONS = 2  # both directions along the animal's long axis
+_SIZE_SD = 0.08  # standard deviation (log) of a session's estimated size
 
 
 def views_along_axis(
@@ -162,28 +162,28 @@ def views_along_axis(
     Args:
         images: m images.
         size: (m,) the animals' size over home size.
-        reach_mm: offsets reach this far from the centre, mm at home size.
+        reach_mm: range of offsets from the centre, mm at home size.
 
     Returns:
-        2 m samples, an image's two in a row, and the frames they are taken in: rotations (2 m, 3,
-        3) and centres (2 m, 3) mm, view frame.
+        2 m samples, an image's two in a row, and their frames: rotations (2 m, 3, 3) and centres (2
+        m, 3) mm, view frame.
     """
     m = len(images.heights)
     check_shapes("proposals", ("size", size, (m,)))
-    image = np.repeat(np.arange(m, dtype=np.int32), N_WAYS)
+    image = np.repeat(np.arange(m, dtype=np.int32), N_DIRECTIONS)
     moments = images.moments[image]
     blob = moment_columns(moments)
-    heading = blob.angle + np.pi * (np.arange(N_WAYS * m) % N_WAYS)
-    turn = np.zeros((N_WAYS * m, 3))
+    heading = blob.angle + np.pi * (np.arange(N_DIRECTIONS * m) % N_DIRECTIONS)
+    turn = np.zeros((N_DIRECTIONS * m, 3))
     turn[:, 2] = heading
     rotation = so3.exp(turn)
     position = np.column_stack([blob.x, blob.y, blob.volume_mm3 / np.maximum(blob.area_mm2, 1.0)])
     each = size[image]
-    views = np.empty((N_WAYS * m, 1, VIEW), np.float32)
-    scalars = np.empty((N_WAYS * m, kernels.N_SCALARS), np.float32)
-    # which way is which: some foregrounds know where an animal's long axis points
-    ways = (1000.0 - 2000.0 * (np.arange(N_WAYS * m) % N_WAYS)).astype(np.float32)
-    kernels.look_all(
+    views = np.empty((N_DIRECTIONS * m, 1, VIEW), np.float32)
+    scalars = np.empty((N_DIRECTIONS * m, kernels.N_SCALARS), np.float32)
+    # some segmenters determine the direction of the long axis
+    directions = (1000.0 - 2000.0 * (np.arange(N_DIRECTIONS * m) % N_DIRECTIONS)).astype(np.float32)
+    kernels.all_features(
         np.zeros(1, np.int64),
         images.crop_cameras,
         images.moments,
@@ -196,7 +196,7 @@ def views_along_axis(
         views,
         scalars,
     )
-    rows = np.column_stack([scalars, ways])
+    rows = np.column_stack([scalars, directions])
     return (
         Samples(images.heights, image, (1.0 / each).astype(np.float32), views, rows),
         rotation,
@@ -219,13 +219,13 @@ def train_proposals(
         images: m images.
         rotations: (m, 3, 3) true base rotations, view frame.
         positions: (m, 3) true base positions, mm, view frame.
-        size: (m,) the animals' true size over home size; the forest sees it with an error.
+        size: (m,) the animals' true size over home size; an error is added to it.
         keep: (m,) bool, the images to learn from.
         method: states the plan, the reach of the features and the lever arm of rotations.
         rng: source of bags, seeds and size errors.
 
     Returns:
-        The forest, with leaves of float16 precision, and (T, m) bool, which images each tree was
+        The forest, with leaves of float16 precision, and (T, m) bool, the images each tree was
         grown on.
     """
     assert method.proposals is not None
@@ -254,7 +254,7 @@ def propose(forest: Forest, images: ImageSet, size: Array, method: Method) -> tu
 
     Returns:
         Rotations (m, 2 T, 3, 3) and positions (m, 2 T, 3) mm, view frame; candidate 2 t + w is tree
-        t's, with the axis taken in direction w.
+        t's, with the axis in direction w.
     """
     samples, frame, centre = views_along_axis(images, size, method.proposal_reach_mm)
     votes = predict_each(forest, samples).astype(float)
@@ -265,9 +265,9 @@ def propose(forest: Forest, images: ImageSet, size: Array, method: Method) -> tu
 
     def in_order(values: Array) -> Array:
         """`values` (2 m, T, ...) reordered to (m, 2 T, ...), the tree varying more slowly."""
-        by_way = values.reshape(len(size), N_WAYS, forest.n_trees, *values.shape[2:])
-        return np.swapaxes(by_way, 1, 2).reshape(
-            len(size), N_WAYS * forest.n_trees, *values.shape[2:]
+        by_direction = values.reshape(len(size), N_DIRECTIONS, forest.n_trees, *values.shape[2:])
+        return np.swapaxes(by_direction, 1, 2).reshape(
+            len(size), N_DIRECTIONS * forest.n_trees, *values.shape[2:]
         )
 
     return in_order(rotation), in_order(position)

@@ -1,9 +1,7 @@
 """Hyperparameters of the pose estimation: the paper's variant of Lie-X, and ours.
 
-The same code runs both variants and reads these numbers; nothing else tells them apart. The paper's
-values (C rounds, Kt initial poses, trees, depths, learned metric) are those of Lie-X sections 4 and
-5.2 where it states them; what differs in the default variant follows the lessons of METHOD, whose
-numbers stand in brackets.
+The same code runs both variants with these numbers. The paper's values (C rounds, Kt initial poses,
+trees, depths, learned metric) are those of Lie-X sections 4 and 5.2 as far as stated there.
 """
 
 from __future__ import annotations
@@ -21,10 +19,10 @@ from liex_lab.forests.grow import GrowthPlan
 
 @dataclass(frozen=True)
 class Method:
-    """Everything that training and estimation do differently from variant to variant.
+    """Everything in which training and estimation differ between variants.
 
-    Angles are in rad; lengths are in mm of an animal of home size. METHOD lessons are in brackets.
-    The names of the fields are keys of the model files.
+    Angles are in rad; lengths are in mm of an animal of home size. The names of the fields are keys
+    of the model files.
 
     Attributes:
         variant: 'default' or 'paper'.
@@ -33,96 +31,94 @@ class Method:
         training_candidates: K, the initial poses per training image.
         regressors: plan of the regressors' forests.
         metric: plan of the learned metric.
-        reach_mm: offsets of the features reach this far from the joint, mm.
-        axis_start: start along the animal's long axis in both directions [8]; else at any heading.
+        reach_mm: range of the features' offsets from the joint, mm.
+        axis_start: start along the animal's long axis in both directions; else at any heading.
         camera_view: heights are measured along the optical axis, as in the paper; else above the
             floor.
         session_size: the animal's size is estimated over the recording; else it is the home size.
         regress_scale: the base joint also corrects the scale of the bones.
-        point_at: labels aim the bone at the true next joint [7].
-        keep_turned: the base learns from samples that are turned by less than this, rad [1].
-        keep_bent: other joints learn from corrections smaller than this, rad [1].
-        keep_off_mm: other joints learn from samples no farther off than this, mm [1].
-        out_of_bag: move a training sample only with trees that were not grown on its image [6].
-        metric_on_own: train the metric on the cascade's own candidates [6]; else on perturbed
-            truth.
+        point_at: labels aim the bone at the true next joint, so that errors do not add up.
+        keep_turned: the base learns from samples rotated by less than this, rad.
+        keep_bent: other joints learn from corrections smaller than this, rad.
+        keep_off_mm: other joints learn from samples within this distance of the truth, mm.
+        out_of_bag: move a training sample only with trees that were not grown on its image, so that
+            training errors are those of new images.
+        metric_on_own: train the metric on the cascade's own candidates; else on perturbed truth.
         metric_shrinkage: shrinkage of the metric's boosting; 0 grows a plain forest.
         mean_shift_mm: bandwidth of the mode over tree votes, mm, of regressors and metric, in
             training and in estimation; 0 averages them.
-        top_k: number of candidates that are averaged [3]; 1 takes the best one.
-        top_tau: averaging weights decay with the predicted error by this, mm.
+        top_k: number of averaged candidates; 1 uses the best one.
+        top_tau: decay of the averaging weights with the predicted error, mm.
         top_radius_mm: only candidates within this of the best one are averaged, mm.
         base_lever_mm: lever arm of the base, at which rotations weigh as much as translations, mm.
         joint_lever_mm: lever arm of the other joints' rotations, mm.
         scale_lever_mm: lever arm of the logarithm of the scale, mm.
-        survivors: candidates that are kept after the base joint [9]; 0: all of them.
+        survivors: candidates kept after the base joint; 0: all of them.
         pruner: plan of the small metric that chooses them; None: no such metric is trained.
         settle: the chosen pose of an unbranched animal undergoes the ridge correction.
-        base_reach_mm: offsets reach this far from the base joint, mm; 0: as far as from the others.
-        corrector: plan of the forest correction of the chosen pose; None: it stays as chosen.
-        home_turn: (3,) rotation vector by which initial poses are turned out of the home pose, rad.
+        base_reach_mm: range of offsets from the base joint, mm; 0: as from the others.
+        corrector: plan of the forest correction of the chosen pose; None: no correction.
+        home_turn: (3,) rotation vector of initial poses relative to the home pose, rad.
         proposals: plan of the forest that proposes initial poses, for an animal of any orientation.
-        proposal_reach_mm: offsets of its features reach this far from the animal's centre, mm.
-        base_rounds: rounds of the base joint where they differ from the others'; 0: as many.
+        proposal_reach_mm: range of its features' offsets from the animal's centre, mm.
+        base_rounds: rounds of the base joint if they differ from the others'; 0: as many.
         refine_steps: Gauss-Newton steps that fit a pose to the height map; 0: none.
-        refined: candidates that are fitted beside the mean of the best; the one that fits is
+        refined: candidates that are fitted in addition to the mean of the best; the best fit is
             chosen.
-        explains: the metric also sees the residuals of the posed body against the height map [4].
-        tells_facing: a head-tail classifier decides where the metric is unsure, see `head_tail`.
+        explains: the metric also uses the residuals of the posed body against the height map.
+        tells_facing: a head-tail classifier decides if the metric is unsure, see `head_tail`.
     """
 
     variant: str
     rounds: int  # C
     n_candidates: int  # Kt
-    training_candidates: int  # K initial poses a training image
+    training_candidates: int  # K initial poses per training image
     regressors: GrowthPlan
     metric: GrowthPlan
-    reach_mm: float  # offsets of the features reach this far from the joint
-    axis_start: bool  # start along the animal's long axis, both ways [8]; else any heading
+    reach_mm: float  # range of the features' offsets from the joint
+    axis_start: bool  # start along the animal's long axis, in both directions; else any heading
     camera_view: bool  # depth along the optical axis, as the paper; else height above the floor
     session_size: bool  # the animal's size is estimated over the recording; else home size
     regress_scale: bool  # the base joint also corrects the bones' scale
-    point_at: bool  # labels aim the bone at the true next joint [7]
-    keep_turned: float  # base: train on samples turned by less than this [1]
-    keep_bent: float  # other joints: train on corrections smaller than this [1]
-    keep_off_mm: float  # other joints: train on samples no farther off than this [1]
-    out_of_bag: bool  # move a training sample only with trees that have not seen its image [6]
-    metric_on_own: (
-        bool  # train the metric on the cascade's own candidates [6]; else on perturbed truth
-    )
+    point_at: bool  # labels aim the bone at the true next joint
+    keep_turned: float  # base: train on samples rotated by less than this
+    keep_bent: float  # other joints: train on smaller corrections than this
+    keep_off_mm: float  # other joints: train on samples within this distance
+    out_of_bag: bool  # move a training sample only with trees not grown on its image
+    metric_on_own: bool  # train the metric on the cascade's own candidates; else on perturbed truth
     metric_shrinkage: float  # of each boosting stage of the metric; 0 grows a plain forest
     mean_shift_mm: float  # bandwidth of the mode over tree votes; 0 averages them
-    top_k: int  # candidates that are averaged [3]; 1 takes the best one
-    top_tau: float  # weights fall off with the predicted error by this, mm
+    top_k: int  # averaged candidates; 1 uses the best one
+    top_tau: float  # decay of weights with the predicted error, mm
     top_radius_mm: float  # only candidates within this of the best one are averaged
     base_lever_mm: float = 30.0  # rotations weigh as much as translations at this arm
     joint_lever_mm: float = 20.0
     scale_lever_mm: float = 50.0
-    survivors: int = 0  # candidates that outlive the base joint [9]; 0: all of them
+    survivors: int = 0  # candidates kept after the base joint; 0: all of them
     # of the small metric that chooses them; None: no such metric is trained
     pruner: GrowthPlan | None = None
-    # the chosen pose of an animal that is one chain settles under its back, see `settle`
+    # ridge correction of the chosen pose of an animal that is one chain
     settle: bool = False
-    # offsets reach this far from the base joint; 0: as far as from the others
+    # range of offsets from the base joint; 0: as from the others
     base_reach_mm: float = 0.0
-    # of the last correction, of the chosen pose; None: it stays as chosen
+    # of the forest correction of the chosen pose; None: no correction
     corrector: GrowthPlan | None = None
     home_turn: tuple[float, ...] = (
         0.0,
         0.0,
         0.0,
-    )  # rotation vector by which starts are turned out of the home pose
-    # trees that say where a start may be, for an animal of any orientation
+    )  # rotation vector of starts relative to the home pose
+    # trees that propose starts, for an animal of any orientation
     proposals: GrowthPlan | None = None
-    # offsets of their features reach this far from the animal's centre
+    # range of their features' offsets from the animal's centre
     proposal_reach_mm: float = 0.0
-    # rounds of the base joint where they are not as many as the others'; 0: as many
+    # rounds of the base joint if they differ from the others'; 0: as many
     base_rounds: int = 0
-    refine_steps: int = 0  # of taking a pose into the image
-    # candidates that are taken there beside the mean of the best; the one that fits is chosen
+    refine_steps: int = 0  # Gauss-Newton steps of the refinement
+    # candidates refined in addition to the mean of the best; the best fit is chosen
     refined: int = 0
-    explains: bool = False  # the metric also knows what the posed body leaves unexplained [4]
-    # a network tells head from tail where the metric is unsure, see `facing`
+    explains: bool = False  # the metric also uses the residuals of the posed body
+    # a network separates head from tail if the metric is unsure, see `head_tail`
     tells_facing: bool = False
 
     def rounds_of(self, joint: int) -> int:
@@ -134,13 +130,10 @@ class Method:
         return self.base_rounds or self.rounds if joint == 0 else self.rounds
 
     def reaches(self, n_joints: int) -> NDArray[np.float64]:
-        """How far feature offsets reach from each joint.
+        """Range (J,) of feature offsets from each joint, mm at home size.
 
         Args:
             n_joints: number of joints, J.
-
-        Returns:
-            (J,) mm at home size.
         """
         reach = np.full(n_joints, self.reach_mm)
         reach[0] = self.base_reach_mm or self.reach_mm
@@ -149,7 +142,7 @@ class Method:
     def to_dict(self) -> dict[str, Any]:
         """Plain values, for the model file and its card.
 
-        Fields that only some animals have are left out where they are unset.
+        Unset fields that only some animals have are omitted.
         """
         return {
             name: _plain_plan(value) if name in _PLANS and value else value
@@ -176,7 +169,7 @@ _PLANS = ("regressors", "metric", "pruner", "corrector", "proposals")
 
 
 def _plain_plan(plan: dict[str, Any]) -> dict[str, Any]:
-    """A plan's fields, without a largest leaf where none is stated."""
+    """A plan's fields, without max_leaf if it has none."""
     return {name: value for name, value in plan.items() if name != "max_leaf" or value}
 
 
@@ -249,8 +242,8 @@ METHODS = {
 }
 
 
-# a hand may turn any side to the camera, and its fingers' bones are short beside their distance
-# from the base
+# a hand may show any side to the camera, and its fingers' bones are short compared with their
+# distance from the base
 _HAND: dict[str, Any] = {
     "camera_view": False,
     "rounds": 3,
@@ -279,8 +272,8 @@ _HAND: dict[str, Any] = {
 }
 
 
-# what an animal does otherwise than the mouse: fields of its method at home size, the rest is the
-# mouse's, scaled
+# differences from the mouse: fields of an animal's method at home size; the rest is the mouse's,
+# scaled
 _OWN: dict[tuple[str, str], dict[str, Any]] = {
     ("mouse", "default"): {"tells_facing": True},
     ("fish", "default"): {
@@ -328,8 +321,8 @@ _LENGTHS = (
 def method_of(variant: str, skeleton: Skeleton | None = None) -> Method:
     """The method of a variant for an animal.
 
-    Lengths are the mouse's over its home length times the animal's, unless the animal has its own.
-    Where the animal is looked at along the optical axis, every variant does so.
+    Lengths are the mouse's, scaled by the ratio of home lengths, unless the animal has its own. An
+    animal viewed along the optical axis is so in every variant.
 
     Args:
         variant: 'default' or 'paper'.
@@ -339,7 +332,7 @@ def method_of(variant: str, skeleton: Skeleton | None = None) -> Method:
         PlanError: there is no such variant.
     """
     if variant not in METHODS:
-        raise PlanError(f"there is no variant '{variant}'; known are {', '.join(METHODS)}")
+        raise PlanError(f"there is no variant '{variant}'; choose one of {', '.join(METHODS)}")
     method = METHODS[variant]
     if skeleton is None:
         return method

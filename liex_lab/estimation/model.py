@@ -2,7 +2,7 @@
 
 The file is a ZIP archive (LZMA) of .npy arrays: `head` is JSON as bytes; each forest is stored as
 six arrays `NNN_tests`, `_threshold`, `_kind`, `_is_leaf`, `_roots` and `_leaves` (float16), the
-child pointers being implied by the order of growth; `settler` holds the ridge correction and
+child pointers being implied by the order of growth; `settler` is the ridge correction and
 `facing_*` the head-tail classifier. Loading never runs code, and equal models give equal bytes.
 """
 
@@ -34,8 +34,8 @@ from liex_lab.mlp import Network, check_layers
 from liex_lab.runtime.memory import check_npz
 
 N_CLUES = 22  # of `scoring.clue_samples`, the residuals apart
-SCHEMA = 3  # of a model that tells which way an animal faces; 2 of one that does not
-# that follow the regressors, as far as a model has them
+SCHEMA = 3  # of a model with a head-tail classifier; 2 of one without
+# after the regressors, if present
 _FORESTS = ("metric", "expectation", "pruner", "corrector", "proposals")
 _DAMAGE = (
     OSError,
@@ -57,12 +57,12 @@ _EPOCH = (
     0,
     0,
     0,
-)  # every file in the archive bears this date, so equal models are equal bytes
+)  # date of every file in the archive, so that equal models are equal bytes
 
 
 @dataclass(frozen=True)
-class Calibration:
-    """What the metric's score means, learned on images that no tree was grown on.
+class ErrorCalibration:
+    """Conversion of the metric's score to mm, learned on images that no tree was grown on.
 
         error = offset + slope * score + spread_slope * spread        (mm at home size)
 
@@ -70,8 +70,7 @@ class Calibration:
         offset: mm at home size.
         slope: mm of error per mm of score.
         spread_slope: mm of error per mm of spread of the averaged candidates.
-        quantiles: (2,) ratios of true to predicted error that 5 % and 95 % of the images stay
-            below.
+        quantiles: (2,) the 5 % and 95 % quantiles of the ratio of true to predicted error.
         joint_share: (J,) each joint's error over the mean; empty: 1 for every joint.
         doubtful_mm: a predicted error above this, mm at home size, is flagged.
         area_mm2: usual area of a home-sized animal seen from above, mm^2.
@@ -95,23 +94,22 @@ class Model:
     Attributes:
         cascade: skeleton, method and regressors.
         metric: the learned metric R_m, which predicts a candidate's mean joint error.
-        expectation: forest that predicts the expected error of a chosen pose from what is known of
-            it; None: the calibration's line is used.
+        expectation: forest that predicts the expected error of a chosen pose; None: the
+            calibration's line is used.
         skeleton_table: the skeleton's TOML as a table.
-        calibration: what the metric's score means in mm.
-        card: how the model was made.
-        pruner: the small metric that sees the base joint only; None: nothing is pruned.
-        corrector: forest that moves the joints of the chosen pose once more, see
-            `forest_correction`.
-        settler: (F, J + 4) table of the ridge correction, where the method has one.
-        facing: network of the head-tail classifier, where the method has one.
+        calibration: conversion of the metric's score to mm.
+        card: provenance of the model.
+        pruner: the small metric on the base joint only; None: nothing is pruned.
+        corrector: forest that corrects the joints of the chosen pose, see `forest_correction`.
+        settler: (F, J + 4) table of the ridge correction, if the method has one.
+        facing: network of the head-tail classifier, if the method has one.
     """
 
     cascade: Cascade
     metric: Forest
     expectation: Forest | None
     skeleton_table: dict[str, Any]
-    calibration: Calibration = field(default_factory=Calibration)
+    calibration: ErrorCalibration = field(default_factory=ErrorCalibration)
     card: dict[str, Any] = field(default_factory=dict)
     pruner: Forest | None = None
     corrector: Forest | None = None
@@ -130,12 +128,14 @@ class Model:
 
     @property
     def proposals(self) -> Forest | None:
-        """The forest that proposes initial poses; None where they are drawn."""
+        """The forest that proposes initial poses; None if they are drawn."""
         return self.cascade.proposals
 
     @cached_property
     def fingerprint(self) -> str:
-        """What tells this model from others of the same animal: a hash of its learned metric."""
+        """A hash of the learned metric, which identifies the model among those of the
+        same animal.
+        """
         return hashlib.sha256(self.metric.nodes.tobytes()).hexdigest()[:16]
 
     def to_bytes(self) -> bytes:
@@ -178,8 +178,8 @@ class Model:
             path: path of an .npz that `to_bytes` made.
 
         Raises:
-            ModelError: there is no such file, it is no whole model file, or a newer program made
-                it.
+            ModelError: there is no such file, it is not a complete model file, or a newer program
+                made it.
         """
         try:
             # opened here, for numpy leaves a damaged archive open
@@ -201,7 +201,7 @@ class Model:
             values = head["calibration"]
             for name in ("quantiles", "joint_share"):
                 values[name] = tuple(values[name])
-            calibration = Calibration(**values)
+            calibration = ErrorCalibration(**values)
             table = head["skeleton"]
             card = head["card"]
         except FileNotFoundError:
@@ -210,17 +210,19 @@ class Model:
             ) from None
         except _DAMAGE as error:
             raise ModelError(
-                f"{path} is not a whole model file ({error}); train it again or copy it anew"
+                f"{path} is not a complete model file ({error}); train it again or copy it again"
             ) from None
         skeleton = Skeleton.from_table(table, str(path))
         rounds = [method.rounds_of(joint) for joint in skeleton.solved]
         if any(type(n) is not int or n < 1 for n in rounds):
             raise ModelError(f"{path} states {rounds} rounds for its joints; train it again")
         n_regressors = sum(rounds)
-        extra = head.get("forests", _FORESTS[: len(forests) - n_regressors])  # schema 1 did not say
+        extra = head.get(
+            "forests", _FORESTS[: len(forests) - n_regressors]
+        )  # schema 1 did not state it
         if len(forests) != n_regressors + len(extra) or "metric" not in extra:
             raise ModelError(
-                f"{path} holds {len(forests)} forests, not {n_regressors} and a metric; train it "
+                f"{path} has {len(forests)} forests, not {n_regressors} and a metric; train it "
                 "again"
             )
         named = dict(zip(extra, forests[n_regressors:], strict=True))
@@ -246,8 +248,7 @@ class Model:
             check_model(model)
         except _DAMAGE as error:
             raise ModelError(
-                f"{path} does not hold a model that can be used ({error}); train it again or copy "
-                "it anew"
+                f"{path} does not contain a usable model ({error}); train it again or copy it again"
             ) from None
         return model
 
@@ -257,13 +258,13 @@ class Model:
 
 
 def check_model(model: Model) -> None:
-    """Check every number of a model that came from a file and that arrays are indexed or sized by.
+    """Check every number of a model from a file that is used as an index or a size.
 
     Args:
-        model: the model as it was read.
+        model: the model as read.
 
     Raises:
-        ValueError: what is wrong, as a part of a sentence.
+        ValueError: the error, as a part of a sentence.
     """
     skeleton = model.skeleton
     method = model.method
@@ -315,15 +316,15 @@ def check_model(model: Model) -> None:
     if method.explains or method.refine_steps:
         balls = model.cascade.balls.joints
         if balls.size and (balls.min() < 0 or balls.max() >= j):
-            raise ValueError(f"a sphere of its body lies on none of the {j} joints")
+            raise ValueError(f"a sphere of its body is on none of the {j} joints")
 
 
 def _check_numbers(where: str, values: Any) -> None:
-    """Raise ValueError where there is a number, however deep in tables and lists, that is NaN,
-    infinite or so large that it can mean nothing.
+    """Raise ValueError for a number, at any depth of tables and lists, that is NaN, infinite or
+    implausibly large.
     """
     if isinstance(values, float | int) and not abs(values) <= _HUGE:
-        raise ValueError(f"{where} holds the number {values}")
+        raise ValueError(f"{where} contains the number {values}")
     inner = getattr(values, "__dict__", values)
     if isinstance(inner, dict):
         inner = inner.values()
@@ -336,7 +337,7 @@ def _check_numbers(where: str, values: Any) -> None:
 _HUGE = 1e12
 _MOST_BYTES = 1 << 30  # of a model unpacked: ten times the largest bundled one
 _MOST = 10_000
-# how often each is done, or how many there are, at least
+# least value of each count
 _COUNTS = {
     "rounds": 1,
     "n_candidates": 1,
@@ -351,7 +352,7 @@ _LAYER = "facing_"
 
 
 def _layers(network: Network) -> dict[str, NDArray[Any]]:
-    """A network's layers as the file holds them; its features are not standardised."""
+    """A network's layers as stored in the file; its features are not standardised."""
     return {
         f"{_LAYER}{k}_{name}": values.astype(np.float16)
         for k, layer in enumerate(network.layers)
@@ -382,14 +383,14 @@ _KINDS = {
     "leaves": np.float16,
 }
 _PARTS = tuple(_KINDS)
-_FARTHEST = 127  # what an offset may be
+_FARTHEST = 127  # largest offset
 _TABLES = ("tests", "leaves")
 
 
 def _split(forest: Forest) -> dict[str, NDArray[Any]]:
     """A forest as arrays that compress well.
 
-    The child pointers are left out, for they follow from which nodes are leaves.
+    The child pointers are omitted, as they follow from which nodes are leaves.
     """
     words = forest.nodes
     inner = words[:, 2] >= 0
@@ -408,12 +409,12 @@ def _join(parts: dict[str, NDArray[Any]]) -> Forest:
     """The inverse of `_split`.
 
     Growth numbers nodes and leaves in one order: a tree's children are appended as a pair when
-    their parent splits, the left side of the stack first, so walking the trees again in that order
-    gives every pointer back.
+    their parent splits, the left side of the stack first, so traversing the trees in that order
+    restores every pointer.
     """
     for name, kind in _KINDS.items():
         if parts[name].dtype != kind or parts[name].ndim != (2 if name in _TABLES else 1):
-            raise ValueError(f"{name} of a forest is no list of {np.dtype(kind)}")
+            raise ValueError(f"{name} of a forest is not a list of {np.dtype(kind)}")
     if parts["tests"].min(initial=0) < -_FARTHEST:
         raise ValueError(f"an offset of a test is below -{_FARTHEST}")
     n_inner = len(parts["threshold"])
@@ -421,7 +422,7 @@ def _join(parts: dict[str, NDArray[Any]]) -> Forest:
     n_nodes = n_inner + n_leaves
     is_leaf = np.unpackbits(parts["is_leaf"], count=n_nodes).astype(bool)
     if len(is_leaf) != n_nodes or int(is_leaf.sum()) != n_leaves:
-        raise ValueError(f"a forest does not have the {n_leaves} leaves that it has values of")
+        raise ValueError(f"a forest does not have as many leaves as values, {n_leaves}")
     check_roots(parts["roots"], is_leaf)
     nodes = np.zeros((n_nodes, 4), np.int32)
     words = np.empty((n_inner, 8), np.int8)

@@ -1,15 +1,14 @@
 """Gauss-Newton refinement of a pose against the height map: articulated ICP with a sphere model.
 
-The last step, after the regressors and the learned metric (ours; METHOD sections 2.3 and 2.4). The
-body is a set of spheres carried by the kinematic tree. With p the tangent vector of the base, the
-logarithm of the scale and the free angles, each step minimises
+The last step, after the regressors and the learned metric (ours). The body is a set of spheres
+carried by the kinematic tree. With p the tangent vector of the base, the logarithm of the scale and
+the free angles, each step minimises
 
     sum_i w_i d_i(p)^2 + w_b sum_k b_k(p)^2 + (p - p0)^T diag(prior) (p - p0)
 
-over signed distances d_i of depth readings to the nearest sphere and of spheres to the readings in
-front of which they stick out, both with robust Geman-McClure weights, distances b_k of spheres
-beside the animal to its nearest pixel, and a prior at the pose that the regressors found. The
-kernels are in `_refine_kernels`.
+over signed distances d_i of depth readings to the nearest sphere and of spheres to the readings
+behind them, both with robust Geman-McClure weights, distances b_k of spheres outside the animal to
+its nearest pixel, and a prior at the pose of the regressors. The kernels are in `_refine_kernels`.
 """
 
 from __future__ import annotations
@@ -34,13 +33,13 @@ from liex_lab.scene._height_map_kernels import N_CROP_CAMERA
 Array = NDArray[np.float64]
 
 _ROBUST_MM = 10.0  # in tenths of the balls' usual radius: a reading this far off counts a quarter
-_BESIDE = 0.3  # what a ball beside the animal weighs against a reading
-# that all poses take, and how many of them take the others: those that then lie best
+_BESIDE = 0.3  # weight of a ball outside the animal relative to a reading
+# steps of all poses, and number of the best poses that continue
 _FIRST_STEPS = 1
 _GO_ON = 2
-_BESIDE_MM = 4.0  # in that unit: what it weighs in the choice, if all balls were beside it
-# what it costs to leave the pose that the regressors found, in squares of that unit: a radian of
-# the base, a unit of place, of log scale, and a radian of a joint
+_BESIDE_MM = 4.0  # in that unit: cost in the choice if all balls were outside the animal
+# cost of leaving the pose of the regressors, in squares of that unit: a radian of the base, a unit
+# of its position, of log scale, and a radian of a joint
 _PRIOR = np.array([1e4, 0.5, 1e4, 60.0])
 
 
@@ -50,9 +49,9 @@ class Refiner:
 
     Attributes:
         skeleton: the animal's skeleton.
-        tree: the kinematic tree as the kernels want it.
-        free_angles: what its free angles do, as the kernels want it.
-        body: the sphere model as the kernels want it.
+        tree: the kinematic tree as a record for the kernels.
+        free_angles: its free angles, likewise.
+        body: the sphere model, likewise.
     """
 
     skeleton: Skeleton
@@ -102,7 +101,7 @@ class Refiner:
 
         Args:
             pose: (n, K) poses in their view frames; not changed.
-            heights: (n, S, S) int16 height maps, 1/16 mm, 0 where there is no animal.
+            heights: (n, S, S) int16 height maps, 1/16 mm, 0 outside the animal.
             crop_cameras: (n, 17) packed crop cameras of the height maps.
             size: the animal's size over home size.
             n_steps: number of Gauss-Newton steps.
@@ -116,7 +115,7 @@ class Refiner:
         position = pose.root.translation.copy()
         angles = pose.angles.copy()
         scale = pose.scale.copy()
-        wishes = kernels.ResidualWeights(
+        weights = kernels.ResidualWeights(
             _ROBUST_MM * unit, _BESIDE, *(_PRIOR * np.array([unit**2, 1.0, unit**2, unit**2]))
         )
         kernels.refine_all(
@@ -125,7 +124,7 @@ class Refiner:
             self.tree,
             self.free_angles,
             self.body,
-            wishes,
+            weights,
             n_steps,
             rotation,
             position,
@@ -177,7 +176,7 @@ class Refiner:
     def best(self, poses: Pose, images: ImageSet, size: float, n_steps: int) -> tuple[Pose, Array]:
         """Refine poses and choose the one that fits each height map best.
 
-        One step is taken with all K poses; the two that then fit best take the others.
+        All K poses are refined by one step, and the best two by the remaining steps.
 
         Args:
             poses: (n, K) poses in their view frames.
@@ -200,7 +199,7 @@ class Refiner:
 
 
 def _apart(fit: Array) -> Array:
-    """Distance (n, K) mm of poses from the readings, out of their residuals (n, K, N_FIT)."""
+    """Distance (n, K) mm of poses from the readings, from their residuals (n, K, N_FIT)."""
     distance = (
         fit[..., residual_kernels.OUT_OF] + fit[..., residual_kernels.APART]
     ) / residual_kernels.MM_UNIT

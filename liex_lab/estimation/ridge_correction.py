@@ -1,13 +1,13 @@
 """Ridge regression that corrects the chosen pose of an unbranched animal by the back above it.
 
-The animal is one seen along the optical axis. The regressors see a long animal's depth from its
+For animals viewed along the optical axis. The regressors estimate a long animal's depth from its
 base joint, at one end of it. Once the whole spine is in place, all of its back can be compared with
 it (ours). A linear map fitted by ridge regression (Hoerl and Kennard 1970),
 
     W = (X^T X + lambda n I)^-1 X^T Y        on standardised features X, lambda = 0.01,
 
-on images that no tree was grown on, takes what is seen along the mid-line to how much deeper each
-joint lies, how far the spine has slid along itself, and how much larger the animal is.
+on images that no tree was grown on, maps observations along the mid-line to the depth error of each
+joint, the displacement of the spine along itself, and the relative error of the animal's size.
 """
 
 from __future__ import annotations
@@ -27,15 +27,16 @@ from liex_lab.scene.height_maps import mm_per_px
 Array = NDArray[np.float64]
 
 _MOST_SHARE = 0.08  # of the length: readings farther from the back than this are not the back
-SURE_SHARE = 1 / 3  # of the frames tell the size: those that see most of the animal's far end
+SURE_SHARE = (
+    1 / 3
+)  # share of the frames used for the size: those that show most of the animal's far end
 N_OTHERS = 15  # clues that are not of one joint
 _RIDGE = 1e-2  # of the features' variance
 _LEAST_SPREAD = 1e-6
-_TAIL = 0.01  # of what a clue was seen to be: beyond it is taken for the last that was seen
-# a product's last bits depend on how many frames are asked about at once, and a frame's pose must
-# not
+_TAIL = 0.01  # quantile of a clue in training at which it is clipped
+# a product's last bits depend on the batch size, and a frame's pose must not
 _DECIMALS = 12
-# of the length, and in logarithms: poses farther off are not learned from
+# of the length, and in logarithms: poses with larger errors are excluded
 _SLID_SHARE = 0.1
 _SIZE_LOG = 0.25
 
@@ -47,9 +48,9 @@ class RidgeCorrection:
     Attributes:
         skeleton: the animal's skeleton, one unbranched chain.
         table: (F, J + 4), by columns: the least and the most of each feature of `clues` (beyond
-            which it is clipped), then the weights that lead from the features to the rise of each
-            joint (J), the slide along the spine (both over the animal's length), and the logarithm
-            of the true over the assumed size.
+            which it is clipped), then the weights of the features for the rise of each joint (J),
+            the slide along the spine (both over the animal's length), and the logarithm of the true
+            over the assumed size.
     """
 
     skeleton: Skeleton
@@ -57,11 +58,7 @@ class RidgeCorrection:
 
     @staticmethod
     def serves(skeleton: Skeleton) -> bool:
-        """Whether the correction applies: the skeleton is one unbranched chain.
-
-        Args:
-            skeleton: the animal's skeleton.
-        """
+        """Whether the correction applies: the skeleton is one unbranched chain."""
         return bool((skeleton.parents[1:] == np.arange(skeleton.n_joints - 1)).all())
 
     @staticmethod
@@ -75,8 +72,8 @@ class RidgeCorrection:
     ) -> RidgeCorrection:
         """Fit the correction to chosen poses with known truth.
 
-        Poses that are off by a tenth of the length or more, or by 0.25 in the logarithm of the
-        size, are left out. Features are clipped to their 1 % and 99 % quantiles.
+        Poses with an error of a tenth of the length or more, or of 0.25 in the logarithm of the
+        size, are excluded. Features are clipped to their 1 % and 99 % quantiles.
 
         Args:
             skeleton: the animal's skeleton, one unbranched chain.
@@ -100,8 +97,7 @@ class RidgeCorrection:
         y = labels[good]
         bounds = np.quantile(x, [_TAIL, 1.0 - _TAIL], axis=0)
         x = np.clip(x, *bounds)
-        # from all of them: those that see its far end best were mostly taken for smaller than they
-        # are
+        # from all of them: those that show its far end best were mostly underestimated in size
         return RidgeCorrection(skeleton, np.column_stack([*bounds, _linear(x, y)]))
 
     def correct(self, pose: Pose, images: ImageSet, size: float) -> CorrectedRidge:
@@ -118,29 +114,29 @@ class RidgeCorrection:
         skeleton = self.skeleton
         n = len(pose.scale)
         joints = pose.joints(skeleton)
-        seen = clues(skeleton, pose, joints, images, np.full(n, size))
-        correction = (np.clip(seen, self.table[:, 0], self.table[:, 1]) @ self.table[:, 2:]).round(
-            _DECIMALS
-        )
+        features = clues(skeleton, pose, joints, images, np.full(n, size))
+        correction = (
+            np.clip(features, self.table[:, 0], self.table[:, 1]) @ self.table[:, 2:]
+        ).round(_DECIMALS)
         length = skeleton.length * size
         moved = joints + length * correction[:, -2, None, None] * tangents(joints)
         moved[..., 2] += length * correction[:, :-2]
         return CorrectedRidge(
             Pose.from_joints(skeleton, moved, pose.root.rotation[..., 2]),
             correction[:, -1],
-            far_end_seen(seen),
+            far_end_visibility(features),
         )
 
 
 @dataclass(frozen=True)
 class CorrectedRidge:
-    """Corrected poses and what each tells about the animal's size.
+    """Corrected poses and an estimate of the animal's size from each.
 
     Attributes:
         pose: (n) poses, view frame.
         grown: (n,) logarithm of the animal's true over its assumed size, as each pose estimates it.
-        clear: (n,) in [0, 1], how much of the animal's far end is seen, without which nothing tells
-            its size.
+        clear: (n,) in [0, 1], visible share of the animal's far end, which the size estimate
+            requires.
     """
 
     pose: Pose
@@ -157,7 +153,7 @@ def _linear(x: Array, y: Array) -> Array:
     spread = x.std(axis=0)
     per = np.where(
         spread > _LEAST_SPREAD, 1.0 / np.maximum(spread, _LEAST_SPREAD), 0.0
-    )  # a constant tells nothing
+    )  # a constant has no information
     scaled = (x - middle) * per
     ridge = _RIDGE * len(x) * np.eye(x.shape[1])
     weights = (
@@ -167,17 +163,14 @@ def _linear(x: Array, y: Array) -> Array:
     return np.asarray(weights)
 
 
-def far_end_seen(seen: Array) -> Array:
-    """How much is seen of the last quarter of a chain of joints.
+def far_end_visibility(features: Array) -> Array:
+    """Visible share (n,), in [0, 1], of the last quarter of a chain of joints.
 
     Args:
-        seen: (n, F) features of `clues`.
-
-    Returns:
-        (n,) in [0, 1].
+        features: (n, F) features of `clues`.
     """
-    j = (seen.shape[1] - N_OTHERS) // 2
-    return np.asarray(seen[:, 1 + j + 3 * j // 4 : 1 + 2 * j].mean(axis=1))
+    j = (features.shape[1] - N_OTHERS) // 2
+    return np.asarray(features[:, 1 + j + 3 * j // 4 : 1 + 2 * j].mean(axis=1))
 
 
 def tangents(joints: Array) -> Array:
@@ -197,10 +190,10 @@ def tangents(joints: Array) -> Array:
 def clues(skeleton: Skeleton, pose: Pose, joints: Array, images: ImageSet, size: Array) -> Array:
     """Features of a pose against the height map along its mid-line.
 
-    They are a constant, the height of the back over each joint (J) and how much of it is seen (J),
-    how far the animal reaches past the ends of the chain and the square of that, the slope and roll
-    of the base, the total bend, the size of a pixel, and the scale of the bones. Lengths are over
-    the animal's own.
+    They are a constant, the height of the back over each joint (J) and its visible share (J), the
+    extent of the animal past the ends of the chain and the square of that, the slope and roll of
+    the base, the total bend, the size of a pixel, and the scale of the bones. Lengths are over the
+    animal's own.
 
     Args:
         skeleton: the animal's skeleton, one unbranched chain.
@@ -216,13 +209,20 @@ def clues(skeleton: Skeleton, pose: Pose, joints: Array, images: ImageSet, size:
     j = skeleton.n_joints
     check_shapes("poses", ("joints", joints, (n, j, 3)), ("size", size, (n,)))
     length = skeleton.length * size
-    seen = np.empty((n, 2 * j + 2))
-    kernels.look_along(
-        images.heights, images.crop_cameras, np.ascontiguousarray(joints), length, _MOST_SHARE, seen
+    profile = np.empty((n, 2 * j + 2))
+    kernels.back_profiles(
+        images.heights,
+        images.crop_cameras,
+        np.ascontiguousarray(joints),
+        length,
+        _MOST_SHARE,
+        profile,
     )
-    share = np.minimum(seen[:, j : 2 * j] * 2.0, 1.0)
-    back = np.clip(seen[:, :j] / length[:, None], -2 * _MOST_SHARE, 2 * _MOST_SHARE) * (share > 0)
-    ends = seen[:, 2 * j :] / length[:, None]
+    share = np.minimum(profile[:, j : 2 * j] * 2.0, 1.0)
+    back = np.clip(profile[:, :j] / length[:, None], -2 * _MOST_SHARE, 2 * _MOST_SHARE) * (
+        share > 0
+    )
+    ends = profile[:, 2 * j :] / length[:, None]
     rise = pose.root.rotation[:, 2, 0]
     roll = pose.root.rotation[:, 2, 1]
     bent = np.abs(pose.angles[..., 2]).sum(axis=1)

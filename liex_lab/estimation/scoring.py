@@ -5,7 +5,7 @@ candidates near that one are averaged with weights
 
     w_i ~ exp(-(score_i - score_best) / tau);
 
-rotations take the chordal mean, the polar projection of sum_i w_i R_i, or follow from the mean
+rotations use the chordal mean, the polar projection of sum_i w_i R_i, or follow from the mean
 joints. A boosted forest then predicts the mean joint error of the chosen pose from its scores, its
 spread and the posture (the "expectation forest", ours).
 """
@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from liex_lab.body.pose import Pose
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.estimation.method import Method
-from liex_lab.estimation.model import Calibration, Model
+from liex_lab.estimation.model import ErrorCalibration, Model
 from liex_lab.forests._kernels import VIEW
 from liex_lab.forests.forest import Samples, predict
 from liex_lab.geometry import SE3, so3
@@ -30,18 +30,18 @@ from liex_lab.scene.height_maps import mm_per_px, moment_columns
 Array = NDArray[np.float64]
 
 LOG_UNIT = 10.0  # of logarithms that a forest predicts: its leaves are kept as float16
-# at the reference length: the least error that is ever expected, and what stands for the score of
-# the opposite direction where no candidate points there
+# at the reference length: the least expected error, and the score of the opposite direction if no
+# candidate has it
 LEAST_MM = 0.1
 _NO_OPPOSITE_MM = 40.0
 
 
 class Doubts(NamedTuple):
-    """What speaks against the chosen poses (n,), mm at home size, in the order of `Chosen.doubts`.
+    """Evidence against the chosen poses (n,), mm at home size, in the order of `Chosen.doubts`.
 
     Attributes:
         best: the best score.
-        opposite: the best score of a candidate that points the other way.
+        opposite: the best score of a candidate in the opposite direction.
         score_sd: standard deviation of the good scores.
         distance: mean distance of all candidates from the chosen pose.
     """
@@ -54,10 +54,10 @@ class Doubts(NamedTuple):
 
 @dataclass(frozen=True)
 class Chosen:
-    """One pose for each of n frames, in the view frame of the frame; NaN where no animal was found.
+    """One pose for each of n frames, in the view frame of the frame; NaN if no animal was found.
 
     Attributes:
-        pose: (n) poses; as `choose` makes them, with the frames of their joints.
+        pose: (n) poses; `choose` includes the frames of their joints.
         sd_root: (n, 6) standard deviation of the root over candidates, rad and mm, in its own
             frame.
         sd_angles: (n, J, 3) standard deviation of the joints' rotation vectors over candidates,
@@ -67,10 +67,10 @@ class Chosen:
         score: (n,) weighted mean of the scores, mm at home size.
         spread: (n,) spread of the averaged candidates about the chosen pose, mm at home size.
         doubts: (n, 4) the columns of `Doubts`.
-        fit: (n, F) residuals of the pose against the height map where the method asks, F = 0
-            otherwise, see `_residual_kernels.explain`.
-        told_scale: (n,) the animal's size over home size as this frame alone estimates it.
-        told_trust: (n,) how far that size can be trusted, the higher the better.
+        fit: (n, F) residuals of the pose against the height map if the method uses them, else F =
+            0, see `_residual_kernels.explain`.
+        frame_scale: (n,) the animal's size over home size as estimated from this frame alone.
+        scale_trust: (n,) reliability of that size, higher is better.
     """
 
     pose: Pose
@@ -82,22 +82,18 @@ class Chosen:
     spread: Array
     doubts: Array
     fit: Array
-    told_scale: Array
-    told_trust: Array
+    frame_scale: Array
+    scale_trust: Array
 
     def __getitem__(self, rows: slice) -> Chosen:
-        """Some consecutive frames.
-
-        Args:
-            rows: the frames to take.
-        """
+        """A slice of the frames."""
         return Chosen(*(getattr(self, field.name)[rows] for field in fields(self)))
 
 
 def choose(
     skeleton: Skeleton,
     method: Method,
-    calibration: Calibration,
+    calibration: ErrorCalibration,
     size: float,
     rotations: Array,
     positions: Array,
@@ -105,15 +101,15 @@ def choose(
 ) -> Chosen:
     """Average the best candidates of each frame on the manifold.
 
-    The `top_k` candidates with the lowest predicted error that lie near the best one are averaged
-    with weights exp(-(score - best) / tau). In an unbranched skeleton each bone
-    then turns by the smallest rotation onto its mean direction, and the scale follows from the
-    total length; a branched one is averaged joint by joint, see `mean_pose`.
+    The `top_k` candidates with the lowest predicted error near the best one are averaged with
+    weights exp(-(score - best) / tau). In an unbranched skeleton each bone then rotates by the
+    smallest rotation onto its mean direction, and the scale follows from the total length; a
+    branched one is averaged joint by joint, see `mean_pose`.
 
     Args:
         skeleton: the animal's skeleton.
-        method: states top_k, tau and the radius within which candidates are averaged.
-        calibration: turns score and spread into an expected error.
+        method: states top_k, tau and the radius of the average.
+        calibration: converts score and spread to an expected error.
         size: the animal's size over home size.
         rotations: (n, K, J, 3, 3) joint frames of the candidates, view frame.
         positions: (n, K, J, 3) joints of the candidates, mm, view frame.
@@ -170,9 +166,9 @@ def choose(
 def mean_pose(skeleton: Skeleton, turned: Array, joints: Array, weight: Array) -> Pose:
     """Weighted mean of poses of a kinematic tree, on the group.
 
-    The base takes the chordal mean rotation and the mean position. Every other joint takes the mean
-    of its rotation vectors relative to its parent about its free axes, so bones keep their lengths
-    and hinges their axes; the scale is the mean scale.
+    The base has the chordal mean rotation and the mean position. Every other joint has the mean of
+    its rotation vectors relative to its parent about its free axes, so bones keep their lengths and
+    hinges their axes; the scale is the mean scale.
 
     Args:
         skeleton: the animal's skeleton.
@@ -206,7 +202,7 @@ def mean_pose(skeleton: Skeleton, turned: Array, joints: Array, weight: Array) -
 def with_best(
     skeleton: Skeleton, pose: Pose, k: int, rotations: Array, positions: Array, scores: Array
 ) -> Pose:
-    """Put the best-scored candidates of each frame beside given poses.
+    """Add the best-scored candidates of each frame to given poses.
 
     Args:
         skeleton: the animal's skeleton.
@@ -243,9 +239,9 @@ def _doubts(
 ) -> Array:
     """`Chosen.doubts` of all candidates.
 
-    It follows from the chosen joints (n, J, 3) and the scores (n, k) of the averaged candidates;
-    a pose points from its base to its last joint, as the bundled models' forests of the expected
-    error have learned it (of the chains it is the tip, of the hand the little finger's).
+    Computed from the chosen joints (n, J, 3) and the scores (n, k) of the averaged candidates; the
+    direction of a pose is that from its base to its last joint, as in the training of the bundled
+    models' expectation forests (the tip of a chain, the little finger's of a hand).
     """
     along = positions[:, :, -1] - positions[:, :, 0]
     backwards = np.einsum("nkd,nd->nk", along, mean[:, -1] - mean[:, 0]) < 0
@@ -257,7 +253,7 @@ def _doubts(
 def with_expected_error(
     chosen: Chosen, model: Model, moments: Array, crop_cameras: Array, size: float
 ) -> Chosen:
-    """Replace the expected errors by those that the model's expectation forest predicts.
+    """Replace the expected errors by predictions of the model's expectation forest.
 
     Args:
         chosen: n chosen poses.
@@ -285,11 +281,11 @@ def with_expected_error(
 def clue_samples(
     chosen: Chosen, skeleton: Skeleton, moments: Array, crop_cameras: Array, size: float
 ) -> Samples:
-    """Features of chosen poses, as the expectation forest sees them: numbers only, no depth.
+    """Features of chosen poses for the expectation forest: numbers only, no depth.
 
-    They are scores and doubts, the posture, how large, round and high the animal looks, how many mm
-    a pixel covers, the spreads over candidates, and the residuals against the height map. Lengths
-    are those of an animal of the reference length; all numbers are in hundredths.
+    They are scores and doubts, the posture, the animal's visible size, roundness and height, the
+    size of a pixel in mm, the spreads over candidates, and the residuals against the height map.
+    Lengths are those of an animal of the reference length; all numbers are in hundredths.
 
     Args:
         chosen: n chosen poses.
@@ -299,7 +295,7 @@ def clue_samples(
         size: the animal's size over home size.
 
     Returns:
-        n samples whose scalars hold the features, on a blank height map.
+        n samples whose scalars are the features, on a blank height map.
     """
     pose = chosen.pose
     unit = skeleton.relative_size

@@ -1,15 +1,15 @@
-"""The session's own build: how wide and high this animal is, and how far poses of such a body err.
+"""Body shape of the animal of a session: its width and height, and the pose error that they cause.
 
-Forests learn from bodies of one family; on another build their poses are off in the same way in
-every frame, since nobody sees the mid-axis: a body that is flatter than usual lies higher in its
-skin, a blunt one begins elsewhere in its outline. What all frames of a session show together (the
-mean cross-sections, `cross_sections`) tells the build, and with it that error. A linear map fitted
-by ridge regression (Hoerl and Kennard 1970) on rendered mini-sessions of a wide family of builds,
+Forests learn from bodies of one family; on another build their poses have the same error in every
+frame, since the mid-axis is not visible: a body that is flatter than usual lies higher in its skin,
+a blunt one begins elsewhere in its outline. All frames of a session together (the mean
+cross-sections) determine the build, and with it that error. A linear map fitted by ridge regression
+(Hoerl and Kennard 1970) on rendered mini-sessions of a wide family of builds,
 
     y = W^T x + b,    x the clues of a session, y its build and its poses' mean error,
 
-takes the clues to the mean of true minus estimated joints in the base's frame, over the length, and
-to the logarithms of half width and half height over the average animal's at five places.
+maps the clues to the mean of true minus estimated joints in the base's frame, over the length, and
+to the logarithms of half width and half height over the average animal's at five positions.
 """
 
 from __future__ import annotations
@@ -36,13 +36,18 @@ Array = NDArray[np.float64]
 
 N_STATIONS = 22
 N_LATERAL = 24
-_FROM, _TO = -0.10, 1.10  # along the chain: a body goes on past both its ends
+_FROM, _TO = -0.10, 1.10  # along the chain: a body extends past both its ends
 _REACH = 1.75  # of the default body's half width: the broadest animal is narrower
-_HARDLY = 0.15  # of the frames show a cell: what is read there are other things and torn edges
-_PLACES = (0.05, 0.45, 0.65, 0.85)  # over the half width, where the back's fall is read
-_BACKS = 8  # groups of stations that tell how high the back is
-_FALLS = 6  # and those that tell how it falls
-_MARGIN = 2  # stations at either end that lie past the body
+_HARDLY = 0.15  # of the frames show a cell: rarer readings are other objects and torn edges
+_PLACES = (
+    0.05,
+    0.45,
+    0.65,
+    0.85,
+)  # over the half width: positions at which the back's decline is measured
+_BACKS = 8  # groups of stations for the height of the back
+_FALLS = 6  # and for its decline
+_MARGIN = 2  # stations at either end that are past the body
 _LEAST_WIDTH = 0.05  # of the default body's: thinner, a station shows nothing
 
 
@@ -52,8 +57,8 @@ class CrossSections:
 
     Attributes:
         seen: (S, T) share of the frames in which the animal is there, both sides together.
-        height: (S, T) mean height over the mid-axis, where it is there.
-        step: distance from one lateral place to the next.
+        height: (S, T) mean height over the mid-axis, if it is there.
+        step: distance between lateral positions.
     """
 
     seen: Array
@@ -97,10 +102,10 @@ class CrossSections:
         return np.asarray(self.seen.sum(axis=1) * self.step)
 
     def clues(self, skeleton: Skeleton) -> Array:
-        """What a regression is told of the animal's build.
+        """Input of the regression about the animal's build.
 
-        They are the half widths, how high the back is over the mid-axis and how it falls towards
-        its edge in groups of stations, and how blurred the outline is.
+        They are the half widths, the height of the back over the mid-axis and its decline towards
+        its edge in groups of stations, and the blur of the outline.
 
         Args:
             skeleton: of the animal.
@@ -112,7 +117,7 @@ class CrossSections:
         least = _LEAST_WIDTH * BodyShape.default(skeleton).half_width.max() / skeleton.length
         lateral = (np.arange(N_LATERAL) + 0.5) * self.step
         across = self.height.copy()
-        for t in range(1, N_LATERAL):  # where hardly anything is seen, the back goes on level
+        for t in range(1, N_LATERAL):  # cells that are rarely visible continue the back level
             across[:, t] = np.where(self.seen[:, t] < _HARDLY, across[:, t - 1], across[:, t])
         back = np.zeros((N_STATIONS, len(_PLACES)))
         for s in np.flatnonzero(width > least):
@@ -154,21 +159,21 @@ PLACES = (0.1, 0.25, 0.4, 0.6, 0.8)  # of the body's length
 _FOLDER = Path(__file__).with_name("shapes")
 _RIDGE = 0.03  # of the clues' variance
 _FOLDS = 5
-_TAIL = 0.005  # of what a clue was seen to be: beyond it is taken for the last that was seen
+_TAIL = 0.005  # quantile of a clue in training at which it is clipped
 _DECIMALS = 9  # a product's last bits depend on the machine
 
 
 def session_clues(
     skeleton: Skeleton, pose: Pose, heights: NDArray[np.int16], crop_cameras: Array, size: float
 ) -> Array:
-    """What the frames of a session tell together about the animal's build.
+    """Evidence about the animal's build from all frames of a session.
 
     Args:
         skeleton: of the animal, one chain with a tube as its surface.
         pose: (n) estimated poses, view frame, at least one.
         heights: (n, H, W) int16 height maps, 1/16 mm.
         crop_cameras: (n, 17) packed crop cameras of the height maps.
-        size: the animal's size over home size, as the poses were estimated with.
+        size: the animal's size over home size used for the poses.
 
     Returns:
         (F,) numbers, see `CrossSections.clues`, then the size of a pixel and that of the bones over
@@ -190,9 +195,9 @@ class ShapePrior:
     Attributes:
         bounds: (2, F) the least and the most of each clue, beyond which it is clipped.
         table: (F + 1, K) weights of the clues, and the constant.
-        spread: (K,) standard deviation of what is left of each label, by cross-fitting.
-        unseen: standard deviations over the length of what is left of the joints' height, and of
-            their place along the body, on builds that the regression has not seen either.
+        spread: (K,) residual standard deviation of each label, by cross-fitting.
+        unseen: residual standard deviations, over the length, of the joints' height and of their
+            position along the body, on builds that are not in the training data either.
         model: fingerprint of the pose model whose errors these are.
     """
 
@@ -205,21 +210,13 @@ class ShapePrior:
     @staticmethod
     @cache
     def of(name: str) -> ShapePrior | None:
-        """The prior of an animal; None where there is none.
-
-        Args:
-            name: name of the skeleton.
-        """
+        """The prior of an animal by the name of its skeleton; None if absent."""
         path = _FOLDER / f"{name}.npz"
         return ShapePrior.load(path) if path.is_file() else None
 
     @staticmethod
     def load(path: Path) -> ShapePrior:
-        """Read a prior.
-
-        Args:
-            path: the file that `save` wrote.
-        """
+        """Read a prior that `save` wrote."""
         with np.load(path) as held:
             height, along = held["unseen"].tolist()
             return ShapePrior(
@@ -231,7 +228,7 @@ class ShapePrior:
             )
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """The arrays of the file, in single precision but for `unseen`."""
+        """The arrays of the file, in single precision except for `unseen`."""
         return {
             "bounds": self.bounds.astype(np.float32),
             "table": self.table.astype(np.float32),
@@ -249,7 +246,7 @@ class ShapePrior:
             labels: (n, K) of them.
 
         Returns:
-            The prior; `unseen` is nought until builds that it has not seen have been measured.
+            The prior; `unseen` is zero until measured on other builds.
         """
         bounds = np.quantile(clues, [_TAIL, 1.0 - _TAIL], axis=0)
         x = np.clip(clues, *bounds)
@@ -287,7 +284,7 @@ def _ridge(x: Array, y: Array) -> Array:
 
 
 def labels_of(offset: Array, width: Array, height: Array) -> Array:
-    """Labels of a session as `ShapePrior` wants them.
+    """Labels of a session for `ShapePrior`.
 
     Args:
         offset: (J, 3) mean of true minus estimated joints, base frame, over the length.
@@ -299,16 +296,16 @@ def labels_of(offset: Array, width: Array, height: Array) -> Array:
 
 @dataclass(frozen=True)
 class Build:
-    """An animal's build beside the average one's, and how far its estimated poses lie off.
+    """An animal's build relative to the average one's, and the error of its estimated poses.
 
     Attributes:
-        offset: (J, 3) what is added to the joints, base frame, over the animal's length.
+        offset: (J, 3) added to the joints, base frame, over the animal's length.
         width: (P,) half widths over the average animal's of that length, at `PLACES`.
         height: (P,) half heights likewise.
         width_sd: (P,) standard deviations of the logarithms of `width`.
         height_sd: (P,) of `height`.
-        unseen: standard deviations over the length of what is left of the joints' height and of
-            their place along the body.
+        unseen: residual standard deviations, over the length, of the joints' height and of their
+            position along the body.
     """
 
     offset: Array
@@ -319,8 +316,8 @@ class Build:
     unseen: tuple[float, float]
 
     @staticmethod
-    def told(prior: ShapePrior, clues: Array) -> Build:
-        """The build that a session's clues tell.
+    def from_clues(prior: ShapePrior, clues: Array) -> Build:
+        """The build estimated from a session's clues.
 
         Args:
             prior: of the animal.
@@ -330,7 +327,7 @@ class Build:
 
     @staticmethod
     def of(prior: ShapePrior, labels: Array) -> Build:
-        """The build that labels state, as certain as one that a session's clues tell.
+        """The build stated by labels, with the uncertainty of one estimated from clues.
 
         Args:
             prior: of the animal.
@@ -347,11 +344,11 @@ class Build:
         )
 
     def corrected(self, skeleton: Skeleton, pose: Pose, size: float) -> Pose:
-        """The poses with the mean error of such a body taken off.
+        """The poses without the mean error of such a body.
 
         Args:
             skeleton: of the animal, one chain.
-            pose: (n) estimated poses in any frame; rows that are not finite stay as they are.
+            pose: (n) estimated poses in any frame; rows that are not finite are unchanged.
             size: the animal's size over home size.
         """
         rows = np.isfinite(pose.scale)
@@ -389,7 +386,7 @@ def built(
     height: Array | Sequence[float],
     places: Sequence[float] = PLACES,
 ) -> Surface:
-    """The body of an animal that is not built like the average one.
+    """The body of an animal whose build is not the average.
 
     Args:
         skeleton: of the animal, with a tube as its surface.

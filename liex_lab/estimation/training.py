@@ -1,9 +1,8 @@
 """Training of the cascaded regressors (Lie-X Algorithm 2) and of the learned internal metric.
 
-Each forest is trained on the state that its predecessors left: after round c of joint j its
-prediction moves all training candidates, and the label of the next round is again log(g_est^-1
-g_true) (Eq. 11). Where the method says so, a candidate is moved only by trees that were not grown
-on its image.
+Each forest is trained on the result of its predecessors: after round c of joint j its prediction
+moves all training candidates, and the label of the next round is again log(g_est^-1 g_true) (Eq.
+11). Depending on the method, a candidate is moved only by trees that were not grown on its image.
 
 The learned metric R_m (section 4.1) is a forest that predicts the mean joint error of a pose
 without the truth. The paper trains it on perturbed true poses; the default method trains it on the
@@ -20,20 +19,26 @@ from numpy.typing import NDArray
 
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.estimation.cascade import Candidates, Cascade, ImageSet, Truth
-from liex_lab.estimation.initial import N_WAYS, draw_starts, propose, start_poses, train_proposals
+from liex_lab.estimation.initial import (
+    N_DIRECTIONS,
+    draw_starts,
+    propose,
+    start_poses,
+    train_proposals,
+)
 from liex_lab.estimation.method import Method
 from liex_lab.forests.forest import Forest
 from liex_lab.forests.grow import boost_forest, grow_forest
 from liex_lab.geometry import SE3, so3
 
 Array = NDArray[np.float64]
-Tell = Callable[[float, str], None]  # share done, what is being done
+ProgressCallback = Callable[[float, str], None]  # completed share, name of the step
 
-# at the reference length: a pose worse than this is simply wrong; how wrong is not worth learning
+# at the reference length: larger errors are capped, as their differences do not matter
 _ERROR_CAP_MM = 30.0
 _FEW_JOINTS = 3
 _PRUNER_SHRINKAGE = 0.3
-_SIZE_SD = 0.08  # how far off (log) a session's estimated size may be
+_SIZE_SD = 0.08  # standard deviation (log) of a session's estimated size
 
 
 @dataclass(frozen=True)
@@ -44,9 +49,9 @@ class TrainingSet:
         images: m images.
         truth: true poses of the m images.
         size: (m,) the true size of each animal over home size.
-        animal: (m,) bool, False where the height map shows something else of about the animal's
-            size; such an image teaches the learned metric what is no animal, and the regressors
-            nothing.
+        animal: (m,) bool, False if the height map shows another object of about the animal's size;
+            such an image is a negative example of the learned metric, and not used by the
+            regressors.
     """
 
     images: ImageSet
@@ -56,11 +61,7 @@ class TrainingSet:
 
     @staticmethod
     def join(parts: list[TrainingSet]) -> TrainingSet:
-        """Concatenate the images of several sets.
-
-        Args:
-            parts: the sets, in order.
-        """
+        """Concatenate the images of multiple sets."""
         images = [p.images for p in parts]
         truths = [p.truth for p in parts]
         return TrainingSet(
@@ -82,17 +83,15 @@ class TrainingSet:
 
 
 def base_at_front(skeleton: Skeleton) -> bool:
-    """Whether the base joint is the animal's front, as the fish's head, not its rear.
-
-    Args:
-        skeleton: the animal's skeleton; the mouse's base is its rump.
+    """Whether the base joint is the animal's front, like the fish's head, or its rear, like the
+    mouse's rump.
     """
     return bool(skeleton.offsets[skeleton.next_joint[0], 0] < 0)
 
 
 @dataclass(frozen=True)
 class Proposals:
-    """A forest that proposes initial poses, and which images each of its trees was grown on.
+    """A forest that proposes initial poses, and the images each of its trees was grown on.
 
     Attributes:
         forest: the forest.
@@ -127,7 +126,7 @@ class Proposals:
     def draw(self, rng: np.random.Generator, m: int, k: int) -> NDArray[np.int64]:
         """Draw K different proposals for every image.
 
-        Out-of-bag trees come first, so in-bag ones are taken only where these do not suffice.
+        In-bag trees are used only if there are not enough out-of-bag ones.
 
         Args:
             rng: source of the draw.
@@ -137,8 +136,8 @@ class Proposals:
         Returns:
             (m, k) numbers of proposals, as `propose` orders them.
         """
-        order = rng.random((m, N_WAYS * self.forest.n_trees))
-        order += np.repeat(self.in_bag, N_WAYS, axis=0).T
+        order = rng.random((m, N_DIRECTIONS * self.forest.n_trees))
+        order += np.repeat(self.in_bag, N_DIRECTIONS, axis=0).T
         return np.argsort(order, axis=1)[:, :k]
 
 
@@ -147,7 +146,7 @@ def start_candidates(
     skeleton: Skeleton,
     method: Method,
     rng: np.random.Generator,
-    seen: Proposals | None = None,
+    proposals: Proposals | None = None,
 ) -> Candidates:
     """Initial poses for every training image, each with its own guess of the animal's size.
 
@@ -156,8 +155,8 @@ def start_candidates(
         skeleton: the animal's skeleton.
         method: the variant, which states K, the number of initial poses per image.
         rng: source of the poses and of the size errors.
-        seen: proposals, where the method starts from them; each initial pose is then that of a tree
-            that was not grown on the image.
+        proposals: if the method uses them; each initial pose is then that of a tree not grown on
+            the image.
 
     Returns:
         m K candidates with their base in place, those of an image in a row.
@@ -179,9 +178,9 @@ def start_candidates(
         method.camera_view,
         method.home_turn,
     )
-    if seen is not None:
-        bases, places = propose(seen.forest, data.images, data.size, method)
-        chosen = seen.draw(rng, m, k)
+    if proposals is not None:
+        bases, places = propose(proposals.forest, data.images, data.size, method)
+        chosen = proposals.draw(rng, m, k)
         rotation = np.take_along_axis(bases, chosen[..., None, None], axis=1)
         position = np.take_along_axis(places, chosen[..., None], axis=1)
     image = np.repeat(np.arange(m, dtype=np.int32), k)
@@ -196,7 +195,11 @@ def start_candidates(
 
 
 def train_cascade(
-    data: TrainingSet, skeleton: Skeleton, method: Method, rng: np.random.Generator, tell: Tell
+    data: TrainingSet,
+    skeleton: Skeleton,
+    method: Method,
+    rng: np.random.Generator,
+    tell: ProgressCallback,
 ) -> tuple[Cascade, Candidates]:
     """Train all regressors joint by joint and round by round (Lie-X Algorithm 2).
 
@@ -205,14 +208,14 @@ def train_cascade(
         skeleton: the animal's skeleton.
         method: the variant of the method.
         rng: source of all randomness.
-        tell: called before each forest with the share done and what is being trained.
+        tell: called before each forest with the completed share and the name of the step.
 
     Returns:
-        The cascade, and the training candidates as its last forest left them.
+        The cascade, and the training candidates after its last forest.
     """
-    seen = Proposals.train(data, method, rng) if method.proposals is not None else None
-    cascade = Cascade(skeleton, method, [], seen.forest if seen is not None else None)
-    candidates = start_candidates(data, skeleton, method, rng, seen)
+    proposals = Proposals.train(data, method, rng) if method.proposals is not None else None
+    cascade = Cascade(skeleton, method, [], proposals.forest if proposals is not None else None)
+    candidates = start_candidates(data, skeleton, method, rng, proposals)
     n_steps = sum(method.rounds_of(joint) for joint in skeleton.solved)
     n_done = 0
     for joint in skeleton.solved:
@@ -227,8 +230,8 @@ def train_cascade(
             rows = np.ascontiguousarray(labels, np.float32)
             forest, in_bag = grow_forest(samples, rows, keep, method.regressors, rng)
             forest = quantised(forest)
-            told = cascade.predict(forest, samples, in_bag if method.out_of_bag else None)
-            cascade.apply(candidates, joint, told)
+            values = cascade.predict(forest, samples, in_bag if method.out_of_bag else None)
+            cascade.apply(candidates, joint, values)
             rounds.append(forest)
         cascade.forests.append(rounds)
         n_done += len(rounds)
@@ -237,12 +240,11 @@ def train_cascade(
 
 
 def quantised(forest: Forest) -> Forest:
-    """Round a forest's leaves to float16, as the model file holds them.
-
-    Training then moves candidates by what a user will get.
+    """Round a forest's leaves to float16, the precision of the model file, so that training uses
+    the same forest as estimation.
 
     Args:
-        forest: the forest as it was grown.
+        forest: the forest as grown.
 
     Returns:
         The forest with float32 leaves of float16 precision.
@@ -269,8 +271,8 @@ def perturbed_truth(
 ) -> Candidates:
     """Randomly perturbed true poses, the paper's training examples of the learned metric.
 
-    The base moves by a random twist, every other joint turns about its free axes; the strength is
-    drawn uniformly for each pose. The paper leaves the distribution open; a long chain bends no
+    The base moves by a random twist, every other joint rotates about its free axes; the strength is
+    drawn uniformly for each pose. The paper does not state the distribution; a long chain bends no
     more as a whole than a short one.
 
     Args:
@@ -316,9 +318,9 @@ def train_metric(
 ) -> Forest:
     """Train the learned metric, which predicts a pose's mean joint error without the truth.
 
-    Examples are the cascade's own final candidates, or perturbed true poses as the paper has it, as
-    the method says. Errors are capped at 30 mm at the reference length: how wrong a wrong pose is,
-    is not worth learning.
+    Examples are the cascade's own final candidates or, as in the paper, perturbed true poses,
+    depending on the method. Errors are capped at 30 mm at the reference length, as differences
+    between gross errors do not matter.
 
     Args:
         data: training images with truth.
@@ -349,8 +351,8 @@ def train_pruner(
 ) -> Forest | None:
     """Train the small metric that predicts the error of the whole pose from the base joint alone.
 
-    METHOD lesson 9. The base has not moved since its own rounds, so the cascade's final candidates
-    are its examples, too.
+    The base does not move after its own rounds, so the cascade's final candidates are its examples,
+    too.
 
     Args:
         data: training images with truth.
@@ -359,7 +361,7 @@ def train_pruner(
         rng: source of bags and seeds.
 
     Returns:
-        The boosted forest, mm at home size; None where the method has no pruner.
+        The boosted forest, mm at home size; None if the method has no pruner.
     """
     plan = cascade.method.pruner
     if plan is None:

@@ -15,7 +15,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from liex_lab.body.skeleton import VIEWS, View
+from liex_lab.body.skeleton import VIEWS, CameraView
 from liex_lab.errors import EstimationError
 from liex_lab.optics.camera import Camera
 from liex_lab.recordings.recording import Recording
@@ -330,7 +330,7 @@ class TargetAnimal:
 
     spine_mm: tuple[float, float]
     min_height_mm: float
-    view: View
+    view: CameraView
 
     @property
     def stands_on_floor(self) -> bool:

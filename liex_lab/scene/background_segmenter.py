@@ -20,7 +20,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from liex_lab.body.skeleton import MOUSE_VIEW, VIEWS, View
+from liex_lab.body.skeleton import MOUSE_VIEW, VIEWS, CameraView
 from liex_lab.errors import EstimationError
 from liex_lab.optics.camera import Camera, SensorCard
 from liex_lab.recordings.recording import Recording
@@ -183,7 +183,7 @@ class BackgroundSubtraction(StillScene):
         spine_mm: tuple[float, float],
         n_frames: int = 96,
         min_height_mm: float = 7.0,
-        view: View = MOUSE_VIEW,
+        view: CameraView = MOUSE_VIEW,
         floor: Floor | None = None,
         region: NDArray[np.bool_] | None = None,
     ) -> tuple[BackgroundSubtraction, NDArray[np.float32]]:

@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from liex_lab.body.skeleton import View
+from liex_lab.body.skeleton import CameraView
 from liex_lab.errors import EstimationError
 from liex_lab.optics.camera import Camera
 from liex_lab.recordings.recording import Recording
@@ -56,7 +56,7 @@ class HandSegmenter(Segmenter):
 
     camera: Camera
     floor: Floor
-    view: View
+    view: CameraView
     near_mm: float = RANGE_MM[0]
     far_mm: float = RANGE_MM[1]
     area_mm2: float = 0.0
@@ -65,7 +65,7 @@ class HandSegmenter(Segmenter):
     @staticmethod
     def learn(
         recording: Recording,
-        view: View,
+        view: CameraView,
         n_frames: int = 96,
         range_mm: tuple[float, float] = RANGE_MM,
     ) -> tuple[HandSegmenter, NDArray[np.float32]]:
@@ -210,7 +210,7 @@ class HandPatches:
     depth: NDArray[np.uint16]
     intrinsics: Array
     origin: Array
-    view: View
+    view: CameraView
 
     def extract(
         self, size: Array, camera_view: bool = False, n_candidates: int = 1
@@ -238,7 +238,7 @@ def cut_nearest(
     depths: NDArray[np.float32] | NDArray[np.uint16],
     intrinsics: Array,
     size: Array,
-    view: View,
+    view: CameraView,
     range_mm: tuple[float, float],
     camera_view: bool,
     n_candidates: int,

@@ -20,7 +20,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 
-from liex_lab.body.skeleton import MOUSE_VIEW, View
+from liex_lab.body.skeleton import MOUSE_VIEW, CameraView
 from liex_lab.geometry import SE3
 from liex_lab.optics.camera import Camera
 from liex_lab.runtime.shapes import check_shapes
@@ -282,7 +282,7 @@ class Patches:
     intrinsics: Array
     origin: Array
     inverse_depth: Array
-    view: View = MOUSE_VIEW
+    view: CameraView = MOUSE_VIEW
 
     def __post_init__(self) -> None:
         """Check that the shapes match, as kernels do not."""

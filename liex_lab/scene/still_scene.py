@@ -16,7 +16,7 @@ from typing import Self, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from liex_lab.body.skeleton import MOUSE_VIEW, VIEWS, View
+from liex_lab.body.skeleton import MOUSE_VIEW, VIEWS, CameraView
 from liex_lab.optics.camera import Camera, SensorCard
 from liex_lab.runtime.shapes import check_shapes
 from liex_lab.runtime.threads import threads
@@ -148,7 +148,7 @@ class StillScene(Segmenter):
     on_floor: NDArray[np.bool_]
     area_mm2: float = 0.0
     volume_mm3: float = 0.0
-    view: View = MOUSE_VIEW
+    view: CameraView = MOUSE_VIEW
     stride: int = 1
     support_plane: SupportPlane | None = None
     level: FloorLevel | None = None

@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from liex_lab.body.skeleton import VIEWS, View
+from liex_lab.body.skeleton import VIEWS, CameraView
 from liex_lab.errors import EstimationError
 from liex_lab.optics.camera import Camera
 from liex_lab.runtime.threads import side_by_side
@@ -147,7 +147,7 @@ class SampledScene:
     camera: Camera
     spine_mm: tuple[float, float]
     min_height_mm: float
-    view: View
+    view: CameraView
 
     @property
     def areas_mm2(self) -> tuple[float, float]:

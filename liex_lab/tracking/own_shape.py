@@ -158,7 +158,7 @@ def fit_shape(
         return OwnShape(None, len(good), why=why), average
     held_out = good[::_HELD_OUT]
     fitted = np.setdiff1d(good, held_out)
-    build = Build.told(prior, frames.clues(fitted))
+    build = Build.from_clues(prior, frames.clues(fitted))
     own = frames.at_best_girth(build, fitted, average.camera_view)
     before, after = frames.residuals(average, held_out), frames.residuals(own, held_out, build)
     mm = _median(before), _median(after)

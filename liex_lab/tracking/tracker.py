@@ -146,7 +146,7 @@ class FrameTracker:
         agreement = body.agreement(pose[used], crops[used], scene)
         misfit = agreement.residual_mm[np.isfinite(agreement.residual_mm)]
         blur = float(np.median(misfit)) / (home * size) if len(misfit) else 0.0
-        spread = float(np.log(estimator.sizes_told(estimates)).std())
+        spread = float(np.log(estimator.sizes_by_frame(estimates)).std())
         ends = None
         if (
             camera_view and estimator.skeleton.is_chain
@@ -431,8 +431,10 @@ class PatchObserver:
             seen = np.flatnonzero(best.found)
             if not len(seen):
                 return 1.0
-            sure = seen[np.argsort(-best.chosen.told_trust[seen])[: max(8, int(_SURE * len(seen)))]]
-            size = float(np.median(best.chosen.told_scale[sure]))
+            sure = seen[
+                np.argsort(-best.chosen.scale_trust[seen])[: max(8, int(_SURE * len(seen)))]
+            ]
+            size = float(np.median(best.chosen.frame_scale[sure]))
         return size
 
     def observe(
@@ -457,7 +459,7 @@ class PatchObserver:
             start = rows.stop
             some = seen[rows]
             for h, estimates in enumerate(
-                self.estimator.both_ways(*self._cut(windows, size), size)
+                self.estimator.both_directions(*self._cut(windows, size), size)
             ):
                 some.put_pose(h, estimates.chosen.pose.moved(place))
                 some.error_mm[:, h] = estimates.chosen.error_mm

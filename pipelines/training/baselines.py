@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from liex_lab.baselines.cnn import Cnn
     from liex_lab.baselines.forest import RegressionForest
     from liex_lab.body.skeleton import Skeleton
-    from liex_lab.estimation.training import Tell
+    from liex_lab.estimation.training import ProgressCallback
 
     from .pose_model import Recipe
 
@@ -175,7 +175,7 @@ def train_baseline(
 
 
 def _trained(
-    training: Training, data: Any, skeleton: Skeleton, tell: Tell
+    training: Training, data: Any, skeleton: Skeleton, tell: ProgressCallback
 ) -> RegressionForest | Cnn:
     rng = np.random.default_rng(training.recipe.seed)
     if isinstance(training.plan, CnnPlan):

@@ -222,7 +222,7 @@ def make_model(
         The model with its card, in memory.
     """
     from liex_lab.estimation.calibration import calibrate, with_corrector, with_facing, with_settler
-    from liex_lab.estimation.model import Calibration, Model
+    from liex_lab.estimation.model import ErrorCalibration, Model
     from liex_lab.estimation.training import train_cascade, train_metric, train_pruner
     from liex_lab.scene.height_maps import moment_columns
     from liex_lab.simulation.simulator import world_of
@@ -249,7 +249,9 @@ def make_model(
         "images": world_of(skeleton).sources,
         **({"draw": draw} if draw else {}),
     }
-    model = Model(cascade, metric, None, skeleton.table, Calibration(area_mm2=area), card, pruner)
+    model = Model(
+        cascade, metric, None, skeleton.table, ErrorCalibration(area_mm2=area), card, pruner
+    )
     if recipe.n_correction and (method.corrector is not None or method.settle):
         progress(steps - 1, steps, "learning the last correction")
         unseen = rendered_set(

@@ -237,7 +237,7 @@ def _mini_session(
         estimates = plain.best_of(crops, crop_cameras, size)
         if estimates.found.sum() < _LEAST_GOOD:
             return None
-        told = float(np.median(plain.sizes_told(estimates)))
+        told = float(np.median(plain.sizes_by_frame(estimates)))
         size *= (told / size) ** _PER_PASS
     estimates = estimator.best_of(crops, crop_cameras, size)
     pose = estimates.chosen.pose.moved(view_of(crop_cameras))

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from liex_lab.body import Pose, Skeleton
-from liex_lab.body.fitting import Fit, _jacobian, _moved, fit_poses
+from liex_lab.body.fitting import Fit, _after_step, _jacobian, fit_poses
 from liex_lab.geometry import SE3, so3
 
 HAND = Skeleton.load("hand")
@@ -69,7 +69,7 @@ def test_the_slopes_are_those_of_small_steps(seed: int) -> None:
         by = np.zeros((3, slope.shape[-1]))
         by[:, c] = step
         ahead, back = (
-            _moved(pose, sign * by, FREE, low, high).joints(HAND) for sign in (1.0, -1.0)
+            _after_step(pose, sign * by, FREE, low, high).joints(HAND) for sign in (1.0, -1.0)
         )
         numeric = (ahead - back).reshape(3, -1) / (2.0 * step)
         np.testing.assert_allclose(slope[..., c], numeric, atol=2e-4)

@@ -9,7 +9,7 @@ from liex_lab.body import pose as pose_module
 from liex_lab.body.pose import PlacedPose, Pose
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.estimation.method import METHODS
-from liex_lab.estimation.model import Calibration
+from liex_lab.estimation.model import ErrorCalibration
 from liex_lab.estimation.scoring import choose
 from liex_lab.geometry import SE3, so3
 
@@ -61,7 +61,13 @@ def test_choosing_a_pose_runs_forward_kinematics_once_for_all_who_ask_for_its_jo
     monkeypatch.setattr(pose_module, "forward_kinematics", counted)
     scores = np.random.default_rng(1).uniform(1, 9, (3, 4))
     picked = choose(
-        skeleton, METHODS["default"], Calibration(), 1.0, home.rotation, home.translation, scores
+        skeleton,
+        METHODS["default"],
+        ErrorCalibration(),
+        1.0,
+        home.rotation,
+        home.translation,
+        scores,
     )
     kept = picked.pose.frames(skeleton)
     assert len(runs) == 1

@@ -11,7 +11,7 @@ import pytest
 
 from liex_lab.body import Pose, Skeleton
 from liex_lab.body.kinematics import aim
-from liex_lab.body.skeleton import PRESETS, View
+from liex_lab.body.skeleton import PRESETS, CameraView
 from liex_lab.errors import LiexError
 from liex_lab.geometry import SE3, so3
 from liex_lab.geometry.se3 import product_of_exponentials
@@ -113,7 +113,7 @@ def test_an_unknown_animal_names_the_nearest():
 
 def test_a_view_follows_from_the_animals_size_unless_the_toml_states_it():
     mouse, fish = Skeleton.load("mouse"), Skeleton.load("fish")
-    assert mouse.view == View("floor", 120.0, 2.0, (0.12, 1.3), 7.0)
+    assert mouse.view == CameraView("floor", 120.0, 2.0, (0.12, 1.3), 7.0)
     assert (mouse.relative_size, fish.view.frame, fish.view.behind_mm) == (1.0, "camera", 30.0)
     assert fish.relative_size == pytest.approx(30.0 / 52.834, abs=1e-6)
     table = {**mouse.table, "joints": [dict(joint) for joint in mouse.table["joints"]]}

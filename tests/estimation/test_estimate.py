@@ -14,7 +14,7 @@ from liex_lab.body.skeleton import Skeleton
 from liex_lab.estimation._cascade_kernels import choose_survivors, mode_of_votes
 from liex_lab.estimation.estimator import Estimates, PoseEstimator
 from liex_lab.estimation.method import METHODS
-from liex_lab.estimation.model import Calibration
+from liex_lab.estimation.model import ErrorCalibration
 from liex_lab.estimation.scoring import Chosen, choose
 from liex_lab.estimation.training import train_pruner
 from liex_lab.geometry import SE3, so3
@@ -283,7 +283,9 @@ def test_with_top_1_the_candidate_of_the_lowest_score_comes_out_unchanged():
     skeleton, pose, rotations, positions = drawn_candidates(20, 8, seed=1)
     scores = np.random.default_rng(2).uniform(1, 20, (20, 8))
     best, rows = scores.argmin(axis=1), np.arange(20)
-    picked = choose(skeleton, METHODS["paper"], Calibration(), 1.0, rotations, positions, scores)
+    picked = choose(
+        skeleton, METHODS["paper"], ErrorCalibration(), 1.0, rotations, positions, scores
+    )
     np.testing.assert_allclose(picked.pose.joints(skeleton), positions[rows, best], atol=1e-9)
     np.testing.assert_allclose(picked.pose.root.rotation, rotations[rows, best, 0], atol=1e-9)
     np.testing.assert_allclose(picked.pose.scale, pose.scale[rows, best], rtol=1e-12)
@@ -297,7 +299,7 @@ def test_the_mean_of_candidates_that_are_all_alike_is_that_candidate():
     skeleton, pose, rotations, positions = drawn_candidates(10, 1, seed=3)
     scores = np.random.default_rng(4).uniform(1, 9, (10, 12))
     turned, placed = (np.repeat(values, 12, axis=1) for values in (rotations, positions))
-    picked = choose(skeleton, METHODS["default"], Calibration(), 1.0, turned, placed, scores)
+    picked = choose(skeleton, METHODS["default"], ErrorCalibration(), 1.0, turned, placed, scores)
     np.testing.assert_allclose(picked.pose.joints(skeleton), positions[:, 0], atol=1e-9)
     np.testing.assert_allclose(picked.pose.angles, pose.angles[:, 0], atol=1e-7)
     np.testing.assert_allclose(picked.pose.scale, pose.scale[:, 0], rtol=1e-12)
@@ -316,7 +318,7 @@ def test_the_mean_weighs_by_score_and_leaves_out_what_lies_far_from_the_best():
     picked = choose(
         skeleton,
         method,
-        Calibration(),
+        ErrorCalibration(),
         1.0,
         np.repeat(rotations, 4, 1),
         np.repeat(positions, 4, 1) + moved,
@@ -333,7 +335,7 @@ def test_the_expected_error_is_a_straight_line_through_score_and_spread_and_grow
     skeleton, _, rotations, positions = drawn_candidates(6, 4, seed=6)
     scores = np.random.default_rng(7).uniform(1, 20, (6, 4))
     share = (0.5, 0.8, 1.0, 1.2, 1.5)
-    calibration = Calibration(offset=0.3, slope=0.6, spread_slope=0.2, joint_share=share)
+    calibration = ErrorCalibration(offset=0.3, slope=0.6, spread_slope=0.2, joint_share=share)
     for size in (1.0, 1.7):
         picked = choose(
             skeleton, METHODS["default"], calibration, size, rotations, positions, scores
@@ -351,7 +353,7 @@ def test_doubts_say_how_good_a_candidate_of_the_opposite_direction_is():
         picked = choose(
             skeleton,
             METHODS["paper"],
-            Calibration(),
+            ErrorCalibration(),
             1.0,
             np.repeat(rotations, 2, 1),
             both[:, order],

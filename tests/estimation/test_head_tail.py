@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from liex_lab.estimation.estimator import PoseEstimator
-from liex_lab.estimation.head_tail import UNSURE_MM, HeadTailClassifier, both_ways, laid_along
+from liex_lab.estimation.head_tail import UNSURE_MM, HeadTailClassifier, both_directions, laid_along
 from liex_lab.estimation.method import METHODS
 from liex_lab.estimation.model import Model
 from liex_lab.mlp import Network
@@ -107,7 +107,7 @@ def test_the_word_counts_where_scores_are_near_and_only_there(mice, network):
     np.testing.assert_array_equal(judged[0, 2:], scores[0, 2:])
     np.testing.assert_allclose(judged[0, 1] - judged[0, 0], 1.0)  # who falls behind keeps his order
     np.testing.assert_array_equal(judged[1:], scores[1:])
-    assert both_ways(positions, judged, skeleton.tip)[0].tolist() == [2, 0, 2, 0]
+    assert both_directions(positions, judged, skeleton.tip)[0].tolist() == [2, 0, 2, 0]
 
 
 def test_an_estimator_with_it_measures_as_before_where_it_was_sure(network):
@@ -119,7 +119,7 @@ def test_an_estimator_with_it_measures_as_before_where_it_was_sure(network):
         e.estimate(toy.depths, SCENE, 1.0).chosen.pose.joints(e.skeleton) for e in (plain, told)
     )
     sight = plain._look(toy.depths, SCENE, 1.0, True)[0]
-    sure = ~(both_ways(sight.positions, sight.scores, plain.skeleton.tip)[2] < UNSURE_MM)
+    sure = ~(both_directions(sight.positions, sight.scores, plain.skeleton.tip)[2] < UNSURE_MM)
     assert sure.any()
     np.testing.assert_array_equal(after[sure], before[sure])
     true = SCENE.floor.T_arena_camera.inverse() @ toy.joints.reshape(-1, 3)

@@ -121,7 +121,7 @@ def test_a_batch_of_looks_agrees_with_one_look_at_a_time():
     )
     views, scalars = np.empty((n, 2, VIEW)), np.empty((n, kernels.N_SCALARS))
     reach = np.full(2, REACH)
-    kernels.look_all(
+    kernels.all_features(
         np.array([2, 0]),
         np.stack([window.look] * 2),
         moments,

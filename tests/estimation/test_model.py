@@ -22,7 +22,7 @@ from liex_lab.catalog import MODELS
 from liex_lab.errors import ModelError
 from liex_lab.estimation.calibration import calibrate
 from liex_lab.estimation.estimator import PoseEstimator
-from liex_lab.estimation.model import N_CLUES, SCHEMA, Calibration, Model
+from liex_lab.estimation.model import N_CLUES, SCHEMA, ErrorCalibration, Model
 from liex_lab.estimation.scoring import Chosen, clue_samples
 from liex_lab.forests.forest import Forest
 from liex_lab.geometry import SE3
@@ -33,7 +33,7 @@ VARIANTS = ["default", "paper"]
 
 @pytest.fixture(scope="module")
 def model() -> Model:
-    calibration = Calibration(
+    calibration = ErrorCalibration(
         0.25, 0.75, 0.125, (0.5, 1.75), (0.5, 1.0, 1.5, 0.75, 2.0), 4.5, 1111.0
     )
     return replace(
@@ -187,7 +187,7 @@ def test_a_file_that_would_run_code_is_refused_unread(tmp_path):
 
 @pytest.mark.parametrize("share", [0.0, 0.001, 0.3, 0.7, 0.99])
 def test_a_truncated_file_is_refused(tmp_path, content, share):
-    assert "not a whole model file" in refusal(tmp_path, content[: int(share * len(content))])
+    assert "not a complete model file" in refusal(tmp_path, content[: int(share * len(content))])
 
 
 @pytest.mark.parametrize("seed", range(12))
@@ -199,13 +199,13 @@ def test_a_damaged_file_is_refused(tmp_path, content, seed):
     damaged = np.frombuffer(content, np.uint8).copy()
     first = entry.header_offset + 30 + len(entry.filename)
     damaged[first + rng.integers(12, entry.compress_size, 4)] ^= np.uint8(rng.integers(1, 256))
-    assert "not a whole model file" in refusal(tmp_path, damaged.tobytes())
+    assert "not a complete model file" in refusal(tmp_path, damaged.tobytes())
 
 
 def test_a_file_that_lacks_a_part_is_refused(tmp_path, content):
     refusal(tmp_path, repacked(content, lambda head: None, without="003_leaves"))
     refusal(tmp_path, repacked(content, lambda head: None, without="head"))
-    assert "holds 8 forests" in refusal(
+    assert "has 8 forests" in refusal(
         tmp_path, repacked(content, lambda head: None, without="008")
     )
 

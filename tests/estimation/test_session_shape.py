@@ -185,7 +185,7 @@ def test_labels_come_back_as_a_build(toy):
         np.vstack([np.zeros((n, len(labels))), labels]),
         np.full(len(labels), 0.1),
     )
-    told = Build.told(prior, clues)
+    told = Build.from_clues(prior, clues)
     np.testing.assert_allclose(told.offset, offset, atol=1e-8)
     np.testing.assert_allclose(told.width, wide, rtol=1e-8)
     np.testing.assert_allclose(told.height, high, rtol=1e-8)

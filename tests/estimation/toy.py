@@ -19,7 +19,7 @@ from liex_lab.body.skeleton import PRESETS, Skeleton
 from liex_lab.body.surface import Surface, render_meshes
 from liex_lab.estimation.cascade import Candidates, ImageSet, Truth
 from liex_lab.estimation.method import METHODS, Method
-from liex_lab.estimation.model import Calibration, Model
+from liex_lab.estimation.model import ErrorCalibration, Model
 from liex_lab.estimation.training import TrainingSet, train_cascade, train_metric
 from liex_lab.forests.grow import GrowthPlan
 from liex_lab.geometry import SE3, so3
@@ -172,7 +172,7 @@ def train(toy: Toy, method: Method, seed: int = 0) -> Trained:
     table = tomllib.loads((PRESETS / "mouse.toml").read_text(encoding="utf-8"))
     area = float(np.median(data.images.moments[:, 1] / data.size**2))
     return Trained(
-        Model(cascade, metric, None, table, Calibration(area_mm2=area)), data, candidates
+        Model(cascade, metric, None, table, ErrorCalibration(area_mm2=area)), data, candidates
     )
 
 

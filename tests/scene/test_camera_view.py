@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from liex_lab.body.skeleton import View
+from liex_lab.body.skeleton import CameraView
 from liex_lab.estimation.initial import draw_starts, start_poses
 from liex_lab.optics.camera import Camera
 from liex_lab.recordings.recording import Recording
@@ -25,7 +25,7 @@ BEHIND, HIGH = 20.0, 40.0
 
 def scene(frame: str) -> BackgroundSubtraction:
     bare = BackgroundSubtraction.from_floor(CAMERA, FLOOR, 3.0)
-    view = View(frame, behind_mm=BEHIND, smooth_mm=0.6)
+    view = CameraView(frame, behind_mm=BEHIND, smooth_mm=0.6)
     return BackgroundSubtraction(
         CAMERA, FLOOR, bare.background, bare.limit, bare.on_floor, view=view
     )

@@ -119,7 +119,7 @@ SLIPS = [
     ("zones = [5]", "should be a table with a name"),
     ("[[zones]\n", "should be a TOML file"),
     ("[[zones]]\nname = 'a'", "either a circle or a polygon"),
-    ("[[zones]]\nnmae = 'a'", "the nearest one is name"),
+    ("[[zones]]\nnmae = 'a'", "the nearest known key is name"),
     ("[[zones]]\nname = 'left half'\npolygon = []", "letters, digits"),
     ("[[zones]]\nname = 'a'\npolygon = [[0, 0], [1, 1]]", "at least three corners"),
     ("[[zones]]\nname = 'a'\npolygon = [[0, 0], [1, 1], [2, 2]]", "enclose no area"),

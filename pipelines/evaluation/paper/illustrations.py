@@ -44,7 +44,7 @@ def illustrate(model: Model, n_images: int = 128) -> dict[str, Any]:
         at home size (of the example its own), after every joint and round; `heights`, `true_px` and
         `edges` of the example; amounts and protocol.
     """
-    from liex_lab.estimation.initial import N_WAYS
+    from liex_lab.estimation.initial import N_DIRECTIONS
     from liex_lab.estimation.training import Proposals, start_candidates
 
     skeleton = model.skeleton
@@ -55,7 +55,7 @@ def illustrate(model: Model, n_images: int = 128) -> dict[str, Any]:
     n = len(data.size)
     seen = None
     if (forest := model.cascade.proposals) is not None:
-        k = min(k, N_WAYS * forest.n_trees)
+        k = min(k, N_DIRECTIONS * forest.n_trees)
         seen = Proposals(
             forest, np.zeros((forest.n_trees, n), np.bool_)
         )  # no tree has seen any of them
