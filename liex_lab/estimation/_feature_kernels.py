@@ -100,7 +100,7 @@ def fill_scalars(rotation, position, scale, moments, size, scalars):
     rise = blob.slope * (np.cos(blob.angle) * c + np.sin(blob.angle) * s) / np.sqrt(norm)
     scalars[7] = _LOG_UNIT * (rotation[2, 0] - rise)
     scalars[8] = _LOG_UNIT * rotation[2, 1]
-    # the sine of twice the angle from the joint's heading to the long axis, without computing angles
+    # the sine of twice the angle from the joint's heading to the long axis, without trigonometry
     twice = np.sin(2.0 * blob.angle) * (c * c - s * s) - np.cos(2.0 * blob.angle) * 2.0 * s * c
     longer = blob.sd_along - blob.sd_across
     scalars[9] = _LOG_UNIT * twice / norm * longer / max(blob.sd_along + blob.sd_across, 1e-6)

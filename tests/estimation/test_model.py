@@ -205,9 +205,7 @@ def test_a_damaged_file_is_refused(tmp_path, content, seed):
 def test_a_file_that_lacks_a_part_is_refused(tmp_path, content):
     refusal(tmp_path, repacked(content, lambda head: None, without="003_leaves"))
     refusal(tmp_path, repacked(content, lambda head: None, without="head"))
-    assert "has 8 forests" in refusal(
-        tmp_path, repacked(content, lambda head: None, without="008")
-    )
+    assert "has 8 forests" in refusal(tmp_path, repacked(content, lambda head: None, without="008"))
 
 
 @pytest.mark.parametrize("section", ["method", "skeleton", "calibration", "card"])
