@@ -118,7 +118,7 @@ def test_an_estimator_with_it_measures_as_before_where_it_was_sure(network):
     before, after = (
         e.estimate(toy.depths, SCENE, 1.0).chosen.pose.joints(e.skeleton) for e in (plain, told)
     )
-    sight = plain._look(toy.depths, SCENE, 1.0, True)[0]
+    sight = plain._detect_both(toy.depths, SCENE, 1.0, True)[0]
     sure = ~(both_directions(sight.positions, sight.scores, plain.skeleton.tip)[2] < UNSURE_MM)
     assert sure.any()
     np.testing.assert_array_equal(after[sure], before[sure])
