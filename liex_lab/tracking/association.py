@@ -2,12 +2,11 @@
 
 The most probable path of a hidden Markov model whose states are the hypotheses of each frame and
 "missed": minimise sum_t score_t / score_mm (capped) + transition costs + missed-detection costs, by
-dynamic programming with a beam of 24 (Viterbi 1967; kernels in `_association_kernels`). Of an
-animal of a build that the metric does not know, score_mm is larger, and an animal that goes tail
-first for long is the less likely of two ways round (`backward_cost`). Head and
-tail are told apart on that path by the forward-backward algorithm over two states (Rabiner 1989),
-which gives the flip posterior. Lie-X has no such step: its tracker is a particle filter (section
-4.2).
+dynamic programming with a beam of 24 (Viterbi 1967; kernels in `_association_kernels`). For an
+animal of a build that the metric was not trained on, score_mm is larger, and a hypothesis that
+moves tail first for long costs more (`backward_cost`). The forward-backward algorithm over two
+states (Rabiner 1989) then distinguishes head and tail on that path, and gives the flip posterior.
+Lie-X has no such step: its tracker is a particle filter (section 4.2).
 """
 
 from __future__ import annotations
@@ -60,14 +59,14 @@ class AssociationCosts:
     """Costs of a chain of hypotheses, nats; lengths are those of an animal of the reference length.
 
     Attributes:
-        score_mm: so much of the learned metric's score, mm, weighs one nat.
-        score_most: the most nats that a score costs.
-        none: missed-detection cost, of passing all hypotheses of a frame by.
-        ceiling: the most that a transition costs.
+        score_mm: the score of the learned metric, mm, that costs one nat.
+        score_most: the largest cost of a score, nats.
+        none: missed-detection cost, for skipping a frame.
+        ceiling: the largest cost of a transition.
         error_factor: standard deviation of a measurement over its predicted error.
-        shift: how fast the middle moves by itself, lengths a second (standard deviation).
-        bend: how fast the posture about the middle changes by itself, lengths a second.
-        tail: from so many nats on, a transition cost grows as a logarithm.
+        shift: random speed of the middle, lengths a second (standard deviation).
+        bend: random change of the posture about the middle, lengths a second.
+        tail: above this many nats, a transition cost grows logarithmically.
     """
 
     score_mm: float
@@ -83,12 +82,12 @@ class AssociationCosts:
 class HypothesisAssociation:
     """Associates the hypotheses of frames with one animal; frames may be added.
 
-    `path` explains all frames seen so far at once (Viterbi), so a stretch that looked like one
-    component is another as soon as what follows says so.
+    `path` explains all observed frames together (Viterbi), so later frames can change the choice
+    for earlier ones.
 
     Args:
-        skeleton: kinematic tree of the animal; up to eight of its joints measure how far it has
-            moved.
+        skeleton: kinematic tree of the animal; up to eight of its joints measure its
+            movement.
         length_mm: spine length of the animal, mm.
         tuning: costs.
         n_animals: how many animals are in view at once.
@@ -126,7 +125,7 @@ class HypothesisAssociation:
             allocate: allocator of the result.
 
         Returns:
-            (n, H, k, 3) mm, float32, arena frame, NaN where there is no hypothesis; k is at most 8.
+            (n, H, k, 3) mm, float32, arena frame, NaN if there is no hypothesis; k is at most 8.
         """
         return seen.joints(self._joints, allocate)
 
@@ -142,13 +141,13 @@ class HypothesisAssociation:
 
         Args:
             seen: hypotheses (n, H).
-            told: (m,) decisions of the first m frames that stand, None where all are open.
-            joints: what `joints` gave, where it is at hand.
+            told: (m,) final decisions of the first m frames, None if all are open.
+            joints: result of `joints`, if available.
             allocate: allocator of intermediate arrays.
-            emission: what `emission` gave, where it is at hand.
+            emission: result of `emission`, if available.
 
         Returns:
-            (n,) int64 index of the hypothesis, `NONE` where the frame was passed by.
+            (n,) int64 index of the hypothesis, `NONE` if the frame is skipped.
         """
         n, h = seen.score.shape
         joints = self.joints(seen) if joints is None else joints
@@ -173,16 +172,15 @@ class HypothesisAssociation:
     def emission(
         self, seen: Observations, joints: NDArray[np.float32], allocate: Allocator = np.empty
     ) -> Array:
-        """Emission cost of each hypothesis: its capped score, and what it costs an animal to go
-        tail first.
+        """Emission cost of each hypothesis: its capped score, and the cost of moving tail first.
 
         Args:
             seen: hypotheses (n, H).
-            joints: what `joints` gave.
+            joints: result of `joints`.
             allocate: allocator of the result.
 
         Returns:
-            (n, H) nats; NaN where there is no hypothesis.
+            (n, H) nats; NaN if there is no hypothesis.
         """
         cost = allocate(seen.score.shape, float)
         score_mm = self._score_mm * self._strangeness(seen) ** 2
@@ -207,8 +205,8 @@ class HypothesisAssociation:
         return cost
 
     def independent(self, seen: Observations) -> float:
-        """How much of an independent measurement a frame is, 0 to 1: pictures shortly after each
-        other show the same posture, and the metric errs in the one as in the other.
+        """Weight of a frame as an independent measurement, 0 to 1: frames in quick succession show
+        the same posture, and the metric makes the same error in them.
 
         Args:
             seen: hypotheses (n, H) of consecutive frames.
@@ -218,8 +216,8 @@ class HypothesisAssociation:
         return float(min(1.0, np.median(np.diff(seen.seconds)) / _ALIKE_S))
 
     def _missed(self, seen: Observations) -> Array:
-        """What it costs (n,) to pass a frame by: little where several animals are one thing in it,
-        whose pose is that of any of them, and nothing where nothing is in view.
+        """The cost (n,) of skipping a frame: small if several animals form one component, whose
+        pose may be that of any of them, and 0 if nothing is in view.
         """
         cost = np.where(seen.known.any(axis=1), self._tuning.none, 0.0)
         if not self._alone:
@@ -228,26 +226,24 @@ class HypothesisAssociation:
         return cost
 
     def _likeness(self, cost: Array) -> Array:
-        """What (n, H) of a thing's cost says nothing where several animals are in view.
+        """The part (n, H) of a component's cost to ignore when several animals are in view.
 
-        Of two animals the one whose build the metric knows better scores better in every frame,
-        which is no reason to change over to it. So what the likelier way round of a thing costs, up
-        to the price of passing a frame by, counts for nothing; the difference between its ways
-        stays.
+        The animal whose build is closer to the training data scores better in every frame, which
+        is no reason to switch to it. The cost of a component's likelier direction, up to the cost
+        of skipping a frame, is therefore ignored; the difference between its directions is kept.
         """
         other = np.arange(cost.shape[1]) ^ 1
         likelier = np.fmin(cost, cost[:, other])
         return np.asarray(np.minimum(likelier, self._tuning.none))
 
     def _strangeness(self, seen: Observations) -> float:
-        """How many times worse than ordinary the metric scores the poses of this animal, 1 or more.
+        """Ratio of the metric's scores of this animal to ordinary scores, 1 or more.
 
-        The metric knows the builds that it was trained on. Of another build every pose scores
-        badly: the frame would be passed by though the picture agrees with the body. And what the
-        score says of head against tail is worth less: it is right in some two of three frames, for
-        many frames running. So the unit of the scores grows by the square of this factor, the
-        median of the best scores of those frames in which the picture does agree, over what is
-        ordinary.
+        Every pose of a build outside the training data scores badly: the frame would be skipped
+        although the depth image agrees with the body. The score is also weaker evidence for head
+        or tail: it is right in about two of three frames, with long runs of errors. The unit of the
+        scores therefore grows by the square of this factor: the median of the best scores in frames
+        whose depth image agrees, over the ordinary score.
         """
         some = seen[:: max(1, len(seen) // _SAMPLE)]
         best = np.where(some.known, some.score, np.inf).argmin(axis=1)
@@ -272,20 +268,20 @@ class HypothesisAssociation:
     ) -> Array:
         """Flip posterior (n,): probability that head and tail are exchanged on this path.
 
-        Forward-backward over two states. What a frame says is the difference between its hypothesis
-        and the same component turned round (h ^ 1), or score_most where it has no such; between
-        frames, how likely it is that an animal turns round, or does not, in the time between them.
-        Frames that were passed by get values interpolated between their neighbours'.
+        Forward-backward over two states. The emission is the difference between the frame's
+        hypothesis and the reversed one of the same component (h ^ 1), or score_most if there is
+        none; the transition is the probability that an animal turns round between two frames.
+        Values of skipped frames are interpolated.
 
         Args:
             seen: hypotheses (n, H).
             path: (n,) from `path`.
-            joints: what `joints` gave, where it is at hand.
+            joints: result of `joints`, if available.
             allocate: allocator of intermediate arrays.
-            emission: what `emission` gave, where it is at hand.
+            emission: result of `emission`, if available.
 
         Returns:
-            (n,) probabilities; 0 throughout where the path is empty.
+            (n,) probabilities; all 0 if the path is empty.
         """
         rows = np.arange(len(path))
         other = np.where(path >= 0, path ^ 1, NONE)
@@ -325,10 +321,10 @@ class HypothesisAssociation:
 
 
 def backward_cost(seen: Observations, ahead: NDArray[np.float32], length_mm: float) -> Array:
-    """What it costs (n, H) each hypothesis to go tail first, nats.
+    """The cost (n, H) of moving tail first for each hypothesis, nats.
 
-    Animals back up, but slowly and not for long. The velocity of what is seen, by its centroid
-    within 0.2 s before and after, is held against the direction from base to tip.
+    Animals move backwards only slowly and briefly. The velocity of the component's centroid, from
+    0.2 s before to 0.2 s after, is compared with the direction from base to tip.
 
     Args:
         seen: hypotheses (n, H) of consecutive frames.
@@ -363,19 +359,18 @@ _CLEARLY = 1.5  # times the residual of one animal is that of another body
 
 
 def cost_of_the_other(seen: Observations, path: NDArray[np.int64]) -> Array | None:
-    """What it costs (n, H) each hypothesis not to be of the animal that a path follows, nats.
+    """The cost (n, H) of each hypothesis for belonging to the other of two animals, nats.
 
-    The likelihood ratio of one order of sizes over the other, log-normal, at most 2 nats a frame.
-    Which of the two, the larger or the smaller one, is to be followed is the one that the body of
-    this session fits clearly better, for its size and girth were measured on that one; else what
-    the path says of most frames.
+    The log-normal likelihood ratio of one order of sizes over the other, at most 2 nats a frame.
+    The target is the animal, larger or smaller, that the session's body fits clearly better,
+    because its size and girth were measured on that one; otherwise the majority on the path.
 
     Args:
-        seen: hypotheses (n, H) of the frames, those of a frame's second thing after the first's.
-        path: (n,) which of them is meant, negative for none.
+        seen: hypotheses (n, H) of the frames, the second component's after the first's.
+        path: (n,) index of the hypothesis, negative for none.
 
     Returns:
-        0 where only one thing is in view; None where sizes do not tell one from the other.
+        0 if only one component is in view; None if sizes do not distinguish the animals.
     """
     first, second = seen.n_px[:, 0], seen.n_px[:, 2]
     apart = seen.known[:, 0] & seen.known[:, 2] & (first != second)
@@ -401,8 +396,8 @@ def cost_of_the_other(seen: Observations, path: NDArray[np.int64]) -> Array | No
 
 
 def _better_fit(seen: Observations, ratio: Array, apart: NDArray[np.bool_]) -> float:
-    """1 where the session's body fits the larger one clearly better while both are apart, -1 where
-    it fits the smaller one, 0 where neither, by their residuals in the frames `apart` (n,).
+    """1 if the session's body fits the larger one clearly better, -1 if the smaller one, else 0, by
+    their residuals in the frames `apart` (n,).
     """
     first, second = (seen.residual_mm[apart, h].astype(float) for h in (0, 2))
     first_larger = ratio[apart] > 0.0
@@ -416,12 +411,12 @@ def _better_fit(seen: Observations, ratio: Array, apart: NDArray[np.bool_]) -> f
 
 
 def _keeps_order(own: Array, frames: NDArray[np.int64]) -> bool:
-    """Whether a followed thing is the larger one, or the smaller one, all the while that both are
+    """Whether the tracked component is always the larger, or always the smaller one, while both are
     apart.
 
     Args:
         own: (k,) logarithm of its pixels over the other's.
-        frames: (k,) their indices; where some are left out both may have touched.
+        frames: (k,) their indices; both may have touched in missing frames.
     """
     begins = np.concatenate([[0], np.flatnonzero(np.diff(frames) > 1) + 1])
     n = np.diff(np.append(begins, len(own)))

@@ -1,11 +1,11 @@
-"""Occlusion correction: an animal with one end hidden is slid along its axis.
+"""Occlusion correction: an animal with one end hidden is shifted along its axis.
 
-Where the rest of the animal lies is told by the end that is seen. A pose that was fitted to what is
-seen of an animal lies in the middle of it. Which end is hidden is told by where pixels of the
-animal border on nearer ones, or on the picture's edge; the other end is where it is seen to end,
-less what is usually seen of it beyond or short of the chain's end. The shift is at most 0.45 of the
-hidden share of the usual area, and 0 where the animal is whole or nothing lies clearly to one end.
-Ours, not in Lie-X; used for chains that swim, seen along the optical axis.
+A pose that was fitted to the visible part of an animal is centred on that part; the visible end
+gives the true position. The hidden end is the one where the animal's pixels border on nearer pixels
+or on the image edge. The other end is at the end of the visible pixels, corrected by their usual
+distance from the end of the chain. The shift is at most 0.45 of the hidden share of the usual area,
+and 0 if the animal is whole or the hidden end is unclear.
+Not in Lie-X; used for chains that swim, viewed along the optical axis.
 """
 
 from __future__ import annotations
@@ -31,14 +31,14 @@ _REACH_PX = 3  # picture pixels beside the edge, which a sensor often cannot rea
 
 
 def behind_something(crops: HeightMaps, depths: NDArray[np.float32]) -> Array:
-    """The share of each animal's outline that ends at something nearer, or at the picture's edge.
+    """The share of each animal's outline that ends at a nearer object or at the image edge.
 
     Args:
         crops: n height maps.
-        depths: (n, H, W) float32 mm, the pictures that they were cut from, 0 where unread.
+        depths: (n, H, W) float32 mm, the depth images that they were cut from, 0 where unread.
 
     Returns:
-        (n,) 0 to 1; 0 where nothing was found.
+        (n,) 0 to 1; 0 if nothing was found.
     """
     n = len(crops.n_px)
     check_shapes("frames", ("depths", depths, (n, "H", "W")))
@@ -49,7 +49,7 @@ def behind_something(crops: HeightMaps, depths: NDArray[np.float32]) -> Array:
 
 @njit(cache=True, parallel=True, nogil=True)
 def _share_behind(heights, origin, step, depths, nearer_mm, reach_px, out):
-    """Fill out (n,) with the share of the edges of each height map (n, S, S) behind something."""
+    """Fill out (n,) with the share of the edges of each height map (n, S, S) behind an object."""
     for i in prange(heights.shape[0]):
         size = heights.shape[1]
         n_edges = 0
@@ -88,7 +88,7 @@ def _is_behind_another(height, step, r, c, depth, v, u, dr, dc, nearer, reach_px
 
 @njit(cache=True)
 def is_behind(depth, v, u, dv, du, nearer, reach_px):
-    """Whether, in one direction, a reading nearer than `nearer` or the picture's edge is near."""
+    """Whether a reading nearer than `nearer`, or the image edge, is close in one direction."""
     for k in range(1, reach_px + 1):
         row = v + k * dv
         column = u + k * du
@@ -108,15 +108,15 @@ _SLIDE = 0.45  # of the share that is hidden: a chain that was fitted to the res
 
 @dataclass(frozen=True)
 class OcclusionCorrection:
-    """Slides poses along their axes to where the end that is seen says (occlusion correction).
+    """Shifts poses along their axes according to the visible end (occlusion correction).
 
-    Positions along the axis are over the line from the base (0) to the tip (1) in the picture.
+    Positions along the axis run from the base (0) to the tip (1) in the image.
 
     Attributes:
         skeleton: kinematic tree of the animal, one chain.
         scene: the segmenter that cut the height maps.
-        begins: where what is seen of a whole animal begins, usually about 0.
-        ends: where it ends, usually about 1.
+        begins: start of the visible pixels of a whole animal, usually about 0.
+        ends: their end, usually about 1.
     """
 
     skeleton: Skeleton
@@ -132,7 +132,7 @@ class OcclusionCorrection:
         crops: HeightMaps,
         depths: NDArray[np.float32],
     ) -> OcclusionCorrection:
-        """A correction whose usual ends are those of sampled frames that show it whole.
+        """A correction with the usual ends from sampled frames that show the whole animal.
 
         Args:
             skeleton: kinematic tree of the animal, one chain.
@@ -142,8 +142,8 @@ class OcclusionCorrection:
             depths: (n, H, W) float32 mm, the frames.
 
         Returns:
-            The correction, with the medians of those frames; with ends 0 and 1 where no frame shows
-            the animal whole.
+            The correction, with the medians of those frames; ends 0 and 1 if no frame shows the
+            whole animal.
         """
         ends = OcclusionCorrection(skeleton, scene)
         sight = ends._sight(joints_of(skeleton, pose), crops, depths)
@@ -154,7 +154,7 @@ class OcclusionCorrection:
         return replace(ends, begins=float(begins), ends=float(stops))
 
     def slid(self, pose: Pose, crops: HeightMaps, depths: NDArray[np.float32]) -> Pose:
-        """The poses, each moved along the line from base to tip to where its free end says.
+        """The poses, each moved along the line from base to tip according to its free end.
 
         Args:
             pose: (n) poses, camera frame.
@@ -162,7 +162,7 @@ class OcclusionCorrection:
             depths: (n, H, W) float32 mm, the frames.
 
         Returns:
-            (n) poses, camera frame; unchanged where nothing is hidden or nobody knows which end is.
+            (n) poses, camera frame; unchanged if nothing is hidden or the hidden end is unknown.
         """
         joints = joints_of(self.skeleton, pose)
         sight = self._sight(joints, crops, depths)
@@ -180,7 +180,7 @@ class OcclusionCorrection:
         )
 
     def _sight(self, joints: Array, crops: HeightMaps, depths: NDArray[np.float32]) -> Array:
-        """What is seen (n, 5) of each animal, see `_look`, with its area over the usual one.
+        """The visible part (n, 5) of each animal, see `_look`, with its area over the usual one.
 
         Its joints (n, J, 3) mm are in the camera frame.
         """
@@ -199,11 +199,11 @@ class OcclusionCorrection:
 
 @njit(cache=True, parallel=True)
 def _look(heights, origin, step, distance, depths, ends, before, out):
-    """Fill out (n, 5) with what is seen of each animal along its line from base to tip.
+    """Fill out (n, 5) with the visible pixels of each animal along its line from base to tip.
 
-    ends (n, 2, 2) px are the line's ends. Columns: pixels seen times their squared depth; how many
-    of them lie beside something nearer by `before` mm or beside the picture's edge; how far these
-    are from the middle of all over half of what is seen; and where that begins and ends.
+    ends (n, 2, 2) px are the line's ends. Columns: visible pixels times their squared depth; how
+    many of them are next to an object nearer by `before` mm or to the image edge; the distance of
+    these from the middle of all, over half the visible length; start and end of the visible part.
     """
     for i in prange(heights.shape[0]):
         size = heights.shape[1]
@@ -246,7 +246,7 @@ def _look(heights, origin, step, distance, depths, ends, before, out):
 
 @njit(cache=True)
 def _beside(depth, v, u, step, nearer):
-    """Whether a pixel lies within three crop pixels of a nearer one or of the picture's edge."""
+    """Whether a pixel is within three crop pixels of a nearer one or of the image edge."""
     for dv, du in ((1, 0), (-1, 0), (0, 1), (0, -1)):
         if is_behind(depth, v, u, step * dv, step * du, nearer, _REACH_PX):
             return True

@@ -1,15 +1,14 @@
-"""The session's own shape: fitted over many frames, and kept only where other frames bear it out.
+"""The session's shape: fitted over many frames, and used only if held-out frames support it.
 
-The regression of `estimation.session_shape` tells the animal's build from two thirds of the
-sampled frames that are seen well. The body of that build, at the girth that fits these best and in
-the poses that are corrected for it, is then held against the depth of the other third, beside the
-average body at its best girth in the poses as they were (hold-out validation). It is the session's
-where it leaves the smaller median residual or, the same frames beside each other, the smaller one
-in the mean: a near tie speaks for neither, and a told build is the likelier. With fewer than 50
-such frames it is the average one.
+The regression of `estimation.session_shape` estimates the animal's build from two thirds of the
+sampled frames that show it well. The body of that build, at its best girth and in the corrected
+poses, is then compared with the depth of the other third, as is the average body at its best girth
+in the original poses (hold-out validation). The fitted body is used if it has the smaller median
+residual or, paired by frame, the smaller mean: in a near tie the estimated build is the likelier.
+With fewer than 50 such frames the average body is used.
 
-A shape that is stated, as sessions of one animal share it, is taken as it is and only held against
-the depth of all well-seen frames.
+A stated shape, as shared by the sessions of one animal, is used unchanged, and is only compared
+with the depth of all frames that show the animal well.
 """
 
 from __future__ import annotations
@@ -37,12 +36,12 @@ _HELD_OUT = 3  # every so many-th frame is not fitted to
 
 @dataclass(frozen=True)
 class StatedShape:
-    """A shape that nothing is fitted for.
+    """A stated shape, which is not fitted.
 
     Attributes:
-        labels: (K,), see `session_shape.labels_of`; None states the average animal's.
-        girth: of the average body; None finds it.
-        by: who states it, such as '4 sessions of m07'.
+        labels: (K,), see `session_shape.labels_of`; None for the average animal's.
+        girth: of the average body; None fits it.
+        by: the source, such as '4 sessions of m07'.
     """
 
     labels: Array | None
@@ -52,16 +51,16 @@ class StatedShape:
 
 @dataclass(frozen=True)
 class OwnShape:
-    """A session's shape: the animal's build, and what speaks for it.
+    """A session's shape: the animal's build, and the evidence for it.
 
     Attributes:
-        build: the build; None where the average body was kept.
-        n_frames: well-seen frames of the sample.
+        build: the build; None if the average body was kept.
+        n_frames: frames of the sample that show the animal well.
         average_residual_mm: median distance of the average body, at its best girth, from the depth
-            of the frames that were held out, mm; NaN where none were.
+            of the held-out frames, mm; NaN if there are none.
         residual_mm: the same of the fitted body in the corrected poses.
-        why: why the average body was kept; empty where it was not.
-        shared_by: who states the shape; empty where the session's own frames tell it.
+        why: why the average body was kept; empty if it was not.
+        shared_by: source of a stated shape; empty if it was estimated from the session's frames.
     """
 
     build: Build | None
@@ -72,11 +71,11 @@ class OwnShape:
     shared_by: str = ""
 
     def corrected(self, estimator: PoseEstimator, pose: Pose, size: float) -> Pose:
-        """Poses with the mean error of such a body taken off; as they are where none is known.
+        """Poses minus the mean error of such a body; unchanged if it is unknown.
 
         Args:
             estimator: the animal's.
-            pose: (n) poses in any frame, NaN where there is none.
+            pose: (n) poses in any frame, NaN if absent.
             size: the animal's size over home size.
         """
         return pose if self.build is None else self.build.corrected(estimator.skeleton, pose, size)
@@ -117,20 +116,19 @@ def fit_shape(
     average: BodyResidual,
     stated: StatedShape | None = None,
 ) -> tuple[OwnShape | None, BodyResidual]:
-    """The session's shape from a sample of its frames, and the body that its frames are held to.
+    """The session's shape from a sample of its frames, and the body for all its frames.
 
     Args:
-        prior: of the animal, None where no shapes were learned of it.
+        prior: of the animal, None if no shapes were learned.
         estimator: the animal's.
         scene: the segmenter of the recording's camera.
         estimates: of the sampled frames, camera frame.
         size: the animal's size over home size.
         average: the average body at its best girth.
-        stated: the shape where it is stated; None fits it.
+        stated: a stated shape; None fits it.
 
     Returns:
-        The shape, None of an animal of which no shapes were learned; and `average` or the fitted
-        body.
+        The shape, None if no shapes were learned; and `average` or the fitted body.
     """
     skeleton = estimator.skeleton
     if prior is None:
@@ -172,14 +170,14 @@ def fit_shape(
 
 
 def borne_out(before: Array, after: Array) -> bool:
-    """Whether frames that were held out bear a body of its own out.
+    """Whether held-out frames support the fitted body.
 
     Args:
-        before: (n,) residuals of the average body, mm; NaN where too little is covered.
-        after: (n,) of the other one.
+        before: (n,) residuals of the average body, mm; NaN if too little is covered.
+        after: (n,) of the fitted body.
 
     Returns:
-        True where the median falls, or the mean of what falls in each frame is above nought.
+        True if the median decreases, or if the mean decrease per frame is above zero.
     """
     if _median(after) < _median(before):
         return True
@@ -190,7 +188,7 @@ def borne_out(before: Array, after: Array) -> bool:
 
 @dataclass(frozen=True)
 class _Frames:
-    """The sampled frames, of which some (`rows`) are asked; see `fit_shape`."""
+    """The sampled frames, or some of them (`rows`); see `fit_shape`."""
 
     estimator: PoseEstimator
     scene: Segmenter
@@ -208,7 +206,7 @@ class _Frames:
     def at_best_girth(
         self, build: Build, rows: NDArray[np.int64], camera_view: bool
     ) -> BodyResidual:
-        """The body of a build at the girth that fits best, as the average one is."""
+        """The body of a build at its best girth, like the average body."""
         surface = build.surface(self.estimator.skeleton)
         crops = self.estimates.crops[rows]
         return BodyResidual.fit(
@@ -222,7 +220,7 @@ class _Frames:
         return body.of(self._pose(rows, build), self.estimates.crops[rows], self.scene)
 
     def _pose(self, rows: NDArray[np.int64], build: Build | None) -> Pose:
-        """Poses (n), arena frame, corrected for a build where there is one."""
+        """Poses (n), arena frame, corrected for a build if there is one."""
         pose = self.estimates.chosen.pose[rows]
         if build is not None:
             pose = build.corrected(self.estimator.skeleton, pose, self.size)
@@ -230,7 +228,7 @@ class _Frames:
 
 
 def _median(residual: Array) -> float:
-    """Median over the frames, mm; NaN where nothing is covered."""
+    """Median over the frames, mm; NaN if nothing is covered."""
     known = residual[np.isfinite(residual)]
     return float(np.median(known)) if len(known) else float("nan")
 
@@ -244,17 +242,16 @@ _LEAST_SD = 0.001  # of the length: no session tells it better
 
 @dataclass(frozen=True)
 class Found:
-    """What one session found of its animal by itself.
+    """The estimates of one session about its animal.
 
     Attributes:
         spine_mm: the animal's length, mm.
-        stated: whether the plan states that length; then it is not a finding.
-        log_sd: standard deviation of the logarithm of the length that single frames tell.
+        stated: whether the plan states that length, so that it is not an estimate.
+        log_sd: standard deviation of the logarithm of the length in single frames.
         n_frames: frames with a pose.
-        girth: of the average body; it does not count where a shape was kept.
-        shape: (K,) labels of the shape that was kept, see `session_shape.labels_of`; None of a
-            session that kept none.
-        refused: whether frames that were held out contradicted a shape of its own.
+        girth: of the average body; unused if a shape was kept.
+        shape: (K,) labels of the kept shape, see `session_shape.labels_of`; None if there is none.
+        refused: whether held-out frames contradicted the fitted shape.
         n_well_seen: frames that show the animal well.
     """
 
@@ -269,18 +266,18 @@ class Found:
 
     @property
     def variance(self) -> float:
-        """Of the logarithm of the length, by the scatter of its own frames alone."""
+        """Variance of the logarithm of the length, from the scatter of its own frames only."""
         return max(self.log_sd**2 / max(self.n_frames, 1), _LEAST_SD**2)
 
 
 @dataclass(frozen=True)
 class Agreed:
-    """What sessions of one animal agree on.
+    """The shared values of the sessions of one animal.
 
     Attributes:
-        spine_mm: the length, mm; None where every session's plan states its own.
-        girth: of the average body; None where a shape is shared.
-        shape: (K,) labels of the shape; None where too few sessions bear one out.
+        spine_mm: the length, mm; None if every session's plan states its own.
+        girth: of the average body; None if a shape is shared.
+        shape: (K,) labels of the shape; None if too few sessions support one.
     """
 
     spine_mm: float | None
@@ -289,7 +286,7 @@ class Agreed:
 
 
 def spread_of(found: Sequence[Found]) -> float:
-    """How far apart the lengths lie: largest less smallest, over the median.
+    """The spread of the lengths: largest minus smallest, over the median.
 
     Args:
         found: of sessions of one animal, at least one.
@@ -299,10 +296,10 @@ def spread_of(found: Sequence[Found]) -> float:
 
 
 def agree(found: Sequence[Found]) -> Agreed:
-    """What sessions agree on, whatever their order.
+    """The shared values of sessions, independent of their order.
 
     Args:
-        found: of sessions of one animal whose lengths lie no more than `MOST_APART` apart.
+        found: of sessions of one animal whose lengths are at most `MOST_APART` apart.
     """
     measured = [one for one in found if not one.stated]
     shape = _shape(found)

@@ -1,9 +1,8 @@
-"""Rows of a track: what a smoothed curve says of them, which of them hold, and how far they may be
-off.
+"""Rows of a track: values of the smoothed curve, validity and uncertainty.
 
-A row is measured, bridged over a gap, or missing; it is doubtful where its predicted error is large
-or its picture contradicts it, and hidden where the animal is behind something. Its spread is that
-of the curve, and what a body of another build or size is off throughout.
+A row is measured, bridged over a gap, or missing. It is doubtful if its predicted error is large or
+its depth image contradicts it, and hidden if the animal is behind an object. Its spread is that of
+the curve plus the systematic error of a body of a different build or size.
 """
 
 from __future__ import annotations
@@ -51,19 +50,19 @@ def to_track(
     """The rows of a track that a smoothed curve gives: measured, bridged over a gap, or missing.
 
     Args:
-        subject: whom the track is of.
+        subject: the animal of the track.
         seen: hypotheses (n, H) of the frames that the curve covers.
-        path: (n,) hypothesis of each frame, `NONE` where it was passed by.
+        path: (n,) hypothesis of each frame, `NONE` if it was skipped.
         curve: smoothed poses of the n frames, arena frame.
         doubt: (n,) probability that head and tail are exchanged.
-        ahead: the curve also goes on for up to `bridge_s` after the last measurement (prediction).
-        told: only these rows are returned; gaps are judged by all n.
-        tuning: motion parameters with the calibration factors; None takes the animal's own.
-        usual_px: pixels that the animal usually shows; None takes the median of these frames.
+        ahead: extend the curve for up to `bridge_s` after the last measurement (prediction).
+        told: rows to return; gaps are determined from all n.
+        tuning: motion parameters with the calibration factors; None uses the animal's own.
+        usual_px: the animal's usual number of pixels; None uses the median of these frames.
 
     Returns:
-        A track of the rows `told`; NaN where nothing was measured or bridged, flagged as hidden
-        where too little of the animal is in view beside something nearer.
+        A track of the rows `told`; NaN if nothing was measured or bridged, flagged as hidden if too
+        little of the animal is visible next to a nearer object.
     """
     tuning = tuning or TrackingParameters.of(subject.skeleton.name)
     measured = curve.used & (path >= 0)
@@ -94,7 +93,7 @@ def hide(track: Track, hidden: NDArray[np.bool_]) -> None:
 
     Args:
         track: n rows.
-        hidden: where the animal is behind or under something; what was bridged there is no pose.
+        hidden: frames with the animal behind or under an object; bridged poses there are removed.
     """
     hidden = hidden & (track.flag == "not_found")
     _mask(track, hidden)
@@ -103,7 +102,7 @@ def hide(track: Track, hidden: NDArray[np.bool_]) -> None:
 
 
 def _mask(track: Track, rows: NDArray[np.bool_]) -> None:
-    """Take the pose, with its spread and projection, out of rows (n,) of a track."""
+    """Remove the pose, with its spread and projection, from rows (n,) of a track."""
     for column in (
         track.joints_mm,
         track.uv_px,
@@ -123,10 +122,10 @@ def _mask(track: Track, rows: NDArray[np.bool_]) -> None:
 
 
 def write_curve(subject: Subject, track: Track, curve: Curve, tuning: TrackingParameters) -> None:
-    """Write a curve into rows of a track, whether anything was measured there or not.
+    """Write a curve into rows of a track, measured or not.
 
     Args:
-        subject: whom the track is of.
+        subject: the animal of the track.
         track: its n rows, filled in place.
         curve: smoothed poses of these n frames, arena frame.
         tuning: motion parameters with the calibration factors.
@@ -176,18 +175,18 @@ def mask_and_flag(
     bridged: NDArray[np.bool_],
     strayed: NDArray[np.bool_],
 ) -> None:
-    """Mask rows of a track to those measured or bridged; add projections, flags and sight.
+    """Mask rows of a track to those measured or bridged; add projections, flags and visibility.
 
     Args:
-        subject: whom the track is of.
+        subject: the animal of the track.
         track: its n rows, changed in place.
         seen: hypotheses (n, H) of these frames.
-        path: (n,) hypothesis of each frame, `NONE` where it was passed by.
+        path: (n,) hypothesis of each frame, `NONE` if it was skipped.
         doubt: (n,) probability that head and tail are exchanged.
-        measured: (n,) bool, where a hypothesis was taken.
-        bridged: (n,) bool, where the curve goes over a gap.
-        strayed: (n,) bool, where the picture contradicts the pose, which is doubtful then, as is
-            one of a large predicted error.
+        measured: (n,) bool, where a hypothesis was selected.
+        bridged: (n,) bool, where the curve bridges a gap.
+        strayed: (n,) bool, where the depth image contradicts the pose, which makes it doubtful
+            like a large predicted error.
     """
     there = measured | bridged
     _mask(track, ~there)
@@ -231,10 +230,10 @@ def covariance_of_root(curve: Curve) -> Array:
 
 
 def stretch_of(stretch_sd: float, joints: Array) -> Array:
-    """Standard deviations (n, J) mm of joints whose distances from the base are all off.
+    """Standard deviations (n, J) mm of joints from a common error of their distances to the base.
 
     Args:
-        stretch_sd: share by which the distances are off, as a standard deviation.
+        stretch_sd: relative error of the distances, as a standard deviation.
         joints: (n, J, 3) mm, the base first.
 
     Returns:
@@ -244,12 +243,12 @@ def stretch_of(stretch_sd: float, joints: Array) -> Array:
 
 
 def add_sight_of_copies(track: Track, seen: Observations, copies: NDArray[np.bool_]) -> None:
-    """Write into copies what was seen of the animal in the images that they repeat, in place.
+    """Write the observations of the repeated images into their copies, in place.
 
     Args:
         track: n rows.
         seen: hypotheses (n, H) of these frames.
-        copies: (n,) bool, frames whose depth image is that of a frame before.
+        copies: (n,) bool, frames whose depth image equals that of an earlier frame.
     """
     shown = seen.shown[copies]
     for column in (track.n_foreground_px, track.centroid_mm, track.centroid_px, track.residual_mm):
@@ -259,7 +258,7 @@ def add_sight_of_copies(track: Track, seen: Observations, copies: NDArray[np.boo
 def _add_sight(
     track: Track, seen: Observations, path: NDArray[np.int64], measured: NDArray[np.bool_]
 ) -> None:
-    """What was seen of the animal where it was measured."""
+    """Add the observations of the animal to measured rows."""
     rows = np.flatnonzero(measured)
     taken = path[measured]
     track.n_foreground_px[rows] = seen.n_px[rows, taken]
@@ -269,17 +268,17 @@ def _add_sight(
 
 
 def single_frames(subject: Subject, seen: Observations) -> Track:
-    """The track of each frame by itself, without its neighbours: its first hypothesis.
+    """The track of single frames, without their neighbours: the first hypothesis of each.
 
     No association, no smoothing and no bridging; p_flip is 0 throughout. The spread is that of one
     measurement.
 
     Args:
-        subject: whom the track is of; its `bridge_s` is not used.
+        subject: the animal of the track; its `bridge_s` is not used.
         seen: hypotheses (n, H), arena frame.
 
     Returns:
-        A track of n rows, NaN where a frame has no first hypothesis.
+        A track of n rows, NaN if a frame has no first hypothesis.
     """
     path = np.where(seen.known[:, 0], 0, NONE)
     pose = seen.pose(path)
@@ -300,16 +299,16 @@ def doubted(
     in_view: Array,
     usual_px: float,
 ) -> NDArray[np.bool_]:
-    """Whether (n,) a pose is doubtful for what its picture shows.
+    """Whether (n,) a pose is doubtful because of its depth image.
 
-    It contradicts the pose, a part of the animal is behind something, or it touches another animal.
+    The image contradicts the pose, the animal is partly hidden, or it touches another animal.
 
     Args:
-        subject: whom the track is of.
+        subject: the animal of the track.
         seen: hypotheses (n, H).
-        path: (n,) hypothesis of each frame, `NONE` where it was passed by.
-        in_view: (n,) share of the animal that is in view.
-        usual_px: pixels that it usually shows.
+        path: (n,) hypothesis of each frame, `NONE` if it was skipped.
+        in_view: (n,) visible share of the animal.
+        usual_px: its usual number of pixels.
     """
     found = contradicted(seen, path, subject.length_mm) | (in_view < WHOLE)
     if subject.n_animals > 1:

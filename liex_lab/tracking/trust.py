@@ -1,14 +1,14 @@
-"""Which poses of a track the picture contradicts, whatever error the model predicts for them.
+"""Poses of a track that the depth image contradicts, whatever error the model predicts for them.
 
-An error of more than a quarter of the length is none to trust, whatever limit the plan states. Of a
-measured pose four numbers come from the picture itself (`residual.Agreement`): the distance between
-rendered body and readings, the same in the part of the body where it is largest, the share of the
-silhouette that the body covers, and the share of the body beside it. Of a pose that was smoothed or
-bridged, the distance from what the frame itself says is asked: while an animal is in full view, a
-pose that lies elsewhere is none.
+A pose with an error of more than a quarter of the length is not trusted, whatever limit the plan
+states. A measured pose is compared with the depth image by four numbers (`residual.Agreement`): the
+distance between the rendered body and the depth, the same in the part of the body where it is
+largest, the share of the silhouette that the body covers, and the share of the body outside it. A
+smoothed or bridged pose is compared with the hypotheses of its frame: while an animal is in full
+view, a pose elsewhere is rejected.
 
-The limits were set on virtual recordings of the mouse, the fish and the hand with known truth; how,
-and what lies on either side of them, stands in `docs/trust.md`.
+The limits were set on virtual recordings of the mouse, the fish and the hand with known truth;
+`docs/trust.md` describes how.
 """
 
 from __future__ import annotations
@@ -59,15 +59,15 @@ _ELSEWHERE = 0.25
 def contradicted(
     seen: Observations, path: NDArray[np.int64], length_mm: float
 ) -> NDArray[np.bool_]:
-    """Whether (n,) the picture contradicts the pose that a frame's own hypothesis gives.
+    """Whether (n,) the depth image contradicts the pose of a frame's own hypothesis.
 
     Args:
         seen: hypotheses (n, H) of the frames.
-        path: (n,) which of them is meant, negative for none.
+        path: (n,) index of the hypothesis, negative for none.
         length_mm: of the animal.
 
     Returns:
-        False where there is no hypothesis, or nothing is known of how it agrees with the picture.
+        False if there is no hypothesis, or its agreement with the depth image is unknown.
     """
     residual = seen.along(seen.residual_mm, path)
     known = residual[np.isfinite(residual)]
@@ -85,30 +85,30 @@ def contradicted(
 
 
 def usual_pixels(seen: Observations, path: NDArray[np.int64]) -> float:
-    """The pixels that the animal usually shows where nothing stands before it.
+    """The animal's usual number of pixels when it is unobstructed.
 
-    The median along a path over the frames in which its outline ends at nothing nearer, or over all
-    of them where fewer than 12 are such.
+    The median along a path over the frames in which its outline does not end at a nearer object, or
+    over all frames if fewer than 12 of them qualify.
 
     Args:
         seen: hypotheses (n, H) of the frames.
-        path: (n,) which of them is meant, negative for none.
+        path: (n,) index of the hypothesis, negative for none.
 
     Returns:
-        The pixels; 0 where the path is empty.
+        The pixels; 0 if the path is empty.
     """
     return median_of_whole(seen.along(seen.n_px, path), seen.along(seen.behind, path))
 
 
 def median_of_whole(shown: Array, behind: Array) -> float:
-    """The pixels that an animal usually shows where nothing stands before it.
+    """An animal's usual number of pixels when it is unobstructed.
 
     Args:
-        shown: (n,) its pixels, NaN where they are not known.
-        behind: (n,) share of its outline that ends at something nearer.
+        shown: (n,) its pixels, NaN if unknown.
+        behind: (n,) share of its outline that ends at a nearer object.
 
     Returns:
-        The median; 0 where none is known.
+        The median; 0 if none is known.
     """
     known = np.isfinite(shown)
     whole = known & (np.nan_to_num(behind) <= _BEHIND)
@@ -117,14 +117,14 @@ def median_of_whole(shown: Array, behind: Array) -> float:
 
 
 def together(seen: Observations, path: NDArray[np.int64], usual_px: float) -> NDArray[np.bool_]:
-    """Whether (n,) an animal touches another, so that both are one thing in the picture.
+    """Whether (n,) an animal touches another, so that both are one component of the depth image.
 
-    How large both are is told by the frames in which each is a thing of its own.
+    The size of both is estimated from the frames in which they are separate components.
 
     Args:
         seen: hypotheses (n, H) of the frames.
-        path: (n,) which of them is meant, negative for none.
-        usual_px: pixels that the animal usually shows.
+        path: (n,) index of the hypothesis, negative for none.
+        usual_px: the animal's usual number of pixels.
     """
     shown = seen.along(seen.n_px, path)
     others = np.where(seen.known & (seen.n_px != shown[:, None]), seen.n_px, 0).max(axis=1)
@@ -137,15 +137,15 @@ def together(seen: Observations, path: NDArray[np.int64], usual_px: float) -> ND
 
 
 def share_in_view(seen: Observations, path: NDArray[np.int64], usual_px: float) -> Array:
-    """The share (n,) of an animal that is in view where something stands before the rest of it.
+    """The visible share (n,) of an animal that is partly behind a nearer object.
 
     Args:
         seen: hypotheses (n, H) of consecutive frames.
-        path: (n,) which of them is meant, negative for none, which takes the first.
-        usual_px: pixels that the animal usually shows.
+        path: (n,) index of the hypothesis; if negative, the first one is used.
+        usual_px: the animal's usual number of pixels.
 
     Returns:
-        1 where nothing is before it, or there is no hypothesis.
+        1 if it is unobstructed, or if there is no hypothesis.
     """
     meant = np.where((path < 0) & seen.known[:, 0], 0, path)
     share = in_view(seen.along(seen.behind, meant), seen.along(seen.n_px, meant), usual_px)
@@ -153,26 +153,26 @@ def share_in_view(seen: Observations, path: NDArray[np.int64], usual_px: float) 
 
 
 def lies_unknown(in_view: Array, doubt: Array) -> NDArray[np.bool_]:
-    """Whether (n,) so much of an animal is hidden that nobody knows how it lies.
+    """Whether (n,) so much of an animal is hidden that its pose is unknown.
 
     Args:
-        in_view: (n,) share of it that is in view.
+        in_view: (n,) its visible share.
         doubt: (n,) probability that its head and tail are exchanged.
 
     Returns:
-        True where less than 0.7 is in view, or not all of it and its ends are unknown as well.
+        True if less than 0.7 is visible, or if part of it is hidden and its ends are uncertain.
     """
     return np.asarray((in_view < MOSTLY) | ((in_view < WHOLE) & (doubt > _UNSURE)))
 
 
 def in_view(behind: Array, shown_px: Array, usual_px: float, beside: int = _FRAMES) -> Array:
-    """The share (n,) of an animal that is in view where something stands before the rest of it.
+    """The visible share (n,) of an animal that is partly behind a nearer object.
 
     Args:
-        behind: (n,) share of its outline that ends at something nearer.
+        behind: (n,) share of its outline that ends at a nearer object.
         shown_px: (n,) its pixels.
-        usual_px: those that it usually shows.
-        beside: what stands before it in so many frames before and after does so in this one.
+        usual_px: its usual pixels.
+        beside: an obstruction within this many frames before and after also counts here.
     """
     near = np.pad(np.nan_to_num(behind), beside)
     most = np.max([near[k : k + len(behind)] for k in range(2 * beside + 1)], axis=0)
@@ -180,16 +180,16 @@ def in_view(behind: Array, shown_px: Array, usual_px: float, beside: int = _FRAM
 
 
 def told_ends(seen: Observations) -> Array:
-    """How much (n, H), 0 to 1, each hypothesis tells of which end of the animal is its head.
+    """The weight (n, H), 0 to 1, of each hypothesis as evidence for which end is the head.
 
-    Of an animal that something stands before, the metric takes one end for the other in frame after
-    frame, for it never saw such an animal: it tells nothing where no more than 0.7 is in view.
+    The metric was not trained on partly hidden animals, and confuses their ends in many consecutive
+    frames: the weight is 0 if no more than 0.7 of the animal is visible.
 
     Args:
         seen: hypotheses (n, H) of consecutive frames.
 
     Returns:
-        1 where all of it is in view, or there is no hypothesis.
+        1 if all of it is visible, or if there is no hypothesis.
     """
     first = np.where(seen.known[:, 0], 0, -1)
     usual_px = usual_pixels(seen, first)
@@ -204,16 +204,16 @@ def told_ends(seen: Observations) -> Array:
 def gone_behind(
     seen: Observations, measured: NDArray[np.bool_], usual_px: float
 ) -> NDArray[np.bool_]:
-    """Whether (n,) the animal is hidden: it went behind or under something and is not back yet.
+    """Whether (n,) the animal is hidden: it disappeared behind or under an object.
 
-    A stretch without a measured pose, in which nothing of the animal's size is in view for a while,
-    and just before which less and less of the animal was seen beside something nearer. Where a
-    recording begins with such a stretch, what is seen just after it says so.
+    A hidden stretch has no measured pose and for a while no object of the animal's size in view;
+    just before it, less and less of the animal was visible next to a nearer object. If a recording
+    begins with such a stretch, the frames after it decide.
 
     Args:
         seen: hypotheses (n, H) of all frames.
         measured: (n,) whether a pose was measured.
-        usual_px: pixels that the animal usually shows.
+        usual_px: the animal's usual number of pixels.
     """
     hidden = np.zeros(len(seen), np.bool_)
     known = np.asarray(seen.known.any(axis=1))
@@ -237,17 +237,16 @@ def gone_behind(
 
 
 def _was_going(shown: Array, behind: Array) -> bool:
-    """Whether frames (k,) show an animal that goes behind something: less of it, and an outline
-    that ends at what is nearer.
+    """Whether frames (k,) show an animal that disappears: fewer pixels, and an outline that ends at
+    a nearer object.
     """
     return len(shown) > 0 and bool(shown.min() < _GOING and behind.max() > _BEHIND)
 
 
 class Watch:
-    """The same while the recording goes on, told frame by frame from the past alone.
+    """`gone_behind` during a recording, frame by frame, from past frames only.
 
-    What comes after cannot be asked: a recording that begins with a hidden animal is of one that
-    was not found.
+    Without later frames, an animal that is hidden at the beginning counts as not found.
     """
 
     def __init__(self) -> None:
@@ -260,7 +259,7 @@ class Watch:
 
     @property
     def usual_px(self) -> float | None:
-        """Pixels that the animal usually shows; None before the first measurement."""
+        """The animal's usual number of pixels; None before the first measurement."""
         return median_of_whole(*np.array(self._shown).T) if self._shown else None
 
     def gone(
@@ -270,7 +269,7 @@ class Watch:
 
         Args:
             seen: hypotheses (n, H) of consecutive frames, the first the one after the last.
-            path: (n,) which of them is meant, negative for none.
+            path: (n,) index of the hypothesis, negative for none.
             measured: (n,) whether a pose was measured.
         """
         known = np.asarray(seen.known.any(axis=1))
@@ -301,20 +300,20 @@ def elsewhere(
     length_mm: float,
     usual_px: float,
 ) -> NDArray[np.bool_]:
-    """Whether (n,) a pose lies elsewhere than everything that its frame says of an animal in view.
+    """Whether (n,) a pose differs from all hypotheses of its frame while the animal is in view.
 
-    Either way round counts, for which end is the head is told by more than one frame.
+    Both directions are compared, because the head is decided from several frames.
 
     Args:
         skeleton: kinematic tree of the animal.
         seen: hypotheses (n, H) of the frames.
-        joints_mm: (n, J, 3) the poses, arena frame, mm; NaN where there is none.
+        joints_mm: (n, J, 3) the poses, arena frame, mm; NaN if absent.
         error_mm: (n,) their predicted errors, mm.
         length_mm: of the animal.
-        usual_px: pixels that the animal usually shows.
+        usual_px: the animal's usual number of pixels.
 
     Returns:
-        False where nothing of the animal's size is in full view, or there is no pose.
+        False if no object of the animal's size is in full view, or if there is no pose.
     """
     nearest = np.full(len(seen), np.inf)
     allowed = np.zeros(len(seen))
@@ -348,7 +347,7 @@ _MOST_LENGTHS_S = 10.0  # for a quarter of the time; 1 to 4 are usual, in short 
 
 
 def why_too_fast(track: Track, length_mm: float) -> str:
-    """That the animal goes faster than animals keep up; "" where it does not, or nobody can tell.
+    """A message if the animal is faster than animals can sustain; "" if it is not, or if unknown.
 
     Args:
         track: one row for every frame.
