@@ -564,7 +564,8 @@ def serve_dashboard(
     from liex_lab.pipelines.study.listing import list_sessions
 
     try:
-        from liex_lab.dashboards.app.server import LOOPBACK, address, make_app, serve
+        from liex_lab.dashboards.app.guard import LOOPBACK
+        from liex_lab.dashboards.app.server import address, make_app, serve
     except ModuleNotFoundError as error:
         raise MissingPackageError(
             f"the dashboard needs {error.name}; {how_to_install('dashboard')}"
@@ -647,7 +648,7 @@ def write_long(minutes: float, out: str | Path) -> dict[str, Any]:
         `peak_memory_mb` (None where the system does not tell) and `seconds`.
     """
     from liex_lab.dashboards.report.report import write_report
-    from liex_lab.pipelines.evaluation.long_sessions import write_long as job
+    from liex_lab.pipelines.evaluation.scale import write_long as job
 
     return job(minutes, out, write_report)
 
@@ -699,7 +700,7 @@ def evaluate_tracking(
     """
     from functools import partial
 
-    from liex_lab.dashboards.paper.tracking import draw_tracking
+    from liex_lab.dashboards.paper.figures import draw_tracking
     from liex_lab.pipelines.evaluation.tracking import evaluate_tracking as measure
 
     draw = None if figure is None else partial(draw_tracking, path=figure)
@@ -741,7 +742,7 @@ def evaluate_scenes(
     """
     from functools import partial
 
-    from liex_lab.dashboards.paper.scenes import draw_scene
+    from liex_lab.dashboards.paper.figures import draw_scene
     from liex_lab.pipelines.evaluation.scenes import evaluate_scenes as measure
 
     draw = None if pictures is None else partial(draw_scene, folder=pictures)
@@ -784,7 +785,7 @@ def evaluate_actions(
     """
     from functools import partial
 
-    from liex_lab.dashboards.paper.confusion import draw_confusions
+    from liex_lab.dashboards.paper.figures import draw_confusions
     from liex_lab.pipelines.evaluation.actions import evaluate_actions as measure
 
     draw = None if figure is None else partial(draw_confusions, path=figure)
@@ -823,16 +824,10 @@ def run_tables(
         progress: told how far the work is.
     """
     from liex_lab.catalog import bundled_models
-    from liex_lab.dashboards.paper.confusion import draw_confusions
-    from liex_lab.dashboards.paper.key_frames import draw_key_frames
-    from liex_lab.dashboards.paper.nyu_hands import draw_nyu_hands
-    from liex_lab.dashboards.paper.page import write_page
-    from liex_lab.dashboards.paper.plates import draw_figures
-    from liex_lab.dashboards.paper.tracking import draw_tracking
-    from liex_lab.pipelines.evaluation.paper.drawers import Drawers
-    from liex_lab.pipelines.evaluation.paper.run import make_tables
+    from liex_lab.dashboards.paper.page import write_paper
+    from liex_lab.pipelines.evaluation.paper.run import measure_paper
 
-    return make_tables(
+    results, further, kept = measure_paper(
         out,
         animals or list(bundled_models()),
         n_frames=n_frames,
@@ -842,16 +837,9 @@ def run_tables(
         sealed=sealed,
         without=without,
         nyu=nyu,
-        drawers=Drawers(
-            draw_figures,
-            draw_tracking,
-            draw_confusions,
-            draw_key_frames,
-            draw_nyu_hands,
-            write_page,
-        ),
         progress=progress,
     )
+    return [*kept, *write_paper(Path(out), results, further, quick)]
 
 
 def _layout(session: dict[str, Any]) -> Any:

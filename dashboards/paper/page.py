@@ -1,59 +1,441 @@
-"""index.html: all tables and figures of the Lie-X paper on one page, by a Jinja template.
+"""Tables 1 to 3 of the Lie-X paper as CSV and Markdown, and index.html: every table and figure.
 
-The page holds its pictures and asks nothing of any other machine. Glue: what it says is handed in.
+What is written is data that `liex evaluate tables` measured; the sentences are in `templates`. The
+page contains its figures and loads nothing from any other machine.
 """
 
 from __future__ import annotations
 
 import base64
+import json
 import struct
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
 from markupsafe import Markup, escape
 
+from liex_lab.evaluation.scores import POSE_PROTOCOL, plain
 from liex_lab.runtime.durable import write_whole
+from liex_lab.sessions.provenance import package_version
 
 from ..pages import page
+from .figures import draw_paper
+from .published import (
+    DEVIATIONS,
+    HAND,
+    OTHERS_FPS,
+    OTHERS_MM,
+    PUBLISHED_FPS,
+    PUBLISHED_MM,
+    TITLES,
+)
 
-TEMPLATES = Path(__file__).parent / "templates"
-_DPI_SHOWN = 0.72  # of a picture's pixels, so that its letters are as large as the page's
+Results = Mapping[str, Any]  # what was measured of one animal, by the job's names
+Table = tuple[Sequence[str], Sequence[Sequence[str]]]  # head and rows
+
+_TEMPLATES = Path(__file__).parent / "templates"
+_SPLIT_COLUMNS = (  # of a table's row that differ by split
+    *("split", "median_mm", "mean_mm", "interval95", "mean_interval95", "wrong_object"),
+    *("wrong_object_alone", "mean_joint_error_mm", "median_joint_error_mm", "p95_joint_error_mm"),
+    *("flip_rate", "lost_rate", "n_frames", "n_recordings"),
+)
+_COLUMNS = (
+    *("animal", "split", "method", "variant", *_SPLIT_COLUMNS[1:], "training_images", "seeds"),
+    *("frames_per_s", "ratio_to_default", "published_mean_joint_error_mm"),
+    *("published_frames_per_s", "origin", "processor", "other_processor", "seed", "version"),
+    "command",
+)
+_JSON_COLUMNS = (
+    *("median_mm", "mean_mm", "interval95", "mean_interval95", "run_median_mm", "wrong_object"),
+    *("wrong_object_alone", "lost_rate", "n_frames", "n_recordings", "training_images", "seeds"),
+    *("origin", "processor", "other_processor"),
+)
+_LABELS = (*(f"Table {k}" for k in (1, 2, 3)), *(f"Fig. {k}" for k in range(1, 21)))
+_FIGURES = {  # by label, names of the files
+    **{f"Fig. {k}": f"fig{k:02d}_*.png" for k in (7, 8, 9, 10, 11, 12, 16, 17, 18, 19, 20)},
+    "Fig. 13": "fig13_candidates_fish.png",
+    "Fig. 14": "fig13_candidates_mouse.png",
+    "Fig. 15": "fig13_candidates_hand.png",
+}
+_ANIMAL = {"Fig. 10": "hand", "Fig. 11": "hand", "Fig. 13": "fish", "Fig. 14": "mouse"}
+_ANIMAL |= {"Fig. 15": "hand"}
+_PART = {"Fig. 18": "tracking", "Fig. 19": "actions", "Fig. 20": "actions"}
+_SHOWN_SCALE = 0.72  # of a figure's pixels, so that its letters are as large as the page's
 
 
-def write_page(about: Mapping[str, Any], exhibits: Sequence[Mapping[str, Any]], path: Path) -> Path:
-    """Write the page of tables and figures.
+def write_paper(
+    folder: Path, results: Sequence[Results], further: Mapping[str, Any], quick: bool
+) -> list[Path]:
+    """Write the tables as CSV, Markdown and JSON, the figures, and the page that has them all.
 
     Args:
-        about: `title`, paragraphs `about`, `warnings` and `differences`, all in sentences.
-        exhibits: in order, each with `label`, `title`, `said`, `tables` (caption, head, rows),
-            `notes`, `pictures` (PNG files) and `missing`.
-        path: of the page.
+        folder: where the files are written.
+        results: by animal; the hand goes into Table 2, all others into Table 1.
+        further: what other verbs measured, see `liex_lab.pipelines.evaluation.paper.run`.
+        quick: the rows were trained on next to nothing; the text says so and concludes nothing.
 
     Returns:
-        `path`.
+        The paths of the files.
     """
-    shown = [
+    table = frame(results)
+    hand = table["animal"] == "hand"
+    rates = table.drop_duplicates(["animal", "variant"]).drop(columns=[*_SPLIT_COLUMNS])
+    written = []
+    for number, part in ((1, table[~hand]), (2, table[hand]), (3, rates)):
+        if len(part):
+            written.append(folder / f"table{number}.csv")
+            part = part.reindex(columns=[*_COLUMNS]).dropna(axis=1, how="all")
+            part.to_csv(written[-1], index=False, lineterminator="\r\n")
+    by_split = json.dumps(_by_split(table), indent=1, allow_nan=False)
+    figures = draw_paper(results, further, folder)
+    shown = {
+        "quick": quick,
+        "sealed": any(r["sealed"] for r in results),
+        "differences": DEVIATIONS,
+        "hand": HAND,
+        "protocol": POSE_PROTOCOL,
+        "animals": [_in_markdown(r, quick) for r in results],
+        "rates": _grid(rate_table(results)),
+        "origins": _grid(origin_table(results)),
+        "actions": further["actions"],
+        "exhibits": exhibits(results, further, figures, quick),
+    }
+    texts = {
+        "tables.json": by_split + "\n",
+        "tables.md": page(_TEMPLATES / "tables.md.j2", **shown),
+        "index.html": page(_TEMPLATES / "page.html.j2", **shown),
+    }
+    for name, text in texts.items():
+        write_whole(folder / name, text)
+    return [*written, *figures, *(folder / name for name in texts)]
+
+
+def frame(results: Sequence[Results]) -> pd.DataFrame:
+    """Every row on every split of every animal, with how it was made and what is published."""
+    rows = [
         {
-            **one,
-            "said": _with_code(one["said"]),
-            "missing": _with_code(one["missing"]),
-            "notes": [_with_code(note) for note in one["notes"]],
-            "tables": [_table(*table) for table in one["tables"]],
-            "id": one["label"].lower().replace(".", "").replace(" ", "-"),
-            "pictures": [_picture(file) for file in one["pictures"]],
-            "empty": not one["tables"] and not one["pictures"],
+            "animal": r["animal"],
+            "method": TITLES[variant],
+            "variant": variant,
+            "origin": row["origin"],
+            "other_processor": row["other_processor"],
+            **row["made"],
+            **row["rate"],
+            "published_mean_joint_error_mm": PUBLISHED_MM.get(r["animal"], {}).get(variant),
+            "published_frames_per_s": _published_rate(r, variant),
+            "split": split,
+            **numbers,
         }
-        for one in exhibits
+        for r in results
+        for variant, row in r["rows"].items()
+        for split, numbers in row["splits"].items()
     ]
-    write_whole(path, page(TEMPLATES / "page.html.j2", **about, exhibits=shown))
-    return path
+    return pd.DataFrame(rows, dtype=object)
 
 
-def _table(
-    caption: str, head: Sequence[str], rows: Sequence[Sequence[str]]
-) -> tuple[str, Sequence[str], list[list[Markup]], list[str]]:
-    """A table as it stands in the page; its columns of words are of the class `text`."""
+def _published_rate(results: Results, variant: str) -> float | None:
+    return PUBLISHED_FPS.get(results["animal"]) if variant == "paper" else None
+
+
+def _by_split(table: pd.DataFrame) -> dict[str, Any]:
+    """The figures of tables.json by animal, split and variant."""
+    found: dict[str, Any] = {}
+    for row in table.to_dict("records"):
+        of_split = found.setdefault(row["animal"], {}).setdefault(row["split"], {})
+        of_split[row["variant"]] = {name: row.get(name) for name in _JSON_COLUMNS}
+    return plain(found)
+
+
+def _in_markdown(results: Results, quick: bool) -> dict[str, Any]:
+    """The tables and notes of one animal for tables.md."""
+    hand = results["animal"] == "hand"
+    return {
+        "animal": results["animal"],
+        "number": 2 if hand else 1,
+        "tables": [_grid(error_table(results)), _grid(mean_table(results))],
+        "notes": [Markup(note) for note in [*([HAND] if hand else []), *notes_of(results, quick)]],
+    }
+
+
+def _grid(table: Table) -> Markup:
+    """A table in Markdown."""
+    lines = [table[0], ["---"] * len(table[0]), *table[1]]
+    return Markup("\n".join(f"| {' | '.join(line)} |" for line in lines))
+
+
+def _number(value: float | None, digits: int = 2) -> str:
+    return "" if value is None else f"{value:.{digits}f}"
+
+
+def error_table(results: Results) -> Table:
+    """One animal's medians: a row for each method, and one for the objects that all measured."""
+    published = PUBLISHED_MM.get(results["animal"], {})
+    splits = results["splits"]
+    rows = []
+    for variant, title in TITLES.items():
+        row = results["rows"].get(variant)
+        cells = [_median(row["splits"][split]) if row else "" for split in splits]
+        rows.append([title, *cells, _number(published.get(variant)), _origin(row)])
+    if results["animal"] == "hand":
+        for title, value in OTHERS_MM.items():
+            rows.append([title, *[""] * len(splits), _number(value), "published"])
+    if results["rows"]:
+        given = next(iter(results["rows"].values()))["splits"]  # every row is given the same
+        rows.append(
+            ["another object measured (alone)", *(_wrong(given[s]) for s in splits), "", ""]
+        )
+    head = ["method", *(f"{split}: median (95\u00a0%)" for split in splits)]
+    return [*head, "published, other data: mean", "row"], rows
+
+
+def mean_table(results: Results) -> Table:
+    """One animal's means, flips and lost frames, by method and split."""
+    rows = []
+    for variant, row in results["rows"].items():
+        numbers = [row["splits"][split] for split in results["splits"]]
+        cells = [text for one in numbers for text in (_number(one["mean_mm"]), _flips(one))]
+        lost = "/".join(f"{100 * one['lost_rate']:.1f}" for one in numbers)
+        n_frames = "/".join(str(one["n_frames"]) for one in numbers)
+        rows.append([TITLES[variant], *cells, lost, n_frames])
+    head = [text for split in results["splits"] for text in (f"{split}: mean", "flips")]
+    return ["method", *head, "lost, %", "frames"], rows
+
+
+def _origin(row: Mapping[str, Any] | None) -> str:
+    """Measured in this run, or kept, and then on what other processor."""
+    if row is None:
+        return "not measured"
+    return f"{row['origin']}{', another processor' if row['other_processor'] else ''}"
+
+
+def _median(numbers: Mapping[str, Any]) -> str:
+    bounds = numbers.get("interval95")
+    interval = f" ({_number(bounds[0])} to {_number(bounds[1])})" if bounds else ""
+    return _number(numbers["median_mm"]) + interval
+
+
+def _wrong(numbers: Mapping[str, Any]) -> str:
+    return f"{100 * numbers['wrong_object']:.2f} % ({100 * numbers['wrong_object_alone']:.2f} %)"
+
+
+def _flips(numbers: Mapping[str, Any]) -> str:
+    return "" if numbers["flip_rate"] is None else f"{100 * numbers['flip_rate']:.1f} %"
+
+
+def rate_table(results: Sequence[Results]) -> Table:
+    """Frames per second of each method."""
+    rows = [
+        [
+            r["animal"],
+            TITLES[variant],
+            _number(row["rate"]["frames_per_s"], 0),
+            _number(row["rate"]["ratio_to_default"], 3),
+            row["rate"]["picture"],
+            str(row["rate"]["cores"]),
+            _number(_published_rate(r, variant), 0),
+            _origin(row),
+        ]
+        for r in results
+        for variant, row in r["rows"].items()
+    ]
+    if any(r["animal"] == "hand" for r in results):
+        for title, rate in OTHERS_FPS.items():
+            rows.append(["hand", title, *[""] * 4, f"{_number(rate, 0)} (GPU)", "published"])
+    head = ["animal", "method", "frames/s", "ratio to default", "image", "cores", "published"]
+    return [*head, "row"], rows
+
+
+def origin_table(results: Sequence[Results]) -> Table:
+    """Command, seed, version and amount of training of each row."""
+    rows = [
+        [
+            r["animal"],
+            TITLES[variant],
+            _origin(row),
+            str(row["made"]["training_images"] or ""),
+            f"{row['made']['seed']} ({len(row['made']['seeds'])})",
+            f"{row['made']['version']}, {row['made']['date']}",
+            ", ".join(filter(None, (row["made"]["machine"], row["made"].get("processor")))),
+            f"`{row['made']['command']}`",
+        ]
+        for r in results
+        for variant, row in r["rows"].items()
+    ]
+    head = ["animal", "method", "row", "training images", "seed (trainings)", "version, date"]
+    return [*head, "machine", "command"], rows
+
+
+def notes_of(results: Results, quick: bool) -> list[str]:
+    """Which rows are missing, come from another version or other postures, or rank differently.
+
+    A quick run says nothing of the order of the methods.
+    """
+    postures = results["test_postures"]
+    notes = [f"Test postures are {postures}."] if postures else []
+    for variant, why in results["missing"].items():
+        notes.append(f"{TITLES.get(variant, variant)} was not measured: {why}.")
+    for name, row in results["rows"].items():
+        notes += _kept_notes(TITLES[name], row, postures)
+    for name, curve in results["sensitivity"].items():
+        notes += _kept_notes(f"Fig. 7, {name},", curve, "")
+    if quick:
+        return notes
+    for variant in results["rows"]:
+        if splits := _where_ahead(results, variant, "default"):
+            notes.append(f"{TITLES[variant]} is ahead of the default on {splits}.")
+    turned = list(_turned_pairs(results))
+    published = PUBLISHED_MM.get(results["animal"], {})
+    if not turned and published and set(published) <= set(results["rows"]):
+        notes.append("No two methods rank differently from the paper with disjoint intervals.")
+    return notes + turned
+
+
+def _kept_notes(title: str, entry: Mapping[str, Any], postures: str) -> Iterator[str]:
+    """What a reader has to know of a kept row or curve."""
+    if entry.get("origin") != "kept":
+        return
+    made = entry["made"]
+    if made["version"] != package_version("liex_lab"):
+        yield f"{title} was measured by version {made['version']} with `{made['command']}`."
+    if made.get("test_postures", postures) not in ("", postures):
+        yield f"{title} was measured with test postures {made['test_postures']}."
+
+
+def _where_ahead(results: Results, a: str, b: str) -> str:
+    """The splits on which a variant's median is below another's with disjoint intervals."""
+    if not {a, b} <= set(results["rows"]):
+        return ""
+    found = []
+    for split in results["splits"]:
+        first, second = (results["rows"][name]["splits"][split] for name in (a, b))
+        intervals = first.get("interval95"), second.get("interval95")
+        if None not in intervals and intervals[0][1] < intervals[1][0]:
+            medians = f"{first['median_mm']:.2f} against {second['median_mm']:.2f} mm"
+            found.append(f"{split} (median {medians})")
+    return ", ".join(found)
+
+
+def _turned_pairs(results: Results) -> Iterator[str]:
+    """Pairs of rows whose order is not the published one on some split."""
+    published = PUBLISHED_MM.get(results["animal"], {})
+    for pair in combinations(published, 2):
+        ahead, behind = sorted(pair, key=published.__getitem__)
+        if splits := _where_ahead(results, behind, ahead):
+            yield (
+                f"In the paper, {TITLES[ahead]} (mean {published[ahead]:.2f} mm) is ahead of "
+                f"{TITLES[behind]} ({published[behind]:.2f} mm); here, on the same object and with "
+                f"the differences below, {TITLES[behind]} is ahead on {splits}."
+            )
+
+
+def exhibits(
+    results: Sequence[Results], further: Mapping[str, Any], figures: Sequence[Path], quick: bool
+) -> dict[str, dict[str, Any]]:
+    """What the page shows under each label of the paper: tables, notes, figures, or why nothing."""
+    tables: dict[str, list[tuple[str, Table]]] = {label: [] for label in _LABELS}
+    notes: dict[str, list[str]] = {label: [] for label in _LABELS}
+    for r in results:
+        hand = r["animal"] == "hand"
+        label = "Table 2" if hand else "Table 1"
+        tables[label].append((f"{r['animal']}, rendered: median error, mm", error_table(r)))
+        tables[label].append((f"{r['animal']}, rendered: mean error, mm", mean_table(r)))
+        notes[label] += [note if hand else f"{r['animal']}: {note}" for note in notes_of(r, quick)]
+    tables["Table 3"].append(("", rate_table(results)))
+    tables["Table 3"].append(("How each row of Tables 1 to 3 was made", origin_table(results)))
+    if further["nyu"]:
+        tables["Table 2"].append(("NYU hands", _nyu_table(further["nyu"])))
+        notes["Table 2"].append(further["nyu"]["labels_used"])
+    else:
+        notes["Table 2"].append(f"NYU: {further['missing']['nyu']}.")
+    if told := further["tracking"]:
+        caption = f"{told['animal']}, {told['sequence']} sequence, {told['n_frames']} frames"
+        tables["Fig. 18"].append((caption, _tracking_table(told)))
+    if further["actions"]:
+        tables["Fig. 20"].append(("", _actions_table(further["actions"])))
+    found = {}
+    for label in _LABELS:
+        pattern = _FIGURES.get(label)
+        drawn = [_image(path) for path in figures if pattern and path.match(pattern)]
+        empty = not tables[label] and not drawn
+        found[label] = {
+            "id": label.lower().replace(".", "").replace(" ", "-"),
+            "tables": [_in_html(caption, table) for caption, table in tables[label]],
+            "notes": [_with_code(note) for note in notes[label]],
+            "figures": drawn,
+            "missing": _with_code(_why_missing(label, results, further) if empty else ""),
+        }
+    return found
+
+
+def _why_missing(label: str, results: Sequence[Results], further: Mapping[str, Any]) -> str:
+    """Why there is nothing under a label; '' for the paper's drawings."""
+    if (part := _PART.get(label, "nyu" if label == "Fig. 12" else "")) in further["missing"]:
+        return f"Not made: {further['missing'][part]}."
+    if label == "Fig. 7":
+        why = [
+            f"{r['animal']}, {name.removeprefix('Fig. 7, ')}: {reason}"
+            for r in results
+            for name, reason in r["missing"].items()
+            if name.startswith(label)
+        ]
+        return f"Not made. {'; '.join(why)}."
+    animal = _ANIMAL.get(label)
+    if animal and animal not in {r["animal"] for r in results}:
+        return f"Not made: the {animal} was not asked for; `--animal {animal}` makes it."
+    if label not in _FIGURES:
+        return ""
+    return "Not made: no animal that it shows was asked for; without --animal all are."
+
+
+def _nyu_table(nyu: Mapping[str, Any]) -> Table:
+    """Published answers and ours on NYU frames."""
+    same = {
+        f"{name}, the frames of ours": {"method": f"{name}, on the frames of ours alone", **row}
+        for name, row in nyu["same_frames"].items()
+    }
+    rows = [
+        [
+            str(row.get("method", name)),
+            str(row["n_frames"]),
+            _number(row.get("root_given_mm_14")),
+            _number(row.get("root_estimated_mm_14")),
+        ]
+        for name, row in {**nyu["published"], **same, "liex_lab": nyu["ours"]}.items()
+    ]
+    head = ["method", "frames", "14 points, root given, mm", "14 points, root estimated, mm"]
+    return head, rows
+
+
+def _tracking_table(tracking: Mapping[str, Any]) -> Table:
+    """Errors of the rows of tracking."""
+    keys = ("mean_joint_error_mm", "p95_joint_error_mm", "ratio_to_single", "lost_rate")
+    rows = [
+        [tracking["row_names"][name], *(_number(row.get(key)) for key in keys)]
+        for name, row in tracking["rows"].items()
+    ]
+    return ["", "mean, mm", "95 %, mm", "ratio to single frames", "lost"], rows
+
+
+def _actions_table(actions: Mapping[str, Any]) -> Table:
+    """Accuracies of the recognisers on cut-out actions."""
+    rows = []
+    for name, key, kind, published in (
+        ("the paper's, tangent vectors", "tangent_accuracy", "tangent", "91.33 %"),
+        ("the paper's, joint positions", "joint_accuracy", "joints", "79.19 %"),
+        ("ours", "default_accuracy", "default", ""),
+    ):
+        low, high = actions["accuracy_interval95"][kind]
+        interval = f"{100 * low:.1f} to {100 * high:.1f} %"
+        rows.append([name, f"{100 * actions[key]:.1f} %", interval, published])
+    return ["recogniser", "accuracy", "95 % interval of sequences", "published, real fish"], rows
+
+
+def _in_html(caption: str, table: Table) -> tuple[str, Sequence[str], list[Any], list[str]]:
+    """A table as the template shows it; columns of words are of the class `text`."""
+    head, rows = table
     kinds = []
     for column in zip(*rows, strict=True):
         cells = [cell for cell in column if cell]
@@ -63,19 +445,19 @@ def _table(
 
 
 def _with_code(text: str) -> Markup:
-    """A text of ours, what stands between backticks as code."""
+    """A text of ours; what stands between backticks becomes code."""
     parts = [escape(part) for part in text.split("`")]
     for k in range(1, len(parts) - 1, 2):
         parts[k] = Markup("<code>{}</code>").format(parts[k])
     return Markup("").join(parts)
 
 
-def _picture(path: Path) -> dict[str, Any]:
-    """A PNG as it stands in the page."""
+def _image(path: Path) -> dict[str, Any]:
+    """A PNG as the template shows it."""
     content = path.read_bytes()
     (width,) = struct.unpack(">I", content[16:20])  # of the header chunk
     return {
         "name": path.stem.replace("_", " "),
-        "width": round(_DPI_SHOWN * width),
+        "width": round(_SHOWN_SCALE * width),
         "data": "data:image/png;base64," + base64.b64encode(content).decode("ascii"),
     }

@@ -1,5 +1,12 @@
 """Interface of the baselines: frames and a fitted segmenter in, the animal's joints per frame out.
 
+The ablation without the learned metric is here, too: the plain mean of all candidates,
+
+    x_j = 1/K sum_k x_j^(k)        for each joint j over the K candidates.
+
+The one without multiple initial poses needs no code of its own: it is `PoseEstimator(model, 1,
+start_seed=k)`, which has one initial pose, drawn from the seed k.
+
 All baselines of Lie-X section 5.2 work on the product's own segmentation, so that only the pose
 estimation differs.
 """
@@ -14,7 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.body.skeleton import Skeleton
-from liex_lab.scene.height_maps import HeightMaps
+from liex_lab.estimation.estimator import PoseEstimator
+from liex_lab.scene.height_maps import HeightMaps, in_camera_frame
 from liex_lab.scene.segmenter import Segmenter
 
 Array = NDArray[np.float64]
@@ -98,21 +106,29 @@ class Baseline(Protocol):
         """
 
 
-def see(depths: NDArray[np.float32], scene: Segmenter, parallel: bool) -> tuple[HeightMaps, Array]:
-    """Segment the animal of each frame as the paper's features see it.
+class Sizeless:
+    """A baseline that knows nothing of size, as the paper's do: it measures every animal alike."""
 
-    Heights are measured along the optical axis, and no size is known. Of two components of about
-    the animal's area `second_is_likelier` chooses.
+    takes_size = False
 
-    Args:
-        depths: (n, H, W) float32 mm, 0 where unread.
-        scene: the segmenter that was fitted to the recording.
-        parallel: use all cores rather than one.
+    def find_size(self, sample: NDArray[np.float32], scene: Segmenter) -> float:
+        """Always 1."""
+        return 1.0
 
-    Returns:
-        The height maps, and their packed crop cameras (n, 17).
-    """
-    return chosen(depths, scene, 1.0, second_is_likelier(depths, scene, parallel), True, parallel)
+    def estimate(
+        self: Baseline,
+        depths: NDArray[np.float32],
+        scene: Segmenter,
+        size: float,
+        parallel: bool = True,
+    ) -> Guesses:
+        """Estimate the joints in each frame, of the component that area and volume choose.
+
+        Heights are measured along the optical axis.
+        """
+        second = second_is_likelier(depths, scene, parallel)
+        cut = chosen(depths, scene, 1.0, second, True, parallel)
+        return self.guesses(*cut, size, parallel)
 
 
 def second_is_likelier(
@@ -169,3 +185,71 @@ def chosen(
     if len(rows):
         crops.put(rows, others[rows])
     return crops, scene.crop_cameras(crops, camera_view)
+
+
+@dataclass(frozen=True)
+class PlainMean:
+    """The paper's variant that averages all of its candidates, without the learned metric.
+
+    They are averaged "for each of the joints in the 3D Euclidean space".
+
+    Attributes:
+        estimator: the estimator whose candidates are averaged.
+    """
+
+    estimator: PoseEstimator
+
+    @property
+    def skeleton(self) -> Skeleton:
+        """The animal's skeleton."""
+        return self.estimator.skeleton
+
+    @property
+    def takes_size(self) -> bool:
+        """Whether the animal's size is handed to the estimator."""
+        return self.estimator.model.method.session_size
+
+    def find_size(self, sample: NDArray[np.float32], scene: Segmenter) -> float:
+        """Size of the animal as the estimator finds it.
+
+        Args:
+            sample: (n, H, W) float32 frames, mm, 0 where unread.
+            scene: the segmenter that was fitted to the recording.
+        """
+        return self.estimator.find_size(sample, scene)
+
+    def estimate(
+        self, depths: NDArray[np.float32], scene: Segmenter, size: float, parallel: bool = True
+    ) -> Guesses:
+        """Average each joint's position over all candidates.
+
+        Args:
+            depths: (n, H, W) float32 mm, 0 where unread.
+            scene: the segmenter that was fitted to the recording.
+            size: the animal's size over home size.
+            parallel: use all cores rather than one.
+
+        Returns:
+            The joints in the camera frame; bones do not keep their lengths.
+        """
+        second = second_is_likelier(depths, scene, parallel)
+        return self.guesses(*chosen(depths, scene, size, second, True, parallel), size, parallel)
+
+    def guesses(
+        self, crops: HeightMaps, crop_cameras: Array, size: float, parallel: bool = True
+    ) -> Guesses:
+        """Estimate the joints of objects that were cut out already.
+
+        Args:
+            crops: height maps of n frames, along the optical axis.
+            crop_cameras: (n, 17) crop cameras of the height maps.
+            size: the animal's size over home size.
+            parallel: use all cores rather than one.
+
+        Returns:
+            The joints in the camera frame.
+        """
+        _, positions, _, _ = self.estimator.candidates(crops, crop_cameras, size, parallel)
+        joints = in_camera_frame(positions.mean(axis=1), crop_cameras)
+        joints[~crops.found] = np.nan
+        return Guesses(joints, crops.found, crops)

@@ -11,6 +11,13 @@ them do in half the time. The loss is the mean distance of the joints,
 
     L = 1/J sum_j |y_j - y_j*|,        in half sides of the patch.
 
+A patch is the square around the animal's bounding box, a tenth larger, resampled to 224 x 224.
+Depth is scaled by the same factor as the image, so the animal keeps its proportions (the paper says
+only "rescaled to be in the range of 0 to 255"): 127.5 is the animal's mean depth, and half the
+square's side in mm goes to 0 or 255. Nearer is brighter; what is not the animal is 0. Joints are
+stated in the same unit: (right, down, nearer) from the square's centre at the animal's mean depth,
+in half sides of the square.
+
 torch is an optional dependency: `pip install '.[cnn]'` in the folder of liex_lab.
 """
 
@@ -26,21 +33,112 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from liex_lab.baselines.baseline import DAMAGE, Guesses, see
-from liex_lab.baselines.patches import frames_of, joints_of, patches_of, targets_of
+from liex_lab.baselines import _kernels as kernels
+from liex_lab.baselines.baseline import DAMAGE, Guesses, Sizeless
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.errors import MissingPackageError, ModelError
 from liex_lab.estimation.training import ProgressCallback, TrainingSet
+from liex_lab.runtime.shapes import check_shapes
 from liex_lab.runtime.threads import threads
+from liex_lab.scene._height_map_kernels import N_CROP_CAMERA
 from liex_lab.scene.height_maps import HeightMaps, in_camera_frame
-from liex_lab.scene.segmenter import Segmenter
 
 if TYPE_CHECKING:
     import torch
 
 Array = NDArray[np.float64]
 
+N_FRAME = 5  # numbers of a square, see `frames_of`
 _BATCH = 64
+
+
+def frames_of(heights: NDArray[np.int16], crop_cameras: Array) -> Array:
+    """Squares around the animals, from which patches are resampled.
+
+    Args:
+        heights: (n, S, S) int16 height maps, 1/16 mm, each with at least one pixel of the animal.
+        crop_cameras: (n, 17) packed crop cameras of the height maps.
+
+    Returns:
+        (n, 5): picture pixel (u, v) of the square's centre, half the side in picture pixels, the
+        animal's mean depth, mm, and half the side in mm at that depth.
+    """
+    n = len(crop_cameras)
+    _check(heights, crop_cameras)
+    frames = np.empty((n, N_FRAME))
+    kernels.frames_all(heights, crop_cameras, frames)
+    return frames
+
+
+def patches_of(
+    heights: NDArray[np.int16], crop_cameras: Array, frames: Array
+) -> NDArray[np.float32]:
+    """Resample patches from height maps, bilinearly.
+
+    Args:
+        heights: (n, S, S) int16 height maps, 1/16 mm.
+        crop_cameras: (n, 17) packed crop cameras of the height maps.
+        frames: (n, 5) squares from `frames_of`.
+
+    Returns:
+        (n, PATCH, PATCH) float32 brightness, 0 to 255; 0 beside the animal.
+    """
+    n = len(crop_cameras)
+    _check(heights, crop_cameras)
+    check_shapes("patches", ("frames", frames, (n, N_FRAME)))
+    patches = np.empty((n, kernels.PATCH, kernels.PATCH), np.float32)
+    kernels.patches_all(heights, crop_cameras, frames, patches)
+    return patches
+
+
+def _check(heights: NDArray[np.int16], crop_cameras: Array) -> None:
+    check_shapes(
+        "patches",
+        ("heights", heights, ("n", "S", "S")),
+        ("crop_cameras", crop_cameras, ("n", N_CROP_CAMERA)),
+    )
+
+
+def targets_of(joints_camera: Array, crop_cameras: Array, frames: Array) -> NDArray[np.float32]:
+    """Training targets of the CNN from true joints.
+
+    Args:
+        joints_camera: (n, J, 3) joints, mm, camera frame.
+        crop_cameras: (n, 17) packed crop cameras of the height maps.
+        frames: (n, 5) squares from `frames_of`.
+
+    Returns:
+        (n, 3 J) float32 (right, down, nearer) of each joint, in half sides of its square.
+    """
+    x, y, z = np.moveaxis(joints_camera, -1, 0)
+    u0, v0, half_px, depth, half_mm = frames.T[:, :, None]
+    fx, fy, cx, cy = crop_cameras.T[:4, :, None]
+    right = (fx * x / z + cx - u0) / half_px
+    down = (fy * y / z + cy - v0) / half_px
+    coordinates = np.stack([right, down, (depth - z) / half_mm], axis=-1)
+    return coordinates.reshape(len(crop_cameras), -1).astype(np.float32)
+
+
+def joints_of(coordinates: NDArray[np.float32], crop_cameras: Array, frames: Array) -> Array:
+    """Joints from outputs of the CNN; the inverse of `targets_of`.
+
+    Args:
+        coordinates: (n, 3 J) float32 outputs.
+        crop_cameras: (n, 17) packed crop cameras of the height maps.
+        frames: (n, 5) squares from `frames_of`.
+
+    Returns:
+        (n, J, 3) joints, mm, camera frame.
+    """
+    right, down, nearer = np.moveaxis(
+        coordinates.astype(float).reshape(len(crop_cameras), -1, 3), -1, 0
+    )
+    u0, v0, half_px, depth, half_mm = frames.T[:, :, None]
+    fx, fy, cx, cy = crop_cameras.T[:4, :, None]
+    z = depth - nearer * half_mm
+    return np.stack(
+        [(u0 + right * half_px - cx) / fx * z, (v0 + down * half_px - cy) / fy * z, z], axis=-1
+    )
 
 
 @dataclass(frozen=True)
@@ -156,7 +254,7 @@ def torch_threads(parallel: bool) -> Iterator[None]:
 
 
 @dataclass(frozen=True)
-class Cnn:
+class Cnn(Sizeless):
     """The trained network at work.
 
     It estimates joints, not a pose: nothing holds its bones at their lengths.
@@ -168,36 +266,6 @@ class Cnn:
 
     skeleton: Skeleton
     net: torch.nn.Sequential
-
-    @property
-    def takes_size(self) -> bool:
-        """False: the paper's baselines know nothing of size."""
-        return False
-
-    def find_size(self, sample: NDArray[np.float32], scene: Segmenter) -> float:
-        """Always 1: the network knows nothing of size.
-
-        Args:
-            sample: not used.
-            scene: not used.
-        """
-        return 1.0
-
-    def estimate(
-        self, depths: NDArray[np.float32], scene: Segmenter, size: float, parallel: bool = True
-    ) -> Guesses:
-        """Estimate the joints in each frame.
-
-        Args:
-            depths: (n, H, W) float32 mm, 0 where unread.
-            scene: the segmenter that was fitted to the recording.
-            size: not used.
-            parallel: use all cores rather than one.
-
-        Returns:
-            The joints in the camera frame.
-        """
-        return self.guesses(*see(depths, scene, parallel), size, parallel)
 
     def guesses(
         self, crops: HeightMaps, crop_cameras: Array, size: float, parallel: bool = True

@@ -29,8 +29,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from liex_lab.baselines import _forest as kernels
-from liex_lab.baselines.baseline import DAMAGE, Guesses, see
+from liex_lab.baselines import _kernels as kernels
+from liex_lab.baselines.baseline import DAMAGE, Guesses, Sizeless
 from liex_lab.body.kinematics import KinematicTree, forward_kinematics
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.errors import ModelError
@@ -41,7 +41,6 @@ from liex_lab.forests.grow import GrowthPlan, grow_forest
 from liex_lab.geometry import SE3, so3
 from liex_lab.runtime.threads import threads
 from liex_lab.scene.height_maps import HeightMaps, in_camera_frame
-from liex_lab.scene.segmenter import Segmenter
 
 Array = NDArray[np.float64]
 
@@ -77,7 +76,7 @@ class ForestPlan:
 
 
 @dataclass(frozen=True)
-class RegressionForest:
+class RegressionForest(Sizeless):
     """The trained pair of forests.
 
     Attributes:
@@ -93,11 +92,6 @@ class RegressionForest:
     where: Forest
     pose: Forest
 
-    @property
-    def takes_size(self) -> bool:
-        """False: the paper's baselines know nothing of size."""
-        return False
-
     def __post_init__(self) -> None:
         """Refuse forests that read what their samples do not have, for kernels do not check it."""
         n_coordinates = len(levers(self.skeleton))
@@ -106,31 +100,6 @@ class RegressionForest:
                 check_forest(forest, 1, 0, n)
             except ValueError as error:
                 raise ValueError(f"{name} of a regression forest cannot be used: {error}") from None
-
-    def find_size(self, sample: NDArray[np.float32], scene: Segmenter) -> float:
-        """Always 1: the paper's forests know nothing of size.
-
-        Args:
-            sample: not used.
-            scene: not used.
-        """
-        return 1.0
-
-    def estimate(
-        self, depths: NDArray[np.float32], scene: Segmenter, size: float, parallel: bool = True
-    ) -> Guesses:
-        """Estimate the joints in each frame.
-
-        Args:
-            depths: (n, H, W) float32 mm, 0 where unread.
-            scene: the segmenter that was fitted to the recording.
-            size: not used.
-            parallel: use all cores rather than one.
-
-        Returns:
-            The joints in the camera frame.
-        """
-        return self.guesses(*see(depths, scene, parallel), size, parallel)
 
     def guesses(
         self, crops: HeightMaps, crop_cameras: Array, size: float, parallel: bool = True

@@ -1,9 +1,16 @@
-"""`liex evaluate`: every figure of the product, measured again."""
+"""`liex evaluate`: every figure of the product, measured again.
+
+A benchmark is a function that returns its numbers; `benchmark` makes a verb of it, with a progress
+bar, the numbers on the screen, and `--json FILE`. What measures is imported when it runs.
+"""
 
 from __future__ import annotations
 
+import inspect
+from collections.abc import Callable
+from functools import wraps
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -18,23 +25,72 @@ from liex_lab.cli.options import (
     tell_numbers,
     tell_rows,
 )
+from liex_lab.dashboards.paper.published import DEVIATIONS, HAND
 from liex_lab.errors import LiexError
-from liex_lab.pipelines.evaluation.paper.deviations import DEVIATIONS, HAND
-from liex_lab.runtime.progress import progress_bar
+from liex_lab.runtime.progress import Progress, progress_bar
 
 evaluate = group_of_verbs("Measure the method; --json FILE keeps the numbers.")
+Result = dict[str, Any]
+OwnModel = Annotated[
+    str | None, typer.Option("--model", metavar="FILE", help="A model of your own, .npz.")
+]
 
 
-@evaluate.command("pose")
+def show_numbers(result: Result) -> None:
+    """Every number on the screen."""
+    tell_numbers(result, None)
+
+
+def benchmark(
+    name: str, show: Callable[[Result], None] = show_numbers
+) -> Callable[[Callable[..., Result]], Callable[..., Result]]:
+    """Register a function as the verb `liex evaluate NAME`; its parameters are the options.
+
+    Args:
+        name: of the verb.
+        show: what of its numbers the screen shows.
+    """
+
+    def register(measure: Callable[..., Result]) -> Callable[..., Result]:
+        @wraps(measure)
+        def verb(*, json_file: Path | None, **options: Any) -> None:
+            with progress_bar() as progress:
+                result = measure(**options, progress=progress)
+            if json_file is not None:
+                keep_numbers(result, json_file)
+            show(result)
+
+        own = inspect.signature(measure, eval_str=True).parameters
+        kind = inspect.Parameter.KEYWORD_ONLY
+        shown = [p.replace(kind=kind) for p in own.values() if p.name != "progress"]
+        shown.append(inspect.Parameter("json_file", kind, default=None, annotation=JsonFile))
+        verb.__annotations__ = {p.name: p.annotation for p in shown}
+        vars(verb)["__signature__"] = inspect.Signature(shown)
+        evaluate.command(name)(verb)
+        return measure
+
+    return register
+
+
+def show_poses(result: Result) -> None:
+    """The numbers of a split; of other-build, a row for each kind of build."""
+    if "usual" not in result:
+        tell_numbers(result, None)
+        return
+    rows = {}
+    for kind in ("other", "usual"):
+        rows[kind] = {k: v for k, v in result[kind].items() if not isinstance(v, dict | list)}
+    tell_rows(rows)
+
+
+@benchmark("pose", show_poses)
 def evaluate_pose(
     animal: AnimalName = "mouse",
     split: Annotated[
         str, typer.Option("--split", help="clean, hard, other-body, other-camera or other-build.")
     ] = "clean",
     variant: RowName = "default",
-    model: Annotated[
-        str | None, typer.Option("--model", metavar="FILE", help="A model of your own, .npz.")
-    ] = None,
+    model: OwnModel = None,
     n_frames: Annotated[
         int | None, typer.Option("--frames", min=1, help="Only this many frames of the split.")
     ] = None,
@@ -50,43 +106,25 @@ def evaluate_pose(
             "--sealed", help="Measure the sealed part of other-build; never develop on it."
         ),
     ] = False,
-    json_file: JsonFile = None,
-) -> None:
+    *,
+    progress: Progress,
+) -> Result:
     """Measure joint errors on a fixed split of rendered frames; of other-build on whole tracks."""
     if split == "other-build":
-        from liex_lab.pipelines.evaluation.builds import evaluate_builds
+        from liex_lab.pipelines.evaluation.pose import evaluate_builds
 
         if variant != "default" or model or spine_mm:
             raise LiexError("other-build is measured with the bundled model and sizes of its own")
-        with progress_bar() as progress:
-            result = evaluate_builds(animal, n_frames=n_frames, sealed=sealed, progress=progress)
-        if json_file is not None:
-            keep_numbers(result, json_file)
-        tell_rows(
-            {
-                name: {k: v for k, v in result[name].items() if not isinstance(v, dict | list)}
-                for name in ("other", "usual")
-            }
-        )
-        return
+        return evaluate_builds(animal, n_frames=n_frames, sealed=sealed, progress=progress)
     if sealed:
-        raise LiexError("--sealed is of the split other-build; leave it out")
+        raise LiexError("--sealed belongs to the split other-build; leave it out")
     from liex_lab.pipelines.evaluation.pose import evaluate_pose as measure
 
-    with progress_bar() as progress:
-        result = measure(
-            animal,
-            split,
-            variant,
-            model=model,
-            n_frames=n_frames,
-            spine_mm=spine_mm,
-            progress=progress,
-        )
-    tell_numbers(result, json_file)
+    how: Result = {"model": model, "n_frames": n_frames, "spine_mm": spine_mm}
+    return measure(animal, split, variant, **how, progress=progress)
 
 
-@evaluate.command("speed")
+@benchmark("speed")
 def evaluate_speed(
     animal: AnimalName = "mouse",
     recordings: Annotated[
@@ -95,37 +133,34 @@ def evaluate_speed(
             "--recordings", help="Measure how fast recordings of each format are read instead."
         ),
     ] = False,
-    json_file: JsonFile = None,
-) -> None:
+    *,
+    progress: Progress,
+) -> Result:
     """Measure frames per second on one and two cores by stage, and the ratio to the paper's
     variant.
     """
-    with progress_bar() as progress:
-        if recordings:
-            from liex_lab.pipelines.evaluation.decoding import evaluate_recordings
+    if recordings:
+        from liex_lab.pipelines.evaluation.recordings import evaluate_recordings
 
-            result = evaluate_recordings(progress=progress)
-        else:
-            from liex_lab.pipelines.evaluation.speed import evaluate_speed as measure
+        return evaluate_recordings(progress=progress)
+    from liex_lab.pipelines.evaluation.speed import evaluate_speed as measure
 
-            result = measure(animal, progress=progress)
-    tell_numbers(result, json_file)
+    return measure(animal, progress=progress)
 
 
-@evaluate.command("sizes")
+@benchmark("sizes")
 def evaluate_sizes(
     animal: AnimalName = "mouse",
     n_frames: Annotated[
         int | None, typer.Option("--frames", min=1, help="Only this many frames for each size.")
     ] = None,
-    json_file: JsonFile = None,
-) -> None:
+    *,
+    progress: Progress,
+) -> Result:
     """Measure joint errors of animals 45 to 100 mm long, with their size estimated, not given."""
     from liex_lab.pipelines.evaluation.pose import evaluate_sizes as measure
 
-    with progress_bar() as progress:
-        result = measure(animal, n_frames=n_frames, progress=progress)
-    tell_numbers(result, json_file)
+    return measure(animal, n_frames=n_frames, progress=progress)
 
 
 @evaluate.command("tables", epilog="\n\n".join(["What differs from the paper:", *DEVIATIONS, HAND]))
@@ -174,7 +209,7 @@ def evaluate_tables(
         typer.Option(
             "--sealed",
             help="Measure the sealed split instead: recordings that no test, training or "
-            "development uses. Run it once, when an issue ends.",
+            "development uses. Run it once per release.",
         ),
     ] = False,
     without: Annotated[
@@ -208,7 +243,7 @@ def evaluate_tables(
         say(path)
 
 
-@evaluate.command("actions")
+@benchmark("actions")
 def evaluate_actions(
     animal: AnimalName = "fish",
     model: Annotated[
@@ -224,36 +259,27 @@ def evaluate_actions(
     out: Annotated[
         Path | None, typer.Option("--out", metavar="DIR", help="Draw the confusion matrices there.")
     ] = None,
-    json_file: JsonFile = None,
-) -> None:
+    *,
+    progress: Progress,
+) -> Result:
     """Score the paper's action recogniser and ours, on cut-out sequences and on uncut recordings.
 
     The recordings are rendered and measured first, which takes about half an hour for all 30
-    minutes on two cores. What has been measured is kept in the cache folder (LIEX_CACHE), so that a
-    job that was stopped goes on where it was.
+    minutes on two cores. Measured recordings are kept in the cache folder (LIEX_CACHE), so that a
+    stopped job resumes where it was.
     """
-    from liex_lab.api import evaluate_actions as measure
+    from liex_lab import api
 
+    how: Result = {"model": model, "pose_model": pose_model, "minutes": minutes}
     figure = None if out is None else out / f"{animal}_confusion.png"
-    with progress_bar() as progress:
-        result = measure(
-            animal,
-            model=model,
-            pose_model=pose_model,
-            minutes=minutes,
-            figure=figure,
-            progress=progress,
-        )
-    tell_numbers(result, json_file)
+    return api.evaluate_actions(animal, **how, figure=figure, progress=progress)
 
 
-@evaluate.command("tracking")
+@benchmark("tracking")
 def evaluate_tracking(
     animal: AnimalName = "mouse",
     sequence: Annotated[str, typer.Option("--sequence", help="easy or hard.")] = "hard",
-    model: Annotated[
-        str | None, typer.Option("--model", metavar="FILE", help="A model of your own, .npz.")
-    ] = None,
+    model: OwnModel = None,
     n_frames: Annotated[
         int | None, typer.Option("--frames", min=40, help="A sequence of this many frames.")
     ] = None,
@@ -262,33 +288,30 @@ def evaluate_tracking(
         typer.Option(
             "--paper",
             help="Also the paper's own comparison, Algorithm 1 and 3 on the parts of its variant, "
-            "which is trained first where it has not been (minutes).",
+            "which is trained first if it has not been (minutes).",
         ),
     ] = False,
     figure: Annotated[
         Path | None, typer.Option("--figure", metavar="PNG", help="Draw error over time.")
     ] = None,
-    json_file: JsonFile = None,
-) -> None:
+    *,
+    progress: Progress,
+) -> Result:
     """Measure joint errors over a sequence: single frames, Algorithm 3 on our parts, and the
     default tracker online and smoothed.
     """
-    from liex_lab.api import evaluate_tracking as measure
+    from liex_lab import api
 
-    with progress_bar() as progress:
-        result = measure(
-            animal,
-            sequence,
-            model=model,
-            paper=paper,
-            n_frames=n_frames,
-            figure=figure,
-            progress=progress,
-        )
-    tell_numbers(result, json_file)
+    how: Result = {"model": model, "paper": paper, "n_frames": n_frames, "figure": figure}
+    return api.evaluate_tracking(animal, sequence, **how, progress=progress)
 
 
-@evaluate.command("scenes")
+def show_scenes(result: Result) -> None:
+    """A row for each scene."""
+    tell_rows(result["rows"])
+
+
+@benchmark("scenes", show_scenes)
 def evaluate_scenes(
     only: Annotated[
         str | None, typer.Option("--only", metavar="NAME,...", help="Only these scenes.")
@@ -310,29 +333,20 @@ def evaluate_scenes(
         Path | None,
         typer.Option("--pictures", metavar="DIR", help="Draw frames of each scene there."),
     ] = None,
-    json_file: JsonFile = None,
-) -> None:
+    *,
+    progress: Progress,
+) -> Result:
     """Measure rendered scenes of a lab: frames found, joint errors, and frames that are wrong but
     trusted.
     """
-    from liex_lab.api import evaluate_scenes as measure
+    from liex_lab import api
 
     names = [name.strip() for name in only.split(",")] if only else []
-    with progress_bar() as progress:
-        result = measure(
-            names,
-            n_frames=n_frames,
-            n_recordings=n_recordings,
-            sealed=sealed,
-            pictures=pictures,
-            progress=progress,
-        )
-    if json_file is not None:
-        keep_numbers(result, json_file)
-    tell_rows(result["rows"])
+    how: Result = {"n_frames": n_frames, "n_recordings": n_recordings, "sealed": sealed}
+    return api.evaluate_scenes(names, **how, pictures=pictures, progress=progress)
 
 
-@evaluate.command("live")
+@benchmark("live")
 def evaluate_live(
     animal: AnimalName = "fish",
     n_frames: Annotated[
@@ -345,19 +359,17 @@ def evaluate_live(
     n_cameras: Annotated[
         int, typer.Option("--cameras", min=1, max=16, help="Number of cameras at once.")
     ] = 1,
-    json_file: JsonFile = None,
-) -> None:
+    *,
+    progress: Progress,
+) -> Result:
     """Measure the latency of skeletons while a virtual animal is filmed."""
-    from liex_lab.pipelines.evaluation.live import evaluate_live as measure
+    from liex_lab.pipelines.evaluation.speed import evaluate_live as measure
 
-    with progress_bar() as progress:
-        result = measure(
-            animal, n_frames=n_frames, rate_hz=rate_hz, n_cameras=n_cameras, progress=progress
-        )
-    tell_numbers(result, json_file)
+    how: Result = {"n_frames": n_frames, "rate_hz": rate_hz, "n_cameras": n_cameras}
+    return measure(animal, **how, progress=progress)
 
 
-@evaluate.command("statistics")
+@benchmark("statistics")
 def evaluate_statistics(
     n_studies: Annotated[
         int, typer.Option("--studies", min=20, help="Simulated studies of each kind.")
@@ -368,37 +380,42 @@ def evaluate_statistics(
             "--effect", help="Effect in the studies for the power, in sd between animals."
         ),
     ] = 1.0,
-    json_file: JsonFile = None,
-) -> None:
+    *,
+    progress: Progress,
+) -> Result:
     """Measure how often the comparison of groups is wrong on studies without an effect, and how
     often it finds one.
     """
     from liex_lab.pipelines.evaluation.statistics import evaluate_statistics as measure
 
-    with progress_bar() as progress:
-        result = measure(n_studies, effect, progress=progress)
-    tell_numbers(result, json_file)
+    return measure(n_studies, effect, progress=progress)
 
 
-@evaluate.command("report")
+@benchmark("report")
 def evaluate_report(
     session: SessionPath,
     minutes: Annotated[
         float, typer.Option("--minutes", min=1.0, help="Length of the long session, minutes.")
     ] = 60.0,
-    json_file: JsonFile = None,
-) -> None:
+    *,
+    progress: Progress,
+) -> Result:
     """Measure time and memory of the report of a long session: SESSION repeated until it is so
     long.
     """
-    from liex_lab.pipelines.evaluation.report import evaluate_report as measure
+    from liex_lab.pipelines.evaluation.scale import evaluate_report as measure
 
-    with progress_bar() as progress:
-        result = measure(session, minutes, progress=progress)
-    tell_numbers(result, json_file)
+    return measure(session, minutes, progress=progress)
 
 
-@evaluate.command("nyu")
+def show_hands(result: Result) -> None:
+    """One line for each method."""
+    from liex_lab.pipelines.evaluation import nyu
+
+    tell_numbers(nyu.in_short(result), None)
+
+
+@benchmark("nyu", show_hands)
 def evaluate_nyu(
     reference: Annotated[
         Path,
@@ -411,22 +428,25 @@ def evaluate_nyu(
     model: Annotated[
         str | None, typer.Option("--model", help="A hand model of your own, .npz.")
     ] = None,
-    json_file: JsonFile = None,
-) -> None:
+    *,
+    progress: Progress,
+) -> Result:
     """Compare published answers and ours on hands by the NYU protocol: 14 points, the root given
     and estimated.
     """
     from liex_lab.pipelines.evaluation.nyu import evaluate_nyu as measure
-    from liex_lab.pipelines.evaluation.nyu import in_short
 
-    with progress_bar() as progress:
-        result = measure(reference, model=model, progress=progress)
-    tell_numbers(in_short(result), None)
-    if json_file is not None:
-        keep_numbers(result, json_file)
+    return measure(reference, model=model, progress=progress)
 
 
-@evaluate.command("motion")
+def show_motion(result: Result) -> None:
+    """One measure a row."""
+    from liex_lab.pipelines.evaluation import motion
+
+    tell_rows(motion.in_short(result))
+
+
+@benchmark("motion", show_motion)
 def evaluate_motion(
     reference: Annotated[
         Path,
@@ -449,22 +469,17 @@ def evaluate_motion(
             "--rate", min=1.0, help="Frames per second; without it no speeds are compared."
         ),
     ] = None,
-    json_file: JsonFile = None,
-) -> None:
+    *,
+    progress: Progress,
+) -> Result:
     """Compare posture and movement of a real mouse with the virtual one: 5, 50, 95 % quantiles."""
     from liex_lab.pipelines.evaluation.motion import evaluate_motion as measure
-    from liex_lab.pipelines.evaluation.motion import in_short
 
-    with progress_bar() as progress:
-        result = measure(
-            reference, names=names.split(","), up=up, rate_hz=rate_hz, progress=progress
-        )
-    if json_file is not None:
-        keep_numbers(result, json_file)
-    tell_rows(in_short(result))
+    points = names.split(",")
+    return measure(reference, names=points, up=up, rate_hz=rate_hz, progress=progress)
 
 
-@evaluate.command("reference")
+@benchmark("reference")
 def evaluate_reference(
     session: SessionPath,
     reference: Annotated[
@@ -473,15 +488,16 @@ def evaluate_reference(
             "--reference", metavar="CSV", help="The reference's table, one row per frame."
         ),
     ],
-    json_file: JsonFile = None,
-) -> None:
+    *,
+    progress: Progress,
+) -> Result:
     """Compare a session with what another program measured in the same recording."""
     from liex_lab.pipelines.evaluation.pose import evaluate_reference as measure
 
-    tell_numbers(measure(session, reference), json_file)
+    return measure(session, reference)
 
 
-@evaluate.command("scale")
+@benchmark("scale")
 def evaluate_scale(
     n_frames: Annotated[
         int, typer.Option("--frames", min=2000, help="Frames of each virtual recording.")
@@ -492,16 +508,15 @@ def evaluate_scale(
             "--minutes", min=0.1, help="Measure memory for a recording of this length; repeatable."
         ),
     ] = None,
-    json_file: JsonFile = None,
-) -> None:
+    *,
+    progress: Progress,
+) -> Result:
     """Measure the cost of a study: sessions per hour by workers, memory by length, and where
     the time goes.
 
     Takes about eleven minutes on two cores, and needs a machine without other work; with --minutes
     10 alone, half of that.
     """
-    from liex_lab.api import run_scale
+    from liex_lab import api
 
-    with progress_bar() as progress:
-        numbers = run_scale(n_frames, minutes or (10.0, 60.0, 180.0), progress=progress)
-    tell_numbers(numbers, json_file)
+    return api.run_scale(n_frames, minutes or (10.0, 60.0, 180.0), progress=progress)

@@ -138,7 +138,7 @@ def keep_numbers(result: dict[str, Any], json_file: Path) -> None:
 
 def to_json(result: Any) -> str:
     """Plain values as indented JSON."""
-    from liex_lab.evaluation.pose import plain
+    from liex_lab.evaluation.scores import plain
 
     return json.dumps(plain(result), indent=2, allow_nan=False, ensure_ascii=False)
 

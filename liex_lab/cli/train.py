@@ -124,7 +124,7 @@ def _train_actions(
 
 
 def _search_particles(animal: str, n_frames: int | None, json_file: Path | None) -> None:
-    from liex_lab.pipelines.evaluation.paper.algorithm3 import search_noise
+    from liex_lab.pipelines.evaluation.tracking import search_noise
 
     with progress_bar() as progress:
         found = search_noise(animal, n_frames=n_frames, progress=progress)

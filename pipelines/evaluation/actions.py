@@ -21,13 +21,27 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
+from sklearn.metrics import f1_score
+from sklearn.tree import DecisionTreeClassifier
 
+from liex_lab.actions.channels import channel_names, segments_of
+from liex_lab.actions.ethogram import runs_of
+from liex_lab.actions.labels import LabelledTrack
+from liex_lab.actions.recogniser import DESCRIPTORS, SequenceForest, describe
+from liex_lab.actions.scores import confusion, interval95, timeline_scores
+from liex_lab.actions.storage import bundled_action_models, load_action_model
+from liex_lab.actions.timeline import TimelineModel
+from liex_lab.actions.vocabulary import printed_meanings
+from liex_lab.behaviour.kinematics import Joints, kinematics
+from liex_lab.behaviour.measures import measure_bouts, recognise
 from liex_lab.errors import LiexError
 from liex_lab.runtime.progress import Progress, silent
+from liex_lab.tables.rows import Rows, bout_rows
 
 from ..training.action_model import (
     FAST_HZ,
@@ -39,14 +53,7 @@ from ..training.action_model import (
     training_recordings,
 )
 from ..training.agent_tracks import AgentTrack, acted, acted_tracks
-from ..training.pose_model import cache_folder
-from .pose import estimator_of
-
-if TYPE_CHECKING:
-    import pandas as pd
-
-    from liex_lab.actions.labels import LabelledTrack
-    from liex_lab.actions.timeline import TimelineModel
+from ..training.pose_model import cache_folder, estimator_of
 
 Array = NDArray[np.float64]
 
@@ -170,8 +177,6 @@ def sequence_scores(
         Accuracies (0 to 1), the forests' by seed as well, 95 % intervals by Wilson, and confusion
         matrices (rows: true), the forests' of their first seed.
     """
-    from liex_lab.actions.scores import confusion, interval95
-
     true = [str(one.words[0]) for one in test]
     n = len(test)
     words = sorted(set(true))
@@ -203,8 +208,6 @@ def _recogniser(
     animal: str, model: str | Path | None, pose_model: str | Path | None, progress: Progress
 ) -> TimelineModel:
     """The named model, the bundled one, or one that is trained now."""
-    from liex_lab.actions.storage import bundled_action_models, load_action_model
-
     if model is not None or animal in bundled_action_models():
         return load_action_model(model or animal)
     out = cache_folder() / f"{animal}-actions"
@@ -219,8 +222,6 @@ def cut_out(tracks: Sequence[LabelledTrack]) -> list[LabelledTrack]:
     Args:
         tracks: labelled tracks of uncut recordings.
     """
-    from liex_lab.actions.ethogram import runs_of
-
     found = []
     for one in tracks:
         for start, stop, word in zip(*runs_of(one.words), strict=True):
@@ -241,8 +242,6 @@ def paper_names(
     Returns:
         For each descriptor (`tangent`, `joints`), of every seed one word per test sequence.
     """
-    from liex_lab.actions.recogniser import DESCRIPTORS, SequenceForest, describe
-
     words = [str(one.words[0]) for one in train]
     found = {}
     for kind in DESCRIPTORS:
@@ -301,11 +300,6 @@ def contradictions(
         `unchecked` and `checked`, as `liex run` names: of each the number of `bouts`, those that
         are `contradicting`, and these `by_word`.
     """
-    from liex_lab.actions.vocabulary import printed_meanings
-    from liex_lab.behaviour.kinematics import Joints, kinematics
-    from liex_lab.behaviour.measures import measure_bouts, recognise
-    from liex_lab.tables.rows import Rows, bout_rows
-
     meanings = printed_meanings(recogniser.skeleton, recogniser.definitions)
     tables: dict[str, list[pd.DataFrame]] = {"unchecked": [], "checked": []}
     for one in tracks:
@@ -355,8 +349,6 @@ def one_hour(
         `frames`, `seconds` by the clock, `core_seconds` of this process, and `cores` of the
         machine.
     """
-    from liex_lab.behaviour.measures import recognise
-
     usual = float(np.median(np.diff(one.track.times_ns))) * 1e-9
     n = round(hour_s / usual)
     again = one[np.arange(n) % len(one)].track
@@ -379,8 +371,6 @@ def _minutes(tracks: Sequence[LabelledTrack]) -> float:
 
 
 def _scores(recogniser: TimelineModel, tracks: Sequence[LabelledTrack]) -> dict[str, Any]:
-    from liex_lab.actions.scores import timeline_scores
-    from liex_lab.behaviour.measures import recognise
 
     return timeline_scores(
         (
@@ -404,9 +394,6 @@ def speed_only(
         test: labelled tracks to name.
         recogniser: gives the clock, Hz, and the words that count.
     """
-    from sklearn.metrics import f1_score
-    from sklearn.tree import DecisionTreeClassifier
-
     (x, y), (asked, true) = (_speeds(some, recogniser.clock_hz) for some in (train, test))
     tree = DecisionTreeClassifier(
         max_depth=8, class_weight="balanced", min_samples_leaf=50, random_state=0
@@ -418,7 +405,6 @@ def speed_only(
 
 
 def _speeds(tracks: Sequence[LabelledTrack], clock_hz: float) -> tuple[Array, NDArray[np.str_]]:
-    from liex_lab.actions.channels import channel_names, segments_of
 
     speeds = []
     words = []

@@ -1,30 +1,52 @@
 """Evaluation on the NYU Hand Pose data set: published answers and our own by one protocol.
 
 `liex evaluate nyu` takes real depth frames, the test split of 8,252 frames and two people (Lie-X
-section 5.1) or any of them, with the 14 labelled points of the usual subset. Numbers, mm: mean
-distance of the points and mean over frames, with 14 points and with 13 (without the palm), each for
-the root as estimated and with the palm placed on the true palm, as the published answer of Lie-X
-was; median, error by point, share of frames below thresholds of maximum and mean error, lost rate.
-The published answers are also scored on the very frames that ours were measured on: a mean over
-8,252 frames and one over a few say nothing about each other.
+section 5.1) or any of them, with the 14 labelled points of the usual subset (Tompson et al. 2014).
+With x the estimate and y the truth of n frames,
+
+    error = 1/(14 n) sum_ij |x_ij - y_ij|        or, root given, of x_ij - x_i,palm + y_i,palm.
+
+The published answers are also scored on the very frames that ours were measured on, because a mean
+over 8,252 frames and one over a few cannot be compared.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from liex_lab.errors import LiexError
+from liex_lab.errors import LiexError, ModelError, RecordingError
 from liex_lab.plan import Plan
+from liex_lab.recordings.formats.images.nyu import (
+    N_FIRST_PERSON,
+    PALM,
+    POINTS,
+    NyuReference,
+    frame_numbers,
+    points_of_joints,
+)
 from liex_lab.runtime.progress import Progress, silent
+from liex_lab.simulation.hand.pose_prior import SEEN_SHARE
 
-if TYPE_CHECKING:
-    from liex_lab.recordings.formats.images.nyu import NyuReference
+from ..build import build_estimator, build_recording, build_scene
 
+Array = NDArray[np.float64]
+Draw = Callable[[dict[str, list[dict[str, Any]]]], object]
+Numbers = NDArray[np.int64]
+
+NYU_PROTOCOL = (
+    "Error of a frame: mean over the labelled points of the 3D distance to the true point, mm; "
+    "mean over frames. 14: all points; 13: without the palm. Root estimated: the answer as it is. "
+    "Root given: the answer moved so that its palm lies on the true palm, as the published answer "
+    "of Lie-X was; its mean over 14 then holds an error of zero, so compare it with others over "
+    "13, or with theirs moved alike."
+)
+_MAX_BELOW_MM = (10, 20, 30, 40, 50, 60, 80)
+_MEAN_BELOW_MM = (5, 10, 15, 20, 30, 40)
 _CHUNK = 32  # frames in memory at a time
 _SHOWN = 10  # hands in Fig 12 of Lie-X
 _OURS = "liex_lab"
@@ -41,11 +63,46 @@ _PUBLISHED = {
 }
 
 
+def nyu_errors(answer: Array, truth: Array) -> dict[str, Any]:
+    """Errors of an estimate of hands against the truth, see `NYU_PROTOCOL`.
+
+    Args:
+        answer: (n, 14, 3) estimated points, mm; frames with NaN count as lost.
+        truth: (n, 14, 3) true points, mm, in the order of `POINTS`.
+
+    Returns:
+        Number of frames, rate of lost ones, mean errors with the root estimated and given, over 14
+        points and over 13 without the palm, the median error of a point, mean error of each point,
+        and shares of frames whose largest and mean error are below given limits; only the first two
+        if every frame is lost.
+    """
+    posed = np.asarray(np.isfinite(answer).all(axis=(1, 2)))
+    if not posed.any():
+        return {"n_frames": len(truth), "lost_rate": 1.0}
+    answer, truth = answer[posed], truth[posed]
+    moved = answer - answer[:, PALM : PALM + 1] + truth[:, PALM : PALM + 1]
+    estimated, given = (np.linalg.norm(points - truth, axis=-1) for points in (answer, moved))
+    others = np.arange(len(POINTS)) != PALM
+    worst, mean = estimated.max(axis=1), estimated.mean(axis=1)
+    return {
+        "n_frames": len(posed),
+        "lost_rate": float(1.0 - posed.mean()),
+        "root_estimated_mm_14": float(estimated.mean()),
+        "root_estimated_mm_13": float(estimated[:, others].mean()),
+        "root_given_mm_14": float(given.mean()),
+        "root_given_mm_13": float(given[:, others].mean()),
+        "median_mm_14": float(np.median(estimated)),
+        "per_point_mm": dict(zip(POINTS, estimated.mean(axis=0).tolist(), strict=True)),
+        "share_max_error_below_mm": {str(mm): float((worst < mm).mean()) for mm in _MAX_BELOW_MM},
+        "share_mean_error_below_mm": {str(mm): float((mean < mm).mean()) for mm in _MEAN_BELOW_MM},
+    }
+
+
 def evaluate_nyu(
     reference: str | Path,
     *,
     model: str | None = None,
-    draw: Callable[[list[dict[str, Any]]], object] | None = None,
+    draw: Draw | None = None,
     progress: Progress = silent,
 ) -> dict[str, Any]:
     """Errors on NYU hand data of published answers and of our own, by both root protocols.
@@ -53,108 +110,95 @@ def evaluate_nyu(
     Args:
         reference: folder with `nyu_test_14joints.npz` (labels and answers) or `joint_data.mat`
             (labels), and any of the frames `depth_1_NNNNNNN.png`.
-        model: name or path of a hand model; None takes the bundled one.
-        draw: is given `shown_hands`, for a picture.
+        model: name or path of a hand model; None means the bundled one.
+        draw: is given `shown_hands`, for a figure.
         progress: told frame by frame.
 
     Returns:
-        `published` by method, `ours` (with a note where there are no frames or no model),
+        `published` by method, `ours` (with a note if there are no frames or no model),
         `same_frames`: the published answers on the frames of ours alone, `labels_used`: what of our
         model comes from test labels, `n_labelled` and the protocol.
 
     Raises:
         LiexError: frames and labels do not belong together.
     """
-    from liex_lab.evaluation.nyu import NYU_PROTOCOL, nyu_errors
-    from liex_lab.recordings.formats.images.nyu import NyuReference
-
     folder = Path(reference)
     labels = NyuReference.load(folder)
-    rows = {
-        name: {"method": _PUBLISHED.get(name, name), **nyu_errors(points, labels.truth)}
-        for name, points in labels.answers.items()
-    }
-    numbers = _frame_numbers(folder, len(labels.truth))
+    numbers = frame_numbers_in(folder, len(labels.truth))
     ours, points = _ours(folder, labels.truth, numbers, model, progress)
     if draw is not None:
         draw(shown_hands(labels, numbers, points))
+    published, same = {}, {}
+    for name, answer in labels.answers.items():
+        errors = nyu_errors(answer, labels.truth)
+        published[name] = {"method": _PUBLISHED.get(name, name), **errors}
+        if len(numbers):
+            same[name] = nyu_errors(answer[numbers - 1], labels.truth[numbers - 1])
     return {
         "reference": str(folder),
         "n_labelled": len(labels.truth),
-        "published": rows,
+        "published": published,
         "ours": ours,
-        "same_frames": {
-            name: nyu_errors(points[numbers - 1], labels.truth[numbers - 1])
-            for name, points in labels.answers.items()
-            if len(numbers)
-        },
+        "same_frames": same,
         "labels_used": labels_used(numbers),
         "protocol": NYU_PROTOCOL,
     }
 
 
 def shown_hands(
-    labels: NyuReference, numbers: NDArray[np.int64], ours: NDArray[np.float64]
-) -> list[dict[str, Any]]:
-    """Ten labelled hands, evenly spaced from the first on, with what methods answer, for Fig 12.
+    labels: NyuReference, numbers: Numbers, ours: Array
+) -> dict[str, list[dict[str, Any]]]:
+    """Ten labelled hands, evenly spaced from the first on, with the answers of methods, for Fig 12.
 
     Args:
         labels: true points and published answers.
         numbers: (m,) numbers of the frames that ours was measured on, from 1 on.
-        ours: (m, 14, 3) our points in them, mm, camera frame; NaN where nothing was found.
+        ours: (m, 14, 3) our points in them, mm, camera frame; NaN if nothing was found.
 
     Returns:
-        Of each `frame`, its number, `truth` (14, 3) mm, and `answers` (14, 3) mm by method; ours is
-        among them where it found the hand.
+        By method, for each hand its `head`, `truth` (14, 3) mm, and `pose` (14, 3) mm if the method
+        answered; ours comes first if it found any of them.
     """
     n = len(labels.truth)
-    own = {int(k): points for k, points in zip(numbers, ours, strict=True)}
-    found = []
-    for row in np.unique(np.arange(_SHOWN) * n // _SHOWN):
-        answers = {name: points[row] for name, points in labels.answers.items()}
-        points = own.get(row + 1)
-        if points is not None and np.isfinite(points).all():
-            answers = {_OURS: points, **answers}
-        found.append({"frame": int(row) + 1, "truth": labels.truth[row], "answers": answers})
-    return found
+    rows = np.unique(np.arange(_SHOWN) * n // _SHOWN)
+    own = np.full_like(labels.truth, np.nan)
+    own[numbers - 1] = ours
+    found: dict[str, list[dict[str, Any]]] = {}
+    for name, answer in {_OURS: own, **labels.answers}.items():
+        if np.isfinite(answer[rows]).all(axis=(1, 2)).any():
+            found[name] = [{"head": f"frame {k + 1}", "truth": labels.truth[k]} for k in rows]
+            for hand, k in zip(found[name], rows, strict=True):
+                if np.isfinite(answer[k]).all():
+                    hand["pose"] = answer[k]
+    return found or {"labels": [{"head": f"frame {k + 1}", "truth": labels.truth[k]} for k in rows]}
 
 
-def labels_used(numbers: NDArray[np.int64]) -> str:
+def labels_used(numbers: Numbers) -> str:
     """What of our hand model comes from labels of the test frames, in one sentence.
 
     Args:
         numbers: (n,) numbers of the frames that are measured, from 1 on.
     """
-    from liex_lab.recordings.formats.images.nyu import N_FIRST_PERSON
-    from liex_lab.simulation.hand.pose_prior import SEEN_SHARE
-
     n = int((numbers <= N_FIRST_PERSON).sum())
     return _LABELS.format(share=100 * SEEN_SHARE, last=N_FIRST_PERSON, n=n, of=len(numbers))
 
 
-def _frame_numbers(folder: Path, n_labelled: int) -> NDArray[np.int64]:
-    """Numbers, from 1 on, of the frames in the folder; none where there are no frames."""
-    from liex_lab.errors import RecordingError
-    from liex_lab.recordings.formats.images.nyu import frame_numbers
-
+def frame_numbers_in(folder: Path, n_labelled: int) -> Numbers:
+    """Numbers, from 1 on, of the frames in the folder; empty if there are none."""
     try:
         numbers = np.array(frame_numbers(folder), np.int64)
     except RecordingError:
         return np.zeros(0, np.int64)
     if numbers.max() > n_labelled:
         raise LiexError(
-            f"{folder} holds the frame {numbers.max()}, but labels of {n_labelled} frames; give "
+            f"{folder} contains the frame {numbers.max()}, but labels of {n_labelled} frames; give "
             "the frames that belong to the labels"
         )
     return numbers
 
 
 def in_short(result: dict[str, Any]) -> dict[str, str]:
-    """One line for each method, and the protocol.
-
-    Args:
-        result: what `evaluate_nyu` returns.
-    """
+    """One line for each method, and the protocol, of what `evaluate_nyu` returns."""
     lines = {}
     for name, row in [*result["published"].items(), (_OURS, result["ours"])]:
         if "root_estimated_mm_14" not in row:
@@ -175,45 +219,30 @@ def in_short(result: dict[str, Any]) -> dict[str, str]:
 
 
 def _ours(
-    folder: Path,
-    truth: np.ndarray,
-    numbers: NDArray[np.int64],
-    model: str | None,
-    progress: Progress,
-) -> tuple[dict[str, Any], NDArray[np.float64]]:
-    """Our errors on the frames in the folder, a note where there are none, or no model; and our
+    folder: Path, truth: Array, numbers: Numbers, model: str | None, progress: Progress
+) -> tuple[dict[str, Any], Array]:
+    """Our errors on the frames in the folder, or a note if there are none, or no model; and our
     points (m, 14, 3) mm in them, camera frame.
     """
-    from liex_lab.errors import ModelError
-    from liex_lab.evaluation.nyu import nyu_errors
-    from liex_lab.recordings.formats.images.nyu import points_of_joints
-
-    from ..build import build_estimator, build_recording, build_scene
-
-    plan = Plan.load("hand")
-    if model is not None:
-        plan = plan.with_settings([f"estimation.model={model}"])
     points = np.full((len(numbers), *truth.shape[1:]), np.nan)
     if not len(numbers):
         return {"n_frames": 0, "note": f"no frames depth_1_NNNNNNN.png in {folder}"}, points
+    plan = Plan.load("hand").with_settings([f"estimation.model={model}"] if model else [])
     try:
         estimator = build_estimator(plan)
     except ModelError as error:
         return {"n_frames": 0, "note": str(error)}, points
+    skeleton = estimator.skeleton
     with build_recording(folder, plan) as recording:
-        scene, sample = build_scene(
-            recording, plan, estimator.skeleton, plan.foreground.n_background_frames
-        )
+        n_sample = plan.foreground.n_background_frames
+        scene, sample = build_scene(recording, plan, skeleton, n_sample)
         size = estimator.find_size(sample, scene)
-        weights = points_of_joints(estimator.skeleton)
+        weights = points_of_joints(skeleton)
         for frames in recording.chunks(_CHUNK):
             depths = np.stack([frame.depth for frame in frames])
-            joints = estimator.estimate(depths, scene, size).chosen.pose.joints(estimator.skeleton)
+            joints = estimator.estimate(depths, scene, size).chosen.pose.joints(skeleton)
             points[[frame.index for frame in frames]] = weights @ joints
             progress(frames[-1].index + 1, len(recording), "measuring hands")
-    ours = {
-        "method": "liex_lab, default",
-        "spine_mm": size * estimator.skeleton.length,
-        **nyu_errors(points, truth[numbers - 1]),
-    }
+    errors = nyu_errors(points, truth[numbers - 1])
+    ours = {"method": "liex_lab, default", "spine_mm": size * skeleton.length, **errors}
     return ours, points

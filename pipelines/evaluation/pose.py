@@ -1,98 +1,111 @@
-"""Evaluation of single-frame poses: mean joint error on fixed splits of rendered recordings.
+"""Evaluation of poses: joint errors on fixed splits of rendered recordings, and of other builds.
 
 `liex evaluate pose` measures the protocol of Lie-X (section 5.2, Tables 1 and 2) on rendered test
 splits, `clean`, `hard` (twice the noise, other objects in view), `other-body` (unseen family of
 shapes) and `other-camera` (unseen focal lengths and resolutions), 40 recordings of 50 frames each;
 none was trained on. As in a run, background, floor and animal's size are found by the product.
-Numbers, over all measured frames:
-
-- mean, median and 95 % quantile of the frame error e = mean_j |x_j - x_j^true|, mm;
-- flip rate (base-to-tip direction more than 90 degrees off) and share of frames without a pose;
-- Spearman's correlation of predicted and true error, coverage of the predicted 90 % interval.
-
-`liex evaluate sizes` repeats it over animals of several lengths. `liex evaluate reference` compares
-a session of a real recording with another program's centroid and axis.
+`other-build` tracks moving animals of builds that no forest was trained on, as a run does, beside
+as many of builds like the training's; its sealed part has seeds that no test, no training and no
+development touches. `liex evaluate sizes` repeats `clean` over animals of several lengths. `liex
+evaluate reference` compares a session with another program's centroid and axis.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, Final, cast
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 
-from liex_lab.errors import LiexError, PlanError
-from liex_lab.evaluation.pose import POSE_PROTOCOL, PoseErrors, angle_between_axes, count_reversals
+from liex_lab.baselines.baseline import Baseline, Guesses, PlainMean
+from liex_lab.body.skeleton import Skeleton
+from liex_lab.errors import EstimationError, LiexError, PlanError
+from liex_lab.estimation.estimator import Estimates, PoseEstimator
+from liex_lab.estimation.method import METHODS
+from liex_lab.evaluation.scores import (
+    FAR,
+    POSE_PROTOCOL,
+    Followed,
+    PoseErrors,
+    interval95,
+    rank_correlation,
+)
 from liex_lab.plan import Plan
 from liex_lab.runtime.progress import Progress, silent
+from liex_lab.scene.segmenter import Segmenter
+from liex_lab.sessions import Session
+from liex_lab.simulation.recording import TrueRecording
+from liex_lab.simulation.simulator import BodySimulator, world_of
+from liex_lab.simulation.species import unseen
+from liex_lab.tracking.offline import track_whole
+from liex_lab.tracking.track import Track
 
-from ..build import plan_of
-
-if TYPE_CHECKING:
-    from liex_lab.baselines.baseline import Baseline
-    from liex_lab.estimation.estimator import PoseEstimator
-    from liex_lab.scene.segmenter import Segmenter
-    from liex_lab.simulation.recording import TrueRecording
+from ..build import build_scene, plan_of
+from ..training.pose_model import estimator_of
 
 Array = NDArray[np.float64]
+Subject = PoseEstimator | Baseline
 
+OTHER_BUILD: Final = "other-build"
+SEEDS: Final = tuple(range(500, 524))
+SEALED_SEEDS: Final = tuple(range(953_200_417, 953_200_441))
+N_FRAMES: Final = 120  # of a recording of another build
+_N_RECORDINGS: Final = 12
+_NOISES = (0.7, 1.0, 1.5)
+_FLIP_CLASSES = (0.0, 0.01, 0.05, 0.2, 0.5, 0.8, 1.0)  # of p_flip
 _SIZES_MM = {"mouse": (45.0, 65.0, 80.0, 100.0), "fish": (18.0, 25.0, 32.0, 45.0)}
 _SIZES = (0.75, 1.0, 1.25, 1.5)  # of other animals, over their home length
-
-
-def estimator_of(
-    animal: str,
-    variant: str,
-    progress: Progress = silent,
-    model: str | Path | None = None,
-    draw: int = 0,
-) -> PoseEstimator:
-    """The pose estimator of a model file or of a variant of the method.
-
-    Args:
-        animal: a bundled animal's name, or the path of a skeleton's TOML.
-        variant: `default` takes the bundled model where there is one; every other is trained now,
-            or taken from the cache.
-        progress: told how far the training is, where there is one.
-        model: name or path of a model file, which comes before the variant.
-        draw: number of the draw of a model that is trained, see `make_model`.
-
-    Raises:
-        ModelError: there is no such model, or its file is damaged.
-    """
-    from liex_lab.catalog import bundled_models, find_model
-    from liex_lab.estimation.estimator import PoseEstimator
-    from liex_lab.estimation.model import Model
-
-    from ..training.pose_model import cached_model
-
-    if model is not None or (variant == "default" and animal in bundled_models()):
-        return PoseEstimator(Model.load(find_model(model or animal)))
-    return PoseEstimator(Model.load(cached_model(animal, variant, progress, draw)))
+BUILDS_PROTOCOL = (
+    "Rendered recordings of one moving animal each, of a build that no forest was trained on "
+    "(the tracker's calibration knows other animals of the same family of builds, and so does what "
+    "is said to be left by a fish's own shape; that shape is learned of a wider family, which "
+    "reaches about as far), seen by "
+    "makes of camera of the training's and of focal lengths that it had not, in turn, with "
+    "0.7, 1 and 1.5 times their noise; background, floor, animal and size are found by the "
+    "product. Beside them the same of builds like the training's. found: share of frames with"
+    " a pose. Error of a frame: mean over joints of the 3D distance between tracked and true "
+    "joint in the arena; error_percent: of the true length, mean over all poses, "
+    "error_percent95: its 95 % interval, recordings drawn with replacement. interval90: share"
+    " of joint coordinates within 1.645 sd (sd_xy_mm, sd_z_mm) of the truth; interval90_x_y, "
+    "interval90_z: of these alone; interval90_least: of the worst joint. spearman: rank "
+    "correlation of predicted and true error, both of the length. flips: share of poses whose"
+    " base-to-tip direction is more than 90 degrees off; longest_flip: most frames in a row. "
+    "p_flip: by classes of the probability told, how many poses, the mean told, and the share"
+    " that are. wrong_but_trusted: of the poses that are flagged as trusted, those whose "
+    "error is beyond 15 % of the length. length_off: mean of |found / true length - 1|. "
+    "height_off_mm: mean over recordings of |mean height error|, and height_bias_mm of the "
+    "error itself."
+)
+_REFERENCE_PROTOCOL = (
+    "centroid: of the animal's outline (frames.parquet) against the reference's; joint_mean: the "
+    "plain mean of the joints, which lies ahead of the outline's centre; both in pixels times the "
+    "floor's mm a pixel. heading: base to tip in the image, modulo pi. reversals: heading turns of "
+    "more than 90 degrees between consecutive measured frames. surface: median over frames of the "
+    "median |rendered body - depth| in the animal"
+)
 
 
 def subject_of(
     animal: str, variant: str, progress: Progress = silent, model: str | Path | None = None
-) -> PoseEstimator | Baseline:
+) -> Subject:
     """The subject that a variant names: a variant of the method, an ablation or a baseline.
 
     Args:
         animal: a bundled animal's name, or the path of a skeleton's TOML.
         variant: `default`, `paper`; the ablations `paper-one-pose` (one initial pose) and
             `paper-no-metric` (plain mean of all candidates); the baselines `rf` and `cnn`.
-        progress: told how far the training is, where there is one.
+        progress: told how far the training is.
         model: another model file than the animal's own, for variants of the method.
 
     Raises:
         PlanError: there is no such variant.
         MissingPackageError: the CNN is asked for and torch is not installed.
     """
-    from liex_lab.baselines.ablations import PlainMean
-    from liex_lab.estimation.estimator import PoseEstimator
-    from liex_lab.estimation.method import METHODS
-
     from ..training.baselines import BASELINES, trained_baseline
 
     if variant in METHODS:
@@ -107,87 +120,59 @@ def subject_of(
     raise PlanError(f"there is no variant '{variant}'; known are {known}")
 
 
-def measure(
-    subject: PoseEstimator | Baseline, frames: NDArray[np.float32], scene: Segmenter
-) -> tuple[Array, Array, Array]:
-    """Joints, predicted errors and their interval of the frames, measured by one subject.
-
-    The animal's size is found over the frames themselves.
-
-    Args:
-        subject: an estimator or a baseline.
-        frames: (n, H, W) float32 depth, mm, 0 where unread.
-        scene: the learned segmentation.
+def told_by(subject: Subject, found: Estimates | Guesses) -> tuple[Array, Array, Array]:
+    """What a subject estimated of n frames.
 
     Returns:
-        Joints (n, J, 3) mm, camera frame, NaN where no animal was found; predicted error (n,) mm,
-        NaN where the subject predicts none; and the factors (2,) of it that bound its 90 %
-        interval.
+        Joints (n, J, 3) mm, camera frame, NaN if no animal was found; predicted error (n,) mm, NaN
+        if the subject predicts none; and the factors (2,) of it that bound its 90 % interval.
     """
-    from liex_lab.baselines.baseline import Guesses
-
-    found = subject.estimate(frames, scene, subject.find_size(frames, scene))
     if isinstance(found, Guesses):
-        return found.joints, np.full(len(frames), np.nan), np.full(2, np.nan)
-    calibration = cast("PoseEstimator", subject).model.calibration
+        return found.joints, np.full(len(found.joints), np.nan), np.full(2, np.nan)
     return (
         found.chosen.pose.joints(subject.skeleton),
         found.chosen.error_mm,
-        np.array(calibration.quantiles),
+        np.array(cast("PoseEstimator", subject).model.calibration.quantiles),
     )
 
 
+def measure(
+    subject: Subject, frames: NDArray[np.float32], scene: Segmenter
+) -> tuple[Array, Array, Array]:
+    """What a subject estimates of frames (n, H, W) mm, at the size that it finds in them.
+
+    Returns:
+        As `told_by`.
+    """
+    return told_by(subject, subject.estimate(frames, scene, subject.find_size(frames, scene)))
+
+
 def errors_of(
-    subjects: Mapping[str, PoseEstimator | Baseline],
+    subjects: Mapping[str, Subject],
     sessions: Sequence[TrueRecording],
     plan: Plan,
     progress: Progress,
 ) -> dict[str, PoseErrors]:
     """Errors of several subjects over rendered recordings, all on the same background subtraction.
 
-    Each recording is handled as `liex run` would: background learned, size estimated, all frames.
+    Each recording is processed as by `liex run`: background learned, size estimated, all frames.
 
     Args:
         subjects: estimators and baselines by name, of one animal.
         sessions: recordings with their truth.
         plan: thresholds of the foreground, and expected sizes.
         progress: told recording by recording.
-
-    Returns:
-        By the subjects' names, the errors of all frames of all recordings.
     """
-    from ..build import build_scene
-
     parts: dict[str, list[PoseErrors]] = {name: [] for name in subjects}
+    skeleton = next(iter(subjects.values())).skeleton
     for k, recording in enumerate(sessions):
         progress(k, len(sessions), f"measuring {recording.name}")
-        scene, frames = build_scene(
-            recording, plan, next(iter(subjects.values())).skeleton, len(recording)
-        )
+        scene, frames = build_scene(recording, plan, skeleton, len(recording))
         for name, subject in subjects.items():
-            joints, predicted_mm, quantiles = measure(subject, frames, scene)
-            tip = subject.skeleton.tip
-            parts[name].append(
-                PoseErrors.compare(joints, recording.joints_camera, tip, predicted_mm, quantiles)
-            )
+            joints, *predicted = measure(subject, frames, scene)
+            truth = recording.joints_camera
+            parts[name].append(PoseErrors.compare(joints, truth, skeleton.tip, *predicted))
     return {name: PoseErrors.join(some) for name, some in parts.items()}
-
-
-def pose_errors(
-    subject: PoseEstimator | Baseline,
-    sessions: Sequence[TrueRecording],
-    plan: Plan,
-    progress: Progress,
-) -> PoseErrors:
-    """Errors of one subject over rendered recordings; see `errors_of`.
-
-    Args:
-        subject: an estimator or a baseline.
-        sessions: recordings with their truth.
-        plan: thresholds of the foreground, and expected sizes.
-        progress: told recording by recording.
-    """
-    return errors_of({"": subject}, sessions, plan, progress)[""]
 
 
 def evaluate_pose(
@@ -207,7 +192,7 @@ def evaluate_pose(
         split: a test split of the animal, such as `clean`, `hard` or `other-body`.
         variant: what is measured, see `subject_of`.
         model: another model file than the animal's own.
-        n_frames: only so many frames, rounded up to whole recordings; None takes all.
+        n_frames: only so many frames, rounded up to whole recordings; None means all.
         spine_mm: length of all animals, mm, instead of drawn ones.
         progress: told recording by recording.
 
@@ -217,9 +202,6 @@ def evaluate_pose(
     Raises:
         LiexError: there is no such split or variant.
     """
-    from liex_lab.body.skeleton import Skeleton
-    from liex_lab.simulation.simulator import world_of
-
     world = world_of(Skeleton.load(animal))
     if split not in world.splits:
         raise LiexError(
@@ -229,7 +211,7 @@ def evaluate_pose(
     subject = subject_of(animal, variant, progress, model)
     if n_frames is not None:
         sessions = sessions[: max(1, -(-n_frames // len(sessions[0])))]
-    errors = pose_errors(subject, sessions, plan_of(animal), progress)
+    errors = errors_of({variant: subject}, sessions, plan_of(animal), progress)[variant]
     how = f"{len(sessions)} rendered recordings of {len(sessions[0])} frames, {world.protocol}"
     return {
         "animal": animal,
@@ -244,12 +226,8 @@ def evaluate_pose(
 def sizes_of(animal: str) -> tuple[float, ...]:
     """Spine lengths, mm, from small to large, at which an animal is evaluated.
 
-    Args:
-        animal: a bundled animal's name, or the path of a skeleton's TOML; one without lengths of
-            its own gets 0.75, 1, 1.25 and 1.5 times its home length.
+    One without lengths of its own gets 0.75, 1, 1.25 and 1.5 times its home length.
     """
-    from liex_lab.body.skeleton import Skeleton
-
     if animal in _SIZES_MM:
         return _SIZES_MM[animal]
     home = Skeleton.load(animal).length
@@ -257,11 +235,7 @@ def sizes_of(animal: str) -> tuple[float, ...]:
 
 
 def evaluate_sizes(
-    animal: str = "mouse",
-    spines_mm: Sequence[float] | None = None,
-    *,
-    n_frames: int | None = None,
-    progress: Progress = silent,
+    animal: str = "mouse", *, n_frames: int | None = None, progress: Progress = silent
 ) -> dict[str, Any]:
     """Mean joint error in per cent of the spine over animals' sizes; `liex evaluate sizes`.
 
@@ -269,18 +243,15 @@ def evaluate_sizes(
 
     Args:
         animal: a bundled animal's name, or the path of a skeleton's TOML.
-        spines_mm: spine lengths, mm; None takes those of `sizes_of`.
-        n_frames: frames for each size, rounded up to whole recordings; None takes all.
+        n_frames: frames for each size, rounded up to whole recordings; None means all.
         progress: told recording by recording.
 
     Returns:
         `error_percent_of_spine` and `ratio_to_best` by length, `worst_ratio`, and the protocol.
     """
     rows = {}
-    for spine in spines_mm or sizes_of(animal):
-        result = evaluate_pose(
-            animal, "clean", "default", n_frames=n_frames, spine_mm=spine, progress=progress
-        )
+    for spine in sizes_of(animal):
+        result = evaluate_pose(animal, n_frames=n_frames, spine_mm=spine, progress=progress)
         rows[f"{spine:g}"] = 100.0 * result["mean_joint_error_mm"] / spine
     best = min(rows.values())
     return {
@@ -293,6 +264,185 @@ def evaluate_sizes(
     }
 
 
+@dataclass(frozen=True)
+class Built:
+    """A recording of one animal as it was tracked, with its truth.
+
+    Attributes:
+        track: (n) the track, without a pose if no animal was found.
+        truth: (n, J, 3) true joints, mm, in the track's frame.
+        length_mm: true length of the animal.
+        found_mm: the length that was found; NaN if no animal was.
+        tip: the joint that the base's heading points at.
+    """
+
+    track: Track
+    truth: Array
+    length_mm: float
+    found_mm: float
+    tip: int
+
+    @property
+    def followed(self) -> Followed:
+        """Its errors, intervals and exchanged ends; how fast it was tracked is not known."""
+        track = self.track
+        return Followed(track.joints_mm, self.truth, track.sd_xyz_mm, np.nan, self.tip)
+
+
+def evaluate_builds(
+    animal: str = "mouse",
+    *,
+    n_frames: int | None = None,
+    sealed: bool = False,
+    progress: Progress = silent,
+) -> dict[str, Any]:
+    """Errors and intervals of tracks of animals of another build, beside those of usual builds.
+
+    Args:
+        animal: `mouse` or `fish`.
+        n_frames: frames of other builds, rounded up to whole recordings of 120; None means 12.
+        sealed: the sealed part of the split.
+        progress: told recording by recording.
+
+    Returns:
+        `other` and `usual`, see `BUILDS_PROTOCOL`, the ratio of their errors in per cent of the
+        length, seeds and protocol.
+
+    Raises:
+        LiexError: the animal's simulator knows one build only, or there are not as many recordings.
+    """
+    n_recordings = _N_RECORDINGS if n_frames is None else max(1, -(-n_frames // N_FRAMES))
+    seeds = SEALED_SEEDS if sealed else SEEDS
+    if n_recordings > len(seeds):
+        raise LiexError(
+            f"the split {OTHER_BUILD} has {len(seeds) * N_FRAMES} frames, got {n_frames}; ask for "
+            "at most that many"
+        )
+    seeds = seeds[:n_recordings]
+    estimator = estimator_of(animal, "default", progress)
+    rows: dict[str, list[Built]] = {"other": [], "usual": []}
+    for k, seed in enumerate(seeds):
+        for name, family in (("other", "other"), ("usual", "train")):
+            recording = film(animal, seed, k, family)
+            done = len(rows["other"]) + len(rows["usual"])
+            progress(done, 2 * len(seeds), f"measuring {recording.name}")
+            rows[name].append(track(estimator, recording, plan_of(animal)))
+    joints = estimator.skeleton.names
+    figures = {name: build_figures(some, joints) for name, some in rows.items()}
+    own, usual = (figures[name].get("error_percent") for name in ("other", "usual"))
+    return {
+        "animal": animal,
+        "split": OTHER_BUILD,
+        **figures,
+        "ratio_to_usual": own / usual if own and usual else None,
+        "seeds": "sealed" if sealed else list(seeds),
+        "protocol": BUILDS_PROTOCOL,
+    }
+
+
+def film(animal: str, seed: int, k: int, family: str) -> TrueRecording:
+    """Recording k of the split other-build: cameras and noise take turns.
+
+    Args:
+        animal: `mouse` or `fish`.
+        seed: that everything else is drawn from.
+        k: number of the recording.
+        family: of builds, `other` or `train`.
+
+    Raises:
+        LiexError: the animal's simulator knows one build only.
+    """
+    world = world_of(Skeleton.load(animal))
+    if not isinstance(world, BodySimulator) or animal not in ("mouse", "fish"):
+        raise LiexError(f"the split {OTHER_BUILD} is of mouse and fish, not of '{animal}'")
+    sensors = (*world.species.sensors, *unseen(world.species.sensors))
+    return world.motion(
+        [seed],
+        N_FRAMES,
+        family=family,
+        sensor=sensors[k % len(sensors)],
+        noise=_NOISES[k % len(_NOISES)],
+        name=f"{OTHER_BUILD}-{family}-{k:02d}",
+    )
+
+
+def track(estimator: PoseEstimator, recording: TrueRecording, plan: Plan) -> Built:
+    """A recording as the product tracks it, with its truth."""
+    from ..training.motion_model import observed
+
+    skeleton = estimator.skeleton
+    try:
+        each = observed(estimator, plan, OTHER_BUILD, recording)
+    except EstimationError:
+        lost = Track.empty(skeleton, recording.times_ns)
+        return Built(lost, recording.joints_arena, recording.spine_mm, np.nan, skeleton.tip)
+    tracked = track_whole(each.subject, each.seen).track
+    return Built(tracked, each.truth, recording.spine_mm, each.subject.length_mm, skeleton.tip)
+
+
+def build_figures(rows: Sequence[Built], joints: Sequence[str]) -> dict[str, Any]:
+    """Figures over some recordings, see `BUILDS_PROTOCOL`.
+
+    Args:
+        rows: the recordings, at least one.
+        joints: names of the joints.
+
+    Returns:
+        By name; only those that need no pose if there is none.
+    """
+    followed = [row.followed for row in rows]
+    recording = np.repeat(np.arange(len(rows)), [len(row.truth) for row in rows])
+    lengths_mm = np.array([row.length_mm for row in rows])[recording]
+    error = np.concatenate([one.error_mm for one in followed]) / lengths_mm
+    posed = np.isfinite(error)
+    figures: dict[str, Any] = {
+        "n_recordings": len(rows),
+        "n_frames": len(error),
+        "found": float(posed.mean()),
+    }
+    if not posed.any():
+        return figures
+    inside = np.concatenate([one.inside for one in followed])[posed]
+    by_joint = inside.mean(axis=(0, 2))
+    trusted = np.concatenate([row.track.observed & (row.track.flag == "") for row in rows])
+    flipped = np.concatenate([one.flipped for one in followed])[posed]
+    predicted = np.concatenate([row.track.predicted_error_mm for row in rows]) / lengths_mm
+    p_flip = np.concatenate([row.track.p_flip for row in rows])[posed]
+    off_mm = [(one.joints - one.truth)[..., 2] for one in followed]
+    heights = np.array([np.nanmean(off) for off in off_mm if np.isfinite(off).any()])
+    bounds = interval95(100.0 * error, recording, np.mean)
+    return figures | {
+        "mean_joint_error_mm": float((error * lengths_mm)[posed].mean()),
+        "error_percent": float(100.0 * error[posed].mean()),
+        "error_percent95": None if bounds is None else list(bounds),
+        "interval90": float(inside.mean()),
+        "interval90_x_y": float(inside[..., :2].mean()),
+        "interval90_z": float(inside[..., 2].mean()),
+        "interval90_least": float(by_joint.min()),
+        "interval90_by_joint": dict(zip(joints, by_joint.tolist(), strict=True)),
+        "spearman": rank_correlation(predicted[posed], error[posed]),
+        "flips": float(flipped.mean()),
+        "longest_flip": max(one.longest_flip for one in followed),
+        "p_flip": _reliability(p_flip, flipped),
+        "wrong_but_trusted": float((error > FAR)[trusted].mean()) if trusted.any() else 0.0,
+        "trusted": float(trusted.mean()),
+        "length_off": float(np.nanmean([abs(row.found_mm / row.length_mm - 1.0) for row in rows])),
+        "height_bias_mm": float(heights.mean()),
+        "height_off_mm": float(np.abs(heights).mean()),
+    }
+
+
+def _reliability(told: Array, flipped: NDArray[np.bool_]) -> list[dict[str, Any]]:
+    """By classes of the predicted probability (m,), how many poses and how many are flipped."""
+    rows = []
+    for low, high in pairwise(_FLIP_CLASSES):
+        some = (told >= low) & ((told < high) | (high == _FLIP_CLASSES[-1]))
+        if some.any():
+            shares = {"told": float(told[some].mean()), "flipped": float(flipped[some].mean())}
+            rows.append({"from": low, "to": high, "n": int(some.sum()), **shares})
+    return rows
+
+
 def evaluate_reference(session: str | Path, reference: str | Path) -> dict[str, Any]:
     """A session against another program's centroid and long axis in the same recording.
 
@@ -302,7 +452,7 @@ def evaluate_reference(session: str | Path, reference: str | Path) -> dict[str, 
         session: the session folder.
         reference: a CSV with one row a frame and the columns `frame`, `centroid_x_px`,
             `centroid_y_px`, `angle_rad` (direction (cos a, -sin a) in (right, down), known modulo
-            pi) and, where present, `reliable` (rows other than 1 are left out).
+            pi) and, optionally, `reliable` (rows other than 1 are left out).
 
     Returns:
         Median distances of centroid and joints, px and mm, median heading difference in degrees,
@@ -312,10 +462,6 @@ def evaluate_reference(session: str | Path, reference: str | Path) -> dict[str, 
     Raises:
         LiexError: the table cannot be read, lacks a column, or has no reliable row for any frame.
     """
-    import pandas as pd
-
-    from liex_lab.sessions import Session
-
     opened = Session.open(session)
     try:
         table = pd.read_csv(reference)
@@ -329,41 +475,38 @@ def evaluate_reference(session: str | Path, reference: str | Path) -> dict[str, 
             f"{reference} should have the columns {', '.join(sorted(needed))}; it lacks some of "
             "them"
         )
-    poses = opened.poses
-    frames = opened.frames
+    poses, frames, camera = opened.poses, opened.frames, opened.metadata["camera"]
     names = opened.metadata["animal"]["joints"]
     u, v = (
         poses.pivot(index="frame_index", columns="joint", values=name)[names].to_numpy()
         for name in ("u_px", "v_px")
     )
-    rows = table["frame"].to_numpy(int)
-    used = (rows >= 0) & (rows < len(u))
+    used = table["frame"].astype(int).between(0, len(u) - 1)
     if "reliable" in table:
-        used &= table["reliable"].to_numpy() == 1
+        used &= table["reliable"] == 1
     table = table[used]
-    rows = rows[used]
+    rows = table["frame"].to_numpy(int)
     if not len(rows):
         raise LiexError(
             f"{reference} has no reliable row for any frame of {session}; its column frame counts "
             "from 0"
         )
-    camera = opened.metadata["camera"]
     mm_per_px = camera["floor_distance_mm"] / np.sqrt(camera["fx"] * camera["fy"])
     known = table[["centroid_x_px", "centroid_y_px"]].to_numpy()
     outline = frames[["centroid_u_px", "centroid_v_px"]].to_numpy()[rows]
-    off = float(np.nanmedian(np.linalg.norm(outline - known, axis=1)))
     middle = np.stack([u[rows].mean(axis=1), v[rows].mean(axis=1)], axis=1)
-    joints_off = float(np.nanmedian(np.linalg.norm(middle - known, axis=1)))
+    off, joints_off = (
+        float(np.nanmedian(np.linalg.norm(points - known, axis=1))) for points in (outline, middle)
+    )
     heading = np.arctan2(-(v[:, -1] - v[:, 0]), u[:, -1] - u[:, 0])
     turn = np.degrees(angle_between_axes(heading[rows], table["angle_rad"].to_numpy()))
+    lost = ~np.isfinite(u[:, 0])
     return {
         "session": str(session),
         "n_frames": len(frames),
-        "n_compared": int(len(rows)),
-        "n_lost": int((~np.isfinite(u[:, 0])).sum()),
-        "n_lost_without_flag": int(
-            (~np.isfinite(u[:, 0]) & (frames["flag"].to_numpy() == "")).sum()
-        ),
+        "n_compared": len(rows),
+        "n_lost": int(lost.sum()),
+        "n_lost_without_flag": int((lost & (frames["flag"].to_numpy() == "")).sum()),
         "spine_mm": opened.metadata["animal"].get("spine_mm"),
         "centroid_median_px": off,
         "centroid_median_mm": off * mm_per_px,
@@ -371,12 +514,17 @@ def evaluate_reference(session: str | Path, reference: str | Path) -> dict[str, 
         "heading_median_deg": float(np.nanmedian(turn)),
         "n_reversals": count_reversals(heading),
         "surface_median_mm": float(np.nanmedian(frames["residual_mm"])),
-        "protocol": (
-            "centroid: of the animal's outline (frames.parquet) against the reference's; "
-            "joint_mean: the plain mean of the joints, which lies ahead of the outline's centre; "
-            "both in pixels times the floor's mm a pixel. heading: base to tip in the image, "
-            "modulo pi. reversals: heading turns of more than 90 degrees between consecutive "
-            "measured frames. surface: median over frames of the median |rendered body - depth| "
-            "in the animal"
-        ),
+        "protocol": _REFERENCE_PROTOCOL,
     }
+
+
+def angle_between_axes(a: Array, b: Array) -> Array:
+    """Angles (n,) between undirected axes at angles a and b (n,), rad in [0, pi / 2]."""
+    difference = np.mod(a - b, np.pi)
+    return np.minimum(difference, np.pi - difference)
+
+
+def count_reversals(heading: Array) -> int:
+    """How often a heading (n,) rad turns by more than a right angle; NaN frames are skipped."""
+    known = heading[np.isfinite(heading)]
+    return int((np.cos(np.diff(known)) < 0).sum())

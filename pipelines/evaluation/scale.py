@@ -1,12 +1,11 @@
 """Benchmark of throughput and scaling: sessions per hour, memory by length, time by stage.
 
 `liex evaluate scale` writes virtual mice as 640 x 480 MCAP files and measures `liex run` on them:
-frames/s and ms a frame by stage, held against the bound of opening, decoding and writing alone; one
-recording's shards by one process and by two; a study by one Dask worker and by two (processes held
-on as many cores); peak memory, MB, by length; and whole runs by kind of recording (`kinds`).
-Sessions per hour with up to 1,000 workers are simulated: measured times are drawn with replacement
-(a bootstrap), and sessions handed out one by one by a scheduler that spends its measured time on
-each (`ASSUMPTIONS`, `DEFINITIONS`).
+frames/s and ms a frame by stage, against the bound of opening, decoding and writing alone; one
+recording's shards by one process and by two; a study by one Dask worker and by two (processes kept
+on as many cores); peak memory, MB, by length; and whole runs by kind of recording (`recordings`).
+Sessions per hour with up to 1,000 workers are simulated (`ASSUMPTIONS`, `DEFINITIONS`).
+`liex evaluate report` repeats a measured session until it is long and writes its report.
 """
 
 from __future__ import annotations
@@ -15,45 +14,67 @@ import heapq
 import json
 import os
 import shutil
-import subprocess
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
+from liex_lab.behaviour.summary import measure_rows, stated_by
+from liex_lab.body.skeleton import Skeleton
 from liex_lab.plan import Plan
 from liex_lab.plan.study import Study
-from liex_lab.runtime.processes import own_python
+from liex_lab.recordings import open_recording
+from liex_lab.recordings.frame import DepthFrame
+from liex_lab.runtime.memory import peak_memory_mb, rest
 from liex_lab.runtime.progress import Progress, silent
+from liex_lab.sessions import Provenance, Session, SessionWriter
+from liex_lab.sessions.cutouts import Kept, composed, still_scene
+from liex_lab.sessions.evidence import provenance_of, track_of
+from liex_lab.sessions.mcap import McapWriter
+from liex_lab.sessions.rrd import ReplayWriter
+from liex_lab.sessions.track_tables import Results
+from liex_lab.sessions.writer import ReportMaker
+from liex_lab.tables.rows import Rows, stop_times
+from liex_lab.tracking.observations import COLUMNS, Observations
+from liex_lab.tracking.offline import track_whole
+from liex_lab.tracking.track import Subject
 
 from ..build import build_recording, build_tracker, kept_estimator
 from ..origin import build_provenance
+from ..session import conclude
 from ..shards import CHUNK, Shard, measure_shards
+from ..study.cluster import measure_cohort
+from ..study.status import standings
 from ..workers import Done, Processes, Work, WorkerPool
-from . import kinds
-from .long_sessions import looped
+from . import recordings
+from .recordings import as_mcap, evaluate_kinds
+from .speed import FPS, STEP_NS, isolated, looped, to_and_fro
 
 RunSession = Callable[..., Path]
-_VIRTUAL = "synthetic:walk?seed={seed}&frames=150&sensor=primesense"
+
+_VIRTUAL = "synthetic:walk?seed={seed}&frames={n}&sensor={sensor}"
 _WORKERS = (1, 2, 4, 8, 16, 32, 64, 128, 256, 512, 1000)
-_CREWS = {
+_CREWS = {  # name -> processes, and the cores of all of them
     "1": (1, 1),
     "2": (2, 2),
     "1, free": (1, 2),
-}  # name -> processes, and the cores of all of them
+}
 _N_SIMULATED = 2000  # sessions
-_FPS = 30
+_COARSER = 8  # of a long session's depth images, which go straight to disk, every so many-th pixel
+_BLOCK = 256  # frames
+_COPIED = ("plan.toml", "session.rrd", "session.mcap")
 ASSUMPTIONS = (
     "simulated: every worker has the cores, the memory and the reading and writing speed that one "
     "has here; sessions take the measured times, drawn with replacement and stretched to an hour "
     "of recording; they are handed out one by one, and the scheduler spends its measured time on "
     "each, one after the other; starting workers is not counted"
 )
-
 DEFINITIONS = {
     "frames_per_s": "from opening the recording to the finished session, figures and report too",
     "frames_per_s_once_begun": "the same without the preparation",
@@ -64,18 +85,18 @@ DEFINITIONS = {
     ),
     "times_decode_and_write_without_opening": "the same over decoding and writing alone",
     "times_decode_and_write_once_begun": (
-        "from the first frame that is looked at to the finished session, over decoding and "
-        "writing alone"
+        "from the first frame that is measured to the finished session, over decoding and writing "
+        "alone"
     ),
     "looking": (
-        "frames that processes with one thread for kernels read, look at and write, once each "
-        "has done its first stretch; two on two cores, one on one; free: one that may use both, "
-        "as its logs are packed beside it"
+        "frames that processes with one thread for kernels read, measure and write, once each has "
+        "done its first stretch; two on two cores, one on one; free: one that may use both, as its "
+        "logs are packed beside it"
     ),
     "two_workers_over_one": (
         "sessions an hour of a study, the workers' start included; two workers on two cores over "
-        "one on one; free: over one that may use both, which reads ahead and packs its logs "
-        "beside its work"
+        "one on one; free: over one that may use both, which reads ahead and packs its logs beside "
+        "its work"
     ),
 }
 
@@ -87,8 +108,6 @@ def evaluate_scale(
     progress: Progress = silent,
 ) -> dict[str, Any]:
     """Stages of a session, two workers against one, memory by length, and simulated many workers.
-
-    Workers of one recording share its shards, those of a study its sessions.
 
     Args:
         run: measures a recording, `liex_lab.api.run_session`.
@@ -103,55 +122,50 @@ def evaluate_scale(
     with tempfile.TemporaryDirectory(prefix="liex-scale-") as scratch:
         folder = Path(scratch)
         (folder / "kinds").mkdir()
+        (folder / "rawdata").mkdir()
         progress(0, 6, "running kinds of recordings")
-        by_kind = kinds.evaluate_kinds(n_frames, folder / "kinds")
+        kinds = evaluate_kinds(n_frames, folder / "kinds")
         progress(1, 6, "making recordings")
-        recordings = [_recording(folder, k, n_frames) for k in range(2)]
+        walks = [_walk(folder / "rawdata", k, n_frames) for k in range(2)]
         progress(2, 6, "measuring the stages of a session")
-        stages = _stages(run, recordings[0], folder)
-        progress(3, 6, "looking at one recording by one process and by two")
-        looking = _side_by_side(recordings[0], folder)
+        stages = _stages(run, walks[0], folder)
+        progress(3, 6, "measuring one recording by one process and by two")
+        shards = _side_by_side(walks[0], folder)
         progress(4, 6, "measuring a study by one worker and by two")
-        workers = _workers(run, recordings, folder)
+        study, seconds_each, scheduler_s = _workers(run, walks, folder)
         progress(5, 6, "measuring memory by length")
-        memory = {f"{length:g} min": _memory(length, folder) for length in minutes}
-    hour = [seconds * 3600 * _FPS / n_frames for seconds in workers["seconds_each"]]
-    simulated = simulate(hour, workers["scheduler_s_per_session"])
+        memory = {
+            f"{length:g} min": isolated(
+                "liex_lab.api:write_long", length, folder / f"long-{length:g}"
+            )["peak_memory_mb"]
+            for length in minutes
+        }
+    an_hour = [seconds * 3600 * FPS / n_frames for seconds in seconds_each]
     return {
         **stages,
-        **looking,
-        **workers["study"],
-        "kinds": by_kind,
+        **shards,
+        **study,
+        "kinds": kinds,
         "memory_mb_by_length": memory,
-        "simulated_sessions_per_hour": simulated,
+        "simulated_sessions_per_hour": simulate(an_hour, scheduler_s),
         "assumptions": ASSUMPTIONS,
-        "definitions": {**DEFINITIONS, "kinds": kinds.DEFINITIONS},
+        "definitions": {**DEFINITIONS, "kinds": recordings.DEFINITIONS},
         "n_frames": n_frames,
     }
 
 
-def _recording(folder: Path, seed: int, n_frames: int) -> Path:
+def _walk(folder: Path, seed: int, n_frames: int) -> Path:
     """A virtual mouse, written as an MCAP file: reading it costs what reading a recording costs."""
-    from liex_lab.recordings import open_recording
-
-    from ..convert import convert
-
-    path = folder / "rawdata" / f"walk{seed}.mcap"
-    path.parent.mkdir(exist_ok=True)
-    with open_recording(_VIRTUAL.format(seed=5 + seed)) as short:
-        convert(looped(short, n_frames), path)
-    return path
+    address = _VIRTUAL.format(seed=5 + seed, n=150, sensor="primesense")
+    with open_recording(address) as short:
+        return as_mcap(looped(short, n_frames, f"walk{seed}"), folder)
 
 
 def _stages(run: RunSession, recording: Path, folder: Path) -> dict[str, Any]:
-    """One session after a first one has compiled everything: where its time goes, and the bound it
-    is held against.
-    """
-    from liex_lab.sessions import Session
-
+    """Where the time of a session goes, after a first one has compiled everything."""
     plan = Plan.load("mouse")
     run(recording, plan, folder / "warm")
-    kept_estimator.cache_clear()  # whoever runs one session alone has to load its model
+    kept_estimator.cache_clear()  # a single run has to load its model
     began = time.perf_counter()
     session = Session.open(run(recording, plan, folder / "measured"))
     whole = time.perf_counter() - began
@@ -159,16 +173,13 @@ def _stages(run: RunSession, recording: Path, folder: Path) -> dict[str, Any]:
     spent = session.metadata["timings_s"]
     begun = whole - spent["prepare"]
     bound = _decode_and_write(session, recording, plan, folder / "bound.liex")
+    by_frame = {"decode": bound["decode"], **spent}
     return {
         "frames_per_s": n / whole,
         "frames_per_s_once_begun": n / begun,
         "frames_per_s_to_the_logs": n / (spent["prepare"] + spent["total"]),
         "prepare_s": spent["prepare"],
-        "ms_per_frame": {
-            name: 1e3 * value / n
-            for name, value in {**bound, **spent}.items()
-            if name not in ("opening", "bound", "prepare")
-        },
+        "ms_per_frame": {k: 1e3 * value / n for k, value in by_frame.items() if k != "prepare"},
         "times_decode_and_write": whole / (bound["opening"] + bound["bound"]),
         "times_decode_and_write_without_opening": whole / bound["bound"],
         "times_decode_and_write_once_begun": begun / bound["bound"],
@@ -176,25 +187,68 @@ def _stages(run: RunSession, recording: Path, folder: Path) -> dict[str, Any]:
     }
 
 
+def _decode_and_write(
+    session: Session, recording: Path, plan: Plan, folder: Path
+) -> dict[str, float]:
+    """The least that any program needs which reads a recording and writes both logs.
+
+    Returns:
+        Seconds of `opening` the recording; of opening it and reading all frames (`decode`); and,
+        once it is open, of reading them and writing the session's own cut-outs (`bound`).
+    """
+    began = time.perf_counter()
+    with build_recording(recording, plan) as opened:
+        opening = time.perf_counter() - began
+        for _ in opened.chunks(CHUNK):
+            pass
+        decode = time.perf_counter() - began
+        folder.mkdir()
+        origin = Provenance(
+            "bound",
+            Skeleton.load("mouse"),
+            opened.camera,
+            session.T_arena_camera,
+            1000.0,
+            "0",
+            n_frames=len(opened),
+            replay_depth=plan.replay.depth,
+            background=still_scene(opened),
+        )
+        boxes, background = Kept(session).boxes, origin.background
+        assert boxes is not None
+        assert background is not None
+        replay = ReplayWriter(folder / "session.rrd", origin)
+        messages = McapWriter(folder / "session.mcap", origin)
+        began = time.perf_counter()
+        for frames in opened.chunks(CHUNK):
+            times = [frame.time_ns for frame in frames]
+            rows = [frame.index for frame in frames]
+            cuts = boxes[rows[0] : rows[-1] + 1]
+            depth = [
+                composed(frame.depth, cut, background)
+                for frame, cut in zip(frames, cuts, strict=True)
+            ]
+            replay.add(rows, times, depth, cuts)
+            messages.add(times, depth)
+        replay.flushed()
+        replay.abandon()
+        messages.abandon()
+    return {"opening": opening, "decode": decode, "bound": time.perf_counter() - began}
+
+
 class _Timed:
-    """A worker pool that takes down when each shard came, and how many frames it has."""
+    """A worker pool that notes when each shard came, and how many frames it has."""
 
     def __init__(self, pool: WorkerPool) -> None:
-        self._crew = pool
+        self._pool = pool
         self.fewest, self.here = pool.fewest, pool.here
         self.came: list[tuple[float, int]] = []
 
     def each(self, do: Callable[[Work], Done], works: Sequence[Work]) -> Iterator[Done]:
-        """Results of the pool, the time of each taken down; see `WorkerPool`.
-
-        Args:
-            do: the task.
-            works: its arguments, one a task.
-        """
-        for done in self._crew.each(do, works):
-            self.came.append(
-                (time.perf_counter(), done.stop - done.start if isinstance(done, Shard) else 0)
-            )
+        """Results of the pool; see `WorkerPool`."""
+        for done in self._pool.each(do, works):
+            n = done.stop - done.start if isinstance(done, Shard) else 0
+            self.came.append((time.perf_counter(), n))
             yield done
 
 
@@ -204,18 +258,11 @@ def _side_by_side(recording: Path, folder: Path) -> dict[str, Any]:
     Each process has done its first shard before the clock runs, as it takes some seconds to begin.
     """
     plan = Plan.load("mouse")
-    found = {}
     with build_recording(recording, plan) as opened:
         tracker = build_tracker(opened, plan)
-        whole = Shard(
-            str(recording),
-            plan,
-            tracker,
-            build_provenance(opened, plan, tracker),
-            folder,
-            0,
-            len(opened),
-        )
+        origin = build_provenance(opened, plan, tracker)
+        whole = Shard(str(recording), plan, tracker, origin, folder, 0, len(opened))
+    found = {}
     for name, (count, n_cores) in _CREWS.items():
         pool = _Timed(Processes(count, threads=1))
         with _on_cores(n_cores):
@@ -231,85 +278,32 @@ def _side_by_side(recording: Path, folder: Path) -> dict[str, Any]:
 
 @contextmanager
 def _on_cores(n: int) -> Iterator[None]:
-    """Processes that are started in the block are kept on so many cores, where the system can do
-    that.
-    """
-    if not hasattr(os, "sched_setaffinity"):
-        yield
-        return
-    before = os.sched_getaffinity(0)
-    os.sched_setaffinity(0, sorted(before)[:n])
+    """Keep processes that are started in the block on so many cores, if the system can do that."""
+    before = os.sched_getaffinity(0) if hasattr(os, "sched_setaffinity") else set()
+    if before:
+        os.sched_setaffinity(0, sorted(before)[:n])
     try:
         yield
     finally:
-        os.sched_setaffinity(0, before)
+        if before:
+            os.sched_setaffinity(0, before)
 
 
-def _decode_and_write(session: Any, recording: Path, plan: Plan, place: Path) -> dict[str, float]:
-    """Seconds that opening the recording takes, opening it and reading all frames, and, once it is
-    open, reading them and writing both logs with the session's own cut-outs: nothing that does this
-    can be quicker.
+def _workers(
+    run: RunSession, walks: list[Path], folder: Path
+) -> tuple[dict[str, Any], list[float], float]:
+    """The same sessions on one worker and on two, by the clock.
+
+    Returns:
+        The study's numbers; seconds of each session on one worker; and what the scheduler spends on
+        each, s.
     """
-    from liex_lab.sessions.cutouts import Kept, composed, still_scene
-    from liex_lab.sessions.mcap import McapWriter
-    from liex_lab.sessions.provenance import Provenance
-    from liex_lab.sessions.rrd import ReplayWriter
-
-    began = time.perf_counter()
-    with build_recording(recording, plan) as opened:
-        opening = time.perf_counter() - began
-        for _ in opened.chunks(CHUNK):
-            pass
-        decode = time.perf_counter() - began
-        from liex_lab.body.skeleton import Skeleton
-
-        place.mkdir()
-        origin = Provenance(
-            "bound",
-            Skeleton.load("mouse"),
-            opened.camera,
-            session.T_arena_camera,
-            1000.0,
-            "0",
-            n_frames=len(opened),
-            replay_depth=plan.replay.depth,
-            background=still_scene(opened),
-        )
-        boxes = Kept(session).boxes
-        assert boxes is not None
-        assert origin.background is not None
-        replay = ReplayWriter(place / "session.rrd", origin)
-        messages = McapWriter(place / "session.mcap", origin)
-        began = time.perf_counter()
-        for frames in opened.chunks(CHUNK):
-            times = [frame.time_ns for frame in frames]
-            rows = [frame.index for frame in frames]
-            cuts = boxes[rows[0] : rows[-1] + 1]
-            depth = [
-                composed(frame.depth, cut, origin.background)
-                for frame, cut in zip(frames, cuts, strict=True)
-            ]
-            replay.add(rows, times, depth, cuts)
-            messages.add(times, depth)
-        replay.flushed()
-        replay.abandon()
-        messages.abandon()
-    return {"opening": opening, "decode": decode, "bound": time.perf_counter() - began}
-
-
-def _workers(run: RunSession, recordings: list[Path], folder: Path) -> dict[str, Any]:
-    """The same sessions on one worker and on two, by the wall clock."""
-    from ..study.cluster import measure_cohort
-    from ..study.status import standings
-
-    table = {
-        "animals": [{"id": path.stem} for path in recordings],
-        "sessions": [
-            {"animal": path.stem, "session": f"0{k}", "recording": f"rawdata/{path.name}"}
-            for path in recordings
-            for k in range(2)
-        ],
-    }
+    sessions = [
+        {"animal": path.stem, "session": f"0{k}", "recording": f"rawdata/{path.name}"}
+        for path in walks
+        for k in range(2)
+    ]
+    table = {"animals": [{"id": path.stem} for path in walks], "sessions": sessions}
     wall: dict[str, float] = {}
     each: dict[str, list[float]] = {}
     for k, (name, (count, n_cores)) in enumerate(_CREWS.items()):
@@ -320,17 +314,13 @@ def _workers(run: RunSession, recordings: list[Path], folder: Path) -> dict[str,
         wall[name] = time.perf_counter() - began
         each[name] = [result["seconds"] for result in results]
         shutil.rmtree(folder / "derivatives" / f"w{k}")
-    n = len(table["sessions"])
-    study_told = {
+    n = len(sessions)
+    numbers = {
         "sessions_per_hour": {name: 3600 * n / seconds for name, seconds in wall.items()},
         "two_workers_over_one": wall["1"] / wall["2"],
         "two_workers_over_one_free": wall["1, free"] / wall["2"],
     }
-    return {
-        "study": study_told,
-        "seconds_each": each["1"],
-        "scheduler_s_per_session": max(wall["1"] - sum(each["1"]), 0.0) / n,
-    }
+    return numbers, each["1"], max(wall["1"] - sum(each["1"]), 0.0) / n
 
 
 def simulate(
@@ -341,13 +331,10 @@ def simulate(
     A session begins when a worker is free and the scheduler has handed out all before it.
 
     Args:
-        session_s: measured times of sessions, s, drawn with replacement.
+        session_s: measured times of sessions, s, drawn with replacement (a bootstrap).
         scheduler_s: what handing out one session costs, s, one after the other.
         workers: numbers of workers.
         seed: of the draw.
-
-    Returns:
-        Sessions per hour by number of workers, as text.
     """
     lengths = np.random.default_rng(seed).choice(session_s, _N_SIMULATED)
     found = {}
@@ -355,29 +342,167 @@ def simulate(
         free = [0.0] * count
         scheduler = 0.0
         for length in lengths:
-            begins = max(heapq.heappop(free), scheduler)
-            scheduler = begins + scheduler_s
+            scheduler = max(heapq.heappop(free), scheduler) + scheduler_s
             heapq.heappush(free, scheduler + float(length))
         found[str(count)] = 3600 * _N_SIMULATED / max(free)
     return found
 
 
-_WRITE_LONG = """
-import json, sys
-import numpy as np
-from liex_lab.api import write_long
-print(json.dumps(write_long(float(sys.argv[1]), sys.argv[2])))
-"""
+@dataclass(frozen=True)
+class _Short:
+    """A short recording: coarser depth images, observations in them, and their subject."""
+
+    depth: list[np.ndarray[Any, Any]]
+    observations: Observations
+    subject: Subject
+    origin: Provenance
 
 
-def _memory(minutes: float, folder: Path) -> float:
-    """Peak memory, MB, of a process that tracks and writes so many minutes of 30 frames a
-    second.
+def write_long(
+    minutes: float,
+    out: str | Path,
+    report: ReportMaker | None = None,
+    told: Callable[[str], None] = lambda what: None,
+) -> dict[str, Any]:
+    """Write a session of so many minutes and return its cost.
+
+    Frames of a short recording go to and fro. Every frame is written, tracked and measured as in
+    `liex run`; only its observations are those of the short recording's frame, because measuring it
+    again would give the same. Depth images are every 8th pixel.
+
+    Args:
+        minutes: length of the session.
+        out: folder in which `long.liex` is written.
+        report: makes the report, see `SessionWriter`.
+        told: is told where the job is: `began`, `written`, `tracked`, `closed`.
+
+    Returns:
+        `peak_memory_mb` of the process and `seconds`.
     """
-    done = subprocess.run(
-        own_python("-c", _WRITE_LONG, str(minutes), str(folder / f"long-{minutes:g}")),
-        capture_output=True,
-        text=True,
-        check=True,
+    plan = Plan.load("mouse")
+    n = int(minutes * 60 * FPS)
+    short = _measure_short(plan)
+    origin = replace(short.origin, n_frames=n)
+    rest()
+    told("began")
+    began = time.perf_counter()
+    with SessionWriter(Path(out) / "long.liex", origin, report=report) as writer:
+        for frames, part in _parts(short, n):
+            writer.add(frames, seen=part)
+        told("written")
+        whole = writer.seen(Observations)
+        track = track_whole(short.subject, whole, allocate=writer.allocate)
+        writer.take(track, whole, short.subject)
+        del whole, track
+        told("tracked")
+        conclude(writer, plan, {"prepare": 0.0, "track": 0.0})
+    told("closed")
+    return {"peak_memory_mb": peak_memory_mb(), "seconds": time.perf_counter() - began}
+
+
+def _measure_short(plan: Plan) -> _Short:
+    """Render and measure the short recording; its full depth images are not kept."""
+    with open_recording(_VIRTUAL.format(seed=5, n=300, sensor="primesense-qvga")) as opened:
+        short = looped(opened, len(opened))
+    tracker = build_tracker(short, plan)
+    observed = Observations.join([tracker.observe(frames) for frames in short.chunks(32)])
+    camera = short.camera.every(_COARSER)
+    depth = [np.ascontiguousarray(frame.depth[::_COARSER, ::_COARSER]) for frame in short]
+    origin = replace(build_provenance(short, plan, tracker), camera=camera, gaps=())
+    return _Short(depth, observed, replace(tracker.subject, camera=camera), origin)
+
+
+def _parts(short: _Short, n: int) -> Iterator[tuple[list[DepthFrame], Observations]]:
+    """The frames of a long recording, coarser, and the observations in them."""
+    all_rows = to_and_fro(len(short.depth), n)
+    for start in range(0, n, _BLOCK):
+        rows = all_rows[start : start + _BLOCK]
+        times = (start + np.arange(len(rows), dtype=np.int64)) * STEP_NS
+        columns = {name: getattr(short.observations, name)[rows] for name in COLUMNS}
+        frames = [
+            DepthFrame(start + k, int(times[k]), short.depth[row]) for k, row in enumerate(rows)
+        ]
+        observed = Observations(short.observations.skeleton, **columns | {"times_ns": times})
+        yield frames, observed
+
+
+def evaluate_report(
+    session: str | Path, minutes: float = 60.0, *, progress: Progress = silent
+) -> dict[str, Any]:
+    """Time and peak memory of the report of a session repeated to a given length.
+
+    Args:
+        session: the session folder that is repeated.
+        minutes: least length of the long session.
+        progress: told the stage.
+
+    Returns:
+        `frames`, `minutes`, `seconds` by the clock with the start of Python, `peak_memory_mb` and
+        `report_mb`.
+
+    Raises:
+        LiexError: the report could not be written.
+    """
+    with tempfile.TemporaryDirectory(prefix="liex-long-") as scratch:
+        folder = Path(scratch) / "long.liex"
+        progress(0, None, f"making a session of {minutes:g} minutes")
+        n_frames, seconds = repeat_session(Session.open(session, raw=True), folder, 60.0 * minutes)
+        progress(0, None, "writing its report")
+        found = isolated("liex_lab.dashboards.report.report:write_report", folder)
+        size = (folder / "report.html").stat().st_size
+    return {
+        "frames": n_frames,
+        "minutes": round(seconds / 60.0, 2),
+        "seconds": round(found["seconds_with_start"], 2),
+        "peak_memory_mb": round(found["peak_memory_mb"], 1),
+        "report_mb": round(size / 1e6, 2),
+    }
+
+
+def repeat_session(session: Session, folder: Path, seconds: float) -> tuple[int, float]:
+    """Write a session that repeats another one end to end; its depth is that of one round only.
+
+    Args:
+        session: the session as it was measured, without corrections.
+        folder: the new session's folder, which must not exist.
+        seconds: least length of the new session, s.
+
+    Returns:
+        Its number of frames, and its length in s.
+    """
+    time_s = session.frames["time_s"].to_numpy(float)
+    round_ns = round(1e9 * float(stop_times(time_s)[-1]))
+    n_rounds = max(1, int(np.ceil(seconds * 1e9 / round_ns)))
+    once = track_of(session)
+    times_ns, *columns = (
+        np.concatenate([getattr(once, column.name)] * n_rounds)
+        for column in fields(once)
+        if column.name != "skeleton"
     )
-    return float(json.loads(done.stdout.splitlines()[-1])["peak_memory_mb"])
+    times_ns += np.repeat(np.arange(n_rounds, dtype=np.int64) * round_ns, once.n_frames)
+    track = type(once)(once.skeleton, times_ns, *columns)
+    bouts = []
+    for k in range(n_rounds):
+        bouts.append(session.bouts.copy())
+        bouts[k][["start_s", "stop_s"]] += k * round_ns * 1e-9
+        bouts[k][["start_frame", "stop_frame"]] += k * len(time_s)
+    origin = provenance_of(session, track.skeleton)
+    whose = (origin.name, origin.individual, (), origin.arena, origin.zones)
+    rows = Rows(track, np.arange(track.n_frames), *whose)
+    results = Results(origin, rows)
+    behaviour = measure_rows(
+        rows,
+        *stated_by(session),
+        bouts=pd.concat(bouts, ignore_index=True),
+        actions=session.metadata.get("actions") or {},
+    )
+    folder.mkdir()
+    results.write_track(folder)
+    results.write_measured(folder, behaviour.tables, behaviour.vocabulary.columns)
+    for name in _COPIED:
+        shutil.copyfile(session.path / name, folder / name)
+    if (session.path / "thumbnails").is_dir():
+        shutil.copytree(session.path / "thumbnails", folder / "thumbnails")
+    about = {**session.metadata, "frames": results.counts(), "files": {}}
+    (folder / "session.json").write_text(json.dumps(about, default=str), encoding="utf-8")
+    return track.n_frames, n_rounds * round_ns * 1e-9

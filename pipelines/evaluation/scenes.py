@@ -13,25 +13,25 @@ import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.errors import LiexError, MisfitError
-from liex_lab.evaluation.scenes import SCENES_PROTOCOL, Individual, Tally
+from liex_lab.evaluation.scores import SCENES_PROTOCOL, Individual, Tally
+from liex_lab.plan import Plan
 from liex_lab.runtime.progress import Progress, silent
+from liex_lab.sessions import Session
+from liex_lab.sessions.verdict import verdict_in
+from liex_lab.simulation.recording import TrueRecording
+from liex_lab.simulation.scenes.catalogue import SCENES, film
+from liex_lab.simulation.scenes.recording import TrueAnimal
 
 from ..arenas import measure_arenas
 from ..build import plan_of
 from ..regions import propose_arenas
 from ..session import measure_session
-
-if TYPE_CHECKING:
-    from liex_lab.plan import Plan
-    from liex_lab.sessions import Session
-    from liex_lab.simulation.recording import TrueRecording
-    from liex_lab.simulation.scenes.recording import TrueAnimal
 
 Array = NDArray[np.float64]
 
@@ -82,8 +82,6 @@ def cases() -> dict[str, Case]:
     Returns:
         Every scene under the plan of its animal, then animals under the plan of another.
     """
-    from liex_lab.simulation.scenes.catalogue import SCENES
-
     found = {name: Case(name, plan, beside) for name, (plan, beside) in SCENES.items()}
     return found | {
         "mouse-as-hand": Case("plain", "hand", ""),
@@ -148,8 +146,6 @@ def _measure_row(
     name: str, case: Case, seeds: Sequence[int], n_frames: int, draw: Draw | None
 ) -> dict[str, Any]:
     """The figures of one row over some recordings."""
-    from liex_lab.simulation.scenes.catalogue import film
-
     plan = plan_of(case.plan)
     tally = Tally()
     said: list[str] = []
@@ -181,9 +177,6 @@ def run_product(recording: TrueRecording, plan: Plan) -> Outcome:
     Returns:
         What the tables say in the camera frame, what the run said, and its exit code.
     """
-    from liex_lab.sessions import Session
-    from liex_lab.sessions.verdict import verdict_in
-
     quick = plan.with_settings(["replay.depth=none"])
     with tempfile.TemporaryDirectory(prefix="liex-scenes-") as folder:
         try:

@@ -1,86 +1,202 @@
-"""Benchmark of pose estimation: frames per second, time by stage, and what makes a frame dearer.
+"""How fast poses are estimated and told live, and the clocks of all benchmarks.
 
 `liex evaluate speed` times rendered frames of the split `clean`, in memory, from foreground to
-final pose (Lie-X Table 3), the best of 5 repeats after one that compiles. Numbers: frames/s of the
-default on one and on two cores; the ratio to the paper's variant on our engine, to Algorithm 1 as
-it is written (every candidate walks down every tree by itself), and to baselines trained on this
-machine; ms a frame on one core of foreground, candidates and choice, and against the number of
-joints, of candidates and of pixels.
+final pose (Lie-X Table 3), the best of 5 repeats after one that compiles: frames/s of the default
+on one and on two cores, the ratio to the paper's variant on our engine, to Algorithm 1 as it is
+written, and to the baselines that were trained on this machine; and ms a frame on one core by
+stage, and against the number of joints, of candidates and of pixels.
+
+`liex evaluate live` renders up to 150 frames of a moving virtual animal, keeps them in memory and
+sends them through a local socket at the camera's pace, to and fro: median and 95 % latency, ms, of
+every frame from the first on that came when all before it had been answered, so that learning the
+background is not in it.
 """
 
 from __future__ import annotations
 
+import json
+import multiprocessing
+import os
 import platform
+import subprocess
 import time
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any, cast
+from threading import Barrier
+from typing import Any, cast
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from liex_lab.errors import MissingPackageError
+from liex_lab.baselines.baseline import Baseline
+from liex_lab.body.skeleton import Skeleton
+from liex_lab.errors import LiexError, MissingPackageError
+from liex_lab.estimation.cascade import Candidates, ImageSet
+from liex_lab.estimation.estimator import PoseEstimator
+from liex_lab.estimation.initial import draw_starts, start_poses
+from liex_lab.recordings.recording import Recording
+from liex_lab.runtime.processes import own_python
 from liex_lab.runtime.progress import Progress, silent
+from liex_lab.scene.segmenter import Segmenter
+from liex_lab.simulation.recording import TrueRecording
+from liex_lab.simulation.simulator import world_of
 
-if TYPE_CHECKING:
-    from liex_lab.baselines.baseline import Baseline
-    from liex_lab.estimation.estimator import PoseEstimator
-    from liex_lab.scene.segmenter import Segmenter
+from ..build import build_scene, plan_of
+from ..training.pose_model import estimator_of
 
-Array = NDArray[Any]
 N_FRAMES = 128
 N_REPEATS = 5
 _CANDIDATES = (5, 10, 20, 40)
 _SHRINK = (2, 1)  # every second pixel, every pixel
+_PROTOCOL = (
+    "{n} rendered {pixels} frames in memory, foreground to final pose, best of {repeats}; ratios "
+    "on {cores} cores in the same run, `paper` on our engine, `paper_one_by_one` compiled but as "
+    "published: every candidate walks down every tree by itself, and leaves are averaged; stages "
+    "and costs in ms a frame on one core: `joints` is the whole with that many joints' regressors, "
+    "`candidates` unpruned, `pixels` the foreground alone"
+)
 
 
-@dataclass(frozen=True)
-class _Footage:
-    """Frames in memory of a rendered recording, its segmentation and the animal's size.
+LIVE_PROTOCOL = (
+    "Frames are rendered beforehand, kept in memory, and sent through a socket of this machine at "
+    "the camera's pace, forwards and backwards in turn. latency: from when a whole frame had come "
+    "to when its skeleton was told, without a viewer; counted from the first frame on that came "
+    "when all before it had been told, so that learning the background is not in it, and from "
+    "then on every frame. Some frames are followed beforehand, so that all is compiled."
+)
+_SEED = 78_001
+FPS = 30
+STEP_NS = int(1e9 / FPS)
+_KEPT = 150  # frames rendered
+# frames followed beforehand, and how many times as fast
+_WARM = 60
+_WARM_SPEED = 1000.0
+_OF_EACH = ("latency_median_ms", "latency_p95_ms", "n_frames", "n_live", "n_measured")
+_ONE_THREAD = (
+    *("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "OPENBLAS_NUM_THREADS"),
+    "OPENCV_FOR_THREADS_NUM",
+)
+_CHILD = """
+import json, sys, time
+from importlib import import_module
+module, name = sys.argv[1].split(":")
+job = getattr(import_module(module), name)
+began = time.perf_counter()
+found = job(*map(json.loads, sys.argv[2:]))
+seconds = time.perf_counter() - began
+from liex_lab.runtime.memory import peak_memory_mb
+told = {"seconds": seconds, "peak_memory_mb": peak_memory_mb() or 0.0}
+print(json.dumps(told | (found if isinstance(found, dict) else {})))
+"""
 
-    Attributes:
-        name: of the recording.
-        frames: (n, H, W) float32 depth, mm.
-        scene: the learned segmentation.
-        size: the animal's size over home size.
-    """
 
-    name: str
-    frames: NDArray[np.float32]
-    scene: Segmenter
-    size: float
-
-    @property
-    def pixels(self) -> str:
-        """Size of the pictures in words, such as `640 x 480`."""
-        return f"{self.scene.camera.width} x {self.scene.camera.height}"
-
-
-def best_seconds(job: Callable[[], Any], n_repeats: int | None = None) -> float:
-    """Shortest time of several runs after one that compiles: the least disturbed by other programs.
-
-    Args:
-        job: what is timed.
-        n_repeats: number of runs; None takes `N_REPEATS`.
-
-    Returns:
-        Seconds.
-    """
+def best_seconds(job: Callable[[], Any], n_repeats: int = 5) -> float:
+    """Shortest time, s, of several runs after one that compiles: the least disturbed by others."""
     job()
     times = []
-    for _ in range(n_repeats or N_REPEATS):
+    for _ in range(n_repeats):
         began = time.perf_counter()
         job()
         times.append(time.perf_counter() - began)
     return min(times)
 
 
+def isolated(job: str, *arguments: object, one_thread: bool = False) -> dict[str, Any]:
+    """Run a function in a Python process of its own.
+
+    Args:
+        job: "module:function"; what it returns is kept if it is a dict of plain values.
+        *arguments: of the function, numbers and texts; others are passed as texts.
+        one_thread: the process has one thread for kernels and image decoders.
+
+    Returns:
+        What the function returned, with its `seconds` and the process's `peak_memory_mb`, unless it
+        returned these itself, and `seconds_with_start`, by the clock with the start of Python.
+
+    Raises:
+        LiexError: the process failed.
+    """
+    said = [json.dumps(one if isinstance(one, int | float) else str(one)) for one in arguments]
+    environment = os.environ | dict.fromkeys(_ONE_THREAD if one_thread else (), "1")
+    began = time.perf_counter()
+    command = own_python("-c", _CHILD, job, *said)
+    ran = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    seconds = time.perf_counter() - began
+    if ran.returncode:
+        raise LiexError(
+            f"{job} failed in a process of its own ({ran.stderr.strip()[-300:]}); report this"
+        )
+    return {**json.loads(ran.stdout.splitlines()[-1]), "seconds_with_start": seconds}
+
+
+@contextmanager
+def two_cores() -> Iterator[int]:
+    """Within the block kernels run on at most two cores; gives their number."""
+    cores = min(2, numba.config.NUMBA_NUM_THREADS)
+    before = numba.get_num_threads()
+    numba.set_num_threads(cores)
+    try:
+        yield cores
+    finally:
+        numba.set_num_threads(before)
+
+
+@dataclass(frozen=True)
+class Footage:
+    """Frames in memory of a rendered recording, its segmentation and the animal's size.
+
+    Attributes:
+        frames: (n, H, W) float32 depth, mm.
+        scene: the learned segmentation.
+        sample: the frames that it was learned from.
+        size: the animal's size over home size.
+    """
+
+    frames: NDArray[np.float32]
+    scene: Segmenter
+    sample: NDArray[np.float32]
+    size: float
+
+    @staticmethod
+    def of(
+        animal: str,
+        recordings: Sequence[TrueRecording],
+        subject: PoseEstimator | Baseline,
+        n_frames: int,
+    ) -> Footage:
+        """The first frames, over and over, of the recording with the widest depth images."""
+        recording = max(recordings, key=lambda one: one.width)
+        scene, sample = build_scene(recording, plan_of(animal), subject.skeleton, 96)
+        frames = recording.depths(0, min(len(recording), n_frames))
+        frames = frames[np.arange(n_frames) % len(frames)]
+        return Footage(frames, scene, sample, subject.find_size(sample, scene))
+
+    @property
+    def pixels(self) -> str:
+        """Size of the depth images, such as `640 x 480`."""
+        return f"{self.scene.camera.width} x {self.scene.camera.height}"
+
+    def every(self, step: int) -> Footage:
+        """The same frames with every so many-th pixel of rows and columns."""
+        frames = np.ascontiguousarray(self.frames[:, ::step, ::step])
+        return replace(self, frames=frames, scene=self.scene.every(step))
+
+    def frames_per_s(
+        self, subject: PoseEstimator | Baseline, parallel: bool, n_repeats: int
+    ) -> float:
+        """Frames per second of a subject, on one core or on those that numba may use."""
+        job = partial(subject.estimate, self.frames, self.scene, self.size, parallel)
+        return len(self.frames) / best_seconds(job, n_repeats)
+
+
 def evaluate_speed(animal: str = "mouse", *, progress: Progress = silent) -> dict[str, Any]:
     """Frames per second from frames in memory to poses, foreground included; `liex evaluate speed`.
 
-    The paper's variant is trained where it has not been; baselines are timed where they have been.
+    The paper's variant is trained if it has not been; baselines are timed if they have been.
 
     Args:
         animal: a bundled animal's name, or the path of a skeleton's TOML.
@@ -90,32 +206,24 @@ def evaluate_speed(animal: str = "mouse", *, progress: Progress = silent) -> dic
         `frames_per_s_1core`, `frames_per_s_2cores`, `ratio_to_paper`, `ratio_to` by rival,
         `stages_ms` and `cost_ms` a frame, machine and protocol.
     """
-    import numba
-
-    from .pose import estimator_of
-
     progress(0, 5, "rendering frames")
     default = estimator_of(animal, "default")
-    footage = _footage(animal, default)
+    recordings = world_of(Skeleton.load(animal)).test_split("clean", n_sessions=2)
+    footage = Footage.of(animal, recordings, default, N_FRAMES)
     rivals = _rivals(animal, progress)
-    cores = min(2, numba.config.NUMBA_NUM_THREADS)
-    before = numba.get_num_threads()
-    numba.set_num_threads(cores)
-    try:
+    with two_cores() as cores:
         progress(1, 5, "timing the default")
-        one, two = (_frames_per_s(default, footage, parallel) for parallel in (False, True))
+        one, two = (footage.frames_per_s(default, several, N_REPEATS) for several in (False, True))
         progress(2, 5, "timing the others")
-        ratios = {name: two / _frames_per_s(rival, footage, True) for name, rival in rivals.items()}
-        paper = cast("PoseEstimator", rivals["paper"])
-        ratios["paper_one_by_one"] = (
-            two * best_seconds(partial(_one_by_one, paper, footage)) / N_FRAMES
-        )
+        ratios = {
+            name: two / footage.frames_per_s(rival, True, N_REPEATS)
+            for name, rival in rivals.items()
+        }
+        one_by_one = partial(_one_by_one, cast("PoseEstimator", rivals["paper"]), footage)
+        ratios["paper_one_by_one"] = two * best_seconds(one_by_one, N_REPEATS) / N_FRAMES
         progress(3, 5, "timing the stages")
-        stages = _stages(default, footage)
-        progress(4, 5, "timing what makes a frame dearer")
-        costs = _costs(default, footage)
-    finally:
-        numba.set_num_threads(before)
+        stages, costs = _stages_and_costs(default, footage)
+    machine = platform.processor() or platform.machine()
     return {
         "animal": animal,
         "frames_per_s_1core": one,
@@ -124,47 +232,16 @@ def evaluate_speed(animal: str = "mouse", *, progress: Progress = silent) -> dic
         "ratio_to": ratios,
         "stages_ms": stages,
         "cost_ms": costs,
-        "machine": (
-            f"{platform.processor() or platform.machine()}, {cores} of "
-            f"{numba.config.NUMBA_NUM_THREADS} cores"
-        ),
-        "protocol": (
-            f"{N_FRAMES} rendered {footage.pixels} frames in memory, foreground to final pose, "
-            f"best of {N_REPEATS}; ratios on {cores} cores in the same run, `paper` on our "
-            "engine, `paper_one_by_one` compiled but as published: every candidate walks down "
-            "every tree by itself, and leaves are averaged; stages and costs in ms a frame on "
-            "one core: `joints` is the whole with that many joints' regressors, `candidates` "
-            "unpruned, `pixels` the foreground alone"
+        "machine": f"{machine}, {cores} of {numba.config.NUMBA_NUM_THREADS} cores",
+        "protocol": _PROTOCOL.format(
+            n=N_FRAMES, pixels=footage.pixels, repeats=N_REPEATS, cores=cores
         ),
     }
 
 
-def _footage(animal: str, estimator: PoseEstimator) -> _Footage:
-    """Frames of a rendered recording, as many as are timed, and the scene learned from it."""
-    from liex_lab.body.skeleton import Skeleton
-    from liex_lab.simulation.simulator import world_of
-
-    from ..build import build_scene, plan_of
-
-    sessions = world_of(Skeleton.load(animal)).test_split("clean", n_sessions=2)
-    recording = max(
-        sessions, key=lambda session: session.width
-    )  # of the sensors, the one with the most pixels
-    plan = plan_of(animal)
-    scene, sample = build_scene(recording, plan, estimator.skeleton, 96)
-    frames = recording.depths(
-        0, min(len(recording), N_FRAMES)
-    )  # whole ones, which those of the sample need not be
-    frames = frames[np.arange(N_FRAMES) % len(frames)]
-    return _Footage(recording.name, frames, scene, estimator.find_size(sample, scene))
-
-
 def _rivals(animal: str, progress: Progress) -> dict[str, PoseEstimator | Baseline]:
     """The paper's variant, and the baselines that have been trained on this machine."""
-    from liex_lab.body.skeleton import Skeleton
-
     from ..training.baselines import BASELINES, cached_baseline, trained_baseline, training_of
-    from .pose import estimator_of
 
     rivals: dict[str, PoseEstimator | Baseline] = {"paper": estimator_of(animal, "paper", progress)}
     skeleton = Skeleton.load(animal)
@@ -175,27 +252,15 @@ def _rivals(animal: str, progress: Progress) -> dict[str, PoseEstimator | Baseli
     return rivals
 
 
-def _frames_per_s(subject: PoseEstimator | Baseline, footage: _Footage, parallel: bool) -> float:
-    """Frames per second of a subject on the frames, on one core or on those that numba may use."""
-    job = partial(subject.estimate, footage.frames, footage.scene, footage.size, parallel)
-    return len(footage.frames) / best_seconds(job)
-
-
-def _one_by_one(paper: PoseEstimator, footage: _Footage) -> Array:
+def _one_by_one(paper: PoseEstimator, footage: Footage) -> NDArray[Any]:
     """Algorithm 1 as it is written, from frames to candidate scores; none share a step."""
-    from liex_lab.estimation.cascade import Candidates, ImageSet
-    from liex_lab.estimation.initial import draw_starts, start_poses
     from liex_lab.estimation.training import base_at_front
 
-    method = paper.model.method
-    skeleton = paper.skeleton
-    cascade = paper.model.cascade
+    method, skeleton, cascade = paper.model.method, paper.skeleton, paper.model.cascade
     crops = footage.scene.extract(footage.frames, 1.0, camera_view=method.camera_view)
-    images = ImageSet(
-        crops.heights, footage.scene.crop_cameras(crops, method.camera_view), crops.moments
-    )
-    n = len(crops.heights)
-    k = method.n_candidates
+    crop_cameras = footage.scene.crop_cameras(crops, method.camera_view)
+    images = ImageSet(crops.heights, crop_cameras, crops.moments)
+    n, k = len(crops.heights), method.n_candidates
     rotation, position, scale = start_poses(
         crops.moments,
         draw_starts(np.random.default_rng(0), 1, k),
@@ -206,10 +271,9 @@ def _one_by_one(paper: PoseEstimator, footage: _Footage) -> Array:
         method.camera_view,
         method.home_turn,
     )
-    image = np.repeat(np.arange(n, dtype=np.int32), k)
     poses = Candidates.start(
         skeleton,
-        image,
+        np.repeat(np.arange(n, dtype=np.int32), k),
         rotation.reshape(-1, 3, 3),
         position.reshape(-1, 3),
         scale.ravel(),
@@ -220,67 +284,134 @@ def _one_by_one(paper: PoseEstimator, footage: _Footage) -> Array:
     return cascade.predict(paper.model.metric, cascade.metric_samples(images, poses))
 
 
-def _ms(job: Callable[[], Any]) -> float:
-    """Milliseconds a frame."""
-    return 1000.0 * best_seconds(job) / N_FRAMES
+def _stages_and_costs(
+    default: PoseEstimator, footage: Footage
+) -> tuple[dict[str, float], dict[str, dict[str, float]]]:
+    """Milliseconds a frame on one core by stage, and by number of joints, candidates, pixels."""
+    scene, size = footage.scene, footage.size
+    view = default.model.method.camera_view
+    crops = scene.extract(footage.frames, size, camera_view=view)
+    cameras = scene.crop_cameras(crops, view)
+    rotations, positions, _, scores = default.candidates(crops, cameras, size)
+    images = ImageSet(crops.heights, cameras, crops.moments)
 
+    def ms(job: Callable[..., Any], *arguments: Any) -> float:
+        return 1000.0 * best_seconds(partial(job, *arguments), N_REPEATS) / N_FRAMES
 
-def _stages(default: PoseEstimator, footage: _Footage) -> dict[str, float]:
-    """Milliseconds a frame on one core of what a frame goes through."""
-    from liex_lab.estimation.cascade import ImageSet
+    def candidates_ms(estimator: PoseEstimator) -> float:
+        return ms(estimator.candidates, crops, cameras, size, False)
 
-    frames = footage.frames
-    scene = footage.scene
-    size = footage.size
-    crops = scene.extract(frames, size, camera_view=default.model.method.camera_view)
-    crop_cameras = scene.crop_cameras(crops, default.model.method.camera_view)
-    rotations, positions, _, scores = default.candidates(crops, crop_cameras, size)
-    images = ImageSet(crops.heights, crop_cameras, crops.moments)
-    return {
-        "foreground": _ms(
-            lambda: scene.extract(frames, size, False, default.model.method.camera_view)
-        ),
-        "candidates": _ms(lambda: default.candidates(crops, crop_cameras, size, False)),
-        "choice": _ms(lambda: default.pick(images, size, rotations, positions, scores, False)),
+    stages = {
+        "foreground": ms(scene.extract, footage.frames, size, False, view),
+        "candidates": candidates_ms(default),
+        "choice": ms(default.pick, images, size, rotations, positions, scores, False),
     }
-
-
-def _costs(default: PoseEstimator, footage: _Footage) -> dict[str, dict[str, float]]:
-    """Milliseconds a frame on one core against the number of joints, of candidates, and of
-    pixels.
-    """
-    frames = footage.frames
-    scene = footage.scene
-    size = footage.size
     n_joints = len(default.skeleton.solved)
-    crops = scene.extract(frames, size, camera_view=default.model.method.camera_view)
-    crop_cameras = scene.crop_cameras(crops, default.model.method.camera_view)
-
-    def candidates(estimator: PoseEstimator) -> float:
-        """Milliseconds a frame that an `estimator` takes for its candidates on one core."""
-        return _ms(lambda: estimator.candidates(crops, crop_cameras, size, False))
-
-    joints = sorted({1, (n_joints + 1) // 2, n_joints})
-    return {
-        "joints": {str(n): candidates(replace(default, n_joints=n)) for n in joints},
+    sizes = [footage.every(step) for step in _SHRINK]
+    costs = {
+        "joints": {
+            str(n): candidates_ms(replace(default, n_joints=n))
+            for n in sorted({1, (n_joints + 1) // 2, n_joints})
+        },
         "candidates": {
-            str(n): candidates(replace(default, n_candidates=n, unpruned=True)) for n in _CANDIDATES
+            str(n): candidates_ms(replace(default, n_candidates=n, unpruned=True))
+            for n in _CANDIDATES
         },
-        "pixels": {
-            f"{f.scene.camera.width} x {f.scene.camera.height}": _ms(partial(_cut, f))
-            for f in _sizes(footage)
-        },
+        "pixels": {one.pixels: ms(one.scene.extract, one.frames, size, False) for one in sizes},
     }
+    return stages, costs
 
 
-def _cut(footage: _Footage) -> None:
-    footage.scene.extract(footage.frames, footage.size, False)
+def evaluate_live(
+    animal: str = "fish",
+    *,
+    n_frames: int = 1500,
+    learn_frames: int = 90,
+    rate_hz: float | None = None,
+    n_cameras: int = 1,
+    progress: Progress = silent,
+) -> dict[str, Any]:
+    """Latencies of live tracking over n frames; `liex evaluate live`.
+
+    Args:
+        animal: a bundled animal's name, or the path of a skeleton's TOML.
+        n_frames: frames that each camera sends.
+        learn_frames: frames that background, floor and size are learned from.
+        rate_hz: frames per second that are sent; None means the camera's own rate.
+        n_cameras: cameras that film at once, each in a process of its own.
+        progress: told how far rendering and following are, if there is one camera.
+
+    Returns:
+        `rate_hz`, the numbers of `follow_live`, and the protocol; of several cameras the largest
+        latencies, and in `cameras` the numbers of each.
+    """
+    film = partial(_film, animal, n_frames, learn_frames, rate_hz)
+    if n_cameras == 1:
+        return {**film(_SEED, progress=progress), "protocol": LIVE_PROTOCOL}
+    progress(0, None, f"filming with {n_cameras} cameras at once")
+    spawn = multiprocessing.get_context("spawn")
+    with spawn.Manager() as manager, ProcessPoolExecutor(n_cameras, spawn) as pool:
+        together = partial(film, ready=manager.Barrier(n_cameras))
+        cameras = list(pool.map(together, range(_SEED, _SEED + n_cameras)))
+    told = {name: [one[name] for one in cameras] for name in _OF_EACH}
+    latest = {
+        name: max((one for one in told[name] if one is not None), default=None)
+        for name in ("latency_median_ms", "latency_p95_ms")
+    }
+    about = {"animal": animal, "rate_hz": cameras[0]["rate_hz"], **latest}
+    return {**about, "cameras": told, "protocol": LIVE_PROTOCOL}
 
 
-def _sizes(footage: _Footage) -> list[_Footage]:
-    """The same frames with every second pixel and with all of them."""
-    out = []
-    for step in _SHRINK:
-        frames = np.ascontiguousarray(footage.frames[:, ::step, ::step])
-        out.append(replace(footage, frames=frames, scene=footage.scene.every(step)))
-    return out
+def _film(
+    animal: str,
+    n_frames: int,
+    learn_frames: int,
+    rate_hz: float | None,
+    seed: int,
+    ready: Barrier | None = None,
+    progress: Progress = silent,
+) -> dict[str, Any]:
+    """The numbers of one camera, which begins to film when the others are ready."""
+    from liex_lab.recordings.streaming import replayed
+
+    from ..live import follow_live
+
+    try:
+        filmed = world_of(Skeleton.load(animal)).motion(seed, min(_KEPT, n_frames))
+        progress(0, None, "rendering frames")
+        step_ns = round(1e9 / rate_hz) if rate_hz else int(np.median(np.diff(filmed.times_ns)))
+        arriving = looped(filmed, n_frames, f"live-{animal}", step_ns)
+        plan = plan_of(animal)
+        warm = replayed(arriving[: learn_frames + _WARM], _WARM_SPEED)
+        follow_live(warm, plan, learn_frames=learn_frames)
+        if ready is not None:
+            ready.wait()
+    except BaseException:
+        if ready is not None:
+            ready.abort()  # the others would wait for ever
+        raise
+    how: dict[str, Any] = {"learn_frames": learn_frames, "progress": progress}
+    numbers, _ = follow_live(replayed(arriving), plan, **how)
+    return {"animal": animal, "rate_hz": 1e9 / step_ns, **numbers}
+
+
+def looped(
+    short: Recording, n_frames: int, name: str = "long", step_ns: int = STEP_NS
+) -> Recording:
+    """A recording of any length: a short one's frames, in memory, to and fro."""
+    depth = [short.frame(row).depth for row in range(len(short))]
+    rows = to_and_fro(len(depth), n_frames)
+    long = Recording(
+        name=name,
+        format="synthetic",
+        camera=short.camera,
+        times_ns=step_ns * np.arange(n_frames, dtype=np.int64),
+        read=lambda row: depth[rows[row]],
+    )
+    long.files.take_digest("0" * 64)
+    return long
+
+
+def to_and_fro(n_short: int, n: int) -> NDArray[np.int64]:
+    """(n,) which of the short recording's frames each one is."""
+    return np.resize([*range(n_short), *range(n_short - 2, 0, -1)], n)

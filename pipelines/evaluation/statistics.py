@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from liex_lab.behaviour.cohort import compare
 from liex_lab.runtime.progress import Progress, silent
 
 ALPHA = 0.05
@@ -164,7 +165,6 @@ def power(plan: StudyPlan, effect: float, n_studies: int, rng: np.random.Generat
 
 
 def _compared(studies: pd.DataFrame, rng: np.random.Generator) -> pd.DataFrame:
-    from liex_lab.behaviour.cohort import compare
 
     measures = [str(name) for name in studies.columns if str(name).startswith("study_")]
     return compare(studies, measures, seed=int(rng.integers(2**31)))

@@ -116,7 +116,7 @@ def train_actions(
             model, made_by="liex train actions", labels="people's", n_recordings=len(tracks)
         )
         return save_action_model(model, out), report
-    from ..evaluation.pose import estimator_of
+    from .pose_model import estimator_of
 
     estimator = estimator_of(animal, "default", progress, pose_model)
     tracks, cuts = learning_set(animal, estimator, progress)

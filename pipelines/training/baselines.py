@@ -156,7 +156,7 @@ def train_baseline(
         """Report that a `share` (0 to 1) of the training is done, and `what` is being trained."""
         progress(round(100 * share), 100, f"training {what}")
 
-    model = _trained(training, data, skeleton, tell)
+    model = fit(training, data, skeleton, tell)
     card = {
         "animal": skeleton.name,
         "variant": variant,
@@ -174,9 +174,12 @@ def train_baseline(
     unfinished.replace(path)
 
 
-def _trained(
-    training: Training, data: Any, skeleton: Skeleton, tell: ProgressCallback
-) -> RegressionForest | Cnn:
+def fit(training: Training, data: Any, skeleton: Skeleton, tell: ProgressCallback) -> RegressionForest | Cnn:
+    """Train a baseline on rendered images.
+
+    Raises:
+        MissingPackageError: the CNN is asked for and torch is not installed.
+    """
     rng = np.random.default_rng(training.recipe.seed)
     if isinstance(training.plan, CnnPlan):
         from liex_lab.baselines.cnn import train_cnn

@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 
 from liex_lab.body.pose import Pose
 from liex_lab.body.skeleton import Skeleton
-from liex_lab.evaluation.tracking import Followed
+from liex_lab.evaluation.scores import Followed
 from liex_lab.geometry import SE3, so3
 from liex_lab.runtime.progress import Progress, silent
 from liex_lab.simulation.corruptions import Event
@@ -46,7 +46,7 @@ from liex_lab.tracking.track_rows import single_frames, stretch_of
 from liex_lab.tracking.tracker import FrameTracker
 
 from ..build import build_scene, plan_of
-from ..evaluation.pose import estimator_of
+from .pose_model import estimator_of
 
 if TYPE_CHECKING:
     from liex_lab.estimation.estimator import PoseEstimator

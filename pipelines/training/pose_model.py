@@ -34,6 +34,7 @@ from liex_lab.runtime.threads import serial_products
 
 if TYPE_CHECKING:
     from liex_lab.body.skeleton import Skeleton
+    from liex_lab.estimation.estimator import PoseEstimator
     from liex_lab.estimation.method import Method
     from liex_lab.estimation.model import Model
     from liex_lab.estimation.training import TrainingSet
@@ -565,3 +566,32 @@ def cache_folder() -> Path:
     if sys.platform == "darwin":
         return Path.home() / "Library" / "Caches" / "liex_lab"
     return Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "liex_lab"
+
+
+def estimator_of(
+    animal: str,
+    variant: str,
+    progress: Progress = silent,
+    model: str | Path | None = None,
+    draw: int = 0,
+) -> PoseEstimator:
+    """The pose estimator of a model file or of a variant of the method.
+
+    Args:
+        animal: a bundled animal's name, or the path of a skeleton's TOML.
+        variant: `default` is the bundled model if there is one; every other is trained now, or
+            comes from the cache.
+        progress: told how far the training is.
+        model: name or path of a model file, which comes before the variant.
+        draw: number of the draw of a model that is trained, see `make_model`.
+
+    Raises:
+        ModelError: there is no such model, or its file is damaged.
+    """
+    from liex_lab.catalog import bundled_models, find_model
+    from liex_lab.estimation.estimator import PoseEstimator
+    from liex_lab.estimation.model import Model
+
+    if model is not None or (variant == "default" and animal in bundled_models()):
+        return PoseEstimator(Model.load(find_model(model or animal)))
+    return PoseEstimator(Model.load(cached_model(animal, variant, progress, draw)))

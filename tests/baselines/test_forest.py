@@ -12,9 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from liex_lab.pipelines.training.baselines import training_of
 
-from liex_lab.baselines import _forest as kernels
-from liex_lab.baselines.ablations import PlainMean
-from liex_lab.baselines.baseline import see
+from liex_lab.baselines import _kernels as kernels
+from liex_lab.baselines import baseline
 from liex_lab.baselines.forest import (
     ForestPlan,
     RegressionForest,
@@ -221,16 +220,18 @@ def test_a_file_gives_the_forest_back_and_a_damaged_one_is_told_in_a_sentence(gr
 def test_the_plain_mean_is_the_mean_of_all_candidates():
     estimator = PoseEstimator(trained("paper").model)
     toy = toy_mice(8, 4)
-    crops, crop_cameras = see(toy.depths, SCENE, True)
+    second = baseline.second_is_likelier(toy.depths, SCENE)
+    cut = baseline.chosen(toy.depths, SCENE, 1.0, second, True)
+    crops, crop_cameras = cut
     _, positions, _, _ = estimator.candidates(crops, crop_cameras, 1.0)
-    guesses = PlainMean(estimator).estimate(toy.depths, SCENE, 1.0)
+    guesses = baseline.PlainMean(estimator).estimate(toy.depths, SCENE, 1.0)
     np.testing.assert_allclose(
         guesses.joints,
         (positions.mean(axis=1) - [0, 0, 1] * crop_cameras[:, None, 13:14]) * [1, -1, -1],
         atol=1e-9,
     )
     one = replace(estimator, n_candidates=1)
-    alone = PlainMean(one).estimate(toy.depths, SCENE, 1.0).joints
+    alone = baseline.PlainMean(one).estimate(toy.depths, SCENE, 1.0).joints
     chosen = one.estimate(toy.depths, SCENE, 1.0).chosen.pose.joints(toy.skeleton)
     np.testing.assert_allclose(
         alone, chosen, atol=1e-6

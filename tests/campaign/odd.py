@@ -21,7 +21,7 @@ import numpy as np
 from liex_lab.pipelines.evaluation.scenes import read_individuals
 from numpy.typing import NDArray
 
-from liex_lab.evaluation.scenes import Individual
+from liex_lab.evaluation.scores import Individual
 from liex_lab.optics.camera import Camera
 from liex_lab.recordings import open_recording
 from liex_lab.sessions import Session

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from liex_lab.pipelines.evaluation.paper.deviations import DEVIATIONS
+from liex_lab.dashboards.paper.published import DEVIATIONS
 from typer.testing import CliRunner
 
 import liex_lab
@@ -419,7 +419,7 @@ def test_evaluate_speed_measures_recordings_where_asked(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     numbers = {"frames_per_s_1core": {"mcap": 400.0}}
-    job(monkeypatch, "evaluation.decoding", evaluate_recordings=lambda progress: numbers)
+    job(monkeypatch, "evaluation.recordings", evaluate_recordings=lambda progress: numbers)
     file = tmp_path / "numbers.json"
     result = CliRunner().invoke(cli.app, ["evaluate", "speed", "--recordings", "--json", str(file)])
     assert result.exit_code == 0, result.output
@@ -508,7 +508,7 @@ def test_the_noise_of_particles_is_searched_on_as_many_frames_as_are_asked_for(
     def search(animal: str, *, n_frames: int | None, progress: Any) -> dict[str, Any]:
         return {"animal": animal, "n_frames": n_frames}
 
-    job(monkeypatch, "evaluation.paper.algorithm3", search_noise=search)
+    job(monkeypatch, "evaluation.tracking", search_noise=search)
     words = ["train", "tracking", "--animal", "fish", "--particles", "--frames", "60"]
     file = tmp_path / "noise.json"
     assert CliRunner().invoke(cli.app, [*words, "--json", str(file)]).exit_code == 0

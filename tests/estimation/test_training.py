@@ -20,7 +20,7 @@ from liex_lab.estimation.training import (
     train_cascade,
     train_metric,
 )
-from liex_lab.evaluation.pose import rank_correlation
+from liex_lab.evaluation.scores import rank_correlation
 from tests.estimation.toy import (
     CAMERA,
     FLOOR,

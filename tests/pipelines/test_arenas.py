@@ -135,13 +135,13 @@ def test_each_frame_is_decoded_once_for_all_arenas(sessions):
 def test_each_arena_follows_its_own_animal(sessions):
     from liex_lab.pipelines.evaluation.scenes import read_individuals
 
-    from liex_lab.evaluation.scenes import error_mm
+    from liex_lab.evaluation.scores import error_of
     from liex_lab.sessions import Session
 
     made, _ = pictures()
     measured = [read_individuals(Session.open(path))[0].joints_camera for path in sessions[0]]
     errors = [
-        [float(np.nanmedian(error_mm(own, animal.joints_camera))) for animal in made.animals]
+        [float(np.nanmedian(error_of(own, animal.joints_camera))) for animal in made.animals]
         for own in measured
     ]
     assert sorted(int(np.argmin(row)) for row in errors) == [0, 1]

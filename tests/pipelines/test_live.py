@@ -8,7 +8,7 @@ import time
 
 import numpy as np
 import pytest
-from liex_lab.pipelines.evaluation.live import _to_and_fro, evaluate_live
+from liex_lab.pipelines.evaluation.speed import evaluate_live, to_and_fro
 from liex_lab.pipelines.live import follow_live, open_live
 
 from liex_lab.errors import RecordingError
@@ -136,7 +136,7 @@ def test_frames_go_to_and_fro_and_keep_the_time_when_they_came():
         Arrival(DepthFrame(k, k, np.zeros((2, 2), np.float32)), at)
         for k, at in enumerate((0.0, 0.1, 0.2))
     ]
-    assert [_to_and_fro(k, 3) for k in range(8)] == [0, 1, 2, 2, 1, 0, 0, 1]
+    assert to_and_fro(3, 8).tolist() == [0, 1, 2, 1, 0, 1, 2, 1]
     assert [arrival.at_s for arrival in _stamped(iter(frames))] == [0.0, 0.1, 0.2]
 
 

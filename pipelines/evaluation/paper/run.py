@@ -2,41 +2,87 @@
 
 `liex evaluate tables` measures six rows on an animal's test splits (40 recordings each): our
 default, the paper's variant of Lie-X, its ablations without multiple initial poses and without the
-learned metric, and the baselines RF and CNN. All see the same frames and, in each, the same object
-with the same size (`common_view`). Numbers: those of `rows`, 101 quantiles of the error (Fig 8),
-frames/s on at most two cores, sensitivity to five parameters (Fig 7), candidates and convergence of
-one image (Fig 13 to 16). Rows and curves whose models take long to train come from kept results
-(`kept`) unless they are asked for.
+learned metric, and the baselines RF and CNN. Rows and curves whose models take long to train are
+kept: `datasets/kept_results/ANIMAL.json` has their numbers and how they were made (version,
+command, seeds, day and machine). Nothing checks that today's code would give the same numbers; the
+tables name each row of another version, and they are measured again before a release.
 """
 
 from __future__ import annotations
 
+import json
+import platform
+import re
 import shlex
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from datetime import date
+from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
-from liex_lab.errors import MissingPackageError, PlanError
+import numba
+from liex_lab.pipelines.training.action_model import cut_sequences
+
+from liex_lab.actions.storage import load_action_model
+from liex_lab.baselines.cnn import CnnPlan, require_torch
+from liex_lab.body.skeleton import Skeleton
+from liex_lab.catalog import kept_results_folder
+from liex_lab.errors import LiexError, MissingPackageError, PlanError
+from liex_lab.estimation.estimator import PoseEstimator
+from liex_lab.estimation.method import method_of
+from liex_lab.evaluation.scores import plain
 from liex_lab.runtime.progress import Progress, silent
+from liex_lab.sessions.provenance import package_version
+from liex_lab.simulation.recording import SEALED
+from liex_lab.simulation.simulator import world_of
 
-from .results import Results
-from .rows import ROWS, SWEPT, TRAINING_DRAWS
-
-if TYPE_CHECKING:
-    from liex_lab.body.skeleton import Skeleton
-    from liex_lab.estimation.estimator import PoseEstimator
-    from liex_lab.simulation.recording import TrueRecording
-
-    from .drawers import Drawers
-    from .further import Further
-    from .rows import Subject
+from ...training.agent_tracks import acted_tracks
+from ...training.baselines import BASELINES, fit, training_of
+from ...training.pose_model import (
+    estimator_of,
+    make_model,
+    recipe_of,
+    rendered_set,
+    shared_pictures,
+)
+from ..actions import sequence_scores
+from ..nyu import evaluate_nyu
+from ..tracking import evaluate_tracking
+from . import illustrations, rows
+from .illustrations import Sweep
+from .rows import ROWS, SWEPT, TRAINING_DRAWS, Subject, Tests
 
 CURVES = "fig7"  # stands for the curves among the names of rows
+PARTS = ("tracking", "actions")
+SCHEMA = 4
+_DIGITS = 6  # significant ones of a kept number
+_DEEP = re.compile(r"\n {5,}|\n {4}(?=[]}])")  # line breaks within a list or the numbers of a split
 _N_SESSIONS = 40
-_QUICK_FRAMES = 100
 _ILLUSTRATED = 128  # images behind the figures of candidates and convergence
+_TRACKED_FRAMES = 160
+_VERBS = {
+    "tracking": "liex evaluate tracking --animal mouse --sequence easy --figure F.png",
+    "actions": "liex evaluate actions --animal fish --out DIR",
+    "nyu": "liex evaluate nyu --reference FOLDER",
+}
+# a quick run
+_QUICK_FRAMES = 100
 _QUICK_ILLUSTRATED = 16
+_QUICK_TRACKED = 40
+_QUICK_STRIDE = 12  # every so many-th cut-out sequence
+_QUICK_IMAGES = {"paper": 1_024, "rf": 2_048, "cnn": 2_048}
+QUICK_SWEEP = Sweep(
+    n_images=512,
+    n_test=512,
+    values=(
+        ("initial poses", (1, 10)),
+        ("rounds", (1,)),
+        ("trees", (2,)),
+        ("tree depth", (8,)),
+        ("metric trees", (5,)),
+    ),
+)
 
 
 @dataclass(frozen=True)
@@ -44,11 +90,11 @@ class Budget:
     """How much is measured, and of what.
 
     Attributes:
-        n_frames: frames of each split, rounded up to whole recordings; None takes all.
+        n_frames: frames of each split, rounded up to whole recordings; None means all.
         fresh: rows that are trained and measured now.
         curves: those of Fig. 7 are, too.
         kept: the others come from datasets/kept_results; else they are missing.
-        quick: every row is trained on next to nothing, to see that everything runs.
+        quick: every row is trained on next to nothing, to check that everything runs.
         sealed: the sealed split is measured instead of the others.
     """
 
@@ -64,13 +110,6 @@ class Budget:
         n_frames: int | None, quick: bool, fresh: bool, rows: Sequence[str], sealed: bool
     ) -> Budget:
         """What the options of the command line ask for.
-
-        Args:
-            n_frames: frames of each split; with any, nothing kept is used.
-            quick: every row is trained on next to nothing.
-            fresh: all rows and curves are trained and measured now.
-            rows: names of rows that are, and `CURVES`; () names none.
-            sealed: the sealed split; with it, nothing kept is used.
 
         Raises:
             PlanError: there is no such row.
@@ -93,7 +132,7 @@ class Budget:
         )
 
 
-def make_tables(
+def measure_paper(
     out: str | Path,
     animals: Sequence[str],
     *,
@@ -104,78 +143,52 @@ def make_tables(
     sealed: bool = False,
     without: Sequence[str] = (),
     nyu: Path | None = None,
-    drawers: Drawers | None = None,
     progress: Progress = silent,
-) -> list[Path]:
-    """Write tables, figures, their page, and the form in which results are kept into a folder.
+) -> tuple[list[dict[str, Any]], dict[str, Any], list[Path]]:
+    """Measure what the tables and figures show; keep the numbers in a folder.
 
     Args:
-        out: the folder; it is made where it is missing.
+        out: the folder for results.json and kept/ANIMAL.json; it is made if it is missing.
         animals: names of bundled animals.
-        n_frames: frames of each split, of which every row is then measured; None takes all.
-        quick: few frames, every row trained on next to nothing; its numbers say only that
-            everything runs.
+        n_frames: frames of each split, of which every row is then measured; None means all.
+        quick: few frames, every row trained on next to nothing.
         fresh: rows are trained and measured now, not taken from kept results.
-        rows: only these rows are, beside the default, or `fig7` for its curves; the others come
+        rows: only these rows are, besides the default, or `fig7` for its curves; the others come
             from kept results. () names none.
-        sealed: measure the sealed split instead of the others, as is done once when an issue ends.
-        without: parts that belong to other verbs and are left out, `tracking` or `actions`.
+        sealed: measure the sealed split instead of the others, once per release.
+        without: parts of other verbs that are left out, `tracking` or `actions`.
         nyu: folder of the NYU hand data, for Table 2; None leaves it out.
-        drawers: make the figures and the page, of which `tracking`, `actions` and `nyu` are parts;
-            None makes neither.
         progress: told how far the job is.
 
     Returns:
-        The paths of all files that were written.
+        What was measured by animal, see `results_of`; what other verbs measured, see
+        `measure_further`; and the files that were written.
 
     Raises:
         PlanError: there is no such row, or part.
         LiexError: kept results are damaged.
     """
-    from .further import check_parts, measure_further
-    from .kept import keep_results
-    from .table_text import write_tables
-
-    check_parts(without)
+    if unknown := [name for name in without if name not in PARTS]:
+        raise PlanError(
+            f"there is no part '{unknown[0]}' to leave out; known are {', '.join(PARTS)}"
+        )
     budget = Budget.of(n_frames, quick, fresh, rows, sealed)
     command = _command(animals, n_frames, quick, fresh, rows, sealed)
     folder = Path(out)
     folder.mkdir(parents=True, exist_ok=True)
-    all_results = [results_of(animal, budget, command, progress) for animal in animals]
-    written = write_tables(folder, all_results, quick)
-    for results in all_results:
-        parts = [_without_origin(part) for part in (results.rows, results.sensitivity)]
-        written.append(keep_results(folder / "kept", results.animal, *parts))
-    if drawers is None:
-        return written
-    further = measure_further(
-        folder, without=without, nyu=nyu, quick=quick, drawers=drawers, progress=progress
-    )
-    progress(0, None, "drawing")
-    return written + _drawn(folder, all_results, further, quick, drawers)
-
-
-def _drawn(
-    folder: Path, results: Sequence[Results], further: Further, quick: bool, drawers: Drawers
-) -> list[Path]:
-    """All figures, and the page that holds them."""
-    from .deviations import DEVIATIONS
-    from .exhibits import exhibits
-    from .table_text import HOW, QUICK, SEALED
-
-    figures = drawers.figures({r.animal: vars(r) for r in results}, folder)
-    figures += [folder / name for name in further.figures]
-    about = {
-        "title": "Tables and figures of Lie-X, on rendered test frames",
-        "about": [HOW.replace("*", "")],
-        "warnings": [
-            *([QUICK.strip("*")] if quick else []),
-            *([SEALED.replace("*", "")] if any(r.sealed for r in results) else []),
-        ],
-        "differences": DEVIATIONS,
+    results = [results_of(animal, budget, command, progress) for animal in animals]
+    written = [keep_results(folder / "kept", one) for one in results]
+    # the poses are with the rows; what is drawn of them holds depth images
+    numbers = {
+        one["animal"]: {k: v for k, v in one.items() if k not in ("examples", "failures")}
+        for one in results
     }
-    shown = exhibits(results, further, figures, quick)
-    return [*figures, drawers.page(about, shown, folder / "index.html")]
+    path = folder / "results.json"
+    text = json.dumps(plain(numbers), indent=1, allow_nan=False)
+    path.write_text(text + "\n", encoding="utf-8")
+    further = measure_further(without, nyu, quick, progress)
+    progress(0, None, "drawing")
+    return results, further, [*written, path]
 
 
 def _command(
@@ -187,139 +200,189 @@ def _command(
     sealed: bool = False,
 ) -> str:
     """The command line that makes the same numbers."""
-    words = ["liex", "evaluate", "tables", *(f"--animal={animal}" for animal in animals)]
-    words += [f"--frames={n_frames}"] if n_frames else []
-    words += [
-        name
-        for name, given in (("--quick", quick), ("--fresh", fresh), ("--sealed", sealed))
-        if given
+    flags = {"--quick": quick, "--fresh": fresh, "--sealed": sealed}
+    words = [
+        *("liex", "evaluate", "tables", *(f"--animal={animal}" for animal in animals)),
+        *([f"--frames={n_frames}"] if n_frames else []),
+        *(name for name, given in flags.items() if given),
+        *(f"--row={row}" for row in rows),
     ]
-    return shlex.join([*words, *(f"--row={row}" for row in rows)])
+    return shlex.join(words)
 
 
-def _without_origin(entries: Mapping[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
-    """Rows or curves without what is true of this run alone."""
+def kept_results(animal: str, folder: Path | None = None) -> dict[str, Any]:
+    """What is kept for an animal: `rows` and `sensitivity` by variant, empty if nothing is.
+
+    Args:
+        animal: name of the skeleton.
+        folder: where results are kept; None means datasets/kept_results.
+
+    Raises:
+        LiexError: the file is damaged, or of another schema.
+    """
+    path = (folder or kept_results_folder()) / f"{animal}.json"
+    if not path.is_file():
+        return {"rows": {}, "sensitivity": {}}
+    advice = "restore it from the repository, or measure every row with --fresh"
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        schema = content["schema"]
+        kept = {part: dict(content[part]) for part in ("rows", "sensitivity")}
+    except (ValueError, TypeError, KeyError) as error:
+        raise LiexError(
+            f"{path} should contain kept results as JSON, but is damaged ({error}); {advice}"
+        ) from None
+    if schema != SCHEMA:
+        raise LiexError(f"{path} has kept results of schema {schema}, not {SCHEMA}; {advice}")
+    return kept
+
+
+def keep_results(folder: Path, results: Mapping[str, Any]) -> Path:
+    """Write the results of an animal as they are kept; in datasets/kept_results they are used.
+
+    A number has six digits, and a list or a pose takes one line. `default` is measured in every run
+    and is not kept.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / f"{results['animal']}.json"
+    kept, curves = (
+        {name: _lasting(entry) for name, entry in results[part].items()}
+        for part in ("rows", "sensitivity")
+    )
+    content = {
+        "schema": SCHEMA,
+        "animal": results["animal"],
+        "rows": {name: _rounded(row) for name, row in kept.items() if name != "default"},
+        "sensitivity": curves,
+    }
+    text = json.dumps(content, indent=1, sort_keys=True, allow_nan=False)
+    path.write_text(_DEEP.sub("", text) + "\n", encoding="utf-8")
+    return path
+
+
+def _lasting(entry: Mapping[str, Any]) -> dict[str, Any]:
+    """A row or curve without what is true of one run alone."""
+    return {k: v for k, v in entry.items() if k not in ("origin", "other_processor")}
+
+
+def _rounded(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {key: _rounded(one) for key, one in value.items()}
+    if isinstance(value, list):
+        return [_rounded(one) for one in value]
+    return float(f"{value:.{_DIGITS}g}") if isinstance(value, float) else value
+
+
+def processor() -> str:
+    """The kind of processor that numba compiles for, as LLVM names it, such as `znver4`."""
+    import llvmlite.binding as llvm
+
+    return str(numba.config.CPU_NAME or llvm.get_host_cpu_name())
+
+
+def _made_by(command: str) -> dict[str, Any]:
+    """How a row or a curve is made now: command, version, day and machine."""
+    machine = platform.processor() or platform.machine()
     return {
-        name: {key: value for key, value in entry.items() if key != "origin"}
-        for name, entry in entries.items()
+        "command": command,
+        "version": package_version("liex_lab"),
+        "date": date.today().isoformat(),
+        "machine": f"{machine}, Python {platform.python_version()}",
+        "processor": processor(),
     }
 
 
-def results_of(animal: str, budget: Budget, command: str, progress: Progress) -> Results:
+def results_of(
+    animal: str, budget: Budget, command: str, progress: Progress = silent
+) -> dict[str, Any]:
     """Every row, curve and illustration of one animal.
 
-    Args:
-        animal: a bundled animal's name, or the path of a skeleton's TOML.
-        budget: how much is measured.
-        command: the command line that makes the same numbers, noted beside them.
-        progress: told how far the job is.
+    Returns:
+        `animal`, `joints`, `splits`; `rows` by variant, see `rows.measured_rows`, each with `made`,
+        `origin` and `other_processor`, the one of a row that was measured on another than this
+        run's; `missing`, by variant or by figure and variant, why there is no row or curve;
+        `sealed`; `test_postures`, where those of the test splits come from, '' if seeds say so;
+        `sensitivity`, the curves by variant; `illustration` of the default; `examples` and
+        `failures`, poses by variant, see `rows.shown_poses`.
     """
-    from liex_lab.body.skeleton import Skeleton
-    from liex_lab.simulation.simulator import world_of
-
-    from ...training.pose_model import shared_pictures
-    from .illustrations import illustrate
-    from .kept import kept_results
-    from .rows import measured_rows
-
     skeleton = Skeleton.load(animal)
     kept = kept_results(skeleton.name) if budget.kept else {"rows": {}, "sensitivity": {}}
     tests = _tests(skeleton, budget)
-    results = Results(skeleton.name, list(skeleton.names), list(tests), sealed=budget.sealed)
-    results.test_postures = world_of(skeleton).test_postures
+    postures = world_of(skeleton).test_postures
+    runs: dict[str, list[Subject]] = {}
+    missing: dict[str, str] = {}
     with shared_pictures():
-        runs = _runs(animal, budget, results, progress)
+        for name in budget.fresh:
+            try:
+                runs[name] = (quick_runs if budget.quick else rows.runs_of)(animal, name, progress)
+            except MissingPackageError as error:
+                missing[name] = str(error)
     chooser = cast("PoseEstimator", runs["default"][0])
-    measured = measured_rows(animal, runs, chooser, tests, progress)
+    measured = rows.measured_rows(animal, runs, chooser, tests, progress)
+    found: dict[str, dict[str, Any]] = {}
     for name in ROWS:
         if name in measured:
-            made = _made(name, skeleton, budget, command, results.test_postures)
-            results.rows[name] = {"origin": "measured", "made": made, **measured[name]}
+            made = _made_by(command) | _training(name, skeleton, budget.quick)
+            made["test_postures"] = postures
+            found[name] = {"origin": "measured", "made": made, **measured[name]}
         elif name in kept["rows"]:
-            results.rows[name] = {**kept["rows"][name], "origin": "kept"}
-        elif name not in results.missing:
-            results.missing[name] = (
-                f"no row is kept; {_anew(skeleton.name, name)} measures it"
-                if budget.kept
-                else "it was not asked for"
-            )
-    results.sensitivity = _sensitivities(
-        skeleton, kept["sensitivity"], budget, command, results, progress
-    )
+            found[name] = {**kept["rows"][name], "origin": "kept"}
+        elif name not in missing:
+            again = f"no row is kept; {_command_for(skeleton.name, name)} measures it"
+            missing[name] = again if budget.kept else "it was not asked for"
+    for row in found.values():
+        made_on = row["made"].get("processor")
+        row["other_processor"] = None if made_on == processor() else made_on
+    curves = _sensitivities(skeleton, kept["sensitivity"], budget, command, missing, progress)
     progress(0, None, f"{skeleton.name}: candidates and convergence")
     n_images = _QUICK_ILLUSTRATED if budget.quick else _ILLUSTRATED
-    results.illustration = illustrate(chooser.model, n_images)
-    results.examples, results.failures = _poses(results, tests)
-    return results
-
-
-def _poses(
-    results: Results, tests: Mapping[str, Sequence[TrueRecording]]
-) -> tuple[list[dict[str, Any]], dict[str, list[dict[str, Any]]]]:
-    """The poses that are drawn: of all rows in the examples, and where two rows err most."""
-    from .examples import shown_poses
-
-    examples = {name: row["examples"] for name, row in results.rows.items()}
-    failures = {
-        name: shown_poses(some, {name: some}, tests)
-        for name in SWEPT[::-1]
-        if (some := results.rows.get(name, {}).get("failures"))
+    examples = {name: row["examples"] for name, row in found.items()}
+    failures = {name: found[name].get("failures") for name in SWEPT[::-1] if name in found}
+    drawn = {
+        name: rows.shown_poses(some, {name: some}, tests)[name]
+        for name, some in failures.items()
+        if some
     }
-    return shown_poses(examples["default"], examples, tests), failures
+    return {
+        "animal": skeleton.name,
+        "joints": list(skeleton.names),
+        "splits": list(tests),
+        "rows": found,
+        "missing": missing,
+        "sealed": budget.sealed,
+        "test_postures": postures,
+        "sensitivity": curves,
+        "illustration": illustrations.illustrate(chooser.model, n_images),
+        "examples": rows.shown_poses(examples["default"], examples, tests),
+        "failures": drawn,
+    }
 
 
-def _tests(skeleton: Skeleton, budget: Budget) -> dict[str, Sequence[TrueRecording]]:
+def _tests(skeleton: Skeleton, budget: Budget) -> Tests:
     """The recordings by split."""
-    from liex_lab.simulation.recording import SEALED
-    from liex_lab.simulation.simulator import world_of
-
     world = world_of(skeleton)
-    n_sessions = _N_SESSIONS
+    n = _N_SESSIONS
     if budget.n_frames is not None:
-        n_sessions = -(-budget.n_frames // len(world.test_split(world.splits[0], n_sessions=1)[0]))
+        n = -(-budget.n_frames // len(world.test_split(world.splits[0], n_sessions=1)[0]))
     splits = (SEALED,) if budget.sealed else world.splits
-    return {split: world.test_split(split, n_sessions=n_sessions) for split in splits}
+    return {split: world.test_split(split, n_sessions=n) for split in splits}
 
 
-def _anew(animal: str, row: str) -> str:
-    """The command that measures one row anew."""
+def _command_for(animal: str, row: str) -> str:
+    """The command that measures one row again."""
     return f"`{_command([animal], None, False, True, [row])} --out DIR`"
 
 
-def _runs(
-    animal: str, budget: Budget, results: Results, progress: Progress
-) -> dict[str, list[Subject]]:
-    """What has to be measured; why a row cannot be goes into `results.missing`."""
-    from .quick import quick_runs
-    from .rows import runs_of
-
-    runs = {}
-    for name in budget.fresh:
-        try:
-            runs[name] = (quick_runs if budget.quick else runs_of)(animal, name, progress)
-        except MissingPackageError as error:
-            results.missing[name] = str(error)
-    return runs
-
-
-def _made(
-    variant: str, skeleton: Skeleton, budget: Budget, command: str, test_postures: str
-) -> dict[str, Any]:
-    """How a row is made now."""
-    from ...training.baselines import BASELINES, training_of
-    from ...training.pose_model import recipe_of
-    from .kept import made_by
-
+def _training(variant: str, skeleton: Skeleton, quick: bool) -> dict[str, Any]:
+    """Seeds and amount of training of a row."""
     if variant in BASELINES:
         recipe = training_of(variant, skeleton).recipe
     else:
         recipe = recipe_of("default" if variant == "default" else "paper", skeleton)
     return {
-        **made_by(command),
         "seed": recipe.seed,
-        "seeds": list(range(1 if budget.quick else TRAINING_DRAWS.get(variant, 1))),
-        "training_images": None if budget.quick else recipe.n_images,
-        "test_postures": test_postures,
+        "seeds": list(range(1 if quick else TRAINING_DRAWS.get(variant, 1))),
+        "training_images": None if quick else recipe.n_images,
     }
 
 
@@ -328,24 +391,98 @@ def _sensitivities(
     kept: Mapping[str, Any],
     budget: Budget,
     command: str,
-    results: Results,
+    missing: dict[str, str],
     progress: Progress,
 ) -> dict[str, Any]:
-    """Fig. 7 of the paper's variant and of ours, measured now where it is asked for, or kept."""
-    from .kept import made_by
-    from .quick import QUICK_SWEEP
-    from .sensitivity import Sweep, sensitivity
-
+    """Fig. 7 of the paper's variant and of ours, measured now if it is asked for, or kept."""
     curves = {}
     for variant in SWEPT[: 1 if budget.quick else None]:
         if budget.curves:
             sweep = QUICK_SWEEP if budget.quick else Sweep()
-            curve = sensitivity(skeleton, variant, sweep, progress)
-            curves[variant] = {**curve, "made": made_by(command), "origin": "measured"}
+            curve = illustrations.sensitivity(skeleton, variant, sweep, progress)
+            curves[variant] = {**curve, "made": _made_by(command), "origin": "measured"}
         elif variant in kept:
             curves[variant] = {**kept[variant], "origin": "kept"}
         else:
-            results.missing[f"Fig. 7, {variant}"] = (
-                f"no curve is kept; {_anew(skeleton.name, CURVES)} measures it"
-            )
+            again = _command_for(skeleton.name, CURVES)
+            missing[f"Fig. 7, {variant}"] = f"no curve is kept; {again} measures it"
     return curves
+
+
+def quick_runs(animal: str, variant: str, progress: Progress = silent) -> list[Subject]:
+    """As `rows.runs_of`, trained within seconds to check that every row runs.
+
+    Raises:
+        MissingPackageError: the CNN is asked for and torch is not installed.
+    """
+    if variant == "default":
+        return [estimator_of(animal, "default")]
+    if variant not in BASELINES:
+        return rows.runs_of_models(variant, [_quick_paper(animal)])
+    skeleton = Skeleton.load(animal)
+    training = training_of(variant, skeleton)
+    if isinstance(training.plan, CnnPlan):
+        require_torch()
+        plan = replace(training.plan, width=0.25, connected=128, epochs=1)
+        training = replace(training, plan=plan)
+    method = replace(method_of("paper", skeleton), session_size=False)
+    n_images = _QUICK_IMAGES[variant]
+    data = rendered_set(skeleton, method, training.recipe, 0, n_images, silent)
+    return [fit(training, data, skeleton, lambda share, what: None)]
+
+
+@cache
+def _quick_paper(animal: str) -> PoseEstimator:
+
+    skeleton = Skeleton.load(animal)
+    recipe = recipe_of("paper", skeleton)
+    recipe = replace(recipe, n_images=_QUICK_IMAGES["paper"], n_calibration=0)
+    return PoseEstimator(make_model(skeleton, method_of("paper", skeleton), recipe, silent))
+
+
+def measure_further(
+    without: Sequence[str] = (),
+    nyu: Path | None = None,
+    quick: bool = False,
+    progress: Progress = silent,
+) -> dict[str, Any]:
+    """What other verbs measure, as small fixed measurements for the same page.
+
+    Returns:
+        `tracking` (Fig. 18): the first frames of the easy mouse sequence, with `tracked`, the
+        sequence and its rows; `actions` (Figs. 19 and 20): the cut-out sequences of fish, with
+        `key_frames`; `nyu` (Table 2, Fig. 12), with `nyu_hands`; empty if left out; `missing`: by
+        part, why it is not there and which command makes it.
+    """
+    further: dict[str, Any] = {"tracking": {}, "actions": {}, "nyu": {}, "nyu_hands": {}}
+    further["missing"] = {name: f"it was left out; `{_VERBS[name]}` makes it" for name in without}
+    if "tracking" not in without:
+        further["tracking"] = evaluate_tracking(
+            "mouse",
+            "easy",
+            n_frames=_QUICK_TRACKED if quick else _TRACKED_FRAMES,
+            draw=lambda *shown: further.update(tracked=shown),
+            progress=progress,
+        )
+    if "actions" not in without:
+        further["actions"] = _actions("fish", _QUICK_STRIDE if quick else 1, progress)
+        further["key_frames"] = illustrations.acted_key_frames("fish")
+    if nyu is None:
+        why = f"no folder was named with --nyu; with the data `{_VERBS['nyu']}` makes it"
+        further["missing"]["nyu"] = why
+    else:
+        draw = further["nyu_hands"].update
+        further["nyu"] = evaluate_nyu(nyu, draw=draw, progress=progress)
+    return further
+
+
+def _actions(animal: str, stride: int, progress: Progress) -> dict[str, Any]:
+
+    estimator = estimator_of(animal, "default", progress)
+    train, test = (
+        acted_tracks(cut_sequences(animal, side)[::stride], estimator, progress)
+        for side in (False, True)
+    )
+    progress(0, None, "naming actions")
+    scores = sequence_scores(train, test, load_action_model(animal))
+    return {**scores, "n_train": len(train), "n_test": len(test)}

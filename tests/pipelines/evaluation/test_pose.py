@@ -1,5 +1,5 @@
-"""`liex evaluate`: the names of its numbers are an interface, and known offsets come out as they
-went in.
+"""`liex evaluate pose`, `sizes`, `reference` and `speed`: their numbers have names that stay, and
+known offsets are found.
 """
 
 from __future__ import annotations
@@ -9,11 +9,15 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numba
 import numpy as np
 import pandas as pd
 import pytest
 from liex_lab.pipelines.evaluation import pose, speed
+from typer.testing import CliRunner
 
+from liex_lab import cli
+from liex_lab.body.skeleton import Skeleton
 from liex_lab.errors import LiexError
 from liex_lab.estimation.estimator import PoseEstimator
 from liex_lab.plan import Plan
@@ -27,29 +31,13 @@ from tests.sessions import walking_mouse
 from tests.sessions.walking_mouse import FLOOR_MM, SMALL, SPINE_MM, WalkingMouse, steady
 
 POSE_KEYS = [
-    "animal",
-    "split",
-    "variant",
-    "n_frames",
-    "mean_joint_error_mm",
-    "median_joint_error_mm",
-    "p95_joint_error_mm",
-    "flip_rate",
-    "lost_rate",
-    "spearman_predicted_error",
-    "interval90_coverage",
-    "protocol",
+    *("animal", "split", "variant", "n_frames", "mean_joint_error_mm", "median_joint_error_mm"),
+    *("p95_joint_error_mm", "flip_rate", "lost_rate", "spearman_predicted_error"),
+    *("interval90_coverage", "protocol"),
 ]
-SPEED_KEYS = {
-    "animal",
-    "frames_per_s_1core",
-    "frames_per_s_2cores",
-    "ratio_to_paper",
-    "stages_ms",
-    "machine",
-}
 LEFT_OUT = (5, 17)  # frames of the hand-made session without a pose
 TURNED = (10, 13)  # from when to when nose and rump are exchanged in it
+MOUSE = Skeleton.load("mouse")
 
 
 # rendered splits, measured with a toy model: the numbers are poor, their names are not
@@ -60,16 +48,12 @@ def toy_estimator(animal: str, variant: str, progress: Progress = silent) -> Pos
 
 
 @pytest.fixture
-def small_world(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """Two recordings of 10 small frames stand for every split, toy models for every variant; what
-    was asked for.
-    """
-    asked: list[str] = []
+def small_world(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two recordings of 10 small frames stand for every split, toy models for every variant."""
 
     def small_split(
         name: str, spine_mm: float | None = None, n_sessions: int = 2, *_: Any
     ) -> list[SyntheticSession]:
-        asked.append(f"{name} {spine_mm}")
         return [
             SyntheticSession.draw(
                 [5, k], 10, sensor=PRIMESENSE_QVGA_SENSOR, spine_mm=spine_mm, name=f"{name}-{k}"
@@ -78,72 +62,48 @@ def small_world(monkeypatch: pytest.MonkeyPatch) -> list[str]:
         ]
 
     monkeypatch.setattr(recording, "test_split", small_split)
-    monkeypatch.setattr(pose, "estimator_of", toy_estimator)
-    return asked
+    for module in (pose, speed):
+        monkeypatch.setattr(module, "estimator_of", toy_estimator)
 
 
-@pytest.mark.parametrize(("split", "variant"), [("clean", "default"), ("hard", "paper")])
-def test_the_numbers_of_evaluate_pose_are_called_as_they_have_always_been(
-    small_world, split, variant
-):
+@pytest.mark.usefixtures("small_world")
+def test_the_numbers_of_a_split_have_their_names_and_are_the_same_every_time():
     told: list[str] = []
-    result = pose.evaluate_pose(
-        "mouse", split, variant, progress=lambda done, total, what: told.append(what)
-    )
+    result = pose.evaluate_pose("mouse", "hard", progress=lambda *facts: told.append(facts[2]))
     assert list(result) == POSE_KEYS
-    assert (result["animal"], result["split"], result["variant"]) == ("mouse", split, variant)
-    assert result["n_frames"] == 20
-    assert small_world == [f"{split} None"]
-    assert told == [f"measuring {split}-0", f"measuring {split}-1"]
-    for name in POSE_KEYS[4:11]:
-        assert isinstance(result[name], float)
-        assert np.isfinite(result[name])
-    assert 0.0 < result["median_joint_error_mm"] <= result["p95_joint_error_mm"]
-    for name in ("flip_rate", "lost_rate", "interval90_coverage"):
-        assert 0.0 <= result[name] <= 1.0
+    assert (result["animal"], result["split"], result["variant"]) == ("mouse", "hard", "default")
+    assert told == ["measuring hard-0", "measuring hard-1"]
+    assert np.isfinite([result[name] for name in POSE_KEYS[3:11]]).all()
     assert "nothing is handed over" in result["protocol"]
     assert json.loads(json.dumps(result, allow_nan=False)) == result
+    assert pose.evaluate_pose("mouse", "hard") == result
+    fewer = [pose.evaluate_pose("mouse", n_frames=n)["n_frames"] for n in (10, 11)]
+    assert fewer == [10, 20]  # whole recordings
 
 
-def test_evaluating_twice_gives_the_same_numbers_and_fewer_frames_take_whole_recordings(
-    small_world,
-):
-    once, twice = (pose.evaluate_pose("mouse") for _ in range(2))
-    assert once == twice
-    assert pose.evaluate_pose("mouse", n_frames=10)["n_frames"] == 10
-    assert pose.evaluate_pose("mouse", n_frames=11)["n_frames"] == 20
-
-
-def test_a_split_that_does_not_exist_is_refused_before_a_model_is_trained(monkeypatch):
-    monkeypatch.setattr(pose, "estimator_of", lambda *_: pytest.fail("a model was asked for"))
+def test_a_split_or_variant_that_does_not_exist_is_refused(monkeypatch):
+    monkeypatch.setattr(pose, "estimator_of", lambda animal, variant, progress: variant)
     with pytest.raises(LiexError, match="no split 'claen'"):
         pose.evaluate_pose("mouse", "claen", "paper")
-
-
-def test_a_variant_that_does_not_exist_is_refused():
-    with pytest.raises(LiexError, match="no variant 'papre'"):
+    assert pose.subject_of("mouse", "paper") == "paper"
+    with pytest.raises(LiexError, match=r"no variant 'papre'.*paper-no-metric, rf, cnn"):
         pose.evaluate_pose("mouse", "clean", "papre")
 
 
-def test_errors_over_sizes_are_told_in_per_cent_of_the_spine(monkeypatch):
-    asked: list[Any] = []
-
-    def measured(animal: str, split: str, variant: str, **how: Any) -> dict[str, Any]:
-        asked.append((animal, split, variant, how["spine_mm"], how["n_frames"]))
-        error = {50.0: 2.0, 80.0: 2.4}[how["spine_mm"]]
-        return {"mean_joint_error_mm": error, "n_frames": 7, "protocol": "as told"}
+def test_errors_over_sizes_are_in_per_cent_of_the_spine(monkeypatch):
+    def measured(animal: str, spine_mm: float, n_frames: int, **_: Any) -> dict[str, Any]:
+        return {"mean_joint_error_mm": 0.04 * spine_mm + 1, "n_frames": n_frames, "protocol": ""}
 
     monkeypatch.setattr(pose, "evaluate_pose", measured)
-    result = pose.evaluate_sizes("mouse", (50.0, 80.0), n_frames=7)
-    assert asked == [("mouse", "clean", "default", 50.0, 7), ("mouse", "clean", "default", 80.0, 7)]
-    assert result["error_percent_of_spine"] == pytest.approx({"50": 4.0, "80": 3.0})
-    assert result["ratio_to_best"] == pytest.approx({"50": 4 / 3, "80": 1.0})
-    assert result["worst_ratio"] == pytest.approx(4 / 3)
+    monkeypatch.setattr(pose, "sizes_of", lambda animal: (50.0, 100.0))
+    result = pose.evaluate_sizes("mouse", n_frames=7)
+    assert result["error_percent_of_spine"] == pytest.approx({"50": 6.0, "100": 5.0})
+    assert result["ratio_to_best"] == pytest.approx({"50": 1.2, "100": 1.0})
+    assert (result["worst_ratio"], result["n_frames"]) == (pytest.approx(1.2), 7)
 
 
-def test_the_numbers_of_evaluate_speed_are_called_as_they_have_always_been(
-    small_world, monkeypatch
-):
+@pytest.mark.usefixtures("small_world")
+def test_the_numbers_of_evaluate_speed_have_their_names(monkeypatch):
     def one_of_640(name: str, *how: Any) -> list[SyntheticSession]:
         return [SyntheticSession.draw(3, 6, sensor=PRIMESENSE_SENSOR, name=name)]
 
@@ -151,17 +111,25 @@ def test_the_numbers_of_evaluate_speed_are_called_as_they_have_always_been(
     monkeypatch.setattr(speed, "N_FRAMES", 8)
     monkeypatch.setattr(speed, "N_REPEATS", 1)
     result = speed.evaluate_speed("mouse")
-    assert set(result) >= SPEED_KEYS
+    assert set(result) >= {"animal", "frames_per_s_1core", "frames_per_s_2cores", "machine"}
     assert set(result["stages_ms"]) == {"foreground", "candidates", "choice"}
-    assert all(value > 0 for value in result["stages_ms"].values())
+    assert all(value > 0 for value in (*result["stages_ms"].values(), result["ratio_to_paper"]))
     assert set(result["cost_ms"]["joints"]) == {"1", "2", "4"}
     assert set(result["cost_ms"]["pixels"]) == {"320 x 240", "640 x 480"}
-    assert result["ratio_to_paper"] > 0
-    assert result["frames_per_s_1core"] > 0
     assert json.loads(json.dumps(result, allow_nan=False)) == result
 
 
-def test_what_is_lost_in_a_rendered_recording_counts_as_lost(small_world, monkeypatch):
+def test_a_clock_restores_the_threads_and_a_process_that_fails_says_so():
+    before = numba.get_num_threads()
+    with pytest.raises(MemoryError), speed.two_cores():
+        raise MemoryError
+    assert numba.get_num_threads() == before
+    with pytest.raises(LiexError, match=r"os:abort_not_there failed.*report this"):
+        speed.isolated("os:abort_not_there")
+
+
+@pytest.mark.usefixtures("small_world")
+def test_what_is_lost_in_a_rendered_recording_counts_as_lost(monkeypatch):
     drawn = SyntheticSession.depths
 
     def without_frame_4(self: SyntheticSession, start: int, stop: int) -> np.ndarray:
@@ -171,9 +139,8 @@ def test_what_is_lost_in_a_rendered_recording_counts_as_lost(small_world, monkey
 
     monkeypatch.setattr(SyntheticSession, "depths", without_frame_4)
     sessions = recording.test_split("clean", n_sessions=1)
-    errors = pose.pose_errors(
-        toy_estimator("mouse", "default"), sessions, Plan.load("mouse"), silent
-    )
+    toys = {"": toy_estimator("mouse", "default")}
+    errors = pose.errors_of(toys, sessions, Plan.load("mouse"), silent)[""]
     assert np.flatnonzero(np.isnan(errors.error_mm)).tolist() == [4]
     assert errors.summary()["lost_rate"] == pytest.approx(0.1)
 
@@ -256,26 +223,165 @@ def test_rows_that_the_reference_does_not_trust_and_frames_that_do_not_exist_are
     assert result["heading_median_deg"] == pytest.approx(np.degrees(0.1), abs=1e-3)
 
 
-def test_a_reference_without_its_columns_is_refused(tmp_path, mouse, session):
-    reference_of(mouse, (0, 0), 0).drop(columns="angle_rad").to_csv(
-        tmp_path / "other.csv", index=False
-    )
-    with pytest.raises(LiexError, match="angle_rad") as error:
-        pose.evaluate_reference(session, tmp_path / "other.csv")
-    assert "\n" not in str(error.value)
-
-
-def test_a_reference_that_is_missing_or_empty_is_refused(tmp_path, session):
+def test_a_reference_that_cannot_be_used_is_refused_in_one_sentence(tmp_path, mouse, session):
+    whole = reference_of(mouse, (0, 0), 0)
+    path = tmp_path / "other.csv"
+    for table, expected in (
+        (whole.drop(columns="angle_rad"), "angle_rad"),
+        (whole.assign(frame=whole["frame"] + 1000), "column frame counts"),
+        (pd.DataFrame(), "other.csv should be a table"),
+    ):
+        table.to_csv(path, index=False)
+        path.write_text("") if table.empty else None
+        with pytest.raises(LiexError, match=expected) as error:
+            pose.evaluate_reference(session, path)
+        assert "\n" not in str(error.value)
     with pytest.raises(LiexError, match="absent"):
         pose.evaluate_reference(session, tmp_path / "absent.csv")
-    (tmp_path / "empty.csv").write_text("")
-    with pytest.raises(LiexError, match="empty"):
-        pose.evaluate_reference(session, tmp_path / "empty.csv")
 
 
-def test_a_reference_that_shares_no_frame_with_the_session_is_refused(tmp_path, mouse, session):
-    reference_of(mouse, (0, 0), 0).assign(frame=lambda t: t["frame"] + 1000).to_csv(
-        tmp_path / "o.csv", index=False
+# axes and headings
+
+
+@pytest.mark.parametrize(
+    ("a", "b", "degrees"),
+    [(0, 180, 0), (10, 350, 20), (10, 170, 20), (0, 90, 90), (5, 94, 89), (725, 7, 2)],
+)
+def test_two_axes_differ_by_a_right_angle_at_most(a, b, degrees):
+    both = np.radians([a]), np.radians([b])
+    for pair in (both, both[::-1]):
+        found = np.degrees(pose.angle_between_axes(*pair))
+        assert found == pytest.approx(degrees, abs=1e-9)
+    assert np.isnan(pose.angle_between_axes(np.array([np.nan]), both[0])).all()
+
+
+@pytest.mark.parametrize(
+    ("degrees", "expected"),
+    [
+        ([0, 10, 20, 30], 0),
+        ([0, 180, 0, 0], 2),
+        ([0, 89, 178, 267, 356], 0),
+        ([0, 91, 91, 0], 2),
+        ([170, -170, 175], 0),  # over the seam, not round
+        ([0, np.nan, np.nan, 180, 180], 1),
+        ([], 0),
+    ],
+)
+def test_a_reversal_is_a_turn_of_more_than_a_right_angle_between_measured_frames(degrees, expected):
+    assert pose.count_reversals(np.radians(np.array(degrees, float))) == expected
+
+
+# animals of another build
+
+N = 400
+LENGTH_MM = 60.0
+
+
+def made(seed: int, sd_mm: float = 1.0, up_mm: float = 0.0, told: float = 1.0) -> pose.Built:
+    """A track whose errors are Gaussian and whose heights are off throughout."""
+    rng = np.random.default_rng(seed)
+    truth = np.cumsum(rng.normal(size=(N, MOUSE.n_joints, 3)), axis=0) * 0.1
+    truth += np.arange(MOUSE.n_joints)[:, None] * [15.0, 0.0, 0.0]
+    track = Track.empty(MOUSE, np.arange(N) * 33_000_000, "")
+    track.joints_mm[:] = truth + rng.normal(0.0, sd_mm, truth.shape) + [0.0, 0.0, up_mm]
+    for column in (track.sd_mm, track.sd_xy_mm, track.sd_z_mm):
+        column[:] = told * sd_mm
+    off = np.linalg.norm(track.joints_mm - truth, axis=-1).mean(axis=1)
+    track.predicted_error_mm[:] = off + rng.normal(0.0, 0.1, N)
+    track.p_flip[:] = 0.02
+    return pose.Built(track, truth, LENGTH_MM, 1.03 * LENGTH_MM, MOUSE.tip)
+
+
+def test_honest_tracks_hold_nine_in_ten_and_others_fewer_or_more() -> None:
+    honest = pose.build_figures([made(1), made(2)], MOUSE.names)
+    assert honest["interval90"] == pytest.approx(0.9, abs=0.01)
+    assert honest["interval90_least"] == min(honest["interval90_by_joint"].values()) > 0.85
+    assert pose.build_figures([made(1, told=0.5)], MOUSE.names)["interval90"] < 0.65
+    too_high = pose.build_figures([made(1, up_mm=3.0), made(2, up_mm=-3.0)], MOUSE.names)
+    assert too_high["interval90_z"] < 0.3 < 0.85 < too_high["interval90_x_y"]
+    assert too_high["height_off_mm"] == pytest.approx(3.0, abs=0.1)
+    assert too_high["height_bias_mm"] == pytest.approx(0.0, abs=0.1)
+
+
+def test_errors_are_of_the_length_with_an_interval_over_recordings() -> None:
+    figures = pose.build_figures([made(k, sd_mm=1.0 + k) for k in range(4)], MOUSE.names)
+    low, high = figures["error_percent95"]
+    assert low < figures["error_percent"] < high
+    assert figures["error_percent"] == pytest.approx(
+        100.0 * figures["mean_joint_error_mm"] / LENGTH_MM
     )
-    with pytest.raises(LiexError, match="frame"):
-        pose.evaluate_reference(session, tmp_path / "o.csv")
+    assert figures["spearman"] > 0.9
+    assert figures["length_off"] == pytest.approx(0.03)
+    assert figures["found"] == 1.0
+
+
+def test_exchanged_ends_are_counted_in_a_row_and_by_what_was_told() -> None:
+    row = made(3)
+    turned = slice(100, 105)
+    row.track.joints_mm[turned] = row.truth[turned][:, ::-1]
+    row.track.p_flip[turned] = 0.9
+    figures = pose.build_figures([row, made(4)], MOUSE.names)
+    assert figures["longest_flip"] == 5
+    assert figures["flips"] == pytest.approx(5 / (2 * N))
+    assert [(c["n"], c["flipped"]) for c in figures["p_flip"]] == [
+        (2 * N - 5, 0.0),
+        (5, 1.0),
+    ]
+    assert figures["wrong_but_trusted"] == pytest.approx(5 / (2 * N))
+    row.track.flag[turned] = "doubtful"
+    assert pose.build_figures([row], MOUSE.names)["wrong_but_trusted"] == 0.0
+
+
+def test_a_recording_in_which_nothing_was_found_counts_as_not_found() -> None:
+    nothing = Track.empty(MOUSE, np.arange(N) * 33_000_000)
+    lost = pose.Built(nothing, made(1).truth, LENGTH_MM, np.nan, MOUSE.tip)
+    assert pose.build_figures([made(1), lost], MOUSE.names)["found"] == 0.5
+    assert pose.build_figures([lost], MOUSE.names) == {
+        "n_recordings": 1,
+        "n_frames": N,
+        "found": 0.0,
+    }
+
+
+@pytest.mark.slow
+def test_a_mouse_of_another_build_stands_beside_a_usual_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(pose, "N_FRAMES", 40)
+    file = tmp_path / "pose.json"
+    words = ["evaluate", "pose", "--split", "other-build", "--frames", "1", "--json", str(file)]
+    result = CliRunner().invoke(cli.app, words)
+    assert result.exit_code == 0, result.output
+    told = json.loads(file.read_text())
+    for name in ("other", "usual"):
+        assert told[name]["n_frames"] == 40
+        assert told[name]["found"] > 0.9
+        assert told[name]["error_percent"] < 15.0
+    assert told["ratio_to_usual"] == pytest.approx(
+        told["other"]["error_percent"] / told["usual"]["error_percent"]
+    )
+
+
+def test_the_sealed_animals_are_others_than_those_of_development() -> None:
+    assert not {*pose.SEEDS, *range(201, 230)} & {*pose.SEALED_SEEDS}
+
+
+def test_cameras_and_noise_go_in_turn() -> None:
+    made = [pose.film("mouse", 500, k, "other") for k in range(12)]
+    assert len({(one.camera.width, round(one.camera.fx)) for one in made}) >= 4
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (["--animal", "hand"], "is of mouse and fish"),
+        (["--variant", "paper"], "bundled model"),
+        (["--frames", "99999"], "at most that many"),
+    ],
+)
+def test_what_cannot_be_measured_is_told(words: list[str], told: str) -> None:
+    result = CliRunner().invoke(cli.app, ["evaluate", "pose", "--split", "other-build", *words])
+    assert isinstance(result.exception, LiexError)
+    assert told in str(result.exception)
+    result = CliRunner().invoke(cli.app, ["evaluate", "pose", "--sealed"])
+    assert "leave it out" in str(result.exception)

@@ -8,12 +8,12 @@ from functools import partial
 
 import numpy as np
 import pytest
-from liex_lab.dashboards.paper.scenes import draw_scene
+from liex_lab.dashboards.paper.figures import draw_scene
 from liex_lab.pipelines.evaluation import scenes
 from liex_lab.pipelines.evaluation.scenes import Outcome, cases, evaluate_scenes
 
 from liex_lab.errors import EstimationError, LiexError
-from liex_lab.evaluation.scenes import Individual
+from liex_lab.evaluation.scores import Individual
 from liex_lab.simulation.scenes.catalogue import SEALED_FROM
 
 
@@ -60,12 +60,9 @@ def test_each_row_stands_beside_the_plain_scene_of_the_same_animal(monkeypatch):
     assert told[0] == (0, 3, "scene plain")
 
 
-def test_no_seed_of_development_is_sealed():
+def test_the_sealed_seeds_are_no_others_and_are_used_only_where_asked(monkeypatch):
     assert set(scenes.SEEDS).isdisjoint(scenes.SEALED_SEEDS)
     assert max(scenes.SEEDS) < SEALED_FROM <= min(scenes.SEALED_SEEDS)
-
-
-def test_the_sealed_seeds_are_used_where_asked_only(monkeypatch):
     taken = []
 
     def row(name, case, seeds, n_frames, draw):

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from liex_lab.dashboards.paper.confusion import draw_confusions
+from liex_lab.dashboards.paper.figures import draw_confusions
 from liex_lab.pipelines.evaluation.actions import one_hour, track_error_mm
 from liex_lab.pipelines.training import agent_tracks as module
 from liex_lab.pipelines.training.agent_tracks import AgentTrack, Scenario, acted, thinned

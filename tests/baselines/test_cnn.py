@@ -11,7 +11,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from liex_lab.baselines.patches import PATCH, frames_of, joints_of, patches_of, targets_of
+from liex_lab.baselines._kernels import PATCH
+from liex_lab.baselines.cnn import frames_of, joints_of, patches_of, targets_of
 from liex_lab.estimation.method import METHODS
 from liex_lab.scene.height_maps import in_camera_frame, in_view_frame
 from tests.estimation.toy import toy_mice, training_set

@@ -1,7 +1,7 @@
-"""Numba kernels of the RF baseline: Hough votes of an animal's pixels for its position and heading.
+"""Numba kernels of the baselines: Hough votes of the RF's pixels, and the CNN's depth patches.
 
-F1's trees vote from pixels for the base's position and heading, F2's trees for the pose; the
-mean-shift mode of the votes is taken (Lie-X section 5.2).
+F1's trees vote from pixels for the base's position and heading, F2's trees for the pose; the answer
+is the mean-shift mode of the votes (Lie-X section 5.2).
 """
 
 from __future__ import annotations
@@ -19,6 +19,9 @@ from liex_lab.scene._height_map_kernels import crop_camera
 _BINS = 72  # of the circle in which headings are counted: 5 degrees each
 _SMOOTH = 3  # bins to either side that a vote for a heading also counts in
 _SETTLE = 2  # times the few mean-shift steps of `mode_of_votes`
+PATCH = 224  # pixels of a patch's side
+PATCH_MARGIN = 1.1
+HEIGHTS_PER_MM = 16.0
 
 
 class VotingForest(NamedTuple):
@@ -320,3 +323,64 @@ def guess_all(heights, crop_cameras, found, settings, where, pose, levers, tree,
         mode_of_votes(votes, settings.bandwidths[1], values)
         rotations = np.empty((n_joints, 3, 3))
         unfold(values, levers, place, heading, tree, rotations, positions[i])
+
+
+@njit(cache=True, parallel=True)
+def frames_all(heights, crop_cameras, frames):
+    for k in prange(len(crop_cameras)):
+        camera = crop_camera(crop_cameras[k])
+        low = np.full(2, 1 << 30)
+        high = np.full(2, -1)
+        total = 0.0
+        n = 0
+        for row in range(heights.shape[1]):
+            for column in range(heights.shape[2]):
+                h = heights[k, row, column]
+                if h > 0:
+                    low[0], low[1] = min(low[0], column), min(low[1], row)
+                    high[0], high[1] = max(high[0], column), max(high[1], row)
+                    total = total + h
+                    n = n + 1
+        side = max(high[0] - low[0], high[1] - low[1]) + 1
+        frames[k, 0] = camera.u0 + camera.step * (low[0] + high[0]) / 2
+        frames[k, 1] = camera.v0 + camera.step * (low[1] + high[1]) / 2
+        frames[k, 2] = 0.5 * PATCH_MARGIN * side * camera.step
+        frames[k, 3] = camera.distance - total / max(n, 1) / HEIGHTS_PER_MM
+        frames[k, 4] = frames[k, 2] * frames[k, 3] / np.sqrt(camera.fx * camera.fy)
+
+
+@njit(cache=True)
+def shade(heights, row, column, level, per_mm):
+    """Brightness of one pixel of a height map; `level` is the animal's mean height, 1/16 mm."""
+    if (
+        not (0 <= row < heights.shape[0] and 0 <= column < heights.shape[1])
+        or heights[row, column] <= 0
+    ):
+        return 0.0
+    return min(
+        max(127.5 * (1.0 + (heights[row, column] - level) / HEIGHTS_PER_MM * per_mm), 1.0), 255.0
+    )
+
+
+@njit(cache=True, parallel=True)
+def patches_all(heights, crop_cameras, frames, patches):
+    for k in prange(len(crop_cameras)):
+        camera = crop_camera(crop_cameras[k])
+        scale = 2.0 * frames[k, 2] / camera.step / PATCH  # height map pixels a patch pixel
+        left = (frames[k, 0] - frames[k, 2] - camera.u0) / camera.step
+        top = (frames[k, 1] - frames[k, 2] - camera.v0) / camera.step
+        level = (camera.distance - frames[k, 3]) * HEIGHTS_PER_MM
+        per_mm = 1.0 / frames[k, 4]
+        for i in range(PATCH):
+            y = top + (i + 0.5) * scale
+            row = int(np.floor(y))
+            for j in range(PATCH):
+                x = left + (j + 0.5) * scale
+                column = int(np.floor(x))
+                a = x - column
+                b = y - row
+                above = (1 - a) * shade(heights[k], row, column, level, per_mm)
+                above += a * shade(heights[k], row, column + 1, level, per_mm)
+                below = (1 - a) * shade(heights[k], row + 1, column, level, per_mm)
+                below += a * shade(heights[k], row + 1, column + 1, level, per_mm)
+                patches[k, i, j] = (1 - b) * above + b * below

@@ -9,10 +9,9 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from liex_lab.dashboards.paper.nyu_hands import draw_nyu_hands
+from liex_lab.dashboards.paper.figures import draw_poses
 from liex_lab.pipelines.evaluation import nyu
 
-from liex_lab.evaluation.nyu import nyu_errors
 from liex_lab.recordings.formats.images.nyu import PALM, POINTS, NyuReference
 
 PAPER = {
@@ -38,7 +37,7 @@ def test_published_answers_have_the_published_errors(
     method: str, folder: Path, reference: NyuReference
 ) -> None:
     expected: dict[str, Any] = json.loads((folder / "expected.json").read_text())["results"][method]
-    found = nyu_errors(reference.answers[method], reference.truth)
+    found = nyu.nyu_errors(reference.answers[method], reference.truth)
     assert found["root_estimated_mm_14"] == pytest.approx(
         expected["mean_joint_error_mm_14"], abs=1e-5
     )
@@ -68,7 +67,7 @@ def random_hands(n: int) -> np.ndarray:
 
 def test_given_the_root_a_shift_of_the_whole_hand_costs_nothing() -> None:
     truth = random_hands(50)
-    found = nyu_errors(truth + np.array([3.0, 0.0, 4.0]), truth)
+    found = nyu.nyu_errors(truth + np.array([3.0, 0.0, 4.0]), truth)
     assert found["root_estimated_mm_14"] == pytest.approx(5.0)
     assert found["root_estimated_mm_13"] == pytest.approx(5.0)
     assert found["root_given_mm_14"] == pytest.approx(0.0, abs=1e-9)
@@ -78,7 +77,7 @@ def test_the_palm_alone_counts_only_where_it_is_counted() -> None:
     truth = random_hands(30)
     answer = truth.copy()
     answer[:, PALM] += [0.0, 0.0, 14.0]
-    found = nyu_errors(answer, truth)
+    found = nyu.nyu_errors(answer, truth)
     assert (found["root_estimated_mm_14"], found["root_estimated_mm_13"]) == pytest.approx(
         (1.0, 0.0)
     )
@@ -89,9 +88,9 @@ def test_lost_frames_are_told_and_not_averaged() -> None:
     truth = random_hands(10)
     answer = truth + np.array([2.0, 0.0, 0.0])
     answer[3, 5] = np.nan
-    found = nyu_errors(answer, truth)
+    found = nyu.nyu_errors(answer, truth)
     assert (found["lost_rate"], found["root_estimated_mm_14"]) == pytest.approx((0.1, 2.0))
-    assert nyu_errors(np.full_like(truth, np.nan), truth) == {"n_frames": 10, "lost_rate": 1.0}
+    assert nyu.nyu_errors(np.full_like(truth, np.nan), truth) == {"n_frames": 10, "lost_rate": 1.0}
 
 
 def test_what_comes_from_test_labels_stands_beside_every_score(folder: Path) -> None:
@@ -100,9 +99,9 @@ def test_what_comes_from_test_labels_stands_beside_every_score(folder: Path) -> 
     assert "frames 1 to 2440" in told
     assert told.endswith("measured on: 2 of 3.")
     truth = NyuReference.load(folder)
-    numbers = nyu._frame_numbers(folder, len(truth.truth))
+    numbers = nyu.frame_numbers_in(folder, len(truth.truth))
     assert numbers.tolist() == [1]
-    same = nyu_errors(truth.answers["liex"][numbers - 1], truth.truth[numbers - 1])
+    same = nyu.nyu_errors(truth.answers["liex"][numbers - 1], truth.truth[numbers - 1])
     assert same["root_given_mm_14"] == pytest.approx(7.8645, abs=5e-4)
 
 
@@ -113,12 +112,16 @@ def test_ten_hands_are_shown_with_the_answers_of_all_and_ours_where_it_was_measu
     answers = {"v2v_posenet": truth + np.array([3.0, 0.0, 4.0]), "somebody": truth + 9.0}
     ours = np.stack([truth[0] + 1.0, np.full((14, 3), np.nan)])
     shown = nyu.shown_hands(NyuReference(truth, answers), np.array([1, 10]), ours)
-    assert [one["frame"] for one in shown] == [1, 10, 20, 29, 39, 48, 58, 67, 77, 86]
-    for one in shown:
-        np.testing.assert_array_equal(one["truth"], truth[one["frame"] - 1])
-    assert list(shown[0]["answers"]) == ["liex_lab", "v2v_posenet", "somebody"]
-    assert list(shown[1]["answers"]) == ["v2v_posenet", "somebody"]  # nothing was found there
-    assert nyu.shown_hands(NyuReference(truth[:3], {}), np.zeros(0, int), ours[:0])[2]["frame"] == 3
-    picture = cv2.imread(str(draw_nyu_hands(shown, tmp_path / "hands.png")))
-    assert picture is not None
-    assert picture.std() > 10
+    assert list(shown) == ["liex_lab", "v2v_posenet", "somebody"]
+    frames = [1, 10, 20, 29, 39, 48, 58, 67, 77, 86]
+    for hands in shown.values():
+        assert [one["head"] for one in hands] == [f"frame {k}" for k in frames]
+        for k, one in zip(frames, hands, strict=True):
+            np.testing.assert_array_equal(one["truth"], truth[k - 1])
+    assert ["pose" in one for one in shown["liex_lab"]] == [True] + 9 * [False]
+    assert all("pose" in one for one in shown["somebody"])
+    figure = cv2.imread(str(draw_poses("NYU", shown, tmp_path / "hands.png")))
+    assert figure is not None
+    assert figure.std() > 10
+    labels = nyu.shown_hands(NyuReference(truth[:3], {}), np.zeros(0, int), ours[:0])["labels"]
+    assert [one["head"] for one in labels] == ["frame 1", "frame 2", "frame 3"]

@@ -1,0 +1,545 @@
+"""Figures 7 to 20 of the Lie-X paper, and the scenes of `liex evaluate scenes`, as PNG.
+
+Nothing is computed here but errors that stand beside a pose.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from textwrap import fill
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from liex_lab.evaluation.scores import Followed, Individual
+from liex_lab.recordings.formats.images.nyu import POINTS
+from liex_lab.simulation.recording import TrueRecording
+from liex_lab.simulation.scenes.recording import TrueAnimal
+from liex_lab.simulation.tracking_sequences import TestSequence
+
+Array = NDArray[np.float64]
+Edges = Sequence[tuple[int, int]]
+Results = Sequence[Mapping[str, Any]]
+
+METHODS = {  # variant: (name in the legend, colour, line)
+    "default": ("liex_lab", "#AA3377", "-"),
+    "paper": ("Lie-X, the paper's variant", "#4477AA", "-"),
+    "paper-one-pose": ("one initial pose", "#4477AA", ":"),
+    "paper-no-metric": ("no learned metric", "#4477AA", "--"),
+    "rf": ("RF", "#228833", "-"),
+    "cnn": ("CNN", "#CCBB44", "-"),
+}
+_NYU_METHODS = {
+    "liex_lab": "liex_lab",
+    "liex": "Lie-X, palm on\nthe true palm",
+    "v2v_posenet": "V2V-PoseNet",
+    "generalized_feedback": "Generalized\nFeedback",
+    "deepprior": "DeepPrior",
+}
+_NYU_BONES = (
+    *((f"{finger}_tip", f"{finger}_mid") for finger in ("pinky", "ring", "middle", "index")),
+    *((f"{finger}_mid", "palm") for finger in ("pinky", "ring", "middle", "index")),
+    *(("thumb_tip", "thumb_mid"), ("thumb_mid", "thumb_base"), ("thumb_base", "palm")),
+    *(("wrist_a", "palm"), ("wrist_b", "palm")),
+)
+_NYU_EDGES = [(list(POINTS).index(a), list(POINTS).index(b)) for a, b in _NYU_BONES]
+_TRACKERS = {  # row: (name in the legend, colour, width)
+    "single": ("single frames", "#999999", 1.0),
+    "algorithm3": ("Algorithm 3 on our parts", "#4477AA", 0.8),
+    "smoothed": ("smoothed", "#AA3377", 1.6),
+}
+_RECOGNISERS = {  # (name in the numbers, in accuracies): title
+    ("tangent", "tangent"): "paper's, tangent vectors",
+    ("joints", "joint"): "paper's, joint positions",
+    ("default", "default"): "default",
+}
+_TRUE = "#33AADD"
+_POSE = "#CC3311"
+_GREEN = "#228833"
+_DPI = 130
+_MOST_CANDIDATES = 40
+_MOST_STAGES = 8
+_SCENE_MOMENTS = (0.08, 0.4, 0.62, 0.95)  # of the recording
+_MOMENTS = 6  # of a tracked sequence
+_APART = 12  # frames between two of them, at least
+
+
+def draw_paper(results: Results, further: Mapping[str, Any], folder: Path) -> list[Path]:
+    """Write every figure for which there are numbers.
+
+    Args:
+        results: what was measured, by animal.
+        further: what other verbs measured.
+        folder: where the PNG files are written.
+
+    Returns:
+        Paths of the figures.
+    """
+    written = []
+    if any(one["sensitivity"] for one in results):
+        written.append(draw_sensitivity(results, folder / "fig07_sensitivity.png"))
+    written.append(draw_cumulative(results, folder / "fig08_cumulative_error.png"))
+    written.append(draw_joint_errors(results, folder / "error_per_joint.png"))
+    for one in results:
+        animal, shown = one["animal"], one["illustration"]
+        hand = animal == "hand"
+        written.append(draw_candidates(shown, folder / f"fig13_candidates_{animal}.png"))
+        written.append(draw_convergence(shown, folder / f"fig16_convergence_{animal}.png"))
+        names = {
+            False: f"fig{'10' if hand else '09'}_poses_{animal}.png",
+            True: f"fig{'11' if hand else '09'}_poses_{animal}_side.png",
+        }
+        for side, name in names.items():
+            if one["examples"]:
+                where = "from the side" if side else "from the camera"
+                title = f"{animal}, {where}: truth, blue; pose of each method, red; dot: base"
+                written.append(draw_poses(title, one["examples"], folder / name, side))
+        if one["failures"]:
+            title = f"{animal}, the largest errors: truth, blue; measured, red"
+            path = folder / f"fig17_failures_{animal}.png"
+            written.append(draw_poses(title, one["failures"], path))
+    if further["nyu"]:
+        title = "NYU test frames, 14 points: labels, blue; answer, red"
+        path = folder / "fig12_nyu_hands.png"
+        written.append(draw_poses(title, further["nyu_hands"], path))
+    if further["tracking"]:
+        sequence, rows = further["tracked"]
+        written.append(draw_tracking(sequence, rows, folder / "fig18_tracking.png"))
+    if further["actions"]:
+        written.append(draw_key_frames(further["key_frames"], folder / "fig19_key_frames.png"))
+        written.append(draw_confusions(further["actions"], folder / "fig20_confusions.png"))
+    return written
+
+
+def _sheet(
+    n_rows: int, n_columns: int, width: float, height: float, margin: tuple[float, float] = (0, 0)
+) -> tuple[Figure, list[list[Axes]]]:
+    """A figure with a grid of panels of `width` x `height` inches, and a margin around them."""
+    size = (width * n_columns + margin[0], height * n_rows + margin[1])
+    figure = Figure(figsize=size, layout="constrained")
+    return figure, figure.subplots(n_rows, n_columns, squeeze=False).tolist()
+
+
+def _save(figure: Figure, path: Path) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=_DPI)
+    return path
+
+
+def _bones(
+    panel: Axes, points: Array, edges: Edges, colour: str, width: float, dot: int | None = 0
+) -> None:
+    """A skeleton of points (J, 2), with a dot on one joint."""
+    for a, b in edges:
+        ends = points[[a, b]]
+        panel.plot(*ends.T, "-", color=colour, lw=width, solid_capstyle="round")
+    if dot is not None:
+        panel.plot(*points[dot], "o", color=colour, ms=2.5 * width)
+
+
+def _depth(panel: Axes, depth: NDArray[Any], low: float, high: float, colours: str) -> None:
+    """A depth image or height map without axes; unread pixels stay empty."""
+    shown = np.where(depth > 0, depth, np.nan).astype(float)
+    panel.imshow(shown, cmap=colours, vmin=low, vmax=high, interpolation="nearest")
+    panel.set(xticks=[], yticks=[])
+
+
+def _around(panel: Axes, middle: Sequence[float] | Array, half: float) -> None:
+    """Show the square around a point; y goes down."""
+    panel.set(xlim=(middle[0] - half, middle[0] + half), ylim=(middle[1] + half, middle[1] - half))
+
+
+def draw_sensitivity(results: Results, path: Path) -> Path:
+    """Fig. 7: the error over each of the five parameters; a red dot marks the value in use."""
+    curves = [curve for one in results for curve in one["sensitivity"].values()]
+    numbers = list(dict.fromkeys(number for curve in curves for number in curve["curves"]))
+    figure, grid = _sheet(max(len(numbers), 1), len(results), 3.8, 2.4)
+    for column, one in enumerate(results):
+        for line, number in zip(grid, numbers, strict=True):
+            panel = line[column]
+            for variant, curve in one["sensitivity"].items():
+                name, colour, _ = METHODS[variant]
+                if number in curve.get("left_out", {}):
+                    reason = fill(f"{name} {curve['left_out'][number]}", 48)
+                    panel.text(0.04, 0.04, reason, fontsize=6, transform=panel.transAxes)
+                    continue
+                points = {p["value"]: p["mean_mm"] for p in curve["curves"].get(number, [])}
+                panel.plot([*points], [*points.values()], ".-", color=colour, label=name)
+                chosen = curve["chosen"][number]
+                panel.plot(chosen, points.get(chosen, np.nan), "o", color=_POSE, ms=6)
+            panel.set(xlabel=number, ylabel="mm")
+            panel.locator_params(axis="x", integer=True)
+            panel.margins(y=0.1)
+            panel.set_ylim(bottom=0)
+            panel.grid(alpha=0.3)
+        grid[0][column].set_title(one["animal"])
+    grid[0][0].legend(fontsize=7)
+    return _save(figure, path)
+
+
+def draw_cumulative(results: Results, path: Path) -> Path:
+    """Fig. 8: share of frames with a mean joint error within so many mm; lost ones never are."""
+    figure, grid = _sheet(len(results), max(len(one["splits"]) for one in results), 4.2, 3.2)
+    for line, one in zip(grid, results, strict=True):
+        for panel, split in zip(line, one["splits"], strict=False):
+            farthest = 0.0
+            for variant, row in one["rows"].items():
+                error = np.array(row["splits"][split]["error_quantiles_mm"])
+                if len(error):
+                    found = 100 * (1 - row["splits"][split]["lost_rate"])
+                    name, colour, style = METHODS[variant]
+                    share = np.linspace(0, found, len(error))
+                    panel.plot(error, share, style, color=colour, label=name, lw=1.6)
+                    farthest = max(farthest, float(error[round(0.85 * (len(error) - 1))]))
+            panel.set(title=f"{one['animal']}, {split}", xlim=(0, farthest), ylim=(0, 100))
+            panel.set(xlabel="mean joint error within, mm", ylabel="frames, %")
+            panel.grid(alpha=0.3)
+    grid[0][0].legend(fontsize=7, loc="lower right")
+    return _save(figure, path)
+
+
+def draw_joint_errors(results: Results, path: Path) -> Path:
+    """Mean error of every joint, by method."""
+    figure, grid = _sheet(len(results), max(len(one["splits"]) for one in results), 4.6, 3.2)
+    for line, one in zip(grid, results, strict=True):
+        joints = one["joints"]
+        for panel, split in zip(line, one["splits"], strict=False):
+            for variant, row in one["rows"].items():
+                name, colour, style = METHODS[variant]
+                if error := row["splits"][split]["joint_mm"]:
+                    panel.plot(error, style, marker=".", color=colour, label=name)
+            panel.set(title=f"{one['animal']}, {split}", ylabel="mean error, mm")
+            turn = 60 if len(joints) > 6 else 0
+            panel.set_xticks(range(len(joints)), joints, rotation=turn, fontsize=7)
+            panel.set_ylim(bottom=0)
+            panel.grid(alpha=0.3)
+    grid[0][0].legend(fontsize=7)
+    return _save(figure, path)
+
+
+def draw_poses(
+    title: str,
+    rows: Mapping[str, Sequence[Mapping[str, Any]]],
+    path: Path,
+    side: bool = False,
+) -> Path:
+    """Figs. 9 to 12 and 17: poses in some frames beside the truth, a row per method.
+
+    Args:
+        title: of the figure.
+        rows: by method, frames with `head`, `truth` (J, 3) mm, camera frame, `pose`, which is None
+            if nothing was found and absent if none is known, and, where a depth image is drawn,
+            `depth`, `camera`, `edges` and `spine_mm`.
+        path: the PNG to write.
+        side: view along the image's rows instead of along the optical axis.
+    """
+    n = max(1, *map(len, rows.values()))
+    figure, grid = _sheet(len(rows), n, 1.65, 2.1, (1.3, 0.6))
+    for line, (name, frames) in zip(grid, rows.items(), strict=True):
+        label = METHODS[name][0].replace(", ", ",\n") if name in METHODS else name
+        line[0].set_ylabel(_NYU_METHODS.get(name, label), fontsize=8)
+        for panel in line[len(frames) :]:
+            panel.set_axis_off()
+        for panel, one in zip(line, frames, strict=False):
+            _pose(panel, one, side)
+    figure.suptitle(fill(f"{title}; mean error in mm", int(14 * figure.get_figwidth())), fontsize=9)
+    return _save(figure, path)
+
+
+def _pose(panel: Axes, one: Mapping[str, Any], side: bool) -> None:
+    """One frame with its truth and a pose."""
+    truth: Array = one["truth"]
+    camera: Any = one.get("camera")
+    plane = [0, 2] if side else [0, 1]
+    low, high = truth.min(axis=0), truth.max(axis=0)
+    panel.set(xticks=[], yticks=[])
+    if camera is None or side:
+        panel.set_aspect("equal")
+        half = (0.75 if side else 0.65) * max(float((high - low)[: 3 if side else 2].max()), 1.0)
+        _around(panel, 0.5 * (low + high)[plane], half)
+    if side:
+        v, u = np.nonzero(one["depth"] > 0)
+        points = camera.unproject(np.stack([u, v], -1), one["depth"][v, u].astype(float))
+        near = (abs(points - 0.5 * (low + high)) < half).all(axis=1)
+        panel.plot(*points[near][:, plane].T, ".", color="#8a8f94", ms=1.6, alpha=0.7)
+    elif camera is not None:
+        middle, reach = float(truth[:, 2].mean()), 0.55 * one["spine_mm"]
+        _depth(panel, one["depth"], middle - 1.6 * reach, middle + reach, "gray")
+        panel.set_facecolor("#dfe3e6")
+
+    def flat(points: Array) -> Array:
+        return points[:, plane] if side or camera is None else camera.project(points)
+
+    edges = one.get("edges", _NYU_EDGES)
+    _bones(panel, flat(truth), edges, _TRUE, 1.4)
+    pose = one.get("pose")
+    said = "nothing found" if "pose" in one else "not kept"
+    if pose is not None:
+        _bones(panel, flat(pose), edges, _POSE, 1.4)
+        said = f"{np.linalg.norm(pose - truth, axis=-1).mean():.1f} mm"
+    if camera is not None and not side:
+        _, _ = panel.set_xlim(-0.5, camera.width - 0.5), panel.set_ylim(camera.height - 0.5, -0.5)
+    panel.set_title(f"{one['head']}\n{said}", fontsize=8)
+
+
+def _height_map(panel: Axes, shown: Mapping[str, Any], joints_px: Array) -> None:
+    """The illustrated animal with its truth and a candidate."""
+    heights = shown["heights"]
+    rows, columns = np.nonzero(heights > 0)
+    tallest = heights[heights > 0]
+    _depth(panel, heights, tallest.min() - 0.5 * np.ptp(tallest), tallest.max(), "gray")
+    middle = 0.5 * (columns.min() + columns.max()), 0.5 * (rows.min() + rows.max())
+    _around(panel, middle, 0.75 * max(np.ptp(rows), np.ptp(columns)))
+    _bones(panel, shown["true_px"], shown["edges"], _TRUE, 1.0)
+    _bones(panel, joints_px, shown["edges"], "#EE6677", 1.5)
+
+
+def draw_candidates(shown: Mapping[str, Any], path: Path) -> Path:
+    """Figs. 13 to 15: candidates as the learned metric ranks them, estimated and true error."""
+    ranked = shown["ranked"]
+    n = min(len(ranked["score_mm"]), _MOST_CANDIDATES)
+    columns = min(n, 10 if n > 10 else 5)
+    figure, grid = _sheet(-(-n // columns), columns, 1.7, 2.25)
+    true_rank = np.argsort(np.argsort(ranked["error_mm"], kind="stable")) + 1
+    for k, panel in enumerate(panel for line in grid for panel in line):
+        if k >= n:
+            panel.set_axis_off()
+            continue
+        _height_map(panel, shown, ranked["joints_px"][k])
+        above = f"{k + 1}: {ranked['score_mm'][k]:.2f} mm"
+        panel.set_title(above, color="#117733", fontsize=8)
+        below = f"{true_rank[k]}: {ranked['error_mm'][k]:.2f} mm"
+        panel.set_xlabel(below, color=_POSE, fontsize=8)
+    figure.suptitle(
+        f"{shown['animal']}: candidates of one image, red; truth, blue. Above: rank and predicted "
+        "error; below: true rank and error.\nRank correlation of the two, mean of "
+        f"{shown['n_images']} images: {shown['rank_correlation']:.2f}",
+        fontsize=8,
+    )
+    return _save(figure, path)
+
+
+def draw_convergence(shown: Mapping[str, Any], path: Path) -> Path:
+    """Fig. 16: one candidate from start to end, and all errors after every joint and round."""
+    steps = shown["steps"]
+    n = len(steps["names"])
+    stages = np.unique(np.linspace(0, n - 1, min(_MOST_STAGES, n)).round().astype(int))
+    figure = Figure(figsize=(1.7 * len(stages), 5.0), layout="constrained")
+    grid = figure.add_gridspec(2, len(stages), height_ratios=[1, 1.6])
+    for k, step in enumerate(stages):
+        panel = figure.add_subplot(grid[0, k])
+        _height_map(panel, shown, steps["joints_px"][step])
+        panel.set_title(steps["names"][step], fontsize=8)
+        panel.set_xlabel(f"{steps['example_mm'][step]:.1f} mm", fontsize=8)
+    panel = figure.add_subplot(grid[1, :])
+    blue = METHODS["paper"][1]
+    half: dict[str, Any] = {
+        "label": "middle half of all candidates",
+        "color": blue,
+        "alpha": 0.2,
+        "lw": 0,
+    }
+    panel.fill_between(range(n), steps["low_mm"], steps["high_mm"], **half)
+    panel.plot(steps["median_mm"], color=blue, label="median of all candidates")
+    first = "the candidate ranked first, mean"
+    panel.plot(steps["best_mm"], color=METHODS["default"][1], label=first)
+    ticks = range(0, n, -(-n // 40))
+    names = [steps["names"][k] for k in ticks]
+    panel.set_xticks(ticks, names, rotation=60, fontsize=7, ha="right")
+    panel.set(ylabel="mean joint error, mm", ylim=(0, None))
+    title = f"{shown['animal']}: after every joint and round, {shown['n_images']} images"
+    panel.set_title(title, fontsize=8)
+    panel.legend(fontsize=7)
+    panel.grid(alpha=0.3)
+    return _save(figure, path)
+
+
+def draw_tracking(sequence: TestSequence, rows: Mapping[str, Followed], path: Path) -> Path:
+    """Fig. 18: error of tracking over time beside single frames, and the worst moments.
+
+    Args:
+        sequence: the sequence with its truth.
+        rows: `single` (frames by themselves), and where they exist `algorithm3` and `smoothed`.
+        path: the PNG to write; its folder is made.
+    """
+    figure = Figure(figsize=(13.0, 6.4), layout="constrained")
+    grid = figure.add_gridspec(2, _MOMENTS, height_ratios=(1.3, 1.0))
+    panel = figure.add_subplot(grid[0, :])
+    seconds = (sequence.times_ns - sequence.times_ns[0]) * 1e-9
+    top = panel.get_xaxis_transform()
+    for event in sequence.events:
+        if event.kind not in ("hidden", "dropped"):
+            start, stop = seconds[event.start], seconds[event.stop - 1]
+            panel.axvspan(start, stop, color="#000000", alpha=0.05, lw=0)
+            panel.text(start, 0.98, event.kind, fontsize=7, va="top", transform=top)
+    for name, (label, colour, width) in _TRACKERS.items():
+        if name in rows:
+            error = rows[name].error_mm
+            mean = float(np.nanmean(error))
+            label = f"{label}: mean {mean:.2f} mm"
+            panel.plot(seconds, error, color=colour, lw=width, label=label)
+            panel.axhline(mean, color=colour, lw=width, ls="--")
+    panel.set(xlabel="time, s", ylabel="mean joint error, mm", yscale="log")
+    panel.margins(x=0.0)
+    panel.legend(loc="upper right", fontsize=8)
+    for k, frame in enumerate(worst_moments(rows["single"].error_mm)):
+        _moment(figure.add_subplot(grid[1, k]), sequence, rows, frame)
+    return _save(figure, path)
+
+
+def worst_moments(error: Array) -> list[int]:
+    """At most six frames with the largest errors (n,), none within twelve frames of another."""
+    left = np.nan_to_num(error, nan=-1.0)
+    chosen: list[int] = []
+    while len(chosen) < _MOMENTS and left.max() >= 0:
+        chosen.append(int(np.argmax(left)))
+        left[max(0, chosen[-1] - _APART) : chosen[-1] + _APART] = -1.0
+    return sorted(chosen)
+
+
+def _moment(panel: Axes, sequence: TestSequence, rows: Mapping[str, Followed], frame: int) -> None:
+    """The depth around the animal with the true and the estimated skeletons."""
+    spine = sequence.spine_mm
+    T_camera_arena = sequence.T_arena_camera.inverse()
+    middle = sequence.joints_camera[frame].mean(axis=0)
+    depth = sequence.depths(frame, frame + 1)[0]
+    _depth(panel, depth, middle[2] - 0.6 * spine, middle[2] + 0.6 * spine, "Greys")
+    reach = 0.9 * spine * sequence.camera.fx / middle[2]
+    _around(panel, sequence.camera.project(middle), reach)
+    shown = {"": (sequence.joints_arena[frame], _GREEN)}
+    for name in ("single", "smoothed"):
+        if name in rows:
+            shown[name] = (rows[name].joints[frame], _TRACKERS[name][1])
+    for joints, colour in shown.values():
+        points = sequence.camera.project(T_camera_arena @ joints)
+        _bones(panel, points, sequence.skeleton.edges, colour, 2.0, -1)
+    alone = rows["single"].error_mm[frame]
+    tracked = rows["smoothed"].error_mm[frame] if "smoothed" in rows else np.nan
+    panel.set_title(f"frame {frame}: {alone:.0f} mm, smoothed {tracked:.0f} mm", fontsize=8)
+
+
+def draw_key_frames(acts: Sequence[Mapping[str, Any]], path: Path) -> Path:
+    """Fig. 19: key frames and path of each action.
+
+    Args:
+        acts: of each action `word`, `side`, `path_mm`, `bodies_mm`, `skeletons_mm`, `edges` and
+            `seconds`.
+        path: the PNG to write; its folder is made.
+    """
+    figure, grid = _sheet(-(-len(acts) // 3), 3, 3.6, 3.5, (0.0, 0.4))
+    panels = [panel for line in grid for panel in line]
+    for panel in panels[len(acts) :]:
+        panel.set_axis_off()
+    for panel, act in zip(panels, acts, strict=False):
+        for body in act["bodies_mm"]:
+            panel.plot(*body.T, ".", color="#b9bfc5", ms=1.6, alpha=0.6)
+        for joints in act["skeletons_mm"]:
+            _bones(panel, joints, act["edges"], "#3a4046", 0.9, None)
+        along = act["path_mm"]
+        order = np.linspace(0, 1, len(along))
+        panel.scatter(along[:, 0], along[:, 1], c=order, cmap="coolwarm", s=9, zorder=3)
+        everything = np.concatenate([along, *act["bodies_mm"], *act["skeletons_mm"]])
+        low, high = everything.min(axis=0), everything.max(axis=0)
+        half = 0.5 * float((high - low).max()) + 8.0  # square, in any direction
+        x, y = 0.5 * (low + high) - half
+        panel.plot([x + 2.0, x + 22.0], [y + 2.0] * 2, "-", color="#000000", lw=2)
+        panel.set(xlim=(x, x + 2 * half), ylim=(y, y + 2 * half), xticks=[], yticks=[])
+        panel.set_aspect("equal")
+        where = "from the side" if act["side"] else "from above"
+        name = act["word"].replace("_", " ")
+        panel.set_title(f"{name}, {1000 * act['seconds']:.0f} ms, {where}", fontsize=9)
+    title = "Key frames of the fish's actions, and the path of the middle of its body"
+    figure.suptitle(f"{title} from blue to red; bar: 20 mm", fontsize=9)
+    return _save(figure, path)
+
+
+def draw_confusions(result: Mapping[str, Any], path: Path) -> Path:
+    """Fig. 20: confusion matrices of cut-out actions, rows the true action, shares in per cent.
+
+    Args:
+        result: what `evaluate_actions` found: confusion, accuracies and their 95 % intervals.
+        path: the PNG to write; its folder is made.
+    """
+    words = [str(word).replace("_", " ") for word in result["confusion"]["words"]]
+    side = 1.6 + 0.42 * len(words)
+    figure, (panels,) = _sheet(1, len(_RECOGNISERS), side, side + 0.4)
+    for panel, ((name, key), title) in zip(panels, _RECOGNISERS.items(), strict=True):
+        first = panel is panels[0]
+        low, high = (100 * bound for bound in result["accuracy_interval95"][name])
+        accuracy = result[f"{key}_accuracy"]
+        panel.set_title(f"{title}: {accuracy:.1%} ({low:.1f} to {high:.1f})", fontsize=9)
+        counts = np.asarray(result["confusion"][name], float)
+        share = 100.0 * counts / np.maximum(counts.sum(axis=1, keepdims=True), 1.0)
+        panel.imshow(share, cmap="Blues", vmin=0.0, vmax=100.0)
+        style: dict[str, Any] = {"ha": "center", "va": "center", "fontsize": 7}
+        for row, column in zip(*np.nonzero(counts), strict=True):
+            value = share[row, column]
+            colour = "white" if value > 55.0 else "black"
+            panel.text(column, row, f"{value:.0f}", color=colour, **style)
+        turned: dict[str, Any] = {"rotation": 60, "ha": "right", "rotation_mode": "anchor"}
+        panel.set_xticks(range(len(words)), words, fontsize=7, **turned)
+        panel.set_yticks(range(len(words)), words if first else [""] * len(words), fontsize=7)
+        panel.set_xlabel("recognised as", fontsize=8)
+        panel.set_ylabel("true action" if first else "", fontsize=8)
+    return _save(figure, path)
+
+
+def draw_scene(
+    name: str,
+    recording: TrueRecording,
+    truths: Sequence[TrueAnimal],
+    individuals: Sequence[Individual],
+    folder: Path,
+) -> Path:
+    """Frames of a scene with true and measured skeletons: the whole depth image, and near.
+
+    Args:
+        name: of the scene, which names the file.
+        recording: its frames.
+        truths: its animals, green.
+        individuals: what was measured, purple where it is trusted, else orange.
+        folder: of the PNG; it is made.
+    """
+    figure, panels = _sheet(2, len(_SCENE_MOMENTS), 3.75, 3.6)
+    for k, share in enumerate(_SCENE_MOMENTS):
+        frame = min(int(share * len(recording)), len(recording) - 1)
+        depth = recording.depths(frame, frame + 1)[0]
+        read = depth[depth > 0]
+        low, high = np.quantile(read, [0.01, 0.99]) if len(read) else (0.0, 1.0)
+        shown = [(truth.joints_camera[frame], _GREEN, 2.2) for truth in truths]
+        for one in individuals:
+            colour = "#AA3377" if one.trusted[frame] else "#EE7733"
+            shown.append((one.joints_camera[frame], colour, 1.2))
+        for panel in (panels[0][k], panels[1][k]):
+            _depth(panel, depth, low, high, "viridis_r")
+            panel.set_facecolor("black")
+            for joints, colour, width in shown:
+                _in_image(panel, recording, joints, colour, width)
+            panel.set(xlim=(-0.5, recording.width - 0.5), ylim=(recording.height - 0.5, -0.5))
+        view = ", ".join(f"{100 * truth.visible[frame]:.0f} %" for truth in truths)
+        title = f"{name}, frame {frame}, in view: {view or 'none'}"
+        panels[0][k].set_title(title, fontsize=8)
+        if truths and np.isfinite(truths[0].joints_camera[frame]).all():
+            middle, spine = truths[0].joints_camera[frame].mean(axis=0), truths[0].spine_mm
+            near = panels[1][k]
+            near.images[0].set_clim(middle[2] - 0.8 * spine, middle[2] + 0.8 * spine)
+            reach = 1.6 * spine * recording.camera.fx / middle[2]
+            _around(near, recording.camera.project(middle), reach)
+    return _save(figure, folder / f"{name}.png")
+
+
+def _in_image(
+    panel: Axes, recording: TrueRecording, joints: Array, colour: str, width: float
+) -> None:
+    """Bones where the joints are those of the recording's animal, else dots."""
+    if not np.isfinite(joints).all():
+        return
+    skeleton, points = recording.skeleton, recording.camera.project(joints)
+    if len(joints) == skeleton.n_joints:
+        _bones(panel, points, skeleton.edges, colour, width, skeleton.tip)
+    else:
+        panel.plot(*points.T, ".", color=colour, ms=3.0)
