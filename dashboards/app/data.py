@@ -223,7 +223,7 @@ class StudyData:
             if isinstance(table, pd.DataFrame):
                 stated = {name: value for name, value in entry.who.items() if value}
                 tables.append(table.assign(key=entry.key, **stated))
-        whole, notes = pd.DataFrame(columns=["key", "session_id", *WHO]), []
+        whole = pd.DataFrame(columns=["key", "session_id", *WHO])
         if tables:
             whole, notes = cohort.unified(pd.concat(tables, ignore_index=True))
             whole.attrs["check"] = notes

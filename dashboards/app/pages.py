@@ -279,7 +279,7 @@ def ethogram_rows(data: StudyData) -> dict[str, Any]:
                 "key": key,
                 "group": group if group != before else "",
                 "bars": _bars(one, words, (start_s, stop_s), len(ones), (unit, size)),
-                "shares": _shares(summaries.loc[key], [*words, "unlabelled"], coloured),
+                "shares": _shares(summaries.loc[[key]].iloc[0], [*words, "unlabelled"], coloured),
             }
         )
         before = group

@@ -148,8 +148,10 @@ def curves(
             f"{title}, {seen.who}, n = {counted(n, 'frame')}" if k == 0 else title, size=6.5
         )
         kept = kept_rows(values[near], _MOST_COLUMNS)
-        dots = {} if span_s is None or len(kept) > _MOST_DOTS else {"marker": "o", "markersize": 1}
-        axes.plot(time_s[near][kept] / size, values[near][kept], color=colour, **dots)
+        marker = "" if span_s is None or len(kept) > _MOST_DOTS else "o"
+        axes.plot(
+            time_s[near][kept] / size, values[near][kept], color=colour, marker=marker, markersize=1
+        )
         axes.set_ylabel(unit)
         axes.grid(axis="y", color=LINE, linewidth=0.4)
         _clock(axes, (first_s, last_s), last=k == len(rows) - 1)

@@ -159,7 +159,7 @@ def _measure(
     with board(len(todo)) as shown:
 
         def finished(result: dict[str, Any]) -> None:
-            """ProgressCallback the board how a session went: its `result`."""
+            """Tell the board how a session went: its `result`."""
             failure = result["failure"]
             copy = result.get("corrections_taken_from")
             taken = f", with the corrections of {copy}" if copy else ""

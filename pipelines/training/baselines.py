@@ -174,7 +174,9 @@ def train_baseline(
     unfinished.replace(path)
 
 
-def fit(training: Training, data: Any, skeleton: Skeleton, tell: ProgressCallback) -> RegressionForest | Cnn:
+def fit(
+    training: Training, data: Any, skeleton: Skeleton, tell: ProgressCallback
+) -> RegressionForest | Cnn:
     """Train a baseline on rendered images.
 
     Raises:

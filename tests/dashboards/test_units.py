@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pandas as pd
 import pytest
-from liex_lab.dashboards.app import plots, tables
-from liex_lab.dashboards.app.page_groups import verdict
+from liex_lab.dashboards.app import tables
 from liex_lab.dashboards.units import counted, day, reading, shown, titled
 
 
@@ -56,49 +55,24 @@ def test_a_day_is_written_as_people_write_it() -> None:
     assert day("some day") == "some day"
 
 
-def test_one_page_of_groups_has_one_unit_for_a_speed() -> None:
-    """Marks, differences, sentence and table say the same number in the same unit."""
-    rows = pd.DataFrame(
-        {
-            "key": ["a", "b"],
-            "subject_id": ["a", "b"],
-            "group": ["x", "y"],
-            "mean_speed_mm_s": [120.0, 80.0],
-        }
-    )
-    drawn = plots.groups(rows, "mean_speed_mm_s", "mm/s")
-    assert [float(trace["y"][0]) for trace in drawn["data"]] == [12.0, 12.0, 8.0, 8.0]
-    assert drawn["layout"]["yaxis"]["title"]["text"] == "mean speed, cm/s"
+def test_the_table_of_differences_has_the_unit_of_its_measure() -> None:
     stats = pd.DataFrame(
         [
             {
                 **dict.fromkeys(tables.STATS, 1),
                 "measure": "mean_speed_mm_s",
-                "contrast": "y - x",
                 "estimate": -40.0,
                 "ci_low": -60.0,
                 "ci_high": -20.0,
-                "test": "",
-                "refused": "two animals",
             }
         ]
     )
-    figure = plots.differences(stats, "mm/s")
-    (trace,) = figure["data"]
-    assert (trace["x"][0], trace["error_x"]["array"][0]) == (-4.0, 2.0)
-    assert "cm/s" in figure["layout"]["xaxis"]["title"]["text"]
-    said = str(verdict(stats.iloc[0].to_dict(), "mm/s"))
-    assert "Mean speed was 4 cm/s lower in 1 than in 1 (95 % CI of y - x: -6 to -2 cm/s" in said
     shown_table = tables.Table(stats, tables.STATS, units={"mean_speed_mm_s": "mm/s"})
-    heads = list(tables.STATS)
-    cells = tables.fill("stats", shown_table, "", {"column": "", "down": False})["rows"][0]
-    assert cells[heads.index("measure")]["text"] == "mean speed, cm/s"
-    assert [cells[heads.index(name)]["text"] for name in ("estimate", "ci_low", "ci_high")] == [
-        "-4",
-        "-6",
-        "-2",
-    ]
-    assert cells[heads.index("effect_size")]["text"] == "1"
+    cells = tables.fill(shown_table)["rows"][0]
+    texts = {name: cell["text"] for name, cell in zip(tables.STATS, cells, strict=True)}
+    assert texts["measure"] == "mean speed, cm/s"
+    assert [texts[name] for name in ("estimate", "ci_low", "ci_high")] == ["-4", "-6", "-2"]
+    assert texts["effect_size"] == "1"
 
 
 def test_a_bouts_peak_speed_is_in_the_unit_of_the_curve_above_it() -> None:
@@ -106,6 +80,6 @@ def test_a_bouts_peak_speed_is_in_the_unit_of_the_curve_above_it() -> None:
     table = tables.Table(
         bouts, {"action": "action", "peak_speed_mm_s": "peak"}, units=tables.BOUT_UNITS
     )
-    cells = tables.fill("bouts", table, "", {"column": "", "down": False})["rows"][0]
+    cells = tables.fill(table)["rows"][0]
     assert cells[1]["text"] == "25"
     assert tables.BOUTS["peak_speed_mm_s"].endswith("cm/s")
