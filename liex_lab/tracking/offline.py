@@ -1,18 +1,17 @@
 """Fixed-interval smoothing of a whole recording: association, flip posterior, then RTS smoothing.
 
-1. Viterbi over the hypotheses of single frames (`association`) says which of them the animal is, or
-   none.
+1. Viterbi over the hypotheses of single frames (`association`) selects the animal's, or none.
 2. A forward-backward pass over two states, head and tail as they are or exchanged, gives the flip
    posterior; spans that a person corrected are exchanged with certainty.
 3. A Kalman filter and Rauch-Tung-Striebel smoother of an integrated Ornstein-Uhlenbeck process
    (`smoother`) runs over blocks of 4096 frames with a margin of 160 frames on either side. It is
-   cut where a person's exchange makes a half turn: neither side has a say about the other.
-4. Validation gate: a hypothesis that was passed by, but lies within one predicted error of the
-   curve, its own and the curve's together, is a measurement after all; twice over, for each time
-   the curve comes nearer to others.
+   cut where a person's exchange makes a half turn: the sides do not affect each other.
+4. Validation gate: a skipped hypothesis within one predicted error of the curve, its own and the
+   curve's combined, is used as a measurement. This is done twice, because each pass moves the curve
+   closer to others.
 5. Gaps up to `bridge_s` are bridged by the curve, longer ones are NaN, and so are frames in which
    an animal is in full view elsewhere.
-6. Poses that the picture contradicts are doubtful (`trust`).
+6. Poses that the depth image contradicts are doubtful (`trust`).
 
 The default tracker of the package; it replaces the particle filter of Lie-X section 4.2
 (`particles`).
@@ -67,7 +66,7 @@ _SOON = 0.9  # of a step: sooner than the camera could have made another image
 
 
 def asked_too_often(times_ns: NDArray[np.int64], copies: Mask, known: Mask) -> Mask:
-    """Which copies (n,) came of asking faster than the camera made images; in others it froze.
+    """Which copies (n,) result from polling faster than the frame rate; in others the stream froze.
 
     Args:
         times_ns: (n,) time stamps, ns.
@@ -88,7 +87,7 @@ def asked_too_often(times_ns: NDArray[np.int64], copies: Mask, known: Mask) -> M
 def copies_told(
     times_ns: NDArray[np.int64], repeats: Mask, noisy: bool
 ) -> tuple[list[str], list[str]]:
-    """Sentences on images that repeat: why to look at the recording, and what else to know.
+    """Messages about repeated images: reasons to review the recording, and notes.
 
     Args:
         times_ns: (n,) time stamps, ns.
@@ -158,11 +157,11 @@ def track_whole(
     is in memory.
 
     Args:
-        subject: whom the track is of.
+        subject: the animal of the track.
         seen: hypotheses (n, H) of all frames, arena frame.
-        corrections: spans in which a person says that head and tail are exchanged; those with
+        corrections: spans that a person marked as having head and tail exchanged; those with
             `undone_at` are not applied.
-        tuning: motion and association parameters; None takes the animal's own.
+        tuning: motion and association parameters; None uses the animal's own.
         allocate: allocator of the track's columns, `np.empty` or one on disk.
 
     Returns:
@@ -275,8 +274,8 @@ def _turn_round(
 ) -> NDArray[np.int64]:
     """Exchange head and tail in the spans that a person corrected; their flip posterior is 0.
 
-    The path takes the reversed hypothesis where a frame has it. Returns how often (n,) the pose
-    itself is to be turned round elsewhere.
+    The path uses the reversed hypothesis if the frame has one. Returns how many times (n,) the pose
+    itself must be reversed elsewhere.
     """
     turned = np.zeros(len(seen), np.int64)
     for span in (one for one in corrections if not one.undone_at):
@@ -333,11 +332,11 @@ def _admit(
     track: Track,
     usual_px: float,
 ) -> None:
-    """Gate: put hypotheses that lie on the curve after all into the path of frames passed by.
+    """Gate: add hypotheses on the curve to the path in skipped frames.
 
-    Fills path (n,) and error (n,). Such a hypothesis lies within one predicted error, its own and
-    the curve's together, and shows between half and 1.5 times as many pixels as usual: of half an
-    animal nobody knows how it lies, and in a gap nobody knows where the curve is.
+    Fills path (n,) and error (n,). Such a hypothesis is within one predicted error, its own and the
+    curve's combined, and has 0.5 to 1.5 times the usual pixels: the pose of half an animal is
+    unknown, as is the curve in a gap.
     """
     best = np.full(len(seen), _ADMIT)
     passed = (path == NONE) & np.isfinite(track.predicted_error_mm)

@@ -2,14 +2,14 @@
 
 r = median over the pixels that both cover of |z_rendered - z_observed|, with a default body of the
 skeleton whose girth is found once per recording by a grid search from 0.75 to 1.35. A tube that
-stretches keeps its volume, as the virtual mouse does: of bones of scale s its girth is that of the
-session's size times sqrt(size / s), for an animal that draws itself up is thicker, not thinner. The
-readings are those of the height maps, taken back to depth: z = (1 - h / d) / (a u + b v + c), with
-h the height, d the camera's distance and a u + b v + c the inverse depth of the plane. Beside the
-distance stand the two shares of the outlines: |S and B| / |S| of the silhouette S that the body B
-covers, and |B without S| / |B| of the body that lies beside it. For a trunk that fits hides a head
-that does not, the same median is taken over each part of the body, the pixels nearest to one of its
-joints in the picture and a twentieth of all at least, and the largest is told.
+stretches keeps its volume, as the virtual mouse does: for bones of scale s, its girth is that of
+the session's size times sqrt(size / s), because a contracted animal is thicker, not thinner. The
+depth is computed from the height maps: z = (1 - h / d) / (a u + b v + c), with
+h the height, d the camera's distance and a u + b v + c the inverse depth of the plane. Two
+shares of the outlines are also computed: |S and B| / |S| of the silhouette S that the body B
+covers, and |B without S| / |B| of the body outside it. Because a fitting trunk can hide a misplaced head,
+the same median is computed for each part of the body, the pixels nearest to one of its joints in
+the image and at least a twentieth of all, and the largest is reported.
 """
 
 from __future__ import annotations
@@ -41,14 +41,14 @@ _MIN_PART = 0.05
 
 @dataclass(frozen=True)
 class Agreement:
-    """How well rendered bodies agree with what was read, in n height maps.
+    """The agreement of rendered bodies with the depth in n height maps.
 
     Attributes:
         residual_mm: (n,) median absolute difference between body and reading over the pixels that
-            both cover, mm; NaN where fewer than 20 pixels are covered by both.
+            both cover, mm; NaN if both cover fewer than 20 pixels.
         covered: (n,) share (0 to 1) of the silhouette's pixels that the body covers.
-        beside: (n,) share (0 to 1) of the body's pixels on which nothing of the animal was read; 1
-            where the body is nowhere in the height map.
+        beside: (n,) share (0 to 1) of the body's pixels outside the animal; 1 if the body is
+            outside the height map.
         part_mm: (n,) that difference in the part of the body where it is largest, mm; NaN as in
             `residual_mm`.
     """
@@ -61,7 +61,7 @@ class Agreement:
 
 @dataclass(frozen=True)
 class BodyResidual:
-    """The default body of a skeleton, fattened or thinned by `girth`, held against depth.
+    """The default body of a skeleton, scaled across by `girth`, for comparison with depth.
 
     Attributes:
         surface: the body's surface.
@@ -90,7 +90,7 @@ class BodyResidual:
         return self.agreement(pose_arena, crops, scene).residual_mm
 
     def agreement(self, pose_arena: Pose, crops: HeightMaps, scene: Segmenter) -> Agreement:
-        """Distance of the body from the readings, and how their outlines lie over each other.
+        """Distance of the body from the depth, and overlap of their outlines.
 
         Args:
             pose_arena: (n) poses, arena frame.
@@ -142,7 +142,7 @@ class BodyResidual:
             size: of the animal, see `BodyResidual`.
 
         Returns:
-            The body whose median residual over the frames is least; the default girth where no
+            The body with the smallest median residual over the frames; the default girth if no
             frame shows enough of any body.
         """
         placed = pose_arena.placed(surface.skeleton)
@@ -158,7 +158,7 @@ class BodyResidual:
 
 
 def _median(residual_mm: Array) -> float:
-    """The median of what is known; infinite where nothing is."""
+    """The median of the known values; infinite if there are none."""
     known = residual_mm[np.isfinite(residual_mm)]
     return float(np.median(known)) if len(known) else np.inf
 
@@ -176,7 +176,7 @@ def render_crops(
         scene: the segmenter that cut them, for its camera and floor.
 
     Returns:
-        (n, CROP, CROP) float32 mm, 0 where the body is not.
+        (n, CROP, CROP) float32 mm, 0 outside the body.
     """
     camera = scene.camera
     n = len(pose_arena.scale)
@@ -197,8 +197,8 @@ def render_crops(
 @njit(cache=True, parallel=True)
 def _compare(rendered, heights, origin, step, planes, distance, joints, out):
     """Median |rendered - observed| depth, mm, over pixels where both are, the share of the observed
-    pixels that are covered, the share of the rendered ones that lie beside, and the largest median
-    of a part of the body, into out (4, n). joints (n, J, 2) are px of the picture.
+    pixels that are covered, the share of the rendered ones outside, and the largest median
+    of a part of the body, into out (4, n). joints (n, J, 2) are px of the image.
     """
     for i in prange(rendered.shape[0]):
         size = rendered.shape[1]
@@ -314,14 +314,14 @@ class SampleFit:
 
     Attributes:
         n_frames: frames that hold depth.
-        n_found: frames in which something of the animal's size was found and has a pose.
+        n_found: frames with an object of the animal's size and a pose.
         spine_mm: the animal's length, mm.
         error_mm: predicted mean joint error, mm.
-        residual_mm: distance between rendered body and reading, mm; NaN where they hardly overlap.
+        residual_mm: distance between rendered body and reading, mm; NaN if they hardly overlap.
         covered: share (0 to 1) of the silhouette that the body covers.
-        beside: share (0 to 1) of the body that lies beside the silhouette.
-        n_animals: how many things of the animal's size are in view at once whose outline and
-            surface its body fits.
+        beside: share (0 to 1) of the body outside the silhouette.
+        n_animals: how many objects of the animal's size, whose outline and surface its body fits,
+            are in view at once.
     """
 
     n_frames: int
@@ -343,8 +343,8 @@ class SampleFit:
             n_frames: frames of the sample that hold depth.
             spine_mm: the animal's length, mm.
             error_mm: (m,) predicted errors of the m frames with a pose, mm, at least one.
-            agreement: of those m poses with their pictures.
-            n_animals: things of the animal's size in view at once.
+            agreement: of those m poses with their depth images.
+            n_animals: objects of the animal's size in view at once.
         """
         residual = agreement.residual_mm[np.isfinite(agreement.residual_mm)]
         return SampleFit(
@@ -368,12 +368,12 @@ class SampleFit:
         return low_mm * (1.0 - _SIZE_MARGIN) <= self.spine_mm <= high_mm * (1.0 + _SIZE_MARGIN)
 
     def misfits(self, low_mm: float, high_mm: float, stated: bool = False) -> list[str]:
-        """What contradicts that this is the plan's animal; empty where nothing does.
+        """The contradictions to this being the plan's animal; empty if there are none.
 
         Args:
             low_mm: the plan's least length of the animal, mm.
             high_mm: its largest, mm.
-            stated: the plan states this animal's length itself, which is not questioned then.
+            stated: the plan states this animal's length, which is then not checked.
 
         Returns:
             Parts of a sentence, such as 'it is 743 mm long and the plan expects 130 to 220 mm'.
@@ -407,11 +407,11 @@ class SampleFit:
 
 
 def count_animals(first: Agreement, second: Agreement, rows: NDArray[np.int64], n: int) -> int:
-    """How many things of the animal's size are in view at once: 1 or 2.
+    """How many objects of the animal's size are in view at once: 1 or 2.
 
     Args:
-        first: agreement of the animal's own poses with the pictures of n frames.
-        second: the same of the next thing of about its size, in m of these frames.
+        first: agreement of the animal's own poses with the depth images of n frames.
+        second: the same of the next object of about its size, in m of these frames.
         rows: (m,) which frames those are.
         n: number of frames.
     """

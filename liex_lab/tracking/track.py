@@ -49,7 +49,7 @@ FLAGS = {
 
 @dataclass(frozen=True)
 class Track:
-    """Poses over time: one row for EVERY frame of the recording, NaN where there is none.
+    """Poses over time: one row for EVERY frame of the recording, NaN without a pose.
 
     Attributes:
         skeleton: kinematic tree of the animal.
@@ -57,11 +57,11 @@ class Track:
         joints_mm: (n, J, 3) arena frame.
         uv_px: (n, J, 2) pixels of the depth image.
         sd_mm: (n, J) standard deviation of each joint along one axis from one frame to another, mm;
-            speeds are made of it.
-        sd_xy_mm: (n, J) that of its place along x and along y: `sd_mm`, and by how much all joints
-            of a recording may be shifted along the body, whose build nobody knows.
-        sd_z_mm: (n, J) that of its height: `sd_mm`, and by how much all heights of a recording may
-            be wrong, as a camera sees the back only.
+            speeds are computed from it.
+        sd_xy_mm: (n, J) that of its position along x and along y: `sd_mm`, and the common shift of
+            all joints along the body, because the build is unknown.
+        sd_z_mm: (n, J) that of its height: `sd_mm`, and the common error of all heights, because
+            a camera only records the back.
         root_rotation: (n, 3, 3) rotation of T_arena_root.
         root_mm: (n, 3) translation of T_arena_root.
         cov_root: (n, 6, 6) covariance of the root's turn, rad, and shift, mm, about and along its
@@ -71,13 +71,13 @@ class Track:
         scale: (n,) of the skeleton's bones.
         predicted_error_mm: (n,) mean joint error expected by the learned metric and the smoother.
         residual_mm: (n,) median distance between the rendered body and the observed depth.
-        n_foreground_px: (n,) int64, 0 where nothing was measured.
-        centroid_mm: (n, 3) centre of the animal as seen from above and its mean height, arena
+        n_foreground_px: (n,) int64, 0 if nothing was measured.
+        centroid_mm: (n, 3) centre of the animal from above and its mean height, arena
             frame.
         centroid_px: (n, 2) the same in the depth image.
         p_flip: (n,) probability that head and tail are exchanged.
-        bridged: (n,) nothing was measured, but shortly before and after, and the pose is what lies
-            between.
+        bridged: (n,) not measured, but interpolated between measurements shortly before and
+            after.
         flag: (n,) a word of `FLAGS`.
     """
 
@@ -179,7 +179,7 @@ class Track:
         return Track(parts[0].skeleton, *columns)
 
     def put_pose(self, rows: NDArray[np.int64], pose: Pose) -> None:
-        """Write poses into some rows, in place, but for `uv_px`, which belongs to the camera.
+        """Write poses into some rows, in place, except `uv_px`, which depends on the camera.
 
         Args:
             rows: (k,) the rows.
@@ -219,7 +219,7 @@ class Track:
 
     @property
     def pose(self) -> Pose:
-        """The poses (n), arena frame; NaN where there is none."""
+        """The poses (n), arena frame; NaN if absent."""
         return Pose(self.root, self.angles_rad, self.scale)
 
     @property
@@ -248,11 +248,10 @@ class Flip:
     Attributes:
         start: first frame.
         stop: frame after the last.
-        p_flip: probability that they were, in the single frames' answers where `applied` says that
-            this was undone, else in the track.
+        p_flip: their probability, in the single frames if `applied`, else in the track.
         applied: whether the exchange was undone in the track.
         source: model or human.
-        undone_at: when a person took the correction back, ISO 8601; empty otherwise.
+        undone_at: when a person undid the correction, ISO 8601; empty otherwise.
     """
 
     start: int
@@ -264,7 +263,7 @@ class Flip:
 
 
 def ends_of(spans: Iterable[tuple[int, int]]) -> list[int]:
-    """Where an exchange of head and tail begins or ends; what is exchanged twice is as it was.
+    """Starts and ends of exchanges of head and tail; exchanging twice restores the original.
 
     Args:
         spans: start and stop (exclusive) of each exchange, rows or frames; they may overlap.
@@ -280,7 +279,7 @@ def ends_of(spans: Iterable[tuple[int, int]]) -> list[int]:
 
 @dataclass(frozen=True)
 class Tracked:
-    """A track and what was found out about head and tail on the way.
+    """A track and its exchanges of head and tail.
 
     Attributes:
         track: one row for every frame.
@@ -299,7 +298,7 @@ class Tracked:
 
 @dataclass(frozen=True)
 class Subject:
-    """Whom a track is of, before which camera, and by which limits its rows are kept or flagged.
+    """The animal of a track, its camera, and the limits for keeping or flagging rows.
 
     Attributes:
         skeleton: kinematic tree of the animal.
@@ -307,16 +306,16 @@ class Subject:
         T_arena_camera: pose of the camera in the arena frame, mm.
         length_mm: spine length of this animal, mm.
         doubtful_mm: frames with a larger predicted mean joint error, mm, are flagged.
-        bridge_s: so long a gap without a measurement is bridged, s, and half as far into a longer
-            one from both its ends.
+        bridge_s: the longest gap that is bridged, s; a longer one is bridged half as far from
+            both its ends.
         joint_share: (J,) error of each joint over the mean of all joints.
-        stretch_sd: standard deviation of the share by which all distances from the base may be off
-            throughout, for an animal whose ends a sensor eats is taken for a smaller one; None
-            where nothing is known of it, which takes the usual share of `Motion`.
-        unseen: standard deviations over the length of the joints' height and of their place along
-            the body that a session's own shape leaves; None without one, which takes those of
+        stretch_sd: standard deviation of the common relative error of all distances from the base,
+            because an animal whose edges the sensor loses appears smaller; None uses the usual
+            value of `Motion`.
+        unseen: remaining standard deviations, over the length, of the joints' height and of their
+            position along the body after fitting a session's own shape; None uses those of
             `Motion`.
-        n_animals: how many animals are in view at once, one of which is followed.
+        n_animals: how many animals are in view at once, one of which is tracked.
     """
 
     skeleton: Skeleton

@@ -54,15 +54,14 @@ class FrameTracker:
         size_origin: where the size comes from, 'plan' or 'recording'.
         body: the default body at the recording's girth, or that of `shape`.
         doubtful_mm: frames with a larger predicted mean joint error, mm, are flagged.
-        bridge_s: so long a gap without a measurement is bridged, s.
-        blur: how far the body lies from the depth seen, over its length, in the sampled frames.
+        bridge_s: the longest gap that is bridged, s.
+        blur: distance of the body from the depth, over its length, in the sampled frames.
         size_spread: standard deviation of the logarithm of the size that the sampled frames
             estimate.
-        free_ends: occlusion correction, which puts an animal that swims where the end of it that is
-            seen says; None without.
-        sample_fit: how well the model explains the sampled frames; None of a tracker that was made
-            without any.
-        shape: the session's own shape; None where none was asked for.
+        free_ends: occlusion correction, which shifts a swimming animal according to its visible
+            end; None to disable it.
+        sample_fit: agreement of the model with the sampled frames; None without sampled frames.
+        shape: the session's own shape; None if it is not used.
         noisy: whether the sensor has noise, so that a depth image which repeats is a copy.
     """
 
@@ -97,12 +96,12 @@ class FrameTracker:
             estimator: the pose estimator.
             scene: the segmenter of the recording's camera.
             sample: (n, H, W) float32 mm, frames spread over the recording.
-            spine_mm: spine length, mm, where the user knows it; None measures it.
-            doubtful_mm: flagging limit, mm; None takes the model's calibration at the animal's
+            spine_mm: spine length, mm, if known; None measures it.
+            doubtful_mm: flagging limit, mm; None uses the model's calibration at the animal's
                 size.
             bridge_s: the longest gap that is bridged whole, s.
             adapt: fit a shape to the sample; else the body is the average one at its best girth.
-            stated: the animal's shape where it is stated; None fits it.
+            stated: a stated shape of the animal; None fits it.
 
         Returns:
             The tracker.
@@ -185,7 +184,7 @@ class FrameTracker:
 
     @cached_property
     def subject(self) -> Subject:
-        """Whom the track is of, with the limits and shares of this recording."""
+        """The animal of the track, with the limits and shares of this recording."""
         skeleton = self.estimator.skeleton
         share = self.estimator.model.calibration.joint_share or (1.0,) * skeleton.n_joints
         return Subject(
@@ -203,14 +202,14 @@ class FrameTracker:
 
     @property
     def stretch_sd(self) -> float:
-        """Standard deviation of the share by which lengths may be off, see `Subject`."""
+        """Standard deviation of the relative error of lengths, see `Subject`."""
         motion = TrackingParameters.of(self.estimator.skeleton.name).motion
         return motion.stretch_sd(self.blur, self.size_spread)
 
     def observe(self, frames: Sequence[DepthFrame]) -> Observations:
         """The pose hypotheses of consecutive frames, each by itself.
 
-        A depth image that a noisy sensor repeats bit for bit is a copy, which says nothing.
+        A depth image that a noisy sensor repeats bit for bit is a copy and is ignored.
 
         Args:
             frames: at least one.
@@ -251,7 +250,7 @@ class FrameTracker:
         """The same as `follow`, from the frames' observations.
 
         Args:
-            seen: what `observe` gave.
+            seen: result of `observe`.
 
         Returns:
             A track of n rows.
@@ -264,8 +263,8 @@ class FrameTracker:
         """The smoothed track of a whole recording, see `offline.track_whole`.
 
         Args:
-            seen: what `observe` gave of all frames.
-            corrections: spans in which a person says that head and tail are exchanged.
+            seen: result of `observe` for all frames.
+            corrections: spans that a person marked as having head and tail exchanged.
             allocate: allocator of the track's columns.
 
         Returns:
@@ -309,10 +308,10 @@ class FrameTracker:
         poses: Sequence[Pose],
         cleared: NDArray[np.float32],
     ) -> None:
-        """Put in how the best pose (n) of each component lies over the depth, arena frame.
+        """Set the agreement of the best pose (n) of each component with the depth, arena frame.
 
-        `cleared` are the pictures without what the animal wears. All components are set against the
-        depth in one go, as a call costs as much as a frame.
+        `cleared` are the depth images without worn objects. All components are compared in one
+        call, because a call costs as much as a frame.
         """
         rows = [np.flatnonzero(one.found) for one in hypotheses]
         best = [h for h in range(0, len(hypotheses), 2) if len(rows[h])]
@@ -341,8 +340,8 @@ class FrameTracker:
 def _whole(
     scene: Segmenter, sample: NDArray[np.float32], estimates: Estimates
 ) -> NDArray[np.bool_]:
-    """Which frames (n,) of a sample (n, H, W) mm do not show a part of the animal only, beside
-    something nearer.
+    """Which frames (n,) of a sample (n, H, W) mm show the whole animal, not partly hidden by a
+    nearer object.
     """
     if not isinstance(scene, BackgroundSubtraction):
         return np.ones(len(sample), np.bool_)
@@ -366,7 +365,7 @@ def _count(
 ) -> int:
     """How many animals are in view at once in a sample (n, H, W) mm of frames with an animal.
 
-    Of hands, whose pictures always hold ends of other things, one is counted.
+    Always 1 for hands, whose depth images always contain ends of other objects.
     """
     if not isinstance(scene, BackgroundSubtraction):
         return 1
@@ -412,14 +411,14 @@ class PatchObserver:
         """The animal's spine over the home length, measured in some patches.
 
         As over a recording's sample, a fixed-point iteration: the median of the sizes that the
-        surest half of the frames estimate becomes the size of the next of four passes. The
+        most certain half of the frames becomes the size of the next of four passes. The
         estimator's final correction is left out, as it pulls sizes to the usual.
 
         Args:
             windows: patches of one animal.
 
         Returns:
-            The size; 1 where the model knows no session size or no patch shows an animal.
+            The size; 1 if the model has no session size or no patch shows an animal.
         """
         model = self.estimator.model
         size = 1.0
@@ -468,7 +467,7 @@ class PatchObserver:
         return seen
 
     def subject(self, camera: Camera, T_arena_camera: SE3, size: float) -> Subject:
-        """Whom a track from such patches is of.
+        """The subject of a track from such patches.
 
         Args:
             camera: the camera that the track is projected into.
