@@ -7,9 +7,9 @@ the session's size times sqrt(size / s), because a contracted animal is thicker,
 depth is computed from the height maps: z = (1 - h / d) / (a u + b v + c), with
 h the height, d the camera's distance and a u + b v + c the inverse depth of the plane. Two
 shares of the outlines are also computed: |S and B| / |S| of the silhouette S that the body B
-covers, and |B without S| / |B| of the body outside it. Because a fitting trunk can hide a misplaced head,
-the same median is computed for each part of the body, the pixels nearest to one of its joints in
-the image and at least a twentieth of all, and the largest is reported.
+covers, and |B without S| / |B| of the body outside it. Because a fitting trunk can hide a
+misplaced head, the same median is computed for each part of the body, the pixels nearest to one of
+its joints in the image and at least a twentieth of all, and the largest is reported.
 """
 
 from __future__ import annotations

@@ -410,9 +410,9 @@ class PatchObserver:
     def find_size(self, windows: Patches) -> float:
         """The animal's spine over the home length, measured in some patches.
 
-        As over a recording's sample, a fixed-point iteration: the median of the sizes that the
-        most certain half of the frames becomes the size of the next of four passes. The
-        estimator's final correction is left out, as it pulls sizes to the usual.
+        A fixed-point iteration, as over a recording's sample: the median size in the most certain
+        half of the frames becomes the size of the next of four passes. The estimator's final
+        correction is omitted, because it biases sizes towards the usual one.
 
         Args:
             windows: patches of one animal.
