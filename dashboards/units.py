@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from datetime import datetime
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -69,3 +70,25 @@ def day(iso: str) -> str:
     zone = when.strftime("%z")
     told = f" (UTC{zone[:3]}:{zone[3:5]})" if zone else ""
     return f"{when.day} {when:%B %Y, %H:%M:%S}{told}"
+
+
+# HTML pages from jinja2 templates.
+
+
+def page(template: Path, **shown: Any) -> str:
+    """A page from its template; what is shown is escaped, and nothing that it names may be missing.
+
+    Args:
+        template: the file, HTML with jinja2's marks.
+        shown: what the template names.
+    """
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
+    pages = Environment(
+        loader=FileSystemLoader(template.parent),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    return pages.get_template(template.name).render(**shown)

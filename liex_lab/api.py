@@ -226,7 +226,7 @@ def follow_live(
         LiexError: the source is over before it has a frame, or cannot be read, or there is no
             screen for a viewer.
     """
-    from liex_lab.dashboards.replay.rerun_blueprint import live_blueprint
+    from liex_lab.dashboards.replay.layouts import live_blueprint
     from liex_lab.pipelines.live import follow_live as job
     from liex_lab.pipelines.live import open_live
     from liex_lab.sessions.viewer import LiveView, need_screen
@@ -844,7 +844,7 @@ def run_tables(
 
 def _layout(session: dict[str, Any]) -> Any:
     """The Rerun layout of a session.json; it is imported when it is wanted."""
-    from liex_lab.dashboards.replay.rerun_blueprint import replay_blueprint
+    from liex_lab.dashboards.replay.layouts import replay_blueprint
 
     return replay_blueprint(session)
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from flask import Flask, Response, jsonify, request
+from liex_lab.dashboards.report.contact_sheet import Mark, scene_marks, svg_marks
 from numpy.typing import NDArray
 
 from liex_lab.errors import LiexError, PlanError, SessionError
@@ -18,7 +19,6 @@ from liex_lab.scene.background import usual_depth
 from liex_lab.sessions import Session
 
 from ..report.contact_sheet import png_uri, shade
-from ..report.scene_marks import Mark, scene_marks, svg_marks
 from .data import StudyData
 from .frames import Frames
 

@@ -15,6 +15,7 @@ from urllib.parse import quote, unquote
 
 import numpy as np
 from flask import Flask, Response, jsonify, redirect, render_template, request
+from liex_lab.dashboards.report.contact_sheet import WORDS, scene_marks
 from markupsafe import Markup
 from werkzeug.exceptions import NotFound
 
@@ -38,7 +39,6 @@ from ..figures.style import (
     time_unit,
 )
 from ..report.quality import warnings
-from ..report.scene_marks import WORDS, scene_marks
 from ..units import shown, titled
 from . import tables
 from .data import (

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from types import TracebackType
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -12,9 +13,13 @@ from numpy.typing import NDArray
 
 from liex_lab.behaviour.places import hold_times
 from liex_lab.sessions import Session
+from liex_lab.sessions.cutouts import meant_to_keep_depth
+
+from ..app.frames import Frames
 
 if TYPE_CHECKING:
     import pandas as pd
+
 
 Array = NDArray[np.float64]
 # the columns that are drawn, beyond those that every table has
@@ -190,3 +195,46 @@ def joints_in_picture(all_seen: Sequence[Seen], n: int) -> list[Array]:
         own = table if seen.alone else table[table["individual"].astype(str) == seen.individual]
         found.append(own[["u_px", "v_px"]].to_numpy(float).reshape(n, -1, 2))
     return found
+
+
+# Depth pictures of a session for figures and videos, by the one function that reads them.
+
+
+class DepthReader:
+    """The depth pictures of a session's replay, open for a while (a context manager).
+
+    Args:
+        session: the opened session.
+    """
+
+    def __init__(self, session: Session) -> None:
+        self._session = session
+        self._frames = Frames()
+
+    def __enter__(self) -> DepthReader:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the file that is open."""
+        self._frames.close()
+
+    @property
+    def whole(self) -> bool:
+        """Whether the session's replay keeps depth, beyond the thumbnails of the report."""
+        return meant_to_keep_depth(self._session) and self._session.has("session.mcap")
+
+    def picture(self, row: int) -> NDArray[np.uint16] | None:
+        """(H, W) uint16 mm, 0 where unread; None where the session keeps none of this frame.
+
+        Args:
+            row: the frame's row in the table `frames`.
+        """
+        return self._frames.depth(self._session.name, self._session, row)

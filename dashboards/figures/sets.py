@@ -27,8 +27,7 @@ from liex_lab.runtime.text_files import read_harmless
 from liex_lab.sessions import Session
 
 from . import actions, groups, places, times
-from .pictures import DepthReader
-from .seen import Seen, animals
+from .seen import DepthReader, Seen, animals
 from .style import FORMATS, drawing, image_bytes, on_page
 
 if TYPE_CHECKING:

@@ -15,13 +15,13 @@ from pathlib import Path
 from typing import Any
 
 import pandas as pd
+from liex_lab.dashboards.units import page
 from markupsafe import Markup, escape
 
 from liex_lab.evaluation.scores import POSE_PROTOCOL, plain
 from liex_lab.runtime.durable import write_whole
 from liex_lab.sessions.provenance import package_version
 
-from ..pages import page
 from .figures import draw_paper
 from .published import (
     DEVIATIONS,

@@ -15,7 +15,7 @@ from ..figures.times import drawn_curves
 from ..units import shown
 from ..video.relief import Relief, put_back, scale_mm
 from . import contact_sheet
-from .scene_marks import BESIDE, Mark, scene_marks
+from .contact_sheet import BESIDE, Mark, scene_marks
 
 if TYPE_CHECKING:
     import pandas as pd

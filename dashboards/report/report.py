@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from liex_lab.dashboards.units import page
 
 from liex_lab.actions.ethogram import ACROSS_GAPS
 from liex_lab.actions.vocabulary import NO_POSE, UNLABELLED, action_colours
@@ -21,12 +22,10 @@ from liex_lab.sessions.verdict import verdict_in
 
 from ..figures.seen import FRAMES, KINEMATICS
 from ..figures.sets import FOLDER, for_the_page
-from ..pages import page
 from ..units import counted, day, reading, shown, titled
 from ..video.relief import scale_mm
 from .charts import pictures, whole_picture
-from .facts import facts
-from .methods import methods
+from .facts import facts, methods
 from .quality import flip_rows, frame_account, refusal_rows, warnings
 
 TEMPLATES = Path(__file__).parent / "templates"

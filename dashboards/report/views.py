@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from liex_lab.dashboards.replay.layouts import write_blueprint, write_layout
+
 from liex_lab.sessions import Session
 
-from ..replay.foxglove_layout import write_layout
-from ..replay.rerun_blueprint import write_blueprint
 from .report import write_report
 
 

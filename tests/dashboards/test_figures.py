@@ -11,8 +11,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from liex_lab.dashboards.figures import actions, groups, places, sets, times
-from liex_lab.dashboards.figures.pictures import DepthReader
-from liex_lab.dashboards.figures.seen import Seen, animals
+from liex_lab.dashboards.figures.seen import DepthReader, Seen, animals
 from liex_lab.dashboards.figures.style import drawing, image_bytes, on_page, scale_bar, sheet
 from liex_lab.dashboards.report.contact_sheet import picture, shade
 from matplotlib.backends.backend_agg import FigureCanvasAgg

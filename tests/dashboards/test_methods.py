@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from liex_lab.dashboards.report.methods import methods
+from liex_lab.dashboards.report.facts import methods
 from liex_lab.dashboards.report.report import render
 
 from liex_lab.actions.vocabulary import WORDS

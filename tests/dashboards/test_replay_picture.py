@@ -18,7 +18,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from liex_lab.dashboards.replay.rerun_blueprint import replay_blueprint
+from liex_lab.dashboards.replay.layouts import replay_blueprint
 
 from liex_lab.api import correct_session
 from liex_lab.recordings.depth_kernels import rvl_message, to_millimetres

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from liex_lab.dashboards.app.page_region import scene_svg
 from liex_lab.dashboards.report.charts import pictures
-from liex_lab.dashboards.report.contact_sheet import picture
-from liex_lab.dashboards.report.scene_marks import Mark, scene_marks
+from liex_lab.dashboards.report.contact_sheet import Mark, picture, scene_marks
 
 from liex_lab.scene.floor import Floor
 from liex_lab.scene.outline import Arena

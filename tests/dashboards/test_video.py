@@ -7,7 +7,7 @@ from pathlib import Path
 import av
 import numpy as np
 import pytest
-from liex_lab.dashboards.video import encoder
+from liex_lab.dashboards.video import video
 from liex_lab.dashboards.video.film import Film, View
 from liex_lab.dashboards.video.relief import Relief, scale_mm
 from liex_lab.dashboards.video.video import matches
@@ -181,7 +181,7 @@ def test_the_project_for_boris_names_the_video_that_was_made(session, tmp_path):
 
 
 def test_without_an_encoder_there_is_a_sentence_and_no_file(session, monkeypatch):
-    monkeypatch.setattr(encoder, "_CODECS", ("no_such_codec", "nor_this"))
+    monkeypatch.setattr(video, "_CODECS", ("no_such_codec", "nor_this"))
     with pytest.raises(SessionError, match="neither no_such_codec nor nor_this"):
         export_video(session.path)
     assert not list(session.path.glob("*.mp4"))
@@ -241,8 +241,8 @@ def test_a_link_in_the_place_of_a_video_is_not_written_through(session, tmp_path
 
 def test_a_video_that_breaks_off_leaves_nothing(tmp_path):
     def breaks() -> None:
-        with encoder.Video(tmp_path / "v.mp4", 30.0) as video:
-            video.add(np.zeros((64, 64, 3), np.uint8), 0.0)
+        with video.Video(tmp_path / "v.mp4", 30.0) as writer:
+            writer.add(np.zeros((64, 64, 3), np.uint8), 0.0)
             raise RuntimeError("stop")
 
     with pytest.raises(RuntimeError):

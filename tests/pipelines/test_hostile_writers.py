@@ -15,8 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from liex_lab.dashboards.replay.foxglove_layout import write_layout
-from liex_lab.dashboards.replay.rerun_blueprint import write_blueprint
+from liex_lab.dashboards.replay.layouts import write_blueprint, write_layout
 from liex_lab.dashboards.report.report import write_report
 from liex_lab.pipelines.compare import compare_sessions
 from liex_lab.pipelines.correct import correct_session
