@@ -1,4 +1,4 @@
-"""Rerun blueprint of a session's replay: 3D scene and picture above, lanes and curves below."""
+"""Layouts of a replay: the Rerun blueprint, and the Foxglove layout of session.mcap."""
 
 from __future__ import annotations
 
