@@ -23,7 +23,7 @@ import cv2
 import matplotlib as mpl
 import matplotlib.pyplot as plt
 import numpy as np
-from liex_lab.dashboards.picture import photograph
+from readme_picture import photograph
 
 import liex_lab
 from liex_lab.api import run_demo, run_session

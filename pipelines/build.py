@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from liex_lab.optics.refraction import Water
     from liex_lab.plan.sections import SharedShape
     from liex_lab.recordings.recording import Recording
-    from liex_lab.scene.segmenter import Segmenter
+    from liex_lab.scene.height_maps import Segmenter
     from liex_lab.tracking.own_shape import StatedShape
     from liex_lab.tracking.tracker import FrameTracker
 

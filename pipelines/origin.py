@@ -15,9 +15,9 @@ if TYPE_CHECKING:
     from liex_lab.plan import Plan
     from liex_lab.plan.sections import Animal
     from liex_lab.recordings.recording import Recording
+    from liex_lab.scene.height_maps import Segmenter
     from liex_lab.scene.outline import Arena
     from liex_lab.scene.scene import Scene
-    from liex_lab.scene.segmenter import Segmenter
     from liex_lab.scene.zones import DrawnZone, Zone
     from liex_lab.sessions import Provenance
     from liex_lab.tracking.tracker import FrameTracker

@@ -22,8 +22,7 @@ from numpy.typing import NDArray
 
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.estimation.estimator import PoseEstimator
-from liex_lab.scene.height_maps import HeightMaps, in_camera_frame
-from liex_lab.scene.segmenter import Segmenter
+from liex_lab.scene.height_maps import HeightMaps, Segmenter, in_camera_frame
 
 Array = NDArray[np.float64]
 

@@ -19,7 +19,7 @@ import typer
 
 import liex_lab
 from liex_lab.cli.correct import correct, describe
-from liex_lab.cli.evaluate import evaluate
+from liex_lab.cli.models import evaluate, train
 from liex_lab.cli.options import (
     MODELS,
     RECORDINGS,
@@ -42,7 +42,6 @@ from liex_lab.cli.options import (
 )
 from liex_lab.cli.sessions import compare, convert, export, figures, pack, report, show
 from liex_lab.cli.study import cohort, dashboard, verify
-from liex_lab.cli.train import train
 from liex_lab.errors import LiexError, MisfitError, printable
 from liex_lab.runtime.memory import why_short
 from liex_lab.runtime.places import is_full, why_full

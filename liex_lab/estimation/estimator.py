@@ -41,8 +41,7 @@ from liex_lab.estimation.training import base_at_front
 from liex_lab.forests.forest import Forest
 from liex_lab.geometry import SE3
 from liex_lab.runtime.threads import threads
-from liex_lab.scene.height_maps import HeightMaps, view_of
-from liex_lab.scene.segmenter import Segmenter
+from liex_lab.scene.height_maps import HeightMaps, Segmenter, view_of
 
 Array = NDArray[np.float64]
 

@@ -25,8 +25,14 @@ from liex_lab.runtime.threads import threads
 from liex_lab.scene import _hand_kernels as kernels
 from liex_lab.scene.background import sample_frames
 from liex_lab.scene.floor import Floor
-from liex_lab.scene.height_maps import CROP, HeightMaps, crop_columns, pack_crop_cameras, view_of
-from liex_lab.scene.segmenter import Segmenter
+from liex_lab.scene.height_maps import (
+    CROP,
+    HeightMaps,
+    Segmenter,
+    crop_columns,
+    pack_crop_cameras,
+    view_of,
+)
 
 Array = NDArray[np.float64]
 

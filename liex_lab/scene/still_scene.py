@@ -24,9 +24,8 @@ from liex_lab.scene import _height_map_kernels as kernels
 from liex_lab.scene._blob_kernels import MAX_BLOBS
 from liex_lab.scene.background import FloorLevel
 from liex_lab.scene.floor import Floor
-from liex_lab.scene.height_maps import HeightMaps, pack_crop_cameras
+from liex_lab.scene.height_maps import HeightMaps, Segmenter, pack_crop_cameras
 from liex_lab.scene.scene import Fixture, Scene, find_fixtures, region_corners, roughness
-from liex_lab.scene.segmenter import Segmenter
 from liex_lab.scene.support_plane import SupportPlane
 from liex_lab.scene.worn import Cable, HeadStage
 

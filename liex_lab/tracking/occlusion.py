@@ -20,8 +20,7 @@ from liex_lab.body.pose import Pose
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.geometry import SE3
 from liex_lab.runtime.shapes import check_shapes
-from liex_lab.scene.height_maps import HeightMaps
-from liex_lab.scene.segmenter import Segmenter
+from liex_lab.scene.height_maps import HeightMaps, Segmenter
 from liex_lab.tracking.observations import joints_of
 
 Array = NDArray[np.float64]

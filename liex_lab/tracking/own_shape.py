@@ -24,8 +24,7 @@ from numpy.typing import NDArray
 from liex_lab.body.pose import Pose
 from liex_lab.estimation.estimator import Estimates, PoseEstimator
 from liex_lab.estimation.session_shape import PLACES, Build, ShapePrior, session_clues
-from liex_lab.scene.height_maps import view_of
-from liex_lab.scene.segmenter import Segmenter
+from liex_lab.scene.height_maps import Segmenter, view_of
 from liex_lab.tracking.residual import BodyResidual
 
 Array = NDArray[np.float64]

@@ -26,8 +26,7 @@ from liex_lab.estimation.cascade import Candidates, ImageSet
 from liex_lab.estimation.estimator import Estimates, PoseEstimator
 from liex_lab.geometry import SE3, brownian_ends, brownian_steps, so3
 from liex_lab.recordings.frame import DepthFrame
-from liex_lab.scene.height_maps import view_of
-from liex_lab.scene.segmenter import Segmenter
+from liex_lab.scene.height_maps import Segmenter, view_of
 
 Array = NDArray[np.float64]
 

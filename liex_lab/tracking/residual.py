@@ -24,8 +24,7 @@ from liex_lab.body.pose import Pose
 from liex_lab.body.surface import Surface, render_meshes
 from liex_lab.geometry import SE3
 from liex_lab.runtime.shapes import check_shapes
-from liex_lab.scene.height_maps import CROP, HeightMaps
-from liex_lab.scene.segmenter import Segmenter
+from liex_lab.scene.height_maps import CROP, HeightMaps, Segmenter
 from liex_lab.tracking.observations import joints_of
 from liex_lab.tracking.trust import MOST_ERROR, MOST_RESIDUAL
 

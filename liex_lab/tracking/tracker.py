@@ -26,8 +26,7 @@ from liex_lab.runtime.memory import Allocator
 from liex_lab.runtime.threads import threads
 from liex_lab.scene.background import has_noise
 from liex_lab.scene.background_segmenter import BackgroundSubtraction
-from liex_lab.scene.height_maps import HeightMaps, Patches
-from liex_lab.scene.segmenter import Segmenter
+from liex_lab.scene.height_maps import HeightMaps, Patches, Segmenter
 from liex_lab.tracking.motion_model import TrackingParameters
 from liex_lab.tracking.observations import Observations
 from liex_lab.tracking.occlusion import OcclusionCorrection, behind_something

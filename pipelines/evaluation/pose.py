@@ -37,7 +37,7 @@ from liex_lab.evaluation.scores import (
 )
 from liex_lab.plan import Plan
 from liex_lab.runtime.progress import Progress, silent
-from liex_lab.scene.segmenter import Segmenter
+from liex_lab.scene.height_maps import Segmenter
 from liex_lab.sessions import Session
 from liex_lab.simulation.recording import TrueRecording
 from liex_lab.simulation.simulator import BodySimulator, world_of

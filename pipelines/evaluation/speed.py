@@ -41,7 +41,7 @@ from liex_lab.estimation.initial import draw_starts, start_poses
 from liex_lab.recordings.recording import Recording
 from liex_lab.runtime.processes import own_python
 from liex_lab.runtime.progress import Progress, silent
-from liex_lab.scene.segmenter import Segmenter
+from liex_lab.scene.height_maps import Segmenter
 from liex_lab.simulation.recording import TrueRecording
 from liex_lab.simulation.simulator import world_of
 

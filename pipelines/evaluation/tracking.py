@@ -38,7 +38,7 @@ from liex_lab.evaluation.scores import TRACKING_PROTOCOL, Followed, tracking_fig
 from liex_lab.plan import Plan
 from liex_lab.runtime.progress import Progress, silent
 from liex_lab.runtime.threads import threads
-from liex_lab.scene.segmenter import Segmenter
+from liex_lab.scene.height_maps import Segmenter
 from liex_lab.simulation.simulator import world_of
 from liex_lab.simulation.tracking_sequences import TestSequence, tracking_sequence
 from liex_lab.tracking.observations import Observations

@@ -25,8 +25,7 @@ from liex_lab.evaluation.scores import PoseErrors, interval95, plain
 from liex_lab.geometry import SE3
 from liex_lab.plan import Plan
 from liex_lab.runtime.progress import Progress, silent
-from liex_lab.scene.height_maps import HeightMaps, view_of
-from liex_lab.scene.segmenter import Segmenter
+from liex_lab.scene.height_maps import HeightMaps, Segmenter, view_of
 from liex_lab.simulation.recording import TrueRecording
 
 from ...build import build_scene, plan_of

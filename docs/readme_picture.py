@@ -11,11 +11,11 @@ import subprocess
 import tempfile
 from pathlib import Path
 
-from liex_lab.sessions import Session
+from liex_lab.dashboards.figures.sets import for_the_page
+from liex_lab.dashboards.report.charts import pictures
+from liex_lab.dashboards.report.report import TEMPLATES
 
-from .figures.sets import for_the_page
-from .report.charts import pictures
-from .report.report import TEMPLATES
+from liex_lab.sessions import Session
 
 WIDTH = 860
 HEIGHT = 1064
