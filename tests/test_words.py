@@ -1,0 +1,73 @@
+"""One noun, one word, the field's: `python -m tests.test_words` counts the words that should go.
+
+A limit is what is left today. It only ever goes down; at 0 the word is gone.
+"""
+
+from __future__ import annotations
+
+import re
+import subprocess
+from pathlib import Path
+
+import pytest
+
+REPOSITORY = Path(__file__).resolve().parents[1]
+COUNTED = (
+    "liex_lab",
+    "pipelines",
+    "dashboards",
+    "docs",
+    "README.md",
+    "CHANGELOG.md",
+    "CONTRIBUTING.md",
+)
+ENDINGS = {".py", ".md", ".toml", ".html", ".j2", ".mjs", ".js"}
+LIMITS = {
+    "pictures?": 984,
+    "told": 438,
+    "tells?": 145,
+    "seen": 1031,
+    "said": 278,
+    "says?": 470,
+    "whom?": 124,
+    "looks?": 284,
+    "looked": 90,
+    "anew": 21,
+    "things?": 231,
+    "put right": 11,
+    "bear out": 1,
+    "by far": 0,
+    "wants": 13,
+    "is none": 129,
+    "Wanted": 14,
+    "Listed": 19,
+    "put_in": 7,
+    "Standing": 0,
+    "stating": 0,
+    "METHOD lesson": 1,
+}
+
+
+def count_words() -> dict[str, int]:
+    """How often each word stands in the product and its manual."""
+    listed = subprocess.run(
+        ["git", "ls-files", "--", *COUNTED],
+        cwd=REPOSITORY,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    paths = [REPOSITORY / name for name in listed.stdout.split("\n") if name]
+    text = "\n".join(path.read_text(encoding="utf-8") for path in paths if path.suffix in ENDINGS)
+    return {word: len(re.findall(rf"(?<![A-Za-z]){word}(?![A-Za-z])", text)) for word in LIMITS}
+
+
+@pytest.mark.checks
+def test_words_of_our_own_only_become_fewer() -> None:
+    more = {word: n for word, n in count_words().items() if n > LIMITS[word]}
+    assert not more, f"use the field's word (CONTRIBUTING.md); these became more: {more}"
+
+
+if __name__ == "__main__":
+    for word, n in count_words().items():
+        print(f"{n:5d} of {LIMITS[word]:5d}  {word}")
