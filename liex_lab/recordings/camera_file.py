@@ -46,18 +46,18 @@ class CameraFile:
     Attributes:
         path: where the file is, or would be.
         intrinsics: any of fx, fy, cx, cy, px.
-        width: columns of the pictures, px.
-        height: rows of the pictures, px.
+        width: columns of the images, px.
+        height: rows of the images, px.
         unit_mm: mm per stored step.
         states_unit: whether the file states unit_mm.
         unread: stored values that mean "no reading".
         encoding: how stored values mean depth, one of `ENCODINGS`.
-        byte_order: of PGM pictures, "big" or "little".
+        byte_order: of PGM images, "big" or "little".
         fps: frame rate, Hz, used where there are no stamps.
         timestamps: name of the stamp file.
         time_column: its column of times, see `read_csv_times`.
         time_unit: the unit of that column.
-        pattern: which pictures of the folder to read, as in "*_depth.png".
+        pattern: which images of the folder to read, as in "*_depth.png".
         metadata: subject_id and session_start_time, where stated.
         source: who says all this, for `Camera.source`.
         problems: sentences about keys that mean nothing or were not used.
@@ -116,7 +116,7 @@ class CameraFile:
         """Depth of stored values, by the stated encoding and unit.
 
         Args:
-            stored: (H, W), or (H, W, 3) for colour pictures, as the file holds them.
+            stored: (H, W), or (H, W, 3) for colour images, as the file holds them.
 
         Returns:
             (H, W) float32 mm, 0 where unread.
@@ -124,11 +124,11 @@ class CameraFile:
         return decode(stored, self.encoding, self.unit_mm, self.unread)
 
     def camera(self, width: int, height: int, stated: Lens | None = None) -> Camera:
-        """The camera of pictures of a given size.
+        """The camera of images of a given size.
 
         Args:
-            width: columns of the pictures, px.
-            height: rows of the pictures, px.
+            width: columns of the images, px.
+            height: rows of the images, px.
             stated: a camera or lens that comes before the file.
 
         Returns:
@@ -159,12 +159,12 @@ class CameraFile:
 
 
 def fitting(lens: Lens, width: int, height: int, where: str) -> Camera:
-    """The camera itself, if it belongs to pictures of this size; a bare lens belongs to any.
+    """The camera itself, if it belongs to images of this size; a bare lens belongs to any.
 
     Args:
         lens: a camera, or intrinsics without a size.
-        width: columns of the pictures, px.
-        height: rows of the pictures, px.
+        width: columns of the images, px.
+        height: rows of the images, px.
         where: who states the intrinsics, for the sentence.
 
     Returns:
@@ -187,7 +187,7 @@ def rate(fps: float | None, where: str) -> float | None:
     """A stated frame rate, checked.
 
     Args:
-        fps: frames per second, Hz; None where none is stated.
+        fps: frames per second, Hz; None if none is stated.
         where: who states it, for the sentence.
 
     Returns:

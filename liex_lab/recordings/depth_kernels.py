@@ -32,14 +32,14 @@ UNREAD = np.float32(1e30)  # stands where a pixel without reading belongs, and y
 _ONE = np.float32(1.0)
 _HALF = np.float32(0.5)
 _FOUR = np.float32(4.0)
-# a picture's depths are finite; without infinities and signed zeros the compiler may treat eight
+# an image's depths are finite; without infinities and signed zeros the compiler may treat eight
 # pixels at once
 _FAST = {"nnan", "ninf", "nsz", "arcp", "contract", "afn", "reassoc"}
 
 
 @njit(cache=True, nogil=True)
 def look_up(depth, source, out):
-    """Copy, for every pixel of the ideal picture, the depth of one pixel of the real one.
+    """Copy, for every pixel of the ideal image, the depth of one pixel of the real one.
 
     Args:
         depth: (h, w) float32 mm.
@@ -88,7 +88,7 @@ def lift_row(depth, law, u, v, deep):
 
 @njit(cache=True, nogil=True)
 def lift(depth, laws, out):
-    """Splat every pixel of a depth picture to its true position, the nearest on top.
+    """Splat every pixel of a depth image to its true position, the nearest on top.
 
     A pixel without reading moves like the reading before it in its row, and leaves `UNREAD`.
 
@@ -267,7 +267,7 @@ def _take(
 
 @njit(cache=True, nogil=True)
 def _unpack(words: NDArray[np.uint32], pixels: NDArray[np.uint16]) -> bool:
-    """Decode words into pixels (n,), which are zero before; False where the words do not fit n."""
+    """Decode words into pixels (n,), which are zero before; False if the words do not fit n."""
     n = len(pixels)
     i = 0
     at = 0
@@ -301,7 +301,7 @@ def unpack_rvl(data: bytes | memoryview, width: int, height: int) -> NDArray[np.
         height: rows of the image, px.
 
     Returns:
-        (H, W) uint16; None where the words are cut short or damaged.
+        (H, W) uint16; None if the words are cut short or damaged.
     """
     words = np.frombuffer(data, "<u4", len(data) // 4).astype(np.uint32, copy=False)
     pixels = np.zeros(width * height, np.uint16)
@@ -348,7 +348,7 @@ def _oni_kernels_unpack(stream, table, out):
         out: (n,) float32 mm, written.
 
     Returns:
-        False where the stream and the number of pixels or the table do not fit one another.
+        False if the stream and the number of pixels or the table do not fit one another.
     """
     n_bytes = len(stream)
     n_pixels = len(out)
@@ -414,7 +414,7 @@ def unpack_16z(
         embedded_table: True for `16zT`, False for `16zP`.
 
     Returns:
-        (n_pixels,) float32 mm; None where it is damaged or has another number of pixels.
+        (n_pixels,) float32 mm; None if it is damaged or has another number of pixels.
     """
     table = meaning
     if embedded_table:
@@ -449,17 +449,17 @@ def crc_table():
 
 @njit(cache=True)
 def slices_agree(data, table):
-    """Whether the slices of a picture, found from its last byte backwards, agree with their CRC-32.
+    """Whether the slices of an image, found from its last byte backwards, agree with their CRC-32.
 
     Each slice ends in its length (3 bytes), an error flag (1) and a check sum (4) that makes the
     whole slice's CRC 0.
 
     Args:
-        data: (m,) uint8 bytes of the picture.
+        data: (m,) uint8 bytes of the image.
         table: (256,) uint32 of `crc_table`.
 
     Returns:
-        True where all agree.
+        True if all agree.
     """
     end = data.size
     while end > 8:
@@ -476,7 +476,7 @@ def slices_agree(data, table):
     return end == 0
 
 
-# LZF decompression (Lehmann's LibLZF), in which PCL packs its pictures: numba kernel.
+# LZF decompression (Lehmann's LibLZF), in which PCL packs its images: numba kernel.
 
 
 @njit(cache=True)

@@ -33,7 +33,7 @@ _MOST_ROOMS = 6  # that are kept: being filled, waiting, looked at (two at once)
 
 @dataclass(frozen=True)
 class DepthFrame:
-    """One depth picture with its row and its time.
+    """One depth image with its row and its time.
 
     Attributes:
         index: its row in the recording that it was read from.
@@ -54,7 +54,7 @@ def marked(frames: Iterable[DepthFrame], before: Depth | None = None) -> Iterato
 
     Args:
         frames: in order; the depth of the last one is held until the next one has come.
-        before: depth (H, W) mm of the frame before the first; None where there is none.
+        before: depth (H, W) mm of the frame before the first; None if absent.
     """
     for frame in frames:
         # a few rows tell nearly all images apart
@@ -71,8 +71,8 @@ def marked(frames: Iterable[DepthFrame], before: Depth | None = None) -> Iterato
 class FrameRooms:
     """Room for frames that lie side by side, used again once nobody holds a frame in it.
 
-    What is new in memory has to be blanked by the system first, which takes longer than copying a
-    picture into room that was used before.
+    The system has to blank new memory first, which takes longer than copying an image into memory
+    that was used before.
     """
 
     def __init__(self) -> None:
@@ -141,7 +141,7 @@ def stacked(frames: Sequence[DepthFrame]) -> NDArray[np.float32]:
 
 
 def has_readings(depth: Depth) -> bool:
-    """Whether a picture shows anything at all; of one that does a few pixels tell, as a rule.
+    """Whether an image shows anything at all; of one that does a few pixels tell, as a rule.
 
     Args:
         depth: (H, W) float32 mm, 0 where unread.
@@ -175,14 +175,14 @@ def depth_mm(stored: NDArray[Any], unit_mm: float = 1.0, unread: Sequence[float]
     return depth
 
 
-# Depth encodings of cameras and data sets, and millimetres as the steps of 16-bit pictures.
+# Depth encodings of cameras and data sets, and millimetres as the steps of 16-bit images.
 
 
 Stored = NDArray[Any]
 
 # median depth: nearer than any camera reads, farther than any animal is watched
 PLAUSIBLE_MM = (100.0, 10_000.0)
-COLOUR = "nyu-hand"  # the one encoding of 8-bit colour pictures
+COLOUR = "nyu-hand"  # the one encoding of 8-bit colour images
 LARGEST_STEP = 0xFFFF
 _NO_DISPARITY = 2047  # of 11 bits
 _FARTHEST_MM = 10_000.0
@@ -235,11 +235,11 @@ def decode(
     """Depth in millimetres of stored values in a named encoding.
 
     Args:
-        stored: (H, W), or (H, W, 3) uint8 (blue, green, red) for colour pictures.
+        stored: (H, W), or (H, W, 3) uint8 (blue, green, red) for colour images.
         encoding: one of `ENCODINGS`.
         unit_mm: mm per step of what `encoding` gives.
         unread: *stored* values that mean "no reading" (of what the encoding gives for colour
-            pictures), besides those that it has by itself: the largest of a type of integers where
+            images), besides those that it has by itself: the largest of a type of integers where
             it would lie farther than any animal is watched, as cameras and programs write it.
 
     Returns:
@@ -266,7 +266,7 @@ def whole_steps(depth: Depth, step_mm: float) -> NDArray[np.uint16] | None:
         step_mm: mm of a step.
 
     Returns:
-        (H, W) uint16; None where there are none, or they need more than 16 bits.
+        (H, W) uint16; None if absent, or they need more than 16 bits.
     """
     if depth.size and float(depth.max()) > LARGEST_STEP * step_mm:
         return None
@@ -288,7 +288,7 @@ def nearest_steps(depth: Depth, step_mm: float) -> NDArray[np.uint16] | None:
         step_mm: mm of a step.
 
     Returns:
-        (H, W) uint16; None where they do not fit into 16 bits.
+        (H, W) uint16; None if they do not fit into 16 bits.
     """
     steps = np.rint(depth / np.float32(step_mm))
     return steps.astype(np.uint16) if not depth.size or float(steps.max()) <= LARGEST_STEP else None
@@ -322,14 +322,14 @@ def region_mask(corners: Sequence[Sequence[float]], width: int, height: int) -> 
 
     Args:
         corners: (u, v) pixels, at least three.
-        width: of the picture, px.
-        height: of the picture, px.
+        width: of the image, px.
+        height: of the image, px.
 
     Returns:
         (height, width) bool.
 
     Raises:
-        PlanError: the corners are no polygon, or nothing of it is in the picture.
+        PlanError: the corners are no polygon, or nothing of it is in the image.
     """
     import cv2
 

@@ -130,10 +130,10 @@ def open_recording(
     Args:
         path: a file or a folder, or 'synthetic:walk?seed=3&frames=300' for a virtual animal (see
             `open_synthetic`).
-        camera: comes before whatever the files state; a `Lens` for pictures of any size.
+        camera: comes before whatever the files state; a `Lens` for images of any size.
         fps: frame rate, Hz; used only where the files hold no time stamps.
         topic: the depth topic to read of an MCAP file or a ROS bag with several of them.
-        pattern: which pictures of a folder to take, as in `*.tif`, before a camera.toml.
+        pattern: which images of a folder to take, as in `*.tif`, before a camera.toml.
         strict: refuse a recording that is cut short, instead of only saying so in `problems` and
             `truncated`. A part of an MCAP file that is damaged is refused when it is read.
         progress: reports while an archive is unpacked or an index made.

@@ -179,22 +179,22 @@ class Recording:
     Attributes:
         name: name of the recording, usually that of its file or folder without the suffix.
         format: name of the format, such as "images", "moseq", "mcap", "oni" or "rosbag".
-        camera: the camera of the depth pictures.
+        camera: the camera of the depth images.
         files: the files that it is read from; none where it is in no file. Its slices share them.
         times_ns: (n,) int64 time stamps on the recording's own clock, ns, strictly increasing;
             read-only.
         problems: sentences about what is odd in the file, also those found while reading.
         doubts: those of the problems that may make lengths or times wrong; each becomes a reason
             of the verdict.
-        truncated: True where the file is cut or damaged.
+        truncated: True if the file is cut or damaged.
         metadata: facts that the files state, such as subject_id and session_start_time (ISO 8601
             with zone).
         optics: what was undone on reading (distortion, water, mirroring), empty where nothing was;
             see `rectify`.
         unpacked: folder with what an archive was unpacked to, which opens as the same recording
-            while this one is open; None where nothing was.
-        region_px: (u, v) corners, pixels, of the polygon outside of which every picture was made
-            unread; () where the whole picture is there, see `masked`.
+            while this one is open; None if nothing was.
+        region_px: (u, v) corners, pixels, of the polygon outside of which every image was made
+            unread; () where the whole image is there, see `masked`.
     """
 
     def __init__(
@@ -223,7 +223,7 @@ class Recording:
         Args:
             name: name of the recording.
             format: name of the format that it was read from.
-            camera: the camera of the depth pictures.
+            camera: the camera of the depth images.
             times_ns: (n,) int64 stamps, ns, strictly increasing.
             read: turns a stored frame's number into depth (H, W) float32 mm, 0 where unread.
             sources: the files of the input; empty for a recording that is in no file.
@@ -231,14 +231,14 @@ class Recording:
             truncated: whether the file is cut or damaged.
             whole: (n,) bool, which frames are whole; None for all.
             metadata: facts that the files state.
-            close: lets go of open files; called once, at the latest when nobody holds the
+            close: releases open files; called once, at the latest when nobody holds the
                 recording.
             step_ns: median step, ns; a slice inherits it from its parent, None to compute it.
             stored: (n,) int64 number of the stored frame of each row; a slice inherits it, None for
                 0 ... n - 1.
             faults: (n,) uint8, which stamps were moved and why, an index into `FAULTS`; None for
                 none.
-            grow: opens what was appended to the files since, see `grown`; None where the format
+            grow: opens what was appended to the files since, see `grown`; None if the format
                 cannot.
             unpacked: folder with what an archive was unpacked to, if it opens as the same
                 recording.
@@ -297,12 +297,12 @@ class Recording:
 
     @property
     def width(self) -> int:
-        """Columns of a depth picture, px."""
+        """Columns of a depth image, px."""
         return self.camera.width
 
     @property
     def height(self) -> int:
-        """Rows of a depth picture, px."""
+        """Rows of a depth image, px."""
         return self.camera.height
 
     @property
@@ -415,7 +415,7 @@ class Recording:
         yield from iter(lambda: list(islice(frames, n_frames)), [])
 
     def __getitem__(self, part: slice) -> Recording:
-        """Some of the frames as a recording of its own, with rows counted anew.
+        """Some of the frames as a recording of its own, with rows counted again.
 
         It reads from the same files, and has the digest of the whole input.
 
@@ -475,7 +475,7 @@ class Recording:
         nobody holds it any more, unless it is lent.
 
         Args:
-            camera: the camera of the transformed pictures.
+            camera: the camera of the transformed images.
             change: turns depth (H, W) float32 mm of this camera into depth of the other one.
             optics: what `change` undoes, kept as the `optics` of the result.
             lent: this recording stays open whatever becomes of the result.
@@ -489,7 +489,7 @@ class Recording:
     def masked(self, region_px: Sequence[Sequence[float]], *, lent: bool = False) -> Recording:
         """The same frames with everything outside of a polygon unread: an arena cut out of them.
 
-        Size and camera of the pictures stay as they are, so what is measured within keeps its
+        Size and camera of the images stay as they are, so what is measured within keeps its
         place. The input, and so the digest, stays the same.
 
         Args:
@@ -500,7 +500,7 @@ class Recording:
             The recording of what lies inside.
 
         Raises:
-            PlanError: the corners are no polygon in the picture.
+            PlanError: the corners are no polygon in the image.
         """
         inside = region_mask(region_px, self.width, self.height)
         cut = self.seen_by(
@@ -576,7 +576,7 @@ class Recording:
         more.
 
         Returns:
-            The longer recording; None where the format has to be opened anew for that.
+            The longer recording; None if the format has to be opened again for that.
         """
         more = None if self._grow is None else self._grow()
         if more is not None:
@@ -607,7 +607,7 @@ class Recording:
         return whole.hexdigest()
 
     def close(self) -> None:
-        """Let go of files, and remove what was unpacked.
+        """Release files, and remove what was unpacked.
 
         A slice leaves that to the recording that it was cut from.
         """

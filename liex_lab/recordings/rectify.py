@@ -1,8 +1,8 @@
-"""Rectification of depth pictures: lens distortion and refraction at a water surface undone.
+"""Rectification of depth images: lens distortion and refraction at a water surface undone.
 
 Everything that follows works with an ideal pinhole camera in air; a recording without distortion
 and water is handed on untouched. Distortion (Brown-Conrady or Kannala-Brandt): inverse warping by a
-nearest-neighbour lookup table into a straight picture with the same focal lengths, so much larger
+nearest-neighbour lookup table into a straight image with the same focal lengths, so much larger
 that it holds what the distorted one held. Water (Snell's law, `Water.law`): every reading becomes a
 point, is moved to where it truly is and splatted forward with a z-buffer into an ideal camera that
 stands higher than the real one (`Water.without`); small holes are then closed.
@@ -22,14 +22,14 @@ from liex_lab.recordings import depth_kernels as kernels
 from liex_lab.recordings.frame import Depth
 from liex_lab.recordings.recording import Recording
 
-_MUCH_LOST = 0.05  # share of a picture's pixels that leave it
-_MAX_GROWTH = 0.15  # of a picture's width or height, at each side
+_MUCH_LOST = 0.05  # share of an image's pixels that leave it
+_MAX_GROWTH = 0.15  # of an image's width or height, at each side
 
 
 def rectified(recording: Recording, water: Water | None = None) -> Recording:
     """The recording with lens distortion and refraction undone whenever a frame is read.
 
-    Where more than 5 % of the pixels leave the picture, `problems` of the result say so.
+    Where more than 5 % of the pixels leave the image, `problems` of the result say so.
 
     Args:
         recording: depth as the camera delivered it.
@@ -58,9 +58,9 @@ def rectified(recording: Recording, water: Water | None = None) -> Recording:
 
 
 def mirrored(recording: Recording, *, lent: bool = False) -> Recording:
-    """The recording with left and right exchanged in every picture.
+    """The recording with left and right exchanged in every image.
 
-    Drivers of some cameras deliver mirrored pictures; and a left hand in the mirror is a right one.
+    Drivers of some cameras deliver mirrored images; and a left hand in the mirror is a right one.
 
     Args:
         recording: depth to be mirrored.
@@ -78,7 +78,7 @@ def mirrored(recording: Recording, *, lent: bool = False) -> Recording:
 
 
 def ideal_camera(camera: Camera, water: Water | None = None) -> Camera:
-    """The ideal pinhole to which pictures of a camera are carried.
+    """The ideal pinhole to which images of a camera are carried.
 
     Args:
         camera: the real camera, perhaps with distortion.
@@ -92,9 +92,9 @@ def ideal_camera(camera: Camera, water: Water | None = None) -> Camera:
 
 
 def straight_camera(camera: Camera) -> Camera:
-    """The same camera with a straight lens and a picture large enough for what the bent one held.
+    """The same camera with a straight lens and an image large enough for what the bent one held.
 
-    The picture grows at each side by as much as the bent one's edge went in, up to 15 % of its
+    The image grows at each side by as much as the bent one's edge went in, up to 15 % of its
     width or height (`_MAX_GROWTH`), for the far corners of a fisheye lens would be at infinity. Its
     sizes are multiples of four.
 
@@ -172,17 +172,17 @@ def rectifier(camera: Camera, water: Water | None = None) -> Callable[[Depth], D
 
 
 def lookup_table(camera: Camera) -> NDArray[np.int32]:
-    """For every pixel of the straight picture the nearest pixel of the distorted one.
+    """For every pixel of the straight image the nearest pixel of the distorted one.
 
     Nearest-neighbour inverse warping: the other way round would leave holes where the straight
-    picture is the larger one. Depth along the optical axis is the same in both, and is never mixed
+    image is the larger one. Depth along the optical axis is the same in both, and is never mixed
     from neighbours, which would put points between the animal and the floor.
 
     Args:
         camera: the camera with distortion.
 
     Returns:
-        (H', W') int32, row * width + column in the distorted picture; -1 where there is none.
+        (H', W') int32, row * width + column in the distorted image; -1 where there is none.
     """
     straight = straight_camera(camera)
     seen = np.floor(camera.project(straight.unproject(_pixels(straight), 1.0)) + 0.5)
@@ -218,7 +218,7 @@ def pixel_laws(camera: Camera, water: Water) -> NDArray[np.float32]:
 
 
 def share_lost(camera: Camera) -> float:
-    """Share of the distorted picture's pixels that the straight picture does not hold.
+    """Share of the distorted image's pixels that the straight image does not hold.
 
     Args:
         camera: the real camera, perhaps with distortion.
@@ -234,7 +234,7 @@ def share_lost(camera: Camera) -> float:
 
 
 def _inside(uv: NDArray[np.float64], camera: Camera) -> NDArray[np.bool_]:
-    """Where (...) pixels (..., 2) are in the picture; False for NaN."""
+    """Where (...) pixels (..., 2) are in the image; False for NaN."""
     right = uv[..., 0] + 0.5
     down = uv[..., 1] + 0.5
     return np.asarray((right >= 0) & (right < camera.width) & (down >= 0) & (down < camera.height))

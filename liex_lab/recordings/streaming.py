@@ -119,7 +119,7 @@ def _grown(
 
 
 def _again(opened: Recording, reopen: Callable[[], Recording]) -> Recording:
-    """What is there now: read on where the format can, else opened anew."""
+    """What is there now: read on where the format can, else opened again."""
     more = opened.grown()
     if more is None:
         opened.close()
@@ -271,7 +271,7 @@ def _exactly(link: socket.socket, n: int, by: float) -> bytes:
 
 
 def _fill(link: socket.socket, place: memoryview, by: float) -> bool:
-    """Receive bytes until the buffer is full; False where the sender has gone, or time is over.
+    """Receive bytes until the buffer is full; False if the sender has gone, or time is over.
 
     They go straight to where they stay, for a frame has millions of them. `by` is a time of
     `time.monotonic`, s: one who sends a byte now and then does not hold us for ever.

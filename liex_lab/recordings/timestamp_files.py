@@ -42,7 +42,7 @@ _DATE = re.compile(
 )
 _SECONDS = re.compile(
     r"(?<!\d)(\d{9,10})\.(\d{3,9})(?!\d)"
-)  # since 1970, as the TUM data sets name their pictures
+)  # since 1970, as the TUM data sets name their images
 _WHOLE = re.compile(r"(?<!\d)(\d{10})(\d{3}|\d{6}|\d{9})(?!\d)")  # the same in ms, us or ns
 _CLOCKS = (  # nanoseconds in a step, the step of 1970, and what that is called
     (10**9, 0, "seconds since 1970"),
@@ -272,7 +272,7 @@ def read_stamps(
             header; None for one of time_ns, time_us, time_ms and time_s, or else the first column
             of dates or, where usual_ns is given, the first that can be times.
         unit: ns, us, ms or s, where the column's name does not end in it.
-        usual_ns: nanoseconds in the unit of numbers whose column has no name; None where numbers
+        usual_ns: nanoseconds in the unit of numbers whose column has no name; None if numbers
             need one.
 
     Raises:
@@ -362,7 +362,7 @@ def _can_be_times(path: Path, rows: list[tuple[int, list[str]]], numbers: bool) 
 
 
 def _reader(text: str) -> Callable[[str], Decimal] | None:
-    """What reads a stamp that is written like this one; None where it is no stamp."""
+    """What reads a stamp that is written like this one; None if it is no stamp."""
     return next((read for read in (number, _moment_ns, _clock_ns) if _reads(read, text)), None)
 
 
@@ -419,7 +419,7 @@ def _is_column(digits: list[str], header: Sequence[str] = ()) -> bool:
 
 
 def name_numbers(names: Sequence[str]) -> Times | None:
-    """The number that counts in each name; None where the names differ in more than numbers.
+    """The number that counts in each name; None if the names differ in more than numbers.
 
     Of several numbers it is the first that rises with every name and counts, or else the last that
     differs.
@@ -458,7 +458,7 @@ def _stem(name: str) -> str:
 
 
 def name_times(names: Sequence[str]) -> tuple[Times, bool] | None:
-    """Stamps in the names of pictures, and whether they count from 1970 in UTC.
+    """Stamps in the names of images, and whether they count from 1970 in UTC.
 
     They must stand once in every name, in one of these forms: a date and a time with a fraction of
     a second, as in 20121214T142255.814212 (its zone is not known, so it tells steps and no moment);
@@ -469,7 +469,7 @@ def name_times(names: Sequence[str]) -> tuple[Times, bool] | None:
         names: names of the files, in order.
 
     Returns:
-        (n,) int64 stamps, ns, and True where they tell a moment; None where the names hold none.
+        (n,) int64 stamps, ns, and True if they tell a moment; None if the names hold none.
     """
     for form in (_DATE, _SECONDS, _WHOLE):
         found = [form.findall(name) for name in names]

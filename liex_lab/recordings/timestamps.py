@@ -95,7 +95,7 @@ class MonotoneTimes:
         times_ns: (n,) int64 ns, strictly increasing.
         faults: (n,) uint8 index into `FAULTS`: why this frame's stamp was moved, 0 for one that
             stayed.
-        problem: a sentence about what was moved; None where nothing was.
+        problem: a sentence about what was moved; None if nothing was.
         order: (n,) number, in file order, of the frame of each row; empty for 0 ... n - 1.
     """
 
@@ -313,7 +313,7 @@ def frame_counts(numbers: Times, step: int | None = None) -> Times | None:
         step: the step that is asked for; None for any.
 
     Returns:
-        (n,) int64 from 0; None where they do not count.
+        (n,) int64 from 0; None if they do not count.
     """
     steps = np.diff(numbers)
     sizes, often = np.unique(steps, return_counts=True)
@@ -374,7 +374,7 @@ def make_monotone(times_ns: Times) -> MonotoneTimes:
     where it was, as if one frame were missing there: how long the jump really took, nobody knows.
     After that the most stamps that can stay do stay, exactly (a longest increasing subsequence), so
     that one wild stamp does not drag its neighbours along. The others are spread evenly between
-    those that stay, for that is when a camera that runs on takes its pictures.
+    those that stay, for that is when a camera that runs on takes its images.
 
     Args:
         times_ns: (n,) int64 stamps, ns, in file order.
@@ -512,9 +512,9 @@ def match_counts(n_frames: int, n_stamps: int, frames_from: str, times_from: str
     """The sentence on frames and stamps that are not equally many; none where they are.
 
     Args:
-        n_frames: number of pictures.
+        n_frames: number of images.
         n_stamps: number of stamps.
-        frames_from: name of the file or folder of the pictures.
+        frames_from: name of the file or folder of the images.
         times_from: name of the file of the stamps.
     """
     if n_frames == n_stamps:
@@ -545,7 +545,7 @@ def start_of_day(stated: object) -> str | None:
         stated: ISO 8601 text or a datetime, as a file states it; anything else states none.
 
     Returns:
-        The moment; None where there is none, or it has no zone and so says no moment.
+        The moment; None if absent, or it has no zone and so says no moment.
     """
     with suppress(ValueError):
         moment = stated if isinstance(stated, datetime) else read_moment(str(stated))[0]
@@ -582,7 +582,7 @@ def start_of_clock(first_ns: int) -> str | None:
         first_ns: the stamp, ns.
 
     Returns:
-        The moment, to the microsecond; None where the stamp is before 2000 and so plainly counts
+        The moment, to the microsecond; None if the stamp is before 2000 and so plainly counts
         from something else.
     """
     if first_ns < PLAUSIBLE_NS[0]:

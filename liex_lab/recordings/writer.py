@@ -59,7 +59,7 @@ class RecordingWriter(ABC):
 
     @abstractmethod
     def release(self) -> None:
-        """Let go of open files, whether the recording is whole or not."""
+        """Release open files, whether the recording is whole or not."""
 
     def __enter__(self) -> Self:
         return self
@@ -78,9 +78,9 @@ class RecordingWriter(ABC):
 
 
 class PictureFolderWriter(RecordingWriter):
-    """Writer of a folder of 16-bit PNG pictures, with a camera.toml and a timestamps.csv.
+    """Writer of a folder of 16-bit PNG images, with a camera.toml and a timestamps.csv.
 
-    There is one picture to a frame; the stamps are in nanoseconds.
+    There is one image to a frame; the stamps are in nanoseconds.
     """
 
     def __init__(
@@ -109,7 +109,7 @@ class PictureFolderWriter(RecordingWriter):
         path.mkdir()
 
     def add(self, frame: DepthFrame) -> None:
-        """Write one picture; its stamp is kept until the end.
+        """Write one image; its stamp is kept until the end.
 
         Args:
             frame: the frame, depth (H, W) float32 mm.
@@ -178,7 +178,7 @@ def steps_of(frame: DepthFrame, step_mm: float, exact: bool) -> NDArray[np.uint1
 
 
 def png_of(steps: NDArray[np.uint16]) -> bytes:
-    """Encode a picture as 16-bit grey PNG.
+    """Encode an image as 16-bit grey PNG.
 
     Args:
         steps: (H, W) uint16.

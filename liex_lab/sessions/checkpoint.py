@@ -196,7 +196,7 @@ class Checkpoint:
             append_rrd(self.replay, self.folder / LOGS[0])
 
     def tidy(self, folder: Path) -> None:
-        """Remove what is no part of the finished session, and let go of the lock.
+        """Remove what is no part of the finished session, and release the lock.
 
         Args:
             folder: where the session is now.
@@ -207,7 +207,7 @@ class Checkpoint:
         self._held.close()
 
     def leave(self, keep: bool) -> None:
-        """Let go of the folder without finishing the session.
+        """Release the folder without finishing the session.
 
         Args:
             keep: leave it there if it has a checkpoint, so that the work can resume later;
@@ -220,7 +220,7 @@ class Checkpoint:
         self._held.close()
 
     def _cut(self, state: State) -> bool:
-        """Cut everything back to the checkpoint; False where something is shorter than it says."""
+        """Cut everything back to the checkpoint; False if something is shorter than it says."""
         for path in self.folder.iterdir():  # half-written tables, and logs without a checkpoint
             own = path.name in OWN and path.name != _RESUMED
             if not own and path.name not in state.logs:
@@ -312,7 +312,7 @@ class Columns:
 
     @staticmethod
     def cut(folder: Path, n: int) -> bool:
-        """Truncate every column to its first rows; False where one has fewer.
+        """Truncate every column to its first rows; False if one has fewer.
 
         Args:
             folder: where the files lie.

@@ -171,7 +171,7 @@ class Entry:
         number: of the entry, from 1.
         author: who made it.
         made_at: when, ISO 8601 with time zone.
-        what: the correction; None where the entry takes another one back.
+        what: the correction; None if the entry takes another one back.
         undoes: number of the entry that is taken back, a correction or an undo; 0 for a correction.
     """
 

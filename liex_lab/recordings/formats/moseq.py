@@ -64,11 +64,11 @@ class Mode(NamedTuple):
 
     Attributes:
         name: its name in the Azure Kinect sensor SDK.
-        width: columns of its pictures, px.
-        height: rows of its pictures, px.
+        width: columns of its images, px.
+        height: rows of its images, px.
         side: side of the sensor once binned, px.
-        left: column of the picture's corner on it, px.
-        top: row of the picture's corner on it, px.
+        left: column of the image's corner on it, px.
+        top: row of the image's corner on it, px.
     """
 
     name: str
@@ -107,14 +107,14 @@ class FactoryLens(NamedTuple):
 
 
 def mode_of(width: int, height: int) -> Mode | None:
-    """The depth mode with pictures of a given size.
+    """The depth mode with images of a given size.
 
     Args:
         width: columns, px.
         height: rows, px.
 
     Returns:
-        The mode; None where there is none.
+        The mode; None if absent.
     """
     return next((mode for mode in MODES if (mode.width, mode.height) == (width, height)), None)
 
@@ -126,7 +126,7 @@ def read_calibration(data: bytes) -> FactoryLens | None:
         data: the JSON, perhaps with zeros at its end.
 
     Returns:
-        The lens; None where the data do not state one.
+        The lens; None if the data do not state one.
     """
     try:
         cameras = json.loads(data.rstrip(b"\0"))["CalibrationInformation"]["Cameras"]
@@ -145,7 +145,7 @@ def read_calibration(data: bytes) -> FactoryLens | None:
 
 
 def azure_camera(mode: Mode, lens: FactoryLens | None) -> Camera:
-    """The camera of a depth mode, in pixels of its pictures.
+    """The camera of a depth mode, in pixels of its images.
 
     Pixel (0, 0) is the centre of the top-left pixel, hence the half that is taken off.
 
@@ -204,7 +204,7 @@ class RawFrames(Stack):
         height: rows of a frame, px.
         dtype: of the stored values, "<u2" or ">u2".
         n: how many whole frames there are.
-        truncated: True where the file ends in the middle of a frame, or its archive is cut.
+        truncated: True if the file ends in the middle of a frame, or its archive is cut.
         problems: sentences about the file.
         once: True of a file that was unpacked for this, and is read from front to back.
     """
@@ -365,7 +365,7 @@ class _Session:
             name: its name.
             sources: the input's files.
             opened: what closing the recording closes, added to.
-            unpacked: folder of unpacked files; None where nothing was unpacked.
+            unpacked: folder of unpacked files; None if nothing was unpacked.
 
         Returns:
             The recording.
@@ -471,7 +471,7 @@ class _Session:
         lens = next(filter(None, map(read_calibration, attached)), None)
         if mode is not None and lens is not None:
             return azure_camera(mode, lens)
-        # where the files do not name the camera, only a Kinect v2 has pictures of its size
+        # where the files do not name the camera, only a Kinect v2 has images of its size
         kind = self.metadata.camera or KINECT
         if track is not None and any(name.startswith("K4A_") for name in track.tags):
             kind = AZURE

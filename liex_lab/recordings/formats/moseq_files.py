@@ -32,15 +32,15 @@ from liex_lab.runtime.progress import Progress
 from liex_lab.runtime.text_files import read_text
 
 _PACKED = 1 << 18  # bytes read at once
-_UNPACKED = 1 << 17  # and unpacked at once: an empty picture is a thousand times its packed size
+_UNPACKED = 1 << 17  # and unpacked at once: an empty image is a thousand times its packed size
 _PIECE = 256  # packed bytes tried at once where there is damage
 _ENOUGH_ZEROS = (
     1 << 22
 )  # far more than the end of any tar; a walk that asks for more skips over what is missing
 _ALWAYS = 1 << 29  # bytes that are unpacked whatever they were packed to
-_MOST_TIMES = 200  # what more than that unpacks to: true pictures have noise
+_MOST_TIMES = 200  # what more than that unpacks to: true images have noise
 _MOST_HEADER = 1 << 20  # bytes of a member's name and notes
-_MOST_NOTES = 1 << 28  # bytes of any file but the pictures: stamps of days
+_MOST_NOTES = 1 << 28  # bytes of any file but the images: stamps of days
 _GZIP_MAGIC = b"\x1f\x8b"
 Pieces = Generator[bytes | memoryview, None, None]
 
@@ -78,7 +78,7 @@ class Unpacked:
     Attributes:
         files: where the wanted files were written, by their plain names.
         seen: plain names of all files in the archive.
-        cut: True where the archive is cut or damaged.
+        cut: True if the archive is cut or damaged.
     """
 
     files: dict[str, Path]
@@ -270,7 +270,7 @@ def unpack(archive: Path, wanted: Sequence[str], folder: Path, progress: Progres
 def _unpack(
     archive: Path, wanted: Sequence[str], folder: Path, progress: Progress, fast: bool
 ) -> Unpacked | None:
-    """The same by ISA-L or by zlib; None where ISA-L came to no end, and zlib may tell more."""
+    """The same by ISA-L or by zlib; None if ISA-L came to no end, and zlib may tell more."""
     files: dict[str, Path] = {}
     seen: set[str] = set()
     cut = False
@@ -332,7 +332,7 @@ def _check_size(archive: Path, member: tarfile.TarInfo, folder: Path) -> None:
 
 
 def _copy(member: tarfile.TarInfo, to: Path, stream: _Patient) -> bool:
-    """Write the member that comes next as far as its bytes are real; True where some miss."""
+    """Write the member that comes next as far as its bytes are real; True if some miss."""
     stream.seek(member.offset_data)
     try:
         with to.open("wb") as out:
@@ -402,8 +402,8 @@ def read_metadata(path: Path | None, cut: bool) -> Metadata:
     """Parse metadata.json, which is often missing.
 
     Args:
-        path: the file; None where there is none, and then nothing is stated.
-        cut: True where its archive is cut; a broken file is then left out instead of refused.
+        path: the file; None if absent, and then nothing is stated.
+        cut: True if its archive is cut; a broken file is then left out instead of refused.
 
     Returns:
         What it says.
@@ -488,13 +488,13 @@ def read_session_stamps(
 
     Args:
         files: the session's files by name.
-        cut: True where their archive is cut.
+        cut: True if their archive is cut.
         camera_file: may state the column of times and its unit.
         problems: sentences, appended to where the stamps are missing or give an unlikely rate.
         doubts: reasons not to rely on the times, appended to.
 
     Returns:
-        The stamps; None where there are none.
+        The stamps; None if absent.
 
     Raises:
         RecordingError: a line has no stamp where one was expected.

@@ -369,7 +369,7 @@ class OniFrames:
         Args:
             file: the open file.
             node: the depth node with the positions of its frames.
-            form: the picture format that frames must agree with to be of this recording.
+            form: the image format that frames must agree with to be of this recording.
             how: a camera.toml beside the file, for its unit_mm (a further factor) and unread.
             problems: the recording's sentences, appended to when a damaged frame is met.
         """
@@ -411,7 +411,7 @@ class OniFrames:
             number: index of the frame in the node.
 
         Returns:
-            (H, W) float32 mm, 0 where unread; None where it is damaged or of another size.
+            (H, W) float32 mm, 0 where unread; None if it is damaged or of another size.
         """
         form = self._formats[self._node.format_of[number]]
         if form is None or form.constant != self._form.constant:

@@ -147,10 +147,10 @@ def open_files(
 
 
 def none_whole_error(files: list[Path], kind: str) -> RecordingError:
-    """The error for pictures none of which can be read.
+    """The error for images none of which can be read.
 
     Args:
-        files: the pictures.
+        files: the images.
         kind: their kind, such as "PNG".
 
     Returns:
@@ -178,13 +178,13 @@ def too_large(size: Size) -> bool:
         size: (width, height), px.
 
     Returns:
-        True where it is too large.
+        True if it is too large.
     """
     return size[0] * size[1] > MAX_PIXELS
 
 
 def not_depth_error(where: str, found: str, width: int, height: int) -> RecordingError:
-    """The error for a picture that cannot hold depth.
+    """The error for an image that cannot hold depth.
 
     Args:
         where: the file.
@@ -205,10 +205,10 @@ def not_depth_error(where: str, found: str, width: int, height: int) -> Recordin
 
 
 def one_size_error(pictures: list[tuple[str, int, int]]) -> RecordingError:
-    """The error for pictures of several sizes in one recording.
+    """The error for images of several sizes in one recording.
 
     Args:
-        pictures: (name, width, height) of one picture of each size.
+        pictures: (name, width, height) of one image of each size.
 
     Returns:
         The error, to be raised.
@@ -220,7 +220,7 @@ def one_size_error(pictures: list[tuple[str, int, int]]) -> RecordingError:
     )
 
 
-# PNG pictures: 16-bit grey or 8-bit colour, with size, completeness and chunk CRCs checked.
+# PNG images: 16-bit grey or 8-bit colour, with size, completeness and chunk CRCs checked.
 
 
 _SIGNATURE = b"\x89PNG\r\n\x1a\n"
@@ -244,7 +244,7 @@ def decode_png(data: NDArray[np.uint8], colour: bool = False) -> NDArray[Any] | 
         colour: 8-bit colour is expected instead of 16-bit grey.
 
     Returns:
-        (H, W) uint16, or with colour (H, W, 3) uint8 (blue, green, red); None where it does not
+        (H, W) uint16, or with colour (H, W, 3) uint8 (blue, green, red); None if it does not
         decode to that.
     """
     import cv2
@@ -277,15 +277,15 @@ def _sums_agree(data: NDArray[np.uint8]) -> bool:
 
 
 def open_pngs(files: list[Path], progress: Progress, colour: bool = False) -> FileStack:
-    """Open PNG pictures: the head and the tail of every file are checked, and none is decoded.
+    """Open PNG images: the head and the tail of every file are checked, and none is decoded.
 
     Args:
-        files: the pictures, in order.
+        files: the images, in order.
         progress: reports how many were looked at.
         colour: 8-bit colour is expected instead of 16-bit grey.
 
     Returns:
-        The pictures as a stack.
+        The images as a stack.
 
     Raises:
         RecordingError: none is whole, one is of another kind, or their sizes differ.
@@ -326,7 +326,7 @@ def png_size(head: bytes, where: str, colour: bool = False) -> tuple[int, int] |
         colour: 8-bit colour is expected instead of 16-bit grey.
 
     Returns:
-        (width, height), px; None where the header is cut off.
+        (width, height), px; None if the header is cut off.
 
     Raises:
         RecordingError: it is no PNG, its header makes no sense, or it is of another kind.
@@ -354,14 +354,14 @@ def png_size(head: bytes, where: str, colour: bool = False) -> tuple[int, int] |
     return width, height
 
 
-# PGM pictures (Netpbm P5, 16 bits), in the byte order of the standard or in the reverse one.
+# PGM images (Netpbm P5, 16 bits), in the byte order of the standard or in the reverse one.
 
 
 _DTYPES = {"big": np.dtype(">u2"), "little": np.dtype("<u2")}
 _GAP = rb"(?:\s|#[^\n]*\n)+"
 _HEADER = re.compile(rb"P5" + _GAP + rb"(\d{1,9})" + _GAP + rb"(\d{1,9})" + _GAP + rb"(\d{1,5})\s")
 _PGM_HEAD_BYTES = 1024  # comments included
-_N_ASKED = 5  # pictures, spread over the recording, that tell the byte order
+_N_ASKED = 5  # images, spread over the recording, that tell the byte order
 
 
 class _Header(NamedTuple):
@@ -372,16 +372,16 @@ class _Header(NamedTuple):
 
 
 def open_pgms(files: list[Path], progress: Progress, byte_order: str | None = None) -> FileStack:
-    """Open PGM pictures: the header and the length of every file are checked, and none is decoded.
+    """Open PGM images: the header and the length of every file are checked, and none is decoded.
 
     Args:
-        files: the pictures, in order.
+        files: the images, in order.
         progress: reports how many were looked at.
         byte_order: "big", as the format's definition has it, or "little"; None for big, unless most
-            pictures are plainly the other way round, which `problems` then say.
+            images are plainly the other way round, which `problems` then say.
 
     Returns:
-        The pictures as a stack.
+        The images as a stack.
 
     Raises:
         RecordingError: none is whole, one is no depth, or their sizes differ.
@@ -454,7 +454,7 @@ def _is_little(path: Path) -> bool:
     return 2.0 * rough["little"] < rough["big"]
 
 
-# PCL's `.pclzf` pictures: 16-bit depth packed with LZF, intrinsics in the XML beside each.
+# PCL's `.pclzf` images: 16-bit depth packed with LZF, intrinsics in the XML beside each.
 
 
 _MAGIC = b"PCLZF"
@@ -481,14 +481,14 @@ class _PclzfHeader(NamedTuple):
 
 
 def open_pclzfs(files: list[Path], progress: Progress) -> FileStack:
-    """Open PCLZF pictures: the header and the length of every file are checked, none is decoded.
+    """Open PCLZF images: the header and the length of every file are checked, none is decoded.
 
     Args:
-        files: the pictures, in order.
+        files: the images, in order.
         progress: reports how many were looked at.
 
     Returns:
-        The pictures as a stack.
+        The images as a stack.
 
     Raises:
         RecordingError: none is whole, one holds colour, or their sizes differ.
@@ -526,7 +526,7 @@ def _pclzf_decode(path: Path) -> NDArray[np.uint16] | None:
 
 
 def read_pclzf_camera(picture: Path) -> dict[str, float] | None:
-    """Intrinsics and unit in the XML beside a picture.
+    """Intrinsics and unit in the XML beside an image.
 
     PCL writes `frame_T.xml` beside `frame_T_depth.pclzf`, with two elements at the top, <rgb> and
     <depth>, which is why it is no XML until something stands around them.
@@ -535,7 +535,7 @@ def read_pclzf_camera(picture: Path) -> dict[str, float] | None:
         picture: the .pclzf file.
 
     Returns:
-        fx, fy, cx, cy (px) and unit_mm (mm per stored step) by name; None where there is no XML
+        fx, fy, cx, cy (px) and unit_mm (mm per stored step) by name; None if there is no XML
         that states them.
     """
     path = picture.with_name(

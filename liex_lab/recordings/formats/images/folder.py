@@ -1,7 +1,7 @@
-"""Folder of depth pictures (PNG, TIFF, PGM or PCLZF) with a camera.toml and time stamps.
+"""Folder of depth images (PNG, TIFF, PGM or PCLZF) with a camera.toml and time stamps.
 
-Pictures are read in natural order. Times come from a stamp file, or else from the names of the
-pictures, or else from a stated constant rate.
+Images are read in natural order. Times come from a stamp file, or else from the names of the
+images, or else from a stated constant rate.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from liex_lab.recordings.timestamps import (
 )
 from liex_lab.runtime.progress import Progress, silent
 
-KINDS: dict[str, tuple[str, ...]] = {  # of pictures: how their files' names end
+KINDS: dict[str, tuple[str, ...]] = {  # of images: how their files' names end
     "PNG": (".png",),
     "TIFF": (".tif", ".tiff"),
     "PGM": (".pgm",),
@@ -46,21 +46,21 @@ KINDS: dict[str, tuple[str, ...]] = {  # of pictures: how their files' names end
 }
 SUFFIXES = tuple(suffix for kind in KINDS.values() for suffix in kind)
 _EIGHT_BIT = (".jpg", ".jpeg", ".bmp", ".gif", ".webp")
-_COLOUR_PCLZF = "_rgb.pclzf"  # PCL's grabber writes one beside every depth picture
+_COLOUR_PCLZF = "_rgb.pclzf"  # PCL's grabber writes one beside every depth image
 
 
 class Pictures:
-    """Pictures as depth: a cut or damaged one is wholly unread, and `problems` says so once."""
+    """Images as depth: a cut or damaged one is wholly unread, and `problems` says so once."""
 
     def __init__(
         self, stack: Stack, decode: Callable[[Stored], Depth], problems: list[str]
     ) -> None:
-        """Take a stack of pictures.
+        """Take a stack of images.
 
         Args:
-            stack: the stored pictures.
-            decode: stored values of one picture to depth (H, W) float32 mm.
-            problems: the recording's sentences, appended to when a damaged picture is met.
+            stack: the stored images.
+            decode: stored values of one image to depth (H, W) float32 mm.
+            problems: the recording's sentences, appended to when a damaged image is met.
         """
         self.stack = stack
         self.problems = problems
@@ -68,10 +68,10 @@ class Pictures:
         self._bad = {i for i, whole in enumerate(stack.whole) if not whole}
 
     def read(self, index: int) -> Depth:
-        """Depth of one picture.
+        """Depth of one image.
 
         Args:
-            index: number of the picture.
+            index: number of the image.
 
         Returns:
             (H, W) float32 mm, 0 where unread.
@@ -89,7 +89,7 @@ class Pictures:
 
 
 def list_pictures(folder: Path, pattern: str = "*") -> tuple[str, list[Path]]:
-    """The depth pictures of a folder, in natural order: frame_2 before frame_10.
+    """The depth images of a folder, in natural order: frame_2 before frame_10.
 
     Args:
         folder: where they are.
@@ -157,14 +157,14 @@ def open_images(
     progress: Progress = silent,
     pattern: str | None = None,
 ) -> Recording:
-    """Open a folder of pictures, or one picture or stack, as a recording.
+    """Open a folder of images, or one image or stack, as a recording.
 
     Args:
         path: the folder or file.
         camera: comes before a camera.toml.
         fps: frame rate, Hz; used only where there are no time stamps, and before that of a
             camera.toml.
-        progress: reports how many pictures were looked at.
+        progress: reports how many images were looked at.
         pattern: which names of the folder to take; None takes those that camera.toml states.
 
     Returns:
@@ -191,15 +191,15 @@ def open_images(
 
 @dataclass(frozen=True)
 class Folder:
-    """Pictures and all that is needed to make a recording of them.
+    """Images and all that is needed to make a recording of them.
 
     Attributes:
         path: what was asked for, a folder or one file.
-        files: the files of the pictures.
+        files: the files of the images.
         camera_toml: what the folder's camera.toml says.
-        stack: the stored pictures.
+        stack: the stored images.
         decode: stored values to depth (H, W) float32 mm.
-        beside: further files that say how to read the pictures.
+        beside: further files that say how to read the images.
     """
 
     path: Path
@@ -257,7 +257,7 @@ class Folder:
 
     @property
     def folder(self) -> Path:
-        """Where the pictures lie."""
+        """Where the images lie."""
         return self.path if self.path.is_dir() else self.path.parent
 
     def _times(
@@ -318,7 +318,7 @@ def _kind(path: Path) -> str:
 
 
 def _with_xml(camera_file: CameraFile, picture: Path) -> CameraFile:
-    """The camera file completed by the intrinsics that PCL writes beside each picture."""
+    """The camera file completed by the intrinsics that PCL writes beside each image."""
     from liex_lab.recordings.formats.images.files import read_pclzf_camera
 
     found = read_pclzf_camera(picture)
@@ -334,16 +334,16 @@ def _with_xml(camera_file: CameraFile, picture: Path) -> CameraFile:
 
 
 def open_stack(kind: str, files: list[Path], camera_file: CameraFile, progress: Progress) -> Stack:
-    """The pictures of one kind.
+    """The images of one kind.
 
     Args:
         kind: a key of `KINDS`.
-        files: the pictures, in order.
+        files: the images, in order.
         camera_file: what the folder's camera.toml says, for encoding and byte_order.
         progress: reports how many were looked at.
 
     Returns:
-        The pictures as a stack.
+        The images as a stack.
 
     Raises:
         RecordingError: they cannot be read, or the stated encoding does not fit their kind.

@@ -34,13 +34,13 @@ VIEW = 1  # of the three cameras, the one that everybody measures on
 N_JOINTS = 36
 
 _NAME = re.compile(r"(?:depth|synthdepth)_([123])_(\d{7})\.png")
-_N_ASKED = 8  # pictures: one may be damaged
+_N_ASKED = 8  # images: one may be damaged
 _NOMINAL_HZ = 30.0  # the data set holds no times; its cameras ran at this rate
 
 
 @dataclass(frozen=True)
 class NyuJoints:
-    """Ground truth of one view, in the order of its pictures, which are numbered from 1.
+    """Ground truth of one view, in the order of its images, which are numbered from 1.
 
     Attributes:
         names: (J,) names of the joints, as in the file.
@@ -62,7 +62,7 @@ def looks_like_nyu(folder: Path, names: list[str]) -> bool:
         names: names of the files in it.
 
     Returns:
-        True where one of the first eight so named is in colour.
+        True if one of the first eight so named is in colour.
     """
     for name in [name for name in names if _NAME.fullmatch(name)][:_N_ASKED]:
         with (folder / name).open("rb") as file:
@@ -78,20 +78,20 @@ def open_nyu(
     progress: Progress = silent,
     view: int = VIEW,
 ) -> Recording:
-    """Open a folder of `depth_K_NNNNNNN.png` (K is the view), or one such picture, as a recording.
+    """Open a folder of `depth_K_NNNNNNN.png` (K is the view), or one such image, as a recording.
 
     Args:
-        path: the folder or picture.
+        path: the folder or image.
         camera: comes before a camera.toml and the data set's own intrinsics.
         fps: frame rate, Hz, where there is no stamp file; None for that of a camera.toml, or 30.
-        progress: reports how many pictures were looked at.
+        progress: reports how many images were looked at.
         view: which of the three cameras, 1 to 3.
 
     Returns:
         The recording.
 
     Raises:
-        RecordingError: there are no such pictures, or they are damaged.
+        RecordingError: there are no such images, or they are damaged.
     """
     folder = path if path.is_dir() else path.parent
     camera_toml = CameraFile.read(folder / CAMERA_FILE)
@@ -109,7 +109,7 @@ def open_nyu(
 
 
 def frame_numbers(folder: Path, view: int = VIEW) -> list[int]:
-    """Numbers, from 1, of the pictures that `open_nyu` reads, in its order.
+    """Numbers, from 1, of the images that `open_nyu` reads, in its order.
 
     Args:
         folder: where they are.
@@ -119,7 +119,7 @@ def frame_numbers(folder: Path, view: int = VIEW) -> list[int]:
         (N,) numbers out of the names.
 
     Raises:
-        RecordingError: there are no such pictures.
+        RecordingError: there are no such images.
     """
     return [int(path.stem.split("_")[2]) for path in _pictures(folder, view)]
 
@@ -139,7 +139,7 @@ def _pictures(folder: Path, view: int) -> list[Path]:
 def read_nyu_joints(folder: Path, view: int = VIEW) -> NyuJoints:
     """Joints of one view out of a joint_data.mat.
 
-    Row i belongs to the picture with number i + 1.
+    Row i belongs to the image with number i + 1.
 
     Args:
         folder: the folder that holds joint_data.mat, or the file itself.

@@ -1,4 +1,4 @@
-"""Point clouds (XYZ text, PLY) as depth pictures: projection into a pinhole camera with a z-buffer.
+"""Point clouds (XYZ text, PLY) as depth images: projection into a pinhole camera with a z-buffer.
 
 u = floor(fx x / z + cx + 1/2), v likewise; the nearest point of a pixel counts.
 """
@@ -57,7 +57,7 @@ def open_clouds(
     to_camera: Callable[[Points], Points],
     progress: Progress,
 ) -> FileStack:
-    """Open point clouds, one to a file, as pictures of a camera.
+    """Open point clouds, one to a file, as images of a camera.
 
     Args:
         files: the clouds, in order.
@@ -67,7 +67,7 @@ def open_clouds(
         progress: reports how many were looked at.
 
     Returns:
-        Pictures (H, W) float64 mm, 0 = unread, as a stack.
+        Images (H, W) float64 mm, 0 = unread, as a stack.
 
     Raises:
         RecordingError: none of the files is whole.
@@ -81,7 +81,7 @@ def open_clouds(
             path: its file.
 
         Returns:
-            (H, W) mm; None where it is damaged.
+            (H, W) mm; None if it is damaged.
         """
         points = read_points(path, columns)
         return None if points is None else render_points(to_camera(points), camera)
@@ -118,7 +118,7 @@ def read_points(path: Path, columns: tuple[int, int, int]) -> Points | None:
         columns: of x, y, z in a text, from 0.
 
     Returns:
-        (n, 3); None where the file is damaged.
+        (n, 3); None if the file is damaged.
     """
     try:
         return _read_ply(path) if path.suffix.lower() == PLY else _read_text(path, columns)
@@ -181,7 +181,7 @@ class _PlyHeader(NamedTuple):
 
 
 def _ply_header(head: bytes) -> _PlyHeader | None:
-    """What the header says of the vertices; None where it is cut, or the vertices are not the first
+    """What the header says of the vertices; None if it is cut, or the vertices are not the first
     element.
     """
     end = head.find(b"end_header")

@@ -58,10 +58,10 @@ class Profile(BaseModel):
         sign: -1 where object space lies on the negative side of the file's z axis.
         invalid: stored values that mean "no reading" (of points: z).
         valid_mm: nearest and farthest depth after conversion, mm; what is outside is unread.
-        resolution_divisor: the sensor's pixels per pixel of the exported picture.
+        resolution_divisor: the sensor's pixels per pixel of the exported image.
         evidence: how it is known that the profile is right; begins with "confirmed" once measured.
         virtual: v for virtual depth itself, raw for 1 - 1 / v.
-        up: True where y points up in the file.
+        up: True if y points up in the file.
         columns: of x, y, z in a text file, from 0.
         focal_mm: focal length of the main lens, mm, from which the intrinsics follow where no
             camera.toml states them.
@@ -292,7 +292,7 @@ def looks_like_raytrix(folder: Path, names: list[str]) -> bool:
         names: names of the files in it.
 
     Returns:
-        True where one of them is.
+        True if one of them is.
     """
     if any(fnmatch(name.lower(), pattern) for name in names for pattern in _LOOKS_LIKE):
         return True
@@ -342,7 +342,7 @@ def _with_lens(camera_toml: CameraFile, profile: Profile, stack: Stack, path: Pa
 
 
 def _check(stack: Stack, profile: Profile, path: Path) -> None:
-    """The first picture must be what the profile says: stored type, sign, working distance."""
+    """The first image must be what the profile says: stored type, sign, working distance."""
     first = stack.whole.index(True)
     stored = stack.read(first)
     if stored is None:

@@ -1,4 +1,4 @@
-"""TIFF pictures, 16-bit or float32 grey, one to a file or many, BigTIFF and ImageJ included.
+"""TIFF images, 16-bit or float32 grey, one to a file or many, BigTIFF and ImageJ included.
 
 Uncompressed pixels in one piece are read straight from their offset; other pages go through
 tifffile, and codecs that it leaves to another package (LZW) through OpenCV. A stack ends at its
@@ -38,21 +38,21 @@ _UNPACKERS = (8, 32946, 50013, *_LZMA)  # codes of compression: DEFLATE, LZMA
 # sentences
 logging.getLogger("tifffile").addHandler(logging.NullHandler())
 
-_LEAST_DIRECTORY = 30  # bytes: one that describes a picture has more
+_LEAST_DIRECTORY = 30  # bytes: one that describes an image has more
 _DEPTHS = ("u2", "i2", "f4")  # of pixels that hold depth
 _KINDS = {"u": "unsigned integer ", "i": "signed integer ", "f": "floating-point "}
 _SIGNATURES = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 
 
 class _Page(NamedTuple):
-    """One picture.
+    """One image.
 
     Attributes:
         path: its file.
         page: its page in the file.
         offset: where its pixels lie when they are plain bytes in one piece, else -1.
         dtype: of the pixels, with byte order.
-        whole: True where it is not cut short.
+        whole: True if it is not cut short.
     """
 
     path: Path
@@ -64,12 +64,12 @@ class _Page(NamedTuple):
 
 @dataclass
 class TiffStack(Stack):
-    """TIFF pictures of one size, in order, with one file open at a time.
+    """TIFF images of one size, in order, with one file open at a time.
 
     Attributes:
-        pages: the pictures.
-        width: columns of a picture, px.
-        height: rows of a picture, px.
+        pages: the images.
+        width: columns of an image, px.
+        height: rows of an image, px.
         problems: sentences about stacks that are cut short.
     """
 
@@ -86,22 +86,22 @@ class TiffStack(Stack):
 
     @property
     def whole(self) -> list[bool]:
-        """(n,) True for pictures that are not cut short."""
+        """(n,) True for images that are not cut short."""
         return [page.whole for page in self.pages]
 
     @property
     def truncated(self) -> bool:
-        """True where a picture, or the end of a stack, is missing."""
+        """True if an image, or the end of a stack, is missing."""
         return bool(self.problems) or not all(self.whole)
 
     def read(self, index: int) -> NDArray[Any] | None:
-        """Stored values of one picture.
+        """Stored values of one image.
 
         Args:
-            index: number of the picture.
+            index: number of the image.
 
         Returns:
-            (H, W) uint16, int16 or float32; None where the picture is cut or damaged.
+            (H, W) uint16, int16 or float32; None if the image is cut or damaged.
         """
         page = self.pages[index]
         if not page.whole:
@@ -132,7 +132,7 @@ class TiffStack(Stack):
             return _decode_with_opencv(page)
 
     def _check_unpacked(self, tif: tifffile.TiffFile, number: int) -> None:
-        """Raises where a packed piece is larger than the picture when it is unpacked.
+        """Raises where a packed piece is larger than the image when it is unpacked.
 
         tifffile unpacks whole pieces of DEFLATE and LZMA in memory, of any size.
         """
@@ -146,10 +146,10 @@ class TiffStack(Stack):
                 raise _LargerThanStatedError
 
     def label(self, index: int) -> str:
-        """Name of a picture, for a sentence.
+        """Name of an image, for a sentence.
 
         Args:
-            index: number of the picture.
+            index: number of the image.
 
         Returns:
             Its page and file.
@@ -165,7 +165,7 @@ class TiffStack(Stack):
 
 
 class _LargerThanStatedError(Exception):
-    """A packed piece of a picture that holds more than the picture."""
+    """A packed piece of an image that holds more than the image."""
 
 
 def _fits(packed: bytes, compression: int, most: int) -> bool:
@@ -192,7 +192,7 @@ def _fits(packed: bytes, compression: int, most: int) -> bool:
 
 
 def _decode_with_opencv(page: _Page) -> NDArray[Any] | None:
-    """LZW and other codecs that tifffile leaves to another package; None where OpenCV cannot
+    """LZW and other codecs that tifffile leaves to another package; None if OpenCV cannot
     either.
     """
     import cv2
@@ -205,14 +205,14 @@ def _decode_with_opencv(page: _Page) -> NDArray[Any] | None:
 
 
 def open_tiffs(files: list[Path], progress: Progress) -> TiffStack:
-    """Open TIFF pictures: every page is listed and its bytes must be there; none is decoded.
+    """Open TIFF images: every page is listed and its bytes must be there; none is decoded.
 
     Args:
         files: the files, in order, of one page or many.
         progress: reports how many files were looked at.
 
     Returns:
-        The pictures as a stack.
+        The images as a stack.
 
     Raises:
         RecordingError: none is whole, one is no depth, or their sizes differ.
@@ -242,10 +242,10 @@ def open_tiffs(files: list[Path], progress: Progress) -> TiffStack:
 
 
 def _list_pages(path: Path) -> tuple[list[_Page], tuple[int, int] | None, bool]:
-    """The pictures of one file in order, their (width, height), and whether the list of pages comes
+    """The images of one file in order, their (width, height), and whether the list of pages comes
     to its end.
 
-    No pictures and no size where the directory is cut off.
+    No images and no size where the directory is cut off.
     """
     size_bytes = path.stat().st_size
     with path.open("rb") as file:
@@ -275,7 +275,7 @@ def _list_pages(path: Path) -> tuple[list[_Page], tuple[int, int] | None, bool]:
     except RecordingError:
         if not any(page.whole for page in listed):
             raise
-        # damage inside a directory, or a picture of another kind behind the depth: the stack ends
+        # damage inside a directory, or an image of another kind behind the depth: the stack ends
         # before it
         return listed, size, False
     except (
@@ -331,7 +331,7 @@ def _describe(path: Path, index: int, page: Any, size_bytes: int) -> _Page:
 
 
 def _imagej_stack(tif: tifffile.TiffFile, first: _Page, size_bytes: int) -> list[_Page]:
-    """ImageJ describes a stack of over 4 GB as one page; its other pictures follow the first
+    """ImageJ describes a stack of over 4 GB as one page; its other images follow the first
     without a gap.
     """
     shape = tif.series[0].shape if tif.series else ()

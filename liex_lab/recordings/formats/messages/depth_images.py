@@ -1,4 +1,4 @@
-"""Decoders of pictures and point clouds in messages to depth, shared by MCAP files and ROS bags.
+"""Decoders of images and point clouds in messages to depth, shared by MCAP files and ROS bags.
 
 Raw 16UC1, mono16 and 32FC1 (m); PNG; ROS's compressedDepth as PNG or RVL, where quantised depth is
 z = a / (q - b) m; point clouds, in rows or splatted with a z-buffer: u = fx x / z + cx.
@@ -37,19 +37,19 @@ _ENCODINGS = {
 }  # stored type, mm per step
 _CONFIG = struct.Struct(
     "<iff"
-)  # before a compressedDepth picture: format, and a and b of quantised depth
+)  # before a compressedDepth image: format, and a and b of quantised depth
 _RVL_SIZE = struct.Struct("<II")
 _PNG_HEAD = 26
 
 
 def picture_size(message: DepthMessage) -> tuple[int, int] | None:
-    """Size of a depth picture, without decoding it.
+    """Size of a depth image, without decoding it.
 
     Args:
-        message: a picture or a point cloud.
+        message: an image or a point cloud.
 
     Returns:
-        Width and height, px; (0, 0) for points without rows; None for a picture of another kind, or
+        Width and height, px; (0, 0) for points without rows; None for an image of another kind, or
         of more than 2^24 pixels (clouds: 2^22 points).
     """
     if isinstance(message, PointCloud):
@@ -64,7 +64,7 @@ def picture_size(message: DepthMessage) -> tuple[int, int] | None:
     try:
         found = _packed_size(message)
     except (RecordingError, DamagedMessage, struct.error):
-        return None  # a colour PNG is a picture for people
+        return None  # a colour PNG is an image for people
     return found if found is not None and min(found) > 0 and _fits(found) else None
 
 
@@ -72,7 +72,7 @@ def stated_kind(message: DepthMessage) -> str:
     """What a message says that it holds, for a sentence.
 
     Args:
-        message: a picture or a point cloud.
+        message: an image or a point cloud.
     """
     if isinstance(message, PointCloud):
         return f"points of {', '.join(message.columns) or 'nothing'}"
@@ -116,15 +116,15 @@ def decode(
     """Depth of a message.
 
     Args:
-        message: a picture or a point cloud.
-        camera: the camera of the recording, whose size pictures must have; loose points are
+        message: an image or a point cloud.
+        camera: the camera of the recording, whose size images must have; loose points are
             projected by it.
         step_mm: mm in a step of 16-bit depth.
         scale: what a camera.toml multiplies all depth by.
         unread: what a camera.toml calls unread, as stored (for clouds: mm).
 
     Returns:
-        (H, W) float32 mm of the camera's size; None where the message holds no such picture.
+        (H, W) float32 mm of the camera's size; None if the message holds no such image.
     """
     if picture_size(message) not in ((camera.width, camera.height), (0, 0)):
         return None
@@ -213,7 +213,7 @@ def _cloud_depth(cloud: PointCloud, camera: Camera) -> NDArray[np.float64] | Non
 
 
 def _column(cloud: PointCloud, name: str) -> NDArray[np.float64] | None:
-    """One coordinate (height, width) of the points, m; None where the data are shorter than they
+    """One coordinate (height, width) of the points, m; None if the data are shorter than they
     should be.
     """
     offset, kind = cloud.columns[name]

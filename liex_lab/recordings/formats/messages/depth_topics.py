@@ -2,8 +2,8 @@
 
 One walk over the file finds the topics whose first message is depth, the calibrations, and what a
 known program states besides (`realsense`). The calibration of the same frame_id is taken, nearest
-by topic name, and mapped onto the picture by its binning and region of interest; a rectified topic
-takes P instead of K. Stamps are the sensor's, or the times of sending or logging where pictures
+by topic name, and mapped onto the image by its binning and region of interest; a rectified topic
+takes P instead of K. Stamps are the sensor's, or the times of sending or logging where images
 have none.
 """
 
@@ -52,7 +52,7 @@ from liex_lab.recordings.recording import Recording
 from liex_lab.recordings.timestamps import in_order_of_sensor, start_of_clock
 from liex_lab.runtime.progress import Progress
 
-# 16-bit pictures too, but of brightness: not chosen unless asked for
+# 16-bit images too, but of brightness: not chosen unless asked for
 _EXPECTED = (
     "expected foxglove.RawImage or CompressedImage, or sensor_msgs Image or CompressedImage, with "
     "the encoding 16UC1, mono16 or 32FC1 or as 16-bit PNG, or a point cloud"
@@ -62,7 +62,7 @@ _DAMAGE = (ValueError, TypeError, KeyError, OverflowError, struct.error, Damaged
 _FACTS = ("subject_id", "session_start_time")
 # calibrations of a topic that are compared: of all that differ, and of those that an index lists
 _N_COMPARED = 12
-_SAME_CAMERA = 0.005  # of the focal length or the picture: what a driver's rounding changes
+_SAME_CAMERA = 0.005  # of the focal length or the image: what a driver's rounding changes
 _STATE_IT = (
     "state the depth camera's numbers with --set camera.fx=... --set camera.fy=... --set "
     "camera.cx=... --set camera.cy=..."
@@ -155,7 +155,7 @@ class _Found:
         stated: what a known program states about its recording.
         read: the channels of which a message could be read.
         failed: why a message of a channel could not be read.
-        kinds: what the pictures of a channel hold instead of depth.
+        kinds: what the images of a channel hold instead of depth.
     """
 
     parsers: dict[Channel, Parser | None] = field(default_factory=dict)
@@ -175,12 +175,12 @@ class _Found:
 
 @dataclass
 class _Frames:
-    """Pictures of one topic, fetched from the file one at a time.
+    """Images of one topic, fetched from the file one at a time.
 
     Attributes:
         file: the open file.
         topic: the topic.
-        places: (n, 3) chunk, offset and length of each picture's message.
+        places: (n, 3) chunk, offset and length of each image's message.
         camera: the camera of the recording.
         step_mm: mm in a step of 16-bit depth.
         unread: what a camera.toml calls unread.
@@ -202,10 +202,10 @@ class _Frames:
     lock: Any = field(default_factory=Lock)
 
     def read(self, number: int) -> Depth:
-        """Depth of one picture; one that is damaged or of another size is wholly unread.
+        """Depth of one image; one that is damaged or of another size is wholly unread.
 
         Args:
-            number: index of the picture, in order of logging.
+            number: index of the image, in order of logging.
 
         Returns:
             (H, W) float32 mm, 0 where unread.
@@ -356,7 +356,7 @@ def _open(
 def _stamps(
     topic: str, rows: NDArray[np.int64], stated: Statements, problems: list[str]
 ) -> NDArray[np.int64]:
-    """The sensor's stamps; the times of sending or logging instead when pictures have none (zero),
+    """The sensor's stamps; the times of sending or logging instead when images have none (zero),
     for two clocks do not mix.
     """
     logged, sent, in_headers = rows[:, :3].T
@@ -404,7 +404,7 @@ def _walk(file: MessageFile, found: _Found, progress: Progress) -> None:
 
 
 def _note(found: _Found, envelope: Envelope | Listed, parse: Parser) -> bool:
-    """Take note of a message; False where it is the first picture of a topic and not depth, or
+    """Take note of a message; False if it is the first image of a topic and not depth, or
     where others on its topic add nothing.
     """
     channel = envelope.channel
@@ -438,7 +438,7 @@ def _note(found: _Found, envelope: Envelope | Listed, parse: Parser) -> bool:
 
 
 def _choose(file: MessageFile, found: _Found, topic: str | None) -> _Topic:
-    """The topic asked for, or the only one. Pictures come before point clouds, which are made of
+    """The topic asked for, or the only one. Images come before point clouds, which are made of
     them.
     """
     depths = list(found.depths.values())
@@ -537,7 +537,7 @@ def _calibrated(
     problems: list[str],
     doubts: list[str],
 ) -> Camera:
-    """The camera of a topic's calibrations; without distortion where the picture was straightened,
+    """The camera of a topic's calibrations; without distortion where the image was straightened,
     and for points.
     """
     fits = [one for one in calibrations if _mapped(topic, one[1])[1] == topic.size]
@@ -579,17 +579,17 @@ def _calibrated(
 
 
 def _is_straight(topic: _Topic) -> bool:
-    """Whether pictures have no distortion any more: rectified ones, and points."""
+    """Whether images have no distortion any more: rectified ones, and points."""
     is_cloud = plain_schema(topic.channel) in CLOUD_SCHEMAS
     return "rect" in topic.name.rpartition("/")[2] or is_cloud
 
 
 def _mapped(topic: _Topic, calibration: Calibration) -> tuple[_Numbers, tuple[int, int]]:
-    """(fx, fy, cx, cy) and size, px, of the pictures on a topic, by binning and region of interest.
+    """(fx, fy, cx, cy) and size, px, of the images on a topic, by binning and region of interest.
 
-    A calibration is of the full picture, of which the topic may show a part or every second pixel.
+    A calibration is of the full image, of which the topic may show a part or every second pixel.
     Drivers also state these of intrinsics that are mapped already, or beside the size of the part:
-    then the principal point, which lies near the middle of most pictures, decides.
+    then the principal point, which lies near the middle of most images, decides.
     """
     p = calibration.p
     straight = _is_straight(topic) and len(p) == 12 and p[0] > 0 and p[5] > 0
@@ -625,7 +625,7 @@ def _is_of_another_lens(topic: _Topic, where: str, calibration: Calibration) -> 
 
 
 def _size(topic: _Topic, of_camera: tuple[int, int]) -> tuple[int, int]:
-    """Of the pictures; loose points are seen in a picture of the camera's size."""
+    """Of the images; loose points are seen in an image of the camera's size."""
     return topic.size if min(topic.size) else of_camera
 
 

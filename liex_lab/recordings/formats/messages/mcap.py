@@ -140,7 +140,7 @@ class McapFile(MessageFile):
         """Make ready for a walk over what was written behind the last whole record since.
 
         Returns:
-            How many chunks the walks before are sure of; None where the file became shorter.
+            How many chunks the walks before are sure of; None if the file became shorter.
         """
         size = self.path.stat().st_size
         if size < self.size:

@@ -205,13 +205,13 @@ class RosMessages:
         out.floats(d)
         for numbers in _matrices(camera):
             out.floats(numbers)
-        out.whole(0, 0, 0, 0, 0, 0)  # not binned, the whole picture
+        out.whole(0, 0, 0, 0, 0, 0)  # not binned, the whole image
         out.small(0)
         return bytes(out.content)
 
 
 def _compressed_image(time_ns: int, how: str, packed: bytes) -> bytes:
-    """sensor_msgs/msg/CompressedImage of a picture that is packed in some way."""
+    """sensor_msgs/msg/CompressedImage of an image that is packed in some way."""
     out = _Cdr(time_ns)
     out.text(how)
     out.whole(len(packed))
@@ -263,7 +263,7 @@ DEPTH_TOPIC = "/camera/depth"
 CALIBRATION_TOPICS = {"foxglove": "/camera/calibration", "ros": "/camera/camera_info"}
 _CHUNK_BYTES = (
     128 * 1024
-)  # a picture closes its chunk, so that one frame is unpacked to read one frame
+)  # an image closes its chunk, so that one frame is unpacked to read one frame
 
 
 class McapDepthWriter(RecordingWriter):
@@ -289,7 +289,7 @@ class McapDepthWriter(RecordingWriter):
             path: the .mcap file.
             camera: the camera of the frames.
             messages: "foxglove" for Foxglove's schemas in protobuf, "ros" for ROS 2's.
-            packing: "raw", "png", or of ROS's messages "rvl", of a picture within its chunk.
+            packing: "raw", "png", or of ROS's messages "rvl", of an image within its chunk.
             step_mm: mm of a stored step, of "png" and "rvl".
             metadata: facts of the recording, kept as text in a metadata record.
         """
@@ -316,7 +316,7 @@ class McapDepthWriter(RecordingWriter):
         return self._writer.register_channel(topic, self._messages.encoding, number)
 
     def add(self, frame: DepthFrame) -> None:
-        """Write a picture, and about once a second the calibration.
+        """Write an image, and about once a second the calibration.
 
         The calibration is repeated so that a viewer may start anywhere.
 

@@ -47,7 +47,7 @@ class DamagedMessage(ValueError):
 
 @dataclass(frozen=True, slots=True)
 class RawPicture:
-    """An unpacked picture.
+    """An unpacked image.
 
     Attributes:
         stamp_ns: stamp of the sensor, ns.
@@ -56,7 +56,7 @@ class RawPicture:
         height: rows, px.
         encoding: of the pixels, 16UC1, mono16, 32FC1, ...
         step: bytes from one row to the next; 0 for no padding.
-        big_endian: True where the high byte comes first.
+        big_endian: True if the high byte comes first.
         data: the pixels, row by row.
     """
 
@@ -72,7 +72,7 @@ class RawPicture:
 
 @dataclass(frozen=True, slots=True)
 class PackedPicture:
-    """A packed picture.
+    """A packed image.
 
     Attributes:
         stamp_ns: stamp of the sensor, ns.
@@ -89,18 +89,18 @@ class PackedPicture:
 
 @dataclass(frozen=True, slots=True)
 class PointCloud:
-    """Points in metres, in rows like a picture or loose.
+    """Points in metres, in rows like an image or loose.
 
     Attributes:
         stamp_ns: stamp of the sensor, ns.
         frame_id: name of the points' frame.
-        width: columns of the picture that they lie in, row by row.
+        width: columns of the image that they lie in, row by row.
         height: its rows; 1 for loose points.
         columns: by name (x, y, z), the offset within a point, bytes, and NumPy's name of the type.
         point_step: bytes from one point to the next.
         row_step: bytes from one row to the next.
         data: the points.
-        pose: position (3) m and quaternion x, y, z, w of the cloud's own frame; None where the
+        pose: position (3) m and quaternion x, y, z, w of the cloud's own frame; None if the
             points are in the camera frame.
     """
 
@@ -121,14 +121,14 @@ class Calibration:
 
     Attributes:
         frame_id: name of the camera's frame.
-        width: columns of its pictures, px.
-        height: rows of its pictures, px.
+        width: columns of its images, px.
+        height: rows of its images, px.
         model: ROS's name of the distortion model.
         d: distortion coefficients.
         k: (9,) camera matrix 3 x 3, row by row.
-        p: (12,) projection matrix 3 x 4 of the rectified picture, row by row; or empty.
-        binning: pixels of the full picture, along columns and rows, that make one of these; 0 is 1.
-        roi: column and row offset, width and height of the part of the full picture, px; width or
+        p: (12,) projection matrix 3 x 4 of the rectified image, row by row; or empty.
+        binning: pixels of the full image, along columns and rows, that make one of these; 0 is 1.
+        roi: column and row offset, width and height of the part of the full image, px; width or
             height 0 for the whole.
     """
 
@@ -220,7 +220,7 @@ class Listed(NamedTuple):
         log_time_ns: (n,) uint64 times of logging, ns.
         places: (n, 3) int64 chunk, offset and length of each, as a `Place`.
         stamp_ns: (n,) int64 stamps of the sensor, ns; None takes the times of logging.
-        publish_time_ns: (n,) when each was sent, ns; None where that was not read.
+        publish_time_ns: (n,) when each was sent, ns; None if that was not read.
     """
 
     channel: Channel
@@ -239,7 +239,7 @@ class Chunk(NamedTuple):
         packing: their compression: none, zstd, lz4 or bz2.
         size: unpacked size, bytes.
         crc: CRC-32 of the unpacked bytes; 0 for none.
-        cut: True where the file ends before the chunk does.
+        cut: True if the file ends before the chunk does.
     """
 
     offset: int
@@ -262,7 +262,7 @@ class MessageFile(ABC):
         file: the open file.
         size: its size, bytes.
         whole: True while it ends as it should and nothing in it was found damaged.
-        parsed: False where messages were listed by an index, and only some of them looked at.
+        parsed: False if messages were listed by an index, and only some of them looked at.
         channels: all channels that were met, each once, in order; as keys, for a file may name
             thousands of them.
         notes: facts that the file states about itself.
@@ -306,7 +306,7 @@ class MessageFile(ABC):
         """Make ready for a walk over what was written behind the last whole record since.
 
         Returns:
-            How many chunks the walks before are sure of; None where the file has to be opened anew.
+            How many chunks the walks before are sure of; None if the file has to be opened again.
         """
         return None
 
@@ -379,7 +379,7 @@ class MessageFile(ABC):
         return chunk
 
     def close(self) -> None:
-        """Close the file and let go of the last chunk."""
+        """Close the file and release the last chunk."""
         self.file.close()
         self._last_chunk = (-1, memoryview(b""))
 

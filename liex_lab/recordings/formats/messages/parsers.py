@@ -82,7 +82,7 @@ def parser_of(channel: Channel) -> Parser | None:
 def stamp_reader(channel: Channel) -> Callable[[memoryview], int | None] | None:
     """The function that reads the sensor's stamp, ns, from the first bytes of a channel's messages.
 
-    It says what the channel's parser does of the whole message, or None where these bytes do not
+    It says what the channel's parser does of the whole message, or None if these bytes do not
     tell.
 
     Args:
@@ -224,7 +224,7 @@ def _from_json(schema: str, data: memoryview) -> Message:
 
 
 def stamp_in(head: memoryview) -> int | None:
-    """The stamp, ns, in the first bytes of a picture or cloud in protobuf.
+    """The stamp, ns, in the first bytes of an image or cloud in protobuf.
 
     It is the message's first field, and writers put it first.
 
@@ -232,7 +232,7 @@ def stamp_in(head: memoryview) -> int | None:
         head: the message's first bytes.
 
     Returns:
-        The stamp; None where another field comes first, as in a message without a stamp.
+        The stamp; None if another field comes first, as in a message without a stamp.
     """
     if len(head) < 2 or head[0] != _STAMP or head[1] > min(_ONE_BYTE, len(head) - 2):
         return None
@@ -413,7 +413,7 @@ def ros_parser(schema: str, encoding: str) -> Parser | None:
         encoding: "ros1" or "cdr".
 
     Returns:
-        The parser, which raises `DamagedMessage`; None where there is none.
+        The parser, which raises `DamagedMessage`; None if absent.
     """
     layout = _LAYOUTS.get(encoding)
     if layout is None or schema not in _PARSERS:

@@ -152,7 +152,7 @@ class BagFile(MessageFile):
         return _fields(memoryview(block)[:n_header]), begin, begin + n_data
 
     def _learn_ending(self, header: dict[str, bytes]) -> bool:
-        """The connections and places of chunks that the index at the end repeats; False where there
+        """The connections and places of chunks that the index at the end repeats; False if there
         is no index.
         """
         if header.get("encryptor"):

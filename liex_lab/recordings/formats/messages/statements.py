@@ -36,7 +36,7 @@ _LENS = ("width", "height", "fx", "ppx", "fy", "ppy")
 
 
 def calibration_in(statement: Statement) -> Calibration | None:
-    """The intrinsics of a stream that are stated as text; None where it states something else.
+    """The intrinsics of a stream that are stated as text; None if it states something else.
 
     Args:
         statement: what the program states.
@@ -77,7 +77,7 @@ class Statements:
             statement: what it states.
 
         Returns:
-            False where further messages of the channel add nothing.
+            False if further messages of the channel add nothing.
 
         Raises:
             ValueError: a number in it is none.
@@ -111,7 +111,7 @@ class Statements:
             doubts: appended to where it states several.
 
         Returns:
-            mm; None where the file does not state it, or states several and it is settled.
+            mm; None if the file does not state it, or states several and it is settled.
         """
         stated = {of: units for of, units in self.units_mm.items() if topic.startswith(of)}
         if not stated and _OF_PROGRAM.search(topic) and not settled:
@@ -140,7 +140,7 @@ class Statements:
             topic: name of the depth topic.
 
         Returns:
-            The moment; None where it is not stated.
+            The moment; None if it is not stated.
         """
         began = [start_of_clock(ns) for of, ns in self.began_ns.items() if topic.startswith(of)]
         return began[0] if began else None
@@ -209,10 +209,10 @@ class PackFacts:
         moved: frames whose stamps were moved, and why: index into `FAULTS` by row.
         source: name, format and SHA-256 of the recording.
         region_px: (u, v) corners of the polygon that the pixels kept lie in; empty for the whole
-            picture, or where it was found and is no polygon.
-        n_px: pixels of a picture that are kept; 0 where all are.
-        depth_sha256: SHA-256 of times (int64 ns) and pictures (uint16 steps), little endian, in
-            order; empty where it is not known.
+            image, or where it was found and is no polygon.
+        n_px: pixels of an image that are kept; 0 where all are.
+        depth_sha256: SHA-256 of times (int64 ns) and images (uint16 steps), little endian, in
+            order; empty if unknown.
         packed: whether the file is an archive.
     """
 
