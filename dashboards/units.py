@@ -1,4 +1,4 @@
-"""Units, numbers and dates as people read them on pages; see `tables.units`."""
+"""Units, numbers and dates in the form shown on pages; see `tables.units`."""
 
 from __future__ import annotations
 
@@ -17,33 +17,25 @@ _DECIMALS = {"s": 2, "m": 2, "mm": 1, "cm/s": 1, "°": 1, "°/s": 1, "Hz": 1, "1
 
 
 def read_as(measure: str, unit: str) -> str:
-    """A measure as people read it: its name, and the unit that its values are shown in.
+    """The displayed name of a summary column, with the unit of its displayed values.
 
-    Args:
-        measure: a column of the summary.
-        unit: its unit there; "" for none.
+    `unit` is the column's unit in the table; "" for a dimensionless column.
     """
     return f"{titled(measure, unit)}{f', {shown(1.0, unit)[1]}' if unit else ''}"
 
 
 def counted(n: int, one: str, more: str = "") -> str:
-    """A number with its noun: 1 stretch, 2 stretches.
-
-    Args:
-        n: how many.
-        one: the noun for one.
-        more: for several; "" adds an s.
-    """
+    """A number with its noun: 1 stretch, 2 stretches; an empty `more` adds an s to `one`."""
     return f"{n:,} {one if n == 1 else more or one + 's'}"
 
 
 def reading(value: Any, unit: str) -> str:
-    """A number as a person would write it, as text: counts whole, all numbers of a unit with as
-    many decimals, more where one would not have two digits left; NaN is a dash.
+    """A number as text: counts as integers, other numbers with the decimals of their unit, and with
+    more decimals if fewer than two digits would remain; NaN is a dash.
 
     Args:
-        value: in the unit that people read.
-        unit: that unit, as `shown` gives it; "" for counts and ratios.
+        value: in the displayed unit.
+        unit: that unit, as `shown` returns it; "" for counts and ratios.
     """
     if isinstance(value, int | np.integer):
         return f"{value:,}"
@@ -58,10 +50,8 @@ def reading(value: Any, unit: str) -> str:
 
 
 def day(iso: str) -> str:
-    """A date and time of day as people write it; a text that is none as it is.
-
-    Args:
-        iso: such as 2026-08-21T10:00:00+02:00.
+    """An ISO date and time, such as 2026-08-21T10:00:00+02:00, in words; other text is returned as
+    is.
     """
     try:
         when = datetime.fromisoformat(iso)
@@ -76,11 +66,12 @@ def day(iso: str) -> str:
 
 
 def page(template: Path, **shown: Any) -> str:
-    """A page from its template; what is shown is escaped, and nothing that it names may be missing.
+    """An HTML page from its Jinja template; values are escaped, and a missing value raises an
+    error.
 
     Args:
-        template: the file, HTML with jinja2's marks.
-        shown: what the template names.
+        template: the file, HTML with Jinja's marks.
+        shown: the values of the template's variables.
     """
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
 

@@ -1,6 +1,6 @@
-"""Addresses of the page to correct in: JSON and pictures of a session, and corrections to it.
+"""Routes of the correction page: JSON and images of a session, and its corrections.
 
-A correction is checked at once and saved by the queue of `saver`; the page asks how far it is.
+A correction is checked at once and saved by the queue of `saver`; the page polls its state.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ from .desk import Desk, Desks
 from .saver import Saver, Ticket
 
 _KEPT_TICKETS = 1000
-_PICTURE_S = 3600  # for so long a browser may keep a picture; its address says of which session
+_PICTURE_S = 3600  # browser cache time of an image; its address identifies the session
 
 
 class Clerk:
-    """Takes corrections from the page and remembers their tickets by number.
+    """Accepts corrections from the page and keeps their tickets by number.
 
     Args:
         desks: the study's sessions.
-        saver: saves what is corrected.
+        saver: saves the corrections.
     """
 
     def __init__(self, desks: Desks, saver: Saver) -> None:
@@ -39,17 +39,17 @@ class Clerk:
         self._tickets: dict[int, tuple[str, Ticket]] = {}
 
     def take(self, key: str, asked: dict[str, Any]) -> dict[str, Any]:
-        """Check what the page asks for and queue it; returns its ticket and what it does.
+        """Check a request and queue it; returns its ticket and its effect.
 
-        A joint that is only tried, while it is dragged, is checked and not queued.
+        While a joint is dragged, its correction is only checked and not queued.
 
         Args:
             key: the session's name in the study.
-            asked: by, at_s (the moment that is shown), and one of: sentence, perhaps with try; undo
+            asked: by, at_s (the displayed moment), and one of: sentence, optionally with try; undo
                 with a number or a ticket; redo.
 
         Raises:
-            LiexError: it cannot be done.
+            LiexError: the request is invalid.
         """
         desk = self._desks.of(key)
         author = _text(asked, "by")
@@ -63,10 +63,7 @@ class Clerk:
         return self._kept(key, self._saver.add(desk.session.path, what, author))
 
     def state(self, key: str) -> dict[str, Any]:
-        """Where the session's corrections are: unsaved, report, tickets, and the log.
-
-        Args:
-            key: the session's name in the study.
+        """The state of a session's corrections: unsaved, report, tickets, and the log.
 
         Raises:
             SessionError: there is no such session.
@@ -88,7 +85,7 @@ class Clerk:
         }
 
     def _undo(self, key: str, desk: Desk, asked: dict[str, Any], author: str) -> dict[str, Any]:
-        """Take back a correction by its ticket or its number in the log."""
+        """Undo a correction by its ticket or its number in the log."""
         folder = desk.session.path
         number = asked.get("number")
         if "ticket" in asked:
@@ -103,7 +100,9 @@ class Clerk:
         return self._kept(key, self._saver.take_back(folder, number, author))
 
     def _redo(self, key: str, desk: Desk, author: str) -> dict[str, Any]:
-        """Make again what was taken back last, once what waits is saved; names its number."""
+        """Repeat the correction that was last undone, once the queue is saved; returns its
+        number.
+        """
         with self._lock:
             ours = [ticket for of, ticket in self._tickets.values() if of == key]
         if ours:
@@ -130,12 +129,12 @@ def correction_in(desk: Desk, sentence: str, at_s: float) -> Correction:
     `flip` alone exchanges head and tail in the doubtful stretch at the moment, else in its frame.
 
     Args:
-        desk: the session as it is.
+        desk: the session's current state.
         sentence: the sentence.
-        at_s: the moment that is shown, s since the first frame.
+        at_s: the displayed moment, s since the first frame.
 
     Raises:
-        LiexError: it cannot be done.
+        LiexError: the correction is invalid.
     """
     if sentence != "flip":
         return correcting.parse_correction(desk.session, sentence, at_s)
@@ -150,16 +149,13 @@ def correction_in(desk: Desk, sentence: str, at_s: float) -> Correction:
 
 
 def add_routes(server: Flask, desks: Desks, clerk: Clerk | None) -> None:
-    """Add the addresses of the page to correct in.
+    """Add the routes of the correction page; they are protected by the server's guard.
 
-    Args:
-        server: the Flask server of the dashboard; its guard stands before these, too.
-        desks: the sessions.
-        clerk: takes corrections; None takes none.
+    Without a `clerk`, no corrections are accepted.
     """
 
     def told(make: Callable[[], Any], refused: int = 400) -> Response:
-        """JSON of what `make` returns, or a sentence with the status `refused`."""
+        """JSON of the result of `make`, or a message with the status `refused`."""
         try:
             return jsonify(make())
         except LiexError as error:
@@ -167,27 +163,29 @@ def add_routes(server: Flask, desks: Desks, clerk: Clerk | None) -> None:
 
     @server.before_request
     def ahead() -> None:
-        """A session's page is asked for: its picture will be as soon as the browser has it."""
+        """Prepare the image of a requested session page before the browser asks for it."""
         if request.path.startswith("/session/"):
             desks.open_ahead(request.path.removeprefix("/session/"))
 
     @server.get("/desk/<path:key>/about")
     def desk_about(key: str) -> Response:
-        """What the page is told once of the session `key`; of one without poses, why, and no n."""
+        """Facts about the session `key`; for a session without poses, the reason and no n."""
         return told(lambda: {**desks.of(key).about(), "may_correct": clerk is not None}, 200)
 
     @server.get("/desk/<path:key>/times")
     def desk_times(key: str) -> Response:
-        """The times of all frames of the session `key`, s: little-endian float64; none without."""
+        """The times of all frames of the session `key`, s: little-endian float64; empty without
+        poses.
+        """
         try:
             times = desks.of(key).time_s
-        except LiexError:  # the page says why
+        except LiexError:  # the page shows the reason
             times = np.zeros(0)
         return Response(times.astype("<f8").tobytes(), mimetype="application/octet-stream")
 
     @server.get("/desk/<path:key>/rows/<int:first>/<int:stop>")
     def desk_rows(key: str, first: int, stop: int) -> Response:
-        """What is drawn over the rows from `first` to before `stop` of the session `key`."""
+        """The overlay of the rows from `first` to before `stop` of the session `key`."""
         return told(lambda: desks.of(key).rows(first, stop))
 
     @server.get("/desk/<path:key>/bouts")
@@ -197,14 +195,16 @@ def add_routes(server: Flask, desks: Desks, clerk: Clerk | None) -> None:
 
     @server.get("/desk/<path:key>/doubts")
     def desk_doubts(key: str) -> Response:
-        """The doubtful places of the session `key`: its poses, or with ?of=actions its actions."""
+        """The doubtful stretches of the session `key`: of its poses, or with ?of=actions of its
+        actions.
+        """
         if request.args.get("of") == "actions":
             return told(lambda: desks.suggested(key))
         return told(lambda: desks.of(key).doubts())
 
     @server.get("/desk/<path:key>/crossings")
     def desk_crossings(key: str) -> Response:
-        """Where ends or animals of the session `key` may have been taken for one another."""
+        """Where ends or animals of the session `key` may have been exchanged."""
         return told(lambda: desks.of(key).crossings())
 
     @server.get("/desk/<path:key>/frame/<int:row>.png")
@@ -223,14 +223,14 @@ def add_routes(server: Flask, desks: Desks, clerk: Clerk | None) -> None:
 
     @server.get("/desk/<path:key>/state")
     def desk_state(key: str) -> Response:
-        """Where the corrections of the session `key` are."""
+        """The state of the corrections of the session `key`."""
         if clerk is None:
             return told(lambda: {"unsaved": 0, "report_old": False, "tickets": {}, "log": []})
         return told(lambda: clerk.state(key))
 
     @server.post("/desk/<path:key>/correct")
     def desk_correct(key: str) -> Response:
-        """Take a correction of the session `key`, JSON as of `Clerk.take`."""
+        """Accept a correction of the session `key`, as JSON for `Clerk.take`."""
         asked = request.get_json(silent=True)  # another site's form cannot send JSON
         if clerk is None or not isinstance(asked, dict):
             said = {"said": "no correction is taken here"}

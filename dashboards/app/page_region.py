@@ -1,7 +1,7 @@
-"""The dashboard's images of a scene, and the addresses of the page on which a region is drawn.
+"""Depth images of a scene, and the routes of the page on which a region is drawn.
 
-The page's script draws; what it asks for is told here as JSON and pictures, and what it saves is
-checked and written by whoever knows the plans (`Regions`).
+The page's script draws. It requests JSON and PNG images here, and what it saves is checked and
+written by the owner of the plans (`Regions`).
 """
 
 from __future__ import annotations
@@ -25,19 +25,19 @@ from .frames import Frames
 if TYPE_CHECKING:
     from liex_lab.optics.camera import Camera
 
-_N_PICTURES = 9  # of which each pixel's usual depth is shown
+_N_PICTURES = 9  # the frames from which each pixel's usual depth is computed
 _LEAST_REACH_MM = 60.0
 
 
 class Regions(Protocol):
-    """Who knows where a region may be stated, and states it."""
+    """Reads and writes the regions of recordings."""
 
     @property
     def of_recordings(self) -> bool:
-        """Whether recordings are known that were not measured."""
+        """Whether recordings without results are available."""
 
     def about(self, key: str, session: Session | None) -> dict[str, Any]:
-        """What is told of the region of the recording `key`, whose results are `session`."""
+        """Facts about the region of the recording `key`, whose results are `session`."""
 
     def save(
         self,
@@ -47,14 +47,16 @@ class Regions(Protocol):
         corners: Sequence[Any] | None,
         was: Any,
     ) -> str:
-        """State a region of `corners` (px) of the recording `key` in a `place` that said `was`."""
+        """Save a region with `corners` (px) for the recording `key` in `place`, which contained
+        `was`.
+        """
 
     def picture(self, key: str) -> tuple[NDArray[np.uint16], Camera]:
         """The usual depth (mm) of every pixel of the recording `key`, and its camera."""
 
 
 class _Scenes:
-    """Pictures and facts of scenes."""
+    """Depth images and facts of scenes."""
 
     def __init__(self, data: StudyData, frames: Frames, regions: Regions | None) -> None:
         self._data = data
@@ -62,13 +64,13 @@ class _Scenes:
         self._regions = regions
 
     def session(self, key: str) -> Session | None:
-        """The results of the recording `key`; None where there are none."""
+        """The results of the recording `key`; None if absent."""
         if key not in self._data.entries:
             raise SessionError(f"there is no recording '{key}'; see the list of sessions")
         return self._data.session(key) if key in {one.key for one in self._data.done} else None
 
     def about(self, key: str) -> dict[str, Any]:
-        """What the page is told: the picture's size, marks, and where a region is stated."""
+        """Facts for the page: image size, marks, and where a region can be saved."""
         session = self.session(key)
         told: dict[str, Any] = {"may_save": self._regions is not None, "places": [], "region": None}
         if self._regions is not None:
@@ -84,7 +86,7 @@ class _Scenes:
         return {**told, **size, "measured": session is not None, "marks": found}
 
     def save(self, key: str, asked: dict[str, Any]) -> dict[str, Any]:
-        """Check and save what the page asks for; returns what the page is told from now on."""
+        """Check and save the requested region; returns the page's new facts."""
         if self._regions is None:
             raise PlanError("no region is saved here")
         corners = asked.get("corners")
@@ -100,7 +102,7 @@ class _Scenes:
         return self._whole(key)[0] if session is None or of == "recording" else self.usual(key)
 
     def usual(self, key: str) -> NDArray[np.uint16]:
-        """(H, W) uint16 mm: the usual depth of the pictures that the session keeps."""
+        """(H, W) uint16 mm: the usual depth of the frames that the session keeps."""
         session = self._data.session(key)
         n = len(session.frames)
         rows = np.unique(np.linspace(0, n - 1, min(n, _N_PICTURES)).astype(int))
@@ -118,18 +120,14 @@ class _Scenes:
 
 
 def add_scenes(server: Flask, data: StudyData, frames: Frames, regions: Regions | None) -> None:
-    """Add the addresses of scenes and regions.
+    """Add the routes of scenes and regions; they are protected by the server's guard.
 
-    Args:
-        server: the Flask server of the dashboard; its guard stands before these, too.
-        data: the study.
-        frames: the depth pictures.
-        regions: states regions; None states none.
+    Without `regions`, no region can be saved.
     """
     scenes = _Scenes(data, frames, regions)
 
     def told(make: Callable[[], Any]) -> Response:
-        """JSON of what `make` returns, or 400 with a sentence."""
+        """JSON of the result of `make`, or status 400 with a message."""
         try:
             return jsonify(make())
         except LiexError as error:
@@ -138,7 +136,7 @@ def add_scenes(server: Flask, data: StudyData, frames: Frames, regions: Regions 
             return answer
 
     def drawn(make: Callable[[], str | bytes], kind: str) -> Response:
-        """A picture that `make` returns, or 400 with a sentence."""
+        """The image that `make` returns, or status 400 with a message."""
         try:
             return Response(make(), mimetype=kind)
         except LiexError as error:
@@ -146,23 +144,23 @@ def add_scenes(server: Flask, data: StudyData, frames: Frames, regions: Regions 
 
     @server.get("/region/<path:key>/about")
     def region_about(key: str) -> Response:
-        """What the page is told of the recording `key`."""
+        """Facts about the recording `key`."""
         return told(lambda: scenes.about(key))
 
     @server.get("/region/<path:key>/picture.png")
     def region_picture(key: str) -> Response:
-        """The whole depth picture of `key`; with ?of=recording that of its recording."""
+        """The whole depth image of `key`; with ?of=recording, the depth image of its recording."""
         of = request.args.get("of", "")
         return drawn(lambda: _png(scenes.picture(key, of)), "image/png")
 
     @server.get("/region/<path:key>/scene.svg")
     def region_scene(key: str) -> Response:
-        """The depth picture of the session `key` with its scene."""
+        """The depth image of the session `key` with its scene."""
         return drawn(lambda: scene_svg(data.session(key), scenes.usual(key)), "image/svg+xml")
 
     @server.post("/region/<path:key>/save")
     def region_save(key: str) -> Response:
-        """State a region of the recording `key`: JSON of place, corners (px) and was."""
+        """Save a region of the recording `key`: JSON with place, corners (px) and was."""
         asked = request.get_json(silent=True)  # another site's form cannot send JSON
         if regions is None or not isinstance(asked, dict):
             answer = jsonify({"said": "no region is saved here"})
@@ -172,7 +170,7 @@ def add_scenes(server: Flask, data: StudyData, frames: Frames, regions: Regions 
 
 
 def scene_svg(session: Session, depth: NDArray[np.uint16]) -> str:
-    """The whole depth picture of a session with its scene over it.
+    """The whole depth image of a session with its scene drawn over it.
 
     Args:
         session: the opened session.
@@ -187,7 +185,7 @@ def scene_svg(session: Session, depth: NDArray[np.uint16]) -> str:
 
 
 def _shaded(depth: NDArray[np.uint16]) -> NDArray[np.uint8]:
-    """Colours over all heights of a picture, walls and rims with them."""
+    """Colours over the full depth range of an image, including walls and rims."""
     read = depth[depth > 0]
     reach = float(np.ptp(np.percentile(read, [3.0, 95.0]))) if len(read) else 0.0
     return shade(depth, max(reach, _LEAST_REACH_MM))

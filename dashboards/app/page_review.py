@@ -1,7 +1,7 @@
 """The dashboard's blinded review: clips in random order, without group, subject or session.
 
-A rater's browser is told of a clip's number alone: pictures and joints come by that number, and
-what the program or others said comes when the rater has named the last clip.
+A rater's browser only receives a clip's number and requests images and joints by that number. The
+labels of the program and of other raters are sent after the rater's last answer.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class Reviews:
     Args:
         data: the study.
         desks: its sessions.
-        folder: where the files lie.
+        folder: of the review files.
     """
 
     def __init__(self, data: StudyData, desks: Desks, folder: Path) -> None:
@@ -53,13 +53,13 @@ class Reviews:
         return list(review_names(self._folder))
 
     def begin(self, asked: dict[str, Any]) -> str:
-        """Go on with the review of a name, or draw a new one; returns its name.
+        """Resume the named review, or draw a new one; returns its name.
 
         Args:
             asked: name, rater, n (clips) and seed.
 
         Raises:
-            SessionError: something of that cannot be.
+            SessionError: one of these is invalid.
         """
         name = checked_name(str(asked.get("name", "")), "a review")
         checked_name(str(asked.get("rater", "")), "a rater")
@@ -74,11 +74,7 @@ class Reviews:
         return name
 
     def told(self, name: str, rater: str) -> dict[str, Any]:
-        """What a rater may know: the words, the own order and answers; at the end the agreement.
-
-        Args:
-            name: the review.
-            rater: who asks.
+        """What a rater may see: the words, the order and own answers; at the end the agreement.
 
         Raises:
             SessionError: there is no such review.
@@ -99,14 +95,14 @@ class Reviews:
         return found | ({"agreements": _agreements(review)} if found["done"] else {})
 
     def answer(self, name: str, asked: dict[str, Any]) -> dict[str, Any]:
-        """Keep an answer; returns what `told` says then.
+        """Save an answer; returns the new state as `told` does.
 
         Args:
             name: the review.
             asked: rater, clip and word.
 
         Raises:
-            SessionError: something of that cannot be.
+            SessionError: one of these is invalid.
         """
         clip, word = asked.get("clip"), asked.get("word")
         rater = str(asked.get("rater", ""))
@@ -120,10 +116,6 @@ class Reviews:
     def clip(self, name: str, number: int) -> tuple[Clip, Desk, int, int]:
         """A clip, the desk of its session, its first row and the row after its last one.
 
-        Args:
-            name: the review.
-            number: number of the clip.
-
         Raises:
             SessionError: there is no such clip.
         """
@@ -136,11 +128,7 @@ class Reviews:
         return clip, desk, int(first), max(int(stop), int(first) + 1)
 
     def about(self, name: str, number: int) -> dict[str, Any]:
-        """What a clip's picture needs: size, joints and the moment that is to be named.
-
-        Args:
-            name: the review.
-            number: number of the clip.
+        """Facts for drawing a clip: size, joints and the moment to be named.
 
         Raises:
             SessionError: there is no such clip.
@@ -178,15 +166,10 @@ def _agreements(review: Review) -> list[dict[str, Any]]:
 
 
 def add_reviews(server: Flask, reviews: Reviews) -> None:
-    """Add the addresses of blinded reviews.
-
-    Args:
-        server: the Flask server of the dashboard; its guard stands before these, too.
-        reviews: the reviews of the study.
-    """
+    """Add the routes of blinded reviews; they are protected by the server's guard."""
 
     def told(make: Callable[[], Any]) -> Response:
-        """JSON of what `make` returns, or 400 with a sentence."""
+        """JSON of the result of `make`, or status 400 with a message."""
         try:
             return jsonify(make())
         except (LiexError, OSError) as error:
@@ -195,7 +178,7 @@ def add_reviews(server: Flask, reviews: Reviews) -> None:
             return answer
 
     def asked() -> dict[str, Any]:
-        """The JSON that was sent; another site's form cannot send any."""
+        """The JSON of the request; another site's form cannot send JSON."""
         sent = request.get_json(silent=True)
         if not isinstance(sent, dict):
             raise SessionError("this takes JSON")
@@ -208,22 +191,22 @@ def add_reviews(server: Flask, reviews: Reviews) -> None:
 
     @server.post("/reviews")
     def review_begin() -> Response:
-        """Begin a review, or go on with one."""
+        """Begin or resume a review."""
         return told(lambda: {"name": reviews.begin(asked())})
 
     @server.get("/reviews/<path:name>/state")
     def review_state(name: str) -> Response:
-        """What ?rater= may know of the review `name`."""
+        """What ?rater= may see of the review `name`."""
         return told(lambda: reviews.told(name, request.args.get("rater", "")))
 
     @server.post("/reviews/<path:name>/answer")
     def review_answer(name: str) -> Response:
-        """Keep an answer in the review `name`."""
+        """Save an answer in the review `name`."""
         return told(lambda: reviews.answer(name, asked()))
 
     @server.get("/reviews/<path:name>/clip/<int:number>/about")
     def clip_about(name: str, number: int) -> Response:
-        """What the picture of the clip `number` of the review `name` needs."""
+        """Facts for drawing the clip `number` of the review `name`."""
         return told(lambda: reviews.about(name, number))
 
     @server.get("/reviews/<path:name>/clip/<int:number>/times")

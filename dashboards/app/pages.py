@@ -1,6 +1,6 @@
-"""The dashboard's pages: list of sessions, ethograms side by side, groups compared, one session.
+"""The dashboard's pages: list of sessions, ethograms, group comparison, one session.
 
-The statistics are those of `liex_lab.behaviour.cohort`, the figures those of `..figures`.
+The statistics come from `liex_lab.behaviour.cohort`, the figures from `..figures`.
 """
 
 from __future__ import annotations
@@ -64,8 +64,8 @@ if TYPE_CHECKING:
 
 ShowReplay = Callable[[Path, float], object]
 _ASSETS = Path(__file__).parent / "assets"
-_COLUMNS = 800  # parts of the time that a row of an ethogram shows
-_MOST_PARTS = 40_000  # of all rows together
+_COLUMNS = 800  # time bins of an ethogram's row
+_MOST_PARTS = 40_000  # time bins of all rows together
 _STEPS = (
     ("frame", -1, "◀ frame"),
     ("frame", 1, "frame ▶"),
@@ -74,7 +74,7 @@ _STEPS = (
     ("flag", -1, "◀ flagged"),
     ("flag", 1, "flagged ▶"),
 )
-_HALF_S = 4.0  # of the curves around a moment
+_HALF_S = 4.0  # half the duration of the curves around a moment
 _AROUND_MM = 1.2 * ONE_COLUMN_MM
 _FACTS = (
     ("frame_index", "frame", ""),
@@ -97,7 +97,7 @@ def add_pages(
     may_correct: bool,
     of_recordings: bool,
 ) -> None:
-    """Add the pages, and the addresses that their scripts ask.
+    """Add the pages, and the routes that their scripts use.
 
     Args:
         app: the dashboard.
@@ -105,7 +105,7 @@ def add_pages(
         desks: its sessions.
         show_replay: opens the replay of a .rrd at a time (s); None only shows the command.
         may_correct: whether corrections are saved.
-        of_recordings: whether a region can be drawn for recordings that were not measured.
+        of_recordings: whether regions can be drawn for recordings without results.
     """
 
     def table(name: str, **how: Any) -> Markup:
@@ -214,7 +214,9 @@ def add_pages(
 
     @app.get("/moment/<path:key>")
     def moment(key: str) -> Response:
-        """The curves around ?t= (s), the numbers of its frame, and the command of its replay."""
+        """The curves around ?t= (s), the values of its frame, and the command that opens its
+        replay.
+        """
         at_s = _moment()
         span = (at_s - _HALF_S, at_s + _HALF_S)
         with drawing():
@@ -254,11 +256,7 @@ def add_pages(
 
 
 def ethogram_rows(data: StudyData) -> dict[str, Any]:
-    """What the page of ethograms shows of the groups and sessions that are asked for.
-
-    Args:
-        data: the study.
-    """
+    """The variables of the ethogram page, for the requested groups and sessions."""
     names = request.args.getlist("group")
     chosen = request.args.getlist("session")
     ones = data.ethograms(chosen_keys(data, names, chosen))
@@ -300,7 +298,7 @@ def ethogram_rows(data: StudyData) -> dict[str, Any]:
 
 
 def chosen_keys(data: StudyData, names: Sequence[str], sessions: Sequence[str]) -> list[str]:
-    """Keys of the sessions that are named, or of those of the groups, or of all, by group.
+    """Keys of the requested sessions, else of the sessions of the requested groups, by group.
 
     Args:
         data: the study.
@@ -320,7 +318,7 @@ def _bars(
     n_rows: int,
     unit: tuple[str, float],
 ) -> list[dict[str, Any]]:
-    """The runs of one row of the ethograms, in % of the span; nothing after the session's end."""
+    """The runs of one ethogram row, in % of the span; nothing after the session's end."""
     n = min(_COLUMNS, max(120, _MOST_PARTS // n_rows))
     start_s, stop_s = span_s
     codes = raster(one, words, start_s, stop_s, n)
@@ -339,7 +337,7 @@ def _bars(
 def _shares(
     row: pd.Series[float], words: Sequence[str], coloured: Mapping[str, str]
 ) -> list[dict[str, Any]]:
-    """One row of the time budget, in %; actions without a colour of their own are one part."""
+    """One row of the time budget, in %; actions without their own colour are merged."""
     shares = {word: float(row.get(f"{word}_share", np.nan)) for word in words}
     parts: dict[str, float] = {}
     for word, share in shares.items():
@@ -354,7 +352,7 @@ def _shares(
 
 
 def _ticks(low: float, high: float) -> list[tuple[float, str]]:
-    """Round numbers of an axis, each with its place in %."""
+    """Round numbers of an axis, each with its position in %."""
     from matplotlib.ticker import MaxNLocator
 
     ticks = MaxNLocator(8, steps=[1, 2, 5, 10]).tick_values(low, high)
@@ -363,11 +361,7 @@ def _ticks(low: float, high: float) -> list[tuple[float, str]]:
 
 
 def compared_groups(data: StudyData) -> dict[str, Any]:
-    """What the page of groups shows of the measure and reference that are asked for.
-
-    Args:
-        data: the study.
-    """
+    """The variables of the group page, for the requested measure and reference."""
     table = data.collected()
     measures = list(tables.columns_of(data))
     usual = [name for name in cohort.usual_measures(table) if name in measures]
@@ -406,14 +400,14 @@ def compared_groups(data: StudyData) -> dict[str, Any]:
 
 
 def _comparison(data: StudyData, measure: str, reference: str) -> Any:
-    """The figure of a measure by group, whose marks are links to their sessions."""
+    """The figure of a measure by group; its marks link to their sessions."""
     stats = data.stats(measure, reference or None)
     unit, _ = data.described(measure)
     return groups.comparison(data.collected(), stats, measure, unit, link=session_address)
 
 
 def _titled_links(svg: str) -> str:
-    """Links of a figure as the page has them: what follows the # is told where a pointer rests."""
+    """A figure's links for the page: the part after the # becomes the tooltip."""
     return re.sub(
         r'<a href="(/session/[^"#]*)#([^"]*)"([^>]*)>',
         lambda found: f'<a href="{found[1]}"><title>{Markup.escape(unquote(found[2]))}</title>',
@@ -422,7 +416,7 @@ def _titled_links(svg: str) -> str:
 
 
 def _verdict(row: dict[str, Any], unit: str) -> dict[str, Any]:
-    """One contrast in words: what was found, how sure, of how many."""
+    """One contrast in words: the result, its uncertainty and the sample sizes."""
     cages = f"{row['n_cages']} cages, " if row["n_cages"] else ""
     counts = (
         f"{cohort.counted_units(row)}; {row['n_animals']} animals, {cages}{row['n_sessions']} "
@@ -435,11 +429,7 @@ def _verdict(row: dict[str, Any], unit: str) -> dict[str, Any]:
 
 
 def session_facts(data: StudyData, key: str) -> dict[str, Any]:
-    """What the page of a session shows before its script asks for more.
-
-    Args:
-        data: the study.
-        key: the session's name in the study.
+    """The variables of a session's page that are shown before its script loads more.
 
     Raises:
         SessionError: the session cannot be opened.
@@ -470,21 +460,16 @@ def session_facts(data: StudyData, key: str) -> dict[str, Any]:
 
 
 def nearest_row(session: Session, at_s: float) -> int:
-    """Row of the frame whose time is nearest.
-
-    Args:
-        session: the opened session.
-        at_s: the moment, s since its first frame.
-    """
+    """Row of the frame nearest in time to `at_s` (s since the first frame)."""
     return int(np.abs(session.frames["time_s"].to_numpy(float) - at_s).argmin())
 
 
 def moved_to(session: Session, at_s: float, by: str, to: int) -> float:
-    """Time of the next or previous frame, bout or flagged frame, s; `at_s` if there is none.
+    """Time of the next or previous frame, bout or flagged frame, s; `at_s` if absent.
 
     Args:
         session: the opened session.
-        at_s: the moment, s since its first frame.
+        at_s: the moment, s since the first frame.
         by: frame, bout or flag.
         to: 1 for the next, -1 for the previous.
     """
@@ -502,7 +487,7 @@ def moved_to(session: Session, at_s: float, by: str, to: int) -> float:
 
 
 def facts(session: Session, row: int) -> list[tuple[str, str]]:
-    """The numbers of one frame: (what, how much).
+    """The values of one frame as (name, value with unit).
 
     Args:
         session: the opened session.
@@ -535,7 +520,7 @@ def facts(session: Session, row: int) -> list[tuple[str, str]]:
 def _timed(
     name: str, figures: Sequence[Any], span_s: tuple[float, float], width_mm: float, **more: Any
 ) -> Response:
-    """Figures over time as JSON: SVG, and where on it the axis of time begins and ends."""
+    """Figures over time as JSON: SVG, and the start and end of the time axis in the figure."""
     svgs = [
         on_page(image_bytes(one, "svg"), f"{name}{k}", "over time") for k, one in enumerate(figures)
     ]
@@ -555,7 +540,7 @@ def _download(svg: bytes | None) -> Response:
 
 
 def _moment() -> float:
-    """The moment ?t= that a page is asked for, s; 0 without a usable one."""
+    """The requested moment ?t=, s; 0 if absent or invalid."""
     try:
         at_s = float(request.args.get("t", "0"))
     except ValueError:
@@ -564,7 +549,7 @@ def _moment() -> float:
 
 
 def _span(duration_s: float) -> tuple[float, float]:
-    """The stretch from ?from= to ?to= (s) that is asked for; the whole duration without one."""
+    """The requested stretch from ?from= to ?to= (s); the whole duration if absent or invalid."""
     stop_s = max(duration_s, 1e-3)
     try:
         low, high = (float(request.args[name]) for name in ("from", "to"))

@@ -1,8 +1,8 @@
-"""Corrections on their way to disk: a queue that one thread works off, many at a time.
+"""Saves corrections to disk: a queue that one thread processes in batches.
 
-A session's tables follow from all its corrections together, so those that wait for the same
-session are made in one go; its report, which takes longer, is made again when nobody has corrected
-it for a while.
+All corrections of a session together determine its tables, so the corrections waiting for one
+session are applied in one batch. The report takes longer; it is made again after a while without
+corrections.
 """
 
 from __future__ import annotations
@@ -24,21 +24,21 @@ WAITING = "waiting"
 SAVING = "saving"
 SAVED = "saved"
 FAILED = "failed"
-_CALM_S = 3.0  # without a correction, until the report is made again
+_CALM_S = 3.0  # time without a correction before the report is made again
 
 
 @dataclass
 class Ticket:
-    """One correction on its way, or the request to take one back.
+    """A queued correction, or the request to undo one.
 
     Attributes:
         folder: the session folder.
-        what: the correction; None takes one back.
-        author: who asks.
-        undoes: number of the entry of the log to take back; 0 for a correction.
-        number: its own number in the log, once it is saved.
+        what: the correction; None undoes one.
+        author: the author of the request.
+        undoes: number of the log entry to undo; 0 for a correction.
+        number: its own number in the log, once saved.
         state: waiting, saving, saved or failed.
-        said: what it does, or why it failed.
+        said: its effect, or why it failed.
     """
 
     folder: Path
@@ -51,14 +51,14 @@ class Ticket:
 
 
 class Saver:
-    """Saves corrections one after the other, in the order in which they are asked for.
+    """Saves corrections in the order in which they are requested.
 
-    It may be used from several threads at once.
+    Thread-safe.
 
     Args:
-        correct: adds corrections to the session in a folder, or takes some back, by whom.
-        report: makes the report of the session in a folder again; None where `correct` does.
-        calm_s: for so long nobody may have corrected a session before its report is made, s.
+        correct: adds corrections to the session in a folder, or undoes some, with the author.
+        report: makes the report of the session in a folder again; None if `correct` does.
+        calm_s: time without corrections before a session's report is made again, s.
     """
 
     def __init__(
@@ -69,38 +69,23 @@ class Saver:
         self._calm_s = calm_s
         self._changed = threading.Condition()
         self._tickets: list[Ticket] = []
-        self._reports: dict[Path, float] = {}  # when each is due
+        self._reports: dict[Path, float] = {}  # due times
         self._reporting: Path | None = None
         self._thread: threading.Thread | None = None
 
     def add(self, folder: Path, what: Correction, author: str) -> Ticket:
-        """Ask for a correction; it is saved later.
-
-        Args:
-            folder: the session folder.
-            what: the correction.
-            author: who makes it.
-        """
+        """Queue a correction by `author` of the session in `folder`."""
         return self._put(Ticket(folder, what, author, said=str(what)))
 
     def take_back(self, folder: Path, number: int, author: str) -> Ticket:
-        """Ask that an entry of the log is taken back.
-
-        Args:
-            folder: the session folder.
-            number: number of the entry.
-            author: who takes it back.
-        """
+        """Queue the undoing of the log entry `number`."""
         return self._put(Ticket(folder, None, author, number, said=f"{number} is taken back"))
 
     def wait(self, ticket: Ticket) -> None:
-        """Wait until a correction is saved.
-
-        Args:
-            ticket: what `add` or `take_back` returned.
+        """Wait until the correction of a ticket is saved.
 
         Raises:
-            LiexError: it could not be.
+            LiexError: it could not be saved.
         """
         with self._changed:
             self._changed.wait_for(lambda: ticket.state in (SAVED, FAILED))
@@ -108,20 +93,16 @@ class Saver:
             raise LiexError(ticket.said)
 
     def busy(self, folder: Path) -> tuple[int, bool]:
-        """How many corrections of a session are not saved yet, and whether its report is old.
-
-        Args:
-            folder: the session folder.
-        """
+        """The number of unsaved corrections of a session, and whether its report is out of date."""
         with self._changed:
             unsaved = sum(ticket.folder == folder for ticket in self._tickets)
             return unsaved, folder in self._reports or self._reporting == folder
 
     def finish(self, folder: Path | None = None) -> None:
-        """Return when all is saved and the reports are made.
+        """Return when all corrections are saved and the reports are made.
 
         Args:
-            folder: of this session alone; None of all.
+            folder: of this session alone; None waits for all.
         """
         with self._changed:
             for one in self._reports:
@@ -152,20 +133,20 @@ class Saver:
         return ticket
 
     def _work(self) -> None:
-        """Save what waits, for as long as the program runs."""
+        """Save queued corrections for as long as the program runs."""
         while True:
             batch, report = self._next()
             if batch:
                 self._save(batch)
             elif report is not None and self._report is not None:
-                with suppress(LiexError, OSError):  # `liex report` says what is wrong
+                with suppress(LiexError, OSError):  # `liex report` shows the error
                     self._report(report)
                 with self._changed:
                     self._reporting = None
                     self._changed.notify_all()
 
     def _next(self) -> tuple[list[Ticket], Path | None]:
-        """What to do next: corrections of one session by one person, or else a report."""
+        """The next task: corrections of one session by one person, or else a report."""
         with self._changed:
             while True:
                 if self._tickets:
@@ -175,7 +156,7 @@ class Saver:
                         if (ticket.folder, ticket.author) != (first.folder, first.author):
                             break
                         if ticket.what is None and any(one.what for one in batch):
-                            break  # what is taken back goes first in a log's step
+                            break  # a step of the log undoes first
                         batch.append(ticket)
                     for ticket in batch:
                         ticket.state = SAVING
@@ -191,10 +172,10 @@ class Saver:
                 )
 
     def _save(self, batch: list[Ticket]) -> None:
-        """Save some corrections together; one by one where together they cannot be."""
+        """Save a batch of corrections; one by one if the batch fails."""
         try:
             self._once(batch)
-        except Exception as error:  # whatever it is, the others are still to be saved
+        except Exception as error:  # the other corrections must still be saved
             if len(batch) > 1:
                 for ticket in batch:
                     self._save([ticket])

@@ -1,6 +1,6 @@
 """`liex dashboard`: a study in the browser, a Flask app served from this machine by waitress.
 
-Nothing is loaded from anywhere else: the content security policy allows this server alone.
+The content security policy allows no other source than this server.
 """
 
 from __future__ import annotations
@@ -29,10 +29,10 @@ from .saver import Correct, Report, Saver
 
 _SAVER = "liex_saver"
 _IDLE_S = 30  # browsers open connections before they need them; an idle one is closed
-_CONNECTIONS = 256  # open at a time: a browser has six
+_CONNECTIONS = 256  # open at the same time; a browser opens six
 _THREADS = 12
-# addresses to listen on that nobody can open
-_EVERYWHERE = ("", "0.0.0.0", "::")  # nosec B104: compared with, not listened on
+# addresses to listen on that a browser cannot open
+_EVERYWHERE = ("", "0.0.0.0", "::")  # nosec B104: only compared with
 
 
 def make_app(
@@ -47,21 +47,21 @@ def make_app(
     reviews: Path | None = None,
     regions: page_region.Regions | None = None,
 ) -> Flask:
-    """The dashboard of a study, not yet served.
+    """Make the dashboard of a study; `serve` serves it.
 
     Args:
         data: the study.
-        token: what every visitor has to know; empty asks for none.
-        alone: only this machine is answered.
-        show_replay: opens the replay of a .rrd at a time (s), or raises LiexError; None: only the
-            command is shown.
-        correct: adds corrections to the session in a folder, or takes some back; None: the pages
-            only show.
-        report: makes the report of the session in a folder again, after it was corrected; None
-            where `correct` does.
+        token: required of every visitor; empty requires none.
+        alone: only accept requests from this machine.
+        show_replay: opens the replay of a .rrd at a time (s), or raises LiexError; None only shows
+            the command.
+        correct: adds corrections to the session in a folder, or undoes some; None makes the pages
+            read-only.
+        report: makes the report of the session in a folder again after a correction; None if
+            `correct` does.
         suggest: finds the stretches of a session whose actions are least certain; None finds none.
-        reviews: folder of blinded reviews, made with the first one; None takes none.
-        regions: states the regions of arenas in plans; None states none.
+        reviews: folder of blinded reviews, created with the first one; None accepts none.
+        regions: writes the regions of arenas to plans; None writes none.
     """
     app = Flask(
         "liex_lab_dashboard",
@@ -93,12 +93,12 @@ def make_app(
 
 
 def serve(app: Flask, host: str, port: int, told: Callable[[int], None]) -> None:
-    """Serve until interrupted; requests and corrections under way are then completed.
+    """Serve until interrupted; requests and corrections in progress are then completed.
 
     Args:
         app: the dashboard.
         host: the address to listen on.
-        port: the port; 0 takes any that is free.
+        port: the port; 0 uses any free one.
         told: called with the port once the server listens.
 
     Raises:
@@ -132,7 +132,7 @@ def serve(app: Flask, host: str, port: int, told: Callable[[int], None]) -> None
     except KeyboardInterrupt:
         pass
     except Ended as ended:
-        if ended.signal != signal.SIGINT:  # Ctrl-C is how it is ended
+        if ended.signal != signal.SIGINT:  # Ctrl-C ends it normally
             raise
     finally:
         server.task_dispatcher.shutdown()
@@ -142,12 +142,12 @@ def serve(app: Flask, host: str, port: int, told: Callable[[int], None]) -> None
 
 
 def address(host: str, port: int, token: str) -> str:
-    """What to type into a browser.
+    """The address to open in a browser.
 
     Args:
-        host: the address the server listens on; for all of this machine's, its name is shown.
+        host: the address the server listens on; an unspecified address becomes this machine's name.
         port: its port.
-        token: what every visitor has to know; may be empty.
+        token: required of every visitor; may be empty.
     """
     shown = "127.0.0.1" if host in LOOPBACK else host
     if host in _EVERYWHERE:

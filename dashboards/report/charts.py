@@ -1,4 +1,4 @@
-"""The report's figures from a session's tables: the curves of the dashboard, the contact sheet."""
+"""The report's figures from a session's tables: the dashboard's curves, and the contact sheet."""
 
 from __future__ import annotations
 
@@ -24,10 +24,7 @@ Array = NDArray[np.float64]
 
 
 def traces(session: Session) -> list[tuple[str, Array, Array, str]]:
-    """Curves to look at over time, broken at gaps of the camera; the last is the predicted error.
-
-    Args:
-        session: the opened session.
+    """Curves over time, interrupted at gaps of the camera; the last one is the predicted error.
 
     Returns:
         (name with its unit, time s (n,), values (n,), colour) of each.
@@ -43,13 +40,10 @@ def traces(session: Session) -> list[tuple[str, Array, Array, str]]:
 
 
 def pictures(session: Session) -> list[tuple[str, str, str, str]]:
-    """The contact sheet: the kept depth pictures with scene and skeleton over them, by time.
-
-    Args:
-        session: the opened session.
+    """The contact sheet: the kept depth images with scene and skeleton, in order of time.
 
     Returns:
-        (SVG, when, the action that the ethogram names there or an empty text, its colour) of each.
+        (SVG, time, the ethogram's action at that time or an empty text, its colour) of each.
     """
     import cv2
 
@@ -79,13 +73,10 @@ def pictures(session: Session) -> list[tuple[str, str, str, str]]:
 
 
 def whole_picture(session: Session) -> tuple[str, str] | None:
-    """The whole picture with an animal that is in view beside the one that is followed.
-
-    Args:
-        session: the opened session.
+    """The whole depth image with another animal in view that is not tracked.
 
     Returns:
-        SVG, and when it was taken; None where the session kept none.
+        SVG, and its time; None if the session kept none.
     """
     import cv2
 
@@ -119,7 +110,7 @@ def _relief(session: Session) -> Relief:
 
 
 def _in_colours(relief: Relief, depth: Any, entry: dict[str, Any]) -> NDArray[np.uint8]:
-    """What was cut out of a depth picture, as relief: (h, w, 3) uint8 RGB."""
+    """The cropped depth image as relief: (h, w, 3) uint8 RGB."""
     cut = np.asarray(depth, np.uint16)
     left, top = int(entry["left_px"]), int(entry["top_px"])
     side = (cut.shape[1], cut.shape[0])
@@ -127,7 +118,7 @@ def _in_colours(relief: Relief, depth: Any, entry: dict[str, Any]) -> NDArray[np
 
 
 def _word_at(bouts: pd.DataFrame, time_s: float) -> str:
-    """The action at a moment, empty where none is named."""
+    """The action at a moment; empty if there is none."""
     here = bouts.loc[
         (bouts["start_s"] <= time_s + 1e-6) & (bouts["stop_s"] > time_s + 1e-6), "action"
     ]

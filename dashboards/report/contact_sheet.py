@@ -1,7 +1,7 @@
-"""The report's contact sheet: depth pictures with scene and skeleton over them, as SVG.
+"""The report's contact sheet: depth images with scene and skeleton over them, as SVG.
 
-A picture is a PNG of a few pixels inside an SVG, so that the skeleton stays sharp. Lengths on the
-paper are in units of the SVG's viewBox.
+An image is a PNG of a few pixels inside an SVG, so that the skeleton stays sharp. Drawn lengths are
+in units of the SVG's viewBox.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from liex_lab.scene.scene import Fixture
 from liex_lab.sessions import Session
 
 Array = NDArray[np.float64]
-_MOST_HIDDEN = 24  # places that are marked: the longest times
+_MOST_HIDDEN = 24  # hiding positions to mark, the longest first
 REGION = "region"
 OUTLINE = "outline"
 FIXTURE = "fixture"
@@ -41,18 +41,18 @@ _LOOKS = {
 }
 
 
-# from a place to the words about it, in widths of the line
+# offset of a label from its point, in line widths
 _BESIDE_IT = {BESIDE: (16.0, 2.0)}
 
 
 @dataclass(frozen=True)
 class Mark:
-    """One thing of the scene, as it is drawn.
+    """One object of the scene to draw.
 
     Attributes:
         kind: region, outline, fixture, hidden or beside.
-        points_px: (n, 2) corners of a closed line, or the one place, px of the whole picture.
-        said: what is written beside a place.
+        points_px: (n, 2) corners of a closed line, or one point, px of the whole image.
+        said: the label of a point.
     """
 
     kind: str
@@ -61,11 +61,7 @@ class Mark:
 
 
 def scene_marks(session: Session) -> list[Mark]:
-    """The scene of a session in its pictures; none of what was not found.
-
-    Args:
-        session: the opened session.
-    """
+    """The scene of a session in image coordinates; objects that were not found are left out."""
     scene = session.metadata.get("scene") or {}
     made = [Mark(REGION, np.array(scene.get("region_px") or np.empty((0, 2)), float))]
     made.append(Mark(OUTLINE, _in_picture(session, session.arena.outline_mm())))
@@ -86,7 +82,7 @@ def scene_marks(session: Session) -> list[Mark]:
 
 
 def _in_picture(session: Session, xy_mm: Array, height_mm: float = 0.0) -> Array:
-    """Places (n, 2) mm above the floor -> (n, 2) px; empty where one lies behind the camera."""
+    """Positions (n, 2) mm above the floor -> (n, 2) px; empty if any lies behind the camera."""
     if not len(xy_mm):
         return np.empty((0, 2))
     place = np.column_stack([xy_mm, np.full(len(xy_mm), height_mm)])
@@ -103,20 +99,20 @@ def svg_marks(
     unit: float,
     lettered: bool = True,
 ) -> str:
-    """Marks as SVG over a part of the picture.
+    """Marks as SVG over a part of the image.
 
     Args:
-        marks: what is drawn; what lies outside of the part is left out.
+        marks: to be drawn; those outside the part are left out.
         left: first column of the part, px.
         top: its first row, px.
         width: of the part, px.
         height: of the part, px.
-        unit: length on the paper, px, of which lines are 0.8 wide and letters 4 high.
-        lettered: whether is written what a mark says; else a pointer that rests on it is told.
+        unit: length of the drawing, px; lines are 0.8 units wide and letters 4 units high.
+        lettered: whether to write a mark's label; a tooltip is always there.
     """
     parts = []
     for one in marks:
-        # the paper counts from the corner of the picture, we from a pixel's centre
+        # SVG counts from the image's corner, we count from a pixel's centre
         points = one.points_px - [left, top] + 0.5
         if (points.max(axis=0) < 0).any() or (points.min(axis=0) > [width, height]).any():
             continue
@@ -143,7 +139,7 @@ def svg_marks(
 
 
 def _shape(kind: str, points: Array, reach: float) -> tuple[str, str]:
-    """SVG's word for the shape of a mark, and what it needs to be drawn."""
+    """The SVG element of a mark and its attributes."""
     if len(points) > 1:
         return "polygon", f'points="{" ".join(f"{x:.1f},{y:.1f}" for x, y in points)}"'
     (x, y), r = points[0], reach
@@ -157,7 +153,7 @@ def _shape(kind: str, points: Array, reach: float) -> tuple[str, str]:
     return "path", f'd="{way}"'
 
 
-_MOST_PX = 320  # to a side: twice what the widest page shows
+_MOST_PX = 320  # per side: twice the widest display
 _VIRIDIS = np.array(
     [
         [68, 1, 84],
@@ -184,29 +180,29 @@ def picture(
     unit: float | None = None,
     lettered: bool = False,
 ) -> str:
-    """A depth picture cut out of a frame, with the scene and the skeleton over it.
+    """A crop of a depth image, with the scene and the skeleton over it.
 
     Args:
         rgb: (h, w, 3) uint8 RGB, the depth in colours, see `Relief.picture`.
         uv: (J, 2) joints, px of the whole frame, counted from the centre of its first pixel.
         bones: pairs of joints.
-        left: column of the frame at which the picture begins, px.
-        top: row of the frame at which the picture begins, px.
-        marks: what stands still, as far as it is in the picture.
-        unit: radius of a joint, px; None takes that of a picture around the animal, smaller where
-            joints are close to each other.
-        lettered: whether is written what a mark says.
+        left: the crop's first column, px of the frame.
+        top: the crop's first row, px of the frame.
+        marks: objects of the scene; those outside the crop are left out.
+        unit: radius of a joint, px; None takes that of a crop around the animal, smaller if joints
+            are close to each other.
+        lettered: whether to write the labels of marks.
     """
     h, w = rgb.shape[:2]
     points = (
         uv - [left, top] + 0.5
-    )  # the paper counts from the corner of the picture, we from a pixel's centre
+    )  # SVG counts from the image's corner, we count from a pixel's centre
     bone_px = np.median([np.hypot(*(points[a] - points[b])) for a, b in bones] or [w])
     usual = w / 70.0
     r = float(np.clip(0.4 * bone_px, w / 200.0, usual)) if unit is None else unit
     parts = [f'<image href="{png_uri(_small(rgb))}" width="{w}" height="{h}"/>']
     parts.append(svg_marks(marks, left, top, w, h, 0.9 * (unit or usual), lettered))
-    for colour, width in (("#222", 1.3 * r), ("#fff", 0.8 * r)):  # seen on light and dark surfaces
+    for colour, width in (("#222", 1.3 * r), ("#fff", 0.8 * r)):  # for light and dark surfaces
         for a, b in bones:
             (x0, y0), (x1, y1) = points[a], points[b]
             parts.append(
@@ -223,11 +219,11 @@ def picture(
 
 
 def shade(depth: NDArray[np.uint16], reach_mm: float) -> NDArray[np.uint8]:
-    """Colours (h, w, 3) RGB uint8 of a depth picture: far dark, near light, unread grey (viridis).
+    """Colours (h, w, 3) RGB uint8 of a depth image: far dark, near light, unread grey (viridis).
 
     Args:
-        depth: (h, w) uint16 mm, 0 where unread; the floor is taken at its 95 % quantile.
-        reach_mm: how much nearer than the floor is the lightest colour, mm.
+        depth: (h, w) uint16 mm, 0 where unread; the floor is its 95 % quantile.
+        reach_mm: height above the floor of the lightest colour, mm.
     """
     read = depth > 0
     if not read.any():
@@ -242,7 +238,7 @@ def shade(depth: NDArray[np.uint16], reach_mm: float) -> NDArray[np.uint8]:
 
 
 def _small(rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """A picture (h, w, 3) with at most so many pixels to a side as a page shows of it, averaged."""
+    """An image (h, w, 3) reduced by averaging to at most `_MOST_PX` per side."""
     import cv2
 
     height, width, _ = rgb.shape
@@ -254,11 +250,7 @@ def _small(rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 def png_uri(rgb: NDArray[np.uint8]) -> str:
-    """A picture as a data URI of a PNG.
-
-    Args:
-        rgb: (h, w, 3) uint8 RGB.
-    """
+    """An image (h, w, 3) uint8 RGB as the data URI of a PNG."""
     import cv2
 
     _, encoded = cv2.imencode(".png", np.ascontiguousarray(rgb[..., ::-1]))

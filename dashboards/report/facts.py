@@ -1,4 +1,4 @@
-"""Where a report's numbers come from: recording, camera, sensor, animal, software, and cost."""
+"""Provenance of a report: recording, camera, sensor, animal, software, and cost."""
 
 from __future__ import annotations
 
@@ -19,11 +19,7 @@ _TEMPLATE = Path(__file__).parent / "templates" / "methods.j2"
 
 
 def methods(session: Session) -> list[str]:
-    """Paragraphs for a methods section, from the run's own record; the words are in methods.j2.
-
-    Args:
-        session: the opened session.
-    """
+    """Paragraphs for a methods section, from the run's record; the text is in methods.j2."""
     from jinja2 import StrictUndefined, Template
 
     about = session.metadata
@@ -61,7 +57,7 @@ def methods(session: Session) -> list[str]:
 
 
 def _recogniser(session: Session) -> dict[str, Any]:
-    """The recogniser, what it learned from and how often it decides."""
+    """The recogniser, its training data and its decision rate."""
     model = session.metadata.get("action_model") or {}
     planned = session.metadata.get("plan", {}).get("actions") or {}
     hashes = [str(one) for one in session.bouts["model_hash"] if str(one)]
@@ -75,21 +71,13 @@ def _recogniser(session: Session) -> dict[str, Any]:
 
 
 def spine_mm(session: Session) -> float:
-    """The length of the animal on a page: that of the fitted chain, median over the frames, mm.
-
-    Args:
-        session: the opened session.
-    """
+    """The displayed length of the animal: the fitted chain's, median over the frames, mm."""
     return float(session.frames["spine_mm"].median())
 
 
 def optics(session: Session) -> str:
-    """What was undone between the real camera and the ideal one; empty where nothing was.
-
-    A sentence without its full stop.
-
-    Args:
-        session: the opened session.
+    """The lens, water and mirror corrections between the real and the ideal camera, without a full
+    stop; empty if there are none.
     """
     found = session.metadata["camera"].get("optics", {})
     undone = []
@@ -112,11 +100,7 @@ def optics(session: Session) -> str:
 
 
 def naming(session: Session) -> set[str]:
-    """Who named the actions: model, rule or human, those of the table `bouts` and of the record.
-
-    Args:
-        session: the opened session.
-    """
+    """The sources of the actions: model, rule or human, from the table `bouts` and the metadata."""
     found = {str(source) for source in session.bouts["source"]}
     if session.metadata.get("action_model"):
         found.add("model")
@@ -126,7 +110,7 @@ def naming(session: Session) -> set[str]:
 
 
 def beside_average(shape: Mapping[str, Any]) -> str:
-    """This animal beside the average one of its length, in words.
+    """The difference between this animal and the average one of its length, in words.
 
     Args:
         shape: section `animal.shape` of session.json.
@@ -159,11 +143,7 @@ def beside_average(shape: Mapping[str, Any]) -> str:
 
 
 def facts(session: Session) -> list[tuple[str, str]]:
-    """Where the numbers come from: recording, camera, animal, software, cost, as (what, value).
-
-    Args:
-        session: the opened session.
-    """
+    """Recording, camera, animal, software and cost, as (name, value)."""
     about = session.metadata
     camera = about["camera"]
     frames = about["frames"]
@@ -222,7 +202,7 @@ def facts(session: Session) -> list[tuple[str, str]]:
 
 
 def sensor_row(about: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """The line on how good the sensor's readings are; none where nothing is known of it.
+    """The line on the sensor's quality; empty if unknown.
 
     Args:
         about: session.json.

@@ -1,8 +1,7 @@
 """Quality control of a session: warnings by weight, account of all frames, suspected flips.
 
-What a reader has to know before believing a session. Thresholds: 2 % of the frames lost, 5 %
-doubtful, a predicted joint error of 10 % of the length, a speed noise as large as the pause
-threshold.
+Thresholds of the warnings: 2 % of the frames lost, 5 % doubtful, a predicted joint error of 10 % of
+the length, a speed noise as large as the pause threshold.
 """
 
 from __future__ import annotations
@@ -21,11 +20,7 @@ _NOISE_SHARE = 1.0
 
 
 def warnings(session: Session) -> list[str]:
-    """Sentences, the recording's own problems first; empty where there is nothing to warn of.
-
-    Args:
-        session: the opened session.
-    """
+    """Warnings as sentences, those of the recording first; empty if there are none."""
     return [
         *session.metadata["problems"],
         *_of_company(session),
@@ -38,7 +33,7 @@ def warnings(session: Session) -> list[str]:
 
 
 def _of_company(session: Session) -> list[str]:
-    """That there were others beside the animal that was followed."""
+    """Warns that other animals are in view that are not tracked."""
     n = int((session.metadata.get("verdict") or {}).get("n_animals", 1))
     if n < 2:
         return []
@@ -63,13 +58,10 @@ def _of_names(session: Session) -> list[str]:
 
 
 def refusal_rows(session: Session) -> list[tuple[str, str, str, str, str]]:
-    """Bouts that contradict their definition: those renamed first, then those left as they are.
-
-    Args:
-        session: the opened session.
+    """Bouts that contradict their definition: the renamed ones first, then the unchanged ones.
 
     Returns:
-        (from, to, name, what became of it, what does not hold), times in s.
+        (from, to, name, what was done, contradiction), times in s.
     """
     found = [
         (
@@ -125,7 +117,7 @@ def _of_frames(session: Session) -> list[str]:
             f"{counted(doubtful, 'frame is', 'frames are')} doubtful ({doubtful / n:.1%} of "
             f"{n:,}): the predicted error is large, or the depth image contradicts the pose."
         )
-    # two columns alone: the dashboard asks this of every session of a study
+    # only two columns: the dashboard reads them for every session of a study
     error, spine = session.table("frames", ["predicted_error_mm", "spine_mm"]).median()
     if np.isfinite(error) and np.isfinite(spine) and error > _ERROR_SHARE * spine:
         found.append(
@@ -182,14 +174,11 @@ def _of_measures(session: Session) -> list[str]:
 
 
 def frame_account(session: Session) -> list[tuple[str, float, int, str]]:
-    """What became of all frames that the camera should have taken.
-
-    Args:
-        session: the opened session.
+    """The classification of all frames that the camera should have taken.
 
     Returns:
-        (what, share, number, CSS class for its colour) of trusted, doubtful, hidden, lost and
-        undelivered frames; hidden ones only where there are some.
+        (class, share, number, CSS class for its colour) of trusted, doubtful, hidden, lost and
+            undelivered frames; hidden ones only if present.
     """
     frames = session.metadata["frames"]
     doubtful = int(frames["flags"].get("doubtful", 0))
@@ -208,9 +197,6 @@ def frame_account(session: Session) -> list[tuple[str, float, int, str]]:
 
 def flip_rows(session: Session) -> list[tuple[str, str, str, str]]:
     """Stretches in which head and tail may have been exchanged, at most the twelve most probable.
-
-    Args:
-        session: the opened session.
 
     Returns:
         (from, to, probability, what was done) in order of time, times in s.

@@ -1,7 +1,6 @@
-"""report.html: one self-contained HTML file, made by a Jinja template from a session folder alone.
+"""report.html: one self-contained HTML file, made by a Jinja template from a session folder.
 
-It needs no network and no script. Glue: every number comes from the session's tables and
-session.json.
+It needs no network and no script. Every number comes from the session's tables and session.json.
 """
 
 from __future__ import annotations
@@ -46,14 +45,7 @@ _TABLES = {
 
 
 def write_report(folder: str | Path) -> Path:
-    """Make report.html in a session's folder from what lies in it, and its figures as files.
-
-    Args:
-        folder: the session's folder.
-
-    Returns:
-        Path of the report.
-    """
+    """Write report.html and the figure files of a session folder; returns the report's path."""
     path = Path(folder) / "report.html"
     session = Session.open(folder).narrowed(frames=FRAMES, kinematics=KINEMATICS)
     write_whole(path, render(session, path.parent / FOLDER))
@@ -65,7 +57,7 @@ def render(session: Session, figures: Path | None = None) -> str:
 
     Args:
         session: the opened session.
-        figures: the folder for the figures as files; None writes none.
+        figures: the folder for figure files; None writes none.
     """
     words = list(session.metadata.get("actions", {}))
     return page(
@@ -106,11 +98,9 @@ def render(session: Session, figures: Path | None = None) -> str:
 
 
 def action_rows(session: Session, words: list[str]) -> list[tuple[str, str, str, str]]:
-    """The vocabulary: (word, colour, meaning, what the recording's frame rate cannot tell of it).
+    """The vocabulary: (word, colour, meaning, what the frame rate cannot resolve).
 
-    Args:
-        session: the opened session.
-        words: the actions, in the order in which they are coloured.
+    `words` are the actions, in the order of their colours.
     """
     unresolved = session.metadata.get("unresolved_actions") or {}
     return [
@@ -125,12 +115,9 @@ def action_rows(session: Session, words: list[str]) -> list[tuple[str, str, str,
 
 
 def clip_links(session: Session) -> dict[str, str]:
-    """The videos of actions that lie beside the report: action -> name of the file.
+    """The videos of actions in the report's folder: action -> file name.
 
-    A video of `rear` is one of rear_supported, too.
-
-    Args:
-        session: the opened session.
+    A video of `rear` also covers rear_supported.
     """
     links = {}
     for word in dict.fromkeys(str(action) for action in session.bouts["action"]):
@@ -144,11 +131,7 @@ def clip_links(session: Session) -> dict[str, str]:
 
 
 def headline(session: Session) -> str:
-    """What was recorded, in one line.
-
-    Args:
-        session: the opened session.
-    """
+    """A summary of the recording in one line."""
     frames = session.metadata["frames"]
     parts = [counted(frames["n_frames"], "frame"), _clock(frames["duration_s"])]
     if frames["fps_median"]:
@@ -159,11 +142,7 @@ def headline(session: Session) -> str:
 
 
 def cards(session: Session) -> list[tuple[str, str, str]]:
-    """The few numbers to see first: (value, unit, what).
-
-    Args:
-        session: the opened session.
-    """
+    """The key numbers: (value, unit, name)."""
     frames = session.metadata["frames"]
     n = frames["n_frames"]
     good = [
@@ -190,11 +169,8 @@ def cards(session: Session) -> list[tuple[str, str, str]]:
 
 
 def summary_rows(session: Session, words: list[str]) -> list[tuple[str, str, str, str]]:
-    """The summary as (title, value, unit, meaning), but for the columns of the actions and zones.
-
-    Args:
-        session: the opened session.
-        words: the actions.
+    """The summary as (title, value, unit, meaning), without the columns of `words` (actions) and
+    zones.
     """
     if not session.has("summary.csv"):
         return []
@@ -225,7 +201,7 @@ def summary_rows(session: Session, words: list[str]) -> list[tuple[str, str, str
     return found
 
 
-_BUDGET = (  # what of an action, and its unit
+_BUDGET = (  # quantity of an action, and its unit
     ("count", ""),
     ("s", "s"),
     ("share", ""),
@@ -236,11 +212,9 @@ _BUDGET = (  # what of an action, and its unit
 
 
 def budget_rows(session: Session, words: list[str]) -> list[tuple[str, str, list[str]]]:
-    """Time budget, a row per action and for unlabelled time: word, colour, numbers of `_BUDGET`.
+    """Time budget, a row per action and for unlabelled time: word, colour, values of `_BUDGET`.
 
-    Args:
-        session: the opened session.
-        words: the actions, in the order in which they are coloured.
+    `words` are the actions, in the order of their colours.
     """
     if not words or not session.has("summary.csv"):
         return []
@@ -258,11 +232,7 @@ def budget_rows(session: Session, words: list[str]) -> list[tuple[str, str, list
 
 
 def zone_rows(session: Session) -> list[tuple[str, list[str]]]:
-    """A row per zone: name; time, share, visits, latency, mean visit, distance.
-
-    Args:
-        session: the opened session.
-    """
+    """A row per zone: name; time, share, visits, latency, mean visit, distance."""
     if not session.has("zones.parquet"):
         return []
     table = session.table("zones")
@@ -285,10 +255,8 @@ def zone_rows(session: Session) -> list[tuple[str, list[str]]]:
 
 
 def gap_rows(session: Session) -> list[tuple[str, str, str, str]]:
-    """The longest gaps, at most twelve, in order of time: (from, to, frames, reason); times in s.
-
-    Args:
-        session: the opened session.
+    """The longest gaps, at most twelve, in order of time: (from, to, frames, reason); times in
+    s.
     """
     shown = session.gaps.nlargest(12, "n_frames_missing").sort_values("start_s")
     return [
@@ -303,11 +271,7 @@ def gap_rows(session: Session) -> list[tuple[str, str, str, str]]:
 
 
 def glossary(session: Session) -> list[tuple[str, list[dict[Hashable, Any]]]]:
-    """The columns of every table that the session holds: (file, columns).
-
-    Args:
-        session: the opened session.
-    """
+    """The columns of every table of the session: (file, columns)."""
     columns = session.columns.astype(object).where(session.columns.notna(), "")
     return [
         (file, columns[columns["table"] == table].to_dict("records"))

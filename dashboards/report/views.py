@@ -1,4 +1,4 @@
-"""All views of a session that its folder alone can give: report and layouts of both replays."""
+"""All views that need only the session folder: the report and the layouts of both replays."""
 
 from __future__ import annotations
 
@@ -12,14 +12,7 @@ from .report import write_report
 
 
 def write_views(folder: str | Path) -> Path:
-    """Write the report, and the layouts of both replays as files of their own.
-
-    Args:
-        folder: the session's folder.
-
-    Returns:
-        Path of the report.
-    """
+    """Write the report and the layout files of both replays; returns the report's path."""
     session = Session.open(folder)
     write_blueprint(session)
     write_layout(session)
