@@ -1,4 +1,4 @@
 """Jobs of liex_lab: what each command does, in which order, on which files, with how many workers.
 
-The library knows how; a job knows when and where. Installed as `liex_lab.pipelines`.
+The algorithms are in the library. Installed as `liex_lab.pipelines`.
 """

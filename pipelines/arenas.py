@@ -1,9 +1,9 @@
-"""Measurement of several arenas in one picture: a session each, in one pass over the recording.
+"""Measurement of several arenas in one recording: a session per arena, in one pass.
 
-Each frame is decoded once and handed to every arena's pipeline with all but the arena's region
-unread. From there on an arena knows nothing of the others: it has its own background, floor, size,
-track, checkpoint and folder, NAME-ARENA.liex, and its tables are, byte for byte, those of a run
-with that region alone. An arena that cannot be measured stops no other.
+Each frame is decoded once; every arena's pipeline gets it with all pixels outside the arena's
+region unread. The arenas are otherwise independent: each has its own background, floor, size,
+track, checkpoint and folder, NAME-ARENA.liex, and its tables are byte-identical to those of a run
+with that region alone. If one arena fails, the others continue.
 """
 
 from __future__ import annotations
@@ -44,17 +44,17 @@ if TYPE_CHECKING:
     from liex_lab.sessions.writer import BlueprintMaker, ReportMaker
 
 _FACTS = ("individual", "subject_id", "group", "cage", "sex", "batch", "species", "age")
-_REMEMBERED_BYTES = 256 * 2**20  # of frames that several arenas learn their scenes from
+_REMEMBERED_BYTES = 256 * 2**20  # memory for frames that the arenas share to learn their scenes
 
 
 @dataclass(frozen=True)
 class ArenaOutcome:
-    """What became of one arena.
+    """Result of one arena.
 
     Attributes:
         name: of the arena.
-        session: its session folder; None where it could not be measured.
-        error: why it could not; None where it was.
+        session: its session folder; None if it could not be measured.
+        error: why it could not be measured; None if it was.
     """
 
     name: str
@@ -64,7 +64,7 @@ class ArenaOutcome:
 
 @dataclass
 class _Work:
-    """One arena on its way: what it is measured by, and what became of it."""
+    """One arena in progress: its settings and its result."""
 
     arena: SeveralArenas
     settings: tuple[str, ...]
@@ -77,7 +77,7 @@ class _Work:
     session: Path | None = None
 
     def view(self, frames: Sequence[DepthFrame], first: int) -> list[DepthFrame]:
-        """The frames from a row on, as this arena sees them."""
+        """The frames from index `first` on, with all but the arena's region unread."""
         import numpy as np
 
         return [
@@ -102,31 +102,31 @@ def measure_arenas(
     pool: WorkerPool | None = None,
     progress: Progress = silent,
 ) -> list[ArenaOutcome]:
-    """Measure every arena of a recording, each into a session folder of its own.
+    """Measure every arena of a recording, each into its own session folder.
 
-    Unfinished sessions go on where they were. With a pool of workers the shards of each arena are
-    measured arena by arena, and the recording is decoded once for each.
+    Unfinished sessions resume. With a worker pool the arenas are measured one after the other, each
+    in shards, and the recording is decoded once per arena.
 
     Args:
-        recording: a path or address, or a recording that is open already.
-        plan: lists the arenas, or says 'auto'; None takes, for each arena, the bundled plan that
-            fits, with the arenas that `settings` say.
+        recording: a path or address, or an open recording.
+        plan: lists the arenas, or states 'auto'; None uses, for each arena, the bundled plan that
+            fits, with the arenas that `settings` state.
         out: folder of the sessions.
-        settings: changes of a plan that was not named.
-        overwrite: replace sessions that are there already.
-        notes: what each session.json is to hold besides.
+        settings: changes to the plan if none was named.
+        overwrite: replace existing sessions.
+        notes: additional contents of each session.json.
         blueprint: makes the layout of a replay.
         report: makes the report in a folder.
-        pool: pool of workers for the shards of a long recording.
-        progress: told frame by frame.
+        pool: workers for the shards of a long recording.
+        progress: called frame by frame.
 
     Returns:
-        What became of each arena, in the plan's order.
+        The result of each arena, in the plan's order.
 
     Raises:
         RecordingError: the recording cannot be opened or read.
-        PlanError: a region is none in the picture, two overlap, or none are seen.
-        SessionError: a session is there already, or another process writes it.
+        PlanError: a region lies outside the image, two overlap, or no arena is found.
+        SessionError: a session exists already, or another process writes it.
     """
     first = plan or Plan.load(USUAL).with_settings(settings)
     with build_recording(recording, first, progress) as opened:
@@ -159,7 +159,7 @@ def measure_arenas(
 
 
 def arena_settings(arena: SeveralArenas, name: str) -> tuple[str, ...]:
-    """The settings by which a plan of several arenas becomes that of one of them.
+    """The settings that turn a plan of several arenas into the plan of one session.
 
     Args:
         arena: the arena.
@@ -187,7 +187,7 @@ def _prepare(
     shared: Recording,
     progress: Progress,
 ) -> Prepared:
-    """The arena's scene learned, its plan the one that was named or the one that fits."""
+    """Learn the arena's scene with the named plan, or with the one that fits."""
     started = time.perf_counter()
     progress(0, None, f"learning the background and the animal's size in {work.arena.name}")
     chosen = [*settings, *work.settings]
@@ -207,7 +207,7 @@ def _measure(
     report: ReportMaker | None,
     progress: Progress,
 ) -> None:
-    """All frames from where the shortest session ended, each decoded once; then the sessions."""
+    """Measure all frames from the end of the shortest session on, then finish the sessions."""
     from liex_lab.sessions import SessionWriter
 
     if not works:

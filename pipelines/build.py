@@ -1,7 +1,7 @@
 """From a plan to objects: recording, background subtraction, estimator, tracker, rules.
 
-The one place where names and numbers of a plan become objects of the library (a factory for each).
-A slip in the plan is told before any work is done.
+Only this module turns names and numbers of a plan into objects of the library (a factory for each).
+Errors in the plan are raised before any work is done.
 """
 
 from __future__ import annotations
@@ -44,17 +44,17 @@ def build_recording(
 ) -> Recording:
     """The recording as an ideal camera in air would have made it.
 
-    Lens distortion, the water's refraction and a mirror are undone whenever a frame is read, and
-    what lies outside of the plan's region is cut out.
+    Lens distortion, refraction by water and a mirror are undone as each frame is read, and pixels
+    outside the plan's region become unread.
 
     Args:
-        recording: a path or address, or a recording that is open already.
+        recording: a path or address, or an open recording.
         plan: states camera, water surface, mirror, frame rate and topic.
-        progress: told while an archive is unpacked or an index made.
+        progress: called while an archive is unpacked or an index made.
 
     Raises:
         RecordingError: the recording cannot be opened.
-        PlanError: the plan's region is none in this picture.
+        PlanError: the plan's region lies outside the image.
     """
     from liex_lab.recordings.rectify import mirrored, rectified
 
@@ -68,15 +68,15 @@ def open_planned(
     progress: Progress = silent,
     pattern: str | None = None,
 ) -> Recording:
-    """The recording opened as the plan says, its pictures as they are; the plan's camera overrules.
+    """Open a recording with the plan's settings, its images unchanged; the plan's camera overrides.
 
-    A plan that states all four intrinsics opens a recording that has none, too.
+    A plan that states all four intrinsics also opens a recording that has none.
 
     Args:
-        recording: a path or address, or a recording that is open already, whose camera is replaced.
+        recording: a path or address, or an open recording, whose camera is replaced.
         plan: states the camera, and frame rate and topic of recordings that need them.
-        progress: told while an archive is unpacked or an index made.
-        pattern: which pictures of a folder to take; None takes those that its camera.toml states.
+        progress: called while an archive is unpacked or an index made.
+        pattern: which images of a folder to use; None uses those that its camera.toml states.
 
     Raises:
         RecordingError: the recording cannot be opened, or is cut short and the plan does not accept
@@ -100,11 +100,7 @@ def open_planned(
 
 
 def build_water(plan: Plan) -> Water | None:
-    """The plan's water surface, None where it states no height of one.
-
-    Args:
-        plan: its section `water`.
-    """
+    """The plan's water surface; None if the plan states no height of one."""
     from liex_lab.optics.refraction import Water
 
     stated = plan.water.model_dump()
@@ -112,12 +108,14 @@ def build_water(plan: Plan) -> Water | None:
 
 
 def _stated_lens(plan: Plan) -> Lens | None:
-    """The plan's camera where it states all of it, or something to be replaced by its preset."""
+    """The plan's camera if all of it is stated, or a placeholder that its preset replaces; else
+    None.
+    """
     from liex_lab.optics.camera import Lens
 
     stated = {name: getattr(plan.camera, name) for name in ("fx", "fy", "cx", "cy")}
     if None in stated.values() and plan.camera.preset is not None:
-        return Lens(1.0, 1.0, 0.0, 0.0)  # its numbers follow once the pictures' size is known
+        return Lens(1.0, 1.0, 0.0, 0.0)  # its numbers follow once the image size is known
     return None if None in stated.values() else Lens(**stated, distortion=_stated_distortion(plan))
 
 
@@ -128,7 +126,7 @@ def _stated_distortion(plan: Plan) -> Distortion | None:
 
 
 def _overruled(camera: Camera, plan: Plan) -> Camera:
-    """The camera with what the plan states put in."""
+    """The camera with the plan's values."""
     if plan.camera.preset is not None:
         from liex_lab.optics.camera import preset
 
@@ -142,12 +140,12 @@ def _overruled(camera: Camera, plan: Plan) -> Camera:
 
 
 def plan_of(animal: str) -> Plan:
-    """The bundled plan of an animal, or one for the animal of a skeleton's TOML.
+    """The bundled plan of an animal, or a plan for the animal of a skeleton's TOML.
 
-    The latter expects a model `NAME.npz` named as the skeleton's file.
+    The latter expects a model `NAME.npz` with the name of the skeleton's file.
 
     Args:
-        animal: name of a bundled plan, or the path of a skeleton's TOML.
+        animal: name of a bundled plan, or path of a skeleton's TOML.
     """
     from liex_lab.body.skeleton import Skeleton
 
@@ -166,7 +164,7 @@ def plan_of(animal: str) -> Plan:
 def build_estimator(plan: Plan) -> PoseEstimator:
     """The pose estimator of the plan's model and animal.
 
-    The last one is kept, since a study's next session mostly wants the same.
+    The last one stays in memory, since the next session of a study usually needs the same one.
 
     Args:
         plan: its sections `estimation` and `animal`.
@@ -181,7 +179,7 @@ def build_estimator(plan: Plan) -> PoseEstimator:
     path = find_model(plan.estimation.model)
     estimator = kept_estimator(path, sha256(path), plan.estimation.n_candidates or 0)
     wanted = plan.animal.skeleton
-    if wanted.endswith(".toml"):  # a file of the user's own: what matters is the animal in it
+    if wanted.endswith(".toml"):  # the user's own file: the name of its animal counts
         wanted = Skeleton.load(wanted).name
     if estimator.skeleton.name != wanted:
         raise PlanError(
@@ -198,8 +196,8 @@ def kept_estimator(path: Path, digest: str, n_candidates: int) -> PoseEstimator:
 
     Args:
         path: the model file.
-        digest: its SHA-256: another content is another model.
-        n_candidates: initial poses per frame; 0 takes the method's own number.
+        digest: SHA-256 of its content, so that a changed file is loaded again.
+        n_candidates: initial poses per frame; 0 uses the method's default.
     """
     from liex_lab.estimation.estimator import PoseEstimator
     from liex_lab.estimation.model import Model
@@ -210,13 +208,13 @@ def kept_estimator(path: Path, digest: str, n_candidates: int) -> PoseEstimator:
 def build_tracker(
     recording: Recording, plan: Plan, estimator_of: Callable[[], PoseEstimator] | None = None
 ) -> FrameTracker:
-    """The tracker of a recording, its background learned and the animal's size and girth found.
+    """The tracker of a recording: learns the background and estimates the animal's size and girth.
 
     Args:
         recording: an open recording.
         plan: animal, foreground, estimation and tracking.
-        estimator_of: waits for the plan's estimator where that is being made already; None makes
-            it.
+        estimator_of: waits for an estimator of the plan that is already being made; None makes it
+            here.
 
     Raises:
         EstimationError: no floor or no animal is found in the sampled frames.
@@ -225,14 +223,14 @@ def build_tracker(
     from liex_lab.body.skeleton import Skeleton
     from liex_lab.tracking.tracker import FrameTracker
 
-    build_zones(plan)  # a slip in their file is told before any work is done
+    build_zones(plan)  # errors in their file are raised before any work is done
     n_frames = plan.foreground.n_background_frames
     stated = Skeleton.load(plan.animal.skeleton)
-    try:  # while the model is read; a model that cannot be used is told first
+    try:  # while the model is read; an unusable model's error comes first
         scene, sample = build_scene(recording, plan, stated, n_frames)
     finally:
         estimator = estimator_of() if estimator_of else build_estimator(plan)
-    if estimator.skeleton.view != stated.view:  # a model of an older description of the animal
+    if estimator.skeleton.view != stated.view:  # the model has an older version of the skeleton
         scene, sample = build_scene(recording, plan, estimator.skeleton, n_frames)
     shared = plan.animal.shared
     return FrameTracker.prepare(
@@ -248,14 +246,14 @@ def build_tracker(
 
 
 def build_stated_shape(plan: Plan, skeleton: Skeleton) -> StatedShape | None:
-    """The shape that the plan states for its animal; None where it states none.
+    """The shape that the plan states for its animal; None if it states none.
 
     Args:
         plan: its setting `animal.shared`.
         skeleton: the animal's skeleton.
 
     Raises:
-        PlanError: it is that of another skeleton.
+        PlanError: the shape is of another skeleton.
     """
     from liex_lab.tracking.own_shape import StatedShape
 
@@ -275,11 +273,7 @@ def build_stated_shape(plan: Plan, skeleton: Skeleton) -> StatedShape | None:
 
 
 def shape_labels(shape: SharedShape) -> NDArray[np.float64]:
-    """A shape as the library knows it: (K,) labels, see `session_shape.labels_of`.
-
-    Args:
-        shape: as a plan states it.
-    """
+    """A plan's shape as (K,) labels, see `session_shape.labels_of`."""
     import numpy as np
 
     from liex_lab.estimation.session_shape import labels_of
@@ -293,19 +287,20 @@ def build_scene(
 ) -> tuple[Segmenter, NDArray[np.float32]]:
     """The learned segmentation and the sampled frames it was learned from.
 
-    Background subtraction with a floor plane, or for a hand segmentation by distance.
+    Background subtraction with a floor plane; segmentation by distance for a hand.
 
     Args:
         recording: an open recording.
         plan: expected spine lengths, and the foreground's thresholds, mm.
-        skeleton: its view says which segmentation is used.
-        n_frames: how many frames are sampled, spread over the recording.
+        skeleton: its view selects the segmentation.
+        n_frames: number of sampled frames, spread over the recording.
 
     Returns:
         The segmenter, and the sample (n, H, W) float32 mm, 0 where unread.
 
     Raises:
         EstimationError: no floor or no animal is found in the sample.
+        PlanError: the plan states a region or a floor for a hand.
     """
     from liex_lab.body.skeleton import FOREGROUNDS
     from liex_lab.scene.background_segmenter import BackgroundSubtraction
@@ -331,20 +326,16 @@ def build_scene(
 
 
 def build_rules(plan: Plan) -> MouseRules:
-    """Thresholds of the behaviours that rules name.
-
-    Args:
-        plan: its section `behaviour`.
-    """
+    """Thresholds of the rules that name behaviours, from the plan's section `behaviour`."""
     from liex_lab.behaviour.bouts import MouseRules
 
     return MouseRules(**plan.behaviour.model_dump())
 
 
 def build_recogniser(plan: Plan, skeleton: Skeleton) -> TimelineModel | None:
-    """The plan's action recogniser: the named or the bundled one; None where there is none.
+    """The plan's action recogniser, named or bundled; None if there is none.
 
-    Then rules name the actions, or nothing does, see `why_nameless`.
+    Without a recogniser rules name the actions, or nothing does, see `why_nameless`.
 
     Args:
         plan: its setting `actions.model`: a name, a path, `rules`, or None for the animal's bundled
@@ -370,12 +361,12 @@ def build_recogniser(plan: Plan, skeleton: Skeleton) -> TimelineModel | None:
 
 
 def why_nameless(plan: Plan, skeleton: Skeleton) -> str:
-    """Why no actions are named where there is no recogniser; '' where rules name them.
+    """Why no actions are named if there is no recogniser; '' if rules name them.
 
-    The rules are those of a mouse: a hand does not rear, and a snake does not run.
+    The rules are a mouse's: a hand does not rear, and a snake does not run.
 
     Args:
-        plan: its setting `actions.model`; 'rules' asks for the rules, whatever the animal is.
+        plan: its setting `actions.model`; 'rules' applies the rules to any animal.
         skeleton: the animal's skeleton.
     """
     if plan.actions.model is not None or skeleton.name == _RULED:

@@ -1,10 +1,10 @@
-"""Which plan a recording fits: the one that was named, another one, or none.
+"""Which plan a recording fits: the named one, another one, or none.
 
-The scene is learned and the animal's size found as a run does; what `sample_fit` then says of the
-sampled frames decides. Where the named plan does not fit, or none was named and the usual one does
-not, every other bundled plan is tried on a handful of frames. Left and right hands are told apart
-in the same way: the recording and its mirror image are both tried, and of the wrong one the
-predicted error is about twice as large.
+The scene is learned and the animal's size estimated as in a run; `sample_fit` of the sampled frames
+decides. If the named plan does not fit, or none was named and the usual one does not, every other
+bundled plan is tried on a few frames. Left and right hands are distinguished similarly: the
+recording and its mirror image are both tried, and the wrong one's predicted error is about twice as
+large.
 """
 
 from __future__ import annotations
@@ -26,24 +26,24 @@ if TYPE_CHECKING:
     from liex_lab.tracking.residual import SampleFit
     from liex_lab.tracking.tracker import FrameTracker
 
-USUAL = "mouse"  # tried first where no plan is named
+USUAL = "mouse"  # tried first if no plan is named
 _HANDFUL = "foreground.n_background_frames=24"
-# of the predicted error of the pictures as they are: their mirror image fits a hand better
+# of the unmirrored images' predicted error: below it the mirror image fits a hand better
 _MIRRORED_BELOW = 0.75
-# of what stands out from the floor must lie under the body, where nothing moves, to be an animal
+# share of what rises above the floor that the body has to cover, if nothing moves, to be an animal
 _SOME_COVERED = 0.25
 
 
 @dataclass(frozen=True)
 class Fitted:
-    """A plan that is used, and its tracker.
+    """A plan in use, and its tracker.
 
     Attributes:
-        recording: the recording, mirrored where that was found.
-        plan: the plan with what was found filled in.
+        recording: the recording, mirrored if needed.
+        plan: the plan, completed with what was found.
         tracker: the tracker of the recording, prepared.
-        misfits: what contradicts that the recording shows the plan's animal, accepted all the same.
-        notes: what was found and is to be said.
+        misfits: evidence against the plan's animal, if accepted all the same.
+        notes: notes for the user on what was found.
     """
 
     recording: Recording
@@ -55,12 +55,12 @@ class Fitted:
 
 @dataclass(frozen=True)
 class PlanFit:
-    """How well a plan fits a handful of frames.
+    """How well a plan fits a few frames.
 
     Attributes:
         name: of the plan.
-        fit: what the frames say; None where nothing of the animal was found.
-        misfits: what contradicts the plan; empty where it fits.
+        fit: statistics of the frames; None if no animal was found.
+        misfits: evidence against the plan; empty if it fits.
     """
 
     name: str
@@ -70,15 +70,14 @@ class PlanFit:
 
 @dataclass(frozen=True)
 class Proposal:
-    """Which plan a recording fits, for people to read.
+    """Which plan a recording fits, for display.
 
     Attributes:
-        plan: name of the bundled plan, or of the animal of the plan that was given; None where no
-            plan fits.
-        says: how it fits, or what contradicts each plan.
-        n_animals: things of the animal's size in view at once; None where no plan fits.
+        plan: name of the bundled plan, or of the given plan's animal; None if no plan fits.
+        says: how it fits, or the evidence against each plan.
+        n_animals: objects of the animal's size in view at once; None if no plan fits.
         problems: sentences about several animals, and about a given plan that does not fit.
-        is_given: whether the plan that fits is the one that was given.
+        is_given: whether the plan that fits is the given one.
     """
 
     plan: str | None
@@ -89,11 +88,11 @@ class Proposal:
 
 
 def propose_plan(recording: Recording, plan: Plan | None = None) -> Proposal:
-    """The plan that a recording fits, by a handful of frames.
+    """Find the plan that a recording fits, from a few frames.
 
     Args:
         recording: an open recording.
-        plan: the plan that was given, which is tried first; None tries the usual one.
+        plan: the given plan, tried first; None tries the usual one.
     """
     first = try_plan(recording, plan or USUAL)
     looks = [first]
@@ -125,7 +124,7 @@ def propose_plan(recording: Recording, plan: Plan | None = None) -> Proposal:
 
 
 def _other_hand(recording: Recording, found: PlanFit, plan: Plan | None) -> tuple[str, ...]:
-    """That a hand is a left one or its pictures mirrored, where they are; () of anything else."""
+    """A problem if the hand is a left one or its images are mirrored; () otherwise."""
     from liex_lab.recordings.rectify import mirrored
 
     stated = plan is not None and plan.recording.mirrored is not None
@@ -149,19 +148,19 @@ def fit_plan(
     settings: Sequence[str] | None = None,
     progress: Progress = silent,
 ) -> Fitted:
-    """The tracker of a recording by its plan, or by the bundled one that fits where none was named.
+    """The tracker of a recording by its plan, or by the bundled plan that fits if none was named.
 
     Args:
         recording: an open recording.
-        plan: the plan that was named, or the usual one.
+        plan: the named plan, or the usual one.
         estimator_of: waits for the plan's estimator; None makes it.
-        settings: where no plan was named, the settings that are changed in any of them; None where
-            `plan` was named.
-        progress: told what is being done.
+        settings: if no plan was named, the settings to change in any plan; None if `plan` was
+            named.
+        progress: called with the current step.
 
     Raises:
-        MisfitError: the recording shows something else than the plan's animal, and the plan does
-            not say to measure it all the same.
+        MisfitError: the recording does not show the plan's animal, and the plan does not accept
+            that.
         EstimationError: no animal is found, and no other plan fits.
     """
     tracker = None
@@ -178,7 +177,7 @@ def fit_plan(
         found = _right_way_round(Fitted(recording, plan, tracker, misfits), progress)
         if not found.misfits:
             return found
-        if accepted:  # but no pose of it is trusted
+        if accepted:  # but none of its poses is trusted
             return replace(found, tracker=replace(found.tracker, doubtful_mm=0.0))
     if cause is not None and accepted:
         raise cause
@@ -201,7 +200,7 @@ def fit_plan(
 
 
 def _shows_an_animal(tracker: FrameTracker) -> bool:
-    """Whether anything moved, or the body covers what stands still before the floor."""
+    """Whether anything moved, or the body covers enough of what rises above the floor."""
     from liex_lab.scene.background_segmenter import BackgroundSubtraction
 
     scene = tracker.scene
@@ -212,7 +211,7 @@ def _shows_an_animal(tracker: FrameTracker) -> bool:
 
 
 def try_plan(recording: Recording, plan: Plan | str) -> PlanFit:
-    """Fit a plan to a handful of frames.
+    """Fit a plan to a few frames.
 
     Args:
         recording: an open recording.
@@ -229,20 +228,18 @@ def try_plan(recording: Recording, plan: Plan | str) -> PlanFit:
 
 
 def best(looks: Sequence[PlanFit]) -> PlanFit | None:
-    """The plan that fits, and of several the one with the least error for its animal's length.
-
-    Args:
-        looks: plans that were tried.
+    """The plan that fits; of several, the one with the least error relative to its animal's
+    length.
     """
     fitting = [one for one in looks if one.fit is not None and not one.misfits]
     return min(fitting, key=_error_share, default=None)
 
 
 def misfits_of(fit: SampleFit | None, plan: Plan) -> tuple[str, ...]:
-    """What contradicts that a recording shows the plan's animal.
+    """Evidence that a recording does not show the plan's animal.
 
     Args:
-        fit: what the sampled frames say; None where nothing is known.
+        fit: statistics of the sampled frames; None if unknown.
         plan: its section `animal`.
     """
     if fit is None:
@@ -279,7 +276,7 @@ def _refusal(plan: Plan, misfits: Sequence[str], fitting: PlanFit | None) -> str
 
 
 def _right_way_round(found: Fitted, progress: Progress) -> Fitted:
-    """The same, or the mirror image where the pictures are of a hand and fit better so."""
+    """The same, or mirrored if the images show a hand and fit better mirrored."""
     from liex_lab.recordings.rectify import mirrored
     from liex_lab.scene.hand_segmenter import HandSegmenter
 
@@ -290,7 +287,7 @@ def _right_way_round(found: Fitted, progress: Progress) -> Fitted:
         return found
     animal = animal_of(plan)
     if not fit.has_length(animal.spine_min_mm, animal.spine_max_mm):
-        return found  # it is no hand at all
+        return found  # not a hand
     progress(0, None, "looking which hand it is")
     handful = plan.with_settings([_HANDFUL])
     turned = mirrored(found.recording, lent=True)

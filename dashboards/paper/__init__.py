@@ -1,1 +1,1 @@
-"""Figures of the Lie-X paper, drawn from what the evaluation measured."""
+"""Figures of the Lie-X paper, drawn from the evaluation's results."""

@@ -1,6 +1,6 @@
 """Figures 7 to 20 of the Lie-X paper, and the scenes of `liex evaluate scenes`, as PNG.
 
-Nothing is computed here but errors that stand beside a pose.
+Nothing is computed here except the errors printed next to the poses.
 """
 
 from __future__ import annotations
@@ -63,17 +63,17 @@ _GREEN = "#228833"
 _DPI = 130
 _MOST_CANDIDATES = 40
 _MOST_STAGES = 8
-_SCENE_MOMENTS = (0.08, 0.4, 0.62, 0.95)  # of the recording
+_SCENE_MOMENTS = (0.08, 0.4, 0.62, 0.95)  # share of the recording's length
 _MOMENTS = 6  # of a tracked sequence
-_APART = 12  # frames between two of them, at least
+_APART = 12  # least distance between two of them, frames
 
 
 def draw_paper(results: Results, further: Mapping[str, Any], folder: Path) -> list[Path]:
-    """Write every figure for which there are numbers.
+    """Write every figure for which there are results.
 
     Args:
-        results: what was measured, by animal.
-        further: what other verbs measured.
+        results: evaluation results by animal.
+        further: results of other verbs.
         folder: where the PNG files are written.
 
     Returns:
@@ -182,7 +182,9 @@ def draw_sensitivity(results: Results, path: Path) -> Path:
 
 
 def draw_cumulative(results: Results, path: Path) -> Path:
-    """Fig. 8: share of frames with a mean joint error within so many mm; lost ones never are."""
+    """Fig. 8: share of frames whose mean joint error is at most so many mm; lost frames never
+    count.
+    """
     figure, grid = _sheet(len(results), max(len(one["splits"]) for one in results), 4.2, 3.2)
     for line, one in zip(grid, results, strict=True):
         for panel, split in zip(line, one["splits"], strict=False):
@@ -203,7 +205,7 @@ def draw_cumulative(results: Results, path: Path) -> Path:
 
 
 def draw_joint_errors(results: Results, path: Path) -> Path:
-    """Mean error of every joint, by method."""
+    """Mean error of each joint, by method."""
     figure, grid = _sheet(len(results), max(len(one["splits"]) for one in results), 4.6, 3.2)
     for line, one in zip(grid, results, strict=True):
         joints = one["joints"]
@@ -227,13 +229,13 @@ def draw_poses(
     path: Path,
     side: bool = False,
 ) -> Path:
-    """Figs. 9 to 12 and 17: poses in some frames beside the truth, a row per method.
+    """Figs. 9 to 12 and 17: poses in some frames with the truth, a row per method.
 
     Args:
         title: of the figure.
-        rows: by method, frames with `head`, `truth` (J, 3) mm, camera frame, `pose`, which is None
-            if nothing was found and absent if none is known, and, where a depth image is drawn,
-            `depth`, `camera`, `edges` and `spine_mm`.
+        rows: by method, frames with `head`, `truth` (J, 3) mm, camera frame, `pose` (None if
+            nothing was found, absent if it was not kept), and, to draw a depth image, `depth`,
+            `camera`, `edges` and `spine_mm`.
         path: the PNG to write.
         side: view along the image's rows instead of along the optical axis.
     """
@@ -299,7 +301,7 @@ def _height_map(panel: Axes, shown: Mapping[str, Any], joints_px: Array) -> None
 
 
 def draw_candidates(shown: Mapping[str, Any], path: Path) -> Path:
-    """Figs. 13 to 15: candidates as the learned metric ranks them, estimated and true error."""
+    """Figs. 13 to 15: candidates ranked by the learned metric, with predicted and true error."""
     ranked = shown["ranked"]
     n = min(len(ranked["score_mm"]), _MOST_CANDIDATES)
     columns = min(n, 10 if n > 10 else 5)
@@ -324,7 +326,9 @@ def draw_candidates(shown: Mapping[str, Any], path: Path) -> Path:
 
 
 def draw_convergence(shown: Mapping[str, Any], path: Path) -> Path:
-    """Fig. 16: one candidate from start to end, and all errors after every joint and round."""
+    """Fig. 16: one candidate from start to end, and the errors of all after every joint and
+    round.
+    """
     steps = shown["steps"]
     n = len(steps["names"])
     stages = np.unique(np.linspace(0, n - 1, min(_MOST_STAGES, n)).round().astype(int))
@@ -359,12 +363,12 @@ def draw_convergence(shown: Mapping[str, Any], path: Path) -> Path:
 
 
 def draw_tracking(sequence: TestSequence, rows: Mapping[str, Followed], path: Path) -> Path:
-    """Fig. 18: error of tracking over time beside single frames, and the worst moments.
+    """Fig. 18: tracking error over time compared with single frames, and the worst moments.
 
     Args:
         sequence: the sequence with its truth.
-        rows: `single` (frames by themselves), and where they exist `algorithm3` and `smoothed`.
-        path: the PNG to write; its folder is made.
+        rows: `single` (frames by themselves) and, if available, `algorithm3` and `smoothed`.
+        path: the PNG to write; its folder is created.
     """
     figure = Figure(figsize=(13.0, 6.4), layout="constrained")
     grid = figure.add_gridspec(2, _MOMENTS, height_ratios=(1.3, 1.0))
@@ -426,9 +430,9 @@ def draw_key_frames(acts: Sequence[Mapping[str, Any]], path: Path) -> Path:
     """Fig. 19: key frames and path of each action.
 
     Args:
-        acts: of each action `word`, `side`, `path_mm`, `bodies_mm`, `skeletons_mm`, `edges` and
+        acts: for each action `word`, `side`, `path_mm`, `bodies_mm`, `skeletons_mm`, `edges` and
             `seconds`.
-        path: the PNG to write; its folder is made.
+        path: the PNG to write; its folder is created.
     """
     figure, grid = _sheet(-(-len(acts) // 3), 3, 3.6, 3.5, (0.0, 0.4))
     panels = [panel for line in grid for panel in line]
@@ -458,11 +462,12 @@ def draw_key_frames(acts: Sequence[Mapping[str, Any]], path: Path) -> Path:
 
 
 def draw_confusions(result: Mapping[str, Any], path: Path) -> Path:
-    """Fig. 20: confusion matrices of cut-out actions, rows the true action, shares in per cent.
+    """Fig. 20: confusion matrices of cut-out actions; rows are the true actions, shares in per
+    cent.
 
     Args:
-        result: what `evaluate_actions` found: confusion, accuracies and their 95 % intervals.
-        path: the PNG to write; its folder is made.
+        result: from `evaluate_actions`: confusion, accuracies and their 95 % intervals.
+        path: the PNG to write; its folder is created.
     """
     words = [str(word).replace("_", " ") for word in result["confusion"]["words"]]
     side = 1.6 + 0.42 * len(words)
@@ -495,14 +500,14 @@ def draw_scene(
     individuals: Sequence[Individual],
     folder: Path,
 ) -> Path:
-    """Frames of a scene with true and measured skeletons: the whole depth image, and near.
+    """Frames of a scene with true and measured skeletons: the whole depth image, and a close-up.
 
     Args:
-        name: of the scene, which names the file.
-        recording: its frames.
-        truths: its animals, green.
-        individuals: what was measured, purple where it is trusted, else orange.
-        folder: of the PNG; it is made.
+        name: of the scene and of the file.
+        recording: the scene's frames.
+        truths: true animals, drawn in green.
+        individuals: measured individuals, purple if trusted, orange otherwise.
+        folder: of the PNG; it is created.
     """
     figure, panels = _sheet(2, len(_SCENE_MOMENTS), 3.75, 3.6)
     for k, share in enumerate(_SCENE_MOMENTS):
@@ -535,7 +540,7 @@ def draw_scene(
 def _in_image(
     panel: Axes, recording: TrueRecording, joints: Array, colour: str, width: float
 ) -> None:
-    """Bones where the joints are those of the recording's animal, else dots."""
+    """Draw bones if the joints are those of the recording's animal, dots otherwise."""
     if not np.isfinite(joints).all():
         return
     skeleton, points = recording.skeleton, recording.camera.project(joints)

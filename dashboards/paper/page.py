@@ -1,7 +1,7 @@
-"""Tables 1 to 3 of the Lie-X paper as CSV and Markdown, and index.html: every table and figure.
+"""Tables 1 to 3 of the Lie-X paper as CSV and Markdown, and index.html with every table and figure.
 
-What is written is data that `liex evaluate tables` measured; the sentences are in `templates`. The
-page contains its figures and loads nothing from any other machine.
+The data come from `liex evaluate tables`, the sentences from `templates`. The page embeds its
+figures and loads nothing from the network.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from .published import (
     TITLES,
 )
 
-Results = Mapping[str, Any]  # what was measured of one animal, by the job's names
+Results = Mapping[str, Any]  # results of one animal, by the job's names
 Table = tuple[Sequence[str], Sequence[Sequence[str]]]  # head and rows
 
 _TEMPLATES = Path(__file__).parent / "templates"
@@ -63,19 +63,20 @@ _FIGURES = {  # by label, names of the files
 _ANIMAL = {"Fig. 10": "hand", "Fig. 11": "hand", "Fig. 13": "fish", "Fig. 14": "mouse"}
 _ANIMAL |= {"Fig. 15": "hand"}
 _PART = {"Fig. 18": "tracking", "Fig. 19": "actions", "Fig. 20": "actions"}
-_SHOWN_SCALE = 0.72  # of a figure's pixels, so that its letters are as large as the page's
+_SHOWN_SCALE = 0.72  # of a figure's pixels: letters become as large as the page's
 
 
 def write_paper(
     folder: Path, results: Sequence[Results], further: Mapping[str, Any], quick: bool
 ) -> list[Path]:
-    """Write the tables as CSV, Markdown and JSON, the figures, and the page that has them all.
+    """Write the tables as CSV, Markdown and JSON, the figures, and the page that contains them all.
 
     Args:
         folder: where the files are written.
         results: by animal; the hand goes into Table 2, all others into Table 1.
-        further: what other verbs measured, see `liex_lab.pipelines.evaluation.paper.run`.
-        quick: the rows were trained on next to nothing; the text says so and concludes nothing.
+        further: results of other verbs, see `liex_lab.pipelines.evaluation.paper.run`.
+        quick: the rows were trained on very little data; the text states this and draws no
+            conclusions.
 
     Returns:
         The paths of the files.
@@ -114,7 +115,7 @@ def write_paper(
 
 
 def frame(results: Sequence[Results]) -> pd.DataFrame:
-    """Every row on every split of every animal, with how it was made and what is published."""
+    """Every row on every split of every animal, with its provenance and the published values."""
     rows = [
         {
             "animal": r["animal"],
@@ -141,7 +142,7 @@ def _published_rate(results: Results, variant: str) -> float | None:
 
 
 def _by_split(table: pd.DataFrame) -> dict[str, Any]:
-    """The figures of tables.json by animal, split and variant."""
+    """The numbers of tables.json by animal, split and variant."""
     found: dict[str, Any] = {}
     for row in table.to_dict("records"):
         of_split = found.setdefault(row["animal"], {}).setdefault(row["split"], {})
@@ -171,7 +172,9 @@ def _number(value: float | None, digits: int = 2) -> str:
 
 
 def error_table(results: Results) -> Table:
-    """One animal's medians: a row for each method, and one for the objects that all measured."""
+    """One animal's medians: a row per method, and one for the wrong objects that all methods
+    share.
+    """
     published = PUBLISHED_MM.get(results["animal"], {})
     splits = results["splits"]
     rows = []
@@ -205,7 +208,7 @@ def mean_table(results: Results) -> Table:
 
 
 def _origin(row: Mapping[str, Any] | None) -> str:
-    """Measured in this run, or kept, and then on what other processor."""
+    """Whether a row was measured in this run or kept, and if kept, on another processor."""
     if row is None:
         return "not measured"
     return f"{row['origin']}{', another processor' if row['other_processor'] else ''}"
@@ -269,9 +272,10 @@ def origin_table(results: Sequence[Results]) -> Table:
 
 
 def notes_of(results: Results, quick: bool) -> list[str]:
-    """Which rows are missing, come from another version or other postures, or rank differently.
+    """Notes on rows that are missing, from another version or other postures, or ranked
+    differently.
 
-    A quick run says nothing of the order of the methods.
+    A quick run makes no claim about the order of the methods.
     """
     postures = results["test_postures"]
     notes = [f"Test postures are {postures}."] if postures else []
@@ -294,7 +298,7 @@ def notes_of(results: Results, quick: bool) -> list[str]:
 
 
 def _kept_notes(title: str, entry: Mapping[str, Any], postures: str) -> Iterator[str]:
-    """What a reader has to know of a kept row or curve."""
+    """Caveats about a kept row or curve."""
     if entry.get("origin") != "kept":
         return
     made = entry["made"]
@@ -319,7 +323,7 @@ def _where_ahead(results: Results, a: str, b: str) -> str:
 
 
 def _turned_pairs(results: Results) -> Iterator[str]:
-    """Pairs of rows whose order is not the published one on some split."""
+    """Pairs of rows whose order differs from the published one on some split."""
     published = PUBLISHED_MM.get(results["animal"], {})
     for pair in combinations(published, 2):
         ahead, behind = sorted(pair, key=published.__getitem__)
@@ -334,7 +338,9 @@ def _turned_pairs(results: Results) -> Iterator[str]:
 def exhibits(
     results: Sequence[Results], further: Mapping[str, Any], figures: Sequence[Path], quick: bool
 ) -> dict[str, dict[str, Any]]:
-    """What the page shows under each label of the paper: tables, notes, figures, or why nothing."""
+    """The page's content for each label of the paper: tables, notes, figures, or why there are
+    none.
+    """
     tables: dict[str, list[tuple[str, Table]]] = {label: [] for label in _LABELS}
     notes: dict[str, list[str]] = {label: [] for label in _LABELS}
     for r in results:
@@ -371,7 +377,7 @@ def exhibits(
 
 
 def _why_missing(label: str, results: Sequence[Results], further: Mapping[str, Any]) -> str:
-    """Why there is nothing under a label; '' for the paper's drawings."""
+    """Why a label is empty; '' for the paper's drawings."""
     if (part := _PART.get(label, "nyu" if label == "Fig. 12" else "")) in further["missing"]:
         return f"Not made: {further['missing'][part]}."
     if label == "Fig. 7":
@@ -391,7 +397,7 @@ def _why_missing(label: str, results: Sequence[Results], further: Mapping[str, A
 
 
 def _nyu_table(nyu: Mapping[str, Any]) -> Table:
-    """Published answers and ours on NYU frames."""
+    """Published results and ours on NYU frames."""
     same = {
         f"{name}, the frames of ours": {"method": f"{name}, on the frames of ours alone", **row}
         for name, row in nyu["same_frames"].items()
@@ -410,7 +416,7 @@ def _nyu_table(nyu: Mapping[str, Any]) -> Table:
 
 
 def _tracking_table(tracking: Mapping[str, Any]) -> Table:
-    """Errors of the rows of tracking."""
+    """Errors of each tracker."""
     keys = ("mean_joint_error_mm", "p95_joint_error_mm", "ratio_to_single", "lost_rate")
     rows = [
         [tracking["row_names"][name], *(_number(row.get(key)) for key in keys)]
@@ -434,7 +440,7 @@ def _actions_table(actions: Mapping[str, Any]) -> Table:
 
 
 def _in_html(caption: str, table: Table) -> tuple[str, Sequence[str], list[Any], list[str]]:
-    """A table as the template shows it; columns of words are of the class `text`."""
+    """A table for the template; text columns get the class `text`, others `number`."""
     head, rows = table
     kinds = []
     for column in zip(*rows, strict=True):
@@ -445,7 +451,7 @@ def _in_html(caption: str, table: Table) -> tuple[str, Sequence[str], list[Any],
 
 
 def _with_code(text: str) -> Markup:
-    """A text of ours; what stands between backticks becomes code."""
+    """Escape a text of ours and turn what is between backticks into code."""
     parts = [escape(part) for part in text.split("`")]
     for k in range(1, len(parts) - 1, 2):
         parts[k] = Markup("<code>{}</code>").format(parts[k])
@@ -453,7 +459,7 @@ def _with_code(text: str) -> Markup:
 
 
 def _image(path: Path) -> dict[str, Any]:
-    """A PNG as the template shows it."""
+    """A PNG for the template."""
     content = path.read_bytes()
     (width,) = struct.unpack(">I", content[16:20])  # of the header chunk
     return {

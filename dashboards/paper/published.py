@@ -1,4 +1,4 @@
-"""What Lie-X publishes in its Tables 1 to 3, and where our rows differ from the paper.
+"""Results that Lie-X publishes in its Tables 1 to 3, and where our rows differ from the paper.
 
 Constants only: `liex evaluate tables --help` prints the differences without loading anything else.
 """

@@ -1,6 +1,6 @@
 """Numba kernels of the baselines: Hough votes of the RF's pixels, and the CNN's depth patches.
 
-F1's trees vote from pixels for the base's position and heading, F2's trees for the pose; the answer
+F1's trees vote from pixels for the base's position and heading, F2's trees for the pose; the result
 is the mean-shift mode of the votes (Lie-X section 5.2).
 """
 
@@ -16,10 +16,10 @@ from liex_lab.estimation._feature_kernels import correct_base, correct_joint, fi
 from liex_lab.forests._kernels import VIEW, descend
 from liex_lab.scene._height_map_kernels import crop_camera
 
-_BINS = 72  # of the circle in which headings are counted: 5 degrees each
-_SMOOTH = 3  # bins to either side that a vote for a heading also counts in
+_BINS = 72  # heading bins of the circle: 5 degrees each
+_SMOOTH = 3  # bins to either side that a heading's vote also counts in
 _SETTLE = 2  # times the few mean-shift steps of `mode_of_votes`
-PATCH = 224  # pixels of a patch's side
+PATCH = 224  # side of a patch, pixels
 PATCH_MARGIN = 1.1
 HEIGHTS_PER_MM = 16.0
 
@@ -40,11 +40,11 @@ class VotingForest(NamedTuple):
 
 
 class VoteSettings(NamedTuple):
-    """The numbers of the votes.
+    """Settings of the votes.
 
     Attributes:
         n_points: number of pixels that vote.
-        reach: how far offsets reach, mm.
+        reach: largest feature offset, mm.
         bandwidths: (2,) of the mean shifts of F1 and F2, mm.
     """
 
@@ -60,7 +60,7 @@ def animal_points(heights, packed_camera, phase, points):
     Args:
         heights: (S, S) int16 height map, 1/16 mm, 0 where there is no animal.
         packed_camera: (17,) packed crop camera.
-        phase: in [0, 1), chooses which of the pixels.
+        phase: in [0, 1), selects the pixels.
         points: (P, 3) filled, mm, view frame.
     """
     camera = crop_camera(packed_camera)
@@ -111,7 +111,7 @@ def views_all(crop_cameras, image, places, headings, reach, views):
         image: (n,) index of each sample's height map.
         places: (n, 3) positions, mm, view frame.
         headings: (n,) rad, about the view's z axis.
-        reach: how far offsets reach, mm.
+        reach: largest feature offset, mm.
         views: (n, 1, 9) float32, filled.
     """
     for s in prange(image.size):
@@ -135,10 +135,10 @@ def turn_to(heading, rotation):
 
 @njit(cache=True)
 def heading_of(votes):
-    """The heading, rad, that most votes (n, 2) agree on; a vote weighs as much as it is long.
+    """The heading, rad, that most votes (n, 2) agree on; a vote's weight is its length.
 
-    The peak of a smoothed circular histogram is taken, then the mean direction of the votes within
-    about 45 degrees of it.
+    It is the mean direction of the votes within about 45 degrees of the peak of a smoothed circular
+    histogram.
     """
     counts = np.zeros(_BINS)
     angles = np.empty(len(votes))
@@ -159,22 +159,23 @@ def heading_of(votes):
 
 @njit(cache=True)
 def locate(heights, packed_camera, phase, settings, forest, used, place):
-    """Position and heading of the animal, as F1's trees vote.
+    """Position and heading of the animal by the votes of F1's trees.
 
-    Only votes whose own heading agrees with the chosen one take part in the position: a pixel that
-    takes the nose for the tail errs in both.
+    Only votes whose own heading agrees with the chosen one contribute to the position: a pixel that
+    mistakes the nose for the tail errs in both.
 
     Args:
         heights: (S, S) int16 height map, 1/16 mm, 0 where there is no animal.
         packed_camera: (17,) packed crop camera.
-        phase: in [0, 1), chooses which pixels vote.
-        settings: the numbers of the votes.
+        phase: in [0, 1), selects the pixels that vote.
+        settings: settings of the votes.
         forest: F1.
         used: (T,) bool, the trees that vote.
         place: (3,) filled with the base's position, mm, view frame.
 
     Returns:
         The heading, rad.
+    --~ locate_all settings: the numbers of the votes. ==> settings: settings of the votes.
     """
     n_points = settings.n_points
     n_trees = forest.roots.size
@@ -242,7 +243,7 @@ def locate_all(heights, crop_cameras, image, phases, settings, forest, used, pla
 
 @njit(cache=True)
 def unfold(values, levers, place, heading, tree, rotations, positions):
-    """Joint frames of the pose at F2's coordinates, from where F1 put it.
+    """Joint frames of the pose at F2's coordinates, relative to F1's position and heading.
 
     Args:
         values: (D,) coordinates in lever units, see `baselines.forest.levers`.
@@ -255,6 +256,8 @@ def unfold(values, levers, place, heading, tree, rotations, positions):
 
     Returns:
         The scale of the bones.
+    --~ guess_all settings: the numbers of the votes. ==> settings: settings of the votes. found:
+    (n,) bool, where there is an animal. ==> found: (n,) bool, whether an animal was found.
     """
     twist = np.empty(7)
     for k in range(7):
@@ -366,7 +369,7 @@ def shade(heights, row, column, level, per_mm):
 def patches_all(heights, crop_cameras, frames, patches):
     for k in prange(len(crop_cameras)):
         camera = crop_camera(crop_cameras[k])
-        scale = 2.0 * frames[k, 2] / camera.step / PATCH  # height map pixels a patch pixel
+        scale = 2.0 * frames[k, 2] / camera.step / PATCH  # height map pixels per patch pixel
         left = (frames[k, 0] - frames[k, 2] - camera.u0) / camera.step
         top = (frames[k, 1] - frames[k, 2] - camera.v0) / camera.step
         level = (camera.distance - frames[k, 3]) * HEIGHTS_PER_MM

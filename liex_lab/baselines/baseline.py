@@ -33,7 +33,7 @@ DAMAGE = (
     EOFError,
     RuntimeError,
     zipfile.BadZipFile,
-)  # what a broken .npz raises
+)  # exceptions that a broken .npz raises
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class Guesses:
 
 
 class Baseline(Protocol):
-    """A way to measure poses that is not ours, at work on the product's own segmentation."""
+    """A pose estimator from the literature that uses liex_lab's segmentation."""
 
     @property
     def skeleton(self) -> Skeleton:
@@ -60,18 +60,18 @@ class Baseline(Protocol):
 
     @property
     def takes_size(self) -> bool:
-        """Whether the animal's size is handed to it; else it measures every animal alike."""
+        """Whether it uses the animal's size; otherwise it treats all sizes alike."""
 
     def find_size(self, sample: NDArray[np.float32], scene: Segmenter) -> float:
         """Estimate the animal's size from a sample of frames.
 
         Args:
             sample: (n, H, W) float32 frames, mm, 0 where unread.
-            scene: the segmenter that was fitted to the recording.
+            scene: the segmenter fitted to the recording.
 
         Returns:
-            The animal's spine over the home length; 1 where the baseline knows of no such thing, as
-            the paper's do not.
+            The animal's spine over the home length; 1 if the baseline has no notion of size, as the
+            paper's.
         """
 
     def estimate(
@@ -81,7 +81,7 @@ class Baseline(Protocol):
 
         Args:
             depths: (n, H, W) float32 mm, 0 where unread.
-            scene: the segmenter that was fitted to the recording.
+            scene: the segmenter fitted to the recording.
             size: the animal's size, as from `find_size`.
             parallel: use all cores rather than one.
 
@@ -92,7 +92,7 @@ class Baseline(Protocol):
     def guesses(
         self, crops: HeightMaps, crop_cameras: Array, size: float, parallel: bool = True
     ) -> Guesses:
-        """Estimate the joints of objects that were cut out already, as by `chosen`.
+        """Estimate the joints of objects that are already cut out, as by `chosen`.
 
         Args:
             crops: height maps of n frames, along the optical axis.
@@ -106,7 +106,7 @@ class Baseline(Protocol):
 
 
 class Sizeless:
-    """A baseline that knows nothing of size, as the paper's do: it measures every animal alike."""
+    """A baseline without a notion of size, like the paper's: it treats all sizes alike."""
 
     takes_size = False
 
@@ -121,7 +121,7 @@ class Sizeless:
         size: float,
         parallel: bool = True,
     ) -> Guesses:
-        """Estimate the joints in each frame, of the component that area and volume choose.
+        """Estimate the joints in each frame, of the component chosen by area and volume.
 
         Heights are measured along the optical axis.
         """
@@ -133,18 +133,18 @@ class Sizeless:
 def second_is_likelier(
     depths: NDArray[np.float32], scene: Segmenter, parallel: bool = True
 ) -> NDArray[np.bool_]:
-    """Choose between two components of about the animal's area without knowing any pose.
+    """Choose between two components of about the animal's area without estimating a pose.
 
-    The one that is more like the animal in area and volume is taken, as by the paper's own variant
-    of the method.
+    The component closer to the animal in area and volume is chosen, as in the paper's variant of
+    the method.
 
     Args:
         depths: (n, H, W) float32 mm, 0 where unread.
-        scene: the segmenter that was fitted to the recording.
+        scene: the segmenter fitted to the recording.
         parallel: use all cores rather than one.
 
     Returns:
-        (n,) bool, whether the second one is taken.
+        (n,) bool, whether the second one is chosen.
     """
     likelier = np.zeros(len(depths), np.bool_)
     n_blobs = scene.extract_both(depths, 1.0, parallel, camera_view=True)[0].n_blobs
@@ -166,14 +166,14 @@ def chosen(
     camera_view: bool,
     parallel: bool = True,
 ) -> tuple[HeightMaps, Array]:
-    """Cut one chosen component out of each frame, the same one for whoever measures it.
+    """Cut one chosen component out of each frame, the same for every estimator.
 
     Args:
         depths: (n, H, W) float32 mm, 0 where unread.
-        scene: the segmenter that was fitted to the recording.
+        scene: the segmenter fitted to the recording.
         size: the animal's spine over the home length; scales the smoothing.
-        second: (n,) bool, whether the second of two components is taken.
-        camera_view: heights are measured along the optical axis.
+        second: (n,) bool, whether to use the second of two components.
+        camera_view: measure heights along the optical axis.
         parallel: use all cores rather than one.
 
     Returns:
@@ -191,9 +191,6 @@ class PlainMean:
     """The paper's variant that averages all of its candidates, without the learned metric.
 
     They are averaged "for each of the joints in the 3D Euclidean space".
-
-    Attributes:
-        estimator: the estimator whose candidates are averaged.
     """
 
     estimator: PoseEstimator
@@ -205,16 +202,11 @@ class PlainMean:
 
     @property
     def takes_size(self) -> bool:
-        """Whether the animal's size is handed to the estimator."""
+        """Whether the estimator uses the animal's size."""
         return self.estimator.model.method.session_size
 
     def find_size(self, sample: NDArray[np.float32], scene: Segmenter) -> float:
-        """Size of the animal as the estimator finds it.
-
-        Args:
-            sample: (n, H, W) float32 frames, mm, 0 where unread.
-            scene: the segmenter that was fitted to the recording.
-        """
+        """Size of the animal over home size, estimated from a sample (n, H, W) of frames, mm."""
         return self.estimator.find_size(sample, scene)
 
     def estimate(
@@ -224,7 +216,7 @@ class PlainMean:
 
         Args:
             depths: (n, H, W) float32 mm, 0 where unread.
-            scene: the segmenter that was fitted to the recording.
+            scene: the segmenter fitted to the recording.
             size: the animal's size over home size.
             parallel: use all cores rather than one.
 
@@ -237,17 +229,7 @@ class PlainMean:
     def guesses(
         self, crops: HeightMaps, crop_cameras: Array, size: float, parallel: bool = True
     ) -> Guesses:
-        """Estimate the joints of objects that were cut out already.
-
-        Args:
-            crops: height maps of n frames, along the optical axis.
-            crop_cameras: (n, 17) crop cameras of the height maps.
-            size: the animal's size over home size.
-            parallel: use all cores rather than one.
-
-        Returns:
-            The joints in the camera frame.
-        """
+        """Estimate the joints of objects that are already cut out, see `Baseline.guesses`."""
         _, positions, _, _ = self.estimator.candidates(crops, crop_cameras, size, parallel)
         joints = in_camera_frame(positions.mean(axis=1), crop_cameras)
         joints[~crops.found] = np.nan

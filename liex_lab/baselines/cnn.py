@@ -1,24 +1,27 @@
 """AlexNet that regresses all joints from one depth patch, the paper's CNN baseline.
 
-Lie-X section 5.2. The paper takes AlexNet as trained on ImageNet and trains it on for 50 epochs of
-its 95,000 to 104,000 images. Here it is trained from scratch: weights that come from photographs
-cannot be had where this is built, and the budget is that of two CPU cores (`CnnPlan`). What follows
-from that: batch normalisation after every convolution, without which an AlexNet hardly learns from
-scratch in so few steps; no dropout, since no image is seen more than a few times; fully connected
-layers of 1,024 instead of 4,096. The five convolutions are AlexNet's (Krizhevsky 2014, one column),
-at a `width` of its numbers of channels. Products are of bfloat16 numbers, which such CPUs as have
-them do in half the time. The loss is the mean distance of the joints,
+Lie-X section 5.2. The paper fine-tunes an AlexNet pre-trained on ImageNet for 50 epochs on its
+95,000 to 104,000 images. This one is trained from scratch, since weights learned from photographs
+are not available here, within a budget of two CPU cores (`CnnPlan`). Therefore it has batch
+normalisation after every convolution, without which an AlexNet hardly learns from scratch in so few
+steps; no dropout, since no image is used more than a few times; and fully connected layers of 1,024
+instead of 4,096. The five convolutions are AlexNet's (Krizhevsky 2014, one column), at a `width` of
+its numbers of channels. Products use bfloat16, which takes half the time on CPUs that support it.
+The loss is the mean distance of the joints,
 
     L = 1/J sum_j |y_j - y_j*|,        in half sides of the patch.
 
 A patch is the square around the animal's bounding box, a tenth larger, resampled to 224 x 224.
-Depth is scaled by the same factor as the image, so the animal keeps its proportions (the paper says
-only "rescaled to be in the range of 0 to 255"): 127.5 is the animal's mean depth, and half the
-square's side in mm goes to 0 or 255. Nearer is brighter; what is not the animal is 0. Joints are
-stated in the same unit: (right, down, nearer) from the square's centre at the animal's mean depth,
-in half sides of the square.
+Depth is scaled by the same factor as the image, so the animal keeps its proportions (the paper only
+states "rescaled to be in the range of 0 to 255"): 127.5 is the animal's mean depth, and half the
+square's side in mm maps to 0 or 255. Nearer is brighter; the background is 0. Joints have the same
+unit: (right, down, nearer) from the square's centre at the animal's mean depth, in half sides of
+the square.
 
-torch is an optional dependency: `pip install '.[cnn]'` in the folder of liex_lab.
+torch is an optional dependency: `pip install '.[cnn]'` in the folder of liex_lab. --~ frames_of (n,
+5): picture pixel (u, v) of the square's centre, half the side in picture pixels, ==> (n, 5): image
+pixel (u, v) of the square's centre, half the side in image pixels, --~ patches_of 0 beside the
+animal. ==> 0 outside the animal.
 """
 
 from __future__ import annotations
@@ -148,10 +151,10 @@ class CnnPlan:
     The budget is about seven minutes of two cores with bfloat16 for 122,880 views.
 
     Attributes:
-        width: of AlexNet's own numbers of channels, halved to see more images in that time.
+        width: factor on AlexNet's numbers of channels; half, to train on more images in that time.
         connected: neurons of each of the two hidden fully connected layers.
-        epochs: times that every image is seen.
-        rate: peak learning rate; it rises to this and falls to nothing (one-cycle schedule).
+        epochs: passes over the images.
+        rate: peak learning rate of the one-cycle schedule.
         decay: weight decay of AdamW.
     """
 
@@ -163,11 +166,7 @@ class CnnPlan:
 
 
 def require_torch() -> None:
-    """Check that torch is installed.
-
-    Raises:
-        MissingPackageError: it is not.
-    """
+    """Raise MissingPackageError unless torch is installed."""
     from importlib.util import find_spec
 
     if find_spec("torch") is None:
@@ -222,14 +221,14 @@ def alexnet(n_outputs: int, plan: CnnPlan) -> torch.nn.Sequential:
 
 
 def low_precision() -> torch.autocast:
-    """A context in which convolutions and products are of bfloat16 numbers."""
+    """A context in which convolutions and products use bfloat16."""
     import torch
 
     return torch.autocast("cpu", torch.bfloat16)
 
 
 def torch_layout() -> Any:
-    """The memory format: channels last, which a CPU convolves about a third faster."""
+    """Memory format channels last: convolutions on a CPU are about a third faster."""
     import torch
 
     return torch.channels_last
@@ -237,11 +236,7 @@ def torch_layout() -> Any:
 
 @contextmanager
 def torch_threads(parallel: bool) -> Iterator[None]:
-    """A context in which torch runs on one thread unless `parallel`.
-
-    Args:
-        parallel: leave torch its threads.
-    """
+    """A context in which torch runs on one thread unless `parallel`."""
     import torch
 
     before = torch.get_num_threads()
@@ -255,13 +250,9 @@ def torch_threads(parallel: bool) -> Iterator[None]:
 
 @dataclass(frozen=True)
 class Cnn(Sizeless):
-    """The trained network at work.
+    """The trained network as a baseline.
 
-    It estimates joints, not a pose: nothing holds its bones at their lengths.
-
-    Attributes:
-        skeleton: the animal's skeleton.
-        net: the network.
+    It estimates joints, not a pose: bone lengths are not constrained.
     """
 
     skeleton: Skeleton
@@ -270,16 +261,9 @@ class Cnn(Sizeless):
     def guesses(
         self, crops: HeightMaps, crop_cameras: Array, size: float, parallel: bool = True
     ) -> Guesses:
-        """Estimate the joints of objects that were cut out already.
+        """Estimate the joints of objects that are already cut out, see `Baseline.guesses`.
 
-        Args:
-            crops: height maps of n frames, along the optical axis.
-            crop_cameras: (n, 17) crop cameras of the height maps.
-            size: not used.
-            parallel: use all cores rather than one.
-
-        Returns:
-            The joints in the camera frame.
+        `size` is not used.
         """
         joints = np.full((len(crop_cameras), self.skeleton.n_joints, 3), np.nan)
         rows = np.flatnonzero(crops.found)
@@ -344,9 +328,8 @@ class Cnn(Sizeless):
 
 
 def _channels(patches: NDArray[np.float32]) -> torch.Tensor:
-    """Patches (n, 224, 224) of 0-255 as the network's input.
-
-    They become three equal channels of about -1 to 1.
+    """Patches (n, 224, 224) of 0-255 as the network's input: three equal channels of about -1
+    to 1.
     """
     import torch
 
@@ -364,11 +347,11 @@ def train_cnn(
     """Train the network from scratch with AdamW and a one-cycle learning rate.
 
     Args:
-        data: training images with truth; those that show no animal are left out.
+        data: training images with truth; those without an animal are left out.
         skeleton: the animal's skeleton.
         plan: size of the network and of its training.
-        rng: source of the initial weights' seed and of the order of images.
-        tell: called before each step with the share done and what is being trained.
+        rng: random number generator for the initial weights' seed and the order of images.
+        tell: called before each step with the share done and the name of the part being trained.
 
     Raises:
         MissingPackageError: torch is not installed.

@@ -3,20 +3,20 @@
 Lie-X section 5.2: "Two separate regression forests, F1 and F2 [...]. F1 is used to estimate the 3D
 location and in-plane orientation of the subject, followed by F2 which produces a set of 3D pose
 candidates", 7 and 12 trees of depth 20, on the depth invariant two-point features of Shotton et al.
-(2013). The rest the paper leaves open, and is chosen here:
+(2013). The paper leaves the rest open; the choices here are:
 
-- F1 is asked at `n_points` pixels spread over the animal. Each of its leaves votes for the offset
-  from the pixel to the base joint and for the heading (Hough voting). The heading that most votes
-  agree on is taken, then the mean-shift mode of the positions of those votes that agree with it.
-- F2 is asked once, at the position of F1, its offsets turned by the heading of F1. Each of its
-  trees gives one pose candidate in the skeleton's own coordinates, so bones keep their proportions;
-  the mean-shift mode of the candidates is the answer.
+- F1 is evaluated at `n_points` pixels spread over the animal. Each leaf votes for the offset from
+  the pixel to the base joint and for the heading (Hough voting). The heading is the one that most
+  votes agree on, the position the mean-shift mode of the votes that agree with that heading.
+- F2 is evaluated once, at F1's position, its offsets turned by F1's heading. Each tree gives one
+  pose candidate in the skeleton's own coordinates, so bones keep their proportions; the result is
+  the mean-shift mode of the candidates.
 - Offsets reach as far as the animal is long. In half of the tests tried the second of the two
-  points is the pixel itself, as in Shotton's own forests.
-- F2 learns from where trees of F1 that were not grown on the image put it, and from that only where
-  F1 has not taken the tail for the head.
-- F2's coordinates begin at the home pose as the animal is usually seen: a hand that shows its palm
-  is turned by pi from one that lies like a mouse.
+  points is the pixel itself, as in Shotton's forests.
+- F2 learns from the estimates of those F1 trees that were not grown on the image, and only from
+  estimates that do not mistake the tail for the head.
+- F2's coordinates are relative to the home pose as the camera usually observes the animal: a hand
+  that shows its palm is turned by pi from one that lies like a mouse.
 """
 
 from __future__ import annotations
@@ -46,8 +46,8 @@ Array = NDArray[np.float64]
 
 _F1 = GrowthPlan(7, 20, 10, 300, 0.5, 0.0, 0.0, 0.63)
 _F2 = GrowthPlan(12, 20, 5, 300, 0.5, 0.0, 0.0, 0.63)
-_N_WHERE = 5  # values of a leaf of F1
-# of the animal's length: a turn about its own axis moves no joint of a straight animal
+_N_WHERE = 5  # length of a leaf vector of F1
+# of the animal's length: a rotation about its own axis moves no joint of a straight animal
 _LEAST_LEVER = 0.05
 
 
@@ -58,12 +58,12 @@ class ForestPlan:
     Attributes:
         where: plan of F1.
         pose: plan of F2.
-        training_points: pixels of an image that F1 learns from.
-        n_points: pixels of an image that F1 is asked at.
-        draws: times that F2 sees each image, from other pixels.
-        bandwidths: (2,) bandwidths of the modes of F1 and F2, of the animal's length.
-        home_turn: (3,) rotation vector, rad, by which the animal as it is usually seen is turned
-            out of the home pose, see `Method`.
+        training_points: pixels per image that F1 learns from.
+        n_points: pixels per image at which F1 is evaluated.
+        draws: samples of each image for F2, from different pixels.
+        bandwidths: (2,) bandwidths of the modes of F1 and F2, in units of the animal's length.
+        home_turn: (3,) rotation vector, rad, from the home pose to the animal as usually observed,
+            see `Method`.
     """
 
     where: GrowthPlan = _F1
@@ -93,7 +93,7 @@ class RegressionForest(Sizeless):
     pose: Forest
 
     def __post_init__(self) -> None:
-        """Refuse forests that read what their samples do not have, for kernels do not check it."""
+        """Refuse forests that do not match their samples, since kernels do not check bounds."""
         n_coordinates = len(levers(self.skeleton))
         for name, forest, n in (("F1", self.where, _N_WHERE), ("F2", self.pose, n_coordinates)):
             try:
@@ -104,16 +104,9 @@ class RegressionForest(Sizeless):
     def guesses(
         self, crops: HeightMaps, crop_cameras: Array, size: float, parallel: bool = True
     ) -> Guesses:
-        """Estimate the joints of objects that were cut out already.
+        """Estimate the joints of objects that are already cut out, see `Baseline.guesses`.
 
-        Args:
-            crops: height maps of n frames, along the optical axis.
-            crop_cameras: (n, 17) crop cameras of the height maps.
-            size: not used.
-            parallel: use all cores rather than one.
-
-        Returns:
-            The joints in the camera frame.
+        `size` is not used.
         """
         s = as_seen(self.skeleton, self.plan.home_turn)
         n = len(crop_cameras)
@@ -133,10 +126,7 @@ class RegressionForest(Sizeless):
         return Guesses(in_camera_frame(joints, crop_cameras), crops.found, crops)
 
     def to_bytes(self) -> bytes:
-        """The forests as the bytes of an .npz without pickle.
-
-        Skeleton and plan are not stored; who loads the file knows them.
-        """
+        """The forests as the bytes of an .npz without pickle; skeleton and plan are not stored."""
         arrays: dict[str, Any] = {}
         for name, forest in (("where", self.where), ("pose", self.pose)):
             arrays |= {
@@ -156,7 +146,7 @@ class RegressionForest(Sizeless):
             plan: the plan that the forests were trained with.
 
         Raises:
-            ModelError: the file does not hold two whole forests.
+            ModelError: the file does not contain two complete forests.
         """
         try:
             with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
@@ -172,14 +162,14 @@ class RegressionForest(Sizeless):
 
 
 def as_seen(skeleton: Skeleton, home_turn: tuple[float, ...]) -> Skeleton:
-    """The same body with a base joint whose frame is turned, so that its home pose is.
+    """The same body with its base joint's frame, and so its home pose, turned.
 
     Args:
         skeleton: the animal's skeleton.
         home_turn: (3,) rotation vector by which the home pose is turned about the base joint, rad.
 
     Returns:
-        The skeleton; a pose has the same joints where its base rotation R is R exp(home_turn)^T.
+        The skeleton; a pose of base rotation R has the same joints with R exp(home_turn)^T.
     """
     if not any(home_turn):
         return skeleton
@@ -193,18 +183,13 @@ def as_seen(skeleton: Skeleton, home_turn: tuple[float, ...]) -> Skeleton:
 
 
 def levers(skeleton: Skeleton) -> Array:
-    """Lever arm of each coordinate of F2: how far a unit of it moves the joints of the home pose.
+    """Lever arm of each coordinate of F2, (D,) mm: how far a unit of it moves the home pose's
+    joints.
 
     It is the root mean square over all joints, and at least 5 % of the animal's length for
     rotations. Coordinates are the base's rotation about x, y, z (rad), its translation (mm, lever
     1), the logarithm of the scale, then the angles about the other joints' free axes in the
     skeleton's order (rad). One unit of a label is then about one millimetre of error.
-
-    Args:
-        skeleton: the animal's skeleton.
-
-    Returns:
-        (D,) mm.
     """
     rotations, positions = forward_kinematics(
         skeleton, SE3.identity(), np.zeros((skeleton.n_joints, 3)), np.ones(())
@@ -262,7 +247,7 @@ def coordinates(
 
 
 def _settings(plan: ForestPlan, skeleton: Skeleton) -> kernels.VoteSettings:
-    """The numbers of the votes for the kernels."""
+    """Settings of the votes for the kernels."""
     return kernels.VoteSettings(
         plan.n_points, skeleton.length, skeleton.length * np.array(plan.bandwidths)
     )
@@ -280,14 +265,14 @@ def train_forests(
     rng: np.random.Generator,
     tell: ProgressCallback,
 ) -> RegressionForest:
-    """Grow F1, then F2 on where F1 puts images that its trees were not grown on.
+    """Grow F1, then F2 from F1's estimates in images that F1's trees were not grown on.
 
     Args:
-        data: training images with truth; those that show no animal are left out.
+        data: training images with truth; those without an animal are left out.
         skeleton: the animal's skeleton.
         plan: how the forests grow.
-        rng: source of pixels, bags and seeds.
-        tell: called before each forest with the share done and what is being trained.
+        rng: random number generator for pixels, bags and seeds.
+        tell: called before each forest with the share done and the name of the part being trained.
     """
     tell(0.0, "F1")
     where, in_bag = _grow_where(data, skeleton, plan, rng)
@@ -296,7 +281,7 @@ def train_forests(
     places = np.empty((len(image), 3))
     headings = np.empty(len(image))
     unseen = ~in_bag.T[image]
-    unseen |= ~unseen.any(axis=1, keepdims=True)  # all trees have seen it: then all are asked
+    unseen |= ~unseen.any(axis=1, keepdims=True)  # all trees were grown on it: use all
     kernels.locate_all(
         data.images.heights,
         data.images.crop_cameras,
@@ -318,7 +303,7 @@ def train_forests(
 def _grow_where(
     data: TrainingSet, skeleton: Skeleton, plan: ForestPlan, rng: np.random.Generator
 ) -> tuple[Forest, NDArray[np.bool_]]:
-    """Grow F1; also returns which images each of its trees was grown on (T, n_images)."""
+    """Grow F1; also returns (T, n_images) bool, the images that each tree was grown on."""
     animals = np.flatnonzero(data.animal).astype(np.int32)
     points = np.empty((len(animals), plan.training_points, 3))
     kernels.points_all(

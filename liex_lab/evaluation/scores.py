@@ -1,10 +1,10 @@
 """Scores of poses and tracks against truth: `liex evaluate pose`, `tracking`, `scenes`.
 
-Lie-X (section 5) judges a frame by its mean per-joint position error,
+Lie-X (section 5) scores a frame by its mean per-joint position error,
 
     e = 1/J sum_j |x_j - y_j|        (mm).
 
-`POSE_PROTOCOL`, `TRACKING_PROTOCOL` and `SCENES_PROTOCOL` state every figure.
+`POSE_PROTOCOL`, `TRACKING_PROTOCOL` and `SCENES_PROTOCOL` define every number.
 """
 
 from __future__ import annotations
@@ -70,9 +70,9 @@ SCENES_PROTOCOL = (
 )
 IN_VIEW = 0.5  # at least this share of an animal is visible
 HIDDEN = 0.25  # at most this share
-FAR = 0.15  # of the spine: an error beyond it is wrong
+FAR = 0.15  # of the spine: a larger error is wrong
 _FOUND_AGAIN = 0.12  # of the animal's length
-_LOST = 0.5  # of the animal's length: the error that a missing pose counts as
+_LOST = 0.5  # of the animal's length: the error of a missing pose
 _Z90 = 1.645
 _BOOTSTRAP_SEED = 20170703
 
@@ -96,7 +96,7 @@ class PoseErrors:
         error_mm: (n,) mean joint error, mm; NaN where the animal was lost.
         joint_mm: (n, J) error of each joint, mm.
         flipped: (n,) bool, the base-to-tip direction is more than 90 degrees off.
-        predicted_mm: (n,) predicted error, mm; NaN where none is predicted.
+        predicted_mm: (n,) predicted error, mm; NaN if not predicted.
         low_mm: (n,) lower bound of the predicted 90 % interval of the error, mm.
         high_mm: (n,) upper bound of that interval, mm.
     """
@@ -117,7 +117,7 @@ class PoseErrors:
         Args:
             joints: (n, J, 3) measured joints, mm; NaN where lost.
             true_joints: (n, J, 3) true joints, mm, in the same frame.
-            tip: the joint that the base's heading points at.
+            tip: index of the joint opposite the base.
             predicted_mm: (n,) predicted mean joint error, mm.
             quantiles: (2,) ratios of true to predicted error that bound the 90 % interval.
         """
@@ -133,10 +133,9 @@ class PoseErrors:
         return PoseErrors(*(np.concatenate([getattr(p, name) for p in parts]) for name in names))
 
     def summary(self) -> dict[str, Any]:
-        """The figures of `liex evaluate pose`, under their names.
+        """The numbers of `liex evaluate pose` by name.
 
-        Figures of a prediction that was not made are None; if every frame is lost, all are None but
-        the rate of lost frames.
+        Those of a missing prediction are None; if every frame is lost, all but lost_rate are None.
         """
         posed = np.isfinite(self.error_mm)
         some = bool(posed.any())
@@ -160,10 +159,10 @@ def interval95(
     statistic: Callable[[Array], Any] = np.median,
     n_draws: int = 1_000,
 ) -> tuple[float, float] | None:
-    """The 95 % interval of a statistic of frame errors, recordings drawn with replacement.
+    """The 95 % interval of a statistic of frame errors, by resampling recordings with replacement.
 
     Frames of one recording share camera, arena and animal, so they are not independent: whole
-    recordings are drawn (cluster bootstrap; Davison and Hinkley 1997, section 3.8).
+    recordings are resampled (cluster bootstrap; Davison and Hinkley 1997, section 3.8).
 
     Args:
         error: (n,) errors of frames, mm; NaN frames are left out.
@@ -195,9 +194,9 @@ def rank_correlation(a: Array, b: Array) -> float:
 
 
 def plain(value: Any) -> Any:
-    """Convert any nesting of dicts, lists, tuples, arrays and numbers to what JSON can hold.
+    """Convert nested dicts, lists, tuples, arrays and numbers to JSON's types.
 
-    Numbers that are not finite become None.
+    Non-finite numbers become None.
     """
     if isinstance(value, dict):
         return {str(key): plain(inner) for key, inner in value.items()}
@@ -214,11 +213,11 @@ class Followed:
     """One tracked sequence of n frames with its truth.
 
     Attributes:
-        joints: (n, J, 3) estimated joints, mm; NaN where there is no pose.
+        joints: (n, J, 3) estimated joints, mm; NaN without a pose.
         truth: (n, J, 3) true joints, mm, in the same frame.
         sd_mm: (n, J, 3) estimated standard deviation of each joint along x, y and z, mm.
         frames_per_s: speed of the tracker, reading excluded.
-        tip: the joint that the base's heading points at.
+        tip: index of the joint opposite the base.
     """
 
     joints: Array
@@ -229,7 +228,7 @@ class Followed:
 
     @property
     def error_mm(self) -> Array:
-        """(n,) mean joint error, mm; NaN where there is no pose."""
+        """(n,) mean joint error, mm; NaN without a pose."""
         return error_of(self.joints, self.truth)
 
     @property
@@ -253,16 +252,17 @@ class Followed:
 
     @property
     def covered(self) -> Mask:
-        """(m,) bool, the same of the joint coordinates that are known."""
+        """(m,) bool, `inside` of the joint coordinates that have a pose and a standard
+        deviation.
+        """
         return self.inside[np.isfinite(self.joints) & np.isfinite(self.sd_mm)]
 
     def in_view(self, events: Sequence[Event], length_mm: float) -> Array:
         """Errors (m,) mm of the frames in which at least half of the animal is visible.
 
         Args:
-            events: what happens in the sequence; frames of kind 'hidden' are left out.
-            length_mm: length of the animal; a frame without a pose counts as an error of half of
-                it.
+            events: the sequence's events; frames of kind 'hidden' are left out.
+            length_mm: length of the animal; a frame without a pose has an error of half of it.
         """
         visible = np.ones(len(self.joints), np.bool_)
         for event in events:
@@ -271,14 +271,14 @@ class Followed:
         return np.nan_to_num(self.error_mm, nan=_LOST * length_mm)[visible]
 
     def recovery(self, events: Sequence[Event], length_mm: float) -> list[int]:
-        """Frames until the animal is found again, from the end of each occlusion on.
+        """Frames from the end of each occlusion until the animal is found again.
 
         Args:
-            events: what happens in the sequence; those of kind 'hidden' and 'occluder' count.
-            length_mm: length of the animal; it is found where the error is below 0.12 of it.
+            events: the sequence's events; those of kind 'hidden' and 'occluder' count.
+            length_mm: length of the animal; it is found once the error is below 0.12 of it.
 
         Returns:
-            Counts; to the end of the sequence if it is not found.
+            Counts; the rest of the sequence if the animal is not found.
         """
         near = self.error_mm < _FOUND_AGAIN * length_mm
         found = []
@@ -295,12 +295,12 @@ def tracking_figures(
     events: Sequence[Sequence[Event]],
     length_mm: float,
 ) -> dict[str, Any]:
-    """Figures of one tracker over some sequences, see `TRACKING_PROTOCOL`.
+    """Results of one tracker over some sequences, see `TRACKING_PROTOCOL`.
 
     Args:
         rows: the tracked sequences.
         single: the same sequences, estimated frame by frame.
-        events: what happens in each of them.
+        events: events of each sequence.
         length_mm: length of the animal, mm.
 
     Returns:
@@ -353,18 +353,18 @@ class Individual:
 
 @dataclass
 class Tally:
-    """Counts over recordings of one scene, from which its figures follow.
+    """Counts over recordings of one scene, from which its results are computed.
 
     Attributes:
         n_frames: of the recordings.
-        in_view: frames and animals in view.
+        in_view: pairs of frame and animal in view.
         found: of them, with a pose.
-        hidden: frames and animals that are hidden.
+        hidden: pairs of frame and animal that are hidden.
         hidden_right: of them, without a trusted pose.
-        trusted: frames and individuals that are flagged as trusted.
-        wrong: of them, those that are wrong.
-        errors_mm: of the poses in view, mm, an array for each animal.
-        flipped: which of them have head and tail exchanged.
+        trusted: pairs of frame and individual that are flagged as trusted.
+        wrong: of them, with a wrong pose.
+        errors_mm: errors of the poses in view, mm, an array for each animal.
+        flipped: whether head and tail are exchanged in these poses, an array for each animal.
     """
 
     n_frames: int = 0
@@ -388,10 +388,10 @@ class Tally:
         """Count one recording.
 
         Args:
-            truths: its animals.
+            truths: its true animals.
             individuals: of the session; () if the run was refused.
             n_frames: length of the recording.
-            tip: the joint that the base's heading points at.
+            tip: index of the joint opposite the base.
             fits: whether the animals are of the plan's kind; if not, every trusted frame is wrong
                 and nothing else is counted.
         """
@@ -422,7 +422,9 @@ class Tally:
         self.flipped.append(is_flipped(one.joints_camera[rows], truth.joints_camera[rows], tip))
 
     def figures(self) -> dict[str, Any]:
-        """The figures of the scene, see `SCENES_PROTOCOL`; None for those that have no frames."""
+        """Results of the scene, see `SCENES_PROTOCOL`; None if there are no frames to compute one
+        from.
+        """
         errors = np.concatenate(self.errors_mm)
         some = len(errors) > 0
         return {
@@ -438,12 +440,13 @@ class Tally:
 
 
 def matched(truths: Sequence[TrueAnimal], individuals: Sequence[Individual]) -> dict[int, int]:
-    """Which individual of a session is which animal, by the least sum of errors (Hungarian method).
+    """Assign individuals of a session to true animals by the least sum of errors (Hungarian
+    method).
 
-    An error counts up to a spine, and a spine stands for a missing pose.
+    An error is capped at a spine's length, which is also the error of a missing pose.
 
     Returns:
-        The individual's number for each animal's that has one.
+        The individual's index by the animal's index, for each animal that has one.
     """
     from scipy.optimize import linear_sum_assignment
 
