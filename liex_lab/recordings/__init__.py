@@ -1,7 +1,7 @@
 """Depth recordings of every format, opened by one function: `open_recording`.
 
-A recording is lazy, in order of time, and in millimetres along the optical axis, whatever the
-format it was stored in.
+A recording is lazy, in order of time, and in millimetres along the optical axis, whatever its file
+format.
 """
 
 from liex_lab.recordings.frame import DepthFrame

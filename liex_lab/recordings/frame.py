@@ -7,7 +7,7 @@
     nyu-hand            d = 256 green + blue, mm, of an 8-bit colour image (NYU hand pose)
 
 Depth is float32, measured along the optical axis (z of the camera frame, not range along the ray);
-0 means that there is no reading. On writing, steps are exact or nearest.
+0 means no reading. On writing, steps are exact or nearest.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ from liex_lab.errors import PlanError
 
 Depth = NDArray[np.float32]
 
-_FEW = 16  # one row and column of so many
+_FEW = 16  # sample every 16th row and column
 _ROWS = 64
 _LEAST_REGION_PX = 64
-_MOST_ROOMS = 6  # that are kept: being filled, waiting, looked at (two at once), written
+_MOST_ROOMS = 6  # kept: being filled, waiting, processed (two at once), written
 
 
 @dataclass(frozen=True)
@@ -36,11 +36,11 @@ class DepthFrame:
     """One depth image with its row and its time.
 
     Attributes:
-        index: its row in the recording that it was read from.
+        index: its row in the recording.
         time_ns: its time on the recording's own clock, ns.
         depth: (H, W) float32 mm along the optical axis; 0 = unread; finite, never negative.
-        repeats: whether its depth is, bit for bit, that of the frame before it, and holds readings;
-            known of frames that are read in order, see `marked`.
+        repeats: whether its depth equals that of the previous frame, bit for bit, and has readings;
+            set for frames that are read in order, see `marked`.
     """
 
     index: int
@@ -50,14 +50,14 @@ class DepthFrame:
 
 
 def marked(frames: Iterable[DepthFrame], before: Depth | None = None) -> Iterator[DepthFrame]:
-    """Consecutive frames, each marked where it repeats the depth image of the frame before it.
+    """Consecutive frames, each marked if it repeats the depth image of the previous frame.
 
     Args:
-        frames: in order; the depth of the last one is held until the next one has come.
+        frames: in order; the depth of the last one is kept until the next one arrives.
         before: depth (H, W) mm of the frame before the first; None if absent.
     """
     for frame in frames:
-        # a few rows tell nearly all images apart
+        # a few rows distinguish nearly all images
         repeats = (
             before is not None
             and np.array_equal(frame.depth[::_ROWS], before[::_ROWS])
@@ -69,7 +69,7 @@ def marked(frames: Iterable[DepthFrame], before: Depth | None = None) -> Iterato
 
 
 class FrameRooms:
-    """Room for frames that lie side by side, used again once nobody holds a frame in it.
+    """Contiguous buffers for frames, reused once no frame refers to them.
 
     The system has to blank new memory first, which takes longer than copying an image into memory
     that was used before.
@@ -79,13 +79,13 @@ class FrameRooms:
         self._rooms: list[Depth] = []
 
     def filled(self, frames: Iterable[DepthFrame], n_frames: int) -> list[DepthFrame]:
-        """The same frames, the depth of each copied into one array as it comes.
+        """The same frames, with the depth of each copied into one array as it arrives.
 
-        `stacked` then need not copy them.
+        `stacked` then needs no copy.
 
         Args:
             frames: of one size.
-            n_frames: so many are taken at most.
+            n_frames: maximum number of frames.
         """
         taken: list[DepthFrame] = []
         room = None
@@ -98,7 +98,7 @@ class FrameRooms:
         return taken
 
     def _free(self, shape: tuple[int, ...]) -> Depth:
-        """Room of this shape in which nobody holds a frame: a frame's depth refers to its room."""
+        """A buffer of this shape that no frame refers to."""
         for k in range(len(self._rooms)):
             if self._rooms[k].shape == shape and _references(self._rooms, k) == _UNUSED:
                 return self._rooms[k]
@@ -108,21 +108,21 @@ class FrameRooms:
 
 
 def _references(rooms: list[Depth], k: int) -> int:
-    """How often room k of a list is referred to, by the list and by whoever holds a frame in it."""
+    """Reference count of buffer k of a list: the list itself, and frames in the buffer."""
     return sys.getrefcount(rooms[k])
 
 
-_UNUSED = _references([np.empty(0, np.float32)], 0)  # by its list alone
+_UNUSED = _references([np.empty(0, np.float32)], 0)  # referred to by its list only
 
 
 def stacked(frames: Sequence[DepthFrame]) -> NDArray[np.float32]:
-    """Depth of frames as one array, not copied where they lie side by side in one of `FrameRooms`.
+    """Depth of frames as one array, without a copy if they share a buffer of `FrameRooms` in order.
 
     Args:
         frames: at least one, of one size.
 
     Returns:
-        (n, H, W) float32 mm; not to be written to.
+        (n, H, W) float32 mm; do not write to it.
     """
     room = frames[0].depth.base
     if (
@@ -141,34 +141,30 @@ def stacked(frames: Sequence[DepthFrame]) -> NDArray[np.float32]:
 
 
 def has_readings(depth: Depth) -> bool:
-    """Whether an image shows anything at all; of one that does a few pixels tell, as a rule.
-
-    Args:
-        depth: (H, W) float32 mm, 0 where unread.
-    """
+    """Whether a depth image (H, W) has any reading; usually a sparse sample of pixels decides."""
     return bool(depth[::_FEW, ::_FEW].any() or depth.any())
 
 
 def depth_mm(stored: NDArray[Any], unit_mm: float = 1.0, unread: Sequence[float] = (0.0,)) -> Depth:
-    """Depth in millimetres of stored values, by a linear law.
+    """Convert stored values to depth in millimetres by a linear law.
 
     Values that mean "no reading" are marked before scaling, while they can still be compared
-    exactly. 0, NaN and infinite values are always unread, and so is what lies behind the lens.
+    exactly. 0, NaN, infinite values and depths behind the lens are always unread.
 
     Args:
-        stored: (H, W) or any other shape, integers or floats as the file holds them.
-        unit_mm: mm per stored step, negative where the file's depth axis points towards the camera.
+        stored: (H, W) or any other shape, integers or floats as in the file.
+        unit_mm: mm per stored step, negative if the file's depth axis points towards the camera.
         unread: stored values that mean "no reading".
 
     Returns:
-        float32 mm of the same shape, a fresh array; 0 = unread.
+        float32 mm of the same shape, a new array; 0 = unread.
     """
     depth = stored.astype(np.float32)
     for value in unread:
         if value != 0.0:
             depth[stored == value] = 0.0
     if unit_mm != 1.0:
-        with np.errstate(over="ignore"):  # what overflows is not finite and so becomes unread below
+        with np.errstate(over="ignore"):  # overflow is not finite and so becomes unread below
             depth *= np.float32(unit_mm)
     if stored.dtype.kind != "u" or unit_mm < 0:
         depth[~(np.isfinite(depth) & (depth > 0))] = 0.0
@@ -180,7 +176,7 @@ def depth_mm(stored: NDArray[Any], unit_mm: float = 1.0, unread: Sequence[float]
 
 Stored = NDArray[Any]
 
-# median depth: nearer than any camera reads, farther than any animal is watched
+# median depth: limits beyond any camera's range and any animal recording
 PLAUSIBLE_MM = (100.0, 10_000.0)
 COLOUR = "nyu-hand"  # the one encoding of 8-bit colour images
 LARGEST_STEP = 0xFFFF
@@ -189,12 +185,12 @@ _FARTHEST_MM = 10_000.0
 
 
 def _rotated(stored: Stored) -> Stored:
-    """SUN RGB-D: millimetres, their 16 bits turned left by 3."""
+    """SUN RGB-D: millimetres with their 16 bits rotated left by 3."""
     return (stored >> 3) | (stored << 13)
 
 
 def _disparity(stored: Stored) -> Stored:
-    """Kinect v1 disparity of 11 bits, as NYU Depth v2 keeps it: z = 351.3 / (1092.5 - value) m."""
+    """Kinect v1 disparity of 11 bits, as in NYU Depth v2: z = 351.3 / (1092.5 - value) m."""
     ahead = 1092.5 - stored.astype(np.float32)
     read = (ahead > 0) & (stored != _NO_DISPARITY)
     return np.where(read, 351_300.0 / np.where(read, ahead, 1.0), 0.0).astype(np.float32)
@@ -207,7 +203,7 @@ def _green_blue(stored: Stored) -> Stored:
 
 _MILLIMETRES: dict[
     str, tuple[float, Callable[[Stored], Stored]]
-] = {  # name: mm per step of what the function gives
+] = {  # name: mm per step of the function's result, function
     "linear": (1.0, lambda stored: stored),
     "tum": (0.2, lambda stored: stored),  # 5000 steps per metre
     "sun": (1.0, _rotated),
@@ -218,29 +214,23 @@ ENCODINGS = tuple(_MILLIMETRES)
 
 
 def own_unit_mm(encoding: str) -> float:
-    """Millimetres per step of what an encoding gives.
-
-    Args:
-        encoding: one of `ENCODINGS`.
-
-    Returns:
-        mm per step: 0.2 for "tum", else 1.
-    """
+    """Millimetres per step of an encoding's values: 0.2 for "tum", else 1."""
     return _MILLIMETRES[encoding][0]
 
 
 def decode(
     stored: Stored, encoding: str, unit_mm: float, unread: Sequence[float] = (0.0,)
 ) -> Depth:
-    """Depth in millimetres of stored values in a named encoding.
+    """Convert stored values in a named encoding to depth in millimetres.
+
+    For integers, the largest value of the type is also unread if it would be farther than 10 m, as
+    cameras and programs write it.
 
     Args:
         stored: (H, W), or (H, W, 3) uint8 (blue, green, red) for colour images.
         encoding: one of `ENCODINGS`.
-        unit_mm: mm per step of what `encoding` gives.
-        unread: *stored* values that mean "no reading" (of what the encoding gives for colour
-            images), besides those that it has by itself: the largest of a type of integers where
-            it would lie farther than any animal is watched, as cameras and programs write it.
+        unit_mm: mm per step of the encoding's values.
+        unread: stored values that mean "no reading" (for colour images, values after decoding).
 
     Returns:
         (H, W) float32 mm, 0 = unread.
@@ -259,19 +249,19 @@ def decode(
 
 
 def whole_steps(depth: Depth, step_mm: float) -> NDArray[np.uint16] | None:
-    """The 16-bit steps that are read back as exactly this depth.
+    """Depth as 16-bit steps, if they decode to exactly the same depth.
 
     Args:
         depth: (H, W) float32 mm.
         step_mm: mm of a step.
 
     Returns:
-        (H, W) uint16; None if absent, or they need more than 16 bits.
+        (H, W) uint16; None if depths lie between steps or need more than 16 bits.
     """
     if depth.size and float(depth.max()) > LARGEST_STEP * step_mm:
         return None
     steps = (depth if step_mm == 1.0 else np.rint(depth / np.float32(step_mm))).astype(np.uint16)
-    # compared as `depth_mm` will compute it: 0.1 is no number of a float32
+    # compared as `depth_mm` computes it: 0.1 is not exact in float32
     read = steps.astype(np.float32)
     return (
         steps
@@ -295,17 +285,17 @@ def nearest_steps(depth: Depth, step_mm: float) -> NDArray[np.uint16] | None:
 
 
 def metres(depth: Depth) -> tuple[NDArray[np.float32], int]:
-    """Depth in metres that times 1000 is the depth again, in float32.
+    """Depth in metres, chosen so that times 1000 in float32 gives the same millimetres.
 
-    Between 1000 and 1024 mm, and at their halves and doubles, neighbouring float32s of metres are
-    farther apart than those of millimetres. There the nearest is taken, half a millionth of a
-    millimetre per metre off.
+    Between 1000 and 1024 mm, and at their halves and doubles, neighbouring float32 values of metres
+    are farther apart than those of millimetres. There the nearest value is used, with an error of
+    half a millionth of a millimetre per metre.
 
     Args:
         depth: (H, W) float32 mm.
 
     Returns:
-        (H, W) float32 m, and for how many pixels there is no exact number.
+        (H, W) float32 m, and the number of pixels without an exact value.
     """
     scaled = depth / np.float32(1000.0)
     inexact = scaled * np.float32(1000.0) != depth
@@ -329,7 +319,7 @@ def region_mask(corners: Sequence[Sequence[float]], width: int, height: int) -> 
         (height, width) bool.
 
     Raises:
-        PlanError: the corners are no polygon, or nothing of it is in the image.
+        PlanError: the corners are not a polygon, or it covers too little of the image.
     """
     import cv2
 

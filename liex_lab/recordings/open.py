@@ -1,8 +1,8 @@
-"""Dispatch from a path to the reader of its format: the one entry point to depth recordings.
+"""Open a depth recording of any format: dispatch from a path to the reader.
 
-The format follows from the name of a file, or from the names in a folder (an MCAP file, such as an
-archive by `liex pack`, under any name); the reader's module and
-its libraries are imported only when they are needed.
+The format follows from the name of a file, or from the names in a folder; an MCAP file, such as an
+archive by `liex pack`, is also recognised by its first bytes. A reader's module and its libraries
+are imported on demand.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _READS = (
 )
 _PICTURES = (".png", ".tif", ".tiff", ".pgm", ".pclzf")
 _MOSEQ = ("depth.dat", "depth.avi", "depth.mkv")
-_ALONE = {  # how the name of a file ends that holds a whole recording: its module and function
+_ALONE = {  # suffix of a file that is a whole recording: its module and function
     ".tar.gz": "moseq.open_moseq",
     ".tgz": "moseq.open_moseq",
     ".tar": "moseq.open_moseq",
@@ -39,7 +39,7 @@ _ALONE = {  # how the name of a file ends that holds a whole recording: its modu
 _FILES = (
     _ALONE | {".dat": "moseq.open_moseq"} | dict.fromkeys(_PICTURES, "images.folder.open_images")
 )
-# an address of a virtual recording; rendering stands above reading, so it is named only here
+# address of a virtual recording; rendering is a higher layer than reading, so only named here
 _RENDERED = "synthetic:"
 _RENDERER = "liex_lab.simulation.address"
 _MCAP = b"\x89MCAP0\r\n"
@@ -49,7 +49,7 @@ _WITH_TOPICS = (
     "messages.mcap_index.open_indexed",
     "messages.rosbag.open_bag",
 )
-# what is damaged is refused when it is met, so nothing needs to be unpacked before
+# damage is refused on reading, so nothing needs to be unpacked in advance
 _STRICTLY = {"messages.mcap.open_mcap": "messages.mcap_index.open_indexed"}
 _RAYTRIX = (
     "is in Raytrix's own format, which only the maker's licensed software reads; compute metric "
@@ -88,7 +88,7 @@ _NOT_READ = {
 
 @dataclass(frozen=True)
 class _How:
-    """What was asked for besides the path."""
+    """Options of `open_recording` besides the path."""
 
     camera: Lens | None
     fps: float | None
@@ -98,9 +98,7 @@ class _How:
     strict: bool = False
 
     def open(self, where: str, path: Path) -> Recording:
-        """By the function `where` of `formats`, as in "oni.open_oni"; it brings its
-        libraries when asked for.
-        """
+        """Open with the function `where` of `formats`, as in "oni.open_oni", imported on demand."""
         where = _STRICTLY.get(where, where) if self.strict else where
         module, name = where.rsplit(".", 1)
         opener = getattr(import_module(f"liex_lab.recordings.formats.{module}"), name)
@@ -125,25 +123,24 @@ def open_recording(
     strict: bool = False,
     progress: Progress = silent,
 ) -> Recording:
-    """Open a depth recording of any format; frames are decoded when they are asked for.
+    """Open a depth recording of any format; frames are decoded on request.
 
     Args:
         path: a file or a folder, or 'synthetic:walk?seed=3&frames=300' for a virtual animal (see
             `open_synthetic`).
-        camera: comes before whatever the files state; a `Lens` for images of any size.
-        fps: frame rate, Hz; used only where the files hold no time stamps.
-        topic: the depth topic to read of an MCAP file or a ROS bag with several of them.
-        pattern: which images of a folder to take, as in `*.tif`, before a camera.toml.
-        strict: refuse a recording that is cut short, instead of only saying so in `problems` and
-            `truncated`. A part of an MCAP file that is damaged is refused when it is read.
+        camera: overrides the camera in the files; a `Lens` fits images of any size.
+        fps: frame rate, Hz; used only if the files contain no time stamps.
+        topic: the depth topic to read from an MCAP file or a ROS bag with several of them.
+        pattern: which images of a folder to read, as in `*.tif`; overrides a camera.toml.
+        strict: refuse a recording that is cut short, instead of only reporting it in `problems` and
+            `truncated`. A damaged part of an MCAP file is refused when it is read.
         progress: reports while an archive is unpacked or an index made.
 
     Returns:
         The recording; close it, or use it in a `with` block.
 
     Raises:
-        RecordingError: the path does not exist, holds no depth that can be read, or (strict) is
-            cut.
+        RecordingError: the path does not exist, contains no readable depth, or (strict) is cut.
     """
     path = Path(path)
     try:
@@ -154,7 +151,7 @@ def open_recording(
         ) from None
     except RecordingError:
         raise
-    except LiexError as error:  # a camera that cannot be: it came out of this recording
+    except LiexError as error:  # an impossible camera, stated by this recording
         raise RecordingError(f"{path}: {error}") from None
     if strict and recording.truncated:
         recording.close()
@@ -168,14 +165,14 @@ def open_recording(
 
 
 def stated_subject(path: Path, progress: Progress = silent) -> str:
-    """The animal's name in a recording's metadata, without its frames being read.
+    """The animal's name in a recording's metadata; no frame is read.
 
     Args:
         path: a file or a folder.
         progress: reports while an archive is searched.
 
     Returns:
-        As the recording states it; '' where it states none, or cannot be read.
+        The stated name; '' if none is stated, or the metadata cannot be read.
     """
     from liex_lab.recordings.camera_file import CameraFile
     from liex_lab.recordings.formats.moseq_files import METADATA, read_metadata, unpack
@@ -225,7 +222,7 @@ def _reader(name: str, files: dict[str, str] = _FILES) -> str | None:
 
 
 def _reader_by_content(path: Path) -> str | None:
-    """The reader of a file whose name says nothing and whose first bytes are those of MCAP."""
+    """The MCAP reader for a file of any name that starts with MCAP's magic bytes; else None."""
     with path.open("rb") as file:
         return _FILES[".mcap"] if file.read(len(_MCAP)) == _MCAP else None
 

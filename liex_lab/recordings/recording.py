@@ -1,8 +1,8 @@
 """Lazy, re-iterable sequence of depth frames from one camera, independent of the file format.
 
-A `Recording` holds the time stamps and the camera; a depth frame is decoded when it is asked for,
-so memory does not grow with the length. Time stamps are integer nanoseconds and increase strictly;
-gaps are steps of more than 1.5 median steps. The input is identified by the SHA-256 of its files.
+A `Recording` keeps the time stamps and the camera; depth frames are decoded on request, so memory
+use does not grow with length. Time stamps are integer nanoseconds and strictly increasing; a gap is
+a step of more than 1.5 median steps. The SHA-256 of its files identifies the input.
 """
 
 from __future__ import annotations
@@ -37,12 +37,12 @@ from liex_lab.runtime.progress import Progress, silent
 
 Stamp = list[list[str | int]]
 
-_BLOCK = 1 << 24  # bytes read at once: after each, other threads may hold Python's lock for a while
-_GONE = -1  # size of a file that is not there
+_BLOCK = 1 << 24  # bytes per read: after each, other threads may hold the GIL for a while
+_GONE = -1  # size of a missing file
 
 
 class SourceFiles:
-    """The input files of a recording, none of one that is in no file; its slices share them.
+    """The input files of a recording, shared by its slices; empty for a recording without files.
 
     Attributes:
         paths: the files.
@@ -50,20 +50,16 @@ class SourceFiles:
     """
 
     def __init__(self, paths: Iterable[Path] = ()) -> None:
-        """Note how the files are now.
-
-        Args:
-            paths: the files.
-        """
+        """Record the current state of the files."""
         self.paths = tuple(paths)
         self.stamp_at_opening = self.stamp
         self._digest: str | None = None
 
     @property
     def stamp(self) -> Stamp:
-        """Name, size (bytes) and modification time (ns) of each file, in order.
+        """Name, size (bytes) and modification time (ns) of each file, sorted.
 
-        It shows cheaply whether a file changed. Of a file that is gone the size is -1.
+        A cheap check for changed files. The size of a missing file is -1.
         """
         found: Stamp = []
         for path in self.paths:
@@ -77,7 +73,7 @@ class SourceFiles:
 
     @property
     def has_digest(self) -> bool:
-        """Whether the digest is known already."""
+        """Whether the digest has been computed."""
         return self._digest is not None
 
     def digest(self, progress: Progress = silent) -> str:
@@ -91,18 +87,13 @@ class SourceFiles:
         return self._digest
 
     def take_digest(self, digest: str) -> None:
-        """Accept a digest that was computed before, for the files have not changed since.
-
-        Args:
-            digest: the SHA-256, in hexadecimal.
-        """
+        """Accept a digest (hexadecimal SHA-256) computed earlier from the same, unchanged files."""
         self._digest = digest
 
     def rewritten(self) -> tuple[str, ...]:
-        """That files were written to since the recording was opened, in a sentence; () if not.
+        """A sentence if files were modified since the recording was opened; () otherwise.
 
-        A file that only grew is another matter, see `grown`; one that was removed goes on being
-        read.
+        Files that only grew (see `grown`) or were removed do not count.
         """
         names = [
             name
@@ -116,7 +107,7 @@ class SourceFiles:
         )
 
     def grown(self) -> tuple[str, ...]:
-        """That files grew since the recording was opened, in a sentence; () if not."""
+        """A sentence if files grew since the recording was opened; () otherwise."""
         names = [name for (name, size, _), (_, before, _) in self._beside() if size > before]
         return _said(
             names,
@@ -134,7 +125,8 @@ class SourceFiles:
 def file_digest(files: Iterable[Path], progress: Progress = silent) -> str:
     """SHA-256 of one file, or of several files together.
 
-    Of one file its bytes; of several, for each in order of name its name, its size and its bytes.
+    For one file, its bytes are hashed; for several, the name, size and bytes of each, in order of
+    name.
 
     Args:
         files: the paths of the files, in any order.
@@ -161,7 +153,7 @@ def file_digest(files: Iterable[Path], progress: Progress = silent) -> str:
 
 
 def _said(names: list[str], what: str) -> tuple[str, ...]:
-    """What happened to one file by its name, or to how many; () to none."""
+    """A sentence that names the file, or the number of files; () without names."""
     if not names:
         return ()
     return (f"{names[0] if len(names) == 1 else f'{len(names)} files'} {what}",)
@@ -171,30 +163,30 @@ Times = NDArray[np.int64]
 
 
 class Recording:
-    """Depth frames in order of time, from one camera, read one at a time.
+    """Depth frames from one camera, in order of time, read one at a time.
 
-    A format makes one by handing over `read`, which turns a stored frame's number into depth.
-    Memory does not grow with the length; iterating twice reads twice and yields the same.
+    A format creates one by passing `read`, which decodes the depth of a stored frame. Memory use
+    does not grow with length; each iteration reads the files again and yields the same frames.
 
     Attributes:
         name: name of the recording, usually that of its file or folder without the suffix.
         format: name of the format, such as "images", "moseq", "mcap", "oni" or "rosbag".
         camera: the camera of the depth images.
-        files: the files that it is read from; none where it is in no file. Its slices share them.
+        files: the input files, shared with slices; empty for a recording without files.
         times_ns: (n,) int64 time stamps on the recording's own clock, ns, strictly increasing;
             read-only.
-        problems: sentences about what is odd in the file, also those found while reading.
-        doubts: those of the problems that may make lengths or times wrong; each becomes a reason
-            of the verdict.
+        problems: sentences about irregularities in the files, including those found while reading.
+        doubts: the problems that may make lengths or times wrong; each becomes a reason of the
+            verdict.
         truncated: True if the file is cut or damaged.
         metadata: facts that the files state, such as subject_id and session_start_time (ISO 8601
             with zone).
-        optics: what was undone on reading (distortion, water, mirroring), empty where nothing was;
-            see `rectify`.
-        unpacked: folder with what an archive was unpacked to, which opens as the same recording
-            while this one is open; None if nothing was.
-        region_px: (u, v) corners, pixels, of the polygon outside of which every image was made
-            unread; () where the whole image is there, see `masked`.
+        optics: corrections applied on reading (distortion, water, mirroring), empty if none; see
+            `rectify`.
+        unpacked: folder with the unpacked archive, which opens as the same recording while this one
+            is open; None if nothing was unpacked.
+        region_px: (u, v) corners, pixels, of the polygon outside of which all pixels are unread; ()
+            for whole images, see `masked`.
     """
 
     def __init__(
@@ -225,23 +217,23 @@ class Recording:
             format: name of the format that it was read from.
             camera: the camera of the depth images.
             times_ns: (n,) int64 stamps, ns, strictly increasing.
-            read: turns a stored frame's number into depth (H, W) float32 mm, 0 where unread.
-            sources: the files of the input; empty for a recording that is in no file.
-            problems: sentences about what is odd; the list is shared, so reading may append to it.
+            read: decodes a stored frame, by its number, to depth (H, W) float32 mm, 0 where unread.
+            sources: the input files; empty for a recording without files.
+            problems: sentences about irregularities; the list is shared, so reading may append to
+                it.
             truncated: whether the file is cut or damaged.
             whole: (n,) bool, which frames are whole; None for all.
             metadata: facts that the files state.
-            close: releases open files; called once, at the latest when nobody holds the
-                recording.
+            close: closes open files; called once, at the latest when the recording is garbage
+                collected.
             step_ns: median step, ns; a slice inherits it from its parent, None to compute it.
             stored: (n,) int64 number of the stored frame of each row; a slice inherits it, None for
                 0 ... n - 1.
-            faults: (n,) uint8, which stamps were moved and why, an index into `FAULTS`; None for
-                none.
-            grow: opens what was appended to the files since, see `grown`; None if the format
-                cannot.
-            unpacked: folder with what an archive was unpacked to, if it opens as the same
-                recording.
+            faults: (n,) uint8, which stamps were moved and why, an index into `FAULTS`; None if no
+                stamp was moved.
+            grow: opens the data appended to the files since, see `grown`; None if the format does
+                not support this.
+            unpacked: folder with the unpacked archive, if it opens as the same recording.
             doubts: sentences about what may make lengths or times wrong; they are added to the
                 problems. The list is shared, so reading may append to it.
 
@@ -277,12 +269,12 @@ class Recording:
                 "`make_monotone`"
             )
         self.times_ns.flags.writeable = False
-        # at the latest when nobody holds the recording any more, or the program ends
+        # at the latest on garbage collection or when the program ends
         self._close = None if close is None else weakref.finalize(self, close)
 
     @property
     def sources(self) -> tuple[Path, ...]:
-        """The files of the input; none of a recording that is in no file."""
+        """The input files; empty for a recording without files."""
         return self.files.paths
 
     @property
@@ -292,7 +284,7 @@ class Recording:
 
     @property
     def n_whole(self) -> int:
-        """How many of the frames are whole."""
+        """Number of whole frames."""
         return int(self._whole_frames.sum())
 
     @property
@@ -307,15 +299,15 @@ class Recording:
 
     @property
     def rate_hz(self) -> float:
-        """Frames per second while none is missing; NaN for a single frame.
+        """Frame rate without gaps, Hz; NaN for a single frame.
 
-        One over the usual step between neighbouring frames, see `median_step`.
+        The inverse of the usual step between neighbouring frames, see `median_step`.
         """
         return 1e9 / self._step_ns if self._step_ns else float("nan")
 
     @property
     def clock_doubts(self) -> tuple[str, ...]:
-        """Why its times are not to be relied on, in sentences; usually none."""
+        """Reasons why the times are unreliable, in sentences; usually empty."""
         return clock_doubts(self._step_ns, self._faults)
 
     @property
@@ -325,7 +317,7 @@ class Recording:
 
     @property
     def gaps(self) -> list[Gap]:
-        """Intervals in which the camera left out frames: steps of more than 1.5 median steps.
+        """Intervals in which the camera dropped frames: steps of more than 1.5 median steps.
 
         A gap at which the clock jumped has the reason `JUMPED`.
         """
@@ -339,7 +331,7 @@ class Recording:
     def faults(self) -> list[Gap]:
         """Frames whose stamps had to be moved: repeated, out of order, or wild.
 
-        Clock jumps that show as a gap are among the `gaps` instead.
+        Clock jumps that cause a gap are listed in `gaps` instead.
         """
         joined = {gap.start_frame for gap in self.gaps if self._jumped(gap)}
         found = find_faults(self.times_ns, self._step_ns, self._faults)
@@ -355,17 +347,17 @@ class Recording:
         )
 
     def frame(self, index: int) -> DepthFrame:
-        """One frame, decoded now.
+        """Decode one frame.
 
         Args:
-            index: row of the frame, counted from 0, or from the end when negative.
+            index: row of the frame, counted from 0, or from the end if negative.
 
         Returns:
             The frame, with its row, its stamp and its depth (H, W) float32 mm.
 
         Raises:
             IndexError: there is no such row.
-            RecordingError: the recording was closed, or its files are there no more.
+            RecordingError: the recording was closed, or its files can no longer be read.
         """
         if not -len(self) <= index < len(self):
             raise IndexError(f"frame {index} of a recording of {len(self)} frames")
@@ -384,11 +376,11 @@ class Recording:
         return DepthFrame(row, int(self.times_ns[row]), depth)
 
     def frames(self, first: int = 0, stop: int | None = None) -> Iterator[DepthFrame]:
-        """Consecutive frames, decoded one by one, each marked where it repeats the one before it.
+        """Consecutive frames, decoded one by one; a frame that repeats the previous one is marked.
 
         Args:
             first: row of the first frame.
-            stop: row after the last one; None for all that follow.
+            stop: row after the last one; None for the end of the recording.
         """
         before = self.frame(first - 1).depth if 0 < first < len(self) else None
         return marked((self.frame(i) for i in range(len(self))[first:stop]), before)
@@ -397,10 +389,10 @@ class Recording:
         return self.frames()
 
     def chunks(self, n_frames: int, first: int = 0) -> Iterator[list[DepthFrame]]:
-        """Consecutive frames in lists of equal length, of which one is in memory at a time.
+        """Consecutive frames in lists of equal length; one list is in memory at a time.
 
         Args:
-            n_frames: frames to a list; the last list may be shorter.
+            n_frames: frames per list; the last list may be shorter.
             first: row of the first frame.
 
         Yields:
@@ -415,15 +407,12 @@ class Recording:
         yield from iter(lambda: list(islice(frames, n_frames)), [])
 
     def __getitem__(self, part: slice) -> Recording:
-        """Some of the frames as a recording of its own, with rows counted again.
+        """Some of the frames as a recording of its own, with rows counted from 0.
 
         It reads from the same files, and has the digest of the whole input.
 
         Args:
             part: a slice with a positive step.
-
-        Returns:
-            The recording of these frames.
 
         Raises:
             TypeError: part is not a slice.
@@ -469,38 +458,32 @@ class Recording:
         *,
         lent: bool = False,
     ) -> Recording:
-        """The same frames as another camera would have taken them, transformed when they are read.
+        """The same frames as another camera would have recorded them, transformed on reading.
 
-        The input, and so the digest, stays the same; closing one recording closes both, also when
-        nobody holds it any more, unless it is lent.
+        The input, and so the digest, stays the same. Closing one recording closes both, also when
+        it is garbage collected, unless it is lent.
 
         Args:
             camera: the camera of the transformed images.
-            change: turns depth (H, W) float32 mm of this camera into depth of the other one.
-            optics: what `change` undoes, kept as the `optics` of the result.
-            lent: this recording stays open whatever becomes of the result.
-
-        Returns:
-            The recording through the other camera.
+            change: transforms depth (H, W) float32 mm of this camera into depth of the other one.
+            optics: the corrections that `change` applies, kept as the `optics` of the result.
+            lent: keep this recording open when the result is closed.
         """
         read = self._read
         return self._through(camera, lambda number: change(read(number)), change, optics, lent)
 
     def masked(self, region_px: Sequence[Sequence[float]], *, lent: bool = False) -> Recording:
-        """The same frames with everything outside of a polygon unread: an arena cut out of them.
+        """The same frames with every pixel outside a polygon unread, to isolate one arena.
 
-        Size and camera of the images stay as they are, so what is measured within keeps its
-        place. The input, and so the digest, stays the same.
+        Image size and camera are unchanged, so pixel coordinates stay valid. The input, and so the
+        digest, stays the same.
 
         Args:
             region_px: (u, v) corners of the polygon, pixels.
-            lent: this recording stays open whatever becomes of the result.
-
-        Returns:
-            The recording of what lies inside.
+            lent: keep this recording open when the result is closed.
 
         Raises:
-            PlanError: the corners are no polygon in the image.
+            PlanError: the corners are not a polygon in the image.
         """
         inside = region_mask(region_px, self.width, self.height)
         cut = self.seen_by(
@@ -513,12 +496,12 @@ class Recording:
         return cut
 
     def remembering(self, most_bytes: int) -> Recording:
-        """The same recording that keeps the first frames which are read, for several readers.
+        """The same recording with a cache of the first frames read, for several readers.
 
         Closing the result closes this recording.
 
         Args:
-            most_bytes: of kept frames; those read afterwards are decoded each time.
+            most_bytes: size of the cache; frames read after it is full are decoded each time.
         """
         kept: dict[int, Depth] = {}
         n_most = most_bytes // max(1, 4 * self.width * self.height)
@@ -545,7 +528,7 @@ class Recording:
         optics: dict[str, Any],
         lent: bool,
     ) -> Recording:
-        """The same frames read in another way."""
+        """The same frames, read by another function."""
         other = Recording(
             name=self.name,
             format=self.format,
@@ -572,8 +555,8 @@ class Recording:
     def grown(self) -> Recording | None:
         """The same recording with what was appended to its files since it was opened.
 
-        Reading goes on from where it ended. The result takes this one's place, which is used no
-        more.
+        Reading resumes where it ended. The result replaces this recording, which must not be used
+        afterwards.
 
         Returns:
             The longer recording; None if the format has to be opened again for that.
@@ -583,15 +566,15 @@ class Recording:
             more.camera = self.camera
             more.region_px = self.region_px
             if self._close is not None:
-                self._close.detach()  # the files go on being read
+                self._close.detach()  # the files stay open
         return more
 
     def digest(self, progress: Progress = silent) -> str:
         """SHA-256 of the input, in hexadecimal; computed once and kept.
 
-        Of one file its bytes; of several, their names, sizes and bytes in order of name. A
-        recording that is in no file is hashed by its times and depths. A slice has the digest of
-        the whole input.
+        For one file, its bytes are hashed; for several, their names, sizes and bytes in order of
+        name. For a recording without files, its times and depths. A slice has the digest of the
+        whole input.
 
         Args:
             progress: reports how many MB were read.
@@ -607,9 +590,9 @@ class Recording:
         return whole.hexdigest()
 
     def close(self) -> None:
-        """Release files, and remove what was unpacked.
+        """Close files, and remove what was unpacked.
 
-        A slice leaves that to the recording that it was cut from.
+        Closing a slice has no effect on the recording that it was cut from.
         """
         self._closed = self._whole is None
         if self._close is not None:

@@ -1,6 +1,6 @@
-"""Live sources of depth frames: files that still grow, and a TCP stream of raw frames.
+"""Live sources of depth frames: growing files, and a TCP stream of raw frames.
 
-A growing file is polled every 20 ms and read on from where it ended. The stream opens with a JSON
+A growing file is polled every 20 ms and read from where reading ended. The stream opens with a JSON
 greeting (length as u32, then name and camera); each frame follows as index and time (i64, ns),
 height and width (u32), little endian, then H * W float32 mm, row by row.
 """
@@ -29,16 +29,16 @@ from liex_lab.recordings.recording import Recording
 _FRAME = struct.Struct("<qqII")  # index, time ns, height, width; then float32 mm, row by row
 _HEAD = struct.Struct("<I")  # length of the greeting, JSON
 _POLL_S = 0.02
-_GREETING_S = 10.0  # for the whole of it
-_FRAME_S = 30.0  # for the whole of a frame that has begun
+_GREETING_S = 10.0  # for the whole greeting
+_FRAME_S = 30.0  # for the rest of a frame that has begun
 _PATIENCE_S = 300.0  # for the next frame
 _MOST_PX = 1 << 24  # of a camera
 _LONGEST_GREETING = 1 << 20
-_MOST_WAITING = 128  # frames that have come and were not asked for yet; then the sender waits
+_MOST_WAITING = 128  # frames buffered; then the sender waits
 
 
 class Arrival(NamedTuple):
-    """A frame and when it arrived.
+    """A frame and its time of arrival.
 
     Attributes:
         frame: the depth frame.
@@ -51,7 +51,7 @@ class Arrival(NamedTuple):
 
 @dataclass(frozen=True)
 class Arriving:
-    """A recording that goes on: its name and camera, and its frames as they come.
+    """A recording in progress: its name and camera, and its frames as they arrive.
 
     Attributes:
         name: name of the recording.
@@ -65,25 +65,25 @@ class Arriving:
 
 
 def growing(reopen: Callable[[], Recording], patience_s: float) -> Arriving:
-    """Frames of a file or folder that is being written, as they come.
+    """Frames of a file or folder that is being written, as they arrive.
 
     Args:
-        reopen: opens what is there now, as far as it is whole; called again whenever all of what it
-            opened last has been read and the format cannot read on by itself.
-        patience_s: the recording is over when nothing has come for this long, s.
+        reopen: opens the whole frames written so far; called again once these have been read, if
+            the format cannot continue reading by itself.
+        patience_s: the recording is over after this time without a new frame, s.
 
     Returns:
-        The recording that goes on; its first frame is there already.
+        The recording in progress; its first frame has arrived.
 
     Raises:
-        RecordingError: no first frame came within patience_s.
+        RecordingError: no first frame arrived within patience_s.
     """
     first = _when_there(reopen, patience_s)
     return Arriving(first.name, first.camera, _grown(first, reopen, patience_s))
 
 
 def _when_there(reopen: Callable[[], Recording], patience_s: float) -> Recording:
-    """The recording as soon as it has a first frame."""
+    """The recording, opened as soon as it has a first frame."""
     began = time.perf_counter()
     while True:
         try:
@@ -113,13 +113,13 @@ def _grown(
         time.sleep(_POLL_S)
         try:
             opened = _again(opened, reopen)
-        except RecordingError:  # caught in the middle of a write
+        except RecordingError:  # in the middle of a write
             continue
     opened.close()
 
 
 def _again(opened: Recording, reopen: Callable[[], Recording]) -> Recording:
-    """What is there now: read on where the format can, else opened again."""
+    """The recording with new frames: read on if the format supports it, else reopened."""
     more = opened.grown()
     if more is None:
         opened.close()
@@ -128,14 +128,14 @@ def _again(opened: Recording, reopen: Callable[[], Recording]) -> Recording:
 
 
 def replayed(recording: Recording, speed: float = 1.0) -> Arriving:
-    """A recording sent through a socket of this machine at its own pace, or faster.
+    """Send a recording through a local socket at its own pace, or faster.
 
     Args:
-        recording: what is sent, from its first frame to its last, by a thread of its own.
-        speed: how many times as fast as it was recorded.
+        recording: sent from its first frame to its last by a separate thread.
+        speed: factor on the recorded pace.
 
     Returns:
-        The frames as they come out of the socket.
+        The frames as they arrive at the receiving end.
     """
     server = socket.create_server(("127.0.0.1", 0))
     threading.Thread(target=_send, args=(server, recording, speed), daemon=True).start()
@@ -145,18 +145,18 @@ def replayed(recording: Recording, speed: float = 1.0) -> Arriving:
 def received(host: str, port: int) -> Arriving:
     """Frames from a sender like `replayed`, at a TCP address.
 
-    They are read on a thread of their own, so that the time of a frame is when it came and not when
-    it was asked for; at most 128 wait, then the sender waits.
+    A separate thread reads them, so that the time of a frame is its arrival, not its request. At
+    most 128 frames are buffered; then the sender has to wait.
 
     Args:
         host: name or address of the sender.
         port: its TCP port.
 
     Returns:
-        The frames as they come, until the sender closes the connection.
+        The frames as they arrive, until the sender closes the connection.
 
     Raises:
-        RecordingError: nobody answers there, or no greeting with name and camera comes within 10 s.
+        RecordingError: no sender answers, or no greeting with name and camera arrives within 10 s.
     """
     try:
         link = socket.create_connection((host, port), timeout=_GREETING_S)
@@ -175,7 +175,7 @@ def received(host: str, port: int) -> Arriving:
 
 
 def _greeting(link: socket.socket, where: str) -> tuple[str, Camera]:
-    """What a sender says first: the recording's name and its camera."""
+    """Receive the sender's greeting: the recording's name and its camera."""
     by = time.monotonic() + _GREETING_S
     head = _exactly(link, _HEAD.size, by)
     length = _HEAD.unpack(head)[0] if head else 0
@@ -200,9 +200,9 @@ def _greeting(link: socket.socket, where: str) -> tuple[str, Camera]:
 
 
 def _stamped(frames: Iterator[Arrival]) -> Iterator[Arrival]:
-    """The same frames, read on a thread of their own.
+    """The same frames, read on a separate thread.
 
-    So a frame's time is when it came and not when it was asked for.
+    The time of a frame is then its arrival, not its request.
     """
     waiting: Queue[Arrival | RecordingError | None] = Queue(_MOST_WAITING)
 
@@ -222,7 +222,7 @@ def _stamped(frames: Iterator[Arrival]) -> Iterator[Arrival]:
 
 
 def _send(server: socket.socket, recording: Recording, speed: float) -> None:
-    """Greet the one who connects, then send every frame when its time has come."""
+    """Greet the first client, then send every frame at its due time."""
     with server, closing(server.accept()[0]) as link:
         link.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         greeting = json.dumps(
@@ -230,7 +230,7 @@ def _send(server: socket.socket, recording: Recording, speed: float) -> None:
         ).encode()
         link.sendall(_HEAD.pack(len(greeting)) + greeting)
         first = int(recording.times_ns[0])
-        # when the first frame is read: what that takes is not the recording's pace
+        # starts once the first frame is read: decoding it is not part of the recording's pace
         began: float | None = None
         for frame in recording:
             began = time.perf_counter() if began is None else began
@@ -241,12 +241,12 @@ def _send(server: socket.socket, recording: Recording, speed: float) -> None:
             try:
                 link.sendall(_FRAME.pack(frame.index, frame.time_ns, height, width))
                 link.sendall(np.ascontiguousarray(frame.depth, np.float32).data.cast("B"))
-            except OSError:  # nobody listens any more
+            except OSError:  # the client disconnected
                 return
 
 
 def _frames(link: socket.socket, camera: Camera, where: str) -> Iterator[Arrival]:
-    """Frames of the camera's size, each whole in time."""
+    """Frames of the camera's size that arrive whole and in time."""
     with link:
         while True:
             head = _exactly(link, _FRAME.size, time.monotonic() + _PATIENCE_S)
@@ -265,16 +265,16 @@ def _frames(link: socket.socket, camera: Camera, where: str) -> Iterator[Arrival
 
 
 def _exactly(link: socket.socket, n: int, by: float) -> bytes:
-    """The next n bytes, none where the sender has gone or they have not come in time."""
+    """The next n bytes; empty if the sender disconnects or they do not arrive in time."""
     data = bytearray(n)
     return bytes(data) if _fill(link, memoryview(data), by) else b""
 
 
 def _fill(link: socket.socket, place: memoryview, by: float) -> bool:
-    """Receive bytes until the buffer is full; False if the sender has gone, or time is over.
+    """Receive bytes until the buffer is full; False if the sender disconnects, or on timeout.
 
-    They go straight to where they stay, for a frame has millions of them. `by` is a time of
-    `time.monotonic`, s: one who sends a byte now and then does not hold us for ever.
+    They are received in place, because a frame has millions of them. `by` is a time of
+    `time.monotonic`, s: a sender that trickles bytes cannot block forever.
     """
     filled = 0
     while filled < len(place):

@@ -1,8 +1,8 @@
 """Writers of recordings, frame by frame: their interface, and folders of 16-bit PNG images.
 
-A writer is used in a `with` block: what belongs at the end of the file is written where the block
-ends without an error. Its `notes` then say what a reader of the file should know. Depth is stored
-in whole steps of `step_mm`, either exactly or rounded to the nearest step.
+Use a writer in a `with` block: the end of the file is written when the block ends without an error.
+Its `notes` then report what a reader of the file should know. Depth is stored in whole steps of
+`step_mm`, either exactly or rounded to the nearest step.
 """
 
 from __future__ import annotations
@@ -22,44 +22,35 @@ from liex_lab.recordings.camera_file import CAMERA_FILE
 from liex_lab.recordings.frame import LARGEST_STEP, Depth, DepthFrame, nearest_steps, whole_steps
 
 STAMPS = "timestamps.csv"
-_FACTS = ("subject_id", "session_start_time")  # of the metadata, those that a camera.toml can state
+_FACTS = ("subject_id", "session_start_time")  # the metadata that a camera.toml can state
 
 
 class RecordingWriter(ABC):
-    """Interface of a writer that takes the frames of a recording in order of time.
+    """Interface of a writer for the frames of a recording, in order of time.
 
     Attributes:
-        path: the file or folder that is written; there must be nothing yet.
+        path: the file or folder to write; it must not exist.
         camera: the camera of the frames.
-        notes: sentences about what the format could not keep, complete after `finish`.
+        notes: sentences about what the format could not store, complete after `finish`.
     """
 
     def __init__(self, path: Path, camera: Camera) -> None:
-        """Keep the path and the camera; nothing is written.
-
-        Args:
-            path: the file or folder to write.
-            camera: the camera of the frames.
-        """
+        """Keep the path and the camera; nothing is written."""
         self.path = path
         self.camera = camera
         self.notes: list[str] = []
 
     @abstractmethod
     def add(self, frame: DepthFrame) -> None:
-        """Append the next frame.
-
-        Args:
-            frame: the frame; its time is not before that of the last one.
-        """
+        """Append the next frame; its time must not precede that of the last one."""
 
     @abstractmethod
     def finish(self) -> None:
-        """Write what belongs at the end of the file."""
+        """Write the end of the file."""
 
     @abstractmethod
     def release(self) -> None:
-        """Release open files, whether the recording is whole or not."""
+        """Close open files, whether the recording is whole or not."""
 
     def __enter__(self) -> Self:
         return self
@@ -80,7 +71,7 @@ class RecordingWriter(ABC):
 class PictureFolderWriter(RecordingWriter):
     """Writer of a folder of 16-bit PNG images, with a camera.toml and a timestamps.csv.
 
-    There is one image to a frame; the stamps are in nanoseconds.
+    One image per frame; the stamps are in nanoseconds.
     """
 
     def __init__(
@@ -92,14 +83,14 @@ class PictureFolderWriter(RecordingWriter):
         exact: bool = True,
         metadata: dict[str, Any] | None = None,
     ) -> None:
-        """Make the folder.
+        """Create the folder.
 
         Args:
             path: the folder, which must not exist.
             camera: the camera of the frames, for camera.toml.
             step_mm: mm of a stored step.
             exact: refuse depths between steps instead of rounding them.
-            metadata: facts of the recording, of which subject_id and session_start_time are kept.
+            metadata: facts of the recording; only subject_id and session_start_time are stored.
         """
         super().__init__(path, camera)
         self._step_mm = step_mm
@@ -109,7 +100,7 @@ class PictureFolderWriter(RecordingWriter):
         path.mkdir()
 
     def add(self, frame: DepthFrame) -> None:
-        """Write one image; its stamp is kept until the end.
+        """Write one image; its stamp is written by `finish`.
 
         Args:
             frame: the frame, depth (H, W) float32 mm.
@@ -143,7 +134,7 @@ class PictureFolderWriter(RecordingWriter):
             self.notes.append(f"depth was rounded to whole steps of {self._step_mm:g} mm")
 
     def release(self) -> None:
-        """Do nothing, for no file is held open."""
+        """Do nothing: no file stays open."""
 
 
 def steps_of(frame: DepthFrame, step_mm: float, exact: bool) -> NDArray[np.uint16]:
@@ -178,14 +169,7 @@ def steps_of(frame: DepthFrame, step_mm: float, exact: bool) -> NDArray[np.uint1
 
 
 def png_of(steps: NDArray[np.uint16]) -> bytes:
-    """Encode an image as 16-bit grey PNG.
-
-    Args:
-        steps: (H, W) uint16.
-
-    Returns:
-        The bytes of the PNG file.
-    """
+    """Encode a depth image (H, W) uint16 as the bytes of a 16-bit grey PNG file."""
     import cv2
 
     good, packed = cv2.imencode(".png", steps)
