@@ -1,9 +1,8 @@
-"""Public Python interface: the jobs of the command line that scripts ask for.
+"""Public Python interface: the CLI commands as Python functions.
 
-`run_session` is `liex run`, `run_demo` is `liex demo`, and so on. The folders `pipelines` (jobs)
-and `dashboards` (views) do not import each other; this module hands the views, which are the layout
-of the Rerun replay and the HTML report, to the job that writes a session. Jobs are imported when
-they are called.
+`run_session` is `liex run`, `run_demo` is `liex demo`, and so on. The packages `pipelines` (jobs)
+and `dashboards` (views) do not import each other; this module passes the views (the layout of the
+Rerun replay and the HTML report) to the job that writes a session. Jobs are imported on first use.
 """
 
 from __future__ import annotations
@@ -29,8 +28,8 @@ if TYPE_CHECKING:
     from liex_lab.sessions.corrections import Correction
 
 DEMO = "mouse_walk.mcap"
-# what a run needs after its first frames, and takes seconds to import: of the replay, of the table
-# `transitions`, of the figures
+# modules that take seconds to import and are needed only after the first frames: for the replay,
+# the table `transitions` and the figures
 _HEAVY = (
     "pandas",
     "rerun",
@@ -55,33 +54,32 @@ def run_session(
 ) -> Path:
     """Measure every frame of a depth recording and write a session folder; returns its path.
 
-    Background subtraction, pose estimation of single frames by the Lie-X method, association and
-    smoothing over the whole recording, kinematics and ethogram, in this order. Nothing half-written
-    is left behind where the recording, the plan or the animal in it cannot be used.
+    The steps are background subtraction, single-frame pose estimation by the Lie-X method,
+    association and smoothing over the whole recording, kinematics and ethogram. If the recording,
+    the plan or the animal cannot be used, no partial output remains.
 
     Args:
-        recording: path of a recording, or address of a virtual one, or a recording that is open
-            already.
-        plan: all settings of the run; None takes the bundled plan that fits, that of the mouse
-            where it does.
-        out: the folder into which the session folder `<recording's name>.liex` is written.
-        settings: changes of the plan where none is named, texts like 'animal.spine_mm=65'.
-        folder: the session folder itself, where it should have another name.
-        overwrite: replace a session that is there already.
-        notes: further facts for session.json, see `SessionWriter.note`.
-        workers: processes that look at shards of a long recording side by side; 0 takes one for
-            every two cores, four at most, for more than 6,000 frames. The tables are the same for
-            any number of them. A script that asks for more than one begins its work below
-            `if __name__ == "__main__":`, as processes are spawned.
-        pool: a worker pool of the caller's own instead of `workers` processes of this machine.
-        progress: told how far the work is.
+        recording: path of a recording, address of a virtual one, or an open recording.
+        plan: all settings of the run; None selects the bundled plan that fits, the mouse's if it
+            does.
+        out: parent of the session folder `<recording's name>.liex`.
+        settings: overrides when no plan is given, texts like 'animal.spine_mm=65'.
+        folder: the session folder, to use another name.
+        overwrite: replace an existing session.
+        notes: additional facts for session.json, see `SessionWriter.note`.
+        workers: processes for parallel shards of a long recording; 0 uses one for every two cores,
+            four at most, for more than 6,000 frames. The tables are the same for any number.
+            Scripts that use more than one must guard their entry point with `if __name__ ==
+            "__main__":`, as processes are spawned.
+        pool: a worker pool to use instead of `workers` local processes.
+        progress: receives progress reports.
 
     Returns:
         The session folder.
 
     Raises:
-        LiexError: the recording, the plan or the animal in it cannot be used; the message says what
-            to do.
+        LiexError: the recording, the plan or the animal in it cannot be used; the message gives
+            advice.
     """
     from liex_lab.pipelines.session import measure_session
     from liex_lab.pipelines.workers import processes_for
@@ -115,25 +113,23 @@ def run_arenas(
     pool: WorkerPool | None = None,
     progress: Progress = silent,
 ) -> list[ArenaOutcome]:
-    """Measure several arenas in one picture, each as a session of its own, in one pass.
+    """Measure several arenas in one image, each as a separate session, in one pass.
 
     Args:
-        recording: path of a recording, or address of a virtual one, or a recording that is open
-            already.
-        plan: lists the arenas, `[[arenas]]`, or says `arenas = "auto"`; None takes for each arena
-            the bundled plan that fits, with the arenas that `settings` say.
-        out: the folder into which the session folders `<recording's name>-<arena>.liex` are
-            written.
-        settings: changes of the plan where none is named.
-        overwrite: replace sessions that are there already.
-        notes: further facts for every session.json.
-        workers: processes that look at shards of a long recording side by side, each arena by
-            itself; 0 or 1 measure all of them in one pass.
-        pool: a worker pool of the caller's own instead.
-        progress: told how far the work is.
+        recording: path of a recording, address of a virtual one, or an open recording.
+        plan: lists `[[arenas]]`, or has `arenas = "auto"`; None selects the bundled plan that fits
+            each arena, with the arenas in `settings`.
+        out: parent of the session folders `<recording's name>-<arena>.liex`.
+        settings: overrides when no plan is given.
+        overwrite: replace existing sessions.
+        notes: additional facts for every session.json.
+        workers: processes for parallel shards of a long recording, one arena at a time; 0 or 1
+            measures all arenas in one pass.
+        pool: a worker pool to use instead.
+        progress: receives progress reports.
 
     Returns:
-        For each arena its session folder, or why it could not be measured.
+        For each arena its session folder, or the reason why it could not be measured.
 
     Raises:
         LiexError: the recording or the plan cannot be used, or arenas overlap.
@@ -165,19 +161,19 @@ def correct_session(
     report: bool = True,
     progress: Progress = silent,
 ) -> Path:
-    """Add corrections to a session, or take some back by their numbers; tables and report follow.
+    """Add corrections to a session, or undo some by number; updates tables and report.
 
-    What was measured stays as it is; see `liex_lab.sessions.corrections`. With neither `what` nor
-    `undo`, everything that follows from the corrections is made again.
+    The measured data are unchanged; see `liex_lab.sessions.corrections`. Without `what` and `undo`,
+    everything derived from the corrections is regenerated.
 
     Args:
         session: the session folder.
         what: corrections made by the functions of `liex_lab.sessions.correcting`.
-        undo: numbers of corrections to take back.
-        author: whose corrections they are; "" takes who is logged in.
-        report: whether report and figures are made again, too; of many corrections in a row the
-            last one is enough.
-        progress: told how far the work is.
+        undo: numbers of corrections to undo.
+        author: author of the corrections; "" uses the current account.
+        report: whether to regenerate report and figures; for a series of corrections, the last call
+            is enough.
+        progress: receives progress reports.
 
     Returns:
         The session folder.
@@ -207,31 +203,31 @@ def follow_live(
     patience_s: float = 3.0,
     progress: Progress = silent,
 ) -> dict[str, Any]:
-    """Show the skeletons of a recording that goes on in a Rerun viewer; returns measured latencies.
+    """Show the skeletons of an ongoing recording in a Rerun viewer; returns measured latencies.
 
     Args:
         source: a file or folder that is being written, HOST:PORT of a sender, or, with `replay`, a
             recording.
         plan: all settings of the run.
-        replay: send a finished recording at its own pace, as if it were live.
-        to: 'viewer' starts a viewer on this machine; else the address of one, or a file .rrd.
-        patience_s: a file that has not grown for so many seconds is taken for finished.
-        progress: told how many frames have been followed.
+        replay: play back a finished recording at its own pace, as if it were live.
+        to: 'viewer' starts a viewer on this machine; else a viewer's address, or an .rrd file.
+        patience_s: time without growth after which a file counts as finished, s.
+        progress: receives the number of processed frames.
 
     Returns:
-        Table of numbers: name, n_frames, n_live (frames whose latency was measured),
-        latency_median_ms and latency_p95_ms (None where there is none), n_measured, n_bridged.
+        Numbers: name, n_frames, n_live (frames whose latency was measured), latency_median_ms and
+            latency_p95_ms (None if absent), n_measured, n_bridged.
 
     Raises:
-        LiexError: the source is over before it has a frame, or cannot be read, or there is no
-            screen for a viewer.
+        LiexError: the source ends before its first frame, cannot be read, or there is no screen for
+            a viewer.
     """
     from liex_lab.dashboards.replay.layouts import live_blueprint
     from liex_lab.pipelines.live import follow_live as job
     from liex_lab.pipelines.live import open_live
     from liex_lab.sessions.viewer import LiveView, need_screen
 
-    if to == "viewer":  # before minutes are waited for
+    if to == "viewer":  # fail early, before a wait of minutes
         need_screen("write a file with --to NAME.rrd, which any viewer opens")
     arriving = open_live(source, plan, replay=replay, patience_s=patience_s)
     numbers, _ = job(
@@ -253,11 +249,11 @@ def follow_live(
 def run_demo(out: str | Path = ".", *, progress: Progress = silent) -> Path:
     """Measure the bundled sample recording; returns its session folder.
 
-    An earlier session of the demo in the same place is replaced.
+    An earlier demo session in the same folder is replaced.
 
     Args:
-        out: the folder into which the session folder is written.
-        progress: told how far the work is.
+        out: parent of the session folder.
+        progress: receives progress reports.
     """
     from liex_lab.catalog import find_sample
 
@@ -276,24 +272,23 @@ def draw_figures(
 ) -> dict[str, Any]:
     """Draw the figures of a session, a study or a comparison as files.
 
-    They are as wide as one or two columns of a journal, their texts can be edited, and the same
-    tables give the same bytes.
+    Figures are one or two journal columns wide, texts are editable, and the same tables give the
+    same bytes.
 
     Args:
-        place: a session folder; a study file, its folder, or a folder with sessions in it; or the
-            folder of a comparison.
-        only: names of figures, such as 'occupancy'; of a comparison its measures, too; () takes
-            all.
-        formats: some of svg, pdf and png; 'pages' is one file figures.pdf of all of them.
-        out: the folder for them; None takes `figures` beside what they are of.
-        progress: told which figure is drawn.
+        place: a session folder; a study file, its folder, or a folder that contains sessions; or
+            the folder of a comparison.
+        only: names of figures, such as 'occupancy', or measures of a comparison; () draws all.
+        formats: some of svg, pdf and png; 'pages' is a single file figures.pdf with all figures.
+        out: the output folder; None uses `figures` next to the data.
+        progress: receives the name of each figure.
 
     Returns:
-        `files`: the paths; `empty`: names of figures of which there is nothing to draw; `folder`.
+        `files`: the paths; `empty`: names of figures without data; `folder`.
 
     Raises:
-        SessionError: there is no such figure or format, or nothing at all to draw.
-        StudyError: there is no such place.
+        SessionError: there is no such figure or format, or no data to draw.
+        StudyError: there is no such session, study or comparison.
     """
     from liex_lab.dashboards.figures import sets
     from liex_lab.errors import SessionError
@@ -342,23 +337,22 @@ def compare_groups(
     only_trusted: bool = False,
     progress: Progress = silent,
 ) -> dict[str, Any]:
-    """Compare the groups of sessions; writes tables, a text of methods, and figures.
+    """Compare groups of sessions; writes tables, a methods text, and figures.
 
     Args:
-        places: study files, session folders, or folders with sessions anywhere in them.
-        out: folder of the tables; it is made where it is missing.
-        measures: columns of the summary; () takes the usual ones and every action's share.
+        places: study files, session folders, or folders that contain sessions at any depth.
+        out: output folder; created if needed.
+        measures: columns of the summary; () uses the default ones and every action's share.
         reference: compare with this group only; None compares all pairs.
-        animals: a CSV with `subject_id` and any of group, cage, sex, batch, which overrules what
-            the sessions say.
+        animals: a CSV with `subject_id` and any of group, cage, sex, batch; it overrides the
+            sessions' own facts.
         engine: `auto`, `permutation` or `mixed`.
-        only_trusted: leave out sessions that someone has to look at.
-        progress: told session by session and figure by figure.
+        only_trusted: exclude sessions that need review.
+        progress: receives progress by session and figure.
 
     Returns:
-        `stats`: the table's rows; `folder`: where the files are; `figures`: their paths;
-        `sessions`: a sentence that accounts for every session; `check`: sentences on what may be
-        wrong.
+        `stats`: the table's rows; `folder`: the output folder; `figures`: their paths; `sessions`:
+            a sentence that accounts for every session; `check`: warnings.
 
     Raises:
         SessionError: there are no two groups, or a folder, column, engine or CSV cannot be used.
@@ -392,27 +386,27 @@ def export_video(
 ) -> Path:
     """Write a video (H.264): height above the floor, skeleton, trail, action and time.
 
-    One session is shown from beginning to end, on its own clock; several stand beside each other,
-    by group. With `actions` the clips of their bouts do, aligned at the onsets; the report of a
-    session links to those in its folder.
+    One session is shown from beginning to end, on its own clock; several are shown side by side, by
+    group. With `actions`, the video contains clips of these bouts, aligned at the onsets; a
+    session's report links to the videos in its folder.
 
     Args:
-        places: a session folder, or several, or folders with sessions anywhere in them.
-        out: the folder for it; None takes the session's own, or, of several, this one.
-        actions: words, or beginnings of words: rear is rear_supported and rear_unsupported, too.
-        groups: only sessions of these groups; () takes all.
-        start_s: of one session only what follows this time, s.
-        stop_s: and only what is before this one, s.
-        slower: so many times slower than it was.
-        overwrite: replace what is there under this name.
-        progress: told how far it is.
+        places: a session folder, several, or folders that contain sessions at any depth.
+        out: the output folder; None uses the session's own, or the current folder for several.
+        actions: actions, or prefixes of them: rear includes rear_supported and rear_unsupported.
+        groups: only sessions of these groups; () includes all.
+        start_s: start of a stretch of one session, s.
+        stop_s: end of that stretch, s.
+        slower: slow-motion factor.
+        overwrite: replace an existing file.
+        progress: receives progress reports.
 
     Returns:
         Path of the video.
 
     Raises:
-        SessionError: a session keeps no depth, no bout has such a name, this PyAV has no encoder,
-            or there is such a file already.
+        SessionError: a session has no depth, no bout has such a name, this PyAV has no encoder, or
+            the file exists.
     """
     from liex_lab.dashboards.report.report import write_report
     from liex_lab.dashboards.video.video import write_clips, write_session
@@ -464,22 +458,22 @@ def run_study(
     dry_run: bool = False,
     board: Callable[[int], AbstractContextManager[Board]] = progress_board,
 ) -> list[SessionStatus]:
-    """Measure the sessions of a study that are to be done; returns the status of every session.
+    """Measure the pending sessions of a study; returns the status of every session.
 
-    A session that fails leaves failed.json in its folder and stops no other. Where the study says
-    shared = "subject", sessions of one animal are looked at first, and measured with what they
-    agree on. The study's table is written again at the end.
+    A session that fails leaves failed.json in its folder and does not stop the others. If the study
+    has shared = "subject", the sessions of each animal are analysed first, and measured with the
+    size and shape they agree on. The study's table is rewritten at the end.
 
     Args:
-        study: the study file, or the folder that holds study.toml.
-        workers: processes on this machine; 0 takes one for every two cores.
+        study: the study file, or the folder that contains study.toml.
+        workers: local processes; 0 uses one for every two cores.
         scheduler: address of a Dask scheduler whose workers are used instead.
-        slurm: TOML file that says how to ask Slurm for workers; not together with `scheduler`.
-        retry: try sessions again that failed before.
-        again: measure done and failed sessions again, too; excluded ones stay out.
-        only: ids of the sessions to measure; () takes all.
-        dry_run: measure nothing; return the status of the sessions as they are.
-        board: makes, for a number of jobs, the display of all of them (a context manager).
+        slurm: TOML file that configures Slurm workers; not together with `scheduler`.
+        retry: repeat sessions that failed.
+        again: repeat done and failed sessions; excluded ones stay excluded.
+        only: ids of the sessions to measure; () measures all.
+        dry_run: measure nothing; return the current status.
+        board: creates the progress display for a number of jobs (a context manager).
 
     Returns:
         One `SessionStatus` per session, in the order of the study file.
@@ -512,23 +506,23 @@ def describe_session(
     author: str = "",
     progress: Progress = silent,
 ) -> Path:
-    """Say who the animal of a session is; table `sessions` and report follow, nothing is measured.
+    """Set facts about the animal of a session; updates table `sessions` and the report.
 
-    It is kept in the log of corrections and can be taken back like one.
+    Nothing is measured again. The facts are part of the log of corrections and can be undone.
 
     Args:
         session: the session folder.
         facts: any of subject_id, group, cage, sex, batch, species (Latin), age (12 weeks, or P12W)
-            and session_start_time (ISO 8601 with a time zone); an empty text is unknown.
-        author: who says so; "" takes who is logged in.
-        progress: told how far the work is.
+            and session_start_time (ISO 8601 with a time zone); an empty text means unknown.
+        author: author of the change; "" uses the current account.
+        progress: receives progress reports.
 
     Returns:
         The session folder.
 
     Raises:
         SessionError: there is no such fact, or another program is correcting the session.
-        PlanError: a value cannot be used.
+        PlanError: a value is invalid.
     """
     from liex_lab.sessions.correcting import descriptions
 
@@ -543,17 +537,17 @@ def serve_dashboard(
     told: Callable[[str], None] = print,
     progress: Progress = silent,
 ) -> None:
-    """Serve a study, or a folder with sessions in it, to browsers until interrupted.
+    """Serve a study, or a folder that contains sessions, to browsers until interrupted.
 
-    Every visitor has to know a token, new each time, which is part of the address. On a host other
-    than this machine alone no replay is opened.
+    Access requires a token, new for each start, which is part of the address. Replays can be opened
+    only if the server listens on this machine alone.
 
     Args:
-        study: a study file, its folder, or a folder with sessions in it.
+        study: a study file, its folder, or a folder that contains sessions.
         host: the network address to listen on; the default is this machine alone.
         port: the port to listen on.
         told: called with the dashboard's address once it is served.
-        progress: told how far the loading of the sessions is.
+        progress: receives progress while sessions are loaded.
 
     Raises:
         MissingPackageError: the extra `dashboard` is not installed.
@@ -590,8 +584,8 @@ def serve_dashboard(
         Args:
             folder: the session folder.
             what: corrections to add.
-            undo: numbers of corrections to take back.
-            author: whose corrections they are.
+            undo: numbers of corrections to undo.
+            author: author of the corrections.
         """
         correct_session(folder, what, undo=undo, author=author, report=False)
 
@@ -612,22 +606,22 @@ def serve_dashboard(
 def verify_session(
     session: str | Path, recording: str | Path | None = None, *, progress: Progress = silent
 ) -> list[Finding]:
-    """Check whether a session is what it was when it was written; returns what was found.
+    """Check whether a session is unchanged since it was written; returns the findings.
 
-    Compared are the facts in session.json, the files with their SHA-256, the logs, the model and
-    the corrections.
+    Compares the facts in session.json, the files with their SHA-256, the logs, the model and the
+    corrections.
 
     Args:
         session: the session folder.
-        recording: its recording, which is then measured again, to see whether it gives the same;
-            this takes as long as the first time. None leaves that out.
-        progress: told how far the second measurement is.
+        recording: its recording, to check whether re-running reproduces the session, which takes as
+            long as the first run. None skips this.
+        progress: receives progress of the second run.
 
     Returns:
-        One `Finding` per thing that was looked at; its state is ok, wrong or note.
+        One `Finding` per check; its state is ok, wrong or note.
 
     Raises:
-        SessionError: there is no session at all.
+        SessionError: there is no session.
     """
     from liex_lab.pipelines.verify import verify_session as job
 
@@ -637,15 +631,15 @@ def verify_session(
 def write_long(minutes: float, out: str | Path) -> dict[str, Any]:
     """Write a session of a virtual mouse of any length; returns its cost in memory and time.
 
-    The frames of one short recording are repeated to and fro, so that only what grows with the
-    length of a recording is measured.
+    The frames of one short recording are repeated forwards and backwards, so that only costs that
+    grow with the length of a recording are measured.
 
     Args:
         minutes: length of the recording, min, at 30 frames per second.
-        out: the folder into which the session folder long.liex is written.
+        out: parent of the session folder long.liex.
 
     Returns:
-        `peak_memory_mb` (None where the system does not tell) and `seconds`.
+        `peak_memory_mb` (None if the system does not report it) and `seconds`.
     """
     from liex_lab.dashboards.report.report import write_report
     from liex_lab.pipelines.evaluation.scale import write_long as job
@@ -656,18 +650,18 @@ def write_long(minutes: float, out: str | Path) -> dict[str, Any]:
 def run_scale(
     n_frames: int = 3000, minutes: Sequence[float] = (1.0, 10.0), *, progress: Progress = silent
 ) -> dict[str, Any]:
-    """Measure what a study costs: sessions per hour, memory, and where the time goes.
+    """Measure the cost of a study: sessions per hour, memory, and time by step.
 
     Sessions per hour are given by number of workers (one and two measured, more simulated), memory
     by length of recording.
 
     Args:
         n_frames: length of each virtual recording, frames of 640 x 480 px.
-        minutes: lengths of recording whose memory is measured, min.
-        progress: told how far the work is.
+        minutes: lengths of the recordings whose memory is measured, min.
+        progress: receives progress reports.
 
     Returns:
-        Table of numbers, with the definitions and assumptions behind them as text.
+        Numbers, with their definitions and assumptions as text.
     """
     from liex_lab.pipelines.evaluation.scale import evaluate_scale
 
@@ -689,14 +683,14 @@ def evaluate_tracking(
     Args:
         animal: name of the skeleton: fish, mouse or hand.
         sequence: name of the fixed virtual test sequence.
-        model: a pose model by name or path; None takes the animal's bundled one.
+        model: a pose model by name or path; None uses the animal's bundled one.
         paper: also compare Algorithms 1 and 3 with the parts of the paper's variant.
-        n_frames: only so many frames of the sequence; None takes all.
-        figure: the PNG of joint error over time to draw; None draws none.
-        progress: told how far the work is.
+        n_frames: number of frames of the sequence; None uses all.
+        figure: PNG file for the joint error over time; None draws none.
+        progress: receives progress reports.
 
     Returns:
-        Table of numbers: figures of each row, speed, and the protocol as text.
+        Results of each row, speed, and the protocol as text.
     """
     from functools import partial
 
@@ -724,18 +718,18 @@ def evaluate_scenes(
     pictures: Path | None = None,
     progress: Progress = silent,
 ) -> dict[str, Any]:
-    """Measure rendered scenes as a lab's camera would see them, and score the tables.
+    """Measure rendered scenes that mimic lab recordings, and score the tables.
 
     Args:
-        only: names of scenes; () takes all.
+        only: names of scenes; () uses all.
         n_frames: length of each recording.
-        n_recordings: of each scene, each of another animal.
-        sealed: measure on the seeds that are not for development.
-        pictures: the folder for drawn frames, one PNG a scene; None draws none.
-        progress: told how far the work is.
+        n_recordings: recordings of each scene, each of another animal.
+        sealed: use the held-out seeds, which are not for development.
+        pictures: folder for drawn frames, one PNG per scene; None draws none.
+        progress: receives progress reports.
 
     Returns:
-        Table of numbers: `rows` of figures by name, and the protocol as text.
+        `rows` of results by name, and the protocol as text.
 
     Raises:
         LiexError: there is no such scene.
@@ -765,23 +759,22 @@ def evaluate_actions(
     figure: Path | None = None,
     progress: Progress = silent,
 ) -> dict[str, Any]:
-    """Score action recognition on cut-out sequences and on uncut virtual recordings.
+    """Score action recognition on cut sequences and on uncut virtual recordings.
 
     Args:
-        animal: one for which actions are generated: fish or mouse.
-        model: an action model by name or path; None takes the bundled one or, where there is none,
-            trains one now.
-        pose_model: the pose model that measures the frames; None takes the animal's own.
+        animal: an animal with simulated actions: fish or mouse.
+        model: an action model by name or path; None uses the bundled one or, if there is none,
+            trains one.
+        pose_model: the pose model for the frames; None uses the animal's own.
         minutes: length of the uncut test recordings, min.
-        figure: the PNG of the confusion matrices to draw; None draws none.
-        progress: told how far the work is.
+        figure: PNG file for the confusion matrices; None draws none.
+        progress: receives progress reports.
 
     Returns:
-        Table of numbers: accuracy on sequences, F1 of the timeline, both by frame rate, and the
-        protocol as text.
+        Accuracy on sequences, F1 of the timeline, both by frame rate, and the protocol as text.
 
     Raises:
-        LiexError: no actions are generated for this animal.
+        LiexError: there are no simulated actions for this animal.
     """
     from functools import partial
 
@@ -810,18 +803,18 @@ def run_tables(
     """Make every table and figure of the Lie-X paper on one page; returns the files written.
 
     Args:
-        out: the folder that tables and figures are written into.
-        animals: names of animals; () takes those with a bundled model.
-        n_frames: only so many frames of each split, of which every row is measured, none kept;
-            None takes all.
-        quick: a few minutes' run whose numbers say only that everything runs.
-        fresh: nothing kept is used; every variant is trained again, which takes long.
-        rows: these rows are trained and measured anew, or `fig7`, the curves of Fig. 7; the others
-            are kept ones. () names none.
-        sealed: measure the sealed split, which is done once, when an issue ends.
-        without: `tracking` or `actions`, parts of the page that are not measured.
+        out: the output folder for tables and figures.
+        animals: names of animals; () uses those with a bundled model.
+        n_frames: number of frames of each split; every row is then measured and none is stored.
+            None uses all frames.
+        quick: a run of a few minutes that only tests the code; its numbers are meaningless.
+        fresh: ignore stored rows; every variant is trained again, which takes long.
+        rows: rows to train and measure again, or `fig7`, the curves of Fig. 7; the others are
+            stored ones. () measures none.
+        sealed: measure the held-out split, which is evaluated once per issue.
+        without: `tracking` or `actions`, parts of the page to skip.
         nyu: folder of the NYU hand data, counted for Table 2; None leaves it out.
-        progress: told how far the work is.
+        progress: receives progress reports.
     """
     from liex_lab.catalog import bundled_models
     from liex_lab.dashboards.paper.page import write_paper
@@ -843,14 +836,14 @@ def run_tables(
 
 
 def _layout(session: dict[str, Any]) -> Any:
-    """The Rerun layout of a session.json; it is imported when it is wanted."""
+    """The Rerun layout of a session.json; imported on first use."""
     from liex_lab.dashboards.replay.layouts import replay_blueprint
 
     return replay_blueprint(session)
 
 
 def _views(folder: Path) -> Path:
-    """Report and layouts of a session's folder; they are imported when they are wanted."""
+    """Report and layouts of a session's folder; imported on first use."""
     from liex_lab.dashboards.report.views import write_views
 
     return write_views(folder)

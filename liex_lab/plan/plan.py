@@ -1,8 +1,8 @@
 """Plan file: all settings of a run in one small TOML file, validated by pydantic.
 
-Equal plans give equal results. A setting that is left out has its default value. `Plan.to_toml`
-writes the file with a comment for every setting; the comment over a section is the docstring of its
-class in `liex_lab.plan.sections`, the one over a setting its description there.
+Equal plans give equal results. Missing settings have default values. `Plan.to_toml` writes the file
+with a comment for every setting; the comment over a section is the docstring of its class in
+`liex_lab.plan.sections`, the one over a setting its description there.
 """
 
 from __future__ import annotations
@@ -39,8 +39,8 @@ from liex_lab.plan.sections import (
 from liex_lab.runtime.text_files import parse_toml, read_text
 
 _HERE = Path(__file__).resolve().parents[1]
-_MOST_ARENAS = 8  # in one picture
-_NOT_PLANS = {"slurm"}  # it says where sessions are measured, not how
+_MOST_ARENAS = 8  # in one image
+_NOT_PLANS = {"slurm"}  # configures where sessions are measured, not how
 _HEADER = """\
 # A plan of liex_lab: everything a run depends on. Copy this file, change the copy, and name it:
 #     liex run RECORDING --plan my-plan.toml
@@ -51,27 +51,26 @@ _HEADER = """\
 
 
 class Plan(Table):
-    """Everything a run depends on.
+    """All settings of a run.
 
-    Units are in the names of the settings; None is 'not set'. A plan is never changed after it was
-    made.
+    Units are part of the names of the settings; None means not set. Plans are immutable.
 
     Attributes:
-        seed: all randomness of a run comes from this number.
-        arenas: several arenas in one picture; None is one.
-        animal: what is in front of the camera.
-        camera: intrinsics that overrule those of the recording.
+        seed: seed of all random numbers of a run.
+        arenas: several arenas in one image; None is one.
+        animal: the animal and its skeleton.
+        camera: intrinsics that override those of the recording.
         recording: how the file is read.
         water: a flat water surface between camera and animal.
-        arena: where in the arena the animal is.
-        foreground: what belongs to the animal and what to the scene.
+        arena: the arena's floor, region and zones.
+        foreground: segmentation of the animal from the scene.
         estimation: one pose per frame.
-        tracking: from the frames' poses to a curve.
-        session: facts about the animal and the day.
-        actions: who names what the animal does.
-        behaviour: where one behaviour ends and the next begins.
-        replay: what the replays hold.
-        report: what is written beside the report.
+        tracking: from the poses of frames to a trajectory.
+        session: metadata of the animal and the session.
+        actions: the action recogniser.
+        behaviour: thresholds between behaviours.
+        replay: contents of the replays.
+        report: files written with the report.
     """
 
     seed: int = Field(0, ge=0, description="all randomness of a run comes from this number")
@@ -131,13 +130,13 @@ class Plan(Table):
 
     @staticmethod
     def load(plan: str | Path) -> Plan:
-        """Load a bundled plan by name, or the plan in a TOML file.
+        """Load a bundled plan by name, or a TOML file.
 
         Args:
             plan: a bundled name, such as 'mouse', or the path of a .toml file.
 
         Raises:
-            PlanError: there is no such plan, or something in it cannot be used.
+            PlanError: there is no such plan, or it is invalid.
         """
         path = plans_folder() / f"{plan}.toml"
         if not path.is_file():
@@ -154,14 +153,14 @@ class Plan(Table):
 
     @staticmethod
     def from_toml(text: str, origin: str = "the plan") -> Plan:
-        """The plan in a TOML text.
+        """Parse a plan from TOML text.
 
         Args:
-            text: the text.
-            origin: names the file in errors.
+            text: the TOML text.
+            origin: the file's name for error messages.
 
         Raises:
-            PlanError: the text is not TOML, or a setting cannot be used.
+            PlanError: the text is not TOML, or a setting is invalid.
         """
         try:
             table = parse_toml(text)
@@ -173,14 +172,14 @@ class Plan(Table):
 
     @staticmethod
     def from_table(table: dict[str, Any], origin: str = "the plan") -> Plan:
-        """The plan in a nested dict, as TOML or JSON gives it.
+        """Validate a plan from a nested dict, as parsed from TOML or JSON.
 
         Args:
-            table: sections by name; missing settings have their defaults.
-            origin: names the file in errors.
+            table: sections by name; missing settings have defaults.
+            origin: the file's name for error messages.
 
         Raises:
-            PlanError: a setting is not known or its value cannot be used.
+            PlanError: a setting is unknown or its value is invalid.
         """
         try:
             return Plan.model_validate(table)
@@ -191,10 +190,10 @@ class Plan(Table):
         """This plan with some settings changed, as by --set on the command line.
 
         Args:
-            settings: texts like 'animal.spine_mm=65'; 'animal.spine_mm=' brings the default back.
+            settings: texts like 'animal.spine_mm=65'; 'animal.spine_mm=' restores the default.
 
         Raises:
-            PlanError: a setting is not known or its value cannot be used.
+            PlanError: a setting is unknown or its value is invalid.
         """
         chosen = list(settings)
         table = self.model_dump(exclude_none=True)
@@ -238,17 +237,13 @@ class Plan(Table):
 
 
 def arena_lines(arena: SeveralArenas) -> list[str]:
-    """One of several arenas as lines of a plan.
-
-    Args:
-        arena: the arena.
-    """
+    """The lines of one `[[arenas]]` table in a plan."""
     stated = arena.model_dump(exclude_none=True)
     return ["[[arenas]]", *(f"{key} = {toml_value(value)}" for key, value in stated.items())]
 
 
 def plans_folder() -> Path:
-    """Folder of the bundled plans: inside the package once installed, beside it in a clone."""
+    """Folder of the bundled plans: in the package if installed, next to it in a clone."""
     installed = _HERE / "pipelines" / "plans"
     return installed if installed.is_dir() else _HERE.parent / "pipelines" / "plans"
 
@@ -268,7 +263,7 @@ def _read(path: Path) -> str:
 
 
 def _settings() -> dict[str, Any]:
-    """Every setting, dotted, with the type it takes."""
+    """Type of every setting, by dotted name."""
     found: dict[str, Any] = {}
     for name, field in Plan.model_fields.items():
         if isinstance(field.annotation, type) and issubclass(field.annotation, Table):
@@ -280,7 +275,7 @@ def _settings() -> dict[str, Any]:
 
 
 def _value(dotted: str, text: str) -> Any:
-    """The value that a person typed after --set: as TOML, or as the plain word it is."""
+    """Value of a setting typed after --set: parsed as TOML, or the plain word."""
     try:
         value = parse_toml(f"value = {text}")["value"]
     except ValueError:
@@ -293,7 +288,7 @@ def _value(dotted: str, text: str) -> Any:
 
 
 def _unknown(dotted: str) -> str:
-    """What to say about a setting that does not exist: the nearest one that does."""
+    """Error message for an unknown setting, with the nearest existing one."""
     known = list(_settings())
     section, _, key = dotted.rpartition(".")
     tables = sorted({name.partition(".")[0] for name in known if "." in name})
@@ -310,9 +305,9 @@ def _nearest(word: str, known: list[str]) -> str:
 
 
 def _sentence(error: ValidationError) -> str:
-    """The first complaint, as one sentence that says what to do."""
+    """The first validation error as one sentence with advice."""
     first, *others = error.errors(include_url=False)
-    # pydantic names the kinds that a value may have, which are none of the plan's own words
+    # pydantic adds the names of alternative types, which do not occur in a plan
     words = [str(part) for part in first["loc"] if "[" not in str(part)]
     dotted = ".".join(word for word in words if word not in {"Region", "StatedFloor"})
     more = f" (and {len(others)} more)" if others else ""
@@ -342,10 +337,10 @@ def _comment(text: str) -> list[str]:
 
 
 def toml_value(value: Any) -> str:
-    """A value as TOML writes it. JSON's string escapes are TOML's, but for DEL.
+    """Format a value as TOML. JSON's string escapes are valid TOML except for DEL.
 
     Args:
-        value: of a setting: a table, list, text, number or bool.
+        value: a setting's table, list, text, number or bool.
     """
     if isinstance(value, Table):
         return toml_value(value.model_dump(exclude_none=True))

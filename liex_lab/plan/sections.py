@@ -18,7 +18,8 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator, model_valida
 Positive = Annotated[float, Field(gt=0)]
 Factor = Annotated[float, Field(gt=1e-3, lt=1e3)]
 N_PLACES = 5  # along the body, of liex_lab.estimation.session_shape
-# names of liex_lab.optics.camera, stated here for a plan is read before any library is there
+# names of liex_lab.optics.camera, repeated here because a plan is read before libraries are
+# imported
 CameraName = Literal["kinect-v2", "primesense", "azure-nfov", "femto-bolt", "d435", "raytrix-r5"]
 NotNegative = Annotated[float, Field(ge=0)]
 _SPECIES = "Latin name of its species, as Rattus norvegicus; not set: that of the animal's kind"
@@ -30,10 +31,10 @@ _DURATION = re.compile(r"P(?=\d)(\d+Y)?(\d+M)?(\d+W)?(\d+D)?|P\d+\.\d+[YMWD]")
 
 
 def known_species(species: str | None) -> str | None:
-    """A species as archives know it.
+    """Check a species name.
 
     Args:
-        species: its Latin name or its entry in NCBI's taxonomy; None is that of the animal's kind.
+        species: Latin name or entry in NCBI's taxonomy; None is that of the animal's kind.
 
     Raises:
         ValueError: it is neither.
@@ -44,10 +45,10 @@ def known_species(species: str | None) -> str | None:
 
 
 def whole_age(age: str | None) -> str | None:
-    """An age as ISO 8601 writes durations.
+    """An age as an ISO 8601 duration.
 
     Args:
-        age: as a person writes it (12 weeks), or as ISO 8601 does (P12W); None is unknown.
+        age: text such as 12 weeks, or an ISO 8601 duration (P12W); None if unknown.
 
     Raises:
         ValueError: it is neither.
@@ -62,24 +63,23 @@ def whole_age(age: str | None) -> str | None:
 
 
 def first_twice(names: Iterable[str]) -> str:
-    """The first name that occurs again in whatever case, which some file systems ignore, or ''."""
+    """The first name that occurs again, or ''; case is ignored, as on some file systems."""
     listed = list(names)
     counts = Counter(name.lower() for name in listed)
     return next((name for name in listed if counts[name.lower()] > 1), "")
 
 
 class Table(BaseModel):
-    """A table of settings.
+    """Base of the tables of settings.
 
-    It takes no unknown key and no value of another type, nor infinity or NaN, and is never changed
-    after it was made.
+    Tables are immutable and reject unknown keys, values of another type, infinity and NaN.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
 
 
 class SharedShape(Table):
-    """How wide and high an animal is, and where its joints lie, as session.json says it."""
+    """Widths and heights of an animal and offsets of its joints, as in session.json."""
 
     width: list[Factor] = Field(
         min_length=N_PLACES,
@@ -95,7 +95,7 @@ class SharedShape(Table):
 
 
 class SharedBody(Table):
-    """What the sessions of one animal found of it together."""
+    """Size and shape estimated from all sessions of one animal."""
 
     subject: str = Field(min_length=1, max_length=500, description="the animal")
     n_sessions: int = Field(ge=2, description="how many sessions found it")
@@ -115,7 +115,7 @@ class SharedBody(Table):
 
     @property
     def by(self) -> str:
-        """Who shares it, in words."""
+        """The sessions that share it, as text."""
         return f"{self.n_sessions} sessions of {self.subject}"
 
 
@@ -245,7 +245,7 @@ class WaterSurface(Table):
 
 
 class StatedFloor(Table):
-    """A floor that is stated: a point of the plane and its normal, camera frame."""
+    """A user-defined floor: a point of the plane and its normal, camera frame."""
 
     point: Annotated[list[float], Field(min_length=3, max_length=3)]
     normal: Annotated[list[float], Field(min_length=3, max_length=3)]
@@ -262,10 +262,10 @@ class Circle(Table):
 
 
 class Region(Table):
-    """Where an arena is in the picture: a polygon, a rectangle or a circle, in px or in mm.
+    """An arena's region in the image: a polygon, a rectangle or a circle, in px or in mm.
 
-    Millimetres are those of the floor: the arena's frame, with its origin below the camera, x along
-    the picture's rows and y up the picture. A bare list of corners is a polygon in pixels.
+    Millimetres are on the floor, in the arena frame: origin below the camera, x along image rows, y
+    towards the top of the image. A bare list of corners is a polygon in pixels.
     """
 
     polygon: list[Corner] | None = None
@@ -540,7 +540,7 @@ class Replay(Table):
     @field_validator("depth", mode="before")
     @classmethod
     def _in_words(cls, value: Any) -> Any:
-        """Plans of earlier versions said whether there was to be depth at all."""
+        """Accept booleans of earlier versions: whether depth is kept at all."""
         return {True: "all", False: "none"}[value] if isinstance(value, bool) else value
 
 

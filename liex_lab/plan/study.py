@@ -1,8 +1,7 @@
-"""Study file: which animals, in which groups, recorded in which sessions, measured by which plan.
+"""Study file: animals, groups, sessions and plans of a study.
 
-One small TOML file, validated by pydantic; names follow NeuroBlueprint (`sub-m01/ses-01`). The file
-names recordings and never leaves the folder it lies in: its recordings, plans and results are
-inside.
+One small TOML file, validated by pydantic; names follow NeuroBlueprint (`sub-m01/ses-01`). All its
+recordings, plans and results are inside the folder of the file.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ from liex_lab.plan.sections import ArenaName, Region, first_twice
 from liex_lab.runtime.places import named_beside
 from liex_lab.runtime.text_files import read_toml
 
-# as in NeuroBlueprint: letters and digits alone, so that no name is a path, a formula or markup
+# as in NeuroBlueprint: only letters and digits, so that no name is a path, a formula or markup
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9]{1,64}$")]
 SessionName = Annotated[
     str, Field(pattern=r"^[A-Za-z0-9]{1,32}(_[A-Za-z0-9]{1,32}-[A-Za-z0-9]{1,64}){0,6}$")
@@ -37,7 +36,7 @@ Settings = dict[str, Any]
 STUDY_FILE = "study.toml"
 RAW = "rawdata"
 DERIVED = "derivatives/liex-lab"
-# the session folder of one recording, as NeuroBlueprint calls what shows behaviour
+# NeuroBlueprint's name of the folder of behavioural data
 RESULTS = "behav"
 VIRTUAL = "synthetic:"
 _PATHS = (
@@ -80,11 +79,11 @@ class StudyAnimal(_Table):
 
 
 class StudyArena(_Table):
-    """One of several arenas in the pictures of the study's rig, a table [[arenas]].
+    """One of several arenas in the images of the study's rig, a table [[arenas]].
 
     Attributes:
-        name: of the arena, as sessions name it.
-        region: where it is in the picture, as arena.region of a plan says it.
+        name: the arena's name, as used by sessions.
+        region: its region in the image, as arena.region of a plan.
         set: settings of the plan for this arena, nested, such as its zones.
     """
 
@@ -100,10 +99,10 @@ class StudySession(_Table):
         animal: id of the animal.
         session: letters and digits, with key-value pairs after them, as in 01_date-20260821.
         recording: path below the study's folder, or address of a virtual recording.
-        plan: a bundled plan or a path below the study's folder; None takes the study's.
-        arena: which of the study's arenas the animal is in; empty where the picture shows one.
-        start_time: ISO 8601 with time zone; None takes what the recording says.
-        exclude: why the session is left out; empty where it is not.
+        plan: a bundled plan or a path below the study's folder; None uses the study's.
+        arena: the animal's arena, if the image shows several; else empty.
+        start_time: ISO 8601 with time zone; None uses the recording's.
+        exclude: reason for excluding the session; empty if included.
         set: settings of the plan for this session, nested.
     """
 
@@ -118,17 +117,16 @@ class StudySession(_Table):
 
 
 class StudyTable(_Table):
-    """The whole study file as it is written.
+    """The content of a study file.
 
     Attributes:
         name: the study's name.
         plan: a bundled plan or a path below the study's folder.
-        results: path below the study's folder that results go to.
-        shared: what the sessions of one animal share: 'subject', its size and shape; 'off',
-            nothing.
+        results: folder of the results, a path below the study's folder.
+        shared: what the sessions of one animal share: 'subject' (size and shape) or 'off'.
         set: settings of the plan for all sessions, nested.
         animals: the animals.
-        arenas: several arenas in one picture, each recorded with an animal of its own.
+        arenas: several arenas in one image, each with its own animal.
         sessions: the sessions.
     """
 
@@ -175,16 +173,16 @@ class StudyTable(_Table):
 
 @dataclass(frozen=True)
 class PlannedSession:
-    """One recording of the study with everything it is measured by.
+    """One session of the study with its resolved settings.
 
     Attributes:
         id: unique in the study, as in sub-m01_ses-01.
         animal: the animal.
         recording: a path, or the address of a virtual recording.
-        folder: where its results lie.
+        folder: folder of its results.
         plan: all settings, resolved.
-        exclude: why it is left out; empty where it is not.
-        remark: what session.json is to say of it besides; empty where there is nothing.
+        exclude: reason for excluding it; empty if included.
+        remark: an extra remark for session.json; may be empty.
     """
 
     id: str
@@ -197,7 +195,7 @@ class PlannedSession:
 
     @property
     def recording_exists(self) -> bool:
-        """Whether there is anything at the recording's place; a virtual recording always exists."""
+        """Whether the recording's file exists; True for a virtual recording."""
         return self.recording.startswith(VIRTUAL) or Path(self.recording).exists()
 
 
@@ -206,7 +204,7 @@ class Study:
     """A study file that was read.
 
     Attributes:
-        path: absolute path of the file; paths in it count from its folder.
+        path: absolute path of the file; its paths are relative to its folder.
         table: its content.
     """
 
@@ -224,14 +222,13 @@ class Study:
 
     @staticmethod
     def load(path: str | Path) -> Study:
-        """Read the study in a TOML file.
+        """Read a study from a TOML file.
 
         Args:
-            path: the file, or a folder that holds study.toml.
+            path: the file, or a folder that contains study.toml.
 
         Raises:
-            StudyError: there is no such file, or something in it cannot be used; one sentence says
-                what.
+            StudyError: the file does not exist or is invalid.
         """
         file = Path(path)
         if file.is_dir():
@@ -246,14 +243,14 @@ class Study:
 
     @staticmethod
     def from_table(table: dict[str, Any], path: Path) -> Study:
-        """The study in a nested dict, as TOML gives it.
+        """Validate a study from a nested dict, as parsed from TOML.
 
         Args:
             table: the content of a study file.
-            path: where its file is or would be.
+            path: path of the file, which need not exist.
 
         Raises:
-            StudyError: something in it cannot be used.
+            StudyError: the content is invalid.
         """
         try:
             study = Study(path.absolute(), StudyTable.model_validate(table))
@@ -275,15 +272,15 @@ class Study:
 
     @property
     def folder(self) -> Path:
-        """The folder that everything of the study is in."""
+        """The folder of the study."""
         return self.path.parent
 
     @property
     def results(self) -> Path:
-        """Where the sessions' folders go.
+        """Folder of the sessions' folders.
 
         Raises:
-            StudyError: that lies in rawdata, where nothing is written, or outside of the study.
+            StudyError: it is in rawdata, which is never written to, or outside the study.
         """
         found = self.inside(self.table.results, "results")
         raw = self.folder / RAW
@@ -296,26 +293,26 @@ class Study:
 
     @property
     def cohort_folder(self) -> Path:
-        """Where the tables of the whole study go."""
+        """Folder of the tables of the whole study."""
         return self.results / "cohort"
 
     @cached_property
     def sessions(self) -> tuple[PlannedSession, ...]:
-        """Every session of the file, in its order, with its plan resolved.
+        """Every session of the file, in order, with its plan resolved.
 
         Raises:
-            StudyError: a setting or a path cannot be used.
-            PlanError: a plan that is named cannot be used.
+            StudyError: a setting or a path is invalid.
+            PlanError: a named plan is invalid.
         """
         animals = {animal.id: animal for animal in self.table.animals}
         return tuple(self._planned(animals[one.animal], one) for one in self.table.sessions)
 
     def inside(self, text: str, what: str) -> Path:
-        """Full path of a path in the study file, which may not leave the study's folder.
+        """Full path of a path in the study file, which must stay in the study's folder.
 
         Args:
             text: the path as written, with / or backslashes.
-            what: what it is the path of, for the error message.
+            what: description of the path, for the error message.
 
         Raises:
             StudyError: the path is absolute, begins with ~ or a drive, or has a part '..'.
@@ -339,7 +336,7 @@ class Study:
         )
 
     def _plan(self, animal: StudyAnimal, one: StudySession, id: str) -> Plan:
-        """The plan with the settings of study, animal and session put in, in this order."""
+        """The plan with the settings of study, arena, animal and session applied, in this order."""
         named = one.plan or self.table.plan
         plan = Plan.load(named if named in known_plans() else self.inside(named, "plan"))
         facts: Settings = {"name": id, "individual": animal.id, "subject_id": animal.id}
@@ -376,11 +373,11 @@ class Study:
 
 
 def merged(table: Settings, settings: Settings) -> Settings:
-    """Nested settings put into others.
+    """Merge nested settings.
 
     Args:
         table: nested settings; not changed.
-        settings: those that overrule them where both have one.
+        settings: settings that override them.
     """
     out = dict(table)
     for key, value in settings.items():
@@ -392,7 +389,7 @@ def merged(table: Settings, settings: Settings) -> Settings:
 
 
 def _sentence(error: ValidationError) -> str:
-    """The first complaint, as one sentence that says what to do."""
+    """The first validation error as one sentence with advice."""
     first, *others = error.errors(include_url=False)
     more = f" (and {len(others)} more)" if others else ""
     where = "".join(

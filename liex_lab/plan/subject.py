@@ -1,9 +1,9 @@
-"""Which animal a recording shows, by what its metadata, its folders and its name say.
+"""Find the animal of a recording from its metadata, folders and file name.
 
-A name such as `m01_day1` holds an animal, an occasion (day, session, date, test) and often words
-that say nothing about either (`depth`, `copy`). `liex run` and `liex cohort init` find the animal
-by the same rules, and `liex compare` finds ids that differ by an occasion alone. Where a name
-could mean two things it is kept whole: two animals are never merged by cutting too much.
+A name such as `m01_day1` contains an animal, an occasion (day, session, date, test) and often words
+that identify neither (`depth`, `copy`). `liex run` and `liex cohort init` find the animal by the
+same rules, and `liex compare` finds ids that differ only by an occasion. An ambiguous name is kept
+whole: cutting too much would merge two animals.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ _TIME = (
     r"(?:Z|[+-]\d\d:?\d\d)?(?!-\d\d(?!\d)))?"
 )
 _START, _END = r"(?<![^\W_])", r"(?![^\W_])"  # of a word of letters and digits
-_AFTER = r"(?<=[^\W_][-_. ])"  # another word stands before it
+_AFTER = r"(?<=[^\W_][-_. ])"  # after another word
 _OCCASION = re.compile(
     rf"{_START}(?:(?:19|20)\d\d{_MD}{_TIME}"
     rf"|(?:19|20)\d\d([-_. ])(?:0?[1-9]|1[0-2])\1(?:0?[1-9]|[12]\d|3[01]){_TIME}"
@@ -49,14 +49,14 @@ _OCCASION = re.compile(
     re.IGNORECASE,
 )
 _SHORT_GLUED = re.compile(r"(?<=\d)[dsw]\d{1,3}$", re.IGNORECASE)  # as in m01d2, of ids only
-_SILENT = re.compile(  # what programs and cameras add
+_SILENT = re.compile(  # words added by programs and cameras
     rf"{_START}(?:depth|data|raw|rawdata|videos?|vid|movie|film|frames?|images?|pictures?|"
     r"cam(?:era)?|kinect|azure|realsense|d4\d\d|femto|orbbec|topdown|topview|moseq|proc|processed|"
     r"behav(?:iou?r)?|func|converted|compressed|output|exported|capture|copy(?: of)?|kopie|copie)"
     rf"(?:[-_ ]?\d)?{_END}|\(\d+\)",
     re.IGNORECASE,
 )
-_PLACES = re.compile(  # part of an animal's id at most, but no animal
+_PLACES = re.compile(  # part of an animal's id at most, never an animal by itself
     rf"{_START}(?:(?:group|grp|cohort|batch|cage|litter|experiment|exp|study|project|pilot|strain|"
     r"line|condition|cond|box|rig|room|arena|lab|setup|chamber|set)[-_ ]?(?:\d{1,3}|[a-z])?|"
     r"mouse|mice|rats?|animals?|subjects?|subj|fish|hand|default|unknown|unnamed|none|nan|null|na|"
@@ -89,9 +89,9 @@ class Subject:
     """The animal of a recording.
 
     Attributes:
-        id: its name, letters and digits; where nothing names it, the recording's whole name.
-        origin: metadata, folder or file name, which name it; empty where nothing does.
-        session: what else the path says, such as day1; empty for nothing.
+        id: its name, letters and digits; the recording's whole name if nothing names it.
+        origin: source of the name: metadata, folder or file name; empty if nothing names it.
+        session: the rest of the path's information, such as day1; may be empty.
     """
 
     id: str
@@ -100,13 +100,13 @@ class Subject:
 
 
 def find_subject(path: Path, stated: str = "", root: Path | None = None) -> Subject:
-    """The animal of a recording: by its metadata, a folder sub-NAME, another folder, its own name.
+    """Find the animal by metadata, a folder sub-NAME, another folder, or the recording's name.
 
     Args:
         path: the recording.
-        stated: the animal's name in the recording's metadata; empty where these state none.
-        root: the names from this folder on count. None: from `rawdata` or a study file's folder on,
-            and where there is neither, those that look like an animal's tag, such as m01.
+        stated: the animal's name in the recording's metadata; may be empty.
+        root: folder from which names count. None: from `rawdata` or a study file's folder on, or
+            without either, folders that look like an animal's tag, such as m01.
     """
     whole = path.absolute()
     studies = (one for one in whole.parents if one.name == RAW or (one / STUDY_FILE).is_file())
@@ -131,7 +131,7 @@ def find_subject(path: Path, stated: str = "", root: Path | None = None) -> Subj
 
 
 def _session(names: Sequence[str], animal: str) -> str:
-    """What names say besides the animal, in short."""
+    """A short text of what names contain besides the animal."""
     pieces: list[str] = []
     for name in names:
         if name.lower().startswith("ses-"):
@@ -152,7 +152,7 @@ def _tags_above(whole: Path) -> list[str]:
 
 
 def animal_part(name: str) -> str:
-    """A name without its occasions and the words that say nothing.
+    """A name without its occasions and uninformative words.
 
     Args:
         name: such as m01_day1_depth.
@@ -161,7 +161,7 @@ def animal_part(name: str) -> str:
 
 
 def _split(name: str) -> tuple[str, list[str]]:
-    """A name without occasions and words that say nothing, and the occasions."""
+    """A name without occasions and uninformative words, and the occasions."""
     bare = re.sub("^sub-", "", name, flags=re.IGNORECASE)
     text = re.sub(r"[-_., ]{2,}", "_", _SILENT.sub("", bare))
     occasions = [match[0] for match in _OCCASION.finditer(text)]
@@ -174,7 +174,7 @@ def _split(name: str) -> tuple[str, list[str]]:
 
 
 def strength(text: str) -> float:
-    """How surely a name without its occasions names an animal: 0 not at all, 3 as m01 does.
+    """How clearly a name without its occasions names an animal: 0 not at all, 3 as m01 does.
 
     Args:
         text: such as m01, A12 or Bella.
@@ -189,10 +189,7 @@ def strength(text: str) -> float:
 
 
 def letters(text: str) -> str:
-    """Letters and digits for a name, the same for the same name; two names rarely share them.
-
-    Args:
-        text: any text.
+    """An alphanumeric form of a name; collisions are rare.
 
     Returns:
         At most 64 of a to z, A to Z and 0 to 9.
@@ -207,9 +204,9 @@ def letters(text: str) -> str:
 
 
 def same(text: str) -> str:
-    """What a name and its other spellings share: capitals, spaces, _ and - do not count.
+    """A key shared by spellings of a name that differ only in case, spaces, _ or -.
 
-    Between two digits they do: 1-12 and 11-2 are two names.
+    Separators between two digits count: 1-12 and 11-2 are two names.
 
     Args:
         text: the name of an animal, group or cage.
@@ -219,7 +216,7 @@ def same(text: str) -> str:
 
 
 def alike(names: Iterable[str]) -> list[list[str]]:
-    """Names that differ in capitals, spaces, _ or - alone, the most frequent spelling first.
+    """Names that differ only in case, spaces, _ or -, the most frequent spelling first.
 
     Args:
         names: each as often as it occurs.
@@ -231,10 +228,10 @@ def alike(names: Iterable[str]) -> list[list[str]]:
 
 
 def one_animal(ids: Iterable[str]) -> list[list[str]]:
-    """Ids that differ by an occasion alone, such as m01day1 and m01day2, or are nothing else.
+    """Ids that differ only by an occasion, such as m01day1 and m01day2, or consist only of one.
 
     Args:
-        ids: of animals that are taken for different ones.
+        ids: ids that are treated as different animals.
     """
 
     def bare(id: str) -> str:
@@ -247,9 +244,5 @@ def one_animal(ids: Iterable[str]) -> list[list[str]]:
 
 
 def references_first(groups: Iterable[str]) -> list[str]:
-    """Groups in order of their names, those named like a control group first.
-
-    Args:
-        groups: names of groups.
-    """
+    """Sorted names of groups, with those named like a control group first."""
     return sorted(set(groups), key=lambda name: (_REFERENCE.search(name) is None, name))

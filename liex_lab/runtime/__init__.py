@@ -1,1 +1,1 @@
-"""Running on a machine: memory and memory-mapped arrays, threads, prefetching, progress."""
+"""Runtime support: memory, memory-mapped arrays, threads, prefetching, progress, durable files."""

@@ -1,9 +1,9 @@
-"""Folders put in place of older ones so that neither a kill nor a power cut loses both.
+"""Atomic, durable replacement of files and folders, file locks, and temporary folders.
 
-A file that was written is on disk only once it is synchronised (fsync), and a rename only once the
-folder that it happened in is. Systems write the two in any order: a folder renamed into place may
-have empty files in it after a power cut. So what is new is synchronised before it is renamed, and
-what was there before goes only when the rename is on disk, too.
+A written file is on disk only once it is synchronised (fsync), and a rename only once its parent
+folder is. Systems may write the two in any order: a folder that was renamed may contain empty files
+after a power cut. New content is therefore synchronised before the rename, and the old content is
+removed only when the rename is on disk.
 """
 
 from __future__ import annotations
@@ -22,21 +22,19 @@ from typing import IO
 from liex_lab.errors import LiexError, SessionError
 from liex_lab.runtime.places import unlinked
 
-# shares and file systems on which this cannot be asked for
+# errors of network shares and file systems that do not support fsync
 _NOT_HERE = {errno.EINVAL, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS}
-_AT_ONCE = 8  # files that wait for the disk together: it serves them in one go
+_AT_ONCE = 8  # files synchronised in parallel; the disk handles them in one go
 
 
 def sync_tree(folder: Path) -> None:
-    """Synchronise every regular file in a folder to disk, and then every folder in it and itself.
+    """Synchronise all regular files in a folder, then its subfolders and the folder itself.
 
-    Several wait for the disk side by side, which takes a tenth of the time. Links are not followed.
-
-    Args:
-        folder: the folder.
+    Several files are synchronised in parallel, which takes a tenth of the time. Links are not
+    followed.
 
     Raises:
-        OSError: the disk is full or broken, so that what was written is not on it.
+        OSError: the disk is full or broken; the content is not on disk.
     """
     files: list[Path] = []
     folders: list[Path] = []
@@ -51,9 +49,6 @@ def sync_tree(folder: Path) -> None:
 def sync_file(file: Path) -> None:
     """Synchronise the content of a file to disk.
 
-    Args:
-        file: the file.
-
     Raises:
         OSError: the disk is full or broken.
     """
@@ -61,12 +56,9 @@ def sync_file(file: Path) -> None:
 
 
 def sync_folder(folder: Path) -> None:
-    """Synchronise the entries of a folder to disk: which names there are in it.
+    """Synchronise a folder's list of entries to disk.
 
     Does nothing on Windows, which cannot open folders.
-
-    Args:
-        folder: the folder.
 
     Raises:
         OSError: the disk is broken.
@@ -77,21 +69,22 @@ def sync_folder(folder: Path) -> None:
 
 @contextmanager
 def replacing(path: Path, replace_folder: bool = False) -> Iterator[Path]:
-    """A name beside a place to write a file or folder under; it gets its place when it is whole.
+    """Yield a temporary path to write to; it replaces `path` when the block ends without an error.
 
-    What was written is synchronised to disk before it is renamed: after a kill or a power cut the
-    place holds what was there before, or all of the new. If the block fails, nothing stays.
+    The content is synchronised to disk before the rename: after a kill or a power cut, `path` has
+    either its old or its complete new content. If the block fails, the temporary file or folder is
+    removed.
 
     Args:
-        path: the place. A symbolic link there is refused and never followed.
-        replace_folder: whether a folder may be there, which goes for the new one.
+        path: the file or folder to replace. A symbolic link is refused and never followed.
+        replace_folder: whether an existing folder may be replaced.
 
     Yields:
-        The name to write under; nothing is there.
+        The temporary path, which does not exist yet.
 
     Raises:
-        PlaceError: a symbolic link lies at the place.
-        OSError: it cannot be written, synchronised or renamed.
+        PlaceError: `path` is a symbolic link.
+        OSError: writing, synchronising or renaming failed.
     """
     part = unlinked(path).with_name(f".{os.getpid()}.{path.name}")
     _remove(part)
@@ -108,43 +101,39 @@ def replacing(path: Path, replace_folder: bool = False) -> Iterator[Path]:
             sync_folder(path.parent)
     except OSError as error:
         if error.filename is None:
-            error.filename = str(path)  # writing does not tell what was written
+            error.filename = str(path)  # errors of write calls do not name the file
         raise
     finally:
         _remove(part)
 
 
 def write_whole(path: Path, text: str) -> None:
-    """Write a text file atomically, so that nobody ever reads half of it.
+    """Write a text file (UTF-8) atomically; an existing file is replaced.
 
-    It is written under another name beside its place, synchronised to disk and renamed. After a
-    power cut it is the old one or the new one.
-
-    Args:
-        path: the file; one that is there is replaced.
-        text: its content, written as UTF-8.
+    The text is written to a temporary file, synchronised to disk and renamed. After a power cut the
+    file has either its old or its new content.
     """
     with replacing(path) as part:
         part.write_text(text, encoding="utf-8")
 
 
 def put_in_place(new: Path, place: Path, aside: Path) -> None:
-    """Rename a folder into place; the one that was there goes when the new one is safe on disk.
+    """Rename a folder to its final path; the old one is removed when the new one is safe on disk.
 
-    All three lie in the same folder. Killed at any point, either `place` is whole, or it is missing
-    and `aside` is whole, which `put_back` mends.
+    All three paths are in the same parent folder. After a kill at any point, either `place` is
+    complete, or it is missing and `aside` is complete, which `put_back` restores.
 
     Args:
-        new: the folder that was written; synchronised here.
-        place: where it is to be.
-        aside: where the folder that is there waits until then.
+        new: the new folder; synchronised here.
+        place: the final path.
+        aside: where the old folder is kept until then.
 
     Raises:
-        OSError: it could not be done; what was there before is there again.
+        OSError: the rename failed; the old folder was restored.
     """
     sync_tree(new)
     if place.exists():
-        sync_folder(place.parent)  # a folder that waits there has its replacement in place
+        sync_folder(place.parent)  # the replacement of an older folder in `aside` is on disk
         discard(aside)
         place.rename(aside)
     try:
@@ -157,14 +146,14 @@ def put_in_place(new: Path, place: Path, aside: Path) -> None:
 
 
 def put_back(place: Path, aside: Path) -> bool:
-    """Rename back what `put_in_place` had put aside when it was killed.
+    """Restore the folder that an interrupted `put_in_place` moved aside.
 
     Args:
-        place: where the folder was.
-        aside: where it may wait.
+        place: the final path.
+        aside: where the old folder may be.
 
     Returns:
-        Whether it was renamed; not where something is in the place.
+        Whether it was restored; False if `place` exists.
 
     Raises:
         OSError: it cannot be renamed.
@@ -177,13 +166,10 @@ def put_back(place: Path, aside: Path) -> bool:
 
 
 def discard(folder: Path) -> None:
-    """Remove a folder that nobody needs, so that no part of it is ever taken for the whole.
+    """Remove a folder, so that a half-removed one is never mistaken for a complete one.
 
-    It loses its name first. What cannot be removed stays under the other name, NAME.gone, and goes
-    the next time.
-
-    Args:
-        folder: the folder; it need not be there.
+    It is first renamed to NAME.gone. What cannot be removed stays under that name until the next
+    call. A missing folder is no error.
 
     Raises:
         OSError: it cannot be renamed.
@@ -196,7 +182,7 @@ def discard(folder: Path) -> None:
 
 
 def _remove(path: Path) -> None:
-    """Remove a file, a link or a folder, where one is there."""
+    """Remove a file, link or folder, if it exists."""
     if path.is_dir() and not path.is_symlink():
         shutil.rmtree(path, ignore_errors=True)
     else:
@@ -204,9 +190,7 @@ def _remove(path: Path) -> None:
 
 
 def _side_by_side(sync: Callable[[Path], None], paths: Sequence[Path]) -> None:
-    """Synchronise several files or folders; what goes wrong with one is raised, and the rest is not
-    waited for.
-    """
+    """Synchronise several files or folders in parallel; raises the first error without waiting."""
     pool = ThreadPoolExecutor(_AT_ONCE)
     try:
         for done in [pool.submit(sync, path) for path in paths]:
@@ -234,20 +218,16 @@ _NO_LINKS = getattr(os, "O_NOFOLLOW", 0)
 
 
 def take_lock(path: Path) -> IO[bytes] | None:
-    """Lock a file, which is made if needed; None where another process holds it.
+    """Lock a file, creating it if needed; None if another process holds the lock.
 
-    A folder that was renamed or removed in between is no longer the one that was asked for: None,
-    too.
-
-    Args:
-        path: the lock file.
+    Also None if its folder was renamed or removed in the meantime.
 
     Returns:
         The open file; closing it releases the lock.
 
     Raises:
-        PlaceError: a symbolic link lies there.
-        OSError: the file cannot be made.
+        PlaceError: the path is a symbolic link.
+        OSError: the file cannot be created.
     """
     opened = os.open(unlinked(path), os.O_WRONLY | os.O_CREAT | os.O_APPEND | _NO_LINKS, 0o666)
     file = os.fdopen(opened, "ab")
@@ -268,10 +248,10 @@ def locked(path: Path, held: str) -> Iterator[None]:
 
     Args:
         path: the lock file.
-        held: half a sentence for the error, such as 'the study is being measured'.
+        held: the start of the error message, such as 'the study is being measured'.
 
     Raises:
-        SessionError: another process holds it.
+        SessionError: another process holds the lock.
     """
     file = take_lock(path)
     if file is None:
@@ -279,7 +259,7 @@ def locked(path: Path, held: str) -> Iterator[None]:
     try:
         yield
     finally:
-        if sys.platform != "win32":  # there, a file in use cannot go
+        if sys.platform != "win32":  # Windows cannot remove a file in use
             path.unlink(missing_ok=True)
         file.close()
         if sys.platform == "win32":
@@ -288,7 +268,7 @@ def locked(path: Path, held: str) -> Iterator[None]:
 
 
 def _lock(file: IO[bytes]) -> None:
-    """Lock an open file without waiting. Raises OSError where another process holds it."""
+    """Lock an open file without waiting. Raises OSError if another process holds the lock."""
     if sys.platform == "win32":
         import msvcrt
 
@@ -308,29 +288,25 @@ _LOCK = ".lock"
 
 
 class Scratch:
-    """A new temporary folder, below TMPDIR; those of dead processes are removed before.
-
-    Attributes:
-        folder: the folder.
-    """
+    """A new temporary folder in TMPDIR; folders of dead processes are removed first."""
 
     def __init__(self) -> None:
         remove_stale()
         held: IO[bytes] | None = None
-        while held is None:  # somebody who removes stale ones may be faster
+        while held is None:  # another process may remove it as stale
             self.folder = Path(tempfile.mkdtemp(prefix=_PREFIX))
             with suppress(FileNotFoundError):
                 held = take_lock(self.folder / _LOCK)
         self._held = held
 
     def close(self) -> None:
-        """Remove the folder with all that is in it."""
+        """Remove the folder and its contents."""
         self._held.close()
         shutil.rmtree(self.folder, ignore_errors=True)
 
 
 def remove_stale() -> None:
-    """Remove this account's temporary folders whose processes are no more.
+    """Remove this account's temporary folders whose processes have ended.
 
     A process may be killed before it has locked its folder, or while it removes it.
     """
@@ -345,5 +321,5 @@ def remove_stale() -> None:
 
 
 def _own(folder: Path) -> bool:
-    """Whether a folder is this account's."""
+    """Whether this account owns a folder."""
     return not hasattr(os, "getuid") or folder.stat().st_uid == os.getuid()

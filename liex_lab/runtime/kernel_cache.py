@@ -1,8 +1,8 @@
-"""A place for compiled kernels where the account can write to neither the package nor a home.
+"""Fallback cache folder for compiled kernels if neither the package nor the home is writable.
 
-numba keeps machine code beside the package or in the home's cache and does not start without
-either, as in a container or for a service's account. What is loaded from a cache is run, so a
-folder in a shared TMPDIR is taken only where it is this account's own and nobody else can write it.
+numba caches machine code next to the package or in the home's cache and does not start without
+either, as in a container or for a service account. Cached code is executed, so a folder in a shared
+TMPDIR is used only if this account owns it and nobody else can write to it.
 """
 
 from __future__ import annotations
@@ -13,14 +13,14 @@ import sys
 from pathlib import Path
 
 VARIABLE = "NUMBA_CACHE_DIR"
-_ROOM = Path(__file__).resolve().parents[1] / "scene"  # one of those with kernels
+_ROOM = Path(__file__).resolve().parents[1] / "scene"  # one of the packages with kernels
 
 
 def keep_kernels() -> str:
-    """See to it that numba finds a place for compiled kernels.
+    """Ensure that numba has a writable cache folder.
 
     Returns:
-        A sentence where it is a temporary one; "" where nothing had to be done.
+        A message if the folder is temporary or missing; "" if nothing had to be done.
     """
     stated = os.environ.get(VARIABLE)
     places = [Path(stated)] if stated else [_ROOM / "__pycache__", _home_cache()]
@@ -44,7 +44,7 @@ def keep_kernels() -> str:
 
 
 def _home_cache() -> Path:
-    """Where numba looks in a home, or a folder on the way to it."""
+    """Folder of numba's cache in the home; a path that cannot exist if there is no home."""
     try:
         return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "numba"
     except RuntimeError:  # there is no home
@@ -52,7 +52,7 @@ def _home_cache() -> Path:
 
 
 def _writable(place: Path) -> bool:
-    """Whether a folder can be written or made."""
+    """Whether a folder is writable or can be created."""
     try:
         there = next(folder for folder in (place, *place.parents) if folder.exists())
         return there.is_dir() and os.access(there, os.W_OK | os.X_OK)
@@ -61,7 +61,7 @@ def _writable(place: Path) -> bool:
 
 
 def _temporary() -> Path | None:
-    """This account's own folder below TMPDIR; None where there can be none."""
+    """This account's own folder in TMPDIR; None if it cannot be created."""
     import tempfile
 
     try:

@@ -1,8 +1,7 @@
-"""Memory of a process: its peak, and disk-backed arrays (memory maps) that rest while not in use.
+"""Process memory: peak use, memory-mapped arrays on disk, archive size checks, system limits.
 
-Arrays that lie on disk let hours of recording take no more memory than minutes. Whoever works on
-long columns goes through them by `blocks`: after each block the pages of all arrays on disk are
-given back, so nobody else need think of memory.
+With arrays on disk, hours of recording take no more memory than minutes. Code that processes long
+columns iterates with `blocks`, which releases the pages of all arrays on disk after each block.
 """
 
 from __future__ import annotations
@@ -30,23 +29,20 @@ from liex_lab.errors import LiexError
 
 _ZEROS = 1 << 20  # bytes written at once
 _FULL = (errno.ENOSPC, getattr(errno, "EDQUOT", errno.ENOSPC))
-# the maps of all arrays on disk that are in use, and what guards them
+# memory maps of all arrays on disk in use, and their lock
 _maps: weakref.WeakSet[mmap.mmap] = weakref.WeakSet()
 _lock = threading.Lock()
 Allocator = Callable[
     [tuple[int, ...], Any], NDArray[Any]
-]  # shape and dtype -> an array to be filled, as np.empty
+]  # shape and dtype -> an uninitialised array, as np.empty
 
 
 def peak_memory_mb() -> float | None:
-    """The most memory this process has held, MB; None where the system does not tell.
+    """Peak memory of this process, MB; None if the system does not report it.
 
-    VmHWM of /proc/self/status, else getrusage, which would also count the process that started this
-    one.
+    VmHWM of /proc/self/status, else getrusage, which also counts the parent process.
     """
-    status = Path(
-        "/proc/self/status"
-    )  # getrusage would also count the process that started this one
+    status = Path("/proc/self/status")  # getrusage would also count the parent process
     if status.is_file():
         for line in status.read_text().splitlines():
             if line.startswith("VmHWM:"):
@@ -60,10 +56,10 @@ def peak_memory_mb() -> float | None:
 
 
 def rest() -> None:
-    """Hand memory that is not in use back to the system: pages of arrays on disk, and free heap.
+    """Return unused memory to the system: pages of arrays on disk, and free heap.
 
-    The heap would be kept for later otherwise: glibc keeps what lies between arrays still in use,
-    and Arrow what tables took; after hours of recording it is much.
+    Otherwise glibc keeps the gaps between arrays in use, and Arrow keeps the memory of tables;
+    after hours of recording this is a lot.
     """
     _release_pages()
     if "pyarrow" in sys.modules:
@@ -78,10 +74,10 @@ def rest() -> None:
 
 @contextmanager
 def uncollected() -> Iterator[None]:
-    """Within the block Python's collector of garbage is off, where it was on.
+    """Switch Python's garbage collector off within the block, if it was on.
 
-    For what makes many small objects at once, as imports and figures do: they would be gone
-    through again and again meanwhile.
+    For code that creates many small objects, such as imports and figures, which the collector would
+    scan repeatedly.
     """
     was_on = gc.isenabled()
     gc.disable()
@@ -93,26 +89,24 @@ def uncollected() -> Iterator[None]:
 
 
 def on_disk(folder: Path) -> Allocator:
-    """An array allocator whose arrays lie in nameless files and go with their last user.
+    """Make an array allocator that uses unnamed temporary files, freed with their last reference.
 
-    In memory where files of that disk cannot be mapped, as on some shares. Making an array raises
-    OSError where the disk is full, so that filling it cannot fail.
+    Arrays are in memory if files on that disk cannot be mapped, as on some network shares.
+    Allocation raises OSError if the disk is full, so that filling an array cannot fail.
 
     Args:
-        folder: on the disk that is to hold the arrays.
+        folder: a folder on the disk to use.
 
     Returns:
-        A function of shape and dtype that gives an array to be filled, as np.empty.
+        A function of shape and dtype that returns an uninitialised array, as np.empty.
     """
 
     def allocate(shape: tuple[int, ...], dtype: Any) -> NDArray[Any]:
-        """An array of this shape and dtype in a nameless file; OSError where the disk is full."""
+        """An array of this shape and dtype in an unnamed file; OSError if the disk is full."""
         size = int(np.prod(shape)) * np.dtype(dtype).itemsize
         if not size:
             return np.empty(shape, dtype)
-        if (
-            size > shutil.disk_usage(folder).free
-        ):  # asking for the room would take all there is before it fails
+        if size > shutil.disk_usage(folder).free:  # reserving would fill the disk before it fails
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(folder))
         try:
             with tempfile.TemporaryFile(dir=folder) as file:
@@ -127,20 +121,20 @@ def on_disk(folder: Path) -> Allocator:
 
 
 def mapped(path: Path, dtype: np.dtype[Any]) -> NDArray[Any]:
-    """The numbers in a file, read when they are looked at; they rest like arrays of `on_disk`.
+    """Memory-map the numbers in a file; pages are released like those of `on_disk`.
 
     Args:
-        path: the file, which is not empty.
-        dtype: of its numbers.
+        path: a non-empty file.
+        dtype: dtype of its numbers.
 
     Returns:
-        (n,) not to be written to: what is written would be lost.
+        (n,) copy-on-write: changes are not written to the file.
     """
     return _registered(np.memmap(path, dtype, "c"))
 
 
 def _registered(array: NDArray[Any]) -> NDArray[Any]:
-    """A plain array of a map, whose pages are released from now on when others rest."""
+    """A plain array of a memory map, registered for `_release_pages`."""
     base: Any = array
     while not isinstance(base, mmap.mmap):
         base = base.base
@@ -150,7 +144,7 @@ def _registered(array: NDArray[Any]) -> NDArray[Any]:
 
 
 def _release_pages() -> None:
-    """Release the pages of all arrays on disk; they are read again when wanted."""
+    """Release the pages of all arrays on disk; they are read again on access."""
     if sys.platform != "linux":
         return
     with _lock:
@@ -160,7 +154,7 @@ def _release_pages() -> None:
 
 
 def _reserve(file: IO[bytes], size: int) -> None:
-    """Take so many bytes of the disk for a new file. Raises OSError where it has not as many."""
+    """Reserve disk space for a new file, bytes. Raises OSError if there is not enough."""
     if hasattr(os, "posix_fallocate"):
         os.posix_fallocate(file.fileno(), 0, size)
         return
@@ -170,14 +164,14 @@ def _reserve(file: IO[bytes], size: int) -> None:
 
 
 def blocks(n: int, size: int) -> Iterator[slice]:
-    """Consecutive blocks of the rows of something long, as slices; what lies on disk then rests.
+    """Iterate over rows in consecutive blocks, as slices, releasing memory after each.
 
     After each block the pages of all arrays on disk are released (see `on_disk`, `mapped`), and
-    after several the heap is trimmed, too.
+    after the last of several the heap is trimmed.
 
     Args:
-        n: rows.
-        size: rows of a block; the last has fewer.
+        n: number of rows.
+        size: rows per block; the last may have fewer.
     """
     for start in range(0, n, size):
         yield slice(start, min(start + size, n))
@@ -186,7 +180,7 @@ def blocks(n: int, size: int) -> Iterator[slice]:
         rest()
 
 
-# Bounds of a NumPy archive (.npz) from somewhere else, checked before any of it is unpacked.
+# Size limits of a NumPy archive (.npz) of unknown origin, checked before it is unpacked.
 
 
 _HEADS = {
@@ -196,15 +190,15 @@ _HEADS = {
 
 
 def check_npz(source: Path | IO[bytes], most_bytes: int) -> None:
-    """Check that an .npz holds arrays of plain numbers, and no more of them than it may.
+    """Check that an .npz contains only arrays of plain numbers, within a size limit.
 
     Args:
         source: the file.
-        most_bytes: bytes of all arrays together.
+        most_bytes: largest total size of all arrays, bytes.
 
     Raises:
-        ValueError: it holds more, an array is larger than its part of the file, or it is no
-            archive of arrays.
+        ValueError: it is larger, an array's header claims more bytes than its entry has, or it is
+            not an archive of arrays.
     """
     try:
         with zipfile.ZipFile(source) as archive:
@@ -225,7 +219,7 @@ def check_npz(source: Path | IO[bytes], most_bytes: int) -> None:
 
 
 def _check_array(file: IO[bytes], entry: zipfile.ZipInfo) -> None:
-    """Raises ValueError where an array's header claims another size than its file has."""
+    """Raises ValueError if an array's header claims more bytes than its entry has."""
     version = np.lib.format.read_magic(file)
     if version not in _HEADS:
         raise ValueError(f"{entry.filename} has a header of an unknown kind")
@@ -236,11 +230,11 @@ def _check_array(file: IO[bytes], entry: zipfile.ZipInfo) -> None:
         raise ValueError(f"{entry.filename} claims {shape} numbers, more than there are")
 
 
-# What the system gives a process: memory, threads and open files, and which errors say that it
-# gives no more.
+# System resources of a process (memory, threads, open files) and the errors that report their
+# exhaustion.
 
 
-# addresses that a run takes up, most of them never used: below that libraries end the process
+# address space of a run, most of it never used: with less, libraries abort the process
 _LEAST_GB = 4.5
 _MEMORY = (
     "cannot allocate",
@@ -264,10 +258,10 @@ _FILES = (errno.EMFILE, errno.ENFILE)
 
 
 def why_short(error: BaseException | None) -> str:
-    """What the system gives no more of, and what to do; empty where an error does not say so.
+    """The resource that the system has run out of, with advice; "" if an error has another cause.
 
     Args:
-        error: any error, with those that it was raised from; None for none.
+        error: any error, inspected with its causes; None for none.
     """
     asked: set[int] = set()
     while error is not None and id(error) not in asked:
@@ -283,14 +277,14 @@ def why_short(error: BaseException | None) -> str:
 
 
 def check_limits() -> None:
-    """Refuse to begin where this process may take up too few addresses (`ulimit -v`).
+    """Check that the address space limit (`ulimit -v`) is large enough for a run.
 
     Raises:
-        LiexError: it is so.
+        LiexError: the limit is too small.
     """
     try:
         import resource
-    except ImportError:  # Windows knows no such limit
+    except ImportError:  # Windows has no such limit
         return
     limit = resource.getrlimit(resource.RLIMIT_AS)[0]
     if limit != resource.RLIM_INFINITY and limit < _LEAST_GB * 2**30:

@@ -1,9 +1,8 @@
-"""The one door for places that are written to: a folder that the user named, and a name made safe.
+"""Safe output paths: file names from foreign text, symbolic links, full disks, long writes.
 
-A name that was read from a file (the id of a session, a joint, a topic) is text and never a path.
-`inside` makes one file name of it that every file system takes, and that stays in its folder. What
-lies in an output folder may be somebody else's doing: a symbolic link there is refused and never
-written through, nor is a file behind it changed.
+A name that was read from a file (session id, joint, topic) is text and never a path. `inside` turns
+it into a single file name that is valid on every file system and stays in its folder. The contents
+of an output folder are not trusted: symbolic links are refused and never written through.
 """
 
 from __future__ import annotations
@@ -21,29 +20,29 @@ from typing import IO, Any
 from liex_lab.errors import PlaceError
 
 _NOT_IN_NAMES = set('/\\:*?"<>|')
-_UNSEEN = {"Cc", "Cf", "Cs", "Co", "Cn", "Zl", "Zp"}  # Unicode's classes: control, surrogate ...
-_RESERVED = {"CON", "PRN", "AUX", "NUL", "CONIN$", "CONOUT$"}  # names of devices on Windows
+_UNSEEN = {"Cc", "Cf", "Cs", "Co", "Cn", "Zl", "Zp"}  # Unicode categories: control, surrogate ...
+_RESERVED = {"CON", "PRN", "AUX", "NUL", "CONIN$", "CONOUT$"}  # device names on Windows
 _RESERVED |= {f"{port}{digit}" for port in ("COM", "LPT") for digit in "0123456789¹²³"}
-_MOST_BYTES = 180  # of a name without its ending: file systems take 255, parts of files add some
+_MOST_BYTES = 180  # of a name without its ending: file systems allow 255, some suffixes are added
 
 
 def safe_name(text: str, ending: str = "") -> str:
-    """One file name made of a text, whatever it holds.
+    """A valid file name for any text.
 
     Args:
-        text: any text, such as the id of a session or what a recording calls itself.
-        ending: what the name ends with, such as '.liex'; of the program's own making.
+        text: any text, such as a session id or a recording's title.
+        ending: suffix of the name, such as '.liex'; must be valid.
 
     Returns:
-        The text and the ending, where the text can be a name on Linux, macOS and Windows. Else
-        what cannot stand in a name is replaced by _, what is too long is cut, and eight
-        hexadecimal digits of the text's SHA-256 follow, so that two texts never share a name.
+        The text and the ending if the text is valid as a name on Linux, macOS and Windows.
+        Otherwise invalid characters are replaced by _, long text is cut, and eight hexadecimal
+        digits of the text's SHA-256 are appended, so that two texts never share a name.
     """
     name = "".join(
         "_" if c in _NOT_IN_NAMES or unicodedata.category(c) in _UNSEEN else c for c in text
     )
     name = name.strip(" ")
-    if name[:1] in (".", "-"):  # hidden, or taken for an option
+    if name[:1] in (".", "-"):  # hidden, or mistaken for an option
         name = f"_{name[1:]}"
     name = name.rstrip(". ")
     if name.partition(".")[0].rstrip(" ").upper() in _RESERVED:
@@ -57,33 +56,34 @@ def safe_name(text: str, ending: str = "") -> str:
 
 
 def inside(folder: Path, text: str, ending: str = "") -> Path:
-    """Where something with a name of foreign text is written in a folder.
+    """Path in a folder for a file that is named after foreign text.
 
     Args:
         folder: the folder that the user named.
         text: any text, see `safe_name`.
-        ending: what the name ends with.
+        ending: suffix of the name.
 
     Returns:
-        A path right in the folder.
+        A path directly in the folder.
 
     Raises:
-        PlaceError: a symbolic link lies there.
+        PlaceError: the path is a symbolic link.
     """
     return unlinked(folder / safe_name(text, ending))
 
 
 def unlinked(path: Path) -> Path:
-    """The path of a file or folder that is written, where it is no symbolic link.
+    """Check that a path to be written is not a symbolic link.
 
     Args:
-        path: the path; nothing need be there. Links above it, which the user named, are followed.
+        path: the path, which need not exist. Links among its parents, which the user named, are
+            followed.
 
     Returns:
         The same path.
 
     Raises:
-        PlaceError: a symbolic link lies there.
+        PlaceError: the path is a symbolic link.
     """
     if path.is_symlink():
         raise PlaceError(
@@ -94,17 +94,17 @@ def unlinked(path: Path) -> Path:
 
 
 def unlinked_below(root: Path, path: Path) -> Path:
-    """The path of something below a folder, where nothing on the way to it is a symbolic link.
+    """Check that no part of a path below a folder is a symbolic link.
 
     Args:
-        root: the folder that the user named; it may be a link itself.
+        root: the folder that the user named; may itself be a link.
         path: a path below it.
 
     Returns:
         The same path.
 
     Raises:
-        PlaceError: a symbolic link lies on the way, or the path leaves the folder.
+        PlaceError: a part is a symbolic link, or the path leaves the folder.
     """
     parts = Path(os.path.abspath(path)).parts
     above = Path(os.path.abspath(root)).parts
@@ -118,10 +118,10 @@ def unlinked_below(root: Path, path: Path) -> Path:
 
 
 def unlinked_tree(folder: Path) -> Path:
-    """A folder that is written into again, where neither it nor anything in it is a symbolic link.
+    """Check that neither a folder nor anything in it is a symbolic link.
 
     Args:
-        folder: the folder; it need not be there.
+        folder: the folder, which need not exist.
 
     Returns:
         The same folder.
@@ -136,26 +136,23 @@ def unlinked_tree(folder: Path) -> Path:
 
 
 def storable(text: str) -> str:
-    """A text as files can hold it, such as a name that the system does not give as Unicode.
-
-    Args:
-        text: any text.
+    """A text that can be written to files, such as a name that is not valid Unicode.
 
     Returns:
-        The text; NUL and halves of characters are the replacement character.
+        The text, with NUL and lone surrogates replaced by U+FFFD.
     """
     raw = text.replace("\0", "\ufffd").encode("utf-16", "surrogatepass")
     return raw.decode("utf-16", "replace")
 
 
 def storable_document(content: Any) -> Any:
-    """A document as files can hold it.
+    """A JSON document whose texts can be written to files.
 
     Args:
-        content: what becomes JSON: tables, lists and values in each other.
+        content: nested mappings, lists and values.
 
     Returns:
-        The same with `storable` texts, keys and paths; numbers and the like are untouched.
+        The same with `storable` texts, keys and paths; other values are unchanged.
     """
     if isinstance(content, str | PurePath):
         return storable(str(content))
@@ -167,17 +164,17 @@ def storable_document(content: Any) -> Any:
 
 
 def named_beside(text: str) -> bool:
-    """Whether a file may name another one so: in its own folder or below, nowhere else.
+    """Whether a path in a file refers only to its own folder or below.
 
     Args:
-        text: the path as it is written, with / or backslashes.
+        text: the path as written, with / or backslashes.
     """
     parts = PurePosixPath(text.replace("\\", "/")).parts
     outside = text.startswith(("/", "\\", "~")) or text[1:2] == ":" or ".." in parts
     return not outside and "\0" not in text
 
 
-# Writing of files larger than memory, and whether a disk takes any more.
+# Writing files larger than memory, and detecting full disks.
 
 
 _WHY = {
@@ -185,24 +182,20 @@ _WHY = {
     getattr(errno, "EDQUOT", errno.ENOSPC): "is full: it gives this account no more room",
     errno.EFBIG: "is full: it takes no file as large as this one",
 }
-_WHY[errno.ENOSPC] = "is full"  # where there are no quotas
-_PROBE = 1 << 20  # bytes: less room than that is none
-STRETCH = 1 << 26  # bytes of a long file that are in memory at a time
+_WHY[errno.ENOSPC] = "is full"  # overrides EDQUOT on systems without quotas
+_PROBE = 1 << 20  # bytes; a disk with less free space counts as full
+STRETCH = 1 << 26  # bytes of a long file that are in memory at once
 
 
 def is_full(error: BaseException | None) -> bool:
-    """Whether an error says that a disk takes no more.
-
-    Args:
-        error: any error; None for none.
-    """
+    """Whether an error reports a full disk; False for None."""
     return isinstance(error, OSError) and error.errno in _WHY
 
 
 def probe_full(folder: Path) -> OSError | None:
-    """Try to write 1 MB to a disk: the error where it takes no more, None where it does.
+    """Try to write 1 MB to a disk; returns the error if it is full, else None.
 
-    Libraries that write files in threads of their own do not tell why they failed.
+    Libraries that write files in their own threads do not report why they failed.
 
     Args:
         folder: a folder on the disk.
@@ -218,11 +211,11 @@ def probe_full(folder: Path) -> OSError | None:
 
 
 def why_full(error: OSError, folder: Path | None = None) -> str:
-    """The part of a sentence that says which disk is full, and in which way.
+    """Part of an error message that names the full disk and the reason.
 
     Args:
-        error: for which `is_full` holds.
-        folder: on the disk; None where the error itself names the file.
+        error: an error for which `is_full` is true.
+        folder: a folder on the disk; None if the error itself names the file.
     """
     at = folder or (Path(os.fsdecode(error.filename)) if error.filename else None)
     which = f"the disk that holds {at}" if at else "the disk"
@@ -230,33 +223,33 @@ def why_full(error: OSError, folder: Path | None = None) -> str:
 
 
 def let_go(file: IO[bytes], first: int, last: int) -> None:
-    """Give up the memory in which a system keeps a part of a file; nothing where it cannot be told.
+    """Drop part of a file from the page cache; does nothing on systems without `posix_fadvise`.
 
-    What is not on the disk yet is sent there, and its memory is given up when it is told again.
-    Gigabytes that are read or written once would otherwise take new memory to the end, which costs
-    more than the disk, and drive out what others have there.
+    Pages that are not on disk yet are queued for writing, and dropped by the next call. Otherwise
+    gigabytes that are read or written once would fill the cache, which costs more than the disk
+    access and evicts the pages of other programs.
 
     Args:
-        file: the open file, with nothing left in a buffer.
-        first: where the part begins, bytes.
-        last: where it ends.
+        file: the open file, with empty buffers.
+        first: start of the part, bytes.
+        last: end of the part, bytes.
     """
     if hasattr(os, "posix_fadvise"):  # Linux
-        with suppress(OSError):  # it is an advice, which some file systems do not take
+        with suppress(OSError):  # advisory; some file systems do not support it
             os.posix_fadvise(file.fileno(), first, last - first, os.POSIX_FADV_DONTNEED)
 
 
 def write_through(parts: Iterable[memoryview], to: IO[bytes]) -> int:
-    """Write parts into a file, onto the disk as they come.
+    """Write parts to a file, forcing them to disk as they come.
 
-    A system that keeps what is written lets the writer wait once too much is owed to the disk.
+    A system that caches writes blocks the writer once too many pages are dirty.
 
     Args:
-        parts: what is written.
-        to: the open file, which holds nothing yet.
+        parts: the content.
+        to: the open, empty file.
 
     Returns:
-        How many bytes were written.
+        Number of bytes written.
     """
     written = begun = 0
     for part in parts:

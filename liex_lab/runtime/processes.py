@@ -1,8 +1,8 @@
-"""Ctrl-C, SIGTERM and SIGHUP: what is under way is put down within seconds, and said so.
+"""Handling of Ctrl-C, SIGTERM and SIGHUP, and of child processes.
 
-The signal becomes an exception, so that checkpoints are kept and temporary folders go. What does
-not end by itself, such as a kernel or a library's thread, is ended with the process after 4 s; a
-second signal ends it at once. What is on disk then is as after a kill, which every writer expects.
+A signal raises an exception, so that checkpoints are kept and temporary folders removed. If a
+kernel or a library's thread does not stop, the process exits after 4 s; a second signal ends it at
+once. The disk is then in the same state as after a kill, which all writers handle.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _SAID = {"SIGINT": "interrupted (Ctrl-C)", "SIGTERM": "ended (SIGTERM)", "SIGHUP
 
 
 class Ended(BaseException):
-    """Raised in the main thread when the process is asked to end.
+    """Raised in the main thread when the process receives a signal to end.
 
     Attributes:
         signal: the signal's number.
@@ -34,7 +34,7 @@ class Ended(BaseException):
         self.signal = number
 
     def __str__(self) -> str:
-        """One sentence for people."""
+        """The message for the user, one sentence."""
         return (
             f"{_SAID[signal.Signals(self.signal).name]}; the same command goes on where a "
             "measurement was, or begins anew"
@@ -42,7 +42,7 @@ class Ended(BaseException):
 
     @property
     def exit_code(self) -> int:
-        """128 and the signal's number, as shells have it: 130 for Ctrl-C, 143 for SIGTERM."""
+        """128 plus the signal's number, as shells use: 130 for Ctrl-C, 143 for SIGTERM."""
         return 128 + self.signal
 
 
@@ -50,7 +50,7 @@ class Ended(BaseException):
 def ending() -> Iterator[None]:
     """Within the block, signals that ask the process to end raise `Ended` in the main thread.
 
-    Signals that the process was started to ignore, as by nohup, are ignored.
+    Signals that the process ignored from the start, as with nohup, stay ignored.
     """
     asked: list[int] = []
     unheard = threading.Event()
@@ -70,7 +70,7 @@ def ending() -> Iterator[None]:
         raise error
 
     def again(what: sys.UnraisableHookArgs) -> None:
-        """It was raised where Python lets no error out, such as in a weak reference's callback."""
+        """Raise again later: Python discarded the error, as in a weak reference's callback."""
         if not isinstance(what.exc_value, Ended):
             return usual(what)
         unheard.set()
@@ -93,14 +93,14 @@ def ending() -> Iterator[None]:
     finally:
         sys.unraisablehook = usual
         if asked:
-            asked.append(0)  # the sentence is said by who catches the error
+            asked.append(0)  # the caller that catches the error prints the message
         else:  # a second signal would still end it at once
             for number, handler in before.items():
                 signal.signal(number, handler)
 
 
 def _send(number: int) -> None:
-    """A signal to the main thread, whatever it waits for."""
+    """Send a signal to the main thread, even if it is blocked."""
     if hasattr(signal, "pthread_kill"):
         signal.pthread_kill(threading.main_thread().ident or 0, number)
     else:
@@ -110,30 +110,30 @@ def _send(number: int) -> None:
 def _end_now(error: Ended, asked: list[int]) -> None:
     """End the process, whatever its threads are doing."""
     if len(asked) == 1:
-        os.write(2, f"liex: {error}\n".encode())  # a handler may stand within a write of ours
+        os.write(2, f"liex: {error}\n".encode())  # the handler may have interrupted a write of ours
     os._exit(error.exit_code)
 
 
-# Processes that this one starts: in what they find its modules, and that they end with it.
+# Child processes: where they import from, and that they end with this one.
 
 
 def own_python(*arguments: str) -> list[str]:
-    """The command of another Python with the packages of this one.
+    """The command line of another Python process with the packages of this one.
 
-    It takes nothing from the folder that it is started in, which may hold another liex_lab, such as
-    the sources that this one was installed from, or anything that is called like a package.
+    It does not import from its working folder, which may contain another liex_lab, such as the
+    sources this one was installed from, or files that shadow a package.
 
     Args:
-        *arguments: what it runs, as "-m" and a module, or "-c" and a program, and that one's own.
+        *arguments: "-m" and a module, or "-c" and a program, and its arguments.
     """
     return [sys.executable, "-P", *arguments]
 
 
 def end_with_parent() -> None:
-    """In a new process of `multiprocessing`: end when the parent does, and leave Ctrl-C to it.
+    """In a child process of `multiprocessing`: end with the parent, and ignore Ctrl-C.
 
-    The parent holds the other end of a pipe, which the system closes when it is no more: this works
-    on every system, and for SIGKILL.
+    The parent holds the other end of a pipe, which the system closes when the parent ends: this
+    works on every system, also for SIGKILL.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal sends it to both
     parent = multiprocessing.parent_process()
@@ -148,10 +148,10 @@ def end_with_parent() -> None:
 
 
 def end_children(but: set[int]) -> None:
-    """End processes of this one's pools at once.
+    """Terminate the processes of this process's pools.
 
     Args:
-        but: ids of those that stay.
+        but: ids of processes to keep.
     """
     for child in multiprocessing.active_children():
         if child.pid not in but:

@@ -1,7 +1,7 @@
-"""Progress reports of long jobs: one callable, handed down from the command line.
+"""Progress reports of long jobs: a callable, passed down from the command line.
 
-A job calls it with pieces done, pieces in all, and what is being done; a bar or a board shows it to
-the person who waits.
+A job calls it with the number of completed pieces, the total, and a description; a bar or a board
+shows it to the user.
 """
 
 from __future__ import annotations
@@ -15,36 +15,30 @@ from liex_lab.errors import printable
 
 
 class Progress(Protocol):
-    """Whoever wants to know how far a job is."""
+    """A callable that receives progress reports."""
 
     def __call__(self, done: int, total: int | None, what: str) -> None:
-        """Take a report, after every piece of work.
+        """Report progress, after every piece of work.
 
         Args:
-            done: pieces done.
-            total: pieces in all; None where nobody knows.
-            what: what is being done.
+            done: completed pieces.
+            total: total pieces; None if unknown.
+            what: the current activity.
         """
 
 
 def silent(done: int, total: int | None, what: str) -> None:
-    """The progress nobody looks at: the default of every job.
-
-    Args:
-        done: pieces done.
-        total: pieces in all, or None.
-        what: what is being done.
-    """
+    """Ignore progress reports: the default of every job."""
 
 
 @contextmanager
 def progress_bar() -> Iterator[Progress]:
-    """A progress bar on standard error, gone when the block ends.
+    """A progress bar on standard error, removed when the block ends.
 
-    Nothing is shown where that is not a terminal.
+    Nothing is shown if standard error is not a terminal.
 
     Yields:
-        The progress to hand to a job.
+        The progress to pass to a job.
     """
     from rich.console import Console
     from rich.progress import (
@@ -71,10 +65,10 @@ def progress_bar() -> Iterator[Progress]:
         last: tuple[int, int | None] = (0, None)
 
         def report(done: int, total: int | None, what: str) -> None:
-            """Show done out of total pieces and what is being done; a new total resets the time."""
+            """Show completed and total pieces and the activity; a new total resets the time."""
             nonlocal last
             if total != last[1] or done < last[0]:
-                display.reset(task, total=total)  # a new stage: its remaining time is its own
+                display.reset(task, total=total)  # a new stage has its own remaining time
             last = (done, total)
             display.update(task, completed=done, total=total, description=printable(what))
 
@@ -86,15 +80,15 @@ COMPILING = "compiling, once on this machine: a minute or two"
 
 @contextmanager
 def telling_of_compiling(progress: Progress) -> Iterator[Progress]:
-    """The same progress, which within the block also hears of numba kernels being compiled.
+    """The same progress, which within the block also reports compilations of numba kernels.
 
-    After the last compilation it hears again what it heard last.
+    After the last compilation, the latest report of the job is repeated.
 
     Args:
-        progress: who is told.
+        progress: receives the reports.
 
     Yields:
-        The progress to hand to the job.
+        The progress to pass to the job.
     """
     from numba.core import event
 
@@ -102,7 +96,7 @@ def telling_of_compiling(progress: Progress) -> Iterator[Progress]:
     under_way = 0
 
     def tell(done: int, total: int | None, what: str) -> None:
-        """Pass on done, total and what, and keep them."""
+        """Forward a report, and keep it."""
         nonlocal last
         last = (done, total, what)
         progress(done, total, what)
@@ -111,13 +105,13 @@ def telling_of_compiling(progress: Progress) -> Iterator[Progress]:
         """Listener of numba's compilations."""
 
         def on_start(self, event: object) -> None:
-            """A compilation began (event): say so."""
+            """Report that a compilation began."""
             nonlocal under_way
             under_way += 1
             progress(0, None, COMPILING)
 
         def on_end(self, event: object) -> None:
-            """A compilation ended (event): after the last one, say again what was said before."""
+            """A compilation ended: after the last one, repeat the latest report."""
             nonlocal under_way
             under_way -= 1
             if not under_way:
@@ -128,49 +122,49 @@ def telling_of_compiling(progress: Progress) -> Iterator[Progress]:
 
 
 class Board:
-    """How far many jobs are that run at once.
+    """Progress of many concurrent jobs.
 
-    A bar for each that runs, one for all, and a line for each that ended.
+    Shows a bar for each running job, one for all, and a line for each finished job.
 
     Attributes:
-        n_ended: jobs that are over.
-        n_failed: those of them that failed.
+        n_ended: finished jobs.
+        n_failed: finished jobs that failed.
     """
 
     def __init__(
         self, n_jobs: int, say: Callable[[str], None], clock: Callable[[], float] = time.monotonic
     ) -> None:
-        """A board on which no job has begun.
+        """Create a board on which no job has begun.
 
         Args:
-            n_jobs: jobs in all.
-            say: takes the lines.
-            clock: seconds that only go on, whatever the computer's clock is set to.
+            n_jobs: total number of jobs.
+            say: prints a line.
+            clock: monotonic clock, s.
         """
         self._n = n_jobs
         self._say = say
         self._clock = clock
         self._began = clock()
-        self._running: dict[str, float] = {}  # job -> share of it that is done
+        self._running: dict[str, float] = {}  # job -> completed fraction
         self.n_ended = self.n_failed = 0
 
     def told(self, name: str, done: int, total: int | None, what: str) -> None:
-        """Take the report of one job.
+        """Receive a progress report of one job.
 
         Args:
-            name: of the job.
-            done: pieces done.
-            total: pieces in all; None where nobody knows.
-            what: what is being done.
+            name: the job.
+            done: completed pieces.
+            total: total pieces; None if unknown.
+            what: the current activity.
         """
         self._running[name] = min(done / total, 1.0) if total else self._running.get(name, 0.0)
 
     def ended(self, name: str, sentence: str, failed: bool) -> None:
-        """A job is over: count it and say a line, with the time left.
+        """Count a finished job and print a line with the time left.
 
         Args:
-            name: of the job.
-            sentence: how it ended, to follow the name.
+            name: the job.
+            sentence: how it ended; follows the name.
             failed: whether it failed.
         """
         self._running.pop(name, None)
@@ -182,24 +176,24 @@ class Board:
 
     @property
     def share(self) -> float:
-        """How much of the whole is done, 0 to 1."""
+        """Completed fraction of all jobs, 0 to 1."""
         return min((self.n_ended + sum(self._running.values())) / self._n, 1.0) if self._n else 1.0
 
     @property
     def left_s(self) -> float | None:
-        """Seconds until all are done if it goes on like this; None where nothing is known yet."""
+        """Estimated seconds until all jobs are done; None before any progress."""
         share = self.share
         spent = self._clock() - self._began
         return spent * (1.0 - share) / share if share > 0 else None
 
     @property
     def lines(self) -> list[tuple[str, float]]:
-        """The names of the jobs that run, in order, and the share (0 to 1) of each that is done."""
+        """Name and completed fraction (0 to 1) of each running job, sorted by name."""
         return sorted(self._running.items())
 
 
 def _span(seconds: float) -> str:
-    """A time as people say it."""
+    """A duration with a suitable unit."""
     minutes = seconds / 60
     if minutes < 1.5:
         return f"{seconds:.0f} s"
@@ -210,10 +204,7 @@ def _span(seconds: float) -> str:
 
 @contextmanager
 def progress_board(n_jobs: int) -> Iterator[Board]:
-    """A board on standard error; bars only where that is a terminal, the lines always.
-
-    Args:
-        n_jobs: jobs in all.
+    """A board on standard error; lines are always printed, bars only on a terminal.
 
     Yields:
         The board to report to.

@@ -1,8 +1,8 @@
-"""Shapes of arrays, checked once before compiled code reads them.
+"""Shape checks of arrays, done once before compiled code reads them.
 
-A kernel does not check its indices: a row that is narrower than it reads gives the numbers behind
-it, and no error. So whoever hands arrays to a kernel asks here first, or takes a record that has
-asked when it was made.
+Kernels do not check indices: a row that is too narrow yields the numbers that follow it, and no
+error. Callers that pass arrays to a kernel check them here, or pass a record that was checked when
+it was created.
 """
 
 from __future__ import annotations
@@ -11,18 +11,18 @@ from numpy.typing import NDArray
 
 
 def check_shapes(whose: str, *wanted: tuple[str, NDArray, tuple[int | str, ...]]) -> None:
-    """Refuse arrays of another shape than is read.
+    """Raise if an array does not have the expected shape.
 
     Args:
-        whose: names what takes the arrays, for the sentence.
-        *wanted: name, array and shape of each; a number is that length, and a letter is any length,
-            the same one wherever the letter stands.
+        whose: the consumer of the arrays, for the error message.
+        *wanted: name, array and shape of each; a number is an exact length, a letter any length
+            that is the same wherever the letter occurs.
 
     Raises:
         ValueError: an array has other dimensions, or two lengths of one letter differ.
     """
     lengths: dict[int | str, int] = {}
-    for name, array, shape in wanted:  # some forty arrays of a live frame come by here
+    for name, array, shape in wanted:  # about forty arrays per live frame
         known = [lengths.get(n, n) for n in shape]
         fits = array.ndim == len(shape)
         for n, length in zip(known, array.shape, strict=False):
@@ -38,12 +38,12 @@ def check_shapes(whose: str, *wanted: tuple[str, NDArray, tuple[int | str, ...]]
 
 
 def check_index(whose: str, index: NDArray, n: int) -> None:
-    """Refuse row numbers that are none of n rows.
+    """Raise if row numbers are out of range.
 
     Args:
-        whose: names what the rows are of, for the sentence.
+        whose: what the rows belong to, for the error message.
         index: row numbers, of any shape.
-        n: how many rows there are.
+        n: number of rows.
 
     Raises:
         ValueError: a number is below 0 or not below n.

@@ -1,7 +1,7 @@
-"""Text files that a person or another program wrote: encodings, TOML, and the cells of tables.
+"""Text files from people or other programs: encodings, TOML, and tables.
 
 Editors on Windows begin UTF-8 with a byte order mark, and PowerShell 5 writes UTF-16. Spreadsheets
-separate cells by semicolons or tabs where the decimal sign is a comma.
+separate cells by semicolons or tabs in locales with a decimal comma.
 """
 
 from __future__ import annotations
@@ -21,27 +21,24 @@ if TYPE_CHECKING:
 
 _MARKS = {b"\xef\xbb\xbf": "utf-8-sig", b"\xff\xfe": "utf-16", b"\xfe\xff": "utf-16"}
 _SEPARATORS = (";", "\t", ",")
-_SAMPLE = 50  # lines that a separator is chosen by
-_STATED = re.compile(r'"?sep=(.)"?\s*', re.IGNORECASE)  # a first line that Excel writes and reads
-_BLANKS = re.compile(  # in a line of numbers that blanks separate, whatever its commas are
+_SAMPLE = 50  # lines used to detect the separator
+_STATED = re.compile(r'"?sep=(.)"?\s*', re.IGNORECASE)  # first line as Excel writes and reads it
+_BLANKS = re.compile(  # a line of numbers separated by blanks, whatever its commas mean
     r"^\s*[-+]?\d[\d.eE+-]*\s+[-+]?\d|[^,\s]\s+[-+]?\d+,\d+(\s|$)|^\s*[-+]?\d+,\d+\s+[^,\s]"
-    r"|^[-+]?\d{1,3}(,\d{3}){2,}(\.\d+)?$"  # or in a number, which is refused
+    r"|^[-+]?\d{1,3}(,\d{3}){2,}(\.\d+)?$"  # or thousands separators, which are refused
 )
 _DECIMAL_COMMA = re.compile(r"^([-+]?\d+),(\d+(?:[eE][-+]?\d+)?)$")
 _CLOCK = re.compile(r"(?:(\d+):([0-5]?\d):([0-5]\d(?:[.,]\d+)?)|(\d+):([0-5]\d[.,]\d+))")
 
 
 def decoded(raw: bytes) -> str:
-    """The text in the bytes of a file: UTF-8, or UTF-16 by its mark or where it is evident.
-
-    Args:
-        raw: the file's content.
+    """Decode UTF-8, or UTF-16 if there is a byte order mark or the zero bytes show it.
 
     Returns:
-        The text; line ends stay as they are.
+        The text; line ends are kept.
 
     Raises:
-        ValueError: it is no such text; the message names the line and the bytes.
+        ValueError: it is not valid text; the message names the line and the bytes.
     """
     encoding = next((name for mark, name in _MARKS.items() if raw.startswith(mark)), "utf-8")
     even, odd = (raw[first:4096:2].count(0) for first in (0, 1))
@@ -59,20 +56,20 @@ def decoded(raw: bytes) -> str:
 
 
 def read_text(path: Path) -> str:
-    """The text of a file; see `decoded`. Lines end in a line feed.
+    """Read a text file; see `decoded`. Line ends become line feeds.
 
     Raises:
         OSError: the file cannot be read.
-        ValueError: it is no text.
+        ValueError: it is not valid text.
     """
     return decoded(path.read_bytes()).replace("\r\n", "\n").replace("\r", "\n")
 
 
 def parse_toml(text: str) -> dict[str, Any]:
-    """The tables of a TOML text.
+    """Parse TOML.
 
     Raises:
-        ValueError: it is no TOML; the message quotes the line.
+        ValueError: it is not valid TOML; the message quotes the line.
     """
     try:
         return tomllib.loads(text)
@@ -85,23 +82,23 @@ def parse_toml(text: str) -> dict[str, Any]:
 
 
 def read_toml(path: Path) -> dict[str, Any]:
-    """The tables of a TOML file.
+    """Read a TOML file.
 
     Raises:
         OSError: the file cannot be read.
-        ValueError: it is no text, or no TOML.
+        ValueError: it is not valid text or TOML.
     """
     return parse_toml(read_text(path))
 
 
 def split_lines(text: str) -> tuple[str, list[str]]:
-    """The lines of a table, and what separates their cells.
+    """Split a table into lines and find its cell separator.
 
     Args:
-        text: the table. A first line such as `sep=;` states the separator.
+        text: the table. A first line such as `sep=;` sets the separator.
 
     Returns:
-        The separator, which is " " for any blanks, and the lines; one that states the separator is
+        The separator (" " for any white space) and the lines; a line that sets the separator is
         empty.
 
     Raises:
@@ -124,11 +121,11 @@ def split_lines(text: str) -> tuple[str, list[str]]:
 
 
 def split_cells(lines: Sequence[str], separator: str) -> list[list[str]]:
-    """The cells of each line, without blanks around them; no cell for an empty line.
+    """Cells of each line without surrounding blanks; an empty line has no cells.
 
     Args:
         lines: lines of a table.
-        separator: what `split_lines` found.
+        separator: as found by `split_lines`.
 
     Raises:
         ValueError: a cell is too long.
@@ -143,10 +140,10 @@ def split_cells(lines: Sequence[str], separator: str) -> list[list[str]]:
 
 
 def number(text: str) -> Decimal:
-    """A number, exactly; its decimal sign is a point or a comma.
+    """Parse a number exactly; the decimal separator is a point or a comma.
 
     Raises:
-        ValueError: it is no finite number.
+        ValueError: it is not a finite number.
     """
     with suppress(InvalidOperation):
         found = Decimal(_DECIMAL_COMMA.sub(r"\1.\2", text) if "," in text else text)
@@ -156,10 +153,10 @@ def number(text: str) -> Decimal:
 
 
 def clock_s(text: str) -> Decimal:
-    """Seconds of a time as hh:mm:ss, hh:mm:ss.fff or mm:ss.fff, exactly.
+    """Parse a time as hh:mm:ss, hh:mm:ss.fff or mm:ss.fff, exactly; returns seconds.
 
     Raises:
-        ValueError: it is no such time.
+        ValueError: it has another format.
     """
     found = _CLOCK.fullmatch(text.strip())
     if found is None:
@@ -168,75 +165,68 @@ def clock_s(text: str) -> Decimal:
     return 3600 * int(hours) + 60 * int(minutes) + number(seconds)
 
 
-# CSV files that a spreadsheet opens as they are: no cell or heading of them becomes a formula.
+# CSV files that are safe to open in a spreadsheet: no cell or heading becomes a formula.
 
 
-_FORMULA = "=+\\-@\uff1d\uff0b\uff0d\uff20"  # the wide ones are taken for the others in East Asia
-# where a cell begins, or could: at the text's beginning, and behind what may split it
+_FORMULA = "=+\\-@\uff1d\uff0b\uff0d\uff20"  # full-width forms count in East Asian locales
+# where a cell may begin: at the start of the text, and after any possible separator
 _BEGINS = f"^ *(?='*[{_FORMULA}\t\r\n])|(?<=[;\t\r\n]) *(?='*[{_FORMULA}])"
 _MARKED = f"(^ *)'(?='*[{_FORMULA}\t\r\n])|((?<=[;\t\r\n]) *)'(?='*[{_FORMULA}])"
 
 
 def harmless(value: Any) -> Any:
-    """A cell that no spreadsheet takes for a formula, whatever separates its cells.
+    """Escape a cell so that no spreadsheet reads it as a formula, whatever the cell separator.
 
     Args:
-        value: a cell of any kind; only text is changed.
+        value: a cell of any type; only text is changed.
 
     Returns:
-        The cell; text with an apostrophe before each part of it that would be a formula.
+        The cell; an apostrophe precedes each part of a text that would be a formula.
     """
     return re.sub(_BEGINS, r"\g<0>'", value) if isinstance(value, str) else value
 
 
 def as_it_was(value: Any) -> Any:
-    """The inverse of `harmless`.
-
-    Args:
-        value: a cell of any kind.
-
-    Returns:
-        What `harmless` was given.
-    """
+    """The inverse of `harmless`."""
     return re.sub(_MARKED, r"\1\2", value) if isinstance(value, str) else value
 
 
 def harmless_table(table: pd.DataFrame) -> pd.DataFrame:
-    """A table of which neither cells nor headings are taken for formulas.
+    """Escape all cells and headings of a table, see `harmless`.
 
     Args:
-        table: any table; headings of several rows are kept.
+        table: any table; multi-level headings are kept.
 
     Returns:
-        A copy where text was changed.
+        A copy with escaped text.
     """
     found = table.copy(deep=False)
     for k, kind in enumerate(table.dtypes):
-        if kind.kind == "O":  # text, whatever holds it
+        if kind.kind == "O":  # text, whatever its array type
             found.isetitem(k, table.iloc[:, k].map(harmless).array)
     return found.rename(columns=harmless)
 
 
 def write_csv(table: pd.DataFrame, path: Path, *, index: bool = False) -> None:
-    """Write a table as CSV, UTF-8, numbers in full precision, no cell a formula.
+    """Write a table as CSV: UTF-8, full precision, formulas escaped.
 
     Args:
         table: the table.
         path: the file to write.
-        index: whether the rows' labels are written, too.
+        index: whether to write the row labels.
     """
     harmless_table(table).to_csv(path, index=index, lineterminator="\n")
 
 
 def read_texts(path: Path) -> pd.DataFrame:
-    """Read a table that a person made, every cell as it is written: 007 and NA are names, too.
+    """Read a hand-written table with every cell as text: 007 and NA are valid names.
 
     Args:
-        path: the file, as CSV or as a spreadsheet separates its cells.
+        path: a CSV file, or one with a spreadsheet's separators.
 
     Raises:
         OSError: the file cannot be read.
-        ValueError: it is no table with a name for every column.
+        ValueError: it is not a table with a name for every column.
     """
     import pandas as pd
 
@@ -255,11 +245,11 @@ def read_texts(path: Path) -> pd.DataFrame:
 
 
 def read_harmless(path: Path, texts: tuple[str, ...] = ()) -> pd.DataFrame:
-    """Read a CSV file that `write_csv` wrote, cells and headings as they were before.
+    """Read a CSV file written by `write_csv`, with its escapes removed.
 
     Args:
         path: the file.
-        texts: columns that are text even where they look like numbers.
+        texts: columns that are text even if they look like numbers.
     """
     import pandas as pd
 
@@ -272,12 +262,7 @@ def read_harmless(path: Path, texts: tuple[str, ...] = ()) -> pd.DataFrame:
 
 
 def copy_harmless(source: Path, target: Path) -> None:
-    """Copy a CSV file that somebody else may have written; cells that are numbers stay as they are.
-
-    Args:
-        source: the file.
-        target: the file to write.
-    """
+    """Copy a CSV file of unknown origin, escaping formulas; numbers are unchanged."""
     with (
         source.open(encoding="utf-8", newline="") as read,
         target.open("w", encoding="utf-8", newline="") as written,

@@ -1,4 +1,4 @@
-"""Threads of numba kernels and of BLAS, prefetching of an iterator, tasks in the background."""
+"""Threads of numba kernels and BLAS, prefetching iterators, and background tasks."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ Result = TypeVar("Result")
 
 
 def prefetch(items: Iterable[Item]) -> Generator[Item, None, None]:
-    """Prefetch: the same items, each made by a thread while the one before it is used.
+    """Yield the same items, computing each on a thread while the previous one is used.
 
-    What goes wrong while an item is made is raised in its turn.
+    Errors are raised when their item is due.
 
     Args:
-        items: what is iterated over, one item ahead, on a thread of its own.
+        items: consumed one item ahead, on a separate thread.
 
     Yields:
-        The items, in their order.
+        The items, in order.
     """
     left = iter(items)
     end = object()
@@ -45,15 +45,15 @@ def prefetch(items: Iterable[Item]) -> Generator[Item, None, None]:
 
 @contextmanager
 def in_background(make: Callable[[], Item]) -> Iterator[Callable[[], Item]]:
-    """Run one function in the background, on a thread of its own, while the block runs.
+    """Run a function on a separate thread while the block runs.
 
-    A block that ends before is not held up.
+    The end of the block does not wait for the function.
 
     Args:
         make: the function.
 
     Yields:
-        A function that waits for the result and returns it, or raises what went wrong.
+        A function that waits for the result and returns it, or raises the function's error.
     """
     maker = ThreadPoolExecutor(1)
     coming = maker.submit(make)
@@ -64,12 +64,12 @@ def in_background(make: Callable[[], Item]) -> Iterator[Callable[[], Item]]:
 
 
 def side_by_side(do: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:
-    """Results of a function for each item, in their order, on as many threads as kernels may use.
+    """Apply a function to each item on as many threads as kernels may use; results in order.
 
-    For work on whole pictures by numpy and OpenCV, which let other threads run meanwhile.
+    For work on whole frames by numpy and OpenCV, which release the GIL.
 
     Args:
-        do: the function; it changes nothing that another item needs.
+        do: the function; must not change data of other items.
         items: its arguments.
     """
     import numba
@@ -83,14 +83,14 @@ def side_by_side(do: Callable[[Item], Result], items: Sequence[Item]) -> list[Re
 
 @contextmanager
 def imported_ahead(*modules: str) -> Iterator[None]:
-    """Import modules one after another, on a thread of its own, while the block runs.
+    """Import modules one after another on a separate thread while the block runs.
 
-    Who imports one of them meanwhile waits until it is there. One that is missing is told of by who
-    wants it. From then on Python's collector of garbage leaves alone what is in memory, until the
-    block ends: it would go through all of the modules again and again, a sixth of a short run.
+    An import of the same module elsewhere waits for it. Missing modules are skipped here; their
+    importers report them. Afterwards the objects in memory are excluded from garbage collection
+    until the block ends: scanning the modules repeatedly takes a sixth of a short run.
 
     Args:
-        modules: their dotted names, in the order in which they will be wanted.
+        modules: dotted names, in the order in which they will be needed.
     """
 
     def fetch() -> None:
@@ -101,7 +101,7 @@ def imported_ahead(*modules: str) -> Iterator[None]:
                 with suppress(ImportError):
                     import_module(name)
             gc.freeze()
-            if left:  # the block has ended meanwhile, and nobody else would take that back
+            if left:  # the block has ended, and nothing else would undo this
                 gc.unfreeze()
 
     left: list[bool] = []
@@ -118,11 +118,10 @@ def threads(parallel: bool) -> Iterator[None]:
     """Within the block, parallel numba kernels run on all threads or on one.
 
     One kernel serves both: two numba functions made from one Python function, with and without
-    parallel=True, share an entry in numba's cache, and whichever was compiled first is loaded for
-    both.
+    parallel=True, share a cache entry, and whichever was compiled first is loaded for both.
 
     Args:
-        parallel: whether as many threads as before, else one.
+        parallel: whether to keep the current number of threads; False uses one.
     """
     import numba
 
@@ -137,16 +136,17 @@ def threads(parallel: bool) -> Iterator[None]:
 
 @contextmanager
 def serial_products() -> Iterator[None]:
-    """Within the block, BLAS multiplies on one thread: the same bits on any number of cores."""
+    """Within the block, BLAS uses one thread: results are bit-identical on any number of cores."""
     with _loaded(len(sys.modules)).limit(limits=1, user_api="blas"):
         yield
 
 
 @lru_cache(maxsize=1)
 def _loaded(n_modules: int) -> ThreadpoolController:
-    """The libraries that are loaded, which takes milliseconds to find out.
+    """Controller of the loaded libraries; creating it takes milliseconds.
 
-    Of more modules there may be more libraries.
+    Args:
+        n_modules: number of imported modules: the cache key, as imports may load libraries.
     """
     from threadpoolctl import ThreadpoolController
 

@@ -1,13 +1,13 @@
 """Viterbi beam search over the pose hypotheses of frames, with missed detections (numba kernels).
 
-A chain visits at most one hypothesis of each frame and costs, in nats, sum of emission + transition
-+ missed-detection costs; cost[t, h] = emission[t, h] + min over (a, g) of cost[a, g] +
-transition(a, g; t, h) + missed-detection cost of the frames between, where frames may be passed by
-and the beam holds the best last links (Viterbi 1967). Transition cost between joints: d^2 / 2 s_1^2
-+ b^2 / 2 s_2^2, with d the shift of the joints' mean, b the mean change of posture, s_k^2 =
-error_factor^2 (e_a^2 + e_b^2) + (v_k L dt)^2, v_1 = shift, v_2 = bend; robust by T log(1 + c / T)
-with T = tail. `forward_backward` is the forward-backward algorithm over two states, head and tail
-as on the path or exchanged, and gives the flip posterior.
+A chain visits at most one hypothesis of each frame and costs, in nats, the sum of emission,
+transition and missed-detection costs; cost[t, h] = emission[t, h] + min over (a, g) of cost[a, g] +
+transition(a, g; t, h) + missed-detection cost of the frames between. Frames may be skipped, and the
+beam keeps the best last links (Viterbi 1967). Transition cost between joints: d^2 / 2 s_1^2 + b^2 /
+2 s_2^2, with d the shift of the joints' mean, b the mean change of posture, s_k^2 = error_factor^2
+(e_a^2 + e_b^2) + (v_k L dt)^2, v_1 = shift, v_2 = bend; robust by T log(1 + c / T) with T = tail.
+`forward_backward` is the forward-backward algorithm over two states, head and tail as on the path
+or exchanged, and gives the flip posterior.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ NONE = -1
 
 
 class TransitionCosts(NamedTuple):
-    """What a transition costs.
+    """Parameters of the transition cost.
 
     Attributes:
-        error_factor: poses are measured to this many of the predicted errors.
-        shift: standard deviation of the middle, lengths a second.
-        bend: standard deviation of the posture about it, lengths a second.
-        tail: costs above this grow as logarithms, nats.
-        ceiling: the most that a transition costs, nats.
-        elsewhere: the most that it costs for how far the middle moves, where that is more.
+        error_factor: factor from predicted errors to standard deviations.
+        shift: standard deviation of the joints' mean, body lengths per second.
+        bend: standard deviation of the posture about it, body lengths per second.
+        tail: cost above which costs grow logarithmically, nats.
+        ceiling: largest transition cost, nats.
+        elsewhere: largest cost of the shift of the joints' mean, if that is more.
         length: spine length of the animal, mm.
     """
 
@@ -49,7 +49,7 @@ class Hypotheses(NamedTuple):
         times: (n,) s.
         joints: (n, H, J, 3) mm.
         error: (n, H) predicted mean joint error, mm.
-        emission: (n, H) cost of each hypothesis by itself, nats; not finite where there is none.
+        emission: (n, H) emission cost of each hypothesis, nats; not finite if absent.
         missed_cost: (n + 1,) missed-detection cost of all frames before each, cumulative, nats.
     """
 
@@ -61,12 +61,12 @@ class Hypotheses(NamedTuple):
 
 
 class Chains(NamedTuple):
-    """The best chains so far; all is filled in place.
+    """The best chains so far; filled in place.
 
     Attributes:
-        beam: (B, 2) the beam, frame and hypothesis of the best chains' last links.
-        cost: (n, H) cost of the best chain that ends there, nats; infinite without one.
-        parent: (n, H, 2) frame and hypothesis before, `NONE` where the chain begins.
+        beam: (B, 2) frame and hypothesis of the last links of the best chains.
+        cost: (n, H) cost of the best chain that ends there, nats; infinite if none.
+        parent: (n, H, 2) previous frame and hypothesis, `NONE` at the start of a chain.
     """
 
     beam: Any
@@ -76,9 +76,9 @@ class Chains(NamedTuple):
 
 @njit(cache=True)
 def transition_cost(joints_a, joints_b, error_a, error_b, dt, costs):
-    """Transition cost, nats: how unlikely an animal gets from joints (J, 3) mm to others in dt s.
+    """Transition cost of moving from joints (J, 3) mm to others in dt s, nats.
 
-    Animals seldom dart, but they do: costs above the tail grow as logarithms.
+    Animals seldom dart, but they do: costs above the tail grow logarithmically.
 
     Args:
         joints_a: (J, 3) mm, before.
@@ -116,17 +116,17 @@ def transition_cost(joints_a, joints_b, error_a, error_b, dt, costs):
 def extend(t, chains, n_beam, seen, costs):
     """One Viterbi step: add frame t and its hypotheses to the beam; returns the beam's size.
 
-    A chain may begin at any frame and passes a frame by at its missed-detection price.
+    A chain may begin at any frame and skips a frame at its missed-detection cost.
 
     Args:
         t: index of the frame.
         chains: `Chains`, updated in place.
-        n_beam: how many rows of the beam are in use.
+        n_beam: number of beam rows in use.
         seen: `Hypotheses`.
         costs: `TransitionCosts`.
 
     Returns:
-        How many rows of the beam are in use afterwards.
+        Number of beam rows in use afterwards.
     """
     cost = chains.cost
     parent = chains.parent
@@ -162,7 +162,7 @@ def extend(t, chains, n_beam, seen, costs):
 
 @njit(cache=True)
 def _keep_best(t, chains, n_beam, missed_cost):
-    """Prune: the best chains after frame t into the beam, best first; returns how many."""
+    """Prune: keep the best chains after frame t in the beam, best first; returns their number."""
     beam = chains.beam
     cost = chains.cost
     size = beam.shape[0]
@@ -183,7 +183,7 @@ def _keep_best(t, chains, n_beam, missed_cost):
             costs[n] = cost[a, h] + missed_cost[t + 1] - missed_cost[a + 1]
             n += 1
     order = np.empty(n, np.int64)
-    for k in range(n):  # by insertion, in the order of equals: they are few, and most are sorted
+    for k in range(n):  # stable insertion sort: few elements, mostly sorted
         place = k
         while place > 0 and costs[order[place - 1]] > costs[k]:
             order[place] = order[place - 1]
@@ -204,12 +204,12 @@ def extend_all(start, stop, chains, n_beam, seen, costs):
         start: first frame.
         stop: frame after the last.
         chains: `Chains`, updated in place.
-        n_beam: how many rows of the beam are in use.
+        n_beam: number of beam rows in use.
         seen: `Hypotheses`.
         costs: `TransitionCosts`.
 
     Returns:
-        How many rows of the beam are in use afterwards.
+        Number of beam rows in use afterwards.
     """
     for t in range(start, stop):
         n_beam = extend(t, chains, n_beam, seen, costs)
@@ -221,11 +221,11 @@ def trace_back(frame, hypothesis, parent, first, path):
     """Viterbi backtracking: follow the links from a hypothesis back to frame `first`.
 
     Args:
-        frame: where the chain ends.
-        hypothesis: which of that frame's.
+        frame: last frame of the chain.
+        hypothesis: index of its hypothesis.
         parent: (n, H, 2) links, see `extend`.
-        first: the earliest frame that is written.
-        path: (n,) output from `first` on, `NONE` where a frame was passed by.
+        first: the earliest frame to write.
+        path: (n,) output from `first` on, `NONE` for skipped frames.
     """
     path[first:] = NONE
     while frame >= first:
@@ -237,18 +237,17 @@ def trace_back(frame, hypothesis, parent, first, path):
 def forward_backward(times, one, two, error, evidence, costs, doubt):
     """Forward-backward over two states: fill the flip posterior of each frame.
 
-    Transitions within and between the two states cost what `transition_cost` says of their joints;
-    all sums are in logarithms.
+    Transitions within and between the two states cost `transition_cost` of their joints; all sums
+    are in logarithms.
 
     Args:
         times: (n,) s.
         one: (n, J, 3) mm, joints as on the path.
         two: (n, J, 3) mm, joints with head and tail exchanged.
         error: (n,) predicted mean joint error, mm.
-        evidence: (n,) log likelihood ratio of the frame by itself, nats, positive for the first
-            way.
+        evidence: (n,) log likelihood ratio of the frame alone, nats, positive for the first state.
         costs: `TransitionCosts`.
-        doubt: (n,) output, posterior probability of the second way.
+        doubt: (n,) output, posterior probability of the second state.
     """
     n = times.size
     stay = np.empty((n, 2))
@@ -261,7 +260,7 @@ def forward_backward(times, one, two, error, evidence, costs, doubt):
         stay[t, 1] = transition_cost(two[t - 1], two[t], before, after, dt, costs)
         transition[t, 0] = transition_cost(one[t - 1], two[t], before, after, dt, costs)
         transition[t, 1] = transition_cost(two[t - 1], one[t], before, after, dt, costs)
-    # logarithms of what the past says of each way
+    # forward pass: log probabilities of each state given the past
     first = np.zeros(n)
     second = np.zeros(n)
     second[0] = -evidence[0]
@@ -273,7 +272,7 @@ def forward_backward(times, one, two, error, evidence, costs, doubt):
         top = max(first[t], second[t])
         first[t] -= top
         second[t] -= top
-    # and what the future says
+    # backward pass
     a = 0.0
     b = 0.0
     for t in range(n - 1, -1, -1):

@@ -1,14 +1,13 @@
 """Robust Kalman filter and RTS smoother of whole poses: Student-t errors by iterated reweighting.
 
-`smoother` makes four passes of the smoother of whole curves below over all coordinates at once, and
-these kernels do what lies between. After each pass a frame t at the mean joint distance δ_t from
-the curve, in predicted errors, gets the weight w_t = (ν + 1) / (ν + δ_t^2), by which its
-measurement variance is divided (EM for the t distribution, Lange et al. 1989), and is left out
-where δ_t is beyond the gate. Positions are those of the joints' middle, with an error ellipsoid
-aligned with the animal; the root is put where the middle requires it. In the code
-`degrees_of_freedom` is ν, `gate` the gate and `correlated_share` the correlated share, whose square
-is left out of the variance. A kernel that called all others would be compiled with each of them
-once more, for half a minute.
+`smoother` makes four passes of the smoother over all coordinates at once; these kernels do the work
+between them. After each pass a frame t at the mean joint distance δ_t from the curve, in predicted
+errors, gets the weight w_t = (ν + 1) / (ν + δ_t^2), by which its measurement variance is divided
+(EM for the t distribution, Lange et al. 1989), and is excluded if δ_t is beyond the gate. Positions
+are those of the joints' mean, with an error ellipsoid aligned with the animal; the root follows
+from the mean. In the code `degrees_of_freedom` is ν, `gate` the gate and `correlated_share` the
+correlated share, whose square is subtracted from the variance. The kernels are separate because a
+single kernel that called the others would compile each of them again, which takes half a minute.
 """
 
 from __future__ import annotations
@@ -27,9 +26,9 @@ class Moves(NamedTuple):
     """A `Motion` for the kernels; rows are (error, process variance, decay time).
 
     Attributes:
-        position_error: (3,) along the animal, to its side, up; over the predicted mean joint error.
+        position_error: (3,) along the animal, sideways, up; over the predicted mean joint error.
         position_variance: (3,) process variance along the arena's axes, lengths^2/s^3.
-        position_decay_s: decay time of the middle's velocity, s.
+        position_decay_s: decay time of the velocity of the joints' mean, s.
         turn: (3, 3) a row for each axis of the base's rotation.
         bend: (3, 3) a row for each axis of the joint angles.
         size: (3,) of the log scale.
@@ -71,9 +70,9 @@ class Spread(NamedTuple):
     """Posterior spread of n frames.
 
     Attributes:
-        middle: (n, 3, 3) covariance of the joints' middle, mm^2.
+        middle: (n, 3, 3) covariance of the joints' mean, mm^2.
         turn: (n, 3) variance of the base's rotation about its own axes, rad^2.
-        bend: (n, 3) variance of the other joints' angles about theirs, rad^2.
+        bend: (n, 3) variance of the other joints' angles about their axes, rad^2.
     """
 
     middle: NDArray[np.float64]
@@ -83,14 +82,14 @@ class Spread(NamedTuple):
 
 @njit(cache=True)
 def middles(joints, known, tip, middle, frame):
-    """Fill the joints' middle of each frame, and the animal's own frame where it was measured.
+    """Fill the joints' mean of each frame, and the animal's own axes in measured frames.
 
     Args:
         joints: (n, J, 3) measured joints, mm.
         known: (n,) bool, measured.
-        tip: the joint at the other end than the base.
+        tip: the joint at the opposite end from the base.
         middle: (n, 3) output, mm.
-        frame: (n, 3, 3) output, columns along the animal, to its side, and up.
+        frame: (n, 3, 3) output, columns along the animal, sideways and up.
     """
     n_joints = joints.shape[1]
     for t in range(known.size):
@@ -105,7 +104,7 @@ def middles(joints, known, tip, middle, frame):
 
 @njit(cache=True)
 def weigh(seen, made, error, known, degrees_of_freedom, gate, weight, used):
-    """Fill the weights of measurements by their distances from the curve; returns how many count.
+    """Fill measurement weights from their distances to the curve; returns how many are used.
 
     Args:
         seen: (n, J, 3) measured joints, mm.
@@ -113,9 +112,9 @@ def weigh(seen, made, error, known, degrees_of_freedom, gate, weight, used):
         error: (n,) predicted mean joint error, mm.
         known: (n,) bool, measured.
         degrees_of_freedom: of the errors' t distribution.
-        gate: predicted errors beyond which a measurement does not count.
-        weight: (n,) output where known.
-        used: (n,) bool output where known, frames within the gate.
+        gate: predicted errors beyond which a measurement is excluded.
+        weight: (n,) output at measured frames.
+        used: (n,) bool output at measured frames, frames within the gate.
     """
     n_joints = seen.shape[1]
     n_used = 0
@@ -136,17 +135,17 @@ def weigh(seen, made, error, known, degrees_of_freedom, gate, weight, used):
 
 @njit(cache=True)
 def measured_spread(frame, error, weight, used, position_error, correlated_share, variance, r):
-    """Fill the variance of each measurement, and the covariance of its joints' middle.
+    """Fill the variance of each measurement, and the covariance of the joints' mean.
 
     Args:
-        frame: (n, 3, 3) the animal's own frames.
+        frame: (n, 3, 3) the animal's own axes.
         error: (n,) predicted mean joint error, mm.
-        weight: (n,) by which the variance is divided.
+        weight: (n,) divisor of the variance.
         used: (n,) bool, frames within the gate.
-        position_error: (3,) over the predicted error, along the animal, to its side, up.
-        correlated_share: share of an error whose square is left out.
-        variance: (n,) output where used, mm^2.
-        r: (n, 3, 3) output, added to where used, mm^2.
+        position_error: (3,) over the predicted error, along the animal, sideways, up.
+        correlated_share: share of an error whose square is subtracted.
+        variance: (n,) output at used frames, mm^2.
+        r: (n, 3, 3) output, added to at used frames, mm^2.
     """
     for t in range(error.size):
         if used[t]:
@@ -161,7 +160,7 @@ def measured_spread(frame, error, weight, used, position_error, correlated_share
 
 @njit(cache=True)
 def place_middles(body, middle, made):
-    """Put the poses where their joints' middles are.
+    """Translate poses so that their joints have the given means.
 
     Args:
         body: `KinematicTree` of the skeleton.
@@ -190,9 +189,7 @@ def place_middles(body, middle, made):
 
 @njit(cache=True)
 def _own_frame(tip, base, out):
-    """A frame (3, 3), as columns: from base to tip (3,), to its side, and as far up as that
-    leaves.
-    """
+    """Axes (3, 3) as columns: from base to tip (3,), sideways and level, and up."""
     x = tip[0] - base[0]
     y = tip[1] - base[1]
     z = tip[2] - base[2]
@@ -226,7 +223,7 @@ def _own_frame(tip, base, out):
 
 
 class Gains(NamedTuple):
-    """How the coordinates of a group are moved over n frames; one axis, or (3, ...) of three.
+    """Filter and smoother gains of a group of coordinates over n frames, of one axis or (3, ...).
 
     Attributes:
         decay: (n,) decay a of the step that leads to each frame.
@@ -242,19 +239,11 @@ class Gains(NamedTuple):
 
     @classmethod
     def blank(cls, n: int) -> Gains:
-        """Gains of three axes over n frames, not filled yet.
-
-        Args:
-            n: number of frames.
-        """
+        """Zero gains of three axes over n frames."""
         return cls(np.zeros((3, n)), np.zeros((3, n)), np.zeros((3, n, 2)), np.zeros((3, n, 2, 2)))
 
     def axis(self, a: int) -> Gains:
-        """The gains of one of three axes; views.
-
-        Args:
-            a: number of the axis.
-        """
+        """Views of the gains of one of three axes."""
         return Gains(*(values[a] for values in self))
 
 
@@ -273,17 +262,13 @@ class Covariances(NamedTuple):
 
     @classmethod
     def blank(cls, n: int) -> Covariances:
-        """Covariances over n frames, not filled yet.
-
-        Args:
-            n: number of frames.
-        """
+        """Zero covariances over n frames."""
         return cls(np.zeros((n, 2, 2)), np.zeros((n, 2, 2)), np.zeros((n, 2, 2)))
 
 
 @njit(cache=True)
 def _copy(a, out):
-    """Out = a, both (k, l): an assignment of rows compiles to ten times as much."""
+    """Out = a, both (k, l); assigning whole rows compiles to ten times the code."""
     for i in range(out.shape[0]):
         for k in range(out.shape[1]):
             out[i, k] = a[i, k]
@@ -291,7 +276,7 @@ def _copy(a, out):
 
 @njit(cache=True)
 def steps(times, tau, decay, gain_dt):
-    """Fill the decay a and the velocity's gain times dt, g, of the step that leads to each frame.
+    """Fill the decay a and the velocity gain g of the step that leads to each frame.
 
     Args:
         times: (n,) s.
@@ -314,10 +299,10 @@ def gains(times, r, q, tau, start, gain, covariances):
 
     Args:
         times: (n,) s.
-        r: (n,) measurement variance, infinite where nothing was measured.
+        r: (n,) measurement variance, infinite without a measurement.
         q: process variance, the density of the noise on the velocity.
         tau: decay time τ, s.
-        start: index of the first frame that was measured; frames before it are not filled.
+        start: index of the first measured frame; earlier frames are not filled.
         gain: `Gains`, output.
         covariances: `Covariances`, output.
     """
@@ -391,7 +376,7 @@ def gains(times, r, q, tau, start, gain, covariances):
 def _value_variance(dt, tau):
     """Q11 / q, s^3: process variance of the value after dt s; a series for small dt / τ."""
     x = dt / tau
-    if x < 1e-2:  # the differences below lose their digits
+    if x < 1e-2:  # the differences below lose precision
         return dt**3 * (1.0 / 3.0 - x / 4.0 + 7.0 * x * x / 60.0)
     a = np.exp(-x)
     return tau**2 * (dt - 2.0 * tau * (1.0 - a) + 0.5 * tau * (1.0 - a * a))
@@ -436,7 +421,7 @@ def smooth_values(y, known, start, gain, out, rate):
 def smooth_positions(times, y, r, known, start, process_variance, tau, out, spread):
     """Filter and smooth positions with full measurement covariances; the state is (6,).
 
-    Products are loops: matrices so small are not for BLAS.
+    Products are loops: the matrices are too small for BLAS.
 
     Args:
         times: (n,) s.
@@ -494,7 +479,7 @@ def smooth_positions(times, y, r, known, start, process_variance, tau, out, spre
         for i in range(6):
             for k in range(3):
                 state[t, i] += gain[i, k] * (y[t, k] - ahead[t, k])
-                for j in range(i + 1):  # one half: rounding that differs between the two would grow
+                for j in range(i + 1):  # lower triangle only: asymmetric rounding would grow
                     p[t, i, j] -= gain[i, k] * m[t, k, j]
         for i in range(6):
             for j in range(i):
@@ -574,9 +559,7 @@ def _multiply(a, b, out):
 
 @njit(cache=True)
 def _invert(a, out, work):
-    """Out = the inverse of a symmetric positive definite matrix (k, k), by its Cholesky factor in
-    `work`.
-    """
+    """Out = inverse of a symmetric positive definite matrix (k, k), by Cholesky in `work`."""
     cholesky(a, work, 1e-300)
     out[:] = 0.0
     for c in range(a.shape[0]):
@@ -608,8 +591,8 @@ def _between(a, b, out):
 def smooth_rotations(y, known, start, gain, out, rate):
     """Filter and smooth rotations by the left-invariant error: `smooth_values` on SO(3).
 
-    The velocity is the body's own angular velocity, rad/s, and the error a rotation vector on the
-    right, R' = R exp(w). Each axis of the body has its own gains.
+    The velocity is the angular velocity in the body frame, rad/s, and the error a rotation vector
+    on the right, R' = R exp(w). Each axis of the body has its own gains.
 
     Args:
         y: (n, 3, 3) measured rotations.

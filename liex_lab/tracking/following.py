@@ -1,16 +1,16 @@
-"""Poses that a person placed as measurements to the smoother: the frames around them follow.
+"""Corrected poses as measurements to the smoother: the frames around them follow.
 
 Conditioning of a Gaussian process (Rauch, Tung and Striebel 1965): the smoother is affine in its
-measurements, and one more that says what the curve says already changes nothing. So a pose placed
-off the curve by δ at frame k moves the curve by what the same smoother makes of the measurements
+measurements, and an additional measurement that agrees with the curve changes nothing. So a pose
+placed off the curve by δ at frame k moves the curve by the smoother's response to the measurements
 
-    y_k = δ  with (almost) no error,    y_t = 0  with the error of frame t elsewhere,
+  y_k = δ  with (almost) no error,    y_t = 0  with the error of frame t elsewhere,
 
-coordinate by coordinate: the joints' middle (mm), the base's turn log(R^T R') and the joints'
-angles (rad), each an integrated Ornstein-Uhlenbeck process with the parameters of `smoother`. As
-there, errors have heavy tails, w = (ν + 1) / (ν + δ^2) in four passes: frames from which the person
-departs by more than their predicted errors have less to say, and the curve is even. A frame follows
-no farther than to where a joint of it reaches the floor.
+coordinate by coordinate: the joints' mean (mm), the base's rotation log(R^T R') and the joints'
+angles (rad), each an integrated Ornstein-Uhlenbeck process with the parameters of `smoother`. Here
+too errors have heavy tails, w = (ν + 1) / (ν + δ^2) in four passes: frames that differ from the
+correction by more than their predicted errors weigh less, and the curve stays smooth. A frame
+follows only until one of its joints reaches the floor.
 """
 
 from __future__ import annotations
@@ -28,25 +28,25 @@ from liex_lab.tracking.track import Track
 Array = NDArray[np.float64]
 Rows = NDArray[np.int64]
 
-_REACH = 160  # frames on either side that may follow
-_CERTAIN = 1e-3  # of a frame's predicted error: how far a person may err
+_REACH = 160  # frames on either side that may move
+_CERTAIN = 1e-3  # error of a correction over a frame's predicted error
 _PASSES = 4
-_HALVINGS = 10  # how exactly it is found how far a frame can follow before it reaches the floor
-_LEAST_MM = 0.02  # a pose that moves less stays as it was
-_LEAST_ERROR = 0.005  # of the length: so much a frame errs at least
+_HALVINGS = 10  # bisection steps of the share by which a frame can move above the floor
+_LEAST_MM = 0.02  # poses that would move less are unchanged
+_LEAST_ERROR = 0.005  # smallest error of a frame, over the length
 
 
 def let_follow(track: Track, was: Pose, placed: Rows) -> Rows:
-    """Let the poses around some follow them, in place; returns the rows that did.
+    """Move the poses around corrected ones with them, in place; returns the moved rows.
 
     Args:
-        track: the track, n rows, in which the placed poses are already; changed in place, but for
+        track: the track, n rows, with the corrected poses already set; changed in place, except for
             `uv_px`, which belongs to the camera.
-        was: the n poses as they were before.
-        placed: (k,) rows of the placed poses, ascending.
+        was: the n poses before the correction.
+        placed: (k,) rows of the corrected poses, ascending.
 
     Returns:
-        (m,) rows that follow, ascending; no placed one is among them.
+        (m,) moved rows, ascending, without the corrected ones.
     """
     near = np.zeros(len(track.times_ns), bool)
     for row in placed:
@@ -60,7 +60,7 @@ def let_follow(track: Track, was: Pose, placed: Rows) -> Rows:
 
 
 def _follow(track: Track, was: Pose, rows: Rows, placed: NDArray[np.bool_]) -> Rows:
-    """One stretch of rows, of which those of the mask were placed."""
+    """Move one stretch of rows; the mask marks the corrected ones."""
     skeleton = track.skeleton
     motion = TrackingParameters.of(skeleton.name).motion
     joints_were = was[rows].joints(skeleton)
@@ -81,7 +81,7 @@ def _follow(track: Track, was: Pose, rows: Rows, placed: NDArray[np.bool_]) -> R
         weight = np.where(placed, 1.0, (nu + 1.0) / (nu + (apart / error) ** 2))
     lowest = np.minimum(joints_were[..., 2], 0.0)
     share = high = np.ones((len(rows), 1))
-    low = np.zeros((len(rows), 1))  # the share of the move that a frame can follow
+    low = np.zeros((len(rows), 1))  # the share of the move that keeps a frame above the floor
     for _ in range(_HALVINGS):
         joints = _moved(track, was, rows, share * moved).joints(skeleton)
         above = (joints[..., 2] >= lowest).all(axis=1, keepdims=True)
@@ -95,7 +95,7 @@ def _follow(track: Track, was: Pose, rows: Rows, placed: NDArray[np.bool_]) -> R
 
 
 def _departures(track: Track, was: Pose, rows: Rows, joints_were: Array) -> Array:
-    """(n, 6 + 3 J) how far the poses are now from what they were: middle, turn, angles."""
+    """(n, 6 + 3 J) differences between current and previous poses: mean, rotation, angles."""
     middle = (track.joints_mm[rows] - joints_were).mean(axis=1)
     turn = so3.log(np.swapaxes(was.root.rotation[rows], 1, 2) @ track.root_rotation[rows])
     bend = track.angles_rad[rows] - was.angles[rows]
@@ -103,7 +103,7 @@ def _departures(track: Track, was: Pose, rows: Rows, joints_were: Array) -> Arra
 
 
 def _smoothed(seconds: Array, off: Array, error: Array, length: float, motion: Motion) -> Array:
-    """What the smoother makes of the departures (n, c), coordinate by coordinate."""
+    """The smoother's response to the differences (n, c), coordinate by coordinate."""
     n, n_coordinates = off.shape
     known = np.isfinite(error)
     start = int(np.argmax(known))

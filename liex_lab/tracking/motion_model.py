@@ -1,9 +1,9 @@
-"""Motion and association parameters of each animal, read from and written to `tunings.toml` (TOML).
+"""Motion and association parameters of each animal, stored in `tunings.toml`.
 
-They hold what the tracker believes of an animal: how it moves (integrated Ornstein-Uhlenbeck
-processes), how single frames err, and the costs of a chain of hypotheses. The file beside this
-module holds them for the bundled animals; `liex train tracking` finds them again, on rendered
-sequences whose seeds are not those of any test.
+The parameters describe how an animal moves (integrated Ornstein-Uhlenbeck processes), how single
+frames err, and the costs of a chain of hypotheses. The file next to this module contains them for
+the bundled animals; `liex train tracking` fits them on rendered sequences whose seeds are not those
+of any test.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from liex_lab.tracking.association import AssociationCosts
 from liex_lab.tracking.smoother import Motion, OrnsteinUhlenbeck
 
 TUNINGS = Path(__file__).with_name("tunings.toml")
-# fields of `Motion` that have another name in the file, which other versions wrote and read
+# fields of `Motion` with another name in the file, kept for compatibility
 _STORED_AS = {
     "position_error": "place_error",
     "position_variance": "place_drive",
@@ -31,7 +31,7 @@ _STORED_AS = {
     "bend_calibration": "honest_bend",
     "joint_calibration": "honest_joints",
 }
-_USUAL = "mouse"  # what an animal is taken for that has none of its own
+_USUAL = "mouse"  # used for animals without parameters of their own
 
 
 @dataclass(frozen=True)
@@ -49,19 +49,19 @@ class TrackingParameters:
     @staticmethod
     @cache
     def of(name: str) -> TrackingParameters:
-        """The parameters of an animal, the mouse's where it has none of its own.
+        """The parameters of an animal, or the mouse's if it has none of its own.
 
         Args:
             name: name of the skeleton, such as 'fish'.
 
         Returns:
-            The parameters, read once per name.
+            The parameters, cached by name.
         """
         known = tomllib.loads(TUNINGS.read_text(encoding="utf-8"))
         if name in known:
             return TrackingParameters.from_table(known[name])
         usual = TrackingParameters.from_table(known[_USUAL])
-        # its joints are others
+        # the joints differ
         return replace(usual, motion=replace(usual.motion, joint_calibration=()))
 
     @staticmethod
@@ -69,11 +69,8 @@ class TrackingParameters:
         """The parameters from their TOML table.
 
         Args:
-            table: the tables `chain` and `motion` as `tomllib` reads them; the three numbers of a
+            table: the tables `chain` and `motion` as read by `tomllib`; the three numbers of a
                 coordinate are error, drive (process variance) and fade (decay time).
-
-        Returns:
-            The parameters.
         """
         field_of = {stored: name for name, stored in _STORED_AS.items()}
         motion = {field_of.get(key, key): value for key, value in table["motion"].items()}
@@ -114,14 +111,14 @@ class TrackingParameters:
 
 
 def tunings_with(name: str, tuning: TrackingParameters) -> str:
-    """The text of `tunings.toml` with an animal's tables replaced, or added to it.
+    """The text of `tunings.toml` with an animal's tables added or replaced.
 
     Args:
         name: name of the animal's skeleton.
         tuning: its parameters.
 
     Returns:
-        The whole file, with the comment at its head.
+        The whole file, including its leading comment.
     """
     text = TUNINGS.read_text(encoding="utf-8")
     head = text[: text.index("\n[")]

@@ -1,8 +1,8 @@
-"""Pose hypotheses of single frames as columns: the measurements that the tracker works on.
+"""Pose hypotheses of single frames as columns: the measurements used by the tracker.
 
-Each frame has four hypotheses in the arena frame: of the best and of the second component of about
-the animal's size, the best pose and the best pose that points the other way. Hypothesis h ^ 1 is
-hypothesis h with head and tail exchanged. The fields are the columns of `observations.npz`.
+Each frame has four hypotheses in the arena frame: for the best and the second-best component of
+about the animal's size, the best pose and the best pose with the opposite heading. Hypothesis h ^ 1
+is hypothesis h with head and tail exchanged. The fields are the columns of `observations.npz`.
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ from liex_lab.runtime.memory import Allocator, blocks
 Array = NDArray[np.float64]
 Small = NDArray[np.float32]
 
-# of two things in the frame one way round and the other: hypothesis h ^ 1 is h turned round
+# two components, each with both headings: hypothesis h ^ 1 is h reversed
 N_HYPOTHESES = 4
 
 
 @dataclass(frozen=True)
 class Observations:
-    """Hypotheses (n, H) of n frames, NaN where there is none.
+    """Hypotheses (n, H) of n frames, NaN if absent.
 
-    The first is the single frame's own answer. Single precision, for a recording may last hours.
+    The first is the single-frame estimate. Single precision, as a recording may last hours.
 
     Attributes:
         skeleton: kinematic tree of the animal.
@@ -41,17 +41,17 @@ class Observations:
         angles: (n, H, D) rad about the skeleton's D free axes, joint by joint, without the base.
         scale: (n, H) of the bones.
         error_mm: (n, H) expected mean joint error, mm.
-        score: (n, H) what the learned metric says of the candidates behind it, mm at home size.
+        score: (n, H) score of the learned metric for the candidates, mm at home size.
         residual_mm: (n, H) distance between rendered body and depth, mm.
-        n_px: (n, H) int32 pixels of the component that it is a pose of, 0 where there is none.
+        n_px: (n, H) int32 pixels of the hypothesis's component, 0 if absent.
         centroid_mm: (n, H, 3) centre of that component, arena frame, mm.
         centroid_px: (n, H, 2) its projection, px of the depth image.
-        has_depth: (n,) True where anything was read, and not copied from the frame before.
-        covered: (n, H) share of the silhouette that the rendered body covers.
-        beside: (n, H) share of the rendered body that lies beside the silhouette.
-        behind: (n, H) share of the component's outline that ends at something nearer.
+        has_depth: (n,) True if the frame has depth that is not copied from the previous frame.
+        covered: (n, H) share of the silhouette that is covered by the rendered body.
+        beside: (n, H) share of the rendered body that is outside the silhouette.
+        behind: (n, H) share of the component's outline that borders on something nearer.
         part_mm: (n, H) that distance in the part of the body where it is largest, mm.
-        repeats: (n,) True where the depth image is, bit for bit, the one before it.
+        repeats: (n,) True if the depth image is bit-identical to the previous one.
     """
 
     skeleton: Skeleton
@@ -75,7 +75,7 @@ class Observations:
 
     @staticmethod
     def empty(skeleton: Skeleton, times_ns: NDArray[np.int64]) -> Observations:
-        """Observations of frames in which nothing was found; `has_depth` is True throughout.
+        """Observations of frames without detections; `has_depth` is True throughout.
 
         Args:
             skeleton: kinematic tree of the animal.
@@ -118,7 +118,7 @@ class Observations:
 
         Args:
             h: index of the hypothesis.
-            pose: (n) poses in the arena frame, NaN where there is none.
+            pose: (n) poses in the arena frame, NaN if absent.
         """
         known = np.isfinite(pose.scale)
         self.turn[known, h] = so3.log(pose.root.rotation[known])
@@ -128,13 +128,10 @@ class Observations:
 
     @staticmethod
     def join(parts: Sequence[Observations]) -> Observations:
-        """The observations of consecutive frames as one.
+        """Concatenate observations of consecutive frames.
 
         Args:
             parts: observations of one animal in order of time, at least one.
-
-        Returns:
-            All their frames.
         """
         return Observations(
             parts[0].skeleton,
@@ -142,7 +139,7 @@ class Observations:
         )
 
     def __getitem__(self, frames: slice) -> Observations:
-        """Some consecutive frames; what is written into them is written into the whole."""
+        """Some consecutive frames, as views."""
         return Observations(self.skeleton, *(getattr(self, name)[frames] for name in COLUMNS))
 
     def __len__(self) -> int:
@@ -156,11 +153,11 @@ class Observations:
 
     @property
     def known(self) -> NDArray[np.bool_]:
-        """(n, H) True where there is a hypothesis."""
+        """(n, H) True if the hypothesis exists."""
         return np.isfinite(self.score)
 
     def forget(self, copies: NDArray[np.bool_]) -> None:
-        """Take out, in place, what was found in frames (n,) whose depth image is a copy."""
+        """Clear, in place, the observations of frames (n,) whose depth image is a copy."""
         nothing = Observations.empty(self.skeleton, self.times_ns)
         for name in {*COLUMNS} - {"times_ns", "repeats"}:
             getattr(self, name)[copies] = getattr(nothing, name)[copies]
@@ -168,22 +165,22 @@ class Observations:
 
     @property
     def copies(self) -> NDArray[np.bool_]:
-        """(n,) True where the depth image is a copy of the one before it, and so shows nothing."""
+        """(n,) True if the depth image is a copy of the previous one, without new information."""
         return self.repeats & ~self.has_depth
 
     @property
     def shown(self) -> NDArray[np.int64]:
-        """(n,) row of the frame whose depth image each frame shows: its own, but of copies."""
+        """(n,) row of the frame in which each depth image was taken; for copies, the original's."""
         return np.maximum.accumulate(np.where(self.copies, 0, np.arange(len(self))))
 
     def pose(self, path: NDArray[np.int64]) -> Pose:
-        """The poses (n) that a path takes, arena frame.
+        """Poses (n) along a path of hypotheses, arena frame.
 
         Args:
             path: (n,) index of a hypothesis for each frame, negative for none.
 
         Returns:
-            (n) poses; NaN where the path is negative or there is no such hypothesis.
+            (n) poses; NaN if the path is negative or the hypothesis is absent.
         """
         turn, place, free, scale = (
             self.along(v, path) for v in (self.turn, self.place, self.angles, self.scale)
@@ -200,7 +197,7 @@ class Observations:
             path: (n,) index of a hypothesis for each frame, negative for none.
 
         Returns:
-            (n, ...) float64, NaN where the path is negative.
+            (n, ...) float64, NaN if the path is negative.
         """
         taken = values[np.arange(len(path)), np.maximum(path, 0)].astype(np.float64)
         taken[path < 0] = np.nan
@@ -214,7 +211,7 @@ class Observations:
             allocate: allocator of the result.
 
         Returns:
-            (n, H, k, 3) mm, float32, arena frame; NaN where there is no hypothesis.
+            (n, H, k, 3) mm, float32, arena frame; NaN if the hypothesis is absent.
         """
         out = allocate((*self.score.shape, len(joints), 3), np.float32)
         for rows in blocks(len(self), _BLOCK):
@@ -231,7 +228,7 @@ class Observations:
             joints: indices of k joints.
 
         Returns:
-            (n, k, 3) mm, float32, arena frame; NaN where there is no such hypothesis.
+            (n, k, 3) mm, float32, arena frame; NaN if the hypothesis is absent.
         """
         out = np.full((len(self), len(joints), 3), np.nan, np.float32)
         rows = np.flatnonzero(self.known[:, h])
@@ -242,7 +239,7 @@ class Observations:
 
 
 def joints_of(skeleton: Skeleton, pose: Pose) -> Array:
-    """Joint positions of poses by forward kinematics; as `Pose.joints`, but quicker.
+    """Joint positions of poses by forward kinematics; as `Pose.joints`, but faster.
 
     Args:
         skeleton: kinematic tree of the animal.
@@ -268,9 +265,9 @@ COLUMNS = tuple(field.name for field in fields(Observations) if field.name != "s
 
 
 def reversed_pose(skeleton: Skeleton, pose: Pose) -> Pose:
-    """Poses that lie where others do, with head and tail exchanged.
+    """The same poses with head and tail exchanged.
 
-    The joints are moved along the body's line until it is measured from its other end.
+    Joints are moved along the body's midline to the arc lengths measured from its other end.
 
     Args:
         skeleton: a kinematic tree that is one chain.

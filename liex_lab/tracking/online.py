@@ -1,9 +1,7 @@
-"""Fixed-lag smoothing while the recording goes on: the methods of `offline` over a sliding window.
+"""Fixed-lag smoothing of an ongoing recording: the methods of `offline` over a sliding window.
 
-A window of 48 frames is associated by Viterbi, with decisions already given out kept, and smoothed
-by the Kalman filter and Rauch-Tung-Striebel smoother of an integrated Ornstein-Uhlenbeck process
-from 20 frames before the first row due. Each frame's row is given `lag` frames later; lag 0 is
-filtering.
+A window of 48 frames is associated by Viterbi, with earlier decisions fixed, and smoothed by the
+Kalman filter and Rauch-Tung-Striebel smoother of an integrated Ornstein-Uhlenbeck process.
 """
 
 from __future__ import annotations
@@ -19,22 +17,21 @@ from liex_lab.tracking.track import Subject, Track
 from liex_lab.tracking.track_rows import hide, to_track
 from liex_lab.tracking.trust import Watch
 
-# frames that have a say in which hypothesis is the animal, and before the one that is told in where
-# exactly it is
+# frames used to choose the hypothesis, and frames before the current one used to smooth
 _WINDOW = 48
 _BEFORE = 20
 
 
 class OnlineTracker:
-    """Takes the observations of frames as they come; gives a row for every one, `lag` frames later.
+    """Receives observations of frames as they arrive; returns a row for each, `lag` frames later.
 
-    Which hypothesis a frame of the past was stays as it was given out; estimates can only get
-    better with a longer lag. With lag 0 a row is given at once, from the past alone.
+    The hypothesis chosen for a frame does not change once its row is returned; estimates improve
+    with a longer lag. With lag 0 a row is returned at once, from the past alone.
 
     Args:
-        subject: whom the track is of.
-        lag: frames by which a row is held back.
-        tuning: motion and association parameters; None takes the animal's own.
+        subject: the animal.
+        lag: frames by which a row is delayed.
+        tuning: motion and association parameters; None uses the animal's own.
     """
 
     def __init__(
@@ -48,20 +45,20 @@ class OnlineTracker:
             subject.skeleton, subject.length_mm, tuning.chain, subject.n_animals
         )
         self._seen: Observations | None = None
-        self._told = 0  # of the window's frames
+        self._told = 0  # number of the window's frames already returned
         self._path: NDArray[np.int64] = np.zeros(0, np.int64)
-        # of the window's hypotheses, those that the chain goes by
+        # joints of the window's hypotheses that the association uses
         self._joints: NDArray[np.float32] | None = None
         self._watch = Watch()
 
     def add(self, seen: Observations) -> Track | None:
-        """The rows that have become due with these frames.
+        """Add frames; returns the rows that are due.
 
         Args:
             seen: hypotheses (n, H) of the next n frames, arena frame.
 
         Returns:
-            As many rows as are due, in order; None where there are none yet.
+            The rows that are due, in order; None if none are.
         """
         rows = []
         for k in range(len(seen)):
@@ -71,12 +68,12 @@ class OnlineTracker:
         return Track.join(rows) if rows else None
 
     def close(self) -> Track | None:
-        """The rows that were held back, at the end of the recording; None where there are none."""
+        """The delayed rows, at the end of the recording; None if there are none."""
         left = len(self._path) - self._told
         return self._tell(left) if left else None
 
     def _take(self, frame: Observations) -> None:
-        """Move the window on by one frame."""
+        """Advance the window by one frame."""
         joined = frame if self._seen is None else Observations.join([self._seen, frame])
         joints = self._chain.joints(frame)
         joints = joints if self._joints is None else np.concatenate([self._joints, joints])
@@ -87,7 +84,7 @@ class OnlineTracker:
         self._path = np.append(self._path[gone:], NONE)
 
     def _tell(self, n: int) -> Track:
-        """The rows of the n frames after those that were given out."""
+        """The rows of the next n frames that have not been returned yet."""
         assert self._seen is not None
         seen = self._seen
         told = self._told
@@ -97,7 +94,7 @@ class OnlineTracker:
         self._path[told : told + n] = path[told : told + n]
         doubt = self._chain.doubt(seen, path, self._joints, emission=emission)
         first = max(0, told - _BEFORE)
-        if (path[first:] == NONE).all():  # what is known of the animal lies further back
+        if (path[first:] == NONE).all():  # all observations of the animal are older
             first = 0
         seen = seen[first:]
         path = path[first:]

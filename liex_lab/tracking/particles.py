@@ -1,17 +1,17 @@
-"""Particle filter with Brownian motion on SE(3): Algorithm 3 of Lie-X (section 4.2) to the letter.
+"""Particle filter with Brownian motion on SE(3): Algorithm 3 of Lie-X (section 4.2) as published.
 
 1. Select: draw K particles from the cumulative weights.
 2. Propagate: the base joint by a left-invariant Brownian step, g exp(sqrt(δ) ξ) with ξ ~ N(0, C)
-   (Eq. 6 and 7); every other joint by the cascade's regressors from its parent (Eq. 10). They and
-   the metric answer as in Algorithm 1, see `Cascade.predict`. The paper does not say whether the
-   base's own regressors run after its step; `base_rounds` of `ParticleFilter` is the reading.
+(Eq. 6 and 7); every other joint by the cascade's regressors from its parent (Eq. 10). Regressors
+and metric are used as in Algorithm 1, see `Cascade.predict`. The paper does not state whether the
+base's own regressors run after its step; `base_rounds` of `ParticleFilter` selects this.
 3. Measure: m is the learned metric's score; w = exp(-m^2 / 2 σ^2) (Eq. 12), normalised to sum 1
-   (Eq. 13).
-4. Estimate: the weighted average of tangent vectors (Eq. 14), taken about itself: the intrinsic
-   mean on the group.
+(Eq. 13).
+4. Estimate: the weighted average of tangent vectors (Eq. 14), taken at the average itself: the
+intrinsic mean on the group.
 
-What the paper leaves open is stated in `ProcessNoise` and in `ParticleFilter`. The filter keeps its
-rows in the tables of the evaluation; the default tracker is `curve` (`offline`).
+Choices that the paper leaves open are stated in `ProcessNoise` and in `ParticleFilter`. The filter
+is kept for the evaluation tables; the default tracker is `curve` (`offline`).
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ _AVERAGING_PASSES = 10
 
 @dataclass(frozen=True)
 class ProcessNoise:
-    """Process noise of the base joint, and how the metric's scores weigh: left open by the paper.
+    """Process noise of the base joint and scale of the metric's scores, left open by the paper.
 
     Lengths are those of an animal of the reference length.
 
@@ -57,28 +57,28 @@ class ProcessNoise:
     def of(name: str, variant: str = "default", base_rounds: int = 0) -> ProcessNoise:
         """The parameters of an animal.
 
-        A fish goes and turns three times as far, by its length, between two frames as a mouse.
-        Those of the paper's variant are what `liex train tracking --particles` found on sequences
-        to develop on, where it was run, see `searched`.
+        Between two frames a fish moves and turns three times as far as a mouse, relative to its
+        length. Those of the paper's variant were found by `liex train tracking --particles` on
+        development sequences, see `searched`.
 
         Args:
             name: name of the skeleton; 'fish' has its own, all others the default.
-            variant: whose regressors and metric are used, 'default' or 'paper'.
+            variant: variant of the regressors and the metric, 'default' or 'paper'.
             base_rounds: rounds of the base joint, see `ParticleFilter`.
 
         Returns:
-            The parameters; the animal's own where none were searched for the variant.
+            The parameters; the animal's own if none were searched for the variant.
         """
         own = ProcessNoise(turn_rad=0.45, shift_mm=12.0) if name == "fish" else ProcessNoise()
         return _SEARCHED.get((name, variant, base_rounds), own)
 
     @staticmethod
     def searched(name: str, variant: str, base_rounds: int) -> bool:
-        """Whether the parameters of an animal and a variant were searched, and not set by hand.
+        """Whether the parameters of an animal and a variant were searched, not set by hand.
 
         Args:
             name: name of the skeleton.
-            variant: whose regressors and metric are used.
+            variant: variant of the regressors and the metric.
             base_rounds: rounds of the base joint.
         """
         return (name, variant, base_rounds) in _SEARCHED
@@ -102,21 +102,22 @@ class _Particles:
 
 
 class ParticleFilter:
-    """Tracks one animal frame by frame; the first frame in which it is found places all particles.
+    """Tracks one animal frame by frame; its first detection initialises all particles.
 
     Selection, propagation of the base by Eq. 7 and of the other joints by Eq. 10, measurement by
     the learned metric with Eq. 12 and 13, and Eq. 14, where the average of tangent vectors is taken
-    about itself, that is on the group. Each particle keeps the bones' scale of the first frame
-    unless a base round corrects it. In a frame without a foreground particles wander on.
+    at the average itself, that is on the group. Each particle keeps the bones' scale of the first
+    frame unless a base round corrects it. In a frame without a foreground the particles continue to
+    diffuse.
 
     Args:
         estimator: the pose estimator whose regressors and metric are used.
         scene: the segmenter of the recording's camera.
         size: the animal's spine over the skeleton's home length.
-        rng: source of the Brownian steps and of the selection.
-        noise: process noise; None takes the animal's own.
-        base_rounds: so many of the base joint's last regression rounds run on every particle after
-            its Brownian step; 0: none, as the paper's words have it.
+        rng: random number generator.
+        noise: process noise; None uses the animal's own.
+        base_rounds: number of the base joint's last regression rounds that run on every particle
+            after its Brownian step; 0 for none, as in the paper.
     """
 
     def __init__(
@@ -145,7 +146,7 @@ class ParticleFilter:
 
         Returns:
             The pose () in the camera frame and its expected mean joint error, mm; None before the
-            animal is found, and where no particle can be measured.
+            animal is detected, and if no particle can be measured.
         """
         method = self._estimator.model.method
         depths = frame.depth[None]
@@ -189,7 +190,7 @@ class ParticleFilter:
         ), float(found.chosen.error_mm[0])
 
     def _select(self) -> None:
-        """Selection: draw particles from the cumulative weights; all weigh the same afterwards."""
+        """Selection: draw particles from the cumulative weights; all have equal weights afterwards."""
         assert self._particles is not None
         p = self._particles
         k = self._noise.n_particles
@@ -208,7 +209,7 @@ class ParticleFilter:
         p = self._particles
         spread = np.array([noise.turn_rad] * 3 + [noise.shift_mm * self._size * self._unit] * 3)
         n_steps = max(1, int(np.ceil(dt / noise.delta_s - 1e-9)))
-        # the deviations are those of a whole step, so steps are drawn for a unit of time of delta_s
+        # deviations are those of a whole step: the unit of time is delta_s
         steps = brownian_steps(self._rng, np.diag(spread**2), n_steps, len(p.scale))
         p.base = brownian_ends(p.base, steps, 1.0, min(dt / noise.delta_s, float(n_steps)))
 
@@ -241,7 +242,7 @@ class ParticleFilter:
         return candidates.rotations, candidates.positions, scores[:, 0].astype(float)
 
     def _average(self, rotations: Array, positions: Array) -> Pose:
-        """Eq. 14 about the average itself: the base on SE(3), other joints on their axes."""
+        """Eq. 14 at the average itself: the base on SE(3), other joints on their axes."""
         assert self._particles is not None
         weight = self._particles.weight
         skeleton = self._estimator.skeleton

@@ -1,13 +1,13 @@
 """Robust smoothing of poses on SE(3) x R^d: Kalman filter and RTS smoother with Student-t weights.
 
-Every coordinate (the joints' middle, mm; the base's rotation on SO(3); joint angles; log scale) is
-an integrated Ornstein-Uhlenbeck process: dx = v dt, dv = -v / τ dt + sqrt(q) dW (Johnson et al.
-2008). Measurement errors follow a t distribution of ν degrees of freedom, fitted by iteratively
-reweighted smoothing: w = (ν + 1) / (ν + δ^2) with δ the distance from the curve over the predicted
-error, and a gate beyond which a measurement does not count. Of the error's variance the share c^2
-is correlated over neighbouring frames: no smoother takes it away, so it is left out of the filter
-and added to the posterior. Calibration factors then scale the posterior spread to the errors
-observed on rendered sequences. The kernels are in `_smoother_kernels`.
+Every coordinate (the joints' mean, mm; the base's rotation on SO(3); joint angles; log scale) is an
+integrated Ornstein-Uhlenbeck process: dx = v dt, dv = -v / τ dt + sqrt(q) dW (Johnson et al. 2008).
+Measurement errors follow a t distribution of ν degrees of freedom, fitted by iteratively reweighted
+smoothing: w = (ν + 1) / (ν + δ^2) with δ the distance from the curve over the predicted error, and
+a gate beyond which a measurement is excluded. A share c^2 of the error variance is correlated over
+neighbouring frames: smoothing cannot reduce it, so it is excluded from the filter and added to the
+posterior. Calibration factors then scale the posterior spread to the errors observed on rendered
+sequences. The kernels are in `_smoother_kernels`.
 """
 
 from __future__ import annotations
@@ -31,15 +31,14 @@ _PASSES = 4
 
 @dataclass(frozen=True)
 class OrnsteinUhlenbeck:
-    """Integrated Ornstein-Uhlenbeck parameters of one coordinate, and how single frames err in it.
+    """Integrated Ornstein-Uhlenbeck and measurement-error parameters of one coordinate.
 
     Attributes:
         error: standard deviation of a measurement (rad, or of the log scale) times the animal's
             length over the predicted mean joint error.
         process_variance: process variance q, the density of the white noise that drives the
-            velocity,
-            rad^2/s^3 (1/s^3 of the log scale).
-        decay_s: decay time τ, s, within which a velocity dies away by itself.
+            velocity, rad^2/s^3 (1/s^3 of the log scale).
+        decay_s: decay time τ of the velocity, s.
     """
 
     error: float
@@ -49,42 +48,35 @@ class OrnsteinUhlenbeck:
 
 @dataclass(frozen=True)
 class Motion:
-    """How an animal moves and how frames err; errors are over the predicted mean joint error.
+    """Motion and error parameters of an animal; errors are over the predicted mean joint error.
 
     Attributes:
-        position_error: standard deviation of the joints' middle along the animal, to its side, and
-            up.
-        position_variance: process variance of the middle in the level and up, lengths^2/s^3.
-        position_decay_s: decay time of the middle's velocity, s.
+        position_error: standard deviation of the joints' mean along the animal, sideways and up.
+        position_variance: process variance of the mean horizontally and up, lengths^2/s^3.
+        position_decay_s: decay time of the mean's velocity, s.
         turn: the base's rotation about its own x, y and z axis.
         bend: the other joints' angles about their own x, y and z axis.
         size: the logarithm of the bones' scale.
         degrees_of_freedom: degrees of freedom of the t distribution of errors.
-        gate: gate, in predicted errors: a measurement farther off the curve is no measurement at
-            all.
-        correlated_share: correlated share, the share of an error that neighbouring frames have in
-            common and
-            no smoother takes away.
+        gate: distance from the curve beyond which a measurement is excluded, predicted errors.
+        correlated_share: share of an error that is common to neighbouring frames and cannot be
+            smoothed away.
         calibration: calibration factors of the error, pairs (error over length, factor) in rising
-            order,
-            interpolated in the logarithm of the former: the error that is observed over the
-            posterior's, beside what a wrong size does.
-        stretch: what the share by which distances from the base may be off (see `Subject`) grows
-            with: how far the body lies from the depth seen, over its length, and the standard
-            deviation of the logarithm of the size that single frames estimate.
-        usual_stretch: that share in a session of which neither is known.
-        unseen_height: standard deviation, over the length, of the height of the joints as a whole:
-            a camera sees the back of an animal, and how far below it the midline lies is a matter
-            of its build.
-        unseen_shift: the same of their place along the body: where in its outline the joints lie.
-        root_calibration: calibration factors of the root's rotation about (3) and position along
-            (3) its
-            own axes, over what that leaves.
-        bend_calibration: calibration factors of the other joints' angles about their x, y and z
-            axis,
-            likewise.
-        joint_calibration: factors of the joints' standard deviations along each axis, one a joint;
-            () leaves them as they are.
+            order, interpolated in the logarithm of the error: the ratio of observed to posterior
+            error, without the effect of a wrong size.
+        stretch: coefficients of the relative error of distances from the base (see `Subject`): for
+            the residual between body and depth over the length, and for the standard deviation of
+            the logarithm of the sizes estimated from single frames.
+        usual_stretch: that relative error in a session for which neither is available.
+        unseen_height: standard deviation, over the length, of the height of all joints together: a
+            camera observes the animal's back, and the depth of the midline below it depends on the
+            animal's build.
+        unseen_shift: the same for the position of the joints along the body.
+        root_calibration: remaining calibration factors of the root's rotation about (3) and
+            position along (3) its own axes.
+        bend_calibration: likewise, of the other joints' angles about their x, y and z axis.
+        joint_calibration: factors of the joints' standard deviations along each axis, one per
+            joint; () leaves them unchanged.
     """
 
     position_error: tuple[float, float, float]
@@ -106,21 +98,21 @@ class Motion:
     joint_calibration: tuple[float, ...] = ()
 
     def stretch_sd(self, blur: float, size_spread: float) -> float:
-        """Standard deviation of the share by which an animal's lengths may be off, see `Subject`.
+        """Standard deviation of the relative error of an animal's lengths, see `Subject`.
 
         Args:
             blur: usual residual of its body over its length.
-            size_spread: standard deviation of the logarithm of the sizes that frames tell.
+            size_spread: standard deviation of the logarithm of single-frame size estimates.
         """
         per_blur, per_spread = self.stretch
         return float(np.hypot(per_blur * blur, per_spread * size_spread))
 
     @property
     def packed(self) -> kernels.Moves:
-        """The parameters as arrays for the numba kernels, level process variance twice, then up."""
+        """The parameters as arrays for the numba kernels; position variance as (3,) x, y, z."""
 
         def rows(*moves: OrnsteinUhlenbeck) -> Array:
-            """One row (error, drive, fade) for each of the moves given, (k, 3)."""
+            """One row (error, process variance, decay time) per coordinate, (k, 3)."""
             return np.array([[m.error, m.process_variance, m.decay_s] for m in moves])
 
         level, up = self.position_variance
@@ -145,10 +137,10 @@ class Curve:
         pose: (n) smoothed poses.
         joints: (n, J, 3) mm.
         error_mm: (n,) expected mean joint error, mm.
-        cov_middle_mm2: (n, 3, 3) covariance of the joints' middle along the arena's axes, mm^2.
+        cov_middle_mm2: (n, 3, 3) covariance of the joints' mean along the arena's axes, mm^2.
         sd_turn: (n, 3) standard deviation of the base's rotation about its own axes, rad.
-        sd_bend: (n, 3) standard deviation of the other joints' angles about theirs, rad.
-        used: (n,) frames whose measurement the curve goes by.
+        sd_bend: (n, 3) standard deviation of the other joints' angles about their axes, rad.
+        used: (n,) frames whose measurement was used.
     """
 
     pose: Pose
@@ -165,15 +157,7 @@ class Curve:
 
     @staticmethod
     def unknown(n: int, n_joints: int) -> Curve:
-        """A curve of frames in which nothing was measured: all NaN, none used.
-
-        Args:
-            n: number of frames.
-            n_joints: number of joints J.
-
-        Returns:
-            A curve of n rows.
-        """
+        """A curve without measurements: all NaN, none used."""
         nan = np.full((n, n_joints, 3, 3), np.nan)
         axes = nan[:, 0, 0]
         none = nan[:, 0, 0, 0]
@@ -192,22 +176,22 @@ def smooth(
     length_mm: float,
     motion: Motion,
 ) -> Curve:
-    """The smoothed curve through measured poses, with its spread.
+    """Smooth measured poses, and estimate the posterior spread.
 
-    Errors have heavy tails: measurements far off the curve weigh less (iterated weights of a t
-    distribution) and those very far off nothing. Before the first measurement the curve stands
-    still.
+    Errors have heavy tails: measurements far off the curve are down-weighted (iterated weights of a
+    t distribution), and very distant ones are excluded. Before the first measurement the curve is
+    constant.
 
     Args:
         skeleton: kinematic tree of the animal.
         seconds: (n,) s, increasing.
-        pose: (n) measured poses, arena frame, NaN where none is.
+        pose: (n) measured poses, arena frame, NaN if absent.
         error_mm: (n,) predicted mean joint error of each, mm; NaN also counts as not measured.
         length_mm: spine length of the animal, mm.
         motion: motion and error parameters of the animal.
 
     Returns:
-        A curve of n frames; all NaN where nothing was measured.
+        A curve of n frames; all NaN if there are no measurements.
     """
     n = len(seconds)
     check_shapes(
@@ -236,7 +220,7 @@ def smooth(
 
 @dataclass(frozen=True)
 class _Smoother:
-    """Measured poses of n frames, at least one of them measured, and what is known of their errors.
+    """Measured poses of n frames, at least one of them measured, and their errors.
 
     Attributes:
         seconds: (n,) s.
@@ -257,9 +241,9 @@ class _Smoother:
     def smooth(
         self, length: float, made: kernels.Poses, spread: kernels.Spread
     ) -> NDArray[np.bool_]:
-        """Fill `made` with the smoothed curve, and `spread` with its spread less what is shared.
+        """Fill `made` with the smoothed curve, and `spread` without the correlated share.
 
-        Where the gate leaves no frame at all, every measured one is used again.
+        If the gate excludes all frames, every measured one is used again.
 
         Args:
             length: spine length of the animal, mm.
@@ -267,7 +251,7 @@ class _Smoother:
             spread: output.
 
         Returns:
-            (n,) the frames that the curve goes by.
+            (n,) the frames used.
         """
         n = len(self.error)
         middle, frame, weight = np.empty((n, 3)), np.empty((n, 3, 3)), np.ones(n)
@@ -328,7 +312,7 @@ class _Smoother:
         later = np.maximum(np.arange(n), start)
 
         def fill(a: int, group: Array, left: Array | None = None) -> kernels.Gains:
-            """The gains of an axis whose moves these are, and its posterior variance."""
+            """The gains of an axis with these parameters; its posterior variance goes to `left`."""
             relative, axis = group[0] / length, gain.axis(a)
             measured = relative * relative * variance
             kernels.gains(self.seconds, measured, group[1], group[2], start, axis, covariances)
@@ -363,7 +347,7 @@ def _curve(
     middle = np.trace(spread.middle, axis1=1, axis2=2)
     place = np.array(motion.position_error)
     moves = motion.packed
-    # of a frame's predicted error, what the middle's errors and what the bends' are of it
+    # parts of the predicted error due to the joints' mean and to the bends
     relative = 0.5 * middle / (place**2).sum()
     relative += 0.5 * (spread.bend / moves.bend[:, 0] ** 2).mean(axis=1) * length_mm**2
     cov_middle = (
