@@ -1,7 +1,7 @@
-"""The camera.toml format: intrinsics, depth encoding and clock of images that do not hold them.
+"""The camera.toml format: intrinsics, depth encoding and clock of images without metadata.
 
-Keys stand under [camera] (or [recording], or at the top); all may be left out. An unknown key is
-reported with the nearest known one. Also: infrared images, which are recognised by name.
+Keys are in [camera] (or [recording], or at the top level); all are optional. An unknown key is
+reported with the closest valid one. Also: infrared images, recognised by their names.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ WHAT_TO_WRITE = (
 _INTRINSICS = ("fx", "fy", "cx", "cy")
 _NUMBERS = (*_INTRINSICS, "width", "height", "unit_mm", "fps")
 _TEXTS = ("timestamps", "pattern", "subject_id", "session_start_time", "distortion_model")
-_FOCAL_PX = (1e-3, 1e7)  # far beyond any camera
-_WORDS: dict[str, tuple[str, ...]] = {  # keys that take one of a few words
+_FOCAL_PX = (1e-3, 1e7)  # limits far beyond any camera
+_WORDS: dict[str, tuple[str, ...]] = {  # keys with a fixed set of values
     "encoding": ENCODINGS,
     "byte_order": ("big", "little"),
     "time_unit": tuple(UNITS),
@@ -41,26 +41,26 @@ _KEYS = (*_NUMBERS, "unread", "distortion", "time_column", *_TEXTS, *_WORDS)
 
 @dataclass(frozen=True)
 class CameraFile:
-    """Contents of a camera.toml; everything may be left out.
+    """Contents of a camera.toml; every key is optional.
 
     Attributes:
-        path: where the file is, or would be.
+        path: path of the file, which may not exist.
         intrinsics: any of fx, fy, cx, cy, px.
         width: columns of the images, px.
         height: rows of the images, px.
         unit_mm: mm per stored step.
         states_unit: whether the file states unit_mm.
         unread: stored values that mean "no reading".
-        encoding: how stored values mean depth, one of `ENCODINGS`.
+        encoding: how stored values encode depth, one of `ENCODINGS`.
         byte_order: of PGM images, "big" or "little".
-        fps: frame rate, Hz, used where there are no stamps.
+        fps: frame rate, Hz, used if there are no stamps.
         timestamps: name of the stamp file.
-        time_column: its column of times, see `read_csv_times`.
+        time_column: its column of times, see `read_stamps`.
         time_unit: the unit of that column.
         pattern: which images of the folder to read, as in "*_depth.png".
-        metadata: subject_id and session_start_time, where stated.
-        source: who says all this, for `Camera.source`.
-        problems: sentences about keys that mean nothing or were not used.
+        metadata: subject_id and session_start_time, if stated.
+        source: origin of the intrinsics, for `Camera.source`.
+        problems: sentences about keys that are unknown or were ignored.
         distortion: of the lens, from distortion (a list of coefficients in OpenCV's order) and
             distortion_model.
     """
@@ -86,16 +86,13 @@ class CameraFile:
 
     @staticmethod
     def read(path: Path) -> CameraFile:
-        """Parse the file; where there is none, what holds when nothing is stated.
+        """Parse the file; defaults if it does not exist.
 
         Args:
             path: the camera.toml.
 
-        Returns:
-            What it states.
-
         Raises:
-            RecordingError: the file is no TOML, or the value of a key cannot be.
+            RecordingError: the file is not TOML, or a value is invalid.
         """
         if not path.is_file():
             return CameraFile(path)
@@ -113,10 +110,10 @@ class CameraFile:
         return _from_table(path, table, tuple(_unknown_key(path, key) for key in unknown))
 
     def decode(self, stored: Stored) -> Depth:
-        """Depth of stored values, by the stated encoding and unit.
+        """Decode stored values to depth, by the stated encoding and unit.
 
         Args:
-            stored: (H, W), or (H, W, 3) for colour images, as the file holds them.
+            stored: (H, W), or (H, W, 3) for colour images, as in the file.
 
         Returns:
             (H, W) float32 mm, 0 where unread.
@@ -129,13 +126,11 @@ class CameraFile:
         Args:
             width: columns of the images, px.
             height: rows of the images, px.
-            stated: a camera or lens that comes before the file.
-
-        Returns:
-            The camera, of this size.
+            stated: a camera or lens that overrides the file.
 
         Raises:
-            RecordingError: no intrinsics are stated, or those stated belong to another size.
+            UnknownCameraError: intrinsics are missing.
+            RecordingError: the stated ones belong to another size.
         """
         if stated is not None:
             return fitting(stated, width, height, "the camera that was stated")
@@ -159,16 +154,13 @@ class CameraFile:
 
 
 def fitting(lens: Lens, width: int, height: int, where: str) -> Camera:
-    """The camera itself, if it belongs to images of this size; a bare lens belongs to any.
+    """The camera of images of a given size, from a camera of that size or a lens without a size.
 
     Args:
         lens: a camera, or intrinsics without a size.
         width: columns of the images, px.
         height: rows of the images, px.
-        where: who states the intrinsics, for the sentence.
-
-    Returns:
-        The camera of this size.
+        where: source of the intrinsics, for the error message.
 
     Raises:
         RecordingError: the camera is of another size.
@@ -184,14 +176,11 @@ def fitting(lens: Lens, width: int, height: int, where: str) -> Camera:
 
 
 def rate(fps: float | None, where: str) -> float | None:
-    """A stated frame rate, checked.
+    """Check a stated frame rate, and return it.
 
     Args:
-        fps: frames per second, Hz; None if none is stated.
-        where: who states it, for the sentence.
-
-    Returns:
-        fps unchanged.
+        fps: frames per second, Hz; None if absent.
+        where: its source, for the error message.
 
     Raises:
         RecordingError: it is not in [0.0001, 100000].
@@ -307,7 +296,7 @@ def _unknown_key(path: Path, key: str) -> str:
     )
 
 
-# Infrared by its name: images of 16 bits that hold brightness and look like depth to a reader.
+# Infrared images, recognised by name: 16-bit brightness that could be mistaken for depth.
 
 
 _WORD = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+")
@@ -317,10 +306,10 @@ _INFRARED = {"ir", "infra", "passiveir"}
 def is_infrared(name: str) -> bool:
     """Whether the name of a file, topic or track is that of infrared images: "ir", "PASSIVE_IR".
 
-    The words of the name count, so "circle" is none; one that also says depth is depth.
+    Whole words of the name count, so "circle" does not match; a name with the word depth is depth.
 
     Args:
-        name: a name or title, without the ending of a file's name.
+        name: a name or title, without the suffix of a file name.
     """
     words = {word.lower() for word in _WORD.findall(name)}
     found = words & _INFRARED or {word for word in words if word.startswith("infrared")}
@@ -328,10 +317,10 @@ def is_infrared(name: str) -> bool:
 
 
 def refuse_infrared(path: Path, name: str) -> None:
-    """Refuse a file or folder whose name, or the title of its track, is that of infrared images.
+    """Refuse a file, folder or track whose name is that of infrared images.
 
     Args:
-        path: the file or folder, for the sentence.
+        path: the file or folder, for the error message.
         name: as in `is_infrared`.
 
     Raises:

@@ -1,21 +1,20 @@
 """Numba kernels: rectification, and the codecs RVL, 16z (OpenNI), LZF (PCL) and FFV1's CRC-32.
 
-*Rectification* (table lookup, forward splatting with a z-buffer, hole closing) is serial and runs
-without the interpreter's lock: what is written is spread over the image, and two threads that
-spread together cost more than they save (`look_up` of 1024 x 1024 pixels takes about 2 ms, `lift`
-and `close` 6 ms).
+*Rectification* (table lookup, forward splatting with a z-buffer, hole closing) is serial and
+releases the GIL: the output is scattered over the image, and two threads in parallel cost more than
+they save (`look_up` of 1024 x 1024 pixels takes about 2 ms, `lift` and `close` 6 ms).
 
 *RVL* (Wilson, ISS 2017): pairs of counts (unread pixels, read pixels), followed by the read pixels
-as steps s from the one read before, zigzag coded, z = (s << 1) ^ (s >> 63). Every number is written
-in nibbles of three bits and one that says more follow; eight nibbles make a 32-bit word, the first
-in the highest bits.
+as steps s from the previous one, zigzag coded, z = (s << 1) ^ (s >> 63). Every number is written in
+nibbles of three bits and a continuation bit; eight nibbles make a 32-bit word, the first in the
+highest bits.
 
-*16z*: a stream begins with a whole number (u16) and goes on with bytes. 0xE1 to 0xEE: 2 to 28
-pixels like the last one (0xEF: 30); 0xFF: a wide step follows; any other byte is two steps down,
-each counted from 6, where 15 in the low half says that a wide step follows and 13 that there is
-none. A wide step is a byte from 0x80 on, counted from 192, or else a whole number of 15 bits, high
-byte first. The numbers are depths (`16zP`) or indices into a table of the frame's own depths
-(`16zT`). OpenNI's decoder is the reference.
+*16z*: a stream begins with a whole number (u16), followed by bytes. 0xE1 to 0xEE: 2 to 28 pixels
+equal to the last one (0xEF: 30); 0xFF: a wide step follows; any other byte is two downward steps,
+each counted from 6, where 15 in the low half means that a wide step follows and 13 that there is no
+second step. A wide step is a byte from 0x80 on, counted from 192, or else a whole number of 15
+bits, high byte first. The numbers are depths (`16zP`) or indices into a table of the frame's own
+depths (`16zT`). OpenNI's decoder is the reference.
 
 Slow twins: tests/oracles/oni.py, lzf.py and ffv1.py.
 """
@@ -28,22 +27,22 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-UNREAD = np.float32(1e30)  # stands where a pixel without reading belongs, and yields to any reading
+UNREAD = np.float32(1e30)  # marks a pixel without a reading; any reading overrides it
 _ONE = np.float32(1.0)
 _HALF = np.float32(0.5)
 _FOUR = np.float32(4.0)
-# an image's depths are finite; without infinities and signed zeros the compiler may treat eight
-# pixels at once
+# depths are finite; without infinities and signed zeros the compiler can process eight pixels
+# at once
 _FAST = {"nnan", "ninf", "nsz", "arcp", "contract", "afn", "reassoc"}
 
 
 @njit(cache=True, nogil=True)
 def look_up(depth, source, out):
-    """Copy, for every pixel of the ideal image, the depth of one pixel of the real one.
+    """For every pixel of the rectified image, copy the depth of one pixel of the original image.
 
     Args:
         depth: (h, w) float32 mm.
-        source: (H, W) int32, row * w + column in `depth`; -1 where there is none.
+        source: (H, W) int32, row * w + column in `depth`; -1 if there is none.
         out: (H, W) float32 mm, written; 0 where source is -1.
     """
     stored = depth.ravel()
@@ -55,16 +54,16 @@ def look_up(depth, source, out):
 
 @njit(cache=True, nogil=True, fastmath=_FAST, error_model="numpy")
 def lift_row(depth, law, u, v, deep):
-    """New pixels and depths of the readings of one row, moved to where they truly are under water.
+    """Pixels and depths of the readings of one row after correction for refraction.
 
     Where k z > 1 the ray meets the surface, and the depth d below it solves
 
         a d^2 + (b - c z) d = k z - 1,
 
-    in the form of the quadratic formula that does not cancel.
+    in the form of the quadratic formula without cancellation.
 
     Args:
-        depth: (W,) float32 mm, as the camera reported it.
+        depth: (W,) float32 mm, as reported by the camera.
         law: (13, W) float32, see `rectify.pixel_laws`.
         u: (W,) int32, written: new column, px.
         v: (W,) int32, written: new row, px.
@@ -88,14 +87,14 @@ def lift_row(depth, law, u, v, deep):
 
 @njit(cache=True, nogil=True)
 def lift(depth, laws, out):
-    """Splat every pixel of a depth image to its true position, the nearest on top.
+    """Splat every pixel of a depth image to its corrected position; the nearest reading wins.
 
-    A pixel without reading moves like the reading before it in its row, and leaves `UNREAD`.
+    A pixel without a reading moves like the previous reading in its row, and writes `UNREAD`.
 
     Args:
         depth: (H, W) float32 mm, 0 where unread.
         laws: (H, 13, W) float32, see `rectify.pixel_laws`.
-        out: (H, W) float32 mm, written; infinite where nothing went.
+        out: (H, W) float32 mm, written; infinite where nothing was splatted.
     """
     n_rows, n_columns = depth.shape
     u = np.empty(n_columns, np.int32)
@@ -121,15 +120,13 @@ def lift(depth, laws, out):
 
 @njit(cache=True, nogil=True)
 def close(lifted, out):
-    """Fill what lies between two readings with the farther one.
+    """Fill holes between two readings, side by side or one above the other, with the farther one.
 
-    The two lie side by side or one above the other.
-
-    Only where nothing went: a pixel that was unread stays so. The farther, so that no outline
-    grows.
+    Only pixels that received nothing are filled; unread pixels stay unread. The farther reading is
+    used so that outlines do not grow.
 
     Args:
-        lifted: (H, W) float32 mm, `UNREAD` where unread, infinite where nothing went.
+        lifted: (H, W) float32 mm, `UNREAD` where unread, infinite where nothing was splatted.
         out: (H, W) float32 mm, written; 0 where unread.
     """
     n_rows, n_columns = lifted.shape
@@ -159,10 +156,10 @@ def _between(one, other):
 def _put(
     value: int, words: NDArray[np.uint32], word: np.uint32, at: int, held: int
 ) -> tuple[np.uint32, int, int]:
-    """Append a number as nibbles of three bits and one that says more follow.
+    """Append a number as nibbles of three bits and a continuation bit.
 
-    Eight nibbles make a word. Returns the word that is being filled, where the next one goes, and
-    how many nibbles the first holds.
+    Eight nibbles make a word. Returns the word being filled, the index of the next word, and the
+    number of nibbles in the word being filled.
     """
     while True:
         nibble = value & 7
@@ -182,7 +179,7 @@ def _put(
 
 @njit(cache=True, nogil=True)
 def _pack(pixels: NDArray[np.uint16], words: NDArray[np.uint32]) -> int:
-    """Encode pixels (n,) into words (at least n + 2) and return how many words were used."""
+    """Encode pixels (n,) into words (at least n + 2) and return the number of words used."""
     n = len(pixels)
     i = 0
     at = 0
@@ -225,10 +222,10 @@ def pack_rvl(depth: NDArray[np.uint16]) -> NDArray[np.uint32]:
 
 
 def rvl_message(depth: NDArray[np.uint16]) -> NDArray[np.uint8]:
-    """Payload of a compressedDepth RVL message, as ROS writes it and Rerun takes it.
+    """Payload of a compressedDepth RVL message of ROS, which Rerun also accepts.
 
-    Rerun's name for it is `EncodedDepthImage`. Before the words stand the configuration (format,
-    and two floats of a quantisation that is not used) and width and height.
+    Rerun's name for it is `EncodedDepthImage`. A header precedes the words: the format, two floats
+    of an unused quantisation, width and height.
 
     Args:
         depth: (H, W) uint16, 0 where unread.
@@ -245,7 +242,7 @@ def rvl_message(depth: NDArray[np.uint16]) -> NDArray[np.uint8]:
 def _take(
     words: NDArray[np.uint32], word: np.uint32, at: int, held: int
 ) -> tuple[int, np.uint32, int, int]:
-    """The next number, and where it ends; -1 where the words end before it does."""
+    """The next number and the state after it; -1 if the words end too early."""
     value = 0
     shift = 0
     while shift < 33:
@@ -267,7 +264,7 @@ def _take(
 
 @njit(cache=True, nogil=True)
 def _unpack(words: NDArray[np.uint32], pixels: NDArray[np.uint16]) -> bool:
-    """Decode words into pixels (n,), which are zero before; False if the words do not fit n."""
+    """Decode words into pixels (n,), which must be zero; False if the words do not match n."""
     n = len(pixels)
     i = 0
     at = 0
@@ -293,7 +290,7 @@ def _unpack(words: NDArray[np.uint32], pixels: NDArray[np.uint16]) -> bool:
 
 
 def unpack_rvl(data: bytes | memoryview, width: int, height: int) -> NDArray[np.uint16] | None:
-    """Decode a depth image out of its RVL words.
+    """Decode a depth image from its RVL words.
 
     Args:
         data: the words, 32 bits each, little endian, without a header.
@@ -317,13 +314,13 @@ def _to_millimetres(depth: NDArray[np.float32], out: NDArray[np.uint16]) -> None
 
 
 def to_millimetres(depth: NDArray[np.float32]) -> NDArray[np.uint16]:
-    """Depth rounded to the nearest whole millimetre.
+    """Round depth to the nearest whole millimetre.
 
     Args:
         depth: (H, W) float32 mm, 0 where unread.
 
     Returns:
-        (H, W) uint16 mm; 0 stays unread, and what is beyond 65535 mm becomes unread.
+        (H, W) uint16 mm; 0 stays unread, and depths beyond 65535 mm become unread.
     """
     out = np.empty(depth.shape, np.uint16)
     _to_millimetres(np.ascontiguousarray(depth, np.float32), out)
@@ -340,7 +337,7 @@ _WIDE = 0xFF
 
 @njit(cache=True, nogil=True)
 def _oni_kernels_unpack(stream, table, out):
-    """Decode a stream into table[number] for each of its numbers.
+    """Decode a stream of numbers, and look up the depth of each in a table.
 
     Args:
         stream: (m,) uint8.
@@ -348,7 +345,7 @@ def _oni_kernels_unpack(stream, table, out):
         out: (n,) float32 mm, written.
 
     Returns:
-        False if the stream and the number of pixels or the table do not fit one another.
+        False if the stream does not match the number of pixels or the table.
     """
     n_bytes = len(stream)
     n_pixels = len(out)
@@ -408,9 +405,9 @@ def unpack_16z(
     """Decode a packed frame as depth.
 
     Args:
-        payload: (m,) uint8 bytes of the frame, a table before them for `16zT`.
-        meaning: (65536,) float32 mm, the depth that each stored value stands for.
-        n_pixels: how many pixels the frame has.
+        payload: (m,) uint8 bytes of the frame, preceded by a table for `16zT`.
+        meaning: (65536,) float32 mm, the depth of each stored value.
+        n_pixels: number of pixels of the frame.
         embedded_table: True for `16zT`, False for `16zP`.
 
     Returns:
@@ -449,7 +446,7 @@ def crc_table():
 
 @njit(cache=True)
 def slices_agree(data, table):
-    """Whether the slices of an image, found from its last byte backwards, agree with their CRC-32.
+    """Whether the slices of an image, found from its last byte backwards, match their CRC-32.
 
     Each slice ends in its length (3 bytes), an error flag (1) and a check sum (4) that makes the
     whole slice's CRC 0.
@@ -457,9 +454,6 @@ def slices_agree(data, table):
     Args:
         data: (m,) uint8 bytes of the image.
         table: (256,) uint32 of `crc_table`.
-
-    Returns:
-        True if all agree.
     """
     end = data.size
     while end > 8:
@@ -476,23 +470,23 @@ def slices_agree(data, table):
     return end == 0
 
 
-# LZF decompression (Lehmann's LibLZF), in which PCL packs its images: numba kernel.
+# LZF decompression (Lehmann's LibLZF), used by PCL for its images: numba kernel.
 
 
 @njit(cache=True)
 def unpack_lzf(packed, out):
     """Decompress LZF data.
 
-    A byte below 32 is followed by that many literal bytes and one more. Any other byte begins a
-    copy from what is out already: its upper 3 bits are the length less 2 (7: the next byte adds to
-    it), its lower 5 bits and the next byte the distance less 1.
+    A byte below 32 is followed by that many literal bytes plus one. Any other byte begins a copy
+    from earlier output: its upper 3 bits are the length minus 2 (7: the next byte is added), its
+    lower 5 bits and the next byte the distance minus 1.
 
     Args:
         packed: (m,) uint8.
         out: (n,) uint8, written.
 
     Returns:
-        How many bytes were written; -1 where the data make no sense.
+        Number of bytes written; -1 if the data are invalid.
     """
     at = 0
     done = 0
@@ -520,7 +514,7 @@ def unpack_lzf(packed, out):
         at += 1
         if source < 0 or done + n > out.size:
             return -1
-        for k in range(n):  # one by one: a copy may overlap what it makes
+        for k in range(n):  # one by one: a copy may overlap its own output
             out[done + k] = out[source + k]
         done += n
     return done

@@ -1,11 +1,12 @@
-"""Rectification of depth images: lens distortion and refraction at a water surface undone.
+"""Rectification of depth images: correction of lens distortion and of refraction at a water
+surface.
 
-Everything that follows works with an ideal pinhole camera in air; a recording without distortion
-and water is handed on untouched. Distortion (Brown-Conrady or Kannala-Brandt): inverse warping by a
-nearest-neighbour lookup table into a straight image with the same focal lengths, so much larger
-that it holds what the distorted one held. Water (Snell's law, `Water.law`): every reading becomes a
-point, is moved to where it truly is and splatted forward with a z-buffer into an ideal camera that
-stands higher than the real one (`Water.without`); small holes are then closed.
+All later steps assume an ideal pinhole camera in air; a recording without distortion and water is
+returned unchanged. Distortion (Brown-Conrady or Kannala-Brandt): inverse warping by a
+nearest-neighbour lookup table into an undistorted image with the same focal lengths, enlarged to
+contain what the distorted one contained. Water (Snell's law, `Water.law`): every reading becomes a
+point, is moved to its true position and splatted forward with a z-buffer into an ideal camera above
+the real one (`Water.without`); small holes are then closed.
 """
 
 from __future__ import annotations
@@ -22,25 +23,25 @@ from liex_lab.recordings import depth_kernels as kernels
 from liex_lab.recordings.frame import Depth
 from liex_lab.recordings.recording import Recording
 
-_MUCH_LOST = 0.05  # share of an image's pixels that leave it
+_MUCH_LOST = 0.05  # share of an image's pixels lost at its edge
 _MAX_GROWTH = 0.15  # of an image's width or height, at each side
 
 
 def rectified(recording: Recording, water: Water | None = None) -> Recording:
-    """The recording with lens distortion and refraction undone whenever a frame is read.
+    """The recording with lens distortion and refraction corrected on reading.
 
-    Where more than 5 % of the pixels leave the image, `problems` of the result say so.
+    If more than 5 % of the pixels are lost at the image's edge, `problems` of the result report it.
 
     Args:
-        recording: depth as the camera delivered it.
-        water: the water surface; None for air. It is left out where it was undone before.
+        recording: depth as delivered by the camera.
+        water: the water surface; None for air. Ignored if it was corrected before.
 
     Returns:
-        The rectified recording, whose `optics` say what was undone; the recording itself where
-        there is neither distortion nor water.
+        The rectified recording, whose `optics` list the corrections; the recording itself if there
+        is neither distortion nor water.
     """
     camera = recording.camera
-    water = None if recording.optics.get("water") else water  # it was undone before
+    water = None if recording.optics.get("water") else water  # it was corrected before
     if camera.distortion is None and water is None:
         return recording
     optics = {
@@ -60,11 +61,11 @@ def rectified(recording: Recording, water: Water | None = None) -> Recording:
 def mirrored(recording: Recording, *, lent: bool = False) -> Recording:
     """The recording with left and right exchanged in every image.
 
-    Drivers of some cameras deliver mirrored images; and a left hand in the mirror is a right one.
+    Drivers of some cameras deliver mirrored images; a mirrored left hand is also a right hand.
 
     Args:
         recording: depth to be mirrored.
-        lent: the recording stays open whatever becomes of its mirror image.
+        lent: keep the recording open when the result is closed.
 
     Returns:
         The mirrored recording, with its principal point mirrored too.
@@ -78,31 +79,22 @@ def mirrored(recording: Recording, *, lent: bool = False) -> Recording:
 
 
 def ideal_camera(camera: Camera, water: Water | None = None) -> Camera:
-    """The ideal pinhole to which images of a camera are carried.
+    """The ideal pinhole camera, in air, of the rectified images.
 
     Args:
         camera: the real camera, perhaps with distortion.
-        water: the water surface that it looks through; None for air.
-
-    Returns:
-        A camera without distortion, in air.
+        water: the water surface in front of it; None for air.
     """
     straight = straight_camera(camera)
     return straight if water is None else water.without(straight)
 
 
 def straight_camera(camera: Camera) -> Camera:
-    """The same camera with a straight lens and an image large enough for what the bent one held.
+    """The same camera without distortion, with an image large enough for the distorted one.
 
-    The image grows at each side by as much as the bent one's edge went in, up to 15 % of its
-    width or height (`_MAX_GROWTH`), for the far corners of a fisheye lens would be at infinity. Its
-    sizes are multiples of four.
-
-    Args:
-        camera: the real camera, perhaps with distortion.
-
-    Returns:
-        A camera without distortion, with the same focal lengths.
+    The image grows on each side by the displacement of the distorted edge, up to 15 % of its width
+    or height (`_MAX_GROWTH`), because the far corners of a fisheye lens would be at infinity. Its
+    sizes are multiples of four; the focal lengths stay the same.
     """
     straight = replace(camera, distortion=None)
     if camera.distortion is None:
@@ -135,11 +127,11 @@ def straight_camera(camera: Camera) -> Camera:
 
 
 def rectifier(camera: Camera, water: Water | None = None) -> Callable[[Depth], Depth]:
-    """The function that turns depth of a camera into depth of its `ideal_camera`.
+    """The function that converts depth of a camera to depth of its `ideal_camera`.
 
     Args:
         camera: the real camera, perhaps with distortion.
-        water: the water surface that it looks through; None for air.
+        water: the water surface in front of it; None for air.
 
     Returns:
         A function from depth (H, W) float32 mm to depth (H', W') float32 mm, 0 where unread.
@@ -148,14 +140,7 @@ def rectifier(camera: Camera, water: Water | None = None) -> Callable[[Depth], D
     laws = None if water is None else pixel_laws(straight_camera(camera), water)
 
     def undo(depth: Depth) -> Depth:
-        """Depth of the real camera as depth of the ideal one.
-
-        Args:
-            depth: (H, W) float32 mm, 0 where unread.
-
-        Returns:
-            (H', W') float32 mm, 0 where unread.
-        """
+        """Rectify depth (H, W) float32 mm, 0 where unread; returns (H', W') float32 mm."""
         if source is not None:
             straight = np.empty(source.shape, np.float32)
             kernels.look_up(depth, source, straight)
@@ -172,17 +157,17 @@ def rectifier(camera: Camera, water: Water | None = None) -> Callable[[Depth], D
 
 
 def lookup_table(camera: Camera) -> NDArray[np.int32]:
-    """For every pixel of the straight image the nearest pixel of the distorted one.
+    """For every pixel of the undistorted image, the nearest pixel of the distorted one.
 
-    Nearest-neighbour inverse warping: the other way round would leave holes where the straight
-    image is the larger one. Depth along the optical axis is the same in both, and is never mixed
-    from neighbours, which would put points between the animal and the floor.
+    Nearest-neighbour inverse warping: forward warping would leave holes where the undistorted image
+    is larger. Depth along the optical axis is the same in both. It is never interpolated, which
+    would create points between the animal and the floor.
 
     Args:
         camera: the camera with distortion.
 
     Returns:
-        (H', W') int32, row * width + column in the distorted image; -1 where there is none.
+        (H', W') int32, row * width + column in the distorted image; -1 if there is none.
     """
     straight = straight_camera(camera)
     seen = np.floor(camera.project(straight.unproject(_pixels(straight), 1.0)) + 0.5)
@@ -192,14 +177,14 @@ def lookup_table(camera: Camera) -> NDArray[np.int32]:
 
 
 def pixel_laws(camera: Camera, water: Water) -> NDArray[np.float32]:
-    """Refraction law of every pixel's ray, in homogeneous pixels, as `kernels.lift` takes it.
+    """Refraction law of every pixel's ray, in homogeneous pixels, as required by `kernels.lift`.
 
-    A point of the law (`Water.law`) becomes (u z, v z, z) of the camera `without` the water, and
-    three more numbers carry it to that higher camera.
+    A point of the law (`Water.law`) becomes (u z, v z, z) of the camera `without` the water; three
+    more numbers move it to that higher camera.
 
     Args:
         camera: a camera without distortion.
-        water: the water surface that it looks through.
+        water: the water surface in front of it.
 
     Returns:
         (H, 13, W) float32.
@@ -218,7 +203,7 @@ def pixel_laws(camera: Camera, water: Water) -> NDArray[np.float32]:
 
 
 def share_lost(camera: Camera) -> float:
-    """Share of the distorted image's pixels that the straight image does not hold.
+    """Share of the distorted image's pixels that are outside the undistorted image.
 
     Args:
         camera: the real camera, perhaps with distortion.
@@ -234,7 +219,7 @@ def share_lost(camera: Camera) -> float:
 
 
 def _inside(uv: NDArray[np.float64], camera: Camera) -> NDArray[np.bool_]:
-    """Where (...) pixels (..., 2) are in the image; False for NaN."""
+    """Whether (...) pixels (..., 2) are in the image; False for NaN."""
     right = uv[..., 0] + 0.5
     down = uv[..., 1] + 0.5
     return np.asarray((right >= 0) & (right < camera.width) & (down >= 0) & (down < camera.height))

@@ -1,8 +1,8 @@
 """Text formats of time stamps: tables, and stamps or numbers in the names of depth images.
 
-A stamp is read as a decimal number and becomes integer nanoseconds exactly; a float64 of seconds
-since 1970 is good to 200 ns only. Stamps may also be dates (ISO 8601) or hh:mm:ss. Names hold a
-date and time, seconds since 1970 with a fraction (as in the TUM RGB-D data sets), or 13, 16 or 19
+A stamp is parsed as a decimal number and becomes exact integer nanoseconds; a float64 of seconds
+since 1970 is only precise to 200 ns. Stamps may also be dates (ISO 8601) or hh:mm:ss. Names contain
+a date and time, seconds since 1970 with a fraction (as in the TUM RGB-D data sets), or 13, 16 or 19
 digits of ms, µs or ns since 1970.
 """
 
@@ -44,7 +44,7 @@ _SECONDS = re.compile(
     r"(?<!\d)(\d{9,10})\.(\d{3,9})(?!\d)"
 )  # since 1970, as the TUM data sets name their images
 _WHOLE = re.compile(r"(?<!\d)(\d{10})(\d{3}|\d{6}|\d{9})(?!\d)")  # the same in ms, us or ns
-_CLOCKS = (  # nanoseconds in a step, the step of 1970, and what that is called
+_CLOCKS = (  # nanoseconds per step, the step number of 1970, and the name
     (10**9, 0, "seconds since 1970"),
     (10**6, 0, "milliseconds since 1970"),
     (10**3, 0, "microseconds since 1970"),
@@ -55,22 +55,22 @@ _CLOCKS = (  # nanoseconds in a step, the step of 1970, and what that is called
 )
 _HOUR_NS = 3600 * 10**9
 _BLANK = re.compile(r"(?<=\d{4}-\d\d-\d\d) +(?=\d\d:)")  # between date and time
-_TIME_OF_DAY = re.compile(r"(\d\d:\d\d:\d\d),(?=\d{3})")  # whose comma is a decimal sign
-_SURE = 12  # rows: digits behind commas that rise in fewer may be fractions that do so by chance
+_TIME_OF_DAY = re.compile(r"(\d\d:\d\d:\d\d),(?=\d{3})")  # with a decimal comma
+_SURE = 12  # rows: with fewer, digits after commas may be fractions that increase by chance
 _GROUPED = re.compile(r"^([-+]?[1-9]\d{0,2})[.,](\d{3})$")  # a number, or thousands
 
 
 @dataclass(frozen=True)
 class Stamps:
-    """A table of time stamps: the column that was chosen for the times, and its other columns.
+    """A table of time stamps: the column chosen for the times, and its other columns.
 
     Attributes:
         path: the file.
         k: number of the column, from 0.
         cells: line and text of its stamps.
-        read: what reads such a text.
+        read: parser of these texts.
         values: (n,) plain numbers, or nanoseconds of dates and of hh:mm:ss.
-        counts: (n,) frames behind the first, where the numbers rise by one as a counter does.
+        counts: (n,) frames from the first, if the numbers increase by one like a counter.
         rows: line and cells of the rows.
         ns_per_unit: nanoseconds in the unit of plain numbers.
         named: whether the table or camera.toml states that these are times.
@@ -96,7 +96,7 @@ class Stamps:
             k: number of the column, from 0.
 
         Raises:
-            RecordingError: a cell is no stamp of the first one's kind.
+            RecordingError: a cell is not a stamp of the same kind as the first one.
         """
         cells = [(line, row[k] if k < len(row) else "") for line, row in rows]
         read = (_reader(cells[0][1]) if cells else None) or number
@@ -116,7 +116,7 @@ class Stamps:
 
     @property
     def zoned(self) -> bool:
-        """Whether the stamps are moments, as far as they are dates."""
+        """Whether all dates have a time zone; True for stamps that are not dates."""
         return self.read is not _moment_ns or all(
             read_moment(text)[0].tzinfo is not None for _, text in self.cells
         )
@@ -129,20 +129,20 @@ class Stamps:
     def times(
         self, hz: float | None, problems: list[str], doubts: list[str], usual_hz: float | None
     ) -> Times:
-        """The stamps, or the times of the frame numbers that stand in their place.
+        """The stamps, or times computed from frame numbers if there are no stamps.
 
         Args:
-            hz: a rate that is known, Hz.
+            hz: a known frame rate, Hz.
             problems: sentences, appended to.
-            doubts: reasons not to rely on the times, appended to.
-            usual_hz: what to assume for frame numbers without a rate, Hz; None refuses them.
+            doubts: reasons why the times are unreliable, appended to.
+            usual_hz: rate to assume for frame numbers without a rate, Hz; None refuses them.
 
         Returns:
             (n,) int64 ns, in file order.
 
         Raises:
             UnknownTimesError: there are only frame numbers, and no rate is known.
-            RecordingError: a number is no time.
+            RecordingError: a number is not a time.
         """
         if self.counts is not None:
             counter = f"a column of {self.path.name} counts by one: a frame counter, not times"
@@ -160,7 +160,7 @@ class Stamps:
         if self.read is number:
             return self._numbers(problems)
         times = np.array([int(value) for value in self.values], np.int64)
-        if self.read is _clock_ns:  # goes on after midnight
+        if self.read is _clock_ns:  # continues after midnight
             back = np.diff(times, prepend=times[:1]) < -12 * _HOUR_NS
             return times + 24 * _HOUR_NS * np.cumsum(back)
         hours = np.abs(np.abs(np.diff(times)) - _HOUR_NS) < _HOUR_NS // 60
@@ -176,9 +176,9 @@ class Stamps:
         return times
 
     def _numbers(self, problems: list[str]) -> Times:
-        """Numbers as ns; a unit that is only usual gives way to another that alone is possible."""
+        """Numbers as ns; an assumed unit is replaced if only another one is plausible."""
         grouped = [cell for cell in self.cells if _GROUPED.match(cell[1])]
-        if grouped and (self.steps < 0).any():  # as numbers they fall, as thousands they may rise
+        if grouped and (self.steps < 0).any():  # perhaps thousands separators
             flat = [number(_GROUPED.sub(r"\1\2", text)) for _, text in self.cells]
             if flat == sorted(flat):
                 raise _no_stamp(self.path, *grouped[0])
@@ -216,14 +216,14 @@ class Stamps:
         problems: list[str],
         doubts: list[str],
     ) -> NDArray[np.int64]:
-        """The row of each depth image: by the name beside the stamp, or by its number, or in order.
+        """The row of each depth image: by the name next to the stamp, by its number, or in order.
 
         Args:
-            folder: name of the images' folder, for sentences.
-            names: of the images' files, in order.
-            numbers: (m,) the number of each image; all the same where they are not numbered.
+            folder: name of the images' folder, for messages.
+            names: names of the image files, in order.
+            numbers: (m,) the number of each image; all equal if they are not numbered.
             problems: sentences, appended to.
-            doubts: reasons not to rely on the rows, appended to.
+            doubts: reasons why the rows are unreliable, appended to.
 
         Returns:
             (m,) rows; -1 for an image without one.
@@ -262,21 +262,21 @@ def read_stamps(
 ) -> Stamps:
     """Read a table of stamps, with or without a header.
 
-    Lines that begin with # are passed over, but for one that names the columns. Stamps are numbers,
-    or dates (ISO 8601), or hh:mm:ss.
+    Lines that start with # are skipped, unless they name the columns. Stamps are numbers, dates
+    (ISO 8601) or hh:mm:ss.
 
     Args:
         path: the table.
-        doubts: reasons not to rely on the times, appended to.
+        doubts: reasons why the times are unreliable, appended to.
         column: name of the column of times, or its number from 0 in a table that may have no
-            header; None for one of time_ns, time_us, time_ms and time_s, or else the first column
-            of dates or, where usual_ns is given, the first that can be times.
-        unit: ns, us, ms or s, where the column's name does not end in it.
-        usual_ns: nanoseconds in the unit of numbers whose column has no name; None if numbers
-            need one.
+            header. None for one of time_ns, time_us, time_ms and time_s, or else the first column
+            of dates or, if usual_ns is given, the first plausible one.
+        unit: ns, us, ms or s, if the column's name does not end in it.
+        usual_ns: nanoseconds in the assumed unit of a column without a name; None refuses numbers
+            without a unit.
 
     Raises:
-        RecordingError: there is no such column, its unit is not known, or a cell is no stamp.
+        RecordingError: there is no such column, its unit is unknown, or a cell is not a stamp.
     """
     try:
         separator, lines = split_lines(_TIME_OF_DAY.sub(r"\1.", _BLANK.sub("T", read_text(path))))
@@ -334,13 +334,13 @@ def read_stamps(
 
 
 def _can_be_times(path: Path, rows: list[tuple[int, list[str]]], numbers: bool) -> Stamps | None:
-    """The first column that rises and does not count frames; or else one that counts; or else the
-    first of stamps.
+    """The first increasing column that does not count frames; else one that does; else any of
+    stamps.
 
     Args:
         path: the file.
         rows: lines and cells.
-        numbers: whether numbers whose column has no name can be times.
+        numbers: whether plain numbers in a column without a name can be times.
     """
     found: list[Stamps] = []
     for k, cell in enumerate(rows[0][1] if rows else []):
@@ -362,7 +362,7 @@ def _can_be_times(path: Path, rows: list[tuple[int, list[str]]], numbers: bool) 
 
 
 def _reader(text: str) -> Callable[[str], Decimal] | None:
-    """What reads a stamp that is written like this one; None if it is no stamp."""
+    """The parser for a stamp written like this one; None if it is not a stamp."""
     return next((read for read in (number, _moment_ns, _clock_ns) if _reads(read, text)), None)
 
 
@@ -406,10 +406,10 @@ def _are_digits(texts: list[str]) -> bool:
 
 
 def _is_column(digits: list[str], header: Sequence[str] = ()) -> bool:
-    """Whether digits behind commas rise, or are the same, or 0 and 1: a column of their own.
+    """Whether digits after commas are a column of their own: increasing, constant, or 0 and 1.
 
     Args:
-        digits: one text a line.
+        digits: one text per line.
         header: of a table that has more columns than it names.
     """
     values = np.array([int(text[-18:]) for text in digits], np.int64)
@@ -419,13 +419,13 @@ def _is_column(digits: list[str], header: Sequence[str] = ()) -> bool:
 
 
 def name_numbers(names: Sequence[str]) -> Times | None:
-    """The number that counts in each name; None if the names differ in more than numbers.
+    """The frame number in each name; None if the names differ in more than numbers.
 
-    Of several numbers it is the first that rises with every name and counts, or else the last that
-    differs.
+    With several numbers per name, it is the first one that increases and counts frames, or else the
+    last one that varies.
 
     Args:
-        names: names of files, in order; folders and endings do not matter.
+        names: names of files, in order; folders and suffixes are ignored.
 
     Returns:
         (n,) int64.
@@ -445,7 +445,7 @@ def name_numbers(names: Sequence[str]) -> Times | None:
 
 
 def _places(wanted: Iterable[Any], keys: Iterable[Any]) -> NDArray[np.int64]:
-    """Where each of some keys is; -1 where it is not, and everywhere if keys are not unique."""
+    """Index of each wanted key among `keys`; -1 if absent, and for all if keys are not unique."""
     wanted, keys = list(wanted), list(keys)
     places = {key: k for k, key in enumerate(keys)}
     unique = len(places) == len(keys) and len(set(wanted)) == len(wanted)
@@ -453,23 +453,23 @@ def _places(wanted: Iterable[Any], keys: Iterable[Any]) -> NDArray[np.int64]:
 
 
 def _stem(name: str) -> str:
-    """A name without folders and ending, in small letters."""
+    """A name without folders and suffix, in lower case."""
     return re.sub(r"\.[a-z]+$", "", re.split(r"[/\\]", name)[-1].casefold())
 
 
 def name_times(names: Sequence[str]) -> tuple[Times, bool] | None:
-    """Stamps in the names of images, and whether they count from 1970 in UTC.
+    """Parse stamps in the names of images; also whether they count from 1970 in UTC.
 
-    They must stand once in every name, in one of these forms: a date and a time with a fraction of
-    a second, as in 20121214T142255.814212 (its zone is not known, so it tells steps and no moment);
-    seconds since 1970 with a fraction; or 13, 16 or 19 digits of milliseconds, microseconds or
-    nanoseconds since 1970. Stamps outside the years 2000 to 2100 are taken for something else.
+    Every name must contain exactly one, in one of these forms: a date and a time with a fraction of
+    a second, as in 20121214T142255.814212 (its zone is unknown, so it gives steps only); seconds
+    since 1970 with a fraction; or 13, 16 or 19 digits of milliseconds, microseconds or nanoseconds
+    since 1970. Numbers outside the years 2000 to 2100 are not stamps.
 
     Args:
         names: names of the files, in order.
 
     Returns:
-        (n,) int64 stamps, ns, and True if they tell a moment; None if the names hold none.
+        (n,) int64 stamps, ns, and True if they are absolute; None if the names have no stamps.
     """
     for form in (_DATE, _SECONDS, _WHOLE):
         found = [form.findall(name) for name in names]
@@ -482,7 +482,7 @@ def name_times(names: Sequence[str]) -> tuple[Times, bool] | None:
 
 
 def _name_ns(*parts: str) -> int:
-    """The date and time, or else the seconds since 1970, and their fraction, as ns since 1970."""
+    """Date and time, or seconds since 1970, with their fraction, as ns since 1970."""
     *since_1970, fraction = parts
     if len(since_1970) > 1:
         moment = datetime.strptime("".join(since_1970), "%Y%m%d%H%M%S").replace(tzinfo=UTC)

@@ -1,10 +1,10 @@
 """Monotone time stamps with the fewest changes, by a longest increasing subsequence.
 
-Stamps are int64 ns. Those that can all stay form a longest increasing subsequence (patience
-sorting, O(n log n)); the others are spread evenly between their kept neighbours. Strict increase
-t[i] < t[i + 1] of integers is the same as t[i] - i not decreasing, so the longest non-decreasing
-subsequence of t[i] - i is used. Lasting jumps of the clock backwards are taken out first. A gap is
-a step of more than 1.5 median steps. What was moved is reported, never hidden.
+Stamps are int64 ns. The stamps that stay unchanged form a longest increasing subsequence (patience
+sorting, O(n log n)); the others are spread evenly between their unchanged neighbours. For integers,
+strict increase of t[i] is the same as t[i] - i not decreasing, so the longest non-decreasing
+subsequence of t[i] - i is used. Lasting backward jumps of the clock are removed first. A gap is a
+step of more than 1.5 median steps. Every moved stamp is reported.
 """
 
 from __future__ import annotations
@@ -26,23 +26,23 @@ GAP_FACTOR = 1.5  # a step longer than this many median steps means that frames 
 _COARSE = 1e-3
 _OFTEN = 0.05
 _OFF = 0.1
-_LEAST = 0.8  # of the mean of its steps is a clock's own; less comes of stamps without one
+_LEAST = 0.8  # least share of the mean step for a real clock; less comes from stamps without one
 _TICKS_NS = (1_000_000, 15_625_000)  # of clocks that may be as coarse as a camera's step
-_RARELY = 2.25  # times the median: as long is a step across which a frame is missing, at most
-_LONGER = (3, 16, 64, 256)  # frames missing in gaps, short ones first, as they tell the step
-_FAR = 3  # steps; across more of them the clock's phase may be another
+_RARELY = 2.25  # times the median: longest step across one missing frame
+_LONGER = (3, 16, 64, 256)  # frames missing in gaps, short ones first, as they define the step
+_FAR = 3  # steps; the clock's phase may change across more of them
 CLOCK_JUMP_NS = (
     60 * 10**9
 )  # no camera drops frames for a minute: it was stopped, or its clock was set
-# frames on either side that tell a lasting jump of the clock from a few stamps out of order
+# frames on either side that distinguish a lasting jump from a few stamps out of order
 _SURE = 5
 _LONGEST_STEP_NS = 10**9
-LATEST_NS = 2**32 * 10**9  # the year 2106: what the replays' messages can state
+LATEST_NS = 2**32 * 10**9  # the year 2106: the limit of the replay's messages
 LIMIT_NS = 2**62  # the year 2116 on the usual clock; leaves room for sums in int64
-# the years 2000 to 2100: other stamps count from something else than 1970
+# the years 2000 to 2100: other stamps do not count from 1970
 PLAUSIBLE_NS = (946_684_800 * 10**9, 4_102_444_800 * 10**9)
-_COUNTING = 0.75  # of the steps of a counter are the same
-_NEAR = 8  # frames among which one in the wrong place is sorted
+_COUNTING = 0.75  # least share of equal steps in a counter
+_NEAR = 8  # frames on either side within which frames are sorted
 _CLOSEST = 0.6  # steps between two of them
 _MOST_LOST = 8
 
@@ -56,19 +56,19 @@ PULSES_UNKNOWN = (
 
 @dataclass(frozen=True)
 class Gap:
-    """An interval in which the recording's time is not what a steady camera would have written.
+    """An interval in which the time stamps are not those of a steady camera.
 
     Intervals are half open. For frames that the camera did not deliver, start_frame = stop_frame =
-    the frame after the gap, for no frame lies inside; the time runs from one median step after the
-    last frame before the gap to the frame after it. For a stamp that had to be moved, the interval
-    holds the one frame it belongs to, and n_frames_missing = 0.
+    the frame after the gap, as no frame is inside; the time runs from one median step after the
+    last frame before the gap to the frame after it. For a moved stamp, the interval contains its
+    one frame, and n_frames_missing = 0.
 
     Attributes:
         start_frame: row of the first frame of the interval.
-        stop_frame: row behind its last frame.
+        stop_frame: row after its last frame.
         start_ns: beginning of the interval, ns.
         stop_ns: its end, ns.
-        n_frames_missing: how many frames the camera left out, estimated from the mean step.
+        n_frames_missing: number of dropped frames, estimated from the mean step.
         reason: `DROPPED`, or one of `FAULTS`.
     """
 
@@ -83,7 +83,7 @@ class Gap:
 PLAUSIBLE_HZ = (0.5, 2000.0)  # of a depth camera that watches an animal
 _MOST_MOVED = 0.25  # of the stamps may be repeated or out of order, as of a busy computer
 FAULTS = ("", "stamp_repeated", "stamp_out_of_order", JUMPED)  # what `MonotoneTimes.faults` counts
-# their places in it
+# their indices
 _REPEATED, _OUT_OF_ORDER, _JUMPED = range(1, len(FAULTS))
 
 
@@ -93,9 +93,8 @@ class MonotoneTimes:
 
     Attributes:
         times_ns: (n,) int64 ns, strictly increasing.
-        faults: (n,) uint8 index into `FAULTS`: why this frame's stamp was moved, 0 for one that
-            stayed.
-        problem: a sentence about what was moved; None if nothing was.
+        faults: (n,) uint8 index into `FAULTS`: why this frame's stamp was moved; 0 if it was not.
+        problem: a sentence about the moved stamps; None if none was moved.
         order: (n,) number, in file order, of the frame of each row; empty for 0 ... n - 1.
     """
 
@@ -106,7 +105,7 @@ class MonotoneTimes:
 
 
 def median_step(times_ns: Times) -> int:
-    """Usual time between neighbouring frames: their median, of rounded stamps the mean.
+    """Usual time between neighbouring frames: the median step, or the mean for rounded stamps.
 
     Args:
         times_ns: (n,) int64 stamps, ns.
@@ -122,14 +121,14 @@ def median_step(times_ns: Times) -> int:
 def rounded_step(times_ns: Times) -> int:
     """Step of a steady clock whose stamps are rounded or jitter, such as 33, 33, 34 ms.
 
-    No single step is then the camera's. Theirs is the total time over the number of steps, with the
-    steps across a gap counted by `frames_apart`.
+    No single step is then the camera's. The step is the total time divided by the number of steps,
+    with steps across a gap counted by `frames_apart`.
 
     Args:
         times_ns: (n,) int64 stamps, ns.
 
     Returns:
-        The step, ns; 0 where the stamps are as exact as their median step, or none is found.
+        The step, ns; 0 if the stamps are as exact as their median step, or no step is found.
     """
     dt = np.diff(times_ns)
     usual = int(np.median(dt)) if len(dt) else 0
@@ -155,13 +154,13 @@ def rounded_step(times_ns: Times) -> int:
 
 
 def _slope(dt: Times, apart: Times, longest: int, otherwise: float) -> float:
-    """Time per frame, ns: the slope of lines through the stretches without a longer gap.
+    """Time per frame, ns: the slope of a line fitted to the stretches without a longer gap.
 
     Args:
         dt: (n,) steps, ns.
-        apart: (n,) how many frames each of them takes.
-        longest: more frames than these begin a stretch of its own.
-        otherwise: the result where the slope is far from it, as without two frames in a stretch.
+        apart: (n,) number of frames per step.
+        longest: a step of more frames starts a new stretch.
+        otherwise: the result if the slope differs much from it, as without two frames in a stretch.
     """
     stretch = np.append(0, np.cumsum(apart > longest))
     count, time = (
@@ -173,10 +172,10 @@ def _slope(dt: Times, apart: Times, longest: int, otherwise: float) -> float:
 
 
 def _in_phase(times_ns: Times, step_ns: float, window: int) -> Times:
-    """How many steps (n - 1,) of a steady clock lie between neighbouring stamps (n,) ns; 1 or more.
+    """Number of clock steps (n - 1,), at least 1, between neighbouring stamps (n,) ns.
 
-    A stamp is off by up to half of what it was rounded to. The clock's phase, the circular mean
-    over so many frames before a step and after it, is not, and tells what is due to rounding.
+    A stamp is off by up to half its rounding unit. The clock's phase, the circular mean over
+    `window` frames before and after a step, is not, and corrects for the rounding.
     """
     phase = (times_ns - times_ns[0]) / step_ns
     apart = np.diff(phase)
@@ -194,7 +193,7 @@ def _in_phase(times_ns: Times, step_ns: float, window: int) -> Times:
 
 
 def frames_apart(times_ns: Times, step_ns: int) -> Times:
-    """How many frames (n - 1,) each stamp lies after the one before: more than 1 across a gap.
+    """Number of frames (n - 1,) from each stamp to the next: more than 1 across a gap.
 
     Args:
         times_ns: (n,) int64 stamps, ns, increasing.
@@ -213,14 +212,14 @@ def frames_apart(times_ns: Times, step_ns: int) -> Times:
 
 
 def clock_doubts(step_ns: int, faults: NDArray[np.uint8]) -> tuple[str, ...]:
-    """Why the times of a recording are not to be relied on.
+    """Reasons why the times of a recording are unreliable.
 
     Args:
-        step_ns: the median step, ns; 0 where there is none.
+        step_ns: the median step, ns; 0 if there is none.
         faults: (n,) uint8 index into `FAULTS`, as in `MonotoneTimes.faults`.
 
     Returns:
-        Sentences; none where the clock is like a camera's.
+        Sentences; empty for a plausible camera clock.
     """
     found = []
     hz = 1e9 / max(step_ns, 1)
@@ -241,8 +240,8 @@ def clock_doubts(step_ns: int, faults: NDArray[np.uint8]) -> tuple[str, ...]:
 def find_gaps(times_ns: Times, step_ns: int) -> list[Gap]:
     """Intervals in which frames are missing: steps of more than 1.5 median steps.
 
-    A step of more than a minute means that the camera was stopped or its clock set. How many frames
-    are missing there, nobody knows, and one is counted.
+    A step of more than a minute means that the camera was stopped or its clock set. The number of
+    missing frames is then unknown, and counted as one.
 
     Args:
         times_ns: (n,) int64 stamps, ns, increasing.
@@ -272,12 +271,12 @@ def find_faults(times_ns: Times, step_ns: int, faults: NDArray[np.uint8]) -> lis
     """The frames whose stamps were moved, each as an interval of its own.
 
     Args:
-        times_ns: (n,) int64 stamps, ns, after they were made to increase.
+        times_ns: (n,) int64 stamps, ns, made strictly increasing.
         step_ns: the median step, ns, for the end of the last frame.
         faults: (n,) uint8 index into `FAULTS`, as in `MonotoneTimes.faults`.
 
     Returns:
-        One interval for every frame with a fault, in order.
+        One interval per frame with a fault, in order.
     """
     stops = np.append(times_ns[1:], times_ns[-1:] + max(step_ns, 1))
     return [
@@ -287,11 +286,11 @@ def find_faults(times_ns: Times, step_ns: int, faults: NDArray[np.uint8]) -> lis
 
 
 def from_rate(n_frames: int | Times, fps: float) -> Times:
-    """Evenly spaced stamps from 0: the last resort, where a file holds no clock.
+    """Evenly spaced stamps from 0, for files without a clock.
 
     Args:
-        n_frames: how many stamps, or (n,) the place of each frame among those that the camera
-            took, see `frame_counts`.
+        n_frames: number of stamps, or (n,) the index of each frame among those that the camera
+            recorded, see `frame_counts`.
         fps: frame rate, Hz.
 
     Returns:
@@ -302,18 +301,17 @@ def from_rate(n_frames: int | Times, fps: float) -> Times:
 
 
 def frame_counts(numbers: Times, step: int | None = None) -> Times | None:
-    """How many frames each number is behind the first, if the numbers count frames.
+    """Number of frames from the first to each one, if the numbers count frames.
 
-    They count where almost all steps are the same and the others are multiples of it. A counter of
-    8, 16 or 32 bits may wrap around; one that starts again otherwise lost nobody knows how many
-    frames, and none is counted.
+    They do if almost all steps are equal and the others are multiples of it. A counter of 8, 16 or
+    32 bits may wrap around. Any other restart loses an unknown number of frames, counted as none.
 
     Args:
         numbers: (n,) int64.
-        step: the step that is asked for; None for any.
+        step: the required step; None for any.
 
     Returns:
-        (n,) int64 from 0; None if they do not count.
+        (n,) int64 from 0; None if the numbers do not count frames.
     """
     steps = np.diff(numbers)
     sizes, often = np.unique(steps, return_counts=True)
@@ -330,16 +328,15 @@ def frame_counts(numbers: Times, step: int | None = None) -> Times | None:
 
 
 def in_order_of_sensor(times_ns: Times, settled: NDArray[np.int64] | None = None) -> MonotoneTimes:
-    """Stamps made strictly increasing, after frames recorded in the wrong order were sorted.
+    """Make stamps strictly increasing, after sorting frames recorded in the wrong order.
 
-    Frames change places where that is sound: a few neighbours whose stamps, sorted, follow each
-    other as a camera's do, no two closer than `_CLOSEST` steps and none farther than `_MOST_LOST`.
-    Repeated and wild stamps stay where they are, and so do those behind a clock that was set back;
-    `make_monotone` deals with them.
+    Frames are sorted only where that is safe: a few neighbours whose sorted stamps are spaced like
+    a camera's, no two closer than `_CLOSEST` steps and none farther than `_MOST_LOST`. Repeated and
+    wild stamps, and those after a clock was set back, are left to `make_monotone`.
 
     Args:
         times_ns: (n,) int64 stamps, ns, in file order.
-        settled: (m,) order of the first frames, which somebody has read already; None for none.
+        settled: (m,) order of the first frames that have been read already; None if absent.
 
     Returns:
         The stamps in the order of the rows, that order, and a sentence about what was sorted.
@@ -370,11 +367,10 @@ def in_order_of_sensor(times_ns: Times, settled: NDArray[np.int64] | None = None
 def make_monotone(times_ns: Times) -> MonotoneTimes:
     """Make stamps strictly increasing by moving as few as possible; frames stay in file order.
 
-    A clock that was set back, or wrapped around, while frames went on coming is continued from
-    where it was, as if one frame were missing there: how long the jump really took, nobody knows.
-    After that the most stamps that can stay do stay, exactly (a longest increasing subsequence), so
-    that one wild stamp does not drag its neighbours along. The others are spread evenly between
-    those that stay, for that is when a camera that runs on takes its images.
+    If a clock was set back, or wrapped around, while frames continued, time continues as if one
+    frame were missing there; the true length of the jump is unknown. Of the rest, as many stamps as
+    possible stay exact (a longest increasing subsequence), so that one wild stamp does not move its
+    neighbours. The others are spread evenly between those, as from a camera at a constant rate.
 
     Args:
         times_ns: (n,) int64 stamps, ns, in file order.
@@ -412,10 +408,10 @@ def make_monotone(times_ns: Times) -> MonotoneTimes:
 
 
 def _join_clocks(times_ns: Times) -> tuple[Times, NDArray[np.int64]]:
-    """Take every lasting jump back out of the stamps.
+    """Remove every lasting backward jump from the stamps.
 
-    Lasting: `_SURE` stamps before it increase, and `_SURE` from it on increase without reaching the
-    one before it. What is shorter is frames out of order, or one wild stamp.
+    A jump is lasting if `_SURE` stamps before it increase, and `_SURE` from it on increase without
+    reaching the one before it. Shorter jumps are frames out of order, or one wild stamp.
 
     Args:
         times_ns: (n,) int64 stamps, ns.
@@ -425,7 +421,7 @@ def _join_clocks(times_ns: Times) -> tuple[Times, NDArray[np.int64]]:
     """
     dt = np.diff(times_ns)
     back = np.flatnonzero(dt <= 0) + 1
-    rising = np.concatenate([[0], np.cumsum(dt > 0)])  # how many of the steps up to a frame go up
+    rising = np.concatenate([[0], np.cumsum(dt > 0)])  # number of increasing steps up to a frame
     jumps = [
         int(i)
         for i in back
@@ -445,11 +441,7 @@ def _join_clocks(times_ns: Times) -> tuple[Times, NDArray[np.int64]]:
 
 
 def unwritable_times(times_ns: Times) -> str:
-    """Why the stamps of a recording cannot be written into a session; "" where they can.
-
-    Args:
-        times_ns: (n,) stamps, ns.
-    """
+    """Why stamps (n,) ns cannot be written into a session; "" if they can."""
     if not len(times_ns) or (times_ns.min() >= 0 and times_ns.max() < LATEST_NS):
         return ""
     return (
@@ -462,7 +454,7 @@ def unwritable_times(times_ns: Times) -> str:
 def _fewest_moved(times_ns: Times) -> Times:
     """Make stamps strictly increasing by moving as few as possible.
 
-    Those that move are spread evenly between those that stay.
+    The moved stamps are spread evenly between the others.
     """
     # Integers that must increase by at least 1 are integers minus their rank that must not
     # decrease.
@@ -481,7 +473,7 @@ def _fewest_moved(times_ns: Times) -> Times:
 
 
 def _first_of_equal(times_ns: Times, slack: Times, keep: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Keep the first of equal stamps in place of a later one: what repeats is stale."""
+    """Keep the first of equal stamps instead of a later one, as repeats are stale."""
     chosen = keep.copy()
     starts = np.append(True, np.diff(times_ns) != 0)
     run = np.maximum.accumulate(np.where(starts, np.arange(len(times_ns)), 0))
@@ -500,7 +492,7 @@ def _longest_nondecreasing(values: list[int]) -> NDArray[np.int64]:
     for i, value in enumerate(values):
         pile = bisect_right(tops, value)
         before.append(top_index[pile - 1] if pile else -1)
-        tops[pile : pile + 1] = [value]  # a new top, or a new pile behind the last
+        tops[pile : pile + 1] = [value]  # a new top, or a new pile after the last
         top_index[pile : pile + 1] = [i]
     chain = top_index[-1:]
     while before[chain[-1]] >= 0:
@@ -509,7 +501,7 @@ def _longest_nondecreasing(values: list[int]) -> NDArray[np.int64]:
 
 
 def match_counts(n_frames: int, n_stamps: int, frames_from: str, times_from: str) -> list[str]:
-    """The sentence on frames and stamps that are not equally many; none where they are.
+    """The sentence about unequal numbers of frames and stamps; empty if they are equal.
 
     Args:
         n_frames: number of images.
@@ -526,7 +518,7 @@ def match_counts(n_frames: int, n_stamps: int, frames_from: str, times_from: str
 
 
 def unpaired(frames_from: str, times_from: str) -> str:
-    """The doubt about frames and stamps that were paired in order although one of them lacks some.
+    """The doubt about frames and stamps that were paired in order although their numbers differ.
 
     Args:
         frames_from: name of the file or folder of the depth images.
@@ -542,10 +534,10 @@ def start_of_day(stated: object) -> str | None:
     """A stated start of the recording as ISO 8601 with zone.
 
     Args:
-        stated: ISO 8601 text or a datetime, as a file states it; anything else states none.
+        stated: ISO 8601 text or a datetime; anything else is ignored.
 
     Returns:
-        The moment; None if absent, or it has no zone and so says no moment.
+        The start; None if absent or without a time zone.
     """
     with suppress(ValueError):
         moment = stated if isinstance(stated, datetime) else read_moment(str(stated))[0]
@@ -554,17 +546,17 @@ def start_of_day(stated: object) -> str | None:
 
 
 def read_moment(text: str) -> tuple[datetime, int]:
-    """A date and time of day in the forms of ISO 8601, with or without a zone.
+    """Parse an ISO 8601 date and time of day, with or without a zone.
 
     Args:
         text: such as 2024-10-27T02:59:59.1234567+02:00.
 
     Returns:
-        The moment, to the microsecond, and exactly as ns since 1970; one without a zone as if in
-        UTC.
+        The date and time, to the microsecond, and exactly as ns since 1970; UTC is assumed without
+        a zone.
 
     Raises:
-        ValueError: it is none.
+        ValueError: it is not a date and time.
     """
     if len(text.strip()) <= len("2024-10-27"):
         raise ValueError(f"{text!r} has no time of day")
@@ -576,14 +568,9 @@ def read_moment(text: str) -> tuple[datetime, int]:
 
 
 def start_of_clock(first_ns: int) -> str | None:
-    """The moment of a stamp that counts from 1970 (UTC), as ISO 8601.
+    """A stamp in ns since 1970 (UTC) as ISO 8601, to the microsecond; None if it is before 2000.
 
-    Args:
-        first_ns: the stamp, ns.
-
-    Returns:
-        The moment, to the microsecond; None if the stamp is before 2000 and so plainly counts
-        from something else.
+    An earlier stamp counts from something other than 1970.
     """
     if first_ns < PLAUSIBLE_NS[0]:
         return None
