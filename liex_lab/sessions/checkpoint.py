@@ -1,9 +1,9 @@
 """Checkpoint and restart of an unfinished session: append-only files and a record of their lengths.
 
-An unfinished session is a folder beside the final one. It holds the observations of its frames as
-plain arrays that only grow, and the two logs, session.rrd and session.mcap. Every few seconds
+An unfinished session is a folder next to the final one. It contains the observations of its frames
+as plain, growing arrays, and the two logs, session.rrd and session.mcap. Every few seconds
 `checkpoint.json` records, by an atomic rename, how many bytes of each file were valid at one
-moment. Whatever follows is truncated before the work resumes. Rerun cannot append to a file, so a
+moment. Any later bytes are truncated before the work resumes. Rerun cannot append to a file, so a
 resumed run writes resumed.rrd, whose messages are appended to session.rrd later.
 """
 
@@ -30,16 +30,16 @@ from liex_lab.runtime.memory import mapped
 from liex_lab.runtime.places import unlinked, unlinked_tree
 from liex_lab.sessions.mcap_log import append_chunks
 
-# between two checkpoints: as much work is lost at most, besides what it takes to begin
+# between two checkpoints: the most work that can be lost, besides startup
 EVERY_S = 3.0
 _STATE = "checkpoint.json"
 _LOCK = "lock"
 _SEEN = "seen"
 _INPUT = "input.json"
 STRETCHES = "stretches"
-# of work: three hundred years; whole numbers beyond what a float holds are no seconds either
+# of work: 300 years; also excludes integers too large for a float
 _MOST_S = 1e10
-_MOST = 1 << 20  # values of one column that a frame may have
+_MOST = 1 << 20  # values per frame in one column
 OWN = (_STATE, _LOCK, _SEEN, _INPUT, STRETCHES, "resumed.rrd")  # not in the finished session
 
 if TYPE_CHECKING:
@@ -57,13 +57,13 @@ Clock = Callable[[], float]
 
 
 class State(BaseModel):
-    """How far a session is: the content of checkpoint.json.
+    """Progress of a session: the content of checkpoint.json.
 
     Attributes:
-        key: SHA-256 of the facts that the session is made from; only the same ones are resumed.
+        key: SHA-256 of the session's provenance; only the same one is resumed.
         n_frames: frames written, with their observations.
         seconds: time spent on them, s.
-        interruptions: how often the work will have been interrupted if it resumes from here.
+        interruptions: number of interruptions if the work resumes from here.
         logs: valid bytes of each log.
     """
 
@@ -76,33 +76,33 @@ class State(BaseModel):
 
 
 class Checkpoint:
-    """The folder of an unfinished session, locked by this process alone.
+    """The folder of an unfinished session, locked by this process.
 
     Attributes:
         folder: the folder.
-        state: how far the session is.
+        state: progress of the session.
         seconds_before: time spent in earlier runs, s.
-        n_interruptions: how often the work was interrupted before.
-        replay: where Rerun's messages of this run go.
+        n_interruptions: number of earlier interruptions.
+        replay: file of Rerun's messages in this run.
         seen: the observations on disk.
     """
 
     def __init__(
         self, folder: Path, facts: Mapping[str, Any], clock: Clock = time.monotonic
     ) -> None:
-        """Begin, or resume where a session of the same facts was left.
+        """Begin, or resume a session with the same provenance.
 
         Args:
-            folder: the folder NAME.part; made if needed.
-            facts: what the session is made from, as JSON knows it.
-            clock: seconds that never jump.
+            folder: the folder NAME.part; created if needed.
+            facts: the session's provenance, serialisable as JSON.
+            clock: monotonic seconds.
 
         Raises:
             SessionError: another process is writing the session.
         """
         try:
             unlinked_tree(folder).mkdir(parents=True, exist_ok=True)
-        except FileNotFoundError as error:  # a parent that the system makes, as below /proc
+        except FileNotFoundError as error:  # a virtual parent folder, such as /proc
             raise SessionError(
                 f"no folder can be made at {error.filename} ({error.strerror}); name another place"
             ) from None
@@ -167,7 +167,7 @@ class Checkpoint:
 
         Args:
             shard: its folder.
-            n_frames: frames that the session has then.
+            n_frames: frames of the session including the shard.
             seconds: time spent on them, s.
         """
         for log, append in zip(LOGS, (append_rrd, append_chunks), strict=True):
@@ -176,12 +176,12 @@ class Checkpoint:
         self._keep(n_frames=n_frames, seconds=seconds, logs=logs)
 
     def begin_shards(self) -> None:
-        """Record that nothing is there yet, so that what others write meanwhile is kept."""
+        """Save an empty checkpoint, so that shards written by other processes are kept."""
         if not self.is_saved:
             self._keep()
 
     def _keep(self, **changes: Any) -> None:
-        """Record a state once its files are on disk: a power cut leaves nothing that is not."""
+        """Save a state once its files are on disk, so that it survives a power cut."""
         self.seen.flush()
         state = self.state.model_copy(update=changes)
         sync_tree(self.folder / _SEEN)
@@ -191,15 +191,15 @@ class Checkpoint:
         self.state, self._last = state, self._clock()
 
     def join_replay(self) -> None:
-        """Complete session.rrd, all of whose parts were closed."""
+        """Complete session.rrd, all of whose parts are closed."""
         if self.replay.name == _RESUMED:
             append_rrd(self.replay, self.folder / LOGS[0])
 
     def tidy(self, folder: Path) -> None:
-        """Remove what is no part of the finished session, and release the lock.
+        """Remove working files from the finished session, and release the lock.
 
         Args:
-            folder: where the session is now.
+            folder: the current folder of the session.
         """
         self.seen.close()
         for name in OWN:
@@ -210,17 +210,17 @@ class Checkpoint:
         """Release the folder without finishing the session.
 
         Args:
-            keep: leave it there if it has a checkpoint, so that the work can resume later;
-                otherwise nothing stays.
+            keep: leave the folder if it has a checkpoint, so that the work can resume later;
+                otherwise remove it.
         """
-        with suppress(OSError):  # what the disk does not take is behind the checkpoint
+        with suppress(OSError):  # unwritten bytes are after the checkpoint
             self.seen.close()
         if not (keep and self.is_saved):
             shutil.rmtree(self.folder, ignore_errors=True)
         self._held.close()
 
     def _cut(self, state: State) -> bool:
-        """Cut everything back to the checkpoint; False if something is shorter than it says."""
+        """Truncate everything to the checkpoint; False if a file is shorter than recorded."""
         for path in self.folder.iterdir():  # half-written tables, and logs without a checkpoint
             own = path.name in OWN and path.name != _RESUMED
             if not own and path.name not in state.logs:
@@ -240,10 +240,10 @@ class Checkpoint:
 class Columns:
     """Arrays on disk that grow by rows.
 
-    One binary file each, and columns.json with names, dtypes and row shapes in order.
+    One binary file per array, and columns.json with names, dtypes and row shapes in order.
 
     Args:
-        folder: where the files lie; it exists.
+        folder: the existing folder of the files.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -255,11 +255,11 @@ class Columns:
         """Append the next rows of every column.
 
         Args:
-            columns: arrays (n, ...) by name; always the same names, dtypes and row shapes, in the
-                same order.
+            columns: arrays (n, ...) by name; always with the same names, dtypes and row shapes, in
+                the same order.
 
         Raises:
-            ValueError: the columns are others than before.
+            ValueError: the columns differ from earlier ones.
         """
         kinds = {
             name: (values.dtype.str, list(values.shape[1:])) for name, values in columns.items()
@@ -283,7 +283,7 @@ class Columns:
         return 0
 
     def flush(self) -> None:
-        """Hand everything written so far to the operating system."""
+        """Pass everything written so far to the operating system."""
         for file in self._files.values():
             file.flush()
 
@@ -291,7 +291,7 @@ class Columns:
         """Close the files.
 
         Raises:
-            OSError: the system refused to write; all are closed even so.
+            OSError: a write failed; all files are closed nevertheless.
         """
         with ExitStack() as closing:
             for file in self._files.values():
@@ -299,9 +299,9 @@ class Columns:
             self._files.clear()
 
     def read(self) -> dict[str, NDArray[Any]]:
-        """All rows of every column, mapped from the files; empty where none was written.
+        """All rows of every column, mapped from the files; empty columns are left out.
 
-        The arrays are not to be written to, see `mapped`.
+        Do not write to the arrays, see `mapped`.
         """
         self.flush()
         return {
@@ -315,7 +315,7 @@ class Columns:
         """Truncate every column to its first rows; False if one has fewer.
 
         Args:
-            folder: where the files lie.
+            folder: the folder of the files.
             n: rows to keep.
         """
         kinds = _read_kinds(folder)
@@ -339,7 +339,7 @@ def rrd_messages(path: Path, start: int = RRD_HEAD) -> Iterator[tuple[int, int]]
         start: offset of the first message to read.
 
     Raises:
-        SessionError: a message is cut, so the file was not written whole.
+        SessionError: a message is cut, so the file was not written completely.
     """
     size = path.stat().st_size
     at = start
@@ -359,9 +359,9 @@ def rrd_messages(path: Path, start: int = RRD_HEAD) -> Iterator[tuple[int, int]]
 
 
 def append_rrd(source: Path, target: Path) -> None:
-    """Append the messages of an .rrd file to another one, which is made if it does not exist.
+    """Append the messages of an .rrd file to another one, which is created if needed.
 
-    The index that ends a file is left out, for it counts from the file's own beginning.
+    The index at the end of the file is left out, as its offsets are only valid in that file.
 
     Raises:
         SessionError: the last message of `source` is cut.
@@ -386,13 +386,13 @@ def _remove(path: Path) -> None:
 
 
 def hash_once(recording: Recording, folder: Path, progress: Progress) -> None:
-    """Compute the recording's SHA-256, or take it from an interrupted run of the same files.
+    """Compute the recording's SHA-256, or reuse it from an interrupted run of the same files.
 
-    Hashing hours of recording takes long. A hash that took longer than `EVERY_S` is kept in
-    input.json, and holds as long as names, sizes and times of the files are the same.
+    Hashing a long recording takes time. A hash that took longer than `EVERY_S` is stored in
+    input.json, and is valid while names, sizes and modification times of the files are the same.
 
     Args:
-        recording: the recording, which holds its hash afterwards.
+        recording: the recording, which then has its hash.
         folder: the folder of the unfinished session.
         progress: reports how many MB were read.
     """
@@ -411,7 +411,7 @@ def hash_once(recording: Recording, folder: Path, progress: Progress) -> None:
 
 
 def check_free(folder: Path) -> None:
-    """Raise SessionError where another process writes the unfinished session of a folder.
+    """Raise SessionError if another process is writing the unfinished session of a folder.
 
     Args:
         folder: the folder NAME.part.
@@ -427,14 +427,14 @@ def check_free(folder: Path) -> None:
 
 
 def hold(folder: Path) -> IO[bytes] | None:
-    """Hold an unfinished session, so that nobody else writes it.
+    """Lock an unfinished session against other writers.
 
     Args:
         folder: the folder NAME.part.
 
     Returns:
-        The lock, which goes with `close`; None if another process writes the session, or it
-        became whole just now.
+        The lock, released by `close`; None if another process is writing the session, or it was
+        finished in the meantime.
     """
     try:
         return take_lock(folder / _LOCK)
@@ -443,7 +443,7 @@ def hold(folder: Path) -> IO[bytes] | None:
 
 
 def _read_state(path: Path) -> State | None:
-    """The state in a file; None if there is none to resume from."""
+    """The state in a file; None if it cannot be resumed."""
     try:
         return State.model_validate_json(path.read_bytes())
     except (OSError, ValueError):
@@ -451,9 +451,7 @@ def _read_state(path: Path) -> State | None:
 
 
 def _read_kinds(folder: Path) -> dict[str, tuple[str, list[int]]] | None:
-    """What columns.json says of the columns: dtype and shape of a row by name; None if it makes
-    no sense.
-    """
+    """Dtype and row shape of the columns by name, from columns.json; None if it is invalid."""
     try:
         found: dict[str, Any] = json.loads((folder / "columns.json").read_text(encoding="utf-8"))
         kinds = {

@@ -1,10 +1,10 @@
 """Append-only log of human corrections to a session: flips, joints, bouts and descriptions.
 
-The files of a session are never written again. The folder `corrected` beside them holds
-`corrections.json`, a log to which entries are only added (one entry may take back another), and the
-tables that follow from the corrections that stand. The log states the hashes of the tables that it
-was made on and the SHA-256 of its own content. `Session.open` reads the corrected tables;
-`Session.open(path, raw=True)` reads the measured ones.
+The files of a session are never rewritten. Its folder `corrected` contains `corrections.json`, a
+log to which entries are only appended (an entry may undo another), and the tables that result from
+the active corrections. The log states the hashes of the tables it was made on and the SHA-256 of
+its own content. `Session.open` reads the corrected tables; `Session.open(path, raw=True)` reads the
+measured ones.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from liex_lab.sessions.verdict import ALSO, WHO
 FOLDER = "corrected"
 LOG = "corrections.json"
 REPLAY = "corrected.rrd"
-SCHEMA_VERSION = 3  # 2: species and age are described; 3: a correction was made again (redo)
+SCHEMA_VERSION = 3  # 2: species and age are described; 3: redo
 FACTS = {
     "frames",
     "actions",
@@ -45,7 +45,7 @@ _UNDO = "undo"
 
 @dataclass(frozen=True)
 class FlipSpan:
-    """Head and tail are exchanged in a span of frames.
+    """Exchange head and tail in a span of frames.
 
     Attributes:
         start_frame: first frame, the camera's count.
@@ -63,7 +63,7 @@ class FlipSpan:
 
 @dataclass(frozen=True)
 class JointMove:
-    """In one frame a joint lies at another position.
+    """Move a joint of one frame to another position.
 
     Attributes:
         frame: the frame, the camera's count.
@@ -71,7 +71,7 @@ class JointMove:
         x_mm: position in the arena frame, mm.
         y_mm: position in the arena frame, mm.
         z_mm: height above the floor, mm.
-        note: how the height was chosen, where the depth under the pixel did not give it.
+        note: how the height was chosen, if not from the depth under the pixel.
     """
 
     frame: int
@@ -92,19 +92,19 @@ class JointMove:
 
 @dataclass(frozen=True)
 class BoutEdit:
-    """In a span of time the animal does something else than the ethogram says.
+    """Correct the action in a span of time.
 
     Attributes:
-        edit: what is done to the bout.
-        action: what the animal does; '' for nothing that has a name.
+        edit: type of the edit.
+        action: the correct action; '' for none.
         start_ns: start on the recording's clock, ns.
         stop_ns: stop, ns, exclusive.
-        was: action of the bout that is edited, for the reader.
-        was_start_ns: start of the bout that is edited, ns; it loses its time first.
-        was_stop_ns: its stop, ns; equal to its start where there was none.
+        was: action of the edited bout, for the reader.
+        was_start_ns: start of the edited bout, ns; its time is cleared first.
+        was_stop_ns: its stop, ns; equal to its start if there was no bout.
 
     Raises:
-        ValueError: the edit is not known, or the span is empty.
+        ValueError: the edit is unknown, or the span is empty.
     """
 
     edit: Literal["add", "rename", "recut", "delete"]
@@ -132,7 +132,7 @@ class BoutEdit:
 
 @dataclass(frozen=True)
 class Description:
-    """A fact about the animal or the session that no measurement depends on.
+    """A fact about the animal or the session that does not affect measurements.
 
     It applies to every measurement of the recording.
 
@@ -141,7 +141,7 @@ class Description:
         value: its value; '' if unknown.
 
     Raises:
-        ValueError: the key is not known.
+        ValueError: the key is unknown.
     """
 
     key: str
@@ -165,14 +165,14 @@ _CORRECTION: TypeAdapter[Correction] = TypeAdapter(
 
 @dataclass(frozen=True)
 class Entry:
-    """One line of the log: a correction, an undo of one, or an undo of an undo, which is a redo.
+    """One entry of the log: a correction, the undo of one, or the undo of an undo, which is a redo.
 
     Attributes:
         number: of the entry, from 1.
-        author: who made it.
-        made_at: when, ISO 8601 with time zone.
-        what: the correction; None if the entry takes another one back.
-        undoes: number of the entry that is taken back, a correction or an undo; 0 for a correction.
+        author: its author.
+        made_at: its time, ISO 8601 with time zone.
+        what: the correction; None for an undo or redo.
+        undoes: number of the undone entry, a correction or an undo; 0 for a correction.
     """
 
     number: int
@@ -182,7 +182,7 @@ class Entry:
     undoes: int = 0
 
     def to_dict(self) -> dict[str, Any]:
-        """The entry as corrections.json keeps it."""
+        """The entry as stored in corrections.json."""
         about = {"number": self.number, "author": self.author, "made_at": self.made_at}
         if self.what is None:
             return {**about, "kind": _UNDO, "undoes": self.undoes}
@@ -190,10 +190,10 @@ class Entry:
 
     @staticmethod
     def from_dict(entry: Mapping[str, Any]) -> Entry:
-        """The entry that `to_dict` made into a table.
+        """Inverse of `to_dict`.
 
         Raises:
-            ValueError: a value cannot be used, or the kind is not known.
+            ValueError: a value is invalid, or the kind is unknown.
             KeyError: a key is missing.
             TypeError: a value is of another type.
         """
@@ -205,16 +205,16 @@ class Entry:
 
 @dataclass(frozen=True)
 class Log:
-    """All entries, first to last, and what they were applied to.
+    """All entries, first to last, and their results.
 
     Attributes:
-        made_of: which poses and bouts they correct, see `basis`.
+        made_of: the poses and bouts they correct, see `basis`.
         entries: the entries in the order in which they were made.
         files: bytes and SHA-256 of each corrected table by name.
-        facts: sections that session.json would have instead, a subset of `FACTS`.
+        facts: replacements for sections of session.json, a subset of `FACTS`.
 
     Raises:
-        ValueError: a file lies outside of the folder, or a section is not one of `FACTS`.
+        ValueError: a file is outside of the folder, or a section is not one of `FACTS`.
     """
 
     made_of: str
@@ -230,7 +230,7 @@ class Log:
 
     @property
     def standing(self) -> tuple[Entry, ...]:
-        """The corrections that nobody took back, in the order in which they were made."""
+        """The active corrections, not undone, in the order in which they were made."""
         gone = set(self.undos.values())
         return tuple(
             entry for entry in self.entries if entry.what is not None and entry.number not in gone
@@ -238,7 +238,7 @@ class Log:
 
     @property
     def undos(self) -> dict[int, int]:
-        """The undos that no redo took back, by number: the number of the correction of each."""
+        """The active undos, not redone: number of each and of its correction."""
         found: dict[int, int] = {}
         for entry in self.entries:
             if entry.undoes in found:  # a redo
@@ -249,38 +249,38 @@ class Log:
 
     @property
     def redoable(self) -> tuple[int, Correction] | None:
-        """The undo that a redo takes back, by its number, and the correction that returns.
+        """The undo that a redo would undo, by its number, and the correction that returns.
 
-        It is the last undo that stands; a new correction after it leaves none.
+        It is the last active undo; None after a new correction.
         """
         whats = {entry.number: entry.what for entry in self.entries if entry.what is not None}
         number, undone = max(self.undos.items(), default=(0, 0))
         return (number, whats[undone]) if number > max(whats, default=0) else None
 
     def corrections(self, kind: type[Any]) -> list[Any]:
-        """The standing corrections of one kind."""
+        """The active corrections of one kind."""
         return [entry.what for entry in self.standing if isinstance(entry.what, kind)]
 
     @property
     def described(self) -> dict[str, str]:
-        """What is known of animal and session, by the words of `DESCRIBED`; '' is unknown."""
+        """Facts about animal and session, by the keys of `DESCRIBED`; '' is unknown."""
         return {one.key: one.value for one in self.corrections(Description)}
 
     @property
     def touched(self) -> tuple[Entry, ...]:
-        """The standing corrections of what was measured: all but descriptions."""
+        """The active corrections of measurements: all except descriptions."""
         return tuple(one for one in self.standing if not isinstance(one.what, Description))
 
     def added(self, what: Sequence[Correction], undo: Sequence[int] = (), author: str = "") -> Log:
-        """The log with further entries: first those that take others back, then new corrections.
+        """The log with further entries: first undos and redos, then new corrections.
 
         Args:
             what: new corrections.
-            undo: numbers of standing entries to take back, or of the undo that `redoable` names.
-            author: who makes them; "" takes who is logged in.
+            undo: numbers of active corrections to undo, or the undo in `redoable`.
+            author: their author; "" for the current user.
 
         Raises:
-            SessionError: an entry to take back does not stand.
+            SessionError: an entry to undo is not active.
         """
         known = {entry.number for entry in self.standing}
         redoable = self.redoable
@@ -298,7 +298,7 @@ class Log:
         return Log(self.made_of, (*self.entries, *new), self.files, self.facts)
 
     def to_json(self) -> str:
-        """The content of corrections.json, with its own hash in it."""
+        """The content of corrections.json, including its own hash."""
         undos = {entry.number for entry in self.entries if entry.what is None}
         redone = any(entry.undoes in undos for entry in self.entries)
         document = {
@@ -315,14 +315,14 @@ class Log:
 def _sum(document: Mapping[str, Any]) -> str:
     """SHA-256 of a log's content without its own `sum`.
 
-    What is read and merged into session.json's sections was then written by liex_lab.
+    It proves that content merged into session.json was written by liex_lab.
     """
     stated = {key: value for key, value in document.items() if key != "sum"}
     return hashlib.sha256(json.dumps(stated, sort_keys=True).encode()).hexdigest()
 
 
 def author_name() -> str:
-    """Name of who is logged in, as far as the system tells; else 'unknown'."""
+    """Name of the current user, if the system provides it; else 'unknown'."""
     try:
         return getpass.getuser()
     except (OSError, KeyError, ImportError):
@@ -337,7 +337,8 @@ def corrected_folder(session: Path) -> Path:
 
 
 def basis(session: Path, metadata: Mapping[str, Any]) -> str:
-    """Fingerprint of what the corrections of a session are made on: its own poses, bouts and flips.
+    """Fingerprint of the tables that corrections are based on: the session's poses, bouts and
+    flips.
 
     Args:
         session: the session folder.
@@ -359,7 +360,7 @@ def basis(session: Path, metadata: Mapping[str, Any]) -> str:
 
 
 def read_log(session: Path) -> Log:
-    """Read the corrections of a session; an empty log where there are none.
+    """Read the corrections of a session; an empty log if there are none.
 
     Raises:
         SessionError: the log is damaged or was written by a later version.
@@ -396,12 +397,12 @@ def read_log(session: Path) -> Log:
 
 
 def applies(log: Log, session: Path, metadata: Mapping[str, Any]) -> bool:
-    """Whether the log has corrections that stand, and they were made on these poses and bouts."""
+    """Whether the log has active corrections that were made on these poses and bouts."""
     return bool(log.standing) and log.made_of == basis(session, metadata)
 
 
 def with_description(metadata: Mapping[str, Any], described: Mapping[str, str]) -> dict[str, Any]:
-    """The content of session.json with what was described since.
+    """The content of session.json with descriptions applied.
 
     Args:
         metadata: the content of session.json.

@@ -1,8 +1,8 @@
-"""Schema of session.json: what every part of the program may rely on once a session is open.
+"""Schema of session.json: guarantees for every part of the program once a session is open.
 
-A session may come from another lab. Its document is checked once, as a whole, when the session is
-opened: sections, types, sizes, joints and bones that belong together, finite numbers. What is not
-listed here nobody relies on. Sections that came with later versions may be absent.
+A session may come from another lab. Its document is validated once, as a whole, on opening:
+sections, types, sizes, matching joints and bones, finite numbers. Nothing else is guaranteed.
+Sections added by later versions may be absent.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _ESCAPED = re.compile(r"\\u(0000|[dD][89a-fA-F])")
 
 
 def _said(text: str) -> str:
-    """Text that files can hold: Unicode without NUL and halves of characters."""
+    """Check that files can store a text: Unicode without NUL or surrogates."""
     if "\0" in text:
         raise ValueError("holds a NUL character")
     try:
@@ -228,13 +228,13 @@ class Document(_Section):
 
 
 def read_document(path: Path) -> dict[str, Any]:
-    """Read and check a session.json.
+    """Read and validate a session.json.
 
     Args:
         path: the file.
 
     Returns:
-        Its content as it is, once it holds what `Document` says.
+        Its content, unchanged, if it satisfies `Document`.
 
     Raises:
         SessionError: it is damaged, or was written by a newer version.
@@ -266,15 +266,15 @@ def read_document(path: Path) -> dict[str, Any]:
 
 
 def check_document(found: dict[str, Any]) -> None:
-    """Check the content of a session.json.
+    """Validate the content of a session.json.
 
     Args:
         found: its content.
 
     Raises:
-        ValueError: it does not hold what `Document` says; pydantic's error is one.
-        TypeError: something in camera, arena or zones is of another kind.
-        KeyError: something in them is missing.
+        ValueError: it does not satisfy `Document`; pydantic's error is one.
+        TypeError: a value in camera, arena or zones has the wrong type.
+        KeyError: a key in them is missing.
     """
     Document.model_validate(found)
     Camera.from_dict(found["camera"])
@@ -285,7 +285,7 @@ def check_document(found: dict[str, Any]) -> None:
 
 
 def _walk(value: Any) -> None:
-    """Raises ValueError where any text, however deep, holds what no file can."""
+    """Raises ValueError if any nested text contains what files cannot store."""
     if isinstance(value, str):
         _said(value)
     elif isinstance(value, dict):
@@ -302,7 +302,7 @@ def _no_number(text: str) -> NoReturn:
 
 
 def _first(error: ValidationError) -> str:
-    """The first complaint: where, and what was expected."""
+    """The first validation error: where, and what was expected."""
     first = error.errors(include_url=False, include_input=False)[0]
     where = ".".join(str(part) for part in first["loc"])
     said = first["msg"].removeprefix("Value error, ").replace("Input should", "should")
@@ -315,20 +315,20 @@ def _damaged(path: Path, why: str) -> SessionError:
     )
 
 
-# Error translation for reading files of a session: whatever goes wrong becomes one sentence.
+# Error translation for reading files of a session: every error becomes one sentence.
 
 
 @contextmanager
 def reading_from(path: Path) -> Iterator[Path]:
-    """Within the block, turn any error into a SessionError that names the file as damaged.
+    """Within the block, convert any error to a SessionError that names the file as damaged.
 
-    A LiexError passes as it is.
+    A LiexError is passed on unchanged.
 
     Args:
-        path: the file that is read in the block; it is what the `with` statement gives.
+        path: the file that is read in the block, and the value of the `with` statement.
 
     Raises:
-        SessionError: anything went wrong in the block.
+        SessionError: any error in the block.
     """
     try:
         yield path

@@ -1,7 +1,7 @@
 """Reader of a session folder: Parquet tables, JSON metadata, Rerun and MCAP logs of one recording.
 
-A table is read when it is asked for. Where people corrected the session, the corrected tables take
-the place of the measured ones (see `liex_lab.sessions.corrections`).
+Tables are read on demand. In a corrected session, the corrected tables replace the measured ones
+(see `liex_lab.sessions.corrections`).
 """
 
 from __future__ import annotations
@@ -78,21 +78,21 @@ _OPTIONAL = {
 
 
 class Session:
-    """The results of one recording, read from its folder when asked for.
+    """The results of one recording, read from its folder on demand.
 
-    Tables are pandas data frames. Make one with `Session.open`.
+    Tables are pandas data frames. Create one with `Session.open`.
 
     Attributes:
         path: the session folder.
-        metadata: the content of session.json, with what corrections changed in it.
-        log: the corrections that apply; an empty log where there are none, where they were made on
-            another measurement, or where they are not wanted.
+        metadata: the content of session.json, with corrections applied.
+        log: the corrections that apply; an empty log if there are none, if they were made on
+            another measurement, or if the session was opened raw.
 
     Args:
         path: the session folder.
         metadata: the content of session.json.
         log: the corrections that apply; None if absent.
-        described: what people said of the animal since, see `Log.described`; None if absent.
+        described: facts about the animal added since, see `Log.described`; None if absent.
     """
 
     def __init__(
@@ -103,28 +103,27 @@ class Session:
         described: Mapping[str, str] | None = None,
     ) -> None:
         self.path = path
-        self.log = log or Log("")  # of corrections; none where they do not apply, or are not wanted
+        self.log = log or Log("")  # corrections; empty if they do not apply
         self.described = dict(described or {})
         self.metadata = with_description({**metadata, **self.log.facts}, self.described)
 
     @staticmethod
     def open(path: str | Path, *, raw: bool = False) -> Session:
-        """Open the session in a folder, checked for its version and for missing files.
+        """Open the session in a folder; its version and files are checked.
 
-        One that a writer had put aside when it was killed is put back first.
+        A session that a killed writer had moved aside is restored first.
 
         Args:
             path: the session folder.
-            raw: as it was measured, without what people corrected (see
-                `liex_lab.sessions.corrections`).
+            raw: ignore corrections (see `liex_lab.sessions.corrections`).
 
         Raises:
-            SessionError: the folder is no session, is damaged, lacks a file, or was written by a
+            SessionError: the folder is not a session, is damaged, lacks a file, or was written by a
                 newer version.
         """
         folder = Path(path)
         document = folder / "session.json"
-        with suppress(OSError):  # of a medium that cannot be written
+        with suppress(OSError):  # on a read-only medium
             put_back_session(folder)
         if not document.is_file():
             what = "is not a folder" if not folder.is_dir() else "holds no session.json"
@@ -139,13 +138,13 @@ class Session:
                 )
         log = Log("") if raw else read_log(folder)
         fitting = log if applies(log, folder, metadata) else None
-        # absolute, so that a table is found after the process went to another folder, too
+        # absolute, so that tables are found after the process changes its folder
         session = Session(folder.absolute(), metadata, fitting, log.described)
         session._check_tables()
         return session
 
     def _check_tables(self) -> None:
-        """Raises SessionError where a table's file is not of this session's frames and joints."""
+        """Raises SessionError if a table's file does not match the session's frames and joints."""
         n_frames = self.metadata["frames"]["n_frames"]
         n_joints = len(self.metadata["animal"]["joints"])
         for path in sorted(self.path.glob("*.parquet")):
@@ -168,7 +167,7 @@ class Session:
         return str(self.metadata["session_id"])
 
     def file(self, name: str) -> Path:
-        """Path of a file of the session: the corrected one where there is one, else its own.
+        """Path of a file of the session: the corrected one if it exists, else the original.
 
         Args:
             name: the file's name, such as 'poses.parquet'.
@@ -176,7 +175,7 @@ class Session:
         return corrected_folder(self.path) / name if name in self.log.files else self.path / name
 
     def has(self, name: str) -> bool:
-        """Whether the session holds a file.
+        """Whether the session has a file.
 
         Args:
             name: the file's name, such as 'summary.csv'.
@@ -197,7 +196,7 @@ class Session:
     def rotations(self) -> pd.DataFrame:
         """Table `rotations`, one row per recorded frame and joint, and one for the root.
 
-        The root's row is its rigid transform, which has a translation, too. Rotations are rotation
+        The root's row is its rigid transform and includes a translation. Rotations are rotation
         vectors, rad; translations mm.
         """
         return self.table("rotations")
@@ -214,12 +213,12 @@ class Session:
 
     @cached_property
     def gaps(self) -> pd.DataFrame:
-        """Table `gaps`, one row per stretch of frames that are missing or without a pose."""
+        """Table `gaps`, one row per interval of frames that are missing or without a pose."""
         return self.table("gaps")
 
     @cached_property
     def flips(self) -> pd.DataFrame:
-        """Table `flips`, one row per stretch in which head and tail may have been exchanged."""
+        """Table `flips`, one row per interval in which head and tail may be exchanged."""
         return self.table("flips")
 
     @cached_property
@@ -229,14 +228,14 @@ class Session:
 
     @cached_property
     def activity(self) -> pd.DataFrame:
-        """Table `activity`, one row per bin of time: distance (mm) and share of each action."""
+        """Table `activity`, one row per time bin: distance (mm) and share of each action."""
         return self.table("activity")
 
     @cached_property
     def zone_visits(self) -> pd.DataFrame:
         """Table `zones` (zones.parquet), one row per zone: time in it (s), visits, latency (s).
 
-        `zones` are the shapes of the zones; `table("zones")` is this table, too.
+        `zones` are the shapes of the zones; `table("zones")` is the same table.
         """
         return self.table("zones")
 
@@ -271,15 +270,15 @@ class Session:
 
     @cached_property
     def camera(self) -> Camera:
-        """The depth camera, an ideal pinhole one in air; px.
+        """The depth camera, an ideal pinhole camera in air; px.
 
-        `metadata["camera"]["optics"]` says what of lens and water was undone for that.
+        `metadata["camera"]["optics"]` lists the corrections of lens and water.
         """
         return Camera.from_dict(self.metadata["camera"])
 
     @cached_property
     def T_arena_camera(self) -> SE3:
-        """Rigid transform that carries points of the camera frame (mm) into the arena frame."""
+        """Rigid transform from the camera frame (mm) to the arena frame."""
         return SE3.from_matrix(np.array(self.metadata["camera"]["T_arena_camera"], float))
 
     @cached_property
@@ -289,7 +288,7 @@ class Session:
 
     @cached_property
     def zones(self) -> list[Zone]:
-        """The zones that a person has drawn on the floor; their table is `zone_visits`."""
+        """The zones drawn on the floor; their table is `zone_visits`."""
         return [Zone.from_dict(zone) for zone in self.metadata.get("zones", [])]
 
     @property
@@ -299,13 +298,13 @@ class Session:
             return path.read_text(encoding="utf-8")
 
     def narrowed(self, **wanted: Sequence[str]) -> Session:
-        """The same session, of whose named tables no more is read than some columns.
+        """The same session, with only some columns of the named tables in memory.
 
-        Of hours of recording all columns take much memory. A column that a table does not have is
-        left out.
+        All columns of a long recording need much memory. Columns that a table does not have are
+        ignored.
 
         Args:
-            **wanted: table name to the names of its columns, as `frames=["time_s", "flag"]`.
+            **wanted: table name to column names, as in `frames=["time_s", "flag"]`.
         """
         import pyarrow.parquet as pq
 
@@ -323,13 +322,13 @@ class Session:
     def table(
         self, name: str, columns: list[str] | None = None, frame_index: list[int] | None = None
     ) -> pd.DataFrame:
-        """Read a table by its name, or a part of it.
+        """Read a table by its name, or part of it.
 
         Args:
             name: the table's name, such as 'poses'.
-            columns: only these columns; None takes all.
-            frame_index: only the rows of these frames, by their number; then no more than one
-                row group of the file is in memory at a time. None takes all rows.
+            columns: only these columns; None for all.
+            frame_index: only the rows of these frames, by number, with at most one row group of the
+                file in memory at a time. None for all rows.
 
         Raises:
             SessionError: there is no such table, or it is damaged.
@@ -356,7 +355,7 @@ class Session:
             return found.assign(**{key: said[key] for key in said if key in found})
 
     def to_xarray(self) -> xarray.Dataset:
-        """The poses as a labelled data set, in the form of the Python package movement.
+        """The poses as a labelled data set, in the format of the Python package movement.
 
         The dimensions are time (s since the first frame), space (x, y, z; mm, arena frame),
         keypoints and individuals; the variables position, confidence, score, sd_mm and action;
@@ -370,13 +369,13 @@ class Session:
     def pose_arrays(self) -> Poses:
         """The poses as arrays by frame and joint, NaN where there is no pose.
 
-        `session.pose_arrays().xyz_mm[10]` are the joints (J, 3) of the recording's row 10, mm.
+        `session.pose_arrays().xyz_mm[10]` are the joints (J, 3) of row 10 of the recording, mm.
         """
         return Poses.of(self.metadata, self.table("poses"), self.table("frames"))
 
 
 def _narrow(path: Path, columns: list[str]) -> pd.DataFrame:
-    """Some columns of a long table, without much else of it in memory."""
+    """Some columns of a long table, with little else of it in memory."""
     import pyarrow.parquet as pq
 
     with pq.ParquetFile(path, pre_buffer=False) as file:
@@ -388,9 +387,7 @@ def _narrow(path: Path, columns: list[str]) -> pd.DataFrame:
 
 
 def _rows_of(path: Path, columns: list[str] | None, frame_index: list[int]) -> pd.DataFrame:
-    """The rows of some frames of a long table, of which no more than a group of rows is in
-    memory.
-    """
+    """The rows of some frames of a long table, with at most one row group in memory."""
     import pandas as pd
     import pyarrow.parquet as pq
 
@@ -407,34 +404,34 @@ def _rows_of(path: Path, columns: list[str] | None, frame_index: list[int]) -> p
 
 
 def video_path(folder: Path, name: str, what: str = "") -> Path:
-    """Path of a video.
+    """Path of a video of a session or study.
 
     Args:
-        folder: the folder that it lies in.
-        name: of the session, or of the study.
-        what: what of it is shown, such as an action; "" for all of it.
+        folder: its folder.
+        name: of the session or study.
+        what: its subject, such as an action; "" for the whole session.
     """
     tail = "".join(c if c.isalnum() or c in "-_.+" else "_" for c in what)
     return folder / safe_name(f"{name}_{tail}" if tail else name, ".mp4")
 
 
 def stretch(start_s: float | None, stop_s: float | None) -> str:
-    """What a video of a part of a session is called.
+    """Part of a video's file name that states its time span.
 
     Args:
-        start_s: where it begins, s; None at the beginning.
-        stop_s: where it ends, s; None at the end.
+        start_s: start, s; None for the beginning.
+        stop_s: stop, s; None for the end.
     """
     start = f"from_{start_s or 0.0:.2f}s"
     return start if stop_s is None else f"{start}_to_{stop_s:.2f}s"
 
 
 def found_video(session: Session, what: str = "") -> Path | None:
-    """The video of a session in its folder; None if none was made.
+    """The video in a session's folder; None if absent.
 
     Args:
         session: the opened session.
-        what: what of it is shown; "" for all of it.
+        what: its subject; "" for the whole session.
     """
     path = video_path(session.path, session.name, what)
     return path if path.is_file() else None

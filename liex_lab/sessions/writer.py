@@ -1,8 +1,8 @@
-"""Writer of a session folder that survives interruption, made whole by one atomic rename.
+"""Crash-safe writer of a session folder, published by one atomic rename.
 
-The session grows in the folder NAME.part beside its final place. Depth streams straight into the
-Rerun replay and the MCAP file; tables are written at the end. A checkpoint every few seconds lets
-an interrupted run resume there (see `liex_lab.sessions.checkpoint`).
+The session is written to the folder NAME.part next to its final path. Depth is streamed directly
+into the Rerun replay and the MCAP file; tables are written at the end. Every few seconds a
+checkpoint is saved, from which an interrupted run resumes (see `liex_lab.sessions.checkpoint`).
 """
 
 from __future__ import annotations
@@ -57,34 +57,33 @@ BOXES = "kept_box_px"
 _BEHIND = 4  # batches of 16 frames that the logs may be behind, both together
 Kept = TypeVar("Kept")
 
-BlueprintMaker = Callable[
-    [dict[str, Any]], Any
-]  # session.json as known so far -> a Rerun blueprint
+BlueprintMaker = Callable[[dict[str, Any]], Any]  # session.json so far -> a Rerun blueprint
 ReportMaker = Callable[[Path], object]  # the session's folder -> report.html in it
 
 
 class SessionWriter:
-    """Begins a session, takes depth and track part by part, and puts it in its place with `close`.
+    """Writer of a session: receives depth and track in parts, and publishes the session with
+    `close`.
 
-    Depth goes straight to session.rrd and session.mcap, so memory does not grow with it. Use it in
-    a `with` block: an exception goes on, and leaves nothing behind but a folder NAME.part where
-    there is a checkpoint in it. A writer of the same session then begins with `n_frames` frames
-    that need not be given again.
+    Depth is streamed to session.rrd and session.mcap, so memory use does not grow with it. Use it
+    in a `with` block: an exception propagates, and leaves a folder NAME.part only if that has a
+    checkpoint. The next writer of the same session then starts with `n_frames` frames that need not
+    be added again.
 
     Attributes:
-        path: where the session will be.
-        origin: what is known about the recording before its first frame.
+        path: final path of the session.
+        origin: provenance known before the first frame.
 
     Args:
-        path: the session folder to be.
-        origin: what is known about the recording before its first frame.
-        overwrite: replace a session that is there already.
-        blueprint: makes the replay's layout from session.json's content as known so far; None for
-            no layout.
+        path: final path of the session.
+        origin: provenance known before the first frame.
+        overwrite: replace an existing session.
+        blueprint: creates the replay's layout from session.json's content so far; None for no
+            layout.
         report: writes report.html into the folder; None for no report.
 
     Raises:
-        SessionError: the place is taken, or another process is writing there.
+        SessionError: the path is taken, or another process is writing there.
     """
 
     def __init__(
@@ -123,7 +122,7 @@ class SessionWriter:
         self._logging: deque[Future[None]] = deque()
         self._loggers = {
             log: ThreadPoolExecutor(1) for log in LOGS
-        }  # each writes in order, and beside the other
+        }  # each writes in order, parallel to the other
         try:
             self._open_logs(blueprint)
         except BaseException:
@@ -168,10 +167,7 @@ class SessionWriter:
 
     @property
     def n_frames(self) -> int:
-        """Frames that are in the session already.
-
-        More than none where an interrupted session goes on.
-        """
+        """Frames that are in the session already; not 0 at the start of a resumed session."""
         return len(self._index)
 
     def resume(self, depth: Callable[[int], NDArray[np.float32]]) -> None:
@@ -191,8 +187,8 @@ class SessionWriter:
 
         Args:
             frames: the next frames.
-            seen: their observations, one row per frame, kept on disk until the session is whole so
-                that an interrupted run can resume. The depth around the animal in them is kept.
+            seen: their observations, one row per frame, kept on disk until the session is complete
+                so that an interrupted run can resume. The depth around the animal in them is kept.
 
         Raises:
             SessionError: a log could not be written.
@@ -202,11 +198,9 @@ class SessionWriter:
         began = time.perf_counter()
         times = [int(frame.time_ns) for frame in frames]
         index = [int(frame.index) for frame in frames]
-        # of all frames at once, as a call costs as much as a frame
+        # of all frames at once: a call costs as much as a frame
         boxes = self._keeper.boxes(seen if isinstance(seen, Observations) else None)
-        for start in range(
-            0, len(frames), 16
-        ):  # bounds the copies, however many frames come at once
+        for start in range(0, len(frames), 16):  # limits the number of copies
             part = slice(start, start + 16)
             depth = [frame.depth for frame in frames[part]]
             cuts = None if boxes is None else boxes[part]
@@ -228,7 +222,7 @@ class SessionWriter:
         self._seconds += time.perf_counter() - began
 
     def seen(self, kind: Callable[..., Kept]) -> Kept:
-        """The observations of all frames so far, as `add` got them; they lie on disk.
+        """The observations of all frames so far, as passed to `add`, from disk.
 
         Args:
             kind: called with the skeleton and the columns in order, such as `Observations`.
@@ -240,9 +234,7 @@ class SessionWriter:
         )
 
     def _drain(self, behind: int = 0) -> None:
-        """Wait until the logs are at most so many batches behind; what went wrong is raised
-        here.
-        """
+        """Wait until the logs are at most `behind` batches behind; their errors are raised here."""
         while len(self._logging) > behind:
             self._logging.popleft().result()
 
@@ -251,9 +243,7 @@ class SessionWriter:
             logger.shutdown(cancel_futures=True)
 
     def _save_checkpoint(self) -> None:
-        """A checkpoint: everything so far need not be done again. Only what `seen` was given for
-        can resume.
-        """
+        """Save a checkpoint of everything so far. Only frames with observations can resume."""
         self._drain()
         sizes = self._replay.flushed(), self._mcap.flushed()
         if len(self._checkpoint.seen) == len(self._index):
@@ -262,10 +252,7 @@ class SessionWriter:
 
     @property
     def allocate(self) -> Allocator:
-        """Allocator of arrays on the session's disk.
-
-        A track of hours may lie there until the session is whole.
-        """
+        """Allocator of arrays on the session's disk, for the track of a long recording."""
         return on_disk(self._folder)
 
     @property
@@ -288,23 +275,23 @@ class SessionWriter:
         self._rows = None
 
     def take(self, tracked: Tracked, seen: Observations, subject: Subject) -> None:
-        """Take the track of all frames so far, and write what it was made of to observations.npz.
+        """Accept the track of all frames so far, and write its observations to observations.npz.
 
         Args:
-            tracked: the track, and where head and tail may be exchanged.
+            tracked: the track, and possible exchanges of head and tail.
             seen: the observations of all frames.
-            subject: animal and camera that the track is of.
+            subject: animal and camera of the track.
         """
         self.track = tracked.track
         self._flips = tracked.flips
-        rest()  # hours of recording leave much behind
+        rest()  # much memory after a long recording
         self._candidates = seen if self.origin.replay_candidates else None
         self._together = seen if subject.n_animals > 1 else None
         write_evidence(self._folder, seen, subject)
 
     @property
     def rows(self) -> Rows:
-        """The track as the tables see it; the same rows until frames or a track are added."""
+        """The track in the form of the tables; cached until frames or a track are added."""
         if self._rows is None:
             origin = self.origin
             self._rows = Rows(
@@ -319,10 +306,10 @@ class SessionWriter:
         return self._rows
 
     def note(self, **sections: Any) -> None:
-        """Add facts found on the way to session.json.
+        """Add sections to session.json.
 
         Args:
-            **sections: section name to content; tables are merged, lists extended, the rest
+            **sections: section name to content; tables are merged, lists extended, other values
                 replaced.
         """
         for name, value in sections.items():
@@ -347,24 +334,23 @@ class SessionWriter:
         record: Mapping[str, Any] | None = None,
         timings_s: Mapping[str, float] | None = None,
     ) -> Session:
-        """Write everything else and put the session in its place; returns it opened.
+        """Write everything else and publish the session; returns it opened.
 
-        Corrections of the session that was there are taken over; where there was none, those of an
-        outdated copy of it (see `liex_lab.sessions.backups`), and session.json states it under
-        `corrections_taken_from`.
+        Corrections of the replaced session are copied; without one, those of an outdated copy (see
+        `liex_lab.sessions.backups`), which session.json then names under `corrections_taken_from`.
 
-        The report is written last; where that fails the session is kept all the same.
+        The report is written last; if it fails, the session is kept all the same.
 
         Args:
             results: tables by name (kinematics, bouts, summary and others).
-            columns: descriptions of their columns; of bouts, of those beyond `tables.BOUTS`.
+            columns: descriptions of their columns; for bouts, of those beyond `tables.BOUTS`.
             actions: the ethogram's vocabulary, word to definition.
-            record: what else session.json is to hold (see `note`).
+            record: further sections of session.json (see `note`).
             timings_s: time spent on each part of the work, s.
 
         Raises:
-            SessionError: the recording holds no frame, the track is of other frames, a column is
-                not described, a log could not be written, or the disk had no room for the report.
+            SessionError: the recording has no frame, the track is of other frames, a column is not
+                described, a log could not be written, or the disk had no room for the report.
         """
         from liex_lab.sessions.session import Session
 
@@ -374,7 +360,7 @@ class SessionWriter:
             )
         began = time.perf_counter()
         self._drain()
-        if self._checkpoint.state.n_frames:  # it took long: what follows may be interrupted, too
+        if self._checkpoint.state.n_frames:  # a long run: the rest may be interrupted as well
             self._save_checkpoint()
         rows = self.rows
         _check_times(np.array(self._times_ns, np.int64), rows.track)
@@ -417,9 +403,9 @@ class SessionWriter:
         return Session.open(self.path)
 
     def _publish_with_report(self) -> None:
-        """Put the session in its place, with its report or without.
+        """Publish the session, with or without its report.
 
-        A report can be made again; hours of tracking should not go with it.
+        A report can be made again; hours of tracking must not be lost with it.
 
         Raises:
             SessionError: the disk had no room for the report.
@@ -443,7 +429,7 @@ class SessionWriter:
         return time.perf_counter() - self._started
 
     def _account(self, results: Results, timings_s: dict[str, float]) -> dict[str, Any]:
-        """Counts of the frames, and what the run cost."""
+        """Counts of the frames, and the cost of the run."""
         elapsed = self._checkpoint.seconds_before + self._elapsed
         return {
             "frames": results.counts(),
@@ -464,14 +450,16 @@ class SessionWriter:
         }
 
     def _publish(self) -> None:
-        """Put the whole folder in place; an older session goes only when this one is on disk."""
+        """Move the whole folder into place; an older session is removed only once this one is on
+        disk.
+        """
         put_back_held(self.path)
         check_writable(self.path, self._overwrite)
-        sync_tree(self._folder)  # hours may lie there; until it is done the work can resume
+        sync_tree(self._folder)  # can take long; until it is done the work can resume
         made = corrections_for(self.path)
         copy = self._folder / FOLDER
         shutil.rmtree(copy, ignore_errors=True)
-        if made is not None:  # they apply again where the poses came out the same
+        if made is not None:  # they apply again if the poses are the same
             shutil.copytree(unlinked_tree(made), copy)
             sync_tree(copy)
         put_in_place(self._folder, self.path, aside_folder(self.path))
@@ -479,26 +467,26 @@ class SessionWriter:
         self._stop_logging()
         self._checkpoint.tidy(self.path)
         if made is not None:
-            with suppress(OSError):  # then they are found to be the same ones
+            with suppress(OSError):  # they are then recognised as the same
                 note_taken(made, self.path)
 
     def _abandon(self, keep: bool) -> None:
-        """Close what is open; keep: what there is a checkpoint of."""
+        """Close open files; keep: leave the folder if it has a checkpoint."""
         self._stop_logging()
         for log in (self._replay, self._mcap):
-            with suppress(Exception):  # an error is under way already; it is the one to tell
+            with suppress(Exception):  # the error being handled is the one to report
                 log.abandon()
         self._checkpoint.leave(keep)
 
 
 def full_disk(folder: Path, error: BaseException | None) -> str | None:
-    """What to say of an error if it came of a full disk: which disk it is; None if it did not.
+    """The message about a full disk, naming it, if it caused an error; else None.
 
-    Libraries tell of a full disk in errors of their own, so the disk is asked.
+    Libraries report a full disk by errors of their own, so the disk is probed.
 
     Args:
         folder: the folder that is written to.
-        error: the error under way; None if absent.
+        error: the current error; None if absent.
     """
     if error is None or isinstance(error, LiexError) or not isinstance(error, Exception):
         return None
@@ -512,13 +500,12 @@ def full_disk(folder: Path, error: BaseException | None) -> str | None:
 def seen_rows(
     frames: Sequence[DepthFrame], seen: Observations | Track, boxes: Boxes | None = None
 ) -> dict[str, NDArray[Any]]:
-    """Columns kept on disk of consecutive frames: observations, camera's frame count, time (ns).
+    """Columns of consecutive frames to keep on disk: observations, camera's frame count, time (ns).
 
     Args:
         frames: n consecutive frames.
         seen: their observations, n rows.
-        boxes: (n, K, 4) where their kept images are not the background; None if whole
-            images are kept.
+        boxes: (n, K, 4) boxes of the kept depth around the animal; None if whole images are kept.
 
     Returns:
         Arrays (n, ...) by name.
@@ -531,11 +518,11 @@ def seen_rows(
 
 
 def open_unfinished(path: Path, origin: Provenance) -> Checkpoint:
-    """Open the unfinished session of a place, begun or resumed.
+    """Open the unfinished session of a path, new or resumed.
 
     Args:
-        path: where the session will be.
-        origin: what is known about the recording; only a session of the same facts goes on.
+        path: final path of the session.
+        origin: provenance of the recording; only a session with the same provenance is resumed.
 
     Raises:
         SessionError: another process is writing it.
@@ -544,7 +531,7 @@ def open_unfinished(path: Path, origin: Provenance) -> Checkpoint:
 
 
 def _check_times(times_ns: NDArray[np.int64], track: Track) -> None:
-    """Raises SessionError where a track is not of exactly the frames at times_ns (n,)."""
+    """Raises SessionError if a track does not have exactly the frames at times_ns (n,)."""
     if not np.array_equal(times_ns, track.times_ns):
         raise SessionError(
             f"a track has one row for every frame written, got {track.n_frames} rows for "
