@@ -1,8 +1,8 @@
-"""Crossings of a session: where its ends, or its animals, may have been taken for one another.
+"""Crossings of a session: where head and tail, or two animals, may have been exchanged.
 
-Head and tail are exchanged, or may be (table `flips`). Another thing may be taken for the animal
-where its body jumps farther than it can go, and, of several animals in view, where one comes within
-a body's length of the other or is found again after it was lost.
+Exchanges of head and tail come from the table `flips`. The tracker may have changed to another
+object where the body jumps farther than it can move, and, with several animals in view, where
+another one comes within a body's length or an animal is found again after a loss.
 """
 
 from __future__ import annotations
@@ -25,22 +25,22 @@ from .tables import records
 Array = NDArray[np.float64]
 ENDS = "ends"
 IDENTITY = "identity"
-_ONE_S = 0.5  # what is less far apart is one place
-_SPINE_MM = 90.0  # of an animal whose length is not stated
-_LEAST_JUMP = 0.5  # of the spine; a fast camera's jitter is no jump
+_ONE_S = 0.5  # events closer in time are one crossing
+_SPINE_MM = 90.0  # of an animal of unknown length
+_LEAST_JUMP = 0.5  # of the spine; excludes the jitter of a fast camera
 _HUMAN = "human"
 
 
 @dataclass(frozen=True)
 class Crossing:
-    """A place where two things may have been taken for one another.
+    """A stretch in which head and tail, or two animals, may have been exchanged.
 
     Attributes:
         start_s: its beginning, s since the first frame.
         stop_s: its end, s.
-        kind: `ENDS` (head and tail) or `IDENTITY` (the animal and something else).
+        kind: `ENDS` (head and tail) or `IDENTITY` (the animal and another object).
         individual: the animal's name within the session.
-        why: what is to be said of it.
+        why: the reason, as a sentence.
     """
 
     start_s: float
@@ -51,7 +51,7 @@ class Crossing:
 
 
 def crossings(session: Session, all_seen: Sequence[Seen]) -> list[dict[str, Any]]:
-    """Every crossing of a session in order of time, as JSON takes it (the fields of `Crossing`).
+    """The crossings of a session in order of time, as dicts of the fields of `Crossing`.
 
     Args:
         session: the opened session.
@@ -74,7 +74,9 @@ def crossings(session: Session, all_seen: Sequence[Seen]) -> list[dict[str, Any]
 
 
 def _exchanged_ends(seen: Seen) -> Iterator[Crossing]:
-    """Stretches whose head and tail were exchanged or may be; near ones of a kind are one."""
+    """Stretches with a certain or possible exchange of head and tail; near ones of a kind are
+    merged.
+    """
     table = seen.table("flips")
     rows = [] if table is None else records(table.sort_values("start_s"))
     for said in dict.fromkeys(_said_of(row) for row in rows):
@@ -91,7 +93,7 @@ def _exchanged_ends(seen: Seen) -> Iterator[Crossing]:
 
 
 def _said_of(flip: dict[str, Any]) -> str:
-    """What happened to head and tail in a row of the table `flips`."""
+    """The status of a row of the table `flips`, in words."""
     if flip["source"] == _HUMAN:
         undone = isinstance(flip.get("undone_at"), str) and flip["undone_at"]
         return "were exchanged by a person, who took it back" if undone else "exchanged by a person"
@@ -99,7 +101,7 @@ def _said_of(flip: dict[str, Any]) -> str:
 
 
 def _jumps(session: Session, seen: Seen) -> Iterator[Crossing]:
-    """Where the body's centre goes farther between two frames than the plan holds possible."""
+    """Frames between which the body's centre moves faster than the plan allows."""
     rules = (session.metadata.get("plan") or {}).get("behaviour") or {}
     fastest_mm_s = float(rules.get("impossible_above_mm_s") or IMPOSSIBLE_MM_S)
     rows = np.flatnonzero(np.isfinite(seen.xy_mm).all(axis=1))
@@ -112,7 +114,7 @@ def _jumps(session: Session, seen: Seen) -> Iterator[Crossing]:
 
 
 def _near_others(session: Session, seen: Seen) -> Iterator[Crossing]:
-    """Of several animals in view, where another one is within a body's length of the followed."""
+    """Where another animal comes within a body's length of the tracked one."""
     things = read_things(session)
     if things is None:
         return
@@ -124,7 +126,7 @@ def _near_others(session: Session, seen: Seen) -> Iterator[Crossing]:
 
 
 def _found_again(seen: Seen) -> Iterator[Crossing]:
-    """Of several animals in view, where the followed one was lost and one is found again."""
+    """Where the tracked animal was lost and an animal was found again."""
     last_s = float(seen.frames["time_s"].max())
     for start_s, stop_s in seen.lost_s:
         if start_s > 0.0 and stop_s < last_s:
@@ -147,7 +149,7 @@ def _meetings(session: Session, first: Seen, second: Seen) -> Iterator[Crossing]
 
 
 def _runs(time_s: Array, where: NDArray[np.bool_]) -> list[NDArray[np.intp]]:
-    """The rows where a mask is True, those less than `_ONE_S` apart together."""
+    """The rows where a mask is True; rows less than `_ONE_S` apart form one run."""
     rows = np.flatnonzero(where)
     if not len(rows):
         return []

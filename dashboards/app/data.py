@@ -1,7 +1,7 @@
-"""Model of the dashboard: what is shown of a study, read lazily from session folders and cached.
+"""Model of the dashboard: a study's data, read lazily from session folders and cached.
 
-What was read is kept until a session's files change (their time, size and inode). Comparisons of
-groups are those of `liex_lab.behaviour.cohort`.
+The cache is kept until a session's files change (their time, size and inode). Group comparisons
+come from `liex_lab.behaviour.cohort`.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ from ..report.quality import warnings
 if TYPE_CHECKING:
     import pandas as pd
 
-DONE = ("done", "changed")  # states in which there is a session to look at
+DONE = ("done", "changed")  # states of sessions with results
 NO_POSE = "no pose or no frame"
 OTHER = "other actions"
 GREY = "#a3a39b"
 NO_POSE_COLOUR = "#3a3f45"
-_READERS = 4  # threads; most of the time goes into opening files
+_READERS = 4  # threads; most of the time is spent opening files
 _HELD = 6  # sessions whose tables stay in memory
 
 
@@ -47,8 +47,7 @@ class Ethogram:
         words: the n actions.
         lost_s: (m, 2) start and stop of the spans without a pose, s.
         duration_s: length of the session, s.
-        vocabulary: all words that its ethogram could have, in the order in which report and replay
-            colour them.
+        vocabulary: all possible actions, in the order of their colours in report and replay.
     """
 
     spans_s: np.ndarray
@@ -59,16 +58,16 @@ class Ethogram:
 
 
 Made = TypeVar("Made")
-# after which what a correction replaced meanwhile is read again
+# pauses before reading again, while a correction replaces the tables
 _PAUSES_S = (0.05, 0.2, 0.5)
 
 
 class StudyData:
-    """A study, read lazily; every public method may be called from several threads at once.
+    """A study, read lazily; all public methods are thread-safe.
 
     Attributes:
         name: name of the study.
-        entries: the key of each session and where it stands, as the study lists them.
+        entries: key -> state of each session, in the study's order.
     """
 
     def __init__(self, name: str, look: Callable[[], Sequence[Entry]]) -> None:
@@ -83,18 +82,14 @@ class StudyData:
         self.refresh()
 
     def refresh(self) -> None:
-        """Look again which sessions there are and where each stands."""
+        """Update the list of sessions and their states."""
         found = self._look()
         with self._lock:
             self.entries = {entry.key: entry for entry in found}
             self._stats.clear()
 
     def warm(self, progress: Progress = silent) -> None:
-        """Read what the first page shows; a thread reads what the others show meanwhile.
-
-        Args:
-            progress: hears how many sessions were read.
-        """
+        """Read the data of the first page; a thread then reads those of the other pages."""
         entries = self.done
         for k, entry in enumerate(entries):
             progress(k, len(entries), "reading sessions")
@@ -102,13 +97,13 @@ class StudyData:
         threading.Thread(target=self._read_ahead, daemon=True).start()
 
     def _read_ahead(self) -> None:
-        """Read what the pages of ethograms and groups show."""
+        """Read the data of the ethogram and group pages."""
         self.ethograms([entry.key for entry in self.done])
         self.collected()
 
     @property
     def done(self) -> list[Entry]:
-        """The sessions that were measured."""
+        """The sessions with results."""
         return [
             entry
             for entry in self.entries.values()
@@ -118,11 +113,8 @@ class StudyData:
     def session(self, key: str) -> Session:
         """An opened session; the same object until its folder changes.
 
-        Args:
-            key: its name in the study.
-
         Raises:
-            SessionError: the study has no measured session of this name.
+            SessionError: the study has no measured session `key`.
         """
         entry = self.entries.get(key)
         if entry is None or entry.folder is None or entry.state not in DONE:
@@ -134,13 +126,13 @@ class StudyData:
             known = self._open.pop(key, None)
             if known is None or known[0] != stamp:
                 known = (stamp, Session.open(entry.folder))
-            self._open[key] = known  # at the end: the first ones go first
+            self._open[key] = known  # at the end: the first ones are removed first
             while len(self._open) > _HELD:
                 self._open.pop(next(iter(self._open)))
             return known[1]
 
     def read(self, key: str, make: Callable[[Session], Made]) -> Made:
-        """What is made of a session, which a correction may replace while its tables are read.
+        """The result of `make`, repeated while a correction replaces the session's tables.
 
         Args:
             key: its name in the study.
@@ -158,7 +150,7 @@ class StudyData:
         return make(self.session(key))
 
     def overview(self) -> pd.DataFrame:
-        """One row per session: who, state, and how good it is (the columns `QUALITY`)."""
+        """One row per session: subject, state, and quality (the columns `QUALITY`)."""
         import pandas as pd
 
         measured = dict(
@@ -178,11 +170,7 @@ class StudyData:
         return pd.DataFrame(rows, columns=["session", *WHO, "state", "reason", "remedy", *QUALITY])
 
     def ethograms(self, keys: Iterable[str]) -> dict[str, Ethogram]:
-        """The ethograms of some sessions by key, those that cannot be read left out.
-
-        Args:
-            keys: names of measured sessions.
-        """
+        """The ethograms of measured sessions by key; unreadable ones are left out."""
         done = {entry.key: entry for entry in self.done}
         entries = [done[key] for key in keys if key in done]
         found = self._of_all("ethogram", _ethogram, entries)
@@ -193,19 +181,15 @@ class StudyData:
         }
 
     def damage(self, key: str) -> str:
-        """What is wrong with the ethogram of a session, as a sentence; empty where it can be read.
-
-        Args:
-            key: its name in the study.
-        """
+        """The damage of a session's ethogram as a sentence; empty if it is readable."""
         entry = self.entries[key]
         found = self._of_one("ethogram", _ethogram, entry)
         return "" if isinstance(found, Ethogram) else str(found["damage"])
 
     def collected(self) -> pd.DataFrame:
-        """One row per measured session, as `cohort.compare` takes it, with its `key`.
+        """One row per measured session, as needed by `cohort.compare`, with its `key`.
 
-        Animals and groups that the study states overrule those of the session.
+        The animals and groups of the study override those of the session.
         """
         import pandas as pd
 
@@ -232,7 +216,7 @@ class StudyData:
         return whole
 
     def to_check(self) -> list[str]:
-        """Sentences on what may be wrong with the names of animals and groups."""
+        """Sentences on possible mistakes in the names of animals and groups."""
         return list(self.collected().attrs.get("check", ()))
 
     def stats(self, measure: str, reference: str | None = None) -> pd.DataFrame:
@@ -240,7 +224,7 @@ class StudyData:
 
         Args:
             measure: a column of the summaries.
-            reference: compare each group with this one only; None takes every pair.
+            reference: compare each group with this one only; None compares all pairs.
         """
         table = self.collected()
         measures = cohort.usual_measures(table)
@@ -252,13 +236,10 @@ class StudyData:
             return self._stats[asked]
 
     def described(self, measure: str) -> tuple[str, str]:
-        """Unit and meaning of a measure, from the columns of the first session that has it.
-
-        Args:
-            measure: a column of the summaries.
+        """Unit and meaning of a column of the summaries, from the first session that has it.
 
         Returns:
-            Two empty texts where no session has it.
+            Two empty texts if no session has it.
         """
         for entry in self.done:
             columns = self._of_one("columns", lambda session: session.columns, entry)
@@ -269,7 +250,7 @@ class StudyData:
         return "", ""
 
     def units(self) -> dict[str, str]:
-        """The unit of every measure, from the columns of one session; its others lack one."""
+        """The unit of every measure, from the columns of one session; "" for dimensionless ones."""
         for entry in self.done:
             columns = self._of_one("columns", lambda session: session.columns, entry)
             if not isinstance(columns, dict):
@@ -283,7 +264,7 @@ class StudyData:
     def _of_all(
         self, what: str, read: Callable[[Session], Any], entries: Sequence[Entry] | None = None
     ) -> list[Any]:
-        """`read` of every measured session, from memory where its folder has not changed since."""
+        """`read` of every measured session; cached until its folder changes."""
         chosen = self.done if entries is None else entries
         with ThreadPoolExecutor(_READERS) as pool:
             return list(pool.map(lambda entry: self._of_one(what, read, entry), chosen))
@@ -298,7 +279,7 @@ class StudyData:
             value = read(Session.open(entry.folder))
         except LiexError as error:
             value = {"damage": str(error)}
-        except Exception as error:  # one bad session does not take the study's pages down
+        except Exception as error:  # one bad session must not break the study's pages
             value = {
                 "damage": f"{entry.folder} cannot be shown ({type(error).__name__}: "
                 f"{one_line(error)}); look at it with `liex verify`"
@@ -323,11 +304,7 @@ QUALITY = (
 
 
 def shown_words(ethograms: Iterable[Ethogram]) -> list[str]:
-    """The actions of some ethograms, those with the most time first.
-
-    Args:
-        ethograms: the ethograms.
-    """
+    """The actions of some ethograms, by decreasing total time."""
     seconds: dict[str, float] = {}
     for one in ethograms:
         for word, (start, stop) in zip(one.words, one.spans_s, strict=True):
@@ -336,13 +313,13 @@ def shown_words(ethograms: Iterable[Ethogram]) -> list[str]:
 
 
 def colours_of(words: Sequence[str], vocabulary: Sequence[str] = ()) -> dict[str, str]:
-    """A colour for each word: where it is free its own of report and replay.
+    """A colour for each word: its own colour of report and replay if it is free.
 
     Words beyond the last colour share a grey.
 
     Args:
-        words: the words, those that matter most first.
-        vocabulary: all words, which report and replay colour.
+        words: the words, the most important first.
+        vocabulary: all words, in the order of their colours in report and replay.
     """
     own = action_colours(vocabulary)
     chosen: dict[str, str] = {}
@@ -354,28 +331,24 @@ def colours_of(words: Sequence[str], vocabulary: Sequence[str] = ()) -> dict[str
 
 
 def vocabulary_of(ethograms: Iterable[Ethogram]) -> list[str]:
-    """The words of several vocabularies, in the order of the first that has them.
-
-    Args:
-        ethograms: the ethograms.
-    """
+    """The words of several vocabularies, in order of first occurrence."""
     return list(dict.fromkeys(word for one in ethograms for word in one.vocabulary))
 
 
 def raster(
     one: Ethogram, words: Sequence[str], start_s: float, stop_s: float, n: int
 ) -> np.ndarray:
-    """(n,) for each of n equal parts of a span: index of the word with the most time in it.
+    """(n,) the word with the most time in each of n equal bins of a span.
 
     Args:
         one: the ethogram.
-        words: the words to look for.
+        words: the words to count.
         start_s: beginning of the span, s.
         stop_s: its end, s.
-        n: number of parts.
+        n: number of bins.
 
     Returns:
-        Index into `words`, -1 where none of them occurs, -2 where there is mostly no pose.
+        Index into `words`; -1 if none of them occurs, -2 if most of the bin has no pose.
     """
     place = {word: k for k, word in enumerate(words)}
     seconds = np.zeros((len(words) + 1, n))
@@ -399,7 +372,7 @@ def raster(
 
 
 def _stamp(folder: Path) -> Any:
-    """Times, sizes and inodes; they change whenever the session is written again or corrected."""
+    """Times, sizes and inodes; they change when the session is rewritten or corrected."""
     stamps: list[tuple[int, int, int] | None] = []
     for path in (folder / "session.json", corrected_folder(folder) / LOG):
         try:

@@ -1,7 +1,7 @@
-"""What the page to correct in is told of a session: times, joints, bouts, doubts and pictures.
+"""Data of the correction page: times, joints, bouts, doubtful stretches and depth images.
 
-A session of an hour has a hundred thousand frames, so the page asks for the joints of some hundred
-rows at a time, and for one picture at a time.
+A session of an hour has a hundred thousand frames, so the page requests the joints of a few hundred
+rows at a time, and one image at a time.
 """
 
 from __future__ import annotations
@@ -35,9 +35,9 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 Suggest = Callable[[Path], "pd.DataFrame"]
 
-MOST_ROWS = 2000  # that are told of at once
-_LEAST_DOUBT_S = 0.5  # doubtful frames less far apart are one place
-_HELD = 6  # sessions whose desks stay in memory
+MOST_ROWS = 2000  # per request
+_LEAST_DOUBT_S = 0.5  # doubtful frames closer in time form one stretch
+_HELD = 6  # desks that stay in memory
 _FIRST = (
     "liex_lab.recordings.formats.messages.mcap_index",
     "cv2",
@@ -47,12 +47,12 @@ _FIRST = (
 
 
 class Desk:
-    """One session as it is now, as the page takes it.
+    """The current state of one session, as JSON for the page.
 
     Args:
         key: the session's name in the study.
         session: the opened session.
-        frames: the depth pictures.
+        frames: the depth images.
     """
 
     def __init__(self, key: str, session: Session, frames: Frames) -> None:
@@ -68,7 +68,7 @@ class Desk:
 
     @cached_property
     def _numbers(self) -> dict[str, Any]:
-        """Columns of `frames` that are told for every frame."""
+        """Columns of `frames` that are sent for every frame."""
         names = ["flag", "predicted_error_mm", "p_flip", "frame_index"]
         if len(self.seen) > 1:
             names.append("individual")
@@ -79,7 +79,7 @@ class Desk:
 
     @cached_property
     def uv(self) -> list[Array]:
-        """Of each animal the joints (n, J, 2), px; NaN without a pose."""
+        """The joints of each animal (n, J, 2), px; NaN without a pose."""
         return joints_in_picture(self.seen, len(self.time_s))
 
     @cached_property
@@ -92,26 +92,24 @@ class Desk:
 
     @cached_property
     def notes(self) -> list[str]:
-        """Sentences on exchanges of head and tail that contradict the frames around them."""
+        """Sentences on exchanges of head and tail that contradict the neighbouring frames."""
         return disagreements(self.session)
 
     def row_at(self, at_s: float) -> int:
-        """Row of the frame whose time is nearest.
-
-        Args:
-            at_s: the moment, s since the first frame.
-        """
+        """Row of the frame nearest in time to `at_s` (s since the first frame)."""
         return int(np.abs(self.time_s - at_s).argmin())
 
     def open_ahead(self) -> None:
-        """Make what the first picture needs, before it is asked for."""
+        """Prepare the data of the first image before it is requested."""
         self._frames.depth(self.key, self.session, 0)
         self.about()
         self.rows(0, 1)
-        len(self.session.frames)  # the page around tells of them
+        len(self.session.frames)  # shown on the page
 
     def about(self) -> dict[str, Any]:
-        """What is told once: size, animals, words with their colours, and who corrects."""
+        """Facts that the page needs once: size, animals, actions with their colours, and the
+        author.
+        """
         camera = self.session.camera
         animal = self.session.metadata["animal"]
         words = list(self.session.metadata.get("actions") or {})
@@ -138,11 +136,11 @@ class Desk:
         }
 
     def rows(self, first: int, stop: int) -> dict[str, Any]:
-        """What is drawn over some frames: joints, the view's middle, flags and errors.
+        """The overlay of some frames: joints, the view's centre, flags and errors.
 
         Args:
             first: the first row.
-            stop: the row after the last one; no more than `MOST_ROWS` are told.
+            stop: the row after the last one; at most `MOST_ROWS` rows are returned.
         """
         first = int(np.clip(first, 0, len(self.time_s)))
         rows = slice(first, int(np.clip(stop, first, min(len(self.time_s), first + MOST_ROWS))))
@@ -176,7 +174,7 @@ class Desk:
         ]
 
     def doubts(self) -> list[dict[str, Any]]:
-        """Where the poses are in doubt, in order of time: start_s, stop_s, kind and why."""
+        """Doubtful stretches of poses in order of time: start_s, stop_s, kind and why."""
         found: list[dict[str, Any]] = [
             {"start_s": a, "stop_s": b, "kind": "pose", "why": f"pose in doubt: {_error(error)}"}
             for a, b, error in self._doubtful_runs()
@@ -194,7 +192,7 @@ class Desk:
         return sorted(found, key=lambda one: one["start_s"])
 
     def crossings(self) -> list[dict[str, Any]]:
-        """Where ends or animals may have been taken for one another, see `crossings.Crossing`."""
+        """Where ends or animals may have been exchanged, see `crossings.Crossing`."""
         return crossings(self.session, self.seen)
 
     def _doubtful_runs(self) -> list[tuple[float, float, float]]:
@@ -210,7 +208,7 @@ class Desk:
         ]
 
     def log(self) -> list[dict[str, Any]]:
-        """The corrections that stand: number, said, author and when."""
+        """The corrections in effect: number, message (said), author and date."""
         return [
             {
                 "number": entry.number,
@@ -222,7 +220,7 @@ class Desk:
         ]
 
     def redo(self) -> str:
-        """What was taken back last and can be made again; "" if nothing."""
+        """The correction that was last undone and can be repeated; "" if none."""
         redoable = read_log(self.session.path).redoable
         return "" if redoable is None else str(redoable[1])
 
@@ -231,10 +229,10 @@ class Desk:
 
         Args:
             row: the frame's row.
-            box: left, top, width and height of the part, px; it is cut to the picture.
+            box: left, top, width and height of the part, px; clipped to the image.
 
         Raises:
-            SessionError: there is no such frame, or nothing of the box is in the picture.
+            SessionError: there is no such frame, or the box lies outside the image.
         """
         import cv2
 
@@ -258,11 +256,11 @@ class Desk:
 
 
 class Desks:
-    """The desks of a study's sessions, the same ones until a session changes.
+    """The desks of a study's sessions; a desk is replaced when its session changes.
 
     Args:
-        find: opens a session by its key; the same object until its folder changes.
-        frames: the depth pictures.
+        find: opens a session by its key; returns the same object until its folder changes.
+        frames: the depth images.
         suggest: finds the stretches of the session in a folder whose actions are least certain;
             None finds none.
     """
@@ -280,10 +278,7 @@ class Desks:
         threading.Thread(target=_import, daemon=True).start()
 
     def of(self, key: str) -> Desk:
-        """The desk of a session.
-
-        Args:
-            key: the session's name in the study.
+        """The desk of the session `key`.
 
         Raises:
             SessionError: there is no such session.
@@ -298,28 +293,25 @@ class Desks:
             return known
 
     def open_ahead(self, key: str) -> None:
-        """Make what a session's first picture needs in a thread; one at a time, others are left.
+        """Prepare a session's first image in a thread; at most one at a time, further calls do
+        nothing.
 
-        Args:
-            key: the session's name in the study; one that there is not is left, too.
+        An unknown `key` is ignored.
         """
 
         def make() -> None:
             try:
                 self.of(key).open_ahead()
-            except LiexError:  # the page says why
+            except LiexError:  # the page shows the reason
                 pass
             finally:
                 self._ahead.release()
 
         if self._ahead.acquire(blocking=False):
-            threading.Thread(target=make).start()  # short, and waited for at the end
+            threading.Thread(target=make).start()  # short; the interpreter waits for it at exit
 
     def suggested(self, key: str) -> list[dict[str, Any]]:
         """The stretches whose actions are least certain, as `Desk.doubts`; none without a model.
-
-        Args:
-            key: the session's name in the study.
 
         Raises:
             SessionError: there is no such session.
@@ -353,7 +345,7 @@ def _doubt(span: dict[str, Any], kind: str, why: str) -> dict[str, Any]:
 
 
 def _import() -> None:
-    """What the first picture needs, imported while nobody waits for it."""
+    """Import the modules that the first image needs, ahead of its request."""
     for name in _FIRST:
         importlib.import_module(name)
 
@@ -367,7 +359,7 @@ def _error(error_mm: float) -> str:
 
 
 def _plain(values: Any) -> Any:
-    """An array as JSON takes it: two digits after the point, and None where it is not a number."""
+    """An array for JSON: two decimals, and None for values that are not finite."""
     array = np.asarray(values, float)
     rounded = np.round(array, 2).astype(object)
     rounded[~np.isfinite(array)] = None

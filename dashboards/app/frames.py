@@ -1,4 +1,4 @@
-"""Depth picture of any frame of a session, as it is kept there."""
+"""Depth images of a session's frames, from its own files."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ _HELD = 3  # session.mcap files that stay open
 
 
 class Frames:
-    """Depth pictures by session and row; the files that they come from stay open for a while.
+    """Depth images by session and row; their source files stay open for a while.
 
-    It may be used from several threads at once.
+    Thread-safe.
     """
 
     def __init__(self) -> None:
@@ -32,10 +32,10 @@ class Frames:
         self._open: dict[str, tuple[Any, ExitStack, Recording]] = {}
 
     def depth(self, key: str, session: Session, row: int) -> NDArray[np.uint16] | None:
-        """(H, W) uint16 mm, 0 where unread; None where the session keeps no depth of this frame.
+        """(H, W) uint16 mm, 0 where unread; None if the session has no depth of this frame.
 
-        Outside of the cut-outs that a session keeps it is the still scene. Without a replay file
-        that can be read, a thumbnail of this very frame does.
+        Outside the cut-outs that a session keeps, it is the still background. Without a readable
+        replay file, a thumbnail of the same frame is used.
 
         Args:
             key: the session's name in the study.
@@ -61,14 +61,14 @@ class Frames:
                 return _kept(session, row)
 
     def close(self) -> None:
-        """Close the files that are open."""
+        """Close all files."""
         with self._lock:
             while self._open:
                 self._open.popitem()[1][1].close()
 
 
 def _kept(session: Session, row: int) -> NDArray[np.uint16] | None:
-    """The thumbnail of this very frame, put back where it was cut out; None where there is none."""
+    """The thumbnail of this frame at its position in the whole image; None if absent."""
     import cv2
 
     index = int(session.frames["frame_index"].iloc[row])

@@ -1,7 +1,7 @@
 """Access control of the dashboard: host and origin check, token cookie, content security policy.
 
-It answers who knows the token, and its pages load nothing from elsewhere. A fault of ours is a line
-on the terminal and a sentence for the visitor.
+Only requests with the token are answered, and pages load nothing from other sites. An internal
+error gives one line on the terminal and a message for the visitor.
 """
 
 from __future__ import annotations
@@ -24,36 +24,35 @@ if TYPE_CHECKING:
     import pandas as pd
 
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
-MOST_BYTES = 4 << 20  # of what a visitor sends: corrections are some hundred bytes each
+MOST_BYTES = 4 << 20  # of a request's body; a correction has a few hundred bytes
 _COOKIE = "liex_dashboard"
 _POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' data: "
     "blob:; connect-src 'self'; font-src 'self' data:; base-uri 'none'; form-action 'self'; "
     "frame-ancestors 'none'"
 )
-# a report needs no script, so it has none
+# a report needs no script
 _REPORT = "default-src 'none'; style-src 'unsafe-inline'; img-src data:"
 
 
 def guard(server: Flask, token: str, *, alone: bool = True) -> None:
-    """Refuse requests of others, and set the security headers of every answer.
+    """Refuse unauthorised requests, and set the security headers of every response.
 
-    Those are refused that do not know the token: other accounts of this machine reach its loopback
-    as its owner does. On this machine alone so are those to any other name, which would be another
-    site's whose address was bent to us (DNS rebinding); an origin that is not ours is another
-    site's page that sends forms here (CSRF).
+    A request without the token is refused, because other accounts of this machine can reach its
+    loopback address. With `alone`, a request to another host name is refused as well (DNS
+    rebinding). A request from another origin is a form of another site (CSRF).
 
     Args:
         server: the Flask server of the dashboard.
-        token: what every visitor has to know; empty asks for none.
-        alone: only this machine is answered.
+        token: required of every visitor; empty requires none.
+        alone: only accept requests from this machine.
     """
     server.config["MAX_CONTENT_LENGTH"] = MOST_BYTES
     _answer_faults(server)
 
     @server.before_request
     def allowed() -> Any:
-        """Let a request through, or answer it with 401, 403 or the cookie that holds the token."""
+        """Accept a request, or answer with 401, 403 or the cookie that carries the token."""
         name = _site(f"//{request.host}", name=True)
         if alone and name not in LOOPBACK:
             abort(Response("This dashboard answers on 127.0.0.1 only.", 403, mimetype="text/plain"))
@@ -70,7 +69,7 @@ def guard(server: Flask, token: str, *, alone: bool = True) -> None:
         if told and hmac.compare_digest(told.encode(), token.encode()):
             rest = {name: value for name, value in request.args.items() if name != "token"}
             answer = redirect(request.path + ("?" + urlencode(rest) if rest else ""))
-            # lax: whoever comes by the page that --open writes has the cookie at once
+            # lax: the page that --open writes must send the cookie at once
             answer.set_cookie(_cookie(), token, httponly=True, samesite="Lax")
             return answer
         if not hmac.compare_digest(request.cookies.get(_cookie(), "").encode(), token.encode()):
@@ -80,7 +79,7 @@ def guard(server: Flask, token: str, *, alone: bool = True) -> None:
 
     @server.after_request
     def policies(response: Response) -> Response:
-        """Set the security headers of a `response`; a content policy of its own stays."""
+        """Set the security headers of a `response`; its own content policy is kept."""
         response.headers.setdefault("Content-Security-Policy", _POLICY)
         response.headers["X-Content-Type-Options"] = "nosniff"
         response.headers["Referrer-Policy"] = "no-referrer"
@@ -88,27 +87,25 @@ def guard(server: Flask, token: str, *, alone: bool = True) -> None:
 
 
 def _cookie() -> str:
-    """The cookie's name with the port: cookies are a host's, and each dashboard has its token."""
+    """The cookie's name with the port: cookies belong to a host, and each dashboard has its own
+    token.
+    """
     _, _, port = request.host.rpartition(":")
     return f"{_COOKIE}_{port}" if port.isdigit() else _COOKIE
 
 
 def _answer_faults(server: Flask) -> None:
-    """Answer with a sentence where a request fails, and tell the terminal in one line.
-
-    Args:
-        server: the Flask server of the dashboard.
-    """
+    """Answer failed requests with a message, and print one line on the terminal."""
 
     @server.errorhandler(413)
     def too_large(_: HTTPException) -> Response:
-        """More was sent than any page of ours sends."""
+        """The request is larger than any request of the dashboard's pages."""
         said = f"The dashboard takes at most {MOST_BYTES >> 20} MB at a time."
         return Response(said, 413, mimetype="text/plain")
 
     @server.errorhandler(Exception)
     def fault(error: Exception) -> Any:
-        """A request that no page of ours makes, or a fault of ours."""
+        """A request that no page makes, or an internal error."""
         if isinstance(error, HTTPException):
             return error
         told = printable(f"{type(error).__name__}: {error}")[:300]
@@ -119,7 +116,7 @@ def _answer_faults(server: Flask) -> None:
 
 
 def _site(address: str, name: bool = False) -> str | None:
-    """Host and port of an address, or the host's name alone; None where it is none."""
+    """Host and port of an address, or only the host name; None if the address is invalid."""
     try:
         found = urlsplit(address)
         return found.hostname if name else found.netloc
@@ -128,12 +125,7 @@ def _site(address: str, name: bool = False) -> str | None:
 
 
 def add_downloads(server: Flask, data: StudyData) -> None:
-    """Add the addresses of tables as CSV, and of sessions' reports.
-
-    Args:
-        server: the Flask server of the dashboard.
-        data: the study.
-    """
+    """Add the routes of tables as CSV, and of sessions' reports."""
 
     @server.get("/csv/<path:name>.csv")
     def table_csv(name: str) -> Response:
@@ -147,11 +139,11 @@ def add_downloads(server: Flask, data: StudyData) -> None:
 
     @server.get("/report/<path:key>")
     def report(key: str) -> Response:
-        """The report of the session `key`; a report needs no script, so it may have none."""
+        """The report of the session `key`; its content policy allows no script."""
         try:
             folder = data.session(key).path.resolve()
             file = (folder / "report.html").resolve()
-            if file.parent != folder:  # a link that leads elsewhere
+            if file.parent != folder:  # a link to another folder
                 raise FileNotFoundError(file)
             page = file.read_text(encoding="utf-8")
         except (LiexError, OSError, ValueError):

@@ -1,6 +1,6 @@
-"""The dashboard's tables: found by name, sorted, filtered, shown as HTML and handed out as CSV.
+"""The dashboard's tables: found by name, sorted, filtered, shown as HTML and exported as CSV.
 
-Cells of a CSV that a spreadsheet would take for a formula are made harmless.
+CSV cells that a spreadsheet would read as a formula are escaped.
 """
 
 from __future__ import annotations
@@ -22,20 +22,20 @@ from ..units import shown as as_read
 from .data import DONE, StudyData
 
 MOST_ROWS = 400  # on a page; the file has them all
-_BATCH = 20_000  # rows of a long table that are in memory at once
+_BATCH = 20_000  # rows of a long table in memory at once
 
 
 @dataclass(frozen=True)
 class Table:
-    """A table as it is asked for.
+    """A requested table.
 
     Attributes:
         rows: the whole table.
         shown: the columns to show -> their headings.
-        link: the column whose cells link onwards: to a session, or with start_s to a moment; may be
+        link: the column whose cells are links: to a session, or with start_s to a moment; may be
             empty.
-        units: column, or measure that a row is about -> its unit in the table; cells are shown in
-            the unit that people read.
+        units: column, or measure of a row -> its unit in the table; cells are shown in the
+            displayed unit.
     """
 
     rows: pd.DataFrame
@@ -126,7 +126,7 @@ def find(data: StudyData, name: str) -> Table:
             bouts/KEY, gaps/KEY, flips/KEY of a session.
 
     Raises:
-        SessionError: there is no such table, or no such session.
+        SessionError: there is no such table or session.
     """
     what, _, rest = name.partition("/")
     if name == "sessions":
@@ -145,14 +145,12 @@ def find(data: StudyData, name: str) -> Table:
 
 
 def arranged(table: Table, words: str, column: str, down: bool) -> pd.DataFrame:
-    """The rows in which every one of the words occurs, in order of a column.
+    """The rows that contain all of the words, sorted by a column.
 
     Args:
         table: the table.
-        words: words, parted by spaces, each of which must occur in a shown cell; case does not
-            matter.
-        column: the column to sort by, rows without a value last; one that is not there sorts
-            nothing.
+        words: separated by spaces; each must occur in a shown cell, ignoring case.
+        column: the column to sort by, rows without a value last; an unknown column does not sort.
         down: whether the largest comes first.
     """
     rows = table.rows
@@ -167,25 +165,22 @@ def arranged(table: Table, words: str, column: str, down: bool) -> pd.DataFrame:
 
 
 def _searched(value: Any) -> str:
-    """What a cell is found by: its value, and of a state the word that is shown."""
+    """The searchable text of a cell: its value, and for a state the displayed word."""
     return f"{value} {STATES.get(str(value), '')}".lower()
 
 
 def csv_address(name: str) -> str:
-    """Address at which a table is had as CSV.
-
-    Args:
-        name: the table's name, see `find`.
-    """
+    """Address of a table's CSV file; `name` as in `find`."""
     return f"/csv/{quote(name, safe='')}.csv"
 
 
 def fill(table: Table, words: str = "", sorted_by: str = "", down: bool = False) -> dict[str, Any]:
-    """What the template `table.html` shows: heads, rows (at most `MOST_ROWS`), and how many.
+    """The variables of the template `table.html`: heads, rows (at most `MOST_ROWS`), and their
+    number.
 
     Args:
         table: the table.
-        words: what every shown row must contain, see `arranged`.
+        words: required in every shown row, see `arranged`.
         sorted_by: the column to sort by.
         down: whether the largest comes first.
     """
@@ -215,13 +210,8 @@ def fill(table: Table, words: str = "", sorted_by: str = "", down: bool = False)
 
 
 def as_csv(table: pd.DataFrame) -> Iterator[str]:
-    """Yield a table as CSV, piece by piece; no cell is taken for a formula by a spreadsheet.
-
-    Args:
-        table: the table.
-
-    Yields:
-        Text of some thousand rows, the first with the header.
+    """Yield a table as CSV text, some thousand rows at a time, the header first; formulas are
+    escaped.
     """
     for start in range(0, max(len(table), 1), _BATCH):
         part = table.iloc[start : start + _BATCH]
@@ -229,12 +219,7 @@ def as_csv(table: pd.DataFrame) -> Iterator[str]:
 
 
 def session_table(data: StudyData, key: str, name: str) -> pd.DataFrame:
-    """A whole table of a session, every column.
-
-    Args:
-        data: the study.
-        key: the session's name in the study.
-        name: the table's name, see `session_tables`.
+    """A whole table of a session, with all columns; `name` is one of `session_tables`.
 
     Raises:
         SessionError: there is no such session or table.
@@ -246,12 +231,7 @@ def session_table(data: StudyData, key: str, name: str) -> pd.DataFrame:
 
 
 def session_tables(data: StudyData, key: str) -> list[str]:
-    """Names of a session's tables.
-
-    Args:
-        data: the study.
-        key: the session's name in the study.
-    """
+    """Names of a session's tables."""
     session = data.session(key)
     names = sorted(path.stem for path in session.path.glob("*.parquet"))
     return [*(["summary"] if session.has("summary.csv") else []), *names]
@@ -262,19 +242,19 @@ def session_address(key: str, at_s: float | None = None) -> str:
 
     Args:
         key: the session's name in the study.
-        at_s: the moment to show, s since its first frame; None names none.
+        at_s: the moment to show, s since the first frame; None shows the page as it opens.
     """
     return f"/session/{quote(key, safe='')}" + ("" if at_s is None else f"?t={at_s:.3f}")
 
 
 def number(value: Any, places: int | None = None) -> str:
-    """A number as a person would write it.
+    """A value as text.
 
     Args:
-        value: a bool is yes or no, a whole number has its thousands parted, another three digits
-            (none after the point from 1000 on), and NaN is a dash; anything else is taken as text.
-        places: digits after the point of a number that is not whole by its type, as everywhere in
-            its column; None as above.
+        value: a bool is yes or no, an integer has its thousands separated, another number has three
+            significant digits (no decimals from 1000 on), and NaN is a dash; anything else is
+            converted to text.
+        places: decimals of a float, as in its whole column; None as above.
     """
     if isinstance(value, bool | np.bool_):
         return "yes" if value else "no"
@@ -285,7 +265,7 @@ def number(value: Any, places: int | None = None) -> str:
             return "–"
         shown = (
             0.0 if abs(float(value)) < 1e-12 else float(value)
-        )  # what is left of a sum that is none
+        )  # rounding error of a sum that is zero
         if places is not None:
             return f"{shown:,.{places}f}"
         return f"{shown:,.0f}" if abs(shown) >= 1000 or shown == int(shown) else f"{shown:.3g}"
@@ -293,18 +273,14 @@ def number(value: Any, places: int | None = None) -> str:
 
 
 def records(rows: pd.DataFrame) -> list[dict[str, Any]]:
-    """The rows of a table as dicts.
-
-    Args:
-        rows: the table.
-    """
+    """The rows of a table as dicts."""
     return [{str(name): value for name, value in row.items()} for row in rows.to_dict("records")]
 
 
 def _places(values: pd.Series[Any]) -> int | None:
-    """Digits after the point for a column: three digits of its middle value, at most four places.
+    """Decimals for a column: three significant digits of its median, at most four decimals.
 
-    None of a column of other things than numbers, or of p values and estimates of many measures.
+    None if the column is not numeric, or contains p values or estimates of many measures.
     """
     if values.dtype.kind != "f" or values.name in STATS:
         return None
@@ -316,9 +292,9 @@ def _places(values: pd.Series[Any]) -> int | None:
 def _cell(
     table: Table, row: dict[str, Any], column: str, places: int | None = None
 ) -> dict[str, Any]:
-    """A cell: its text and, where it is more than that, its kind and where it leads.
+    """A cell: its text and, if applicable, its kind and link target.
 
-    Numbers have the `places` after the point of their column.
+    Numbers have the decimals (`places`) of their column.
     """
     value = row.get(column, "")
     about = str(row.get("measure", ""))
@@ -350,11 +326,7 @@ def _cell(
 
 
 def columns_of(data: StudyData) -> Sequence[str]:
-    """The measures that groups can be compared by: numeric columns of the summaries with any value.
-
-    Args:
-        data: the study.
-    """
+    """Measures for group comparison: numeric columns of the summaries with at least one value."""
     left_out = {"n_frames", "n_frames_observed", "fps_median", "n_bouts"}
     known = data.collected().select_dtypes("number").dropna(axis="columns", how="all")
     return [

@@ -1,6 +1,6 @@
 """Behaviour of one animal: kinematics, bouts, zones and summary; statistics of groups of animals.
 
-Pandas in, pandas out.
+Input and output are pandas tables.
 """
 
 from liex_lab.behaviour.bouts import ACTIONS, MouseRules, find_bouts

@@ -10,22 +10,22 @@ from liex_lab.tables.schema import shown, titled
 
 STANDS = "stands"  # on a floor, over which it moves
 SWIMS = "swims"  # in all three directions; its tail beats
-BRANCHES = "branches"  # limbs at a base, as a hand's fingers at the palm, and no front
+BRANCHES = "branches"  # limbs at a base, such as a hand's fingers at the palm; no front
 KINDS = (STANDS, SWIMS, BRANCHES)
-_OWN_COLUMN = {"bend_front_rad": SWIMS, "opening": BRANCHES}  # of the table `kinematics`
+_OWN_COLUMN = {"bend_front_rad": SWIMS, "opening": BRANCHES}  # columns of `kinematics`
 
 
 @dataclass(frozen=True)
 class BodyAxis:
-    """An animal's joints by the parts they play, as indices into its skeleton.
+    """The roles of an animal's joints, as indices into its skeleton.
 
     Attributes:
         joints: names of the J joints.
-        kind: one of `KINDS`: what can be measured of it.
-        spine: the chain from front to rear; of a body that branches, its middle limb from the end.
+        kind: one of `KINDS`, which determines the measures.
+        spine: the chain from front to rear; for a branching body, its middle limb from the end.
         axis: (from, to), the line whose direction is the heading.
         trunk: the joints whose mean is the body's centre.
-        limbs: of a body that branches, the chains that can bend, each from the base to its end.
+        limbs: for a branching body, the chains that can bend, each from the base to its end.
     """
 
     joints: tuple[str, ...]
@@ -52,20 +52,20 @@ class BodyAxis:
 
     @staticmethod
     def of(joints: Sequence[str], parents: Sequence[int] | None = None) -> BodyAxis:
-        """The parts by name or along the chain, which begins at the head or at the rump.
+        """The roles by name or along the chain, which begins at the head or at the rump.
 
-        A chain that begins at a head is that of an animal that swims; any other begins at the rump.
-        A tree of several limbs without a nose, as a hand is, has neither front nor rear: its
-        centre is that of the base joint and those next to it, and its heading that of its middle
-        limb's root from the base.
+        A chain that begins at a head is a swimming animal; any other chain begins at the rump. A
+        tree of several limbs without a nose, such as a hand, has neither front nor rear: its centre
+        is the mean of the base joint and its neighbours, and its heading points from the base to
+        the root of its middle limb.
 
         A swimming body's heading is that of the front quarter of its chain, which is stiff, and its
-        centre that of the front half, which the tail's beat hardly moves; a walking body's are rump
-        to neck, and all but the nose.
+        centre that of the front half, which the tail's beat hardly moves. A walking body's heading
+        is rump to neck, and its centre includes all joints except the nose.
 
         Args:
             joints: names of the joints in the skeleton's order.
-            parents: joint before each of them, -1 at the base; None takes them for one chain.
+            parents: joint before each of them, -1 at the base; None means one chain.
         """
         names = tuple(joints)
         n = len(joints)
@@ -93,7 +93,7 @@ class BodyAxis:
 
 
 def kind_of(names: Iterable[Hashable]) -> str:
-    """The kind of body, one of `KINDS`, whose table `kinematics` has these columns."""
+    """The kind of body, one of `KINDS`, whose table `kinematics` has the columns `names`."""
     return next((_OWN_COLUMN[str(name)] for name in names if name in _OWN_COLUMN), STANDS)
 
 
@@ -101,14 +101,14 @@ def parents_of(animal: Mapping[str, Any]) -> tuple[int, ...]:
     """Joint before each joint, -1 at the base.
 
     Args:
-        animal: the section of that name of a session.json.
+        animal: the section `animal` of a session.json.
     """
     before = {int(child): int(parent) for parent, child in animal["bones"]}
     return tuple(before.get(joint, -1) for joint in range(len(animal["joints"])))
 
 
 def _limbs(parents: Sequence[int]) -> tuple[tuple[int, ...], ...]:
-    """The chains from the base to an end, of three joints or more: shorter ones cannot bend."""
+    """The chains from the base to an end with three or more joints; shorter ones cannot bend."""
     found = []
     for end in sorted(set(range(len(parents))) - set(parents)):
         chain = [end]
@@ -119,7 +119,7 @@ def _limbs(parents: Sequence[int]) -> tuple[tuple[int, ...], ...]:
     return tuple(found)
 
 
-# Which measures are drawn over time, by what the body is: one list for report, replay and pages.
+# The measures drawn over time, by kind of body: one list for report, replay and pages.
 
 
 _BLUE = "#4477aa"
@@ -134,9 +134,9 @@ class Curve:
 
     Attributes:
         column: of the table `kinematics`.
-        title: what it is called.
+        title: its name.
         what: the rest of its title.
-        unit: that of the column.
+        unit: of the column.
         colour: as #rrggbb.
         from_zero: whether its axis begins at zero.
     """
@@ -150,31 +150,31 @@ class Curve:
 
     @property
     def entity(self) -> str:
-        """Where a replay keeps it: named by the unit that people read, in which it is kept."""
+        """Its entity in a replay, named by the displayed unit, in which the replay stores it."""
         unit = shown(1.0, self.unit)[1].replace("/", "_").replace("°", "deg")
         name = titled(self.column, self.unit).replace(" ", "_")
         return f"kinematics/{name}_{unit}" if unit else f"kinematics/{name}"
 
     @property
     def entity_before(self) -> str:
-        """Where replays of earlier versions keep it, in the unit of the table."""
+        """Its entity in replays of earlier versions, in the unit of the table."""
         return f"kinematics/{self.column}"
 
 
 def axis_of(animal: Mapping[str, Any]) -> BodyAxis:
-    """Which joint plays which part.
+    """The roles of an animal's joints.
 
     Args:
-        animal: the section of that name of a session.json.
+        animal: the section `animal` of a session.json.
     """
     return BodyAxis.of(animal["joints"], parents_of(animal))
 
 
 def curves_of(animal: Mapping[str, Any]) -> tuple[Curve, ...]:
-    """The measures that are drawn over time of such an animal, the most usual first.
+    """The measures drawn over time for an animal, the most common first.
 
     Args:
-        animal: the section of that name of a session.json.
+        animal: the section `animal` of a session.json.
     """
     body = axis_of(animal)
     speed = Curve("speed_mm_s", "Speed", "of the body centre", "mm/s", _BLUE)
@@ -197,10 +197,10 @@ def curves_of(animal: Mapping[str, Any]) -> tuple[Curve, ...]:
 
 
 def logged_of(animal: Mapping[str, Any]) -> tuple[Curve, ...]:
-    """The measures that a replay keeps over time: the drawn ones, and the bend of a chain.
+    """The measures over time in a replay: the drawn ones, and the bend of a chain.
 
     Args:
-        animal: the section of that name of a session.json.
+        animal: the section `animal` of a session.json.
     """
     drawn = curves_of(animal)
     bends = axis_of(animal).kind == STANDS
@@ -208,12 +208,12 @@ def logged_of(animal: Mapping[str, Any]) -> tuple[Curve, ...]:
 
 
 def _base(body: BodyAxis) -> str:
-    """What the limbs are at."""
+    """Name of the joint at which the limbs meet."""
     return body.joints[body.rear].replace("_", " ")
 
 
 def _limb_names(body: BodyAxis) -> str:
-    """The limbs by the first word of their ends' names."""
+    """The limbs by the first word of their end joints."""
     names = [body.joints[limb[-1]].split("_")[0] for limb in body.limbs]
     if len(set(names)) < len(names):
         return f"the {len(names)} limbs"
