@@ -1,8 +1,8 @@
 """Activity over a session in bins of one minute: distance, mean speed and time in each action.
 
 Time-binned activity as in open-field and locomotor assays; a recording of less than ten minutes is
-cut into ten bins. Every time is a sum over observed frames of the time to the next frame, so the
-actions and the time without a name add up to the observed time.
+divided into ten bins. Every time is a sum over observed frames of the time to the next frame, so
+the times of the actions and the unlabelled time add up to the observed time.
 """
 
 from __future__ import annotations
@@ -22,19 +22,18 @@ from liex_lab.tables.schema import table_columns, to_pandas
 Array = NDArray[np.float64]
 
 BIN_S = 60.0
-FEWEST = 10  # intervals; a shorter recording is cut into so many
+FEWEST = 10  # bins, of a shorter recording
 
 
 def activity(kinematics: pd.DataFrame, bouts: pd.DataFrame, words: Sequence[str]) -> pd.DataFrame:
-    """The table `activity` of one animal: one row per bin of time.
+    """The table `activity` of one animal: one row per time bin.
+
+    A frame counts in the bin in which it begins.
 
     Args:
         kinematics: the table `kinematics`.
         bouts: the table `bouts`, in order of time.
         words: the actions' names.
-
-    Returns:
-        The table; a frame counts in the bin in which it begins.
     """
     time_s = kinematics["time_s"].to_numpy(float)
     edges = intervals(float(stop_times(time_s)[-1]))
@@ -67,12 +66,9 @@ def activity(kinematics: pd.DataFrame, bouts: pd.DataFrame, words: Sequence[str]
 
 
 def intervals(duration_s: float) -> Array:
-    """Edges (k + 1,) of the bins, s: whole minutes, the last one perhaps shorter.
+    """Edges (k + 1,) of the bins of a recording, s: whole minutes, the last one possibly shorter.
 
-    Less than ten minutes are cut into tenths.
-
-    Args:
-        duration_s: length of the recording, s.
+    Less than ten minutes are divided into tenths.
     """
     if duration_s < FEWEST * BIN_S:
         return np.linspace(0.0, duration_s, FEWEST + 1)
@@ -80,12 +76,9 @@ def intervals(duration_s: float) -> Array:
 
 
 def observed_hold(kinematics: pd.DataFrame) -> Array:
-    """How long each frame counts, (n,) s: until the next frame; 0 without a measured pose.
+    """The duration of each frame, (n,) s: until the next frame; 0 without a measured pose.
 
     Before a gap of the camera and at the end it is one median step.
-
-    Args:
-        kinematics: the table `kinematics` of n frames.
     """
     time_s = kinematics["time_s"].to_numpy(float)
     observed = np.isfinite(kinematics["x_mm"].to_numpy(float))
@@ -101,7 +94,7 @@ def time_named(
 ) -> Array:
     """Observed time without a name and in each action, (n, 1 + len(words)) s, in n intervals.
 
-    A row adds up to the observed time of its interval, whatever gaps the bouts continue across.
+    A row adds up to the observed time of its interval, even if bouts continue across gaps.
 
     Args:
         kinematics: the table `kinematics`.
@@ -113,7 +106,7 @@ def time_named(
     time_s = kinematics["time_s"].to_numpy(float)
     index = {word: k for k, word in enumerate(words, 1)}
     code = np.zeros(len(time_s), np.int64)
-    # a frame at a bout's start belongs to it, one at its stop does not, however seconds are rounded
+    # a frame at a bout's start belongs to it, one at its stop does not, despite rounded seconds
     spans = np.searchsorted(time_s, bouts[["start_s", "stop_s"]].to_numpy(float) - 1e-6)
     for (start, stop), word in zip(spans, bouts["action"], strict=True):
         code[start:stop] = index.get(word, 0)
@@ -126,8 +119,8 @@ def time_named(
 
 
 Counts = NDArray[np.int64]
-_ALIKE = 1e-7  # outcomes whose probabilities differ by less are as likely
-_ROUNDS = 500  # of iterative scaling; it converges in some dozens
+_ALIKE = 1e-7  # outcomes with a smaller difference are equally likely
+_ROUNDS = 500  # of iterative scaling, which converges in a few dozen
 
 
 def transitions(
@@ -135,13 +128,13 @@ def transitions(
 ) -> pd.DataFrame:
     """The table `transitions` of one animal: every ordered pair of different actions.
 
-    By chance, each action is followed by another one in proportion to how often those occur. One
-    bout's action depends on the last one's only (first-order Markov); longer patterns are not
-    looked for.
+    By chance, each action is followed by another one in proportion to the frequency of the latter.
+    A bout's action is assumed to depend only on the previous one (first-order Markov); longer
+    patterns are not analysed.
 
     Args:
         bouts: the table `bouts`, in order of time.
-        words: the k words of the vocabulary; every action of `bouts` is one of them.
+        words: the k words of the vocabulary, which include every action of `bouts`.
         gaps: the table `gaps`.
         longest_pause_s: bouts further apart than this do not follow each other, s.
 
@@ -177,7 +170,7 @@ def transitions(
 def count_transitions(
     bouts: pd.DataFrame, words: Sequence[str], gaps: pd.DataFrame, longest_pause_s: float
 ) -> Counts:
-    """(k, k) int64, how often word j followed upon word i != j.
+    """(k, k) int64, the number of transitions from word i to word j != i.
 
     A transition does not count across a gap with missing frames, or across an unnamed stretch
     longer than `longest_pause_s`.
@@ -196,7 +189,7 @@ def count_transitions(
     if len(code) < 2:
         return counts
     broken = gaps.loc[gaps["n_frames_missing"] > 0, "start_s"].to_numpy(float, copy=True)
-    broken.sort()  # a gap parts two bouts when it begins after the one and before the other
+    broken.sort()  # a gap separates two bouts if it begins between them
     parted = np.searchsorted(broken, start[1:] - 1e-9) != np.searchsorted(broken, stop[:-1] - 1e-9)
     near = (start[1:] - stop[:-1] <= longest_pause_s) & ~parted & (code[1:] != code[:-1])
     np.add.at(counts, (code[:-1][near], code[1:][near]), 1)
@@ -206,13 +199,13 @@ def count_transitions(
 def by_chance(counts: Counts) -> Array:
     """(k, k) probability of j after i under quasi-independence, by iterative proportional fitting.
 
-    Row and column sums are those counted, the diagonal is empty (Goodman 1968).
+    Row and column sums equal the counts, the diagonal is empty (Goodman 1968).
 
     Args:
         counts: (k, k) int64 transitions, zero on the diagonal.
 
     Returns:
-        Rows add up to one; NaN in the rows of actions that nothing followed.
+        Rows add up to one; NaN in the rows of actions without a successor.
     """
     rows = counts.sum(axis=1).astype(float)
     columns = counts.sum(axis=0).astype(float)
@@ -232,10 +225,10 @@ def by_chance(counts: Counts) -> Array:
 
 
 def _binomial(n: int, total: int, chance: float) -> float:
-    """Two-sided p of the exact binomial test; NaN where chance leaves no choice.
+    """Two-sided p of the exact binomial test; NaN if `chance` is 0 or 1.
 
-    The probability of all outcomes that are no likelier than this one, as `scipy.stats.binomtest`
-    has it: every run would import half of SciPy for that one number.
+    It sums the probabilities of all outcomes that are at most as likely as the observed one, as
+    `scipy.stats.binomtest` does. That function is avoided because importing it is slow.
     """
     if total == 0 or not 1e-9 < chance < 1.0 - 1e-9:
         return float("nan")
@@ -262,7 +255,7 @@ def _first(table: pd.DataFrame, name: str) -> str:
 BEFORE_S = 1.0
 AFTER_S = 2.0
 _STEPS = 61
-_FEWEST = 5  # bouts; of fewer there are no quartiles
+_FEWEST = 5  # bouts for quartiles
 
 
 @dataclass(frozen=True)
@@ -289,17 +282,17 @@ def around_onsets(
 ) -> Around | None:
     """Peri-event median and quartiles of a column around every onset of an action.
 
-    Values are interpolated linearly between the frames' true times, never across a gap; where a
-    bout has no value it does not count, and a time with fewer than five values is NaN.
+    Values are interpolated linearly between the frames' true times, never across a gap. A bout
+    without a value does not count, and a time with fewer than five values is NaN.
 
     Args:
         kinematics: the table `kinematics`.
         bouts: the table `bouts`.
-        action: the action whose onsets are taken.
+        action: the action.
         column: the column of `kinematics`.
 
     Returns:
-        From `BEFORE_S` before to `AFTER_S` after the onset; None where there are too few bouts.
+        From `BEFORE_S` before to `AFTER_S` after the onset; None if there are too few bouts.
     """
     own = bouts.loc[bouts["action"] == action, "start_s"].to_numpy(float)
     if len(own) < _FEWEST:

@@ -1,10 +1,9 @@
 """Rule-based ethogram of a mouse (rear, run, walk, pause) by double thresholds on speed and height.
 
-One label per frame, half-open bouts, never across a gap; a thin first ethogram. For every action:
-hysteresis (two thresholds, enter and leave), then interruptions shorter than `merge_pauses_s` are
-bridged, then bouts shorter than `min_bout_s` are dropped; where two actions claim a frame the first
-of `ACTIONS` has it. Starting values of the thresholds: Live Mouse Tracker (de Chaumont et al.
-2019).
+One label per frame, half-open bouts, never across a gap. For every action: hysteresis (two
+thresholds, enter and leave), then interruptions shorter than `merge_pauses_s` are bridged, then
+bouts shorter than `min_bout_s` are dropped. If two actions claim a frame, the first of `ACTIONS`
+wins. Default thresholds: Live Mouse Tracker (de Chaumont et al. 2019).
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ from liex_lab.behaviour.measures import measure_bouts
 from liex_lab.tables.rows import constant_runs, frame_count, stop_times
 from liex_lab.tables.schema import BOUTS, to_pandas
 
-ACTIONS = ("rear", "run", "walk", "pause")  # where two claim a frame, the first has it
+ACTIONS = ("rear", "run", "walk", "pause")  # if two claim a frame, the first wins
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -29,23 +28,23 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class MouseRules:
-    """Thresholds of the first ethogram, by the names they have in a plan.
+    """Thresholds of the rule-based ethogram, by their names in a plan.
 
-    `MouseRules(**plan.behaviour.model_dump())` makes them from one. Starting values are Live Mouse
-    Tracker's. Its 40 mm of rearing belong to an adult of some 90 mm; a smaller animal rears from
-    0.6 of its own length on. A bout of rearing reaches to where the nose is below two thirds of
-    that height.
+    `MouseRules(**plan.behaviour.model_dump())` makes them from a plan. The defaults are those of
+    Live Mouse Tracker. Its rearing height of 40 mm applies to an adult of about 90 mm; a smaller
+    animal rears from 0.6 of its own length. A bout of rearing extends down to two thirds of that
+    height.
 
     Attributes:
-        speed_half_window_s: speed at t is taken between frames this far before and after it, s.
+        speed_half_window_s: speed at t is measured between frames this far before and after it, s.
         pause_below_mm_s: slower than this is a pause, mm/s.
         run_above_mm_s: faster than this is a run, mm/s.
         impossible_above_mm_s: faster than this is a tracking error, mm/s.
-        rear_height_mm: nose above the tail's base that makes an adult rear, mm.
+        rear_height_mm: height of the nose above the tail's base in an adult's rear, mm.
         rear_height_bl: the same for a smaller animal, in body lengths.
         rear_leave: rearing lasts down to this share of its height.
-        speed_hysteresis: a threshold is crossed upwards this share above it, downwards as much
-            below.
+        speed_hysteresis: a threshold is crossed upwards this share above it, downwards this share
+            below it.
         merge_pauses_s: shorter interruptions of a bout are bridged, s.
         min_bout_s: shorter bouts are dropped, s.
     """
@@ -63,15 +62,13 @@ class MouseRules:
     min_bout_s: float = 0.23
 
     def rear_mm(self, spine_mm: float) -> float:
-        """Height of the nose above the tail's base, mm, from which on an animal rears.
-
-        Args:
-            spine_mm: length of the animal's spine, mm.
+        """Least height of the nose above the tail's base in a rear, mm, for a spine of `spine_mm`
+        (mm).
         """
         return min(self.rear_height_mm, self.rear_height_bl * spine_mm)
 
     def definitions(self) -> dict[str, str]:
-        """What each word of `ACTIONS` means with these numbers, as sentences for a reader."""
+        """The definition of each word of `ACTIONS` with these thresholds, as sentences."""
         walk = f"{self.pause_below_mm_s / 10.0:g} cm/s"
         run = f"{self.run_above_mm_s / 10.0:g} cm/s"
         return {
@@ -90,16 +87,16 @@ class MouseRules:
 def find_bouts(
     frames: pd.DataFrame, kinematics: pd.DataFrame, rules: MouseRules | None = None
 ) -> pd.DataFrame:
-    """The table `bouts` of one animal by rule, with the measures of each bout.
+    """The rule-based table `bouts` of one animal, with the measures of each bout.
 
     Args:
         frames: the table `frames`; spine_mm is read.
         kinematics: the table `kinematics` of the same frames.
-        rules: the thresholds; None takes the defaults.
+        rules: the thresholds; None uses the defaults.
 
     Returns:
         One row per bout in order of time, source "rule"; the score is the share of its frames that
-        satisfy the rule themselves.
+            satisfy the rule themselves.
     """
     rules = rules or MouseRules()
     time_s = kinematics["time_s"].to_numpy(float)
@@ -153,11 +150,11 @@ def raw_labels(
 
 
 def hysteresis(values: Array, enter: float, leave: float, number: NDArray[np.int64]) -> Mask:
-    """(n,) bool: the runs above `leave` that reach `enter`, afresh in every stretch.
+    """(n,) bool: the runs above `leave` that reach `enter`, separately in every stretch.
 
-    It is True until the values fall below `leave`. Rising belongs to it: the frames between `leave`
-    and `enter` just before the threshold is reached count as well (as in Canny's edge detector, not
-    as in a causal Schmitt trigger).
+    It is True until the values fall below `leave`. The frames between `leave` and `enter` just
+    before the threshold is reached are included (as in Canny's edge detector, not as in a causal
+    Schmitt trigger).
 
     Args:
         values: (n,) the measure; NaN is below every threshold.
@@ -170,7 +167,7 @@ def hysteresis(values: Array, enter: float, leave: float, number: NDArray[np.int
     out = np.zeros(len(values), bool)
     group = np.where(
         inside, number, -1 - number
-    )  # a run of equal group lies in one stretch, above `leave` or not
+    )  # a run of one group is within one stretch, all above `leave` or all below
     for start, stop, which in constant_runs(group):
         out[start:stop] = which >= 0 and bool(high[start:stop].any())
     return out
@@ -190,10 +187,10 @@ def tidy(
 
     Args:
         mask: (n,) bool, the frames that satisfy the rule.
-        free: (n,) bool, the frames that no action claimed before.
+        free: (n,) bool, the frames that no earlier action claimed.
         number: (n,) unbroken stretch of each frame, see `segments`.
         time_s: (n,) times of the frames, s.
-        stop_s: (n,) when each frame's validity ends, s, see `stop_times`.
+        stop_s: (n,) end of each frame's validity, s, see `stop_times`.
         rules: `merge_pauses_s` and `min_bout_s` are used.
 
     Yields:

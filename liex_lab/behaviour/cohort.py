@@ -1,10 +1,10 @@
 """Comparison of groups of animals: Hedges' g, permutation test or mixed model, Benjamini-Hochberg.
 
-From one row per session to one row per measure and contrast, with n at every level. The units come
-from `design` (no pseudoreplication), tests, t intervals and Hedges' g from `statistics`, and the p
-values of the whole table are corrected by Benjamini and Hochberg's procedure (`multiplicity`).
-Every measure that was asked for is in the table, significant or not, tested or refused. `liex
-compare` and the dashboard's page of groups show it.
+One row per session becomes one row per measure and contrast, with n at every level. `statistics`
+finds the units (no pseudoreplication) and computes tests, t intervals and Hedges' g; the p values
+of the whole table are corrected by Benjamini and Hochberg's procedure. Every requested measure is
+in the table, significant or not, tested or refused. `liex compare` and the dashboard's group page
+show it.
 """
 
 from __future__ import annotations
@@ -62,14 +62,14 @@ STATS = table_columns("stats")
 
 
 def collect(sessions: Iterable[SessionTables]) -> pd.DataFrame:
-    """One row per session and animal: who it is, its summary, and its number of bouts.
+    """One row per session and animal: its subject, its summary, and its number of bouts.
 
     Args:
-        sessions: opened sessions that hold a summary.
+        sessions: opened sessions with a summary.
 
     Returns:
-        Columns of the tables `sessions` and `summary`, and n_bouts; columns that both have carry
-        `_summary` in the second.
+        Columns of the tables `sessions` and `summary`, and n_bouts; a column of both tables has the
+            suffix `_summary` for the second.
     """
     rows = [
         session.table("sessions")
@@ -81,7 +81,7 @@ def collect(sessions: Iterable[SessionTables]) -> pd.DataFrame:
 
 
 def usual_measures(table: pd.DataFrame) -> list[str]:
-    """Measures compared when none is named: the usual ones with values, every action's share.
+    """The default measures: the usual ones with values, and every action's share.
 
     Args:
         table: one row per session, see `collect`.
@@ -113,20 +113,20 @@ def compare(
 
     Args:
         table: one row per session, see `collect`; missing columns of `WHO` count as unknown.
-        measures: columns of `table` to compare; one that is missing is refused in its row.
-        reference: compare each group with this one only; None takes every pair of groups.
-        engine: permutation, mixed, or auto, which takes the mixed model where something is nested,
-            there are `FEWEST_FOR_MODEL` units in each group and its variance is not zero. Where no
-            model can be fitted, mixed permutes, too.
+        measures: columns of `table` to compare; a missing one is refused in its row.
+        reference: compare each group with this one only; None compares all pairs of groups.
+        engine: permutation, mixed, or auto, which uses the mixed model if the units are nested,
+            each group has at least `FEWEST_FOR_MODEL` units and the random variance is not zero. If
+            the model cannot be fitted, mixed uses permutation as well.
         blocks: columns within which animals are exchanged.
         alpha: a permutation test that cannot reach this level is refused.
-        family: name of the family of tests, written into the table.
+        family: name of the family of tests, written to the table.
         seed: of the random arrangements; each row has its own stream.
 
     Returns:
         One row per measure and contrast with the columns `STATS`; p_fdr is corrected over all tests
-        of the table (Benjamini-Hochberg). Where a mixed model was fitted, estimate, interval
-        and effect size are the model's, else those of `estimate`.
+            of the table (Benjamini-Hochberg). Estimate, interval and effect size are those of the
+            mixed model if it was fitted, else those of `estimate`.
     """
     texts = {
         name: table[name].fillna("").astype(str) if name in table else ""
@@ -149,13 +149,13 @@ def compare(
 
 
 def unified(table: pd.DataFrame) -> tuple[pd.DataFrame, list[str]]:
-    """The table with names that differ in capitals, spaces, _ or - alone spelled in one way.
+    """The table with one spelling of names that differ only in capitals, spaces, _ or -.
 
     Args:
         table: one row per session, see `collect`; its columns of `WHO` are read.
 
     Returns:
-        The table, and what to check: such names, and animals that may be one.
+        The table, and notes on such names and on animals that may be the same.
     """
     notes = []
     for column in (name for name in WHO if name in table):
@@ -218,18 +218,18 @@ def _compare_one(
 
 
 def _counts(units: Units) -> tuple[int, int]:
-    """Units of the reference and of the group; of pairs each is in both."""
+    """Units of the reference and of the group; paired units count in both."""
     n_second = int(units.second.sum())
     n = len(units.values)
     return (n, n) if units.paired else (n - n_second, n_second)
 
 
 def _sized(found: Estimate, rows: pd.DataFrame, groups: tuple[str, str]) -> dict[str, float]:
-    """The difference with its interval, and both as Hedges' g."""
+    """The difference with its interval, both also as Hedges' g."""
     second = (rows["group"] == groups[1]).to_numpy()
     animal = (
         pd.factorize(rows["subject_id"])[0] * 2 + second
-    )  # one that was in both groups counts in both
+    )  # an animal in both groups counts in both
     subjects, number = np.unique(animal, return_inverse=True)
     sd, correction = spread_of_animals(
         animal_means(rows["value"].to_numpy(float), number), subjects % 2 == 1
@@ -247,7 +247,7 @@ def _tested(
     alpha: float,
     rng: np.random.Generator,
 ) -> dict[str, Any]:
-    """The p and the test's name; raises NotComparable where p cannot reach alpha."""
+    """The p and the test's name; raises NotComparable if p cannot reach alpha."""
     enough = min(int((~units.second).sum()), int(units.second.sum())) >= FEWEST_FOR_MODEL
     if engine == "mixed" or (engine == "auto" and enough):
         model = mixed_model(rows, units, groups)
@@ -269,7 +269,7 @@ def _tested(
 
 
 def counted_units(row: Mapping[Any, Any]) -> str:
-    """How many units of each group, each number beside its group: 4 drug, 5 vehicle (animals).
+    """The number of units of each group: 4 drug, 5 vehicle (animals).
 
     Args:
         row: a row of the table `stats`.
@@ -285,7 +285,7 @@ def result(row: Mapping[Any, Any], unit: str) -> str:
 
     Args:
         row: a row of the table `stats`.
-        unit: the measure's unit in the table; empty where it has none.
+        unit: the measure's unit in the table; empty if dimensionless.
     """
     difference, low, high = (_plain(shown(float(row[name]), unit)[0]) for name in _ESTIMATES)
     g, g_low, g_high = (f"{float(row[name]):.2f}" for name in _EFFECTS)
@@ -313,7 +313,7 @@ def result(row: Mapping[Any, Any], unit: str) -> str:
 
 
 def _plain(value: float) -> str:
-    """Three digits that count, without an exponent."""
+    """Three significant digits, without an exponent."""
     return np.format_float_positional(float(f"{value:.3g}"), trim="-")
 
 
@@ -327,9 +327,9 @@ def methods(
 
     Args:
         stats: the table `stats`, see `compare`.
-        table: the sessions that were compared, see `collect`; None leaves out how many there are.
+        table: the compared sessions, see `collect`; None omits their number.
         said: sentences on the sessions, such as which are left out.
-        alpha: the level of significance that the text names.
+        alpha: the significance level in the text.
 
     Returns:
         One paragraph; empty for an empty table.

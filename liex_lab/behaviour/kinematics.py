@@ -1,13 +1,13 @@
 """Kinematics per frame: central differences over true times, with propagated standard deviations.
 
-Rate of v at t: (v(t + h) - v(t - h)) / true time between the two frames, h about `HALF_WINDOW_S`,
-never across a gap nor across the end of a person's exchange of head and tail, one-sided at the ends
-of an unbroken stretch; speed, acceleration, yaw rate. Its
+Rate of v at t: (v(t + h) - v(t - h)) / true time between the two frames, h about `HALF_WINDOW_S`.
+It is never taken across a gap nor across the end of a person's exchange of head and tail, and is
+one-sided at the ends of an unbroken stretch. This gives speed, acceleration and yaw rate. The
 standard deviation is sqrt(s1^2 + s2^2 - 2 r s1 s2) / span with r = exp(-span / `ERROR_LASTS_S`),
-the autocorrelation of an Ornstein-Uhlenbeck process: the nearer two frames, the more their errors
-agree. Errors of the joints of one frame are taken as one common error (the body is off as a whole),
-those of the two ends of a line as independent. Heading, pitch, length, bend and heights come from
-`posture`, the tail's beat from `tail`. Pandas in, pandas out.
+the autocorrelation of an Ornstein-Uhlenbeck process: the errors of close frames are correlated. The
+joint errors of one frame are treated as one common error (the whole body is displaced), those of
+the two ends of a line as independent. Heading, pitch, length, bend, heights and the tail's beat
+come from `posture`. Input and output are pandas tables.
 """
 
 from __future__ import annotations
@@ -30,25 +30,25 @@ from liex_lab.tracking.track import Track
 Array = NDArray[np.float64]
 Rows = NDArray[np.int64]
 
-# speed at t uses neighbours this far away, as Live Mouse Tracker does at 30 fps
+# distance of the neighbours for the speed at t, as in Live Mouse Tracker at 30 fps
 HALF_WINDOW_S = 0.034
 IMPOSSIBLE_MM_S = 3000.0  # faster than any mouse: a tracking error
-# after which two errors agree by 1/e; on rendered recordings they last longer, smoothed or not
+# correlation time of errors; on rendered recordings it is longer, smoothed or not
 ERROR_LASTS_S = 0.3
-_BLOCK = 16_384  # frames whose postures are in memory at a time
+_BLOCK = 16_384  # frames in memory at a time
 STEEP_RAD = np.radians(75.0)  # beyond it the body's axis has no reliable direction on the floor
 
 
 @dataclass(frozen=True)
 class Spans:
-    """Which frames the derivative at each of m frames is taken between.
+    """The two frames between which the derivative at each of m frames is taken.
 
-    What it is taken of are always the values of all n frames.
+    The derivative's input is always the values of all n frames.
 
     Attributes:
         before: (m,) int64 row of the earlier frame.
         after: (m,) int64 row of the later frame.
-        span_s: (m,) time from the one to the other, s; NaN where a frame stands alone.
+        span_s: (m,) time between them, s; NaN for an isolated frame.
         rows: the m frames among all n.
     """
 
@@ -64,12 +64,12 @@ class Spans:
         half_window_s: float,
         begins: NDArray[np.bool_] | bool = False,
     ) -> Spans:
-        """The neighbours about `half_window_s` away; a frame that stands alone has an empty span.
+        """The neighbours about `half_window_s` away; an isolated frame has the span NaN.
 
         Args:
             time_s: (n,) times of the frames, s.
             observed: (n,) bool, whether the frame has a pose.
-            half_window_s: how far before and after the frame its neighbours are, s.
+            half_window_s: distance of the neighbours before and after the frame, s.
             begins: (n,) bool, see `segments`.
         """
         before, after = neighbours(time_s, observed, half_window_s, begins)
@@ -77,30 +77,28 @@ class Spans:
         return Spans(before, after, span_s, slice(None))
 
     def __getitem__(self, rows: slice) -> Spans:
-        """The spans of some of all frames; `rows` is a slice of a `Spans` of all n frames."""
+        """The spans of a slice of frames; `rows` is a slice of a `Spans` of all n frames."""
         return Spans(self.before[rows], self.after[rows], self.span_s[rows], rows)
 
     def rate(self, values: Array) -> Array:
-        """(m,) or (m, k) change per second of values, NaN where a frame stands alone.
-
-        Args:
-            values: (n,) or (n, k), of all frames.
+        """(m,) or (m, k) change per second of the values (n,) or (n, k) of all frames; NaN for an
+        isolated frame.
         """
         span = self.span_s if values.ndim == 1 else self.span_s[:, None]
         return np.asarray((values[self.after] - values[self.before]) / span)
 
     def turning(self, angle: Array) -> Array:
-        """(m,) rad/s, adding the smallest turns from `before` over the frame itself to `after`.
+        """(m,) rad/s, the smallest turns from `before` to the frame itself and on to `after`,
+        added.
 
-        Args:
-            angle: (n,) rad, of all frames.
+        `angle` (n,) rad is of all frames.
         """
         here = angle[self.rows]
         turn = smallest_turn(here - angle[self.before]) + smallest_turn(angle[self.after] - here)
         return np.asarray(turn / self.span_s)
 
     def sd(self, sd: Array) -> Array:
-        """(m,) standard deviation of the rate; the nearer two frames, the more their errors agree.
+        """(m,) standard deviation of the rate; the errors of close frames are correlated.
 
         Args:
             sd: (n,) standard deviation of the values of all frames, in their unit.
@@ -129,14 +127,13 @@ def kinematics(
         poses: the table `poses` of these frames, or its joints.
         half_window_s: derivatives use neighbours this far before and after, s.
         impossible_above_mm_s: a faster speed is a tracking error and left empty, mm/s.
-        surface_z_mm: height of the water's surface above the floor, mm, for an animal that swims;
-            None if unknown.
-        seams: frames (of `frame_index`) that begin a stretch of their own, see `Surroundings`.
+        surface_z_mm: height of the water's surface above the floor, mm, for a swimming animal; None
+            if unknown.
+        seams: values of `frame_index` that begin a new stretch, see `Surroundings`.
         allocate: makes the arrays of the columns (an allocator, as `np.empty`).
 
     Returns:
-        The table: mm, s and rad in the arena frame, NaN where nothing is
-        known.
+        The table: mm, s and rad in the arena frame, NaN if unknown.
     """
     joints = poses if isinstance(poses, Joints) else Joints.of_table(poses, len(frames))
     body = BodyAxis.of(joints.names, joints.parents)
@@ -175,7 +172,9 @@ def _put(
     n: int,
     allocate: Allocator,
 ) -> None:
-    """Write values (m, ...) of some rows into their columns (n, ...), made where they are new."""
+    """Write values (m, ...) of some rows into their columns (n, ...); missing columns are
+    allocated.
+    """
     for name, some in values.items():
         if name not in columns:
             columns[name] = allocate((n, *some.shape[1:]), float)
@@ -190,7 +189,9 @@ def _moving(
     impossible_above_mm_s: float,
     allocate: Allocator,
 ) -> dict[str, Array]:
-    """Position, speed and turning of the whole body; hold_s (n,) is how long a frame counts, s."""
+    """Position, speed and turning of the whole body; hold_s (n,) is the duration of each frame,
+    s.
+    """
     columns: dict[str, Array] = {}
     for rows in blocks(len(hold_s), _BLOCK):
         centre = shape["centre"][rows]
@@ -211,7 +212,7 @@ def _moving(
             "heading_sd_rad": np.where(flat, shape["heading_sd_rad"][rows], np.nan),
         }
         _put(columns, rows, values, len(hold_s), allocate)
-    for rows in blocks(len(hold_s), _BLOCK):  # now that those of the neighbours are known
+    for rows in blocks(len(hold_s), _BLOCK):  # needs the neighbours' values
         here = spans[rows]
         values = {
             "acceleration_mm_s2": here.rate(columns["speed_mm_s"]),
@@ -225,14 +226,14 @@ def _moving(
 
 @dataclass(frozen=True)
 class Joints:
-    """The J joints of n frames, read some frames at a time.
+    """The J joints of n frames, read in blocks of frames.
 
     Attributes:
         names: names of the joints.
         n_frames: number of frames.
         at: from a slice of m frames to positions (m, J, 3) mm in the arena frame and their standard
-            deviation (m, J) mm along an axis, NaN where they are not known.
-        parents: joint before each of them, -1 at the base; None takes them for one chain.
+            deviation (m, J) mm along an axis, NaN if unknown.
+        parents: joint before each of them, -1 at the base; None means one chain.
     """
 
     names: list[str]
@@ -248,7 +249,7 @@ class Joints:
             poses: the table `poses`, J rows per frame; without sd_mm all standard deviations are
                 NaN.
             n: number of frames.
-            parents: joint before each joint, -1 at the base; None takes them for one chain.
+            parents: joint before each joint, -1 at the base; None means one chain.
         """
         column = poses["joint"]
         names = (
@@ -272,11 +273,7 @@ class Joints:
 
     @staticmethod
     def of_track(track: Track) -> Joints:
-        """The joints of a track; what was bridged was not measured and is NaN.
-
-        Args:
-            track: the track; its arena-frame joints, mm, are read block by block.
-        """
+        """The joints of a track, read in blocks, arena frame, mm; bridged frames are NaN."""
 
         def at(rows: slice) -> tuple[Array, Array]:
             """Positions (m, J, 3) mm and standard deviations (m, J) mm of the frames `rows`."""
@@ -292,7 +289,7 @@ class Joints:
 def _apart(xyz: Sequence[Array]) -> Array:
     """Three coordinates (m, J) as (m, J, 3), each contiguous in memory.
 
-    Sums over joints then have the same bits, wherever the joints came from.
+    This makes sums over joints bitwise equal, whatever the source of the joints.
     """
     return np.moveaxis(np.stack(xyz), 0, -1)
 
@@ -300,14 +297,14 @@ def _apart(xyz: Sequence[Array]) -> Array:
 def segments(
     time_s: Array, observed: NDArray[np.bool_], begins: NDArray[np.bool_] | bool = False
 ) -> Rows:
-    """(n,) int64 number of the unbroken stretch each frame belongs to, from 0 upwards.
+    """(n,) int64 number of each frame's unbroken stretch, from 0 upwards.
 
-    A stretch has no missing frame and no lost animal inside.
+    A stretch has no missing frame and no frame without a pose.
 
     Args:
         time_s: (n,) times of the frames, s.
         observed: (n,) bool, whether the frame has a pose.
-        begins: (n,) bool, whether a stretch begins with the frame for another reason.
+        begins: (n,) bool, whether the frame begins a stretch for another reason.
     """
     broken = np.append(True, gap_follows(time_s)[:-1] | (observed[1:] != observed[:-1]))[
         : len(time_s)
@@ -321,16 +318,16 @@ def neighbours(
     half_window_s: float = HALF_WINDOW_S,
     begins: NDArray[np.bool_] | bool = False,
 ) -> tuple[Rows, Rows]:
-    """Rows to difference between: about `half_window_s` before and after, within the own stretch.
+    """Rows to difference between: about `half_window_s` before and after, within the same stretch.
 
-    At the ends of a stretch the difference is one-sided; a stretch of one frame and a frame without
+    At the ends of a stretch the difference is one-sided. A stretch of one frame and a frame without
     a pose have none (before == after).
 
     Args:
         time_s: (n,) times of the frames, s.
         observed: (n,) bool, whether the frame has a pose.
-        half_window_s: how far before and after the frame its neighbours are, s; at the camera's own
-            rate the next frame counts, jitter of its clock or not.
+        half_window_s: distance of the neighbours before and after the frame, s; at the camera's own
+            rate the next frame is used, despite jitter of the clock.
         begins: (n,) bool, see `segments`.
 
     Returns:
@@ -340,7 +337,7 @@ def neighbours(
     rows = np.arange(len(time_s))
     reach = (
         0.75 * half_window_s
-    )  # at the camera's own rate the next frame counts, jitter of its clock or not
+    )  # at the camera's own rate the next frame is used, despite jitter of its clock
     before = np.searchsorted(time_s, time_s - reach, side="right") - 1
     after = np.searchsorted(time_s, time_s + reach, side="left")
     number = segments(time_s, observed, begins)
@@ -353,9 +350,5 @@ def neighbours(
 
 
 def smallest_turn(angle: Array) -> Array:
-    """Angles wrapped into (-pi, pi].
-
-    Args:
-        angle: angles of any shape, rad.
-    """
+    """Angles of any shape, rad, wrapped into (-pi, pi]."""
     return np.asarray(np.pi - (np.pi - angle) % (2.0 * np.pi))

@@ -1,7 +1,6 @@
-"""Table `bouts` with its measures, and what of each bout contradicts the word it is named by.
+"""Table `bouts` with its measures, and the contradictions between a bout and its action.
 
-Bouts may be named by a rule, a model or a person; `bout_reader` has the measures, `checking` the
-limits.
+Bouts are named by a rule, a model or a person. The limits come from `actions.vocabulary`.
 """
 
 from __future__ import annotations
@@ -26,8 +25,8 @@ if TYPE_CHECKING:
 
 
 Array = NDArray[np.float64]
-_MOST_LAG_S = 0.25  # a wave that takes longer for a third of the body is none
-# of the curvatures of two thirds of the body, for a wave that runs from one to the other
+_MOST_LAG_S = 0.25  # longest time of a wave for a third of the body
+# between the curvatures of two thirds of the body, for a wave to be accepted
 _LEAST_CORRELATION = 0.5
 
 
@@ -54,7 +53,7 @@ class BoutReader:
         """The rows [start, stop) of every bout, at least one row each.
 
         Args:
-            bouts: the table `bouts`; start_frame and stop_frame are the camera's counts.
+            bouts: the table `bouts`; start_frame and stop_frame are frame indices of the camera.
         """
         starts = np.searchsorted(self.frame_index, bouts["start_frame"].to_numpy())
         stops = np.searchsorted(self.frame_index, bouts["stop_frame"].to_numpy())
@@ -65,14 +64,14 @@ class BoutReader:
         ]
 
     def measure(self, start: int, stop: int) -> dict[str, float]:
-        """All measures of one bout but since_last_s, which needs the bout before.
+        """All measures of one bout except since_last_s, which needs the previous bout.
 
         Args:
             start: first row of the bout.
             stop: row after its last.
 
         Returns:
-            Column name to value; NaN where nothing is known.
+            Column name to value; NaN if unknown.
         """
         found = {**self.motion(start, stop), **self.turn(start, stop)}
         if self.kind == SWIMS:
@@ -80,9 +79,9 @@ class BoutReader:
         return found | self.height(start, stop) if self.kind == STANDS else found
 
     def since_last(self, bouts: pd.DataFrame, spans: Sequence[tuple[int, int]]) -> Array:
-        """(n,) time from the end of the last bout of the same action, s.
+        """(n,) time since the end of the last bout of the same action, s.
 
-        It is NaN at the first one, and where the animal was out of sight in between.
+        NaN for the first one, and if the animal was not observed throughout the interval.
 
         Args:
             bouts: the table `bouts`, in order of time.
@@ -96,31 +95,15 @@ class BoutReader:
         return np.where(last["number"].to_numpy() == number[start], since, np.nan)
 
     def column(self, name: str, start: int, stop: int) -> Array:
-        """A column of the table `kinematics` within a bout.
-
-        Args:
-            name: of the column.
-            start: first row of the bout.
-            stop: row after its last.
-        """
+        """A column of the table `kinematics` in the rows [start, stop) of a bout."""
         return self._columns[name][start:stop]
 
     def seconds(self, start: int, stop: int) -> float:
-        """How long a bout lasts, s.
-
-        Args:
-            start: first row of the bout.
-            stop: row after its last.
-        """
+        """Duration of the bout in the rows [start, stop), s."""
         return float(self.time_s[stop - 1] + self.hold_s[stop - 1] - self.time_s[start])
 
     def motion(self, start: int, stop: int) -> dict[str, float]:
-        """Path, displacement and speeds of a bout, mm and mm/s.
-
-        Args:
-            start: first row of the bout.
-            stop: row after its last.
-        """
+        """Path, displacement and speeds of the bout in the rows [start, stop), mm and mm/s."""
         speed = self.column("speed_mm_s", start, stop)
         step = self.column("step_mm", start, stop)
         known = np.flatnonzero(np.isfinite(speed))
@@ -152,12 +135,7 @@ class BoutReader:
         }
 
     def turn(self, start: int, stop: int) -> dict[str, float]:
-        """Turning, pitch and bend of a bout, rad.
-
-        Args:
-            start: first row of the bout.
-            stop: row after its last.
-        """
+        """Turning, pitch and bend of the bout in the rows [start, stop), rad."""
         heading = self.column("heading_rad", start, stop)
         sd = self.column("heading_sd_rad", start, stop)
         known = np.isfinite(heading)
@@ -175,12 +153,7 @@ class BoutReader:
         }
 
     def height(self, start: int, stop: int) -> dict[str, float]:
-        """Heights of the nose of an animal that stands on the floor, mm.
-
-        Args:
-            start: first row of the bout.
-            stop: row after its last.
-        """
+        """Nose heights of a standing animal in the rows [start, stop) of a bout, mm."""
         nose = self.column("nose_height_mm", start, stop)
         top = _top(nose)
         return {
@@ -226,7 +199,9 @@ class BoutReader:
         }
 
     def _wave(self, start: int, stop: int) -> float:
-        """Speed of the bend that runs from the middle third of the body to the rear one, mm/s."""
+        """Speed of the bend that travels from the middle third of the body to the rear one,
+        mm/s.
+        """
         middle, rear = (self.column(f"bend_{part}_rad", start, stop) for part in ("middle", "rear"))
         if not (np.isfinite(middle).all() and np.isfinite(rear).all()) or stop - start < 8:
             return np.nan
@@ -238,7 +213,7 @@ class BoutReader:
         most = min(int(_MOST_LAG_S * 10 * self.fps), len(fine) // 2)
         agreement = [_correlation(a[: len(a) - lag], b[lag:]) for lag in range(most)]
         best = int(np.argmax(agreement)) if agreement else 0
-        # at an end of its range the correlation is not known to have its peak
+        # at an end of the range the peak of the correlation is uncertain
         if best in (0, most - 1) or agreement[best] < _LEAST_CORRELATION:
             return np.nan
         return self.length_mm / 3.0 / (best * 0.1 / self.fps)
@@ -250,12 +225,12 @@ def _correlation(a: Array, b: Array) -> float:
 
 
 def _top(values: Array) -> int | None:
-    """Where the largest value is; None if none is known."""
+    """Index of the largest value; None if all are NaN."""
     return int(np.nanargmax(values)) if np.isfinite(values).any() else None
 
 
 def of_known(measure: Callable[[Array], Any], values: Array) -> float:
-    """A measure, such as `np.median`, of the values that are known; NaN if there is none."""
+    """A measure, such as `np.median`, of the finite values; NaN if there are none."""
     known = values[np.isfinite(values)]
     return float(measure(known)) if len(known) else np.nan
 
@@ -281,12 +256,12 @@ def _turn(name: str, sign: float = 1.0) -> Reading:
 
 
 def _beyond_noise(bout: BoutReader, a: int, b: int) -> float:
-    """Mean speed less what errors of the pose alone look like, mm/s."""
+    """Mean speed minus the apparent speed caused by pose errors, mm/s."""
     noise = of_known(np.median, bout.column("speed_sd_mm_s", a, b))
     return max(bout.motion(a, b)["mean_speed_mm_s"] - (0.0 if np.isnan(noise) else noise), 0.0)
 
 
-# how each of `actions.vocabulary.MEASURES` is read; where there are two values both have to fit
+# how to read each of `actions.vocabulary.MEASURES`; with two values, both must fit
 _READ: dict[str, Reading] = {
     "speed_mm_s": _motion("mean_speed_mm_s", "median_speed_mm_s"),
     "peak_speed_mm_s": _motion("peak_speed_mm_s"),
@@ -312,8 +287,8 @@ class BoutCheck:
 
     Args:
         bouts: reads the measures of bouts.
-        meanings: word -> definition as it is printed; only those of the bundled vocabularies have
-            limits, see `actions.vocabulary.limits_of`.
+        meanings: word -> printed definition; only those of the bundled vocabularies have limits,
+            see `actions.vocabulary.limits_of`.
     """
 
     def __init__(self, bouts: BoutReader, meanings: Mapping[str, str]) -> None:
@@ -321,7 +296,8 @@ class BoutCheck:
         self._limits = {word: limits_of(meaning) for word, meaning in meanings.items()}
 
     def broken(self, start: int, stop: int, word: str) -> str:
-        """What a bout breaks of its word's definition, in words; empty where it breaks nothing.
+        """The contradictions between a bout and its word's definition, in words; empty if there are
+        none.
 
         Args:
             start: first row of the bout in the table `kinematics`.
@@ -350,7 +326,7 @@ def recognise(
         recogniser: names the track.
         track: one animal's track of n frames.
         wall_mm: (n,) distance of the animal from the nearest wall, mm; None if unknown.
-        moved: the table `kinematics` of the track; None makes it with the default settings.
+        moved: the table `kinematics` of the track; None computes it with the default settings.
         allocate: allocator of large intermediate arrays and of the probabilities.
     """
     if moved is None:
@@ -366,14 +342,14 @@ def measure_bouts(
 ) -> pd.DataFrame:
     """The table `bouts` with its measures.
 
-    What a camera of this frame rate cannot measure is left empty (see unreliable_below_fps in
+    Measures that need a higher frame rate are left empty (see unreliable_below_fps in
     columns.json).
 
     Args:
-        bouts: needs the columns of `tables.BOUTS`; all others of it are replaced.
+        bouts: needs the columns of `tables.BOUTS`; its other columns are replaced.
         kinematics: the table `kinematics` of the same animal.
-        meanings: word -> definition as it is printed, which the bouts are checked against; None
-            checks nothing.
+        meanings: word -> printed definition, against which the bouts are checked; None skips the
+            check.
 
     Returns:
         The table with all its columns, one row per bout.

@@ -1,10 +1,10 @@
-"""Where the animal was: zone visits, thigmotaxis (outer half of an open field), novel tank test.
+"""Position of the animal: zone visits, thigmotaxis (outer half of an open field), novel tank test.
 
-A visit is a bout of being inside a zone, with the merging and the least length of `bouts.tidy`. The
-outer half is the border along the walls that takes half of the floor's area: of a circle r (1 -
-sqrt(1/2)), of a rectangle the m that solves (a - m)(b - m) = a b / 2, a and b half its sides. Of a
-fish, the shares of the time in the top and bottom third of the water. Shares are of the time in
-which the animal was observed.
+A visit is a bout inside a zone, with the merging and the least length of `bouts.tidy`. The outer
+half is the border along the walls that covers half of the floor's area: for a circle r (1 -
+sqrt(1/2)), for a rectangle the m that solves (a - m)(b - m) = a b / 2, with a and b half its sides.
+For a fish, the shares of the time in the top and bottom third of the water are measured. Shares are
+of the observed time.
 """
 
 from __future__ import annotations
@@ -30,14 +30,13 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class Surroundings:
-    """What is around the animal.
+    """The animal's surroundings.
 
     Attributes:
         arena: shape of the arena.
         zones: names of the zones.
-        surface_z_mm: height of the water's surface above the floor, mm; None if absent or
-            it is not known.
-        seams: frames (the camera's count) at which a person's exchange of head and tail begins or
+        surface_z_mm: height of the water's surface above the floor, mm; None if absent or unknown.
+        seams: frame indices of the camera at which a person's exchange of head and tail begins or
             ends; nothing is measured across one, as across a gap.
     """
 
@@ -56,7 +55,7 @@ def surface_height_mm(floor_distance_mm: float, optics: dict[str, object]) -> fl
             mm.
 
     Returns:
-        None where there is no water, or the surface is not above the floor.
+        None if there is no water, or the surface is not above the floor.
     """
     water = optics.get("water")
     if not isinstance(water, dict) or not water.get("height_mm"):
@@ -74,8 +73,8 @@ def visits(
         frames: the table `frames`.
         kinematics: the table `kinematics` of the same frames.
         zones: names of the zones.
-        rules: shorter absences than `merge_pauses_s` are bridged, then shorter visits than
-            `min_bout_s` dropped.
+        rules: absences shorter than `merge_pauses_s` are bridged, then visits shorter than
+            `min_bout_s` are dropped.
     """
     time_s = kinematics["time_s"].to_numpy(float)
     stop_s = stop_times(time_s)
@@ -107,10 +106,10 @@ def visits(
 
 
 def inside_zones(frames: pd.DataFrame, zones: Sequence[str]) -> list[Mask]:
-    """For each zone (n,) bool, whether the animal's centroid lies in it; zones may overlap.
+    """For each zone (n,) bool, whether the animal's centroid is inside it; zones may overlap.
 
     Args:
-        frames: the table `frames`; its column zone holds names joined by `SEPARATOR`.
+        frames: the table `frames`; its column zone contains names joined by `SEPARATOR`.
         zones: names of the zones; () for sessions of older versions, which have no such column.
     """
     if not zones:  # sessions of older versions have no such column
@@ -124,13 +123,9 @@ def inside_zones(frames: pd.DataFrame, zones: Sequence[str]) -> list[Mask]:
 
 
 def outer_margin_mm(arena: Arena) -> float:
-    """Width of the border along the walls that takes half of the floor's area, mm.
+    """Width of the border along the walls that covers half of the floor's area, mm.
 
-    Args:
-        arena: shape of the arena.
-
-    Returns:
-        NaN for a shape that is neither a circle nor a rectangle.
+    NaN for a shape that is neither a circle nor a rectangle.
     """
     if arena.radius_mm is not None:
         return float(arena.radius_mm * (1.0 - np.sqrt(0.5)))
@@ -145,7 +140,7 @@ def place_measures(frames: pd.DataFrame, hold: Array, arena: Arena) -> dict[str,
 
     Args:
         frames: the table `frames` of n frames; without wall_distance_mm both are NaN.
-        hold: (n,) how long each observed frame counts, s; 0 for the others.
+        hold: (n,) duration of each observed frame, s; 0 for the others.
         arena: shape of the arena.
 
     Returns:
@@ -173,17 +168,17 @@ def place_measures(frames: pd.DataFrame, hold: Array, arena: Arena) -> dict[str,
 def depth_measures(
     kinematics: pd.DataFrame, hold: Array, surface_z_mm: float | None
 ) -> dict[str, float]:
-    """Where in the water the animal was: the measures of the novel tank test.
+    """Position in the water: the measures of the novel tank test.
 
     Args:
         kinematics: the table `kinematics` of n frames.
-        hold: (n,) how long each observed frame counts, s; 0 for the others.
-        surface_z_mm: height of the water's surface above the floor, mm; None if unknown,
-            and only the mean height is given.
+        hold: (n,) duration of each observed frame, s; 0 for the others.
+        surface_z_mm: height of the water's surface above the floor, mm; None if unknown, which
+            gives the mean height only.
 
     Returns:
-        mean_height_mm, top_third_share, bottom_third_share and top_third_latency_s (s from the
-        first sight of the animal); NaN where not known.
+        mean_height_mm, top_third_share, bottom_third_share and top_third_latency_s (s since the
+            first pose); NaN if unknown.
     """
     z = kinematics["z_mm"].to_numpy(float)
     time_s = kinematics["time_s"].to_numpy(float)
@@ -210,7 +205,7 @@ def depth_measures(
 
 CELL_MM = 5.0
 SD_MM = 10.0  # of the kernel: about half a mouse's width
-_MOST_CELLS = 400  # along a side; of larger floors the cells are larger
+_MOST_CELLS = 400  # along a side; larger floors have larger cells
 
 
 @dataclass(frozen=True)
@@ -221,7 +216,7 @@ class Occupancy:
         time_s: (ny, nx) time in each cell, s; row 0 has the smallest y.
         x_mm: (nx + 1,) edges of the columns, mm, arena frame.
         y_mm: (ny + 1,) edges of the rows, mm, arena frame.
-        n: number of frames with a place.
+        n: number of frames with a position.
     """
 
     time_s: Array
@@ -242,11 +237,7 @@ class Occupancy:
 
 
 def hold_times(time_s: ArrayLike) -> Array:
-    """(n,) how long each frame counts, s: until the next one, the last one as long as usual.
-
-    Args:
-        time_s: (n,) times of the frames, s.
-    """
+    """(n,) the duration of each frame, s: until the next one; the last one lasts a median step."""
     time = np.asarray(time_s, float)
     return np.asarray(stop_times(time) - time)
 
@@ -257,10 +248,10 @@ def occupancy(
     """Time spent in each cell of a rectangle of the floor.
 
     Args:
-        xy_mm: (n, 2) places, mm, arena frame; a row with NaN does not count.
-        hold_s: (n,) how long each counts, s.
-        low_mm: (2,) the rectangle's smallest x and y, mm; it is widened where a place lies outside.
-        high_mm: (2,) its largest.
+        xy_mm: (n, 2) positions, mm, arena frame; a row with NaN does not count.
+        hold_s: (n,) duration of each, s.
+        low_mm: (2,) the rectangle's smallest x and y, mm; it is extended to include all positions.
+        high_mm: (2,) its largest x and y, mm.
         sd_mm: standard deviation of the kernel, mm; 0 for plain counting.
     """
     from scipy.ndimage import gaussian_filter

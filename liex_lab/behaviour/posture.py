@@ -2,10 +2,10 @@
 
 Heading = atan2(dy, dx) and pitch = atan2(dz, hypot(dx, dy)) of the body's axis; the bend is the sum
 of the signed turning angles at the inner joints (total curvature of the discrete midline). It is
-measured in the animal's own frontal plane: the one through its axis and the horizontal, as if it
-did not roll. Positive bends are towards the animal's left. What "the bend of a body" is differs
-between publications by a factor of two and more; here it is the whole turn from the direction of
-the front bone to that of the rear one.
+measured in the animal's frontal plane, through its axis and the horizontal, as if it did not roll.
+Positive bends are towards the animal's left. Definitions of body bend differ between publications
+by a factor of two and more; here it is the whole turn from the direction of the front bone to that
+of the rear one.
 """
 
 from __future__ import annotations
@@ -20,16 +20,16 @@ Array = NDArray[np.float64]
 
 
 def posture(body: BodyAxis, xyz: Array, sd: Array) -> dict[str, Array]:
-    """What each of n frames shows by itself; errors of the joints of one frame count as one.
+    """Measures of n single frames; joint errors of one frame are treated as one common error.
 
     Args:
-        body: which joint plays which part.
+        body: the roles of the joints.
         xyz: (n, J, 3) joints in the arena frame, mm.
         sd: (n, J) their standard deviation along an axis, mm.
 
     Returns:
         Columns of the table `kinematics`, (n,); `centre` (n, 3) and `centre_sd` (n,) of the body,
-        mm; of a body that swims also `rear_sd`, that of the chain's rear end, mm.
+            mm; for a swimming body also `rear_sd`, that of the chain's rear end, mm.
     """
     chain, trunk, (start, stop) = list(body.spine), list(body.trunk), body.axis
     spine = xyz[:, chain]
@@ -49,7 +49,7 @@ def posture(body: BodyAxis, xyz: Array, sd: Array) -> dict[str, Array]:
         "body_pitch_rad": np.arctan2(axis[:, 2], reach),
         "body_pitch_sd_rad": axis_sd / _positive(size),
         "heading_rad": np.arctan2(axis[:, 1], axis[:, 0]),
-        # at most that of a direction that is not known at all (uniform on the circle)
+        # at most that of an unknown direction (uniform on the circle)
         "heading_sd_rad": np.minimum(axis_sd / _positive(reach), np.pi / np.sqrt(3.0)),
         "length_mm": length,
         "straightness": np.linalg.norm(spine[:, 0] - spine[:, -1], axis=1) / _positive(length),
@@ -83,17 +83,17 @@ def posture(body: BodyAxis, xyz: Array, sd: Array) -> dict[str, Array]:
 def _turns(spine: Array, dorsal: Array) -> Array:
     """(n, K - 2) turn at each inner joint of chains (n, K, 3), front to rear, rad.
 
-    Positive to the left, in the plane across the vectors `dorsal` (n, 3) out of the back.
+    Positive to the left, in the plane perpendicular to the vectors `dorsal` (n, 3) out of the back.
     """
     bones = np.diff(spine, axis=1)
     a, b = bones[:, :-1], bones[:, 1:]
-    # the bones point backwards: a chain whose tail is on its left turns clockwise to its rear
+    # the bones point backwards: a chain with its tail on the left turns clockwise to its rear
     across = -np.einsum("nki,ni->nk", np.cross(a, b), dorsal)
     return np.asarray(np.arctan2(across, np.einsum("nki,nki->nk", a, b)))
 
 
 def _stretched(limb: Array) -> Array:
-    """(n,) how far limbs (n, K, 3) are stretched out: 1 is straight."""
+    """(n,) extension of limbs (n, K, 3): 1 is straight."""
     bones = np.linalg.norm(np.diff(limb, axis=1), axis=2).sum(axis=1)
     return np.asarray(np.linalg.norm(limb[:, -1] - limb[:, 0], axis=1) / bones)
 
@@ -108,11 +108,11 @@ def _positive(values: Array) -> Array:
 # length and 2 sd); their times are refined by the parabola through three samples. Bends and beats
 # are counted as in ZebraZoom (Mirat et al. 2013).
 
-SLOWEST_HZ = 1.0  # a slower swing to and fro is a turn of the body and no beat
-# of the frame rate: a faster beat may be another one seen through the camera's shutter
+SLOWEST_HZ = 1.0  # a slower swing is a turn of the body
+# of the frame rate: a faster beat may be an alias of another one
 TRUSTED_SHARE = 0.25
-_LEAST_SHARE = 0.05  # of the body's length: a smaller swing is none
-_LEAST_SD = 2.0  # nor is one of fewer standard deviations
+_LEAST_SHARE = 0.05  # least swing, of the body's length
+_LEAST_SD = 2.0  # least swing, in standard deviations
 
 
 def tail_beat(
@@ -122,13 +122,13 @@ def tail_beat(
 
     A swing lasts from one turning point to the next; frequency = 1 / (2 x its time). A swing slower
     than `SLOWEST_HZ` is left empty, and so are one faster than a quarter of the frame rate
-    (`TRUSTED_SHARE`) and its neighbours, for bends may be missing.
+    (`TRUSTED_SHARE`) and its neighbours, because bends may be missing.
 
     Args:
-        shape: the `posture` of n frames of a body that swims.
+        shape: the `posture` of n frames of a swimming body.
         time_s: (n,) times of the frames, s.
         number: (n,) unbroken stretch of each frame, see `segments`.
-        step_s: the usual time from frame to frame, s; 0 gives an empty beat.
+        step_s: the median time between frames, s; 0 gives an empty beat.
 
     Returns:
         The columns tail_extreme_rad, tail_beat_hz and tail_beat_mm, (n,).
@@ -147,7 +147,7 @@ def tail_beat(
             continue
         gap = np.diff(time_s[rows])
         near = np.minimum(np.append(np.inf, gap), np.append(gap, np.inf)) < 0.5 / SLOWEST_HZ
-        rows = rows[near]  # a lone turning point lies in the rest between two bouts of swimming
+        rows = rows[near]  # a lone turning point is in a rest between two bouts
         extreme[rows] = shape["tail_angle_rad"][rows]
         at = vertex_times(time_s, swing, rows, start, stop)
         frequency = 0.5 / np.maximum(np.diff(at), 1e-9)
@@ -160,10 +160,10 @@ def tail_beat(
 
 
 def turning_points(values: Array, least: float) -> NDArray[np.int64]:
-    """Rows where a series turns back by `least` or more, after having come by as much.
+    """Rows where a series reverses by `least` or more, after a change of at least that size.
 
-    A peak detector with hysteresis: highs and lows alternate. The first one counts only if the
-    series came by `least` before it.
+    A peak detector with hysteresis: maxima and minima alternate. The first one counts only if the
+    series changed by `least` before it.
 
     Args:
         values: (n,) the series, without NaN.
@@ -188,7 +188,7 @@ def turning_points(values: Array, least: float) -> NDArray[np.int64]:
             high = k
     if (
         found and np.ptp(values[: found[0] + 1]) < least
-    ):  # only where the tail lay before it began to swing
+    ):  # only the tail's position before its first swing
         found = found[1:]
     return np.array(found, np.int64)
 
@@ -200,7 +200,7 @@ def vertex_times(
 
     Args:
         time_s: (n,) times of the frames, s.
-        values: (n,) the series that turns.
+        values: (n,) the series.
         rows: (k,) int64 rows of the turning points.
         start: first row of the stretch.
         stop: row after the last of the stretch; a point at either end keeps its frame's time.

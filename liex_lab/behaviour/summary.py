@@ -1,6 +1,6 @@
-"""All behaviour tables of one animal, and the summary: the one row that a biologist reads first.
+"""All behaviour tables of one animal, and the summary: one row with the main results.
 
-Glue over `kinematics`, `bouts`, `measures`, `transitions`, `activity` and `places`; the summary
+Combines `kinematics`, `bouts`, `measures`, `activity` (with transitions) and `places`; the summary
 adds distance, speeds, turn bias, time budget (count, time, share, rate and latency of each action,
 and of all rears together) and times in zones. Shares are of the observed time, and count observed
 frames only.
@@ -51,10 +51,10 @@ class Behaviour:
         bouts: one row per bout, with its measures.
         summary: one row.
         transitions: one row per ordered pair of different actions.
-        activity: one row per bin of time.
+        activity: one row per time bin.
         zones: one row per zone.
-        rules: the thresholds that were used.
-        vocabulary: what decides which columns there are.
+        rules: the thresholds.
+        vocabulary: determines the columns.
         actions: word of the ethogram -> its definition.
     """
 
@@ -74,7 +74,7 @@ class Behaviour:
         return {name: getattr(self, name) for name in BEHAVIOUR}
 
     def for_session(self) -> dict[str, Any]:
-        """The arguments that hand it to a session: `writer.close(**behaviour.for_session())`."""
+        """The arguments for closing a session: `writer.close(**behaviour.for_session())`."""
         return {
             "results": self.tables,
             "columns": self.vocabulary.columns,
@@ -95,8 +95,8 @@ def moving(
     Args:
         frames: the table `frames`.
         poses: the table `poses` of these frames, or its joints.
-        rules: window of the speed, and from where on it is impossible.
-        around: the water's surface, and where nothing is measured across.
+        rules: window of the speed, and the impossible speed.
+        around: the water's surface, and the seams.
         allocate: makes the arrays of the table (an allocator, as `np.empty`).
     """
     return kinematics(
@@ -127,14 +127,14 @@ def measure(
     Args:
         frames: the table `frames`.
         poses: the table `poses` of these frames, or its joints.
-        rules: the thresholds; None takes the defaults.
+        rules: the thresholds; None uses the defaults.
         around: arena, zones and water; None if unknown.
         gaps: the table `gaps`; None if absent.
-        bouts: an ethogram by a model or a person (the columns of `tables.BOUTS`); None takes the
-            rules'.
-        actions: its vocabulary, word -> definition; None takes the rules'. Words that occur in no
-            vocabulary are added without a definition.
-        moved: the table `kinematics` of these poses, where it is made already, see `moving`.
+        bouts: an ethogram by a model or a person (the columns of `tables.BOUTS`); None applies the
+            rules.
+        actions: its vocabulary, word -> definition; None uses that of the rules. Missing words are
+            added without a definition.
+        moved: the table `kinematics` of these poses, if already computed, see `moving`.
         allocate: makes the arrays of the table `kinematics` (an allocator, as `np.empty`).
     """
     rules = rules or MouseRules()
@@ -167,8 +167,8 @@ def measure_rows(
     """`measure` of a track that is not in a session yet.
 
     Args:
-        rows: the track with its frame counts and names.
-        rules: the thresholds; None takes the defaults.
+        rows: the track with its frame indices and names.
+        rules: the thresholds; None uses the defaults.
         around: arena, zones and water; None if unknown.
         **how: bouts, actions, moved and allocate of `measure`.
     """
@@ -182,13 +182,13 @@ def moving_rows(
     """The table `kinematics` of a track that is not in a session yet, see `moving`.
 
     Args:
-        rows: the track with its frame counts and names.
-        rules: window of the speed, and from where on it is impossible.
+        rows: the track with its frame indices and names.
+        rules: window of the speed, and the impossible speed.
         around: the water's surface.
         allocate: makes the arrays of the table (an allocator, as `np.empty`).
     """
     times_ns = rows.track.times_ns
-    frames = pd.DataFrame(  # no more than is needed: the whole table is made once names are known
+    frames = pd.DataFrame(  # only what is needed: the whole table is made once names are known
         {
             "session_id": rows.session_id,
             "individual": rows.individual,
@@ -201,10 +201,9 @@ def moving_rows(
 
 
 def stated_by(session: SessionTables) -> tuple[MouseRules, Surroundings]:
-    """The thresholds and the surroundings that a session states.
+    """The thresholds and the surroundings of a session.
 
-    Args:
-        session: an opened session; thresholds that its session.json lacks are the defaults.
+    Thresholds missing from its session.json are the defaults.
     """
     about = session.metadata
     known = about.get("rules") or {}
@@ -220,11 +219,9 @@ def stated_by(session: SessionTables) -> tuple[MouseRules, Surroundings]:
 
 
 def measure_session(session: SessionTables, rules: MouseRules | None = None) -> Behaviour:
-    """The behaviour tables of a session, from its folder alone, with its own ethogram.
+    """The behaviour tables of a session, from its folder, with its own ethogram.
 
-    Args:
-        session: an opened session.
-        rules: the thresholds; None takes those that the session states.
+    Without `rules`, the session's own thresholds are used.
     """
     stated, around = stated_by(session)
     poses = session.table("poses", ["frame_index", "joint", "x_mm", "y_mm", "z_mm", "sd_mm"])
@@ -255,13 +252,10 @@ def summarise(
         frames: the table `frames`.
         kinematics: the table `kinematics`.
         bouts: the table `bouts` with its measures.
-        words: actions, zones and the kind of body; None takes the rules' actions of a
-            walking animal.
+        words: actions, zones and the kind of body; None means the rules' actions of a walking
+            animal.
         around: arena, zones and water; None if unknown.
-        rules: what is slower than their pause does not move for certain; None takes the defaults.
-
-    Returns:
-        The columns of the table `summary`.
+        rules: speeds below their pause threshold do not count as movement; None uses the defaults.
     """
     words = words or Vocabulary(ACTIONS)
     around = around or Surroundings()
@@ -295,7 +289,7 @@ def summarise(
 
 
 def _motion(kinematics: pd.DataFrame, hold: Array) -> dict[str, float]:
-    """How far, how fast, how it turned."""
+    """Distance, speeds and turning."""
     speed, step = (kinematics[name].to_numpy(float) for name in ("speed_mm_s", "step_mm"))
     known = np.isfinite(speed)
     distance = float(np.nansum(step))
@@ -319,7 +313,7 @@ def _motion(kinematics: pd.DataFrame, hold: Array) -> dict[str, float]:
 def _budget(
     kinematics: pd.DataFrame, bouts: pd.DataFrame, words: Sequence[str], first_s: float
 ) -> dict[str, float]:
-    """Time, number and latency of each action, and the time that has no name."""
+    """Time, number and latency of each action, and the unlabelled time."""
     spent = time_named(kinematics, bouts, words)[0]
     observed_s = float(spent.sum())
     share = spent / observed_s if observed_s > 0 else np.full(len(spent), np.nan)
