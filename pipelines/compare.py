@@ -1,8 +1,9 @@
-"""Group comparison of a cohort, `liex compare`: sessions in, tests between groups out as tables.
+"""Group comparison of a cohort, `liex compare`: reads sessions, writes tests between groups as
+tables.
 
-Each measure and pair of groups is tested by a permutation test or a mixed model over the units that
-were assigned to a group, with false discovery rates over the whole table (see `behaviour.cohort`).
-Every session of a study is accounted for: compared, or why it is not.
+A permutation test or a mixed model tests each measure and pair of groups over the units that were
+assigned to a group, with false discovery rates over the whole table (see `behaviour.cohort`). Every
+session of a study is accounted for: it is compared, or the reason why not is given.
 """
 
 from __future__ import annotations
@@ -41,9 +42,9 @@ from liex_lab.tables.schema import dictionary, from_pandas, write_table
 
 from .study.status import misnamed
 
-# copies of a session that another one has taken the place of, or will take
+# copies of a session that were, or are about to be, replaced
 _SET_ASIDE = re.compile(r"\.(?:outdated(?:-\d+)?|old|part)[/\\]")
-_OBSERVED_SHARES = 8  # from this schema on, shares are of the observed frames
+_OBSERVED_SHARES = 8  # since this schema version shares are of the observed frames
 
 
 def compare_sessions(
@@ -60,31 +61,31 @@ def compare_sessions(
     """Compare the groups of all sessions in the given folders and write the tables.
 
     Writes stats.parquet, stats.csv, sessions.csv, columns.json, results.txt, methods.txt and
-    comparison.json, which says where the sessions are.
+    comparison.json, which lists the sessions' folders.
 
     Args:
-        places: study files, session folders, or folders with sessions anywhere in them.
-        out: folder of the tables; it is made where it is missing.
-        measures: columns of the summary; () takes the usual ones and every action's share.
+        places: study files, session folders, or folders with sessions at any depth.
+        out: folder of the tables; it is created if missing.
+        measures: columns of the summary; () uses the default ones and every action's share.
         reference: compare with this group only; None compares all pairs.
-        animals: a CSV with `subject_id` and any of group, cage, sex, batch, which overrules what
-            the sessions say.
+        animals: a CSV with `subject_id` and any of group, cage, sex, batch, which overrides the
+            sessions' values.
         engine: `auto`, `permutation` or `mixed`.
-        only_trusted: leave out sessions that someone has to look at.
-        progress: accounted session by session.
+        only_trusted: leave out sessions that need review.
+        progress: called session by session.
 
     Returns:
-        `stats`: the table's rows; `folder`: where the files are; `sessions`: a sentence that
-        accounts for every session; `check`: sentences on what may be wrong.
+        `stats`: the table's rows; `folder`: of the files; `sessions`: a sentence that accounts for
+            every session; `check`: sentences on possible errors.
 
     Raises:
-        SessionError: there are no two groups, one recording counts for two animals, or a folder,
-            column, engine or CSV cannot be used.
+        SessionError: there are no two groups, two sessions of one recording state different
+            animals, or a folder, column, engine or CSV cannot be used.
     """
     if engine not in ENGINES:
         raise SessionError(f"the engine is one of {', '.join(ENGINES)}, got '{engine}'")
     entries, check = account(places)
-    left = {one.key: one.state for one in entries if one.folder is None}  # and why
+    left = {one.key: one.state for one in entries if one.folder is None}  # and the reason
     if only_trusted:
         left |= {one.key: "left out, look at it" for one in entries if one.state == LOOK_AT_IT}
     sessions: dict[str, Session] = {}
@@ -150,7 +151,9 @@ def compare_sessions(
 
 
 def _counted_otherwise(sessions: Mapping[str, Session]) -> list[str]:
-    """That some sessions count shares in another way than the others, as a sentence."""
+    """A sentence on sessions of an earlier schema that compute shares differently; [] if none or
+    all do.
+    """
     old = [k for k, one in sessions.items() if one.metadata["schema_version"] < _OBSERVED_SHARES]
     if len(old) in (0, len(sessions)):
         return []
@@ -162,7 +165,7 @@ def _counted_otherwise(sessions: Mapping[str, Session]) -> list[str]:
 
 
 def _in_words(entries: Sequence[Entry], left: Mapping[str, str]) -> str:
-    """How many sessions there are, how many are compared, and the state of each other one."""
+    """How many sessions there are, how many are compared, and the state of each remaining one."""
     n = len(entries)
     states = (f"{one.key} {left.get(one.key, one.state)}" for one in entries)
     others = "; ".join(state for state in states if not state.endswith(" done"))
@@ -171,17 +174,17 @@ def _in_words(entries: Sequence[Entry], left: Mapping[str, str]) -> str:
 
 
 def account(places: Sequence[str | Path]) -> tuple[list[Entry], list[str]]:
-    """Every session in the folders, with its state; of a study those that were not measured, too.
+    """List every session in the folders with its state, including unmeasured sessions of a study.
 
     Args:
-        places: study files, session folders, or folders with sessions anywhere in them.
+        places: study files, session folders, or folders with sessions at any depth.
 
     Returns:
-        The sessions, those that can be compared with their folders; and what the study file says
-        of its animals that may be wrong.
+        The sessions, with a folder if they can be compared; and possible errors in the study's
+        animals.
 
     Raises:
-        SessionError: one is no folder, or has no session in it.
+        SessionError: a path is not a folder, or contains no session.
     """
     found: dict[Path, Entry] = {}
     check: list[str] = []
@@ -206,7 +209,7 @@ def account(places: Sequence[str | Path]) -> tuple[list[Entry], list[str]]:
 
 
 def _state_of(folder: Path, key: str, exclude: str = "") -> Entry:
-    """A session by what lies in its folder."""
+    """A session's state from the files in its folder."""
     if exclude or not (folder / "session.json").is_file():
         failed = "failed" if read_failure(folder) else "not measured"
         return Entry(key, "excluded" if exclude else failed)
@@ -219,7 +222,9 @@ def _state_of(folder: Path, key: str, exclude: str = "") -> Entry:
 
 
 def _study_of(place: Path) -> Study | None:
-    """The study that a file holds, or whose results lie in or around a folder; None for none."""
+    """The study of a file, or the one whose results are in or around a folder; None if there is
+    none.
+    """
     if place.is_file():
         return Study.load(place)
     here = place.resolve()
@@ -233,7 +238,7 @@ def _study_of(place: Path) -> Study | None:
 
 
 def find_copies(sessions: Mapping[str, Session]) -> dict[str, str]:
-    """Sessions of a recording that has another one, by input or by all they measured, and which.
+    """Sessions that duplicate another one, by input or by all measures, with the name of the other.
 
     Args:
         sessions: opened sessions by name.
@@ -265,13 +270,13 @@ def find_copies(sessions: Mapping[str, Session]) -> dict[str, str]:
 def find_sessions(places: Sequence[str | Path]) -> list[Path]:
     """Every session in the folders, each once, in order of their paths.
 
-    Folders inside a session, such as its older tables, are no sessions.
+    Folders inside a session, such as its backups, are not sessions.
 
     Args:
-        places: session folders, or folders with sessions anywhere in them.
+        places: session folders, or folders with sessions at any depth.
 
     Raises:
-        SessionError: one is no folder, or has no session in it.
+        SessionError: a path is not a folder, or contains no session.
     """
     found: set[Path] = set()
     for place in map(Path, places):
@@ -288,7 +293,7 @@ def find_sessions(places: Sequence[str | Path]) -> list[Path]:
 
 
 def _overruled(table: pd.DataFrame, path: Path) -> pd.DataFrame:
-    """The table with group, cage, sex and batch as a CSV of the animals states them."""
+    """The table with group, cage, sex and batch overridden by a CSV of the animals."""
     try:
         stated = read_texts(path)
     except (OSError, ValueError) as error:

@@ -1,10 +1,10 @@
-"""Ahead-of-time compilation of the kernels that a plan needs, side by side, once on a machine.
+"""Ahead-of-time compilation of the kernels that a plan needs, in parallel, once per machine.
 
-numba compiles a kernel when it is called for the first time, one kernel after another. Which
-kernels a run calls, and with arguments of which types, is known beforehand: `kernels.json` lists
-them (`python -m tests.kernels` makes it anew). Before the first run processes compile them side by
-side into numba's cache on disk, where the run finds them. What the list does not hold is compiled
-when it is called, as ever; so a list that is out of date costs time and nothing else.
+numba compiles a kernel at its first call, one kernel after another. The kernels that a run calls,
+and their argument types, are known beforehand: `kernels.json` lists them (regenerate it with
+`python -m tests.kernels`). Before the first run, parallel processes compile them into numba's cache
+on disk, where the run finds them. Kernels that are not listed are compiled when called, as usual,
+so an outdated list only costs time.
 """
 
 from __future__ import annotations
@@ -36,12 +36,12 @@ def compile_ahead(animal: str, progress: Progress = silent) -> bool:
     """Compile the kernels that a run on an animal calls, unless this machine has done so before.
 
     Args:
-        animal: name of the skeleton; for one that is not listed nothing is done.
-        progress: told how many kernels are ready.
+        animal: name of the skeleton; nothing is compiled for one that is not listed.
+        progress: called with the number of compiled kernels.
 
     Returns:
-        Whether all were compiled. Nothing is on a single core, and where numba is told not to
-        compile.
+        Whether all were compiled now; False if that is done already, on a single core, or if
+        numba's compilation is off.
     """
     import numba
 
@@ -60,7 +60,7 @@ def compile_ahead(animal: str, progress: Progress = silent) -> bool:
     ready: list[None] = []
 
     def tell() -> None:
-        """One more kernel is there."""
+        """Report one more compiled kernel."""
         ready.append(None)
         progress(len(ready), len(rows), COMPILING)
 
@@ -73,7 +73,7 @@ def compile_ahead(animal: str, progress: Progress = silent) -> bool:
 
 
 def _shares(costs: Sequence[float], n: int) -> list[list[int]]:
-    """Rows in n shares that take about as long: the longest first, to who has least to do."""
+    """Rows in n shares of about equal duration: the longest first, each to the shortest share."""
     shares: list[list[int]] = [[] for _ in range(n)]
     spent = [0.0] * n
     for row in sorted(range(len(costs)), key=lambda row: -costs[row]):
@@ -86,8 +86,8 @@ def _shares(costs: Sequence[float], n: int) -> list[list[int]]:
 class _Compilers:
     """Processes that compile the rows of a list, each its share.
 
-    They are started by their own command, and not by `multiprocessing`, which would run the script
-    of somebody who calls `run_session` in it once more in each of them.
+    They are started with their own command instead of `multiprocessing`, which would run the main
+    script of a caller of `run_session` again in each of them.
     """
 
     def __init__(self, animal: str, shares: Sequence[Sequence[int]]) -> None:
@@ -95,7 +95,7 @@ class _Compilers:
         self._running: list[subprocess.Popen[str]] = []
 
     def run(self, tell: Callable[[], None]) -> bool:
-        """Wait until all are done; whether all ended well.
+        """Wait until all are done; returns whether all succeeded.
 
         Args:
             tell: called after each kernel.
@@ -111,21 +111,21 @@ class _Compilers:
                 try:
                     return all(list(listeners.map(lambda one: _listen(one, tell), self._running)))
                 finally:
-                    self._end()  # before the listeners are waited for
-        except OSError:  # too little memory or too many processes: the run compiles what it calls
+                    self._end()  # before waiting for the listeners
+        except OSError:  # too little memory or too many processes: the run compiles on call
             return False
         finally:
             self._end()
 
     def _end(self) -> None:
-        """End those that still run; the others do not mind."""
+        """Kill the processes that still run."""
         for one in self._running:
             one.kill()
             one.wait()
 
 
 def _listen(process: subprocess.Popen[str], tell: Callable[[], None]) -> bool:
-    """Pass on each line of a process; whether it ended well."""
+    """Call `tell` for each line of a process; returns whether it succeeded."""
     assert process.stdout is not None
     with process.stdout as lines:
         for _ in lines:
@@ -141,19 +141,17 @@ def listed_kernels(animal: str) -> Sequence[Mapping[str, Any]]:
         animal: name of the skeleton.
 
     Returns:
-        For each `kernel` ("module:name"), `args` (types, see `type_of`) and `cpu_s`, what it took
-        to compile where the list was made; () for an animal that is not listed.
+        For each `kernel` ("module:name"), `args` (types, see `type_of`) and `cpu_s`, its compile
+        time when the list was made; () for an animal that is not listed.
     """
     if not KERNELS.is_file():
-        return ()  # while it is being made
+        return ()  # while it is being generated
     return tuple(json.loads(KERNELS.read_text(encoding="utf-8"))["animals"].get(animal, ()))
 
 
 def compile_kernel(row: Mapping[str, Any]) -> None:
-    """Compile one kernel into numba's cache; nothing where it is there, or is called otherwise now.
-
-    Args:
-        row: of `listed_kernels`.
+    """Compile one kernel of `listed_kernels` into numba's cache, unless it is cached or has
+    changed.
     """
     from numba.core.errors import NumbaError
 
@@ -162,15 +160,11 @@ def compile_kernel(row: Mapping[str, Any]) -> None:
         kernel = getattr(importlib.import_module(module), name)
         kernel.compile(tuple(type_of(spelled) for spelled in row["args"]))
     except (ImportError, AttributeError, TypeError, ValueError, NumbaError):
-        return  # the list is out of date; the run compiles the kernel as it calls it
+        return  # the list is outdated; the run compiles the kernel on call
 
 
 def type_of(spelled: Any) -> Any:
-    """The type in numba of an argument as `spelling` writes it.
-
-    Args:
-        spelled: text of a number's type, or a table.
-    """
+    """The numba type of an argument from its `spelling`, a number's type name or a table."""
     types = _numba_types()
     if isinstance(spelled, str):
         return types.none if spelled == "none" else getattr(types, _NUMBERS.get(spelled, spelled))
@@ -190,19 +184,18 @@ _NUMBERS = {"bool": "boolean"}
 
 
 def _numba_types() -> Any:
-    """The module of numba's types; its stubs know half of them."""
+    """The module of numba's types; its stubs are incomplete."""
     return importlib.import_module("numba.core.types")
 
 
 def spelling(kind: Any) -> Any:
-    """How an argument's type is written in `kernels.json`.
+    """How `kernels.json` spells an argument's type.
 
     Args:
-        kind: numba's type: a number's, an array's, a tuple's, a NamedTuple's, None's or that of a
-            default.
+        kind: numba's type of a number, an array, a tuple, a NamedTuple, None or a default.
 
     Raises:
-        TypeError: it is of another kind, such as a function's.
+        TypeError: it is another kind, such as a function.
     """
     types = _numba_types()
     if isinstance(kind, types.Array):
@@ -223,7 +216,7 @@ def spelling(kind: Any) -> Any:
 
 
 def _mark(animal: str, rows: Sequence[Mapping[str, Any]]) -> Path | None:
-    """The file in numba's cache that says that it has been done; None where nothing is cached.
+    """The file in numba's cache that marks completion; None if nothing is cached.
 
     Its name changes with the program's sources, numba, and the processor.
     """
@@ -244,7 +237,7 @@ def _mark(animal: str, rows: Sequence[Mapping[str, Any]]) -> Path | None:
 
 
 def main() -> None:
-    """Compile the kernels of an animal whose numbers in the list the command names."""
+    """Compile kernels of an animal by their numbers in the list, both from the command line."""
     animal, *numbers = sys.argv[1:]
     for number in numbers:
         compile_kernel(listed_kernels(animal)[int(number)])

@@ -1,13 +1,14 @@
 """`liex convert`, any recording as MCAP or a folder of PNGs, and `liex pack`, its lossless archive.
 
-MCAP keeps every depth as it is. 16-bit images keep whole steps of a size, mm: the largest of some
-of which all depths of a few frames are multiples, or the nearest steps of a stated size.
+MCAP stores every depth unchanged. 16-bit images store whole steps of a size in mm: the largest
+candidate of which all depths of a few frames are multiples, or a stated size, to which depths are
+rounded.
 
-An archive holds ROS's compressedDepth messages (RVL, Wilson 2017) in chunks packed by Zstandard,
-which every verb reads like any recording, and ROS, too. Times, camera and the facts that tables
-depend on are kept. Of a still arena only its region is kept, if what is learned from it is exactly
-what is learned from whole frames; pixels outside of it become unread. The archive states the
-SHA-256 of its times and depth.
+An archive contains ROS's compressedDepth messages (RVL, Wilson 2017) in chunks compressed by
+Zstandard; every verb reads it like any recording, and so does ROS. It keeps times, camera and the
+facts that tables depend on. Of a still arena it keeps only the region, if exactly the same is
+learned from it as from whole frames; pixels outside become unread. The archive states the SHA-256
+of its times and depths.
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ if TYPE_CHECKING:
 
 _STEPS_MM = (1.0, 0.5, 0.25, 0.2, 0.1, 0.05, 0.025, 0.02, 0.01)
 _N_PROBED = 8
-# a name that ends like another kind of file is no folder's
+# a folder must not have the suffix of another kind of file
 _OTHER_KINDS = re.compile(
     r"\.(bag|db3|oni|dat|tar|gz|tgz|avi|mkv|mp4|png|tiff?|jpe?g|pgm|pclzf|ply|npy|npz|h5|nwb|rrd|zip|toml|csv|json)$",
     re.I,
@@ -54,12 +55,12 @@ _PICTURE = re.compile(r"frame_\d+\.png")
 
 @dataclass(frozen=True)
 class Converted:
-    """What was written.
+    """A recording that was written.
 
     Attributes:
-        path: the recording that was written.
+        path: of the recording.
         n_frames: its number of frames.
-        notes: sentences about what is not as it was.
+        notes: sentences about what changed.
         problems: of the recording that was read.
     """
 
@@ -83,23 +84,22 @@ def convert(
 ) -> Converted:
     """Write a recording as MCAP or a folder of PNG images.
 
-    The target has its name only when it is whole.
+    The target gets its name only once it is complete.
 
     Args:
-        recording: a path or address, or a recording that is open already.
+        recording: a path or address, or an open recording.
         to: NAME.mcap, or else a folder for PNG images.
-        camera: intrinsics that come before what the files state, as in `open_recording`.
+        camera: intrinsics that override the files', as in `open_recording`.
         fps: frame rate of recordings without stamps, as in `open_recording`.
         topic: depth topic of a message log, as in `open_recording`.
-        step_mm: mm for each step of 16-bit pictures; depths are rounded to it. None finds one that
-            keeps them.
+        step_mm: mm per step of 16-bit images, to which depths are rounded; None finds a lossless
+            one.
         ros: ROS 2 messages in the MCAP file instead of Foxglove's.
-        overwrite: replace a recording that is in its place.
-        progress: reports frame by frame.
+        overwrite: replace an existing recording.
+        progress: called frame by frame.
 
     Raises:
-        RecordingError: something is in its place, the depths do not fit, or the recording cannot be
-            opened.
+        RecordingError: the target exists, the depths do not fit, or the recording cannot be opened.
     """
     target = Path(to)
     _check_target(target, overwrite)
@@ -160,18 +160,20 @@ def _is_mcap(target: Path) -> bool:
 
 
 def largest_step(recording: Recording) -> float | None:
-    """The largest step, mm, of which the depths of a few frames are multiples; None if none is."""
+    """The largest step, mm, of which the depths of a few frames are multiples; None if there is
+    none.
+    """
     rows = np.unique(np.linspace(0, len(recording) - 1, _N_PROBED).round().astype(int))
     depths = [recording.frame(int(row)).depth for row in rows]
     for step in _STEPS_MM:
         if all(whole_steps(depth, step) is not None for depth in depths):
             return step
-    # a depth that 16 bits cannot reach is told by the writer, with its frame
+    # the writer reports a depth beyond 16 bits, with its frame
     return 1.0 if max(float(depth.max()) for depth in depths) > 65535.0 else None
 
 
 def _step(recording: Recording, target: Path) -> float:
-    """The step of a target's 16-bit pictures."""
+    """The step, mm, of a target's 16-bit images."""
     step = largest_step(recording)
     if step is not None:
         return step
@@ -183,7 +185,9 @@ def _step(recording: Recording, target: Path) -> float:
 
 
 def _check_target(target: Path, overwrite: bool) -> None:
-    """Refuse to write over what is there, and over anything but a recording at all."""
+    """Refuse targets of another kind, existing ones unless `overwrite`, and folders with other
+    files.
+    """
     if _OTHER_KINDS.search(target.name):
         raise RecordingError(
             f"{target.name} is no name of what can be written; give NAME.mcap, or a folder's "
@@ -223,11 +227,11 @@ def _written_here(path: Path) -> bool:
 
 @contextmanager
 def in_place(target: Path) -> Iterator[Path]:
-    """A name beside `target` to write under; what was written gets its own when the block ends, and
-    else is gone.
+    """Yield a temporary name next to `target`; rename it to `target` on success, remove it on
+    failure.
 
     Args:
-        target: the file or folder that is to be.
+        target: the file or folder to write.
 
     Raises:
         RecordingError: it cannot be written.
@@ -247,23 +251,23 @@ def in_place(target: Path) -> Iterator[Path]:
 
 Mask = NDArray[np.bool_]
 
-_WIDER = (0.0, 0.03, 0.1)  # of the picture's width: how much wider than found the region may be
+_WIDER = (0.0, 0.03, 0.1)  # margins that are tried around the found region, of the image's width
 
 
 @dataclass(frozen=True)
 class Packed:
-    """What became of a recording.
+    """Result of packing a recording.
 
     Attributes:
         path: the archive.
         n_frames: its frames.
         n_bytes: its size.
-        source_bytes: size of the recording that it was made of; 0 for one that is in no file.
-        kept: share of the pixels of a picture that are kept.
+        source_bytes: size of the source recording; 0 if it is not in a file.
+        kept: share of an image's pixels that are kept.
         verified: whether it was read again and compared.
-        written: whether it is new, not one that was only verified.
+        written: whether it is new, rather than an existing one that was verified.
         deleted: files that were removed.
-        notes: sentences about what was found.
+        notes: sentences about the result.
     """
 
     path: Path
@@ -288,24 +292,24 @@ def pack(
     overwrite: bool = False,
     progress: Progress = silent,
 ) -> Packed:
-    """Write the archive of a recording; it has its name only when it is whole.
+    """Write the archive of a recording; it gets its name only once it is complete.
 
-    With `verify`, an archive is held against the hash that it states instead.
+    With `verify`, an existing archive is checked against its stated hash instead.
 
     Args:
         recording: a path or address.
-        to: the archive, NAME.mcap; None: NAME.pack.mcap beside the recording.
-        plan: how the recording is opened, and what animal its arena is found by; its
-            `arena.region` is the region where it states one.
-        whole: keep whole pictures.
-        verify: read the archive again and compare every picture and time with the recording.
-        delete_original: remove the recording's file once that was done and nothing differs.
-        overwrite: replace a file that is in the archive's place.
-        progress: reports frame by frame.
+        to: the archive, NAME.mcap; None: NAME.pack.mcap next to the recording.
+        plan: how to open the recording, and the animal for finding the arena; its `arena.region`,
+            if stated, is the region.
+        whole: keep whole images.
+        verify: read the archive again and compare every image and time with the recording.
+        delete_original: remove the recording's file after a comparison without differences.
+        overwrite: replace an existing file.
+        progress: called frame by frame.
 
     Raises:
-        RecordingError: something is in its place, the depths do not fit, the recording cannot be
-            opened or is an archive already, or what was read again differs.
+        RecordingError: the target exists, the depths do not fit, the recording cannot be opened or
+            is an archive already, or the archive differs when read again.
     """
     with open_planned(recording, plan, progress) as opened:
         if "packed" in opened.metadata:
@@ -348,7 +352,7 @@ def pack(
 
 
 def _checked(path: str | Path, opened: Recording, progress: Progress) -> Packed:
-    """An archive, its times and pictures held against the hash that it states."""
+    """Check times and images of an archive against its stated hash."""
     stated = opened.metadata["packed"]
     digest = _hash_of(opened, progress)
     if digest != stated["depth_sha256"]:
@@ -363,7 +367,7 @@ def _checked(path: str | Path, opened: Recording, progress: Progress) -> Packed:
 def _target(
     recording: str | Path, to: str | Path | None, opened: Recording, overwrite: bool
 ) -> Path:
-    """Where the archive goes."""
+    """Path of the archive."""
     from liex_lab.recordings.formats.messages.statements import SUFFIX
 
     beside = Path(recording).parent if opened.sources else Path()
@@ -379,7 +383,7 @@ def _target(
 
 
 def _check_deletable(opened: Recording) -> None:
-    """Refuse to remove anything but the one file of a whole recording."""
+    """Refuse to remove anything but the only file of a complete recording."""
     if len(opened.sources) != 1 or opened.truncated:
         why = (
             "is cut or damaged"
@@ -401,9 +405,9 @@ def _region(
     corners: Corners,
     progress: Progress,
 ) -> tuple[Mask | None, list[str]]:
-    """The pixels to keep (H, W), None for all, and a note on why; those within corners, if stated.
+    """The pixels to keep (H, W), None for all, and a note on why; those within `corners` if given.
 
-    A region that was found is kept where the tracker learned from it is that of whole pictures.
+    A found region is kept if the tracker learned from it equals the one learned from whole images.
     """
     from liex_lab.recordings.frame import region_mask
 
@@ -449,14 +453,16 @@ def _region(
 
 
 def _stated(opened: Recording, plan: Plan) -> Corners:
-    """The corners (u, v) px of the plan's region in the recording's pictures; none without one."""
+    """The corners (u, v) px of the plan's region in the recording's images; () if it states
+    none.
+    """
     from .regions import stated_corners
 
     return () if plan.arena.region is None else stated_corners(opened, plan, plan.arena.region)
 
 
 def _found_region(tracker: FrameTracker, width: int, height: int) -> Mask | None:
-    """The pixels (H, W) that are looked at; None for all."""
+    """The pixels (H, W) in which the animal is searched for; None for all."""
     support_plane = getattr(tracker.scene, "support_plane", None)
     if support_plane is None or support_plane.region is None:
         return None
@@ -477,14 +483,14 @@ def _wider(mask: Mask, px: int) -> Mask:
 
 
 def _within(mask: Mask | None) -> Callable[[Depth], Depth]:
-    """What makes pixels outside of a mask unread."""
+    """A function that makes pixels outside a mask unread."""
     if mask is None:
         return lambda depth: depth
     return lambda depth: np.where(mask, depth, np.float32(0))
 
 
 def _alike(one: FrameTracker, other: FrameTracker) -> bool:
-    """Whether two trackers were learned alike, bit for bit."""
+    """Whether two trackers learned bit-identical values."""
     own = [field.name for field in fields(one) if field.name not in ("estimator", "scene", "body")]
     scene = [field.name for field in fields(one.scene) if field.name != "support_plane"]  # type: ignore[arg-type]
     pairs = [(getattr(one, name), getattr(other, name)) for name in own]
@@ -509,7 +515,7 @@ def _write(
     corners: Corners,
     progress: Progress,
 ) -> str:
-    """Write the archive; returns the hash that it states."""
+    """Write the archive; returns the hash of its times and depths."""
     from liex_lab.recordings.formats.messages.mcap_writer import McapDepthWriter
     from liex_lab.recordings.formats.messages.statements import PackFacts, hash_note
 
@@ -541,7 +547,7 @@ def _write(
 def _compare(
     opened: Recording, part: Path, mask: Mask | None, digest: str, progress: Progress
 ) -> None:
-    """Raise RecordingError where the archive differs from the recording."""
+    """Raise RecordingError if the archive differs from the recording."""
     within = _within(mask)
     with open_recording(part, strict=True) as packed:
         same = packed.metadata.get("packed", {}).get("depth_sha256") == digest

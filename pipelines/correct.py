@@ -1,8 +1,9 @@
-"""Corrections of a session by people, `liex correct`: kept in a log beside it, every table follows.
+"""Manual corrections of a session, `liex correct`: kept in a log, from which every table is
+derived.
 
-What was measured is never written again. The folder `corrected` holds an append-only log of
-flips, moved joints and edited bouts, and the tables that follow from those that stand; it is
-replaced as a whole by a rename, and the one before goes only when the new one is on disk.
+The original measurements are never overwritten. The folder `corrected` contains an append-only log
+of flips, moved joints and edited bouts, and the tables derived from the active ones; a rename
+replaces the folder as a whole, and its predecessor is removed only once the new one is on disk.
 """
 
 from __future__ import annotations
@@ -66,8 +67,8 @@ from .session import measure_behaviour
 Numbers = NDArray[np.int64]  # of rows
 
 _BUSY = ".correcting"
-_AS_BEFORE = ("kinematics", "zones")  # tables that edits of bouts do not change
-_HELD = 20.0  # how much more a joint that a person placed counts than one that may follow
+_AS_BEFORE = ("kinematics", "zones")  # tables that bout edits do not change
+_HELD = 20.0  # weight of a manually placed joint relative to one that may follow
 
 
 def correct_session(
@@ -80,19 +81,19 @@ def correct_session(
     report: ReportMaker | None = None,
     progress: Progress = silent,
 ) -> Path:
-    """Add corrections to a session and take others back; with neither, make everything again.
+    """Add corrections to a session and undo others; with neither, derive all tables again.
 
-    All at once or not at all. Corrections that were made on an earlier measurement of the recording
-    apply to this one from then on.
+    The change is atomic. Corrections made on an earlier measurement of the recording then apply to
+    this one.
 
     Args:
         session: the session folder.
         what: corrections to add.
-        undo: numbers of corrections to take back, or of the undo to take back (`Log.redoable`).
-        author: who corrects.
+        undo: numbers of corrections to undo, or of an undo to redo (`Log.redoable`).
+        author: author of the corrections.
         blueprint: makes the layout of the corrected replay, see `SessionWriter`.
         report: makes the report again, see `SessionWriter`; None leaves it.
-        progress: told the stage.
+        progress: called with the current stage.
 
     Returns:
         The session folder.
@@ -105,7 +106,7 @@ def correct_session(
     with locked(raw.path / _BUSY, f"{raw.path} is being corrected by another program"):
         folder = unlinked_tree(raw.path / FOLDER)
         aside = unlinked(raw.path / f"{FOLDER}.old")
-        put_back(folder, aside)  # somebody was killed here
+        put_back(folder, aside)  # a process may have been killed here
         made_of = basis(raw.path, raw.metadata)
         log = read_log(raw.path)
         if log.touched and log.made_of != made_of and (what or undo):
@@ -140,7 +141,7 @@ def correct_session(
 
 
 def _apply(raw: Session, log: Log, folder: Path, blueprint: BlueprintMaker | None) -> Log:
-    """Write the tables that differ from the session's own, and a replay to be shown with its own.
+    """Write the tables that differ from the session's, and a replay to overlay on the session's.
 
     Returns the log that lists them.
     """
@@ -170,7 +171,9 @@ def _apply(raw: Session, log: Log, folder: Path, blueprint: BlueprintMaker | Non
 
 
 def _describe(raw: Session, log: Log, folder: Path) -> Log:
-    """Write the table `sessions` with what people said of the animal; returns the log with it."""
+    """Write the table `sessions` with the animal's corrected description; returns the log with
+    it.
+    """
     path = folder / "sessions.parquet"
     table = pd.read_parquet(path) if path.is_file() else raw.table("sessions")
     said = {key: value for key, value in log.described.items() if key in table}
@@ -181,7 +184,7 @@ def _describe(raw: Session, log: Log, folder: Path) -> Log:
 
 
 def _told(log: Log) -> dict[str, Any]:
-    """The standing corrections in short for session.json: numbers by kind, authors, last time."""
+    """Summary of the active corrections for session.json: numbers by kind, authors, last time."""
     made = [(entry.what, entry.author) for entry in log.touched if entry.what is not None]
     kinds = {kind: sum(what.kind == kind for what, _ in made) for kind in ("flip", "joint", "bout")}
     return {
@@ -195,10 +198,10 @@ def _told(log: Log) -> dict[str, Any]:
 def _behaviour(
     raw: Session, log: Log, found: CorrectedTrack, results: Results
 ) -> tuple[Behaviour, dict[str, Any]]:
-    """The behaviour of the corrected track, and facts of it for session.json.
+    """The behaviour of the corrected track, and facts about it for session.json.
 
-    The ethogram is the session's own; where head and tail were exchanged it is named again; then
-    come the edits.
+    The ethogram is the session's own, recognised again where head and tail were exchanged, then
+    edited.
     """
     rules, around = stated_by(raw)
     count = frame_count(results.rows.frame_index)
@@ -222,12 +225,12 @@ def _behaviour(
 
 @dataclass(frozen=True)
 class CorrectedTrack:
-    """A track with the corrections of flips and joints in it.
+    """A track with its flips and joints corrected.
 
     Attributes:
         track: the corrected track.
-        turned: (k,) rows in which exchanging head and tail may have changed the pose.
-        moved: (m,) rows with joints that a person placed.
+        turned: (k,) rows whose pose may have changed by exchanging head and tail.
+        moved: (m,) rows with manually placed joints.
         flips: the rows of the table `flips`, frames counted by row.
     """
 
@@ -238,25 +241,25 @@ class CorrectedTrack:
 
     @property
     def seams(self) -> list[int]:
-        """Numbers at which an exchange of head and tail by a person begins or ends."""
+        """Rows at which a manual exchange of head and tail begins or ends."""
         return ends_of((flip.start, flip.stop) for flip in self.flips if flip.source == HUMAN)
 
     @property
     def changed(self) -> bool:
-        """Whether any pose is another one than was measured."""
+        """Whether any pose differs from the measured one."""
         return bool(len(self.turned) + len(self.moved))
 
 
 def corrected_track(session: Session, log: Log, skeleton: Skeleton) -> CorrectedTrack:
-    """Track of a session with the standing corrections of its log.
+    """Track of a session with the active corrections of its log.
 
     Args:
         session: the session, opened raw.
-        log: its corrections; bout edits are not looked at here.
+        log: its corrections; bout edits are ignored here.
         skeleton: the skeleton that the session was made with.
 
     Raises:
-        SessionError: the session holds no observations to make the track of again, or a joint was
+        SessionError: the session has no observations to rebuild the track from, or a joint was
             moved in a frame that has no pose.
     """
     track = track_of(session, skeleton)
@@ -278,7 +281,9 @@ def corrected_track(session: Session, log: Log, skeleton: Skeleton) -> Corrected
 
 
 def _moves_of(log: Log, skeleton: Skeleton) -> list[JointMove]:
-    """The standing moves; one whose frame was exchanged later is of the joint at the other end."""
+    """The active moves; a later exchange of its frame turns a move into one of the mirrored
+    joint.
+    """
     names = list(skeleton.names)
     moves: list[JointMove] = []
     for one in (entry.what for entry in log.standing):
@@ -297,18 +302,18 @@ def _moves_of(log: Log, skeleton: Skeleton) -> list[JointMove]:
 def _turned_round(
     session: Session, track: Track, index: Numbers, spans: Sequence[FlipSpan]
 ) -> tuple[Track, tuple[Flip, ...], Numbers]:
-    """The track made again from the observations, with the spans turned round.
+    """Rebuild the track from the observations with head and tail exchanged in the spans.
 
-    Rows outside of the spans keep what they had, except those within `MARGIN` of an end at which
-    the exchange agrees with its neighbour: there the curve was bent by the half turn that is gone.
-    No row loses its pose or its trust.
+    Rows outside the spans keep their values, except within `MARGIN` of an end at which the exchange
+    agrees with its neighbour: there the smoothed curve was bent by the half turn that is gone. No
+    row loses its pose or its trust.
     """
     seen, subject = read_evidence(session)
     rows_of_spans = (np.searchsorted(index, (one.start_frame, one.stop_frame)) for one in spans)
     wanted = [Flip(int(start), int(stop), 1.0, True, HUMAN) for start, stop in rows_of_spans]
     earlier = [
         flip for flip in read_flips(session) if flip.source == HUMAN
-    ]  # of versions that wrote into the table
+    ]  # from versions that wrote into the table
     again = track_whole(subject, seen, [*earlier, *wanted])
     ends = ends_of((flip.start, flip.stop) for flip in wanted)
     exchanged = np.cumsum(np.bincount(ends, minlength=len(index) + 1))[:-1] % 2 == 1
@@ -323,7 +328,7 @@ def _turned_round(
     lost = near & (
         (track.posed & ~again.track.posed)
         | (track.observed & ~again.track.observed)
-        | (exchanged & (np.einsum("nd,nd->n", was, now) > 0.0))  # passed by, and bridged as it was
+        | (exchanged & (np.einsum("nd,nd->n", was, now) > 0.0))  # ignored: bridged as before
     )
     trusted = near & (track.flag == "")
     for name in {*COLUMNS} - {"times_ns"}:
@@ -344,19 +349,19 @@ def _put(track: Track, rows: Numbers, pose: Pose, camera: Camera, T_arena_camera
 def place_joints(
     track: Track, index: Numbers, moves: Sequence[JointMove], camera: Camera, T_arena_camera: SE3
 ) -> Numbers:
-    """Put joints where a person says, in place, and let the others follow; returns changed rows.
+    """Move joints to manually chosen positions, in place, and let the others follow.
 
     Least-squares fit of the kinematic tree (inverse kinematics by Levenberg-Marquardt): bones keep
-    their lengths and joints their limits. The residual of a joint that a person placed counts 20
-    times that of the others, which stay as near as they can to where they were. The rows get the
+    their lengths and joints their limits. The residual of a manually placed joint counts 20 times
+    that of the others, which stay as near as possible to their former positions. The rows get the
     flag `corrected`.
 
     Args:
         track: the track, n rows, changed in place.
         index: (n,) the camera's frame count of each row, ascending.
-        moves: the joints that were placed, arena frame, mm.
+        moves: the placed joints, arena frame, mm.
         camera: the depth camera, for the pixels of the joints.
-        T_arena_camera: carries the camera frame into the arena frame.
+        T_arena_camera: maps the camera frame to the arena frame.
 
     Returns:
         (k,) rows that were changed.
@@ -398,10 +403,10 @@ def place_joints(
 def edited_bouts(
     bouts: pd.DataFrame, edits: Iterable[BoutEdit], frames: pd.DataFrame
 ) -> pd.DataFrame:
-    """Ethogram with a person's edits applied, one after the other.
+    """Ethogram with manual edits applied in order.
 
-    Each edit clears the bout that it edits, then its own span: a bout that reaches into the span
-    keeps what lies outside. What a person says has the source human, the score 1 and no model.
+    Each edit clears the bout that it edits, then its own span: a bout that overlaps the span keeps
+    the part outside. Edited bouts have the source human, the score 1 and no model.
 
     Args:
         bouts: the table `bouts` of the session.
@@ -425,13 +430,13 @@ def edited_bouts(
 def spliced_bouts(
     bouts: pd.DataFrame, other: pd.DataFrame, rows: Numbers, frames: pd.DataFrame
 ) -> pd.DataFrame:
-    """Ethogram that takes some rows of the recording from another ethogram.
+    """Ethogram with some rows of the recording taken from another ethogram.
 
-    One word across a seam is one bout.
+    The same action on both sides of a seam is one bout.
 
     Args:
-        bouts: the table `bouts` that holds everywhere else.
-        other: the table `bouts` that holds in `rows`.
+        bouts: the table `bouts` for all other rows.
+        other: the table `bouts` for `rows`.
         rows: (k,) rows of the recording, ascending, at least one.
         frames: the table `frames`, for the times of the rows.
 
@@ -459,7 +464,7 @@ def spliced_bouts(
 def _spans(bouts: pd.DataFrame, frames: pd.DataFrame) -> list[dict[str, Any]]:
     """Bouts as dicts with start and stop on the recording's clock, ns.
 
-    A time within 1 ns of a frame's is that frame's own.
+    A time within 1 ns of a frame's is set to the frame's.
     """
     times = frames["time_ns"].to_numpy(np.int64)
     rows: list[dict[str, Any]] = []
@@ -474,7 +479,7 @@ def _spans(bouts: pd.DataFrame, frames: pd.DataFrame) -> list[dict[str, Any]]:
 
 
 def _cleared(rows: list[dict[str, Any]], start_ns: int, stop_ns: int) -> list[dict[str, Any]]:
-    """Bouts without what lies within a span; a bout around it becomes two."""
+    """Bouts with a span removed; a bout around the span becomes two."""
     kept: list[dict[str, Any]] = []
     for row in rows:
         if stop_ns <= start_ns or row["stop_ns"] <= start_ns or row["start_ns"] >= stop_ns:
@@ -486,7 +491,7 @@ def _cleared(rows: list[dict[str, Any]], start_ns: int, stop_ns: int) -> list[di
 
 
 def _table(rows: Sequence[dict[str, Any]], frames: pd.DataFrame) -> pd.DataFrame:
-    """Bouts in order of time as the table `bouts`; a piece of a bout without a frame is dropped."""
+    """Bouts in order of time as the table `bouts`; pieces without a frame are dropped."""
     times = frames["time_ns"].to_numpy(np.int64)
     count = frame_count(frames["frame_index"].to_numpy(np.int64))
     first = int(times[0])

@@ -1,9 +1,9 @@
-"""Quality report of a recording, `liex doctor`: what is in it, and what to know before trusting it.
+"""Quality report of a recording, `liex doctor`: its contents, and problems that affect the results.
 
-Looks at stamps (rate, jitter, gaps, faults), camera and lens, depth range and
-unread pixels, in frames spread over the recording at floor, noise, arena, water and animal, and
-where asked at which plan fits, which alone needs models.
-`FINDINGS` lists every number with its unit; problems are sentences that say what to do.
+Checks time stamps (rate, jitter, gaps, faults), camera and lens, depth range and unread pixels; in
+frames spread over the recording, floor, noise, arena, water and animal; and optionally which plan
+fits, the only check that needs models. `FINDINGS` lists every number with its unit; problems are
+sentences that state what to do.
 """
 
 from __future__ import annotations
@@ -55,31 +55,31 @@ from .origin import animal_of, session_bytes
 from .regions import arenas_of, cut_out, propose_arenas, stated_corners
 
 _USUAL_HZ = 30.0
-_USUAL_FOCAL = 0.9  # of a picture's width: depth cameras see 55 to 65 degrees of it
+_USUAL_FOCAL = 0.9  # of the image's width: depth cameras have a field of view of 55 to 65 degrees
 _GUESS = ["camera.fx=1.0", "camera.fy=1.0", "camera.cx=0.0", "camera.cy=0.0"]
 
 
 def open_anyhow(
     path: str | Path, plan: Plan, progress: Progress = silent
 ) -> tuple[Recording, list[str]]:
-    """Open a recording, with a guess for what it leaves out.
+    """Open a recording, with guesses for missing camera or times.
 
     Args:
         path: a file, folder or address of a recording.
         plan: how it is opened.
-        progress: told while an archive is unpacked or an index made.
+        progress: called while an archive is unpacked or an index made.
 
     Returns:
-        The recording, and sentences that say what is missing and the lines to write.
+        The recording, and sentences that state what is missing and the lines to write.
 
     Raises:
-        RecordingError: there is nothing in it that can be read.
+        RecordingError: it contains nothing that can be read.
     """
     missing: list[str] = []
     guessed = plan
     pattern = None
     unknown_camera = False
-    for _ in range(4):  # each time one thing more is guessed
+    for _ in range(4):  # one more guess each time
         try:
             recording = open_planned(path, guessed, progress, pattern)
         except UnknownCameraError:
@@ -110,7 +110,7 @@ def open_anyhow(
 
 
 def _guess_camera(recording: Recording) -> str:
-    """Give the recording the likeliest camera for its pictures' size; returns what to write."""
+    """Set the likeliest camera for the recording's image size; returns what to write."""
     width = recording.width
     height = recording.height
     names = of_size(width, height)
@@ -138,15 +138,15 @@ def next_command(
     plan: str | None = None,
     options: Sequence[str] = (),
 ) -> str:
-    """What to type next; empty where no plan was looked for.
+    """The command to run next; empty if no plan was searched for.
 
     Args:
         path: the recording.
         proposal: which plan fits.
-        missing: what the files leave out, to be written first.
-        n_arenas: arenas that were seen in the picture, of which each is to be a session.
-        plan: the plan that was given, as it was typed; None where none was.
-        options: further options that were given and that a run takes, too.
+        missing: facts that the files lack, to be written first.
+        n_arenas: arenas found in the image, each a session of its own.
+        plan: the given plan, as typed; None if none was given.
+        options: further given options that a run accepts too.
     """
     if not proposal.says:
         return ""
@@ -165,10 +165,10 @@ def next_command(
 
 _TEXT = read_toml(Path(__file__).with_name("doctor.toml"))
 FINDINGS: Final[dict[str, str]] = _TEXT["findings"]  # key of the JSON: its meaning
-# frames looked at, spread over the recording; as many as a run learns its scene from
+# sampled frames, spread over the recording; as many as a run learns its scene from
 _N_SAMPLED = 96
 _N_RAW = 16
-# frames compared with the one before, and how many in a row of a recording that has more
+# frames compared with their predecessors, and the length of a window in a longer recording
 _N_COMPARED = 400
 _WINDOW = 8
 
@@ -184,22 +184,21 @@ def examine(
     typed: tuple[str | None, Sequence[str]] = (None, ()),
     progress: Progress = silent,
 ) -> dict[str, Any]:
-    """The findings of a recording: the keys of `FINDINGS`, in types that JSON can hold.
+    """The findings of a recording: the keys of `FINDINGS`, in JSON's types.
 
-    A recording that is cut short is looked at as far as it goes. One that does not say what camera
-    took it or when is looked at with a guess, and the lines that say it are told.
+    A recording that is cut short is inspected as far as it can be read. Missing camera or times are
+    guessed, and the report lists the lines that state them.
 
     Args:
         path: a file, folder or address of a recording.
-        plan: camera, water surface, expected sizes; None takes the default plan.
+        plan: camera, water surface, expected sizes; None uses the default plan.
         fps: frame rate of recordings without stamps, before the plan's.
         topic: depth topic of a message log, before the plan's.
-        propose: hold the bundled plans against the recording, which takes their models: the given
-            or the usual one first, and others only where it does not fit.
-        named: whether someone named the plan, who is told then if it does not fit.
-        typed: the plan as it was typed, None where none was, and further options that a run is to
-            have, too.
-        progress: told while an archive is unpacked or an index made.
+        propose: check which bundled plan fits, which needs their models: the given or the usual one
+            first, others only if it does not fit.
+        named: whether the user named the plan; if so, the report states when it does not fit.
+        typed: the plan as typed, None if there is none, and further options for the run.
+        progress: called while an archive is unpacked or an index made.
 
     Raises:
         RecordingError: the recording cannot be opened at all.
@@ -275,14 +274,14 @@ def examine(
 def _session_mb(
     seen: Recording, plan: Plan, length_mm: float | None, distance_mm: float | None
 ) -> float | None:
-    """What a session takes on disk, MB; None where no animal is found."""
+    """Size of a session on disk, MB; None if no animal is found."""
     if length_mm is None or distance_mm is None:
         return None
     return round(session_bytes(seen, plan, length_mm, distance_mm) / 1e6, 1)
 
 
 def _several(seen: Recording, plan: Plan, misplaced: list[str]) -> list[SeveralArenas]:
-    """The several arenas of a picture, listed or proposed; what is wrong with them is told."""
+    """Several arenas in an image, listed or proposed; errors in listed ones go to `misplaced`."""
     try:
         if plan.arenas is None:
             return propose_arenas(seen, plan)
@@ -297,7 +296,7 @@ def _several(seen: Recording, plan: Plan, misplaced: list[str]) -> list[SeveralA
 
 
 def _asked(plan: Plan, fps: float | None, topic: str | None) -> Plan:
-    """The plan with what the command line asks for; a recording that is cut short is accepted."""
+    """The plan with the command line's settings; a recording that is cut short is accepted."""
     settings = ["recording.accept_truncated=true"]
     settings += [f"recording.fps={fps!r}"] if fps is not None else []
     settings += [f"recording.topic={topic}"] if topic is not None else []
@@ -305,10 +304,11 @@ def _asked(plan: Plan, fps: float | None, topic: str | None) -> Plan:
 
 
 def _copies_told(recording: Recording, sample: NDArray[np.float32]) -> list[str]:
-    """Sentences on frames that repeat the depth image before them, of a long recording in windows
-    spread over it.
+    """Sentences on frames that repeat the depth image before them.
+
+    A long recording is compared in windows spread over it.
     """
-    if recording.format == "synthetic":  # rendered when asked for
+    if recording.format == "synthetic":  # rendered on demand
         return []
     n = len(recording)
     starts = [0] if n <= _N_COMPARED else sampled(n - _WINDOW, _N_COMPARED // _WINDOW).tolist()
@@ -340,7 +340,7 @@ def _time_facts(recording: Recording) -> dict[str, Any]:
 
 
 def _dropped(recording: Recording) -> list[Gap]:
-    """The gaps that the camera left while its clock went on."""
+    """The gaps in which the camera dropped frames while its clock continued."""
     return [gap for gap in recording.gaps if gap.reason == DROPPED]
 
 
@@ -369,10 +369,10 @@ def _time_problems(recording: Recording) -> list[str]:
 
 
 class _Depths:
-    """What the sampled frames hold, frame by frame so that memory does not grow."""
+    """Depth statistics of the sampled frames, one frame at a time to bound memory."""
 
     def __init__(self, frames: NDArray[np.float32]) -> None:
-        """Frames (n, H, W) mm as the camera gave them."""
+        """Frames (n, H, W) mm as recorded."""
         self.n_frames = len(frames)
         self.n_empty = 0
         self.low = math.inf
@@ -403,7 +403,7 @@ class _Depths:
         }
 
     def problems(self) -> list[str]:
-        """Sentences about what the depths themselves say."""
+        """Sentences about missing or implausible depths."""
         if self.median_mm is None:
             return [
                 f"none of the {self.n_frames} frames looked at holds any depth; check the camera "
@@ -425,14 +425,14 @@ class _Depths:
 
 
 def _finite(value: float) -> float | None:
-    """A number JSON can hold, or None."""
+    """The number, or None if JSON cannot represent it."""
     return float(value) if math.isfinite(value) else None
 
 
-# What `liex doctor` found, as lines for a person.
+# Findings of `liex doctor` as lines of text.
 
 
-# lines that decide whether a run makes sense
+# lines that determine whether a run makes sense
 _FIRST = ("frames", "rate", "gaps", "intrinsics from", "floor", "arena", "animal", "plan")
 
 
@@ -440,8 +440,8 @@ def print_report(findings: dict[str, Any], verbose: bool = True) -> None:
     """Print the findings on one screen, and the problems below.
 
     Args:
-        findings: what `examine` returns.
-        verbose: print every line, not only those that decide whether a run makes sense.
+        findings: from `examine`.
+        verbose: print every line, not only those that determine whether a run makes sense.
     """
     from rich.console import Console
     from rich.table import Table
@@ -467,11 +467,7 @@ def print_report(findings: dict[str, Any], verbose: bool = True) -> None:
 
 
 def lines(findings: dict[str, Any]) -> list[tuple[str, str]]:
-    """The findings as (name, text), in the order in which they are printed.
-
-    Args:
-        findings: what `examine` returns.
-    """
+    """The findings of `examine` as (name, text), in the order in which they are printed."""
     from jinja2 import Environment
 
     environment = Environment()  # nosec B701: plain text for a terminal

@@ -1,7 +1,8 @@
-"""What `liex doctor` sees in the pictures: floor plane, noise, arena, water, and the animal.
+"""Scene checks of `liex doctor` in the depth images: floor plane, noise, arena, water, and the
+animal.
 
-The floor is a plane fitted to the learned background, noise the 68.3 % quantile of differences
-between frames over sqrt(2), which holds whatever walks through; the animal is found by background
+The floor is a plane fitted to the learned background; noise is the 68.3 % quantile of differences
+between frames over sqrt(2), which moving objects hardly affect. The animal is found by background
 subtraction as in a run, or else among objects up to 20 times smaller or larger.
 """
 
@@ -29,11 +30,11 @@ from .regions import region_of, stated_floor
 if TYPE_CHECKING:
     from liex_lab.scene.background_segmenter import BackgroundSubtraction
 
-_LEVEL_RAD = math.radians(3.0)  # a tank's floor is as level as the water over it, to this
+_LEVEL_RAD = math.radians(3.0)  # largest angle between a tank's floor and its water surface
 _MUCH_UNREAD = 0.2  # share of the pixels on the floor
 _MUCH_NOISE = 0.5  # of the height from which a pixel counts as the animal
 _STILL_SHARE = 0.4  # of the animal's area was in the background
-# an animal whose size the plan does not allow is looked for down to and up to this factor
+# sizes outside the plan's range are searched down to and up to this factor
 _WIDER = 20.0
 
 KEYS = (
@@ -58,11 +59,11 @@ class SceneLook:
     Attributes:
         seen: the recording, rectified.
         plan: expected sizes, thresholds, zones.
-        water: the water surface; None without.
+        water: the water surface; None if there is none.
         sample: (n, H, W) float32 depth, mm, of every `stride`-th pixel.
-        stride: pixels of the picture for one of the sample, along an axis.
-        facts: numbers by the names of `KEYS`; None where they cannot be told.
-        problems: sentences that say what is wrong and what to do.
+        stride: image pixels per sample pixel, along an axis.
+        facts: numbers by the names of `KEYS`; None if unknown.
+        problems: sentences that state what is wrong and what to do.
     """
 
     seen: Recording
@@ -76,7 +77,7 @@ class SceneLook:
     _region: NDArray[np.bool_] | None = None
 
     def at_scene(self) -> None:
-        """Look at floor, noise, arena, water and animal; fills facts and problems."""
+        """Inspect floor, noise, arena, water and animal; fills facts and problems."""
         from liex_lab.scene.background import learn_background
 
         grid = self.seen.camera.every(self.stride)
@@ -176,8 +177,8 @@ class SceneLook:
             )
 
     def _at_animal(self, background: NDArray[np.float32]) -> None:
-        """Find the animal as a run would; where none of the plan's size is, look for one of another
-        size.
+        """Find the animal as a run would; if there is none of the plan's size, search other
+        sizes.
         """
         from liex_lab.scene.background import sampled
         from liex_lab.scene.background_segmenter import BackgroundSubtraction
@@ -213,7 +214,7 @@ class SceneLook:
                 self.facts["scene"] = scene.described().to_dict()
                 self.problems.extend(scene.doubts)
             elif scene.support_plane is not None and not scene.support_plane.moves:
-                continue  # a thing of another size that keeps still is a thing
+                continue  # a still object of another size is not an animal
             crops = scene.extract(sample, 1.0)
             length = 4.0 * float(np.median(crops.blobs.sd_along[crops.found]))
             if factor == 1.0:
@@ -267,10 +268,10 @@ class SceneLook:
 
 
 def _noise(sample: NDArray[np.float32], where: NDArray[np.bool_]) -> float | None:
-    """Standard deviation, mm, of pixels over the sample (n, H, W) mm; None if not known.
+    """Standard deviation, mm, of pixels over the sample (n, H, W) mm; None if unknown.
 
-    Two thirds of the differences are smaller than one standard deviation of theirs, whatever walks
-    through the others.
+    Two thirds of the differences are below one standard deviation of theirs, whatever moves through
+    the remaining third.
     """
     changes = [
         np.abs(after - before)[(before > 0) & (after > 0)]

@@ -175,7 +175,6 @@ def locate(heights, packed_camera, phase, settings, forest, used, place):
 
     Returns:
         The heading, rad.
-    --~ locate_all settings: the numbers of the votes. ==> settings: settings of the votes.
     """
     n_points = settings.n_points
     n_trees = forest.roots.size
@@ -223,7 +222,7 @@ def locate_all(heights, crop_cameras, image, phases, settings, forest, used, pla
         crop_cameras: (m, 17) packed crop cameras of the height maps.
         image: (n,) index of each sample's height map.
         phases: (n,) in [0, 1).
-        settings: the numbers of the votes.
+        settings: settings of the votes.
         forest: F1.
         used: (n, T) bool, the trees that vote.
         places: (n, 3) filled, mm, view frame.
@@ -256,8 +255,6 @@ def unfold(values, levers, place, heading, tree, rotations, positions):
 
     Returns:
         The scale of the bones.
-    --~ guess_all settings: the numbers of the votes. ==> settings: settings of the votes. found:
-    (n,) bool, where there is an animal. ==> found: (n,) bool, whether an animal was found.
     """
     twist = np.empty(7)
     for k in range(7):
@@ -287,8 +284,8 @@ def guess_all(heights, crop_cameras, found, settings, where, pose, levers, tree,
     Args:
         heights: (n, S, S) int16 height maps, 1/16 mm, 0 where there is no animal.
         crop_cameras: (n, 17) packed crop cameras of the height maps.
-        found: (n,) bool, where there is an animal.
-        settings: the numbers of the votes.
+        found: (n,) bool, whether an animal was found.
+        settings: settings of the votes.
         where: F1.
         pose: F2.
         levers: (D,) lever arms of F2's coordinates.

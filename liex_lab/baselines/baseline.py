@@ -1,14 +1,14 @@
 """Interface of the baselines: frames and a fitted segmenter in, the animal's joints per frame out.
 
-The ablation without the learned metric is here, too: the plain mean of all candidates,
+This module also has the ablation without the learned metric, the plain mean of all candidates,
 
     x_j = 1/K sum_k x_j^(k)        for each joint j over the K candidates.
 
-The one without multiple initial poses needs no code of its own: it is `PoseEstimator(model, 1,
-start_seed=k)`, which has one initial pose, drawn from the seed k.
+The ablation without multiple initial poses needs no code of its own: it is `PoseEstimator(model, 1,
+start_seed=k)`, with one initial pose drawn from the seed k.
 
-All baselines of Lie-X section 5.2 work on the product's own segmentation, so that only the pose
-estimation differs.
+All baselines of Lie-X section 5.2 use liex_lab's segmentation, so that only the pose estimation
+differs.
 """
 
 from __future__ import annotations

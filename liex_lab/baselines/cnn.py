@@ -18,10 +18,7 @@ square's side in mm maps to 0 or 255. Nearer is brighter; the background is 0. J
 unit: (right, down, nearer) from the square's centre at the animal's mean depth, in half sides of
 the square.
 
-torch is an optional dependency: `pip install '.[cnn]'` in the folder of liex_lab. --~ frames_of (n,
-5): picture pixel (u, v) of the square's centre, half the side in picture pixels, ==> (n, 5): image
-pixel (u, v) of the square's centre, half the side in image pixels, --~ patches_of 0 beside the
-animal. ==> 0 outside the animal.
+torch is an optional dependency: `pip install '.[cnn]'` in the folder of liex_lab.
 """
 
 from __future__ import annotations
@@ -63,7 +60,7 @@ def frames_of(heights: NDArray[np.int16], crop_cameras: Array) -> Array:
         crop_cameras: (n, 17) packed crop cameras of the height maps.
 
     Returns:
-        (n, 5): picture pixel (u, v) of the square's centre, half the side in picture pixels, the
+        (n, 5): image pixel (u, v) of the square's centre, half the side in image pixels, the
         animal's mean depth, mm, and half the side in mm at that depth.
     """
     n = len(crop_cameras)
@@ -84,7 +81,7 @@ def patches_of(
         frames: (n, 5) squares from `frames_of`.
 
     Returns:
-        (n, PATCH, PATCH) float32 brightness, 0 to 255; 0 beside the animal.
+        (n, PATCH, PATCH) float32 brightness, 0 to 255; 0 outside the animal.
     """
     n = len(crop_cameras)
     _check(heights, crop_cameras)

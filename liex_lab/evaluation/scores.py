@@ -117,7 +117,7 @@ class PoseErrors:
         Args:
             joints: (n, J, 3) measured joints, mm; NaN where lost.
             true_joints: (n, J, 3) true joints, mm, in the same frame.
-            tip: index of the joint opposite the base.
+            tip: the joint whose direction from the base is the heading.
             predicted_mm: (n,) predicted mean joint error, mm.
             quantiles: (2,) ratios of true to predicted error that bound the 90 % interval.
         """
@@ -217,7 +217,7 @@ class Followed:
         truth: (n, J, 3) true joints, mm, in the same frame.
         sd_mm: (n, J, 3) estimated standard deviation of each joint along x, y and z, mm.
         frames_per_s: speed of the tracker, reading excluded.
-        tip: index of the joint opposite the base.
+        tip: the joint whose direction from the base is the heading.
     """
 
     joints: Array
@@ -391,7 +391,7 @@ class Tally:
             truths: its true animals.
             individuals: of the session; () if the run was refused.
             n_frames: length of the recording.
-            tip: index of the joint opposite the base.
+            tip: the joint whose direction from the base is the heading.
             fits: whether the animals are of the plan's kind; if not, every trusted frame is wrong
                 and nothing else is counted.
         """

@@ -1,1 +1,1 @@
-"""Jobs of `liex evaluate`: one benchmark a module, each with its protocol and numbers."""
+"""Jobs of `liex evaluate`: one benchmark per module, each with its protocol and numbers."""

@@ -1,17 +1,17 @@
 """Evaluation of action recognition: cut-out sequences as in Lie-X section 5.4, and uncut timelines.
 
 `liex evaluate actions` generates behaviour of virtual fish or mice, renders, measures and tracks
-it, and scores two recognisers on individuals that neither learned from:
+it, and scores two recognisers on individuals that neither was trained on:
 
-- cut-out sequences of single actions (of fish 426 to learn from and 173 to test on): plain accuracy
-  of the paper's forest (50 trees, depth 20, temporal pyramid) on tangent vectors and on joint
-  positions, mean of 5 seeds with Wilson's 95 % interval, and of the default recogniser; confusion
-  matrices as in Fig 20;
-- uncut recordings of novel individuals (`minutes` in all): macro F1 of frames, and F1 of bouts
-  that overlap by at least half (intersection over union), at the usual frame rate, at 15 and 30 Hz
-  and at 100 Hz; a decision tree on speed alone as the floor; time for an hour's track;
-- of their bouts, how many contradict the printed definition of their word, with the check that
-  `liex run` makes and without it.
+- cut-out sequences of single actions (for fish 426 for training and 173 for testing): plain
+  accuracy of the paper's forest (50 trees, depth 20, temporal pyramid) on tangent vectors and on
+  joint positions, mean of 5 seeds with Wilson's 95 % interval, and of the default recogniser;
+  confusion matrices as in Fig 20;
+- uncut recordings of novel individuals (`minutes` in all): macro F1 of frames, and F1 of bouts that
+  overlap by at least half (intersection over union), at the usual frame rate, at 15 and 30 Hz and
+  at 100 Hz; a decision tree on speed alone as the lower bound; time for an hour's track;
+- number of their bouts that contradict the printed definition of their action, with and without the
+  check of `liex run`.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ Array = NDArray[np.float64]
 _SEEDS = 5
 _SLOWER_HZ = (15.0, 30.0)
 _LEAST_FRAMES = 7  # of a cut-out sequence
-_LEARNERS = 3  # every so many-th recording of fish teaches the tree that knows the speed alone
+_LEARNERS = 3  # every so many-th recording of fish trains the tree on speed alone
 _MAIN = ("macro_f1", "segment_f1_50")
 
 PROTOCOL = (
@@ -97,11 +97,11 @@ def evaluate_actions(
 
     Args:
         animal: `fish` or `mouse`.
-        model: an action model other than the bundled one or, where there is none, one trained now.
-        pose_model: measures the frames, other than the animal's own.
-        minutes: length of the uncut test recordings in all.
-        draw: is given the result, for a picture.
-        progress: told how far rendering and measuring are.
+        model: an action model; None uses the bundled one or, if there is none, trains one.
+        pose_model: another model than the animal's own for measuring the frames.
+        minutes: total length of the uncut test recordings.
+        draw: called with the result, to draw a figure.
+        progress: called with the progress of rendering and measuring.
 
     Returns:
         Accuracies, confusion matrices, `timeline`, `by_fps`, `lost_by_fps`, `contradictions`,
@@ -119,7 +119,7 @@ def evaluate_actions(
     estimator = estimator_of(animal, "default", progress, pose_model)
     recogniser = _recogniser(animal, model, pose_model, progress)
     learners = by_usual_camera(training_recordings(animal))
-    if animal == "fish":  # others' cut-out sequences come out of these, too
+    if animal == "fish":  # other animals' cut-out sequences come from these, too
         learners = learners[::_LEARNERS]
     learned = acted_tracks(learners, estimator, progress)
     recordings = acted(test_recordings(animal, False, minutes), estimator, progress)
@@ -169,13 +169,13 @@ def sequence_scores(
     """Accuracy on cut-out actions of the paper's forest, with either descriptor, and of ours.
 
     Args:
-        train: cut-out sequences that the paper's forests learn from.
-        test: cut-out sequences to name.
+        train: cut-out sequences to train the paper's forests on.
+        test: cut-out sequences to recognise.
         recogniser: the default recogniser, already trained.
 
     Returns:
         Accuracies (0 to 1), the forests' by seed as well, 95 % intervals by Wilson, and confusion
-        matrices (rows: true), the forests' of their first seed.
+        matrices (rows: true), those of the forests for their first seed.
     """
     true = [str(one.words[0]) for one in test]
     n = len(test)
@@ -217,11 +217,7 @@ def _recogniser(
 
 
 def cut_out(tracks: Sequence[LabelledTrack]) -> list[LabelledTrack]:
-    """Every named bout of at least seven frames as a track by itself.
-
-    Args:
-        tracks: labelled tracks of uncut recordings.
-    """
+    """Every named bout of at least seven frames as a track of its own."""
     found = []
     for one in tracks:
         for start, stop, word in zip(*runs_of(one.words), strict=True):
@@ -233,14 +229,14 @@ def cut_out(tracks: Sequence[LabelledTrack]) -> list[LabelledTrack]:
 def paper_names(
     train: Sequence[LabelledTrack], test: Sequence[LabelledTrack]
 ) -> dict[str, list[list[str]]]:
-    """The words that the paper's forests give test sequences, by descriptor and seed.
+    """The actions that the paper's forests assign to test sequences, by descriptor and seed.
 
     Args:
-        train: cut-out sequences to learn from.
-        test: cut-out sequences to name.
+        train: cut-out sequences for training.
+        test: cut-out sequences to recognise.
 
     Returns:
-        For each descriptor (`tangent`, `joints`), of every seed one word per test sequence.
+        For each descriptor (`tangent`, `joints`) and seed, one action per test sequence.
     """
     words = [str(one.words[0]) for one in train]
     found = {}
@@ -290,15 +286,15 @@ def _timelines(
 def contradictions(
     recogniser: TimelineModel, tracks: Sequence[LabelledTrack]
 ) -> dict[str, dict[str, Any]]:
-    """How many bouts contradict their printed definition, as the table `bouts` would say.
+    """Number of bouts that contradict their printed definition, as in the table `bouts`.
 
     Args:
         recogniser: names the tracks.
         tracks: of uncut recordings.
 
     Returns:
-        `unchecked` and `checked`, as `liex run` names: of each the number of `bouts`, those that
-        are `contradicting`, and these `by_word`.
+        `unchecked` and `checked` (as in `liex run`), each with the numbers of `bouts`, of
+        `contradicting` ones, and of these `by_word`.
     """
     meanings = printed_meanings(recogniser.skeleton, recogniser.definitions)
     tables: dict[str, list[pd.DataFrame]] = {"unchecked": [], "checked": []}
@@ -323,11 +319,7 @@ def contradictions(
 
 
 def track_error_mm(tracks: Sequence[LabelledTrack]) -> float:
-    """Mean distance of the tracked from the true joints, mm, over the frames that were measured.
-
-    Args:
-        tracks: labelled tracks with their truth.
-    """
+    """Mean distance of the tracked from the true joints, mm, over the measured frames."""
     off = [
         np.linalg.norm(one.track.joints_mm - np.asarray(one.truth), axis=-1)[one.track.observed]
         for one in tracks
@@ -338,7 +330,7 @@ def track_error_mm(tracks: Sequence[LabelledTrack]) -> float:
 def one_hour(
     recogniser: TimelineModel, one: LabelledTrack, hour_s: float = 3600.0
 ) -> dict[str, float]:
-    """Seconds for features and recognition of an hour's track: this one, over and over.
+    """Seconds for features and recognition of an hour's track, made by repeating a given one.
 
     Args:
         recogniser: a trained recogniser.
@@ -346,8 +338,7 @@ def one_hour(
         hour_s: length of the long track, s.
 
     Returns:
-        `frames`, `seconds` by the clock, `core_seconds` of this process, and `cores` of the
-        machine.
+        `frames`, elapsed `seconds`, `core_seconds` of this process, and `cores` of the machine.
     """
     usual = float(np.median(np.diff(one.track.times_ns))) * 1e-9
     n = round(hour_s / usual)
@@ -384,15 +375,15 @@ def _scores(recogniser: TimelineModel, tracks: Sequence[LabelledTrack]) -> dict[
 def speed_only(
     train: Sequence[LabelledTrack], test: Sequence[LabelledTrack], recogniser: TimelineModel
 ) -> float:
-    """Macro F1 of a decision tree that knows nothing but the speed of the moment.
+    """Macro F1 of a decision tree on the current speed alone.
 
-    It shows that the task is not solved by speed alone. The tree is 8 deep, its leaves hold at
-    least 50 moments, and classes are balanced.
+    It shows that the task is not solved by speed alone. The tree has depth 8 and at least 50
+    samples per leaf, and classes are balanced.
 
     Args:
-        train: labelled tracks to learn from.
-        test: labelled tracks to name.
-        recogniser: gives the clock, Hz, and the words that count.
+        train: labelled tracks for training.
+        test: labelled tracks to recognise.
+        recogniser: its clock, Hz, and its actions.
     """
     (x, y), (asked, true) = (_speeds(some, recogniser.clock_hz) for some in (train, test))
     tree = DecisionTreeClassifier(

@@ -1,7 +1,7 @@
-"""Posture and movement of a real mouse beside the virtual one: `liex evaluate motion`.
+"""Posture and movement of a real mouse compared with the virtual one: `liex evaluate motion`.
 
-The real mouse comes as points in space (an .npz); those of the virtual one are the same places on
-its back, in recordings in which it walks about, and in the postures that models are trained on.
+The real mouse is given by 3D points (an .npz); those of the virtual one are the same points on its
+back, in recordings in which it walks about, and in the training postures of the models.
 
 The points go from the base of the tail to the nose (`POINTS`), the three between them along the
 back. With a, b, c the directions from the first to the middle of the second and third, from there
@@ -11,7 +11,7 @@ to the fourth, and from the first to the fourth, and h from the fourth to the fi
     pitch       elevation of c                        head_turn   angle from c to h on the floor
     head_pitch  elevation of h minus that of c        stretch     tail to nose over its median
 
-`MOTION_PROTOCOL` states every figure.
+`MOTION_PROTOCOL` defines every number.
 """
 
 from __future__ import annotations
@@ -62,13 +62,13 @@ _AT_ONCE = 256
 
 @dataclass(frozen=True)
 class Motion:
-    """Postures of one animal, and how they change.
+    """Postures of one animal, and their rates of change.
 
     Attributes:
         points_mm: (n, 5, 3) see `POINTS`, z up.
-        clips: (n,) number of the recording without a break that each frame belongs to; None where
-            postures have nothing to do with each other.
-        rate_hz: frames a second; None where it is not known.
+        clips: (n,) number of the uninterrupted recording of each frame; None if the postures are
+            unrelated.
+        rate_hz: frames per second; None if unknown.
     """
 
     points_mm: Array
@@ -97,7 +97,9 @@ class Motion:
         }
 
     def change(self) -> dict[str, Array]:
-        """How fast each of speed, turning and the angles changes (m,); {} without a frame rate."""
+        """Rates of change (m,) of position, direction and angles by name; {} without a frame
+        rate.
+        """
         if self.rate_hz is None or self.clips is None:
             return {}
         lag = max(1, round(self.rate_hz * _STEP_S))
@@ -128,17 +130,18 @@ def _elevation(direction: Array) -> Array:
 
 
 def motion_figures(real: Motion, virtual: dict[str, Motion]) -> dict[str, Any]:
-    """Quantiles of a real animal's postures and changes beside those of virtual ones.
+    """Quantiles of postures and rates of change of a real animal and of virtual ones.
 
     Args:
         real: the real animal.
-        virtual: virtual ones by a word for each.
+        virtual: virtual ones by name.
 
     Returns:
-        `quantiles`: by measure, then by whose, the values at `QUANTILES`; `outside`: by whose, then
-        by measure, the share of real frames that lie beyond; `nearest_degrees`: by whose, the
-        median and the 95 % quantile; `lean_degrees`: the real animal's median bend and turn with
-        their signs, nought of one that leans to neither side. See `MOTION_PROTOCOL`.
+        `quantiles`: by measure, then by animal, the values at `QUANTILES`; `outside`: by virtual
+            animal, then by measure, the share of real frames outside its range; `nearest_degrees`:
+            by virtual animal, the median and the 95 % quantile; `lean_degrees`: the real animal's
+            median bend and turn with their signs, 0 without a lean to one side. See
+            `MOTION_PROTOCOL`.
     """
     own = _shown(real)
     others = {name: _shown(one) for name, one in virtual.items()}
@@ -172,7 +175,9 @@ def motion_figures(real: Motion, virtual: dict[str, Motion]) -> dict[str, Any]:
 
 
 def _shown(motion: Motion) -> dict[str, Array]:
-    """Postures, angles on the floor without their sign and about their median, and changes."""
+    """Postures, angles on the floor without their sign and about their median, and rates of
+    change.
+    """
     shown: dict[str, Array] = {}
     for name, values in motion.posture().items():
         shown[name] = np.abs(values) if name in _UNSIGNED else values
@@ -182,11 +187,11 @@ def _shown(motion: Motion) -> dict[str, Array]:
 
 
 def nearest(real: Motion, virtual: Motion) -> Array:
-    """How far (n,) degrees each real posture is from the most similar virtual one.
+    """Difference (n,) degrees of each real posture to the most similar virtual one.
 
     Args:
         real: n frames.
-        virtual: m postures, of which and of whose mirror images the nearest is taken.
+        virtual: m postures, compared with their mirror images as well.
     """
     own, drawn = (_angles(one) for one in (real, virtual))
     mirrored = drawn * np.array([-1.0 if name in _UNSIGNED else 1.0 for name in POSTURE[:-1]])
@@ -220,7 +225,7 @@ _FEWEST = 50  # frames
 
 @dataclass(frozen=True)
 class Bodies:
-    """Virtual mice in their postures.
+    """Virtual mice in various postures.
 
     Attributes:
         pose: (n) poses.
@@ -233,7 +238,7 @@ class Bodies:
     shape: BodyShape
 
     def __getitem__(self, rows: slice) -> Bodies:
-        """Some of them."""
+        """A subset of the bodies."""
         return Bodies(self.pose[rows], self.girth[rows], self.shape[rows])
 
 
@@ -245,15 +250,15 @@ def evaluate_motion(
     rate_hz: float | None = None,
     progress: Progress = silent,
 ) -> dict[str, Any]:
-    """Quantiles of a real mouse's postures and motion beside those of the virtual mouse.
+    """Quantiles of the postures and motion of a real mouse and of the virtual mouse.
 
     Args:
-        reference: .npz with `points_mm` (n, P, 3), `names` (P,), and, where there are breaks,
-            `clip_frames`, after how many frames there is one each time.
+        reference: .npz with `points_mm` (n, P, 3), `names` (P,), and, if there are breaks,
+            `clip_frames`, the number of frames between breaks.
         names: those of the five points, from the tail's base to the nose.
         up: the axis of the file that points up, a key of `UPS`.
-        rate_hz: frames a second of the file; None leaves the speeds out.
-        progress: told recording by recording.
+        rate_hz: frame rate of the file; None leaves the speeds out.
+        progress: called recording by recording.
 
     Returns:
         See `motion_figures`; the virtual ones are `walk` and `training`.
@@ -274,11 +279,7 @@ def evaluate_motion(
 
 
 def in_short(result: dict[str, Any]) -> dict[str, dict[str, Any]]:
-    """The figures as rows of a table, one measure a row.
-
-    Args:
-        result: what `evaluate_motion` gave.
-    """
+    """The result of `evaluate_motion` as rows of a table, one measure per row."""
     rows = {}
     for measure, of in result["quantiles"].items():
         rows[measure] = {
@@ -301,7 +302,7 @@ def read_motion(path: Path, names: Sequence[str], up: str, rate_hz: float | None
         path: of the .npz, see `evaluate_motion`.
         names: of the five points, from the tail's base to the nose.
         up: a key of `UPS`.
-        rate_hz: frames a second; None where nobody knows.
+        rate_hz: frames per second; None if unknown.
 
     Raises:
         LiexError: the file cannot be read, lacks a point, or is upside down.
@@ -336,13 +337,16 @@ def read_motion(path: Path, names: Sequence[str], up: str, rate_hz: float | None
         raise LiexError(
             f"{path}: {whole.sum()} frames have all five points, and {_FEWEST} are needed"
         )
-    # what is not there is a break
+    # incomplete frames are breaks
     clips = clips * len(points) + np.cumsum(~whole)
     return Motion(chosen[whole], clips[whole], rate_hz)
 
 
 def _upright(points: Array, columns: list[int], up: str, path: Path) -> Array:
-    """The chosen points (n, 5, 3) with z up; an error where their back is below everything else."""
+    """The chosen points (n, 5, 3) with z up.
+
+    Raises LiexError if their back is below the other points.
+    """
     axis, sign = UPS[up]
     level = [k for k in range(3) if k != axis]
     turned = np.stack([points[..., level[0]], points[..., level[1]], sign * points[..., axis]], -1)
@@ -357,14 +361,14 @@ def _upright(points: Array, columns: list[int], up: str, path: Path) -> Array:
 
 
 def _shares(points_mm: Array) -> Array:
-    """Where (5,) along an animal the points are, 0 the tail's base and 1 the nose."""
+    """Positions (5,) of the points along an animal, from 0 at the tail's base to 1 at the nose."""
     bones = np.median(np.linalg.norm(np.diff(points_mm, axis=1), axis=-1), axis=0)
     reach = np.concatenate([[0.0], np.cumsum(bones)])
     return np.asarray(reach / reach[-1])
 
 
 def _walk(skeleton: Skeleton, along: Array, above: float, progress: Progress) -> Motion:
-    """A virtual mouse that goes about, some recordings of it."""
+    """A virtual mouse that walks about, in several recordings."""
     points = []
     for k, seed in enumerate(_SEEDS):
         progress(k, len(_SEEDS), "a virtual mouse goes about")
@@ -379,7 +383,7 @@ def _walk(skeleton: Skeleton, along: Array, above: float, progress: Progress) ->
 
 
 def _postures(skeleton: Skeleton) -> Bodies:
-    """Postures as models are trained on."""
+    """Postures as in the models' training."""
     rng = np.random.default_rng(_POSTURE_SEED)
     species = MouseSpecies(skeleton)
     n = _N_POSTURES
@@ -390,9 +394,10 @@ def _postures(skeleton: Skeleton) -> Bodies:
 
 
 def _height_of(real: Motion, skeleton: Skeleton, bodies: Bodies, along: Array) -> float:
-    """How high in a virtual body, as a share of its half height, the real animal's points lie.
+    """Height of the real animal's points in a virtual body, as a share of its half height.
 
-    Nobody says how deep below the fur a point was put. By what the back's arch is in the median.
+    It is chosen to match the median arch of the back, since the depth of the points below the fur
+    is unknown.
     """
     wanted = float(np.median(real.posture()["trunk_arch"]))
     some = bodies[: _N_POSTURES // 8]
@@ -405,13 +410,13 @@ def _height_of(real: Motion, skeleton: Skeleton, bodies: Bodies, along: Array) -
 
 
 def on_back(skeleton: Skeleton, bodies: Bodies, along: Array, above: float) -> Array:
-    """Places of bodies where a real animal's points would be.
+    """Points of virtual bodies that correspond to a real animal's points.
 
     Args:
         skeleton: of the animal, one chain with a tube as its surface.
         bodies: n of them.
         along: (P,) shares of the length, 0 and 1 for the ends, which lie on the mid-axis.
-        above: how high over the mid-axis the others lie, over the body's half height there.
+        above: height of the others over the mid-axis, as a share of the body's half height there.
 
     Returns:
         (n, P, 3) mm, in the frame of the poses.

@@ -1,13 +1,13 @@
-"""Evaluation on the NYU Hand Pose data set: published answers and our own by one protocol.
+"""Evaluation on the NYU Hand Pose data set: published results and ours by one protocol.
 
-`liex evaluate nyu` takes real depth frames, the test split of 8,252 frames and two people (Lie-X
+`liex evaluate nyu` uses real depth frames, the test split of 8,252 frames and two people (Lie-X
 section 5.1) or any of them, with the 14 labelled points of the usual subset (Tompson et al. 2014).
 With x the estimate and y the truth of n frames,
 
     error = 1/(14 n) sum_ij |x_ij - y_ij|        or, root given, of x_ij - x_i,palm + y_i,palm.
 
-The published answers are also scored on the very frames that ours were measured on, because a mean
-over 8,252 frames and one over a few cannot be compared.
+The published results are also scored on exactly the frames that ours were measured on, because a
+mean over 8,252 frames and one over a few are not comparable.
 """
 
 from __future__ import annotations
@@ -105,19 +105,19 @@ def evaluate_nyu(
     draw: Draw | None = None,
     progress: Progress = silent,
 ) -> dict[str, Any]:
-    """Errors on NYU hand data of published answers and of our own, by both root protocols.
+    """Errors on NYU hand data of published results and of ours, by both root protocols.
 
     Args:
-        reference: folder with `nyu_test_14joints.npz` (labels and answers) or `joint_data.mat`
+        reference: folder with `nyu_test_14joints.npz` (labels and results) or `joint_data.mat`
             (labels), and any of the frames `depth_1_NNNNNNN.png`.
         model: name or path of a hand model; None means the bundled one.
-        draw: is given `shown_hands`, for a figure.
-        progress: told frame by frame.
+        draw: called with `shown_hands`, to draw a figure.
+        progress: called frame by frame.
 
     Returns:
         `published` by method, `ours` (with a note if there are no frames or no model),
-        `same_frames`: the published answers on the frames of ours alone, `labels_used`: what of our
-        model comes from test labels, `n_labelled` and the protocol.
+        `same_frames`: the published results on the frames of ours alone, `labels_used`: the use of
+        test labels in our model, `n_labelled` and the protocol.
 
     Raises:
         LiexError: frames and labels do not belong together.
@@ -148,16 +148,16 @@ def evaluate_nyu(
 def shown_hands(
     labels: NyuReference, numbers: Numbers, ours: Array
 ) -> dict[str, list[dict[str, Any]]]:
-    """Ten labelled hands, evenly spaced from the first on, with the answers of methods, for Fig 12.
+    """Ten evenly spaced labelled hands, with the results of all methods, for Fig 12.
 
     Args:
-        labels: true points and published answers.
+        labels: true points and published results.
         numbers: (m,) numbers of the frames that ours was measured on, from 1 on.
         ours: (m, 14, 3) our points in them, mm, camera frame; NaN if nothing was found.
 
     Returns:
         By method, for each hand its `head`, `truth` (14, 3) mm, and `pose` (14, 3) mm if the method
-        answered; ours comes first if it found any of them.
+        has one; ours comes first if it found any of them.
     """
     n = len(labels.truth)
     rows = np.unique(np.arange(_SHOWN) * n // _SHOWN)
@@ -174,7 +174,7 @@ def shown_hands(
 
 
 def labels_used(numbers: Numbers) -> str:
-    """What of our hand model comes from labels of the test frames, in one sentence.
+    """A sentence on the use of test frames' labels in our hand model.
 
     Args:
         numbers: (n,) numbers of the frames that are measured, from 1 on.
@@ -198,7 +198,7 @@ def frame_numbers_in(folder: Path, n_labelled: int) -> Numbers:
 
 
 def in_short(result: dict[str, Any]) -> dict[str, str]:
-    """One line for each method, and the protocol, of what `evaluate_nyu` returns."""
+    """One line for each method, and the protocol, from the result of `evaluate_nyu`."""
     lines = {}
     for name, row in [*result["published"].items(), (_OURS, result["ours"])]:
         if "root_estimated_mm_14" not in row:
@@ -221,8 +221,9 @@ def in_short(result: dict[str, Any]) -> dict[str, str]:
 def _ours(
     folder: Path, truth: Array, numbers: Numbers, model: str | None, progress: Progress
 ) -> tuple[dict[str, Any], Array]:
-    """Our errors on the frames in the folder, or a note if there are none, or no model; and our
-    points (m, 14, 3) mm in them, camera frame.
+    """Our errors on the frames in the folder, and our points (m, 14, 3) mm in them, camera frame.
+
+    The errors are a note if there are no frames or no model.
     """
     points = np.full((len(numbers), *truth.shape[1:]), np.nan)
     if not len(numbers):

@@ -1,12 +1,12 @@
 """Evaluation of poses: joint errors on fixed splits of rendered recordings, and of other builds.
 
-`liex evaluate pose` measures the protocol of Lie-X (section 5.2, Tables 1 and 2) on rendered test
+`liex evaluate pose` follows the protocol of Lie-X (section 5.2, Tables 1 and 2) on rendered test
 splits, `clean`, `hard` (twice the noise, other objects in view), `other-body` (unseen family of
 shapes) and `other-camera` (unseen focal lengths and resolutions), 40 recordings of 50 frames each;
-none was trained on. As in a run, background, floor and animal's size are found by the product.
-`other-build` tracks moving animals of builds that no forest was trained on, as a run does, beside
-as many of builds like the training's; its sealed part has seeds that no test, no training and no
-development touches. `liex evaluate sizes` repeats `clean` over animals of several lengths. `liex
+none was trained on. As in a run, background, floor and the animal's size are estimated.
+`other-build` tracks, as a run does, moving animals of builds that no forest was trained on, and as
+many of builds like the training's; its sealed part has seeds that are not used in tests, training
+or development. `liex evaluate sizes` repeats `clean` over animals of several lengths. `liex
 evaluate reference` compares a session with another program's centroid and axis.
 """
 
@@ -54,7 +54,7 @@ Subject = PoseEstimator | Baseline
 OTHER_BUILD: Final = "other-build"
 SEEDS: Final = tuple(range(500, 524))
 SEALED_SEEDS: Final = tuple(range(953_200_417, 953_200_441))
-N_FRAMES: Final = 120  # of a recording of another build
+N_FRAMES: Final = 120  # frames per recording of another build
 _N_RECORDINGS: Final = 12
 _NOISES = (0.7, 1.0, 1.5)
 _FLIP_CLASSES = (0.0, 0.01, 0.05, 0.2, 0.5, 0.8, 1.0)  # of p_flip
@@ -93,18 +93,18 @@ _REFERENCE_PROTOCOL = (
 def subject_of(
     animal: str, variant: str, progress: Progress = silent, model: str | Path | None = None
 ) -> Subject:
-    """The subject that a variant names: a variant of the method, an ablation or a baseline.
+    """The subject of a variant: a variant of the method, an ablation or a baseline.
 
     Args:
         animal: a bundled animal's name, or the path of a skeleton's TOML.
         variant: `default`, `paper`; the ablations `paper-one-pose` (one initial pose) and
             `paper-no-metric` (plain mean of all candidates); the baselines `rf` and `cnn`.
-        progress: told how far the training is.
+        progress: called with the progress of the training.
         model: another model file than the animal's own, for variants of the method.
 
     Raises:
         PlanError: there is no such variant.
-        MissingPackageError: the CNN is asked for and torch is not installed.
+        MissingPackageError: the variant is `cnn` and torch is not installed.
     """
     from ..training.baselines import BASELINES, trained_baseline
 
@@ -121,11 +121,11 @@ def subject_of(
 
 
 def told_by(subject: Subject, found: Estimates | Guesses) -> tuple[Array, Array, Array]:
-    """What a subject estimated of n frames.
+    """Unpack a subject's estimates of n frames.
 
     Returns:
         Joints (n, J, 3) mm, camera frame, NaN if no animal was found; predicted error (n,) mm, NaN
-        if the subject predicts none; and the factors (2,) of it that bound its 90 % interval.
+        if the subject predicts none; and its factors (2,) that bound the 90 % interval.
     """
     if isinstance(found, Guesses):
         return found.joints, np.full(len(found.joints), np.nan), np.full(2, np.nan)
@@ -139,7 +139,7 @@ def told_by(subject: Subject, found: Estimates | Guesses) -> tuple[Array, Array,
 def measure(
     subject: Subject, frames: NDArray[np.float32], scene: Segmenter
 ) -> tuple[Array, Array, Array]:
-    """What a subject estimates of frames (n, H, W) mm, at the size that it finds in them.
+    """A subject's estimates in frames (n, H, W) mm, at the size that it estimates from them.
 
     Returns:
         As `told_by`.
@@ -161,7 +161,7 @@ def errors_of(
         subjects: estimators and baselines by name, of one animal.
         sessions: recordings with their truth.
         plan: thresholds of the foreground, and expected sizes.
-        progress: told recording by recording.
+        progress: called recording by recording.
     """
     parts: dict[str, list[PoseErrors]] = {name: [] for name in subjects}
     skeleton = next(iter(subjects.values())).skeleton
@@ -190,11 +190,11 @@ def evaluate_pose(
     Args:
         animal: a bundled animal's name, or the path of a skeleton's TOML.
         split: a test split of the animal, such as `clean`, `hard` or `other-body`.
-        variant: what is measured, see `subject_of`.
+        variant: the subject, see `subject_of`.
         model: another model file than the animal's own.
-        n_frames: only so many frames, rounded up to whole recordings; None means all.
+        n_frames: number of frames, rounded up to whole recordings; None means all.
         spine_mm: length of all animals, mm, instead of drawn ones.
-        progress: told recording by recording.
+        progress: called recording by recording.
 
     Returns:
         `PoseErrors.summary` with animal, split, variant, n_frames and the protocol.
@@ -226,7 +226,7 @@ def evaluate_pose(
 def sizes_of(animal: str) -> tuple[float, ...]:
     """Spine lengths, mm, from small to large, at which an animal is evaluated.
 
-    One without lengths of its own gets 0.75, 1, 1.25 and 1.5 times its home length.
+    The default is 0.75, 1, 1.25 and 1.5 times the home length.
     """
     if animal in _SIZES_MM:
         return _SIZES_MM[animal]
@@ -239,12 +239,12 @@ def evaluate_sizes(
 ) -> dict[str, Any]:
     """Mean joint error in per cent of the spine over animals' sizes; `liex evaluate sizes`.
 
-    The default model on the split `clean`; sizes are estimated and not given.
+    The default model on the split `clean`; sizes are estimated, not given.
 
     Args:
         animal: a bundled animal's name, or the path of a skeleton's TOML.
         n_frames: frames for each size, rounded up to whole recordings; None means all.
-        progress: told recording by recording.
+        progress: called recording by recording.
 
     Returns:
         `error_percent_of_spine` and `ratio_to_best` by length, `worst_ratio`, and the protocol.
@@ -266,14 +266,14 @@ def evaluate_sizes(
 
 @dataclass(frozen=True)
 class Built:
-    """A recording of one animal as it was tracked, with its truth.
+    """A tracked recording of one animal with its truth.
 
     Attributes:
         track: (n) the track, without a pose if no animal was found.
         truth: (n, J, 3) true joints, mm, in the track's frame.
         length_mm: true length of the animal.
-        found_mm: the length that was found; NaN if no animal was.
-        tip: the joint that the base's heading points at.
+        found_mm: estimated length; NaN if no animal was found.
+        tip: the joint whose direction from the base is the heading.
     """
 
     track: Track
@@ -284,7 +284,7 @@ class Built:
 
     @property
     def followed(self) -> Followed:
-        """Its errors, intervals and exchanged ends; how fast it was tracked is not known."""
+        """Its errors, intervals and exchanged ends; the tracker's speed is NaN."""
         track = self.track
         return Followed(track.joints_mm, self.truth, track.sd_xyz_mm, np.nan, self.tip)
 
@@ -296,20 +296,21 @@ def evaluate_builds(
     sealed: bool = False,
     progress: Progress = silent,
 ) -> dict[str, Any]:
-    """Errors and intervals of tracks of animals of another build, beside those of usual builds.
+    """Errors and intervals of tracks of animals of another build, and of usual builds.
 
     Args:
         animal: `mouse` or `fish`.
-        n_frames: frames of other builds, rounded up to whole recordings of 120; None means 12.
+        n_frames: frames of other builds, rounded up to whole recordings of 120; None means 12
+            recordings.
         sealed: the sealed part of the split.
-        progress: told recording by recording.
+        progress: called recording by recording.
 
     Returns:
         `other` and `usual`, see `BUILDS_PROTOCOL`, the ratio of their errors in per cent of the
         length, seeds and protocol.
 
     Raises:
-        LiexError: the animal's simulator knows one build only, or there are not as many recordings.
+        LiexError: the animal's simulator has one build only, or there are too few recordings.
     """
     n_recordings = _N_RECORDINGS if n_frames is None else max(1, -(-n_frames // N_FRAMES))
     seeds = SEALED_SEEDS if sealed else SEEDS
@@ -345,12 +346,12 @@ def film(animal: str, seed: int, k: int, family: str) -> TrueRecording:
 
     Args:
         animal: `mouse` or `fish`.
-        seed: that everything else is drawn from.
+        seed: for everything else that is drawn.
         k: number of the recording.
         family: of builds, `other` or `train`.
 
     Raises:
-        LiexError: the animal's simulator knows one build only.
+        LiexError: the animal's simulator has one build only.
     """
     world = world_of(Skeleton.load(animal))
     if not isinstance(world, BodySimulator) or animal not in ("mouse", "fish"):
@@ -367,7 +368,7 @@ def film(animal: str, seed: int, k: int, family: str) -> TrueRecording:
 
 
 def track(estimator: PoseEstimator, recording: TrueRecording, plan: Plan) -> Built:
-    """A recording as the product tracks it, with its truth."""
+    """Track a recording as a run does; returned with its truth."""
     from ..training.motion_model import observed
 
     skeleton = estimator.skeleton
@@ -381,14 +382,14 @@ def track(estimator: PoseEstimator, recording: TrueRecording, plan: Plan) -> Bui
 
 
 def build_figures(rows: Sequence[Built], joints: Sequence[str]) -> dict[str, Any]:
-    """Figures over some recordings, see `BUILDS_PROTOCOL`.
+    """Results over some recordings, see `BUILDS_PROTOCOL`.
 
     Args:
         rows: the recordings, at least one.
         joints: names of the joints.
 
     Returns:
-        By name; only those that need no pose if there is none.
+        By name; without a pose, only those that need none.
     """
     followed = [row.followed for row in rows]
     recording = np.repeat(np.arange(len(rows)), [len(row.truth) for row in rows])
@@ -433,7 +434,9 @@ def build_figures(rows: Sequence[Built], joints: Sequence[str]) -> dict[str, Any
 
 
 def _reliability(told: Array, flipped: NDArray[np.bool_]) -> list[dict[str, Any]]:
-    """By classes of the predicted probability (m,), how many poses and how many are flipped."""
+    """By classes of the predicted flip probability (m,), the number of poses and the flipped
+    share.
+    """
     rows = []
     for low, high in pairwise(_FLIP_CLASSES):
         some = (told >= low) & ((told < high) | (high == _FLIP_CLASSES[-1]))
@@ -444,15 +447,15 @@ def _reliability(told: Array, flipped: NDArray[np.bool_]) -> list[dict[str, Any]
 
 
 def evaluate_reference(session: str | Path, reference: str | Path) -> dict[str, Any]:
-    """A session against another program's centroid and long axis in the same recording.
+    """Compare a session with another program's centroid and long axis in the same recording.
 
     Distances are pixels times the size of a pixel on the floor; headings are compared modulo pi.
 
     Args:
         session: the session folder.
-        reference: a CSV with one row a frame and the columns `frame`, `centroid_x_px`,
-            `centroid_y_px`, `angle_rad` (direction (cos a, -sin a) in (right, down), known modulo
-            pi) and, optionally, `reliable` (rows other than 1 are left out).
+        reference: a CSV with one row per frame and the columns `frame`, `centroid_x_px`,
+            `centroid_y_px`, `angle_rad` (direction (cos a, -sin a) in (right, down), modulo pi)
+            and, optionally, `reliable` (rows other than 1 are left out).
 
     Returns:
         Median distances of centroid and joints, px and mm, median heading difference in degrees,

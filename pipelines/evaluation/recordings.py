@@ -1,9 +1,9 @@
-"""Benchmarks of recording formats: how fast each is read, and what a whole run of each costs.
+"""Benchmarks of recording formats: reading speed, and the cost of a whole run.
 
 `liex evaluate speed --recordings` writes a rendered mouse (640 x 480, PrimeSense noise) in several
-formats and reads each in a process of its own on one thread. `liex evaluate scale` runs a mouse of
-each kind as `liex run` does, in a process of its own, all files written, and reads it before and
-after: the mean of both rates is what one core decodes in the same run.
+formats and reads each in a separate process on one thread. `liex evaluate scale` runs a mouse of
+each kind as `liex run` does, in a separate process, with all files written, and reads the recording
+before and after: the mean of both rates is one core's decoding rate.
 """
 
 from __future__ import annotations
@@ -84,10 +84,10 @@ class MoseqWriter(RecordingWriter):
         self._stamps.write(f"{frame.time_ns / 1e6:.6f} 0\n")
 
     def finish(self) -> None:
-        """Nothing belongs at the end."""
+        """Nothing to write at the end."""
 
     def release(self) -> None:
-        """Close both files; closing twice does no harm."""
+        """Close both files; may be called twice."""
         self._depth.close()
         self._stamps.close()
 
@@ -96,7 +96,7 @@ def _png_mcap(path: Path, camera: Camera) -> RecordingWriter:
     return McapDepthWriter(path, camera, packing="png")
 
 
-# name: file, writer, and how many times as long an hour is as what is written of it. Ten minutes of
+# name: file, writer, and the factor by which an hour is longer than what is written. Ten minutes of
 # images in a folder are 18,000 files, and the other fifty would be like them.
 FORMATS: dict[str, tuple[str, Callable[[Path, Camera], RecordingWriter], int]] = {
     "mcap_zstd_raw": ("r.mcap", McapDepthWriter, 1),
@@ -109,17 +109,17 @@ FORMATS: dict[str, tuple[str, Callable[[Path, Camera], RecordingWriter], int]] =
 def evaluate_recordings(
     *, n_frames: int = 150, n_hour: int = _HOUR, n_repeats: int = 5, progress: Progress = silent
 ) -> dict[str, Any]:
-    """Decoding speed and peak memory of every format that is written; see the protocol in it.
+    """Decoding speed and peak memory of every written format, as the protocol states.
 
     Args:
         n_frames: frames of each full-sized recording.
         n_hour: frames of an hour's recording.
-        n_repeats: how often each recording is read; the best counts.
-        progress: told format by format.
+        n_repeats: number of readings of each recording; the best counts.
+        progress: called format by format.
 
     Returns:
         By format: `frames_per_s_1core`, `open_ms_per_frame`, `peak_mb`, `peak_mb_of_an_hour`;
-        machine and protocol.
+            machine and protocol.
 
     Raises:
         LiexError: the process that reads a recording failed.
@@ -169,7 +169,7 @@ def _write(
     images: NDArray[np.float32],
     n_frames: int,
 ) -> Path:
-    """Write the images over and over, in place of what was there."""
+    """Write the images repeatedly, in place of an existing file or folder."""
     if path.exists():
         (shutil.rmtree if path.is_dir() else os.unlink)(path)
     with writer(path, camera) as out:
@@ -179,7 +179,7 @@ def _write(
 
 
 def read_alone(path: Path, n_repeats: int = 1) -> dict[str, float]:
-    """Read a recording in a process of its own on one thread; the best of some times.
+    """Read a recording in a separate process on one thread; the best of `n_repeats` counts.
 
     Returns:
         `frames_per_s`, `open_ms_per_frame` and `peak_mb`.
@@ -197,7 +197,7 @@ def read_all(path: str, n_repeats: int) -> dict[str, float]:
     with open_recording(path, strict=True) as recording:
         opened_s = time.perf_counter() - began
         seconds = []
-        recording.frame(0)  # what is loaded or compiled for the first frame is no part of the speed
+        recording.frame(0)  # loading and compilation for the first frame do not count
         for _ in range(n_repeats):
             began = time.perf_counter()
             for _frame in recording:
@@ -210,14 +210,14 @@ def read_all(path: str, n_repeats: int) -> dict[str, float]:
 
 
 def evaluate_kinds(n_frames: int, folder: Path) -> dict[str, Any]:
-    """What a whole run costs of each kind of recording; a first run has compiled everything before.
+    """The cost of a whole run of each kind of recording, after a first run has compiled everything.
 
     Args:
         n_frames: length of each recording.
         folder: an empty folder to write into.
 
     Returns:
-        By kind, the numbers that `DEFINITIONS` explains.
+        By kind, the numbers defined in `DEFINITIONS`.
 
     Raises:
         LiexError: a run failed.
@@ -237,12 +237,12 @@ def evaluate_kinds(n_frames: int, folder: Path) -> dict[str, Any]:
 
 def run_mouse(recording: str, out: str) -> None:
     """Run a recording with the plan of the mouse, as `liex run` does."""
-    # by name: jobs do not know the front door, and this process is one of its users
+    # by name: jobs do not import the public API, of which this process is a user
     import_module("liex_lab.api").run_session(recording, Plan.load("mouse"), out)
 
 
 def _measured(recording: Path, out: Path) -> dict[str, float]:
-    """The numbers of one recording."""
+    """The numbers of one recording and its run."""
     before = read_alone(recording)
     ran = isolated(f"{__name__}:run_mouse", recording, out)
     reads = (before, read_alone(recording))
@@ -274,7 +274,9 @@ def as_mcap(recording: Recording, place: Path) -> Path:
 
 
 def as_moseq(recording: Recording, place: Path) -> Path:
-    """Write a recording as MoSeq's extract packs a session: its folder's files in a .tar.gz."""
+    """Write a recording like a session packed by MoSeq's extract: its folder's files in a
+    .tar.gz.
+    """
     folder = place / "session_walk"
     frames: Iterable[DepthFrame] = recording
     with MoseqWriter(folder, recording.camera) as writer:

@@ -1,9 +1,9 @@
-"""What Figures 7, 13 to 16 and 19 of Lie-X show: sensitivity, ranked candidates, key frames.
+"""Data of Figures 7, 13 to 16 and 19 of Lie-X: sensitivity, ranked candidates, key frames.
 
 - Fig. 7: mean and median joint error, mm at home size, over the number of initial poses Kt, rounds
-  C, regressor trees, their depth, and metric trees, one varied at a time around the method's own
-  values; a base that has rounds of its own (`Method.base_rounds`, our hand's) keeps them.
-- Figs. 13 to 16: candidates of one rendered image that no tree has seen, ranked by the learned
+  C, regressor trees, their depth, and metric trees, one varied at a time around the method's
+  default values; a base that has rounds of its own (`Method.base_rounds`, our hand's) keeps them.
+- Figs. 13 to 16: candidates of one rendered image that no tree was grown on, ranked by the learned
   metric, and their errors after every joint and round of Algorithm 1.
 - Fig. 19: one cut-out test sequence of each of the fish's actions; surface and dive from the side.
 """
@@ -64,12 +64,12 @@ _MOST_DOTS = 1_500  # of a body
 
 @dataclass(frozen=True)
 class Sweep:
-    """The budget of a sweep, and the values tried beside the method's own.
+    """The budget of a sweep, and the values to try in addition to the method's own.
 
     Attributes:
         n_images: images that each model is trained on.
         n_test: images that it is tested on.
-        values: (name of the number, values) for each of the five.
+        values: (name of the parameter, values) for each of the five.
     """
 
     n_images: int = 2_048
@@ -84,7 +84,7 @@ class Sweep:
 
 
 def chosen_values(method: Method) -> dict[str, int]:
-    """The method's own value of each of the five numbers."""
+    """The method's own value of each of the five parameters."""
     return {
         INITIAL_POSES: method.n_candidates,
         "rounds": method.rounds,
@@ -95,7 +95,7 @@ def chosen_values(method: Method) -> dict[str, int]:
 
 
 def with_value(method: Method, number: str, value: int) -> Method:
-    """The method with one of the five numbers changed."""
+    """The method with one of the five parameters changed."""
     if number == INITIAL_POSES:
         return replace(method, n_candidates=value, top_k=min(value, method.top_k))
     if number == "rounds":
@@ -109,17 +109,17 @@ def with_value(method: Method, number: str, value: int) -> Method:
 def sensitivity(
     skeleton: Skeleton, variant: str, sweep: Sweep, progress: Progress = silent
 ) -> dict[str, Any]:
-    """Curves of a variant: mean and median error, mm, over the values of each number.
+    """Curves of a variant: mean and median error, mm, over the values of each parameter.
 
     Args:
         skeleton: the animal's skeleton.
         variant: `paper` or `default`.
         sweep: images and values.
-        progress: told point by point.
+        progress: called point by point.
 
     Returns:
-        `curves` by number, the method's `chosen` values, the numbers `left_out` with the reason,
-        amounts, seed and protocol.
+        `curves` by parameter, the method's `chosen` values, the parameters `left_out` with the
+        reason, amounts, seed and protocol.
     """
     method = method_of(variant, skeleton)
     recipe = _near_home_size(skeleton)
@@ -154,7 +154,7 @@ def sensitivity(
 
 
 def _near_home_size(skeleton: Skeleton) -> Any:
-    """The default's recipe, with animals of the sizes that the paper's variant learns from."""
+    """The default's recipe, with animals of the sizes that the paper's variant is trained on."""
     return replace(recipe_of("default", skeleton), sizes=recipe_of("paper", skeleton).sizes)
 
 
@@ -175,7 +175,7 @@ def _retrained(
     changed: Method,
     seed: int,
 ) -> tuple[Cascade, Any]:
-    """Cascade and metric for a changed number, trained again only as far as it matters."""
+    """Cascade and metric for a changed parameter, retrained only as far as needed."""
     cascade, candidates, metric = base
     if number == INITIAL_POSES or changed == method:
         return cascade, metric
@@ -194,13 +194,13 @@ def _errors(cascade: Cascade, metric: Any, test: TrainingSet, seed: int) -> tupl
 
 
 def illustrate(model: Model, n_images: int = 128) -> dict[str, Any]:
-    """What the figures of candidates and convergence show, for a model on unseen images.
+    """Data for the figures of candidates and convergence, for a model on unseen images.
 
     Returns:
         `ranked`: the example's candidates, best score first; `rank_correlation`: mean over images
-        of Spearman's correlation of score and error over an image's candidates; `steps`: error, mm
-        at home size (of the example its own), after every joint and round; `heights`, `true_px` and
-        `edges` of the example; amounts and protocol.
+            of Spearman's correlation of score and error over an image's candidates; `steps`:
+            errors, mm at home size (the example's at its own size), after every joint and round;
+            `heights`, `true_px` and `edges` of the example; amounts and protocol.
     """
     skeleton, method = model.skeleton, model.method
     data = _unseen(skeleton, model, n_images)
@@ -250,7 +250,7 @@ def illustrate(model: Model, n_images: int = 128) -> dict[str, Any]:
 
 
 def _unseen(skeleton: Skeleton, model: Model, n: int) -> TrainingSet:
-    """Images (n) of animals near home size that come after those of forests and calibration."""
+    """Images (n) of animals near home size, beyond those used for forests and calibration."""
     recipe = _near_home_size(skeleton)
     first = recipe.n_images + recipe.n_correction + recipe.n_calibration
     data = rendered_set(skeleton, model.method, recipe, first, n, silent)
@@ -274,7 +274,7 @@ def _follow(
 
     def note(name: str) -> None:
         for joint in left:
-            cascade.place(candidates, joint)  # straight on from where its parent is now
+            cascade.place(candidates, joint)  # straight on from its parent's current position
         names.append(name)
         errors.append(joint_error(candidates, data.truth))
         positions.append(candidates.positions.copy())
@@ -297,11 +297,11 @@ def _pixels(positions: Array, data: TrainingSet, image: int) -> Array:
 
 
 def acted_key_frames(animal: str = "fish") -> list[dict[str, Any]]:
-    """What Fig. 19 shows of the first test sequence of each action.
+    """Data for Fig. 19 from the first test sequence of each action.
 
     Returns:
         For each action `word`; `side`, whether it is viewed from the side; `path_mm` (n, 2) of the
-        middle of the body; `bodies_mm`, of each key frame the points (m, 2) that the camera sees;
+        middle of the body; `bodies_mm`, for each key frame the points (m, 2) visible to the camera;
         `skeletons_mm` (k, J, 2); `edges`; and `seconds`, its length.
     """
     first: dict[str, Scenario] = {}
@@ -331,7 +331,7 @@ def _key_frames(scenario: Scenario) -> dict[str, Any]:
 
 
 def _direction(path: Array) -> Array:
-    """The horizontal direction (2,) in which a path (n, 3) leads."""
+    """The main horizontal direction (2,) of a path (n, 3), pointing from its start to its end."""
     off = path[:, :2] - path[:, :2].mean(axis=0)
     axis = np.linalg.svd(off, full_matrices=False)[2][0]
     return np.asarray(axis if (path[-1, :2] - path[0, :2]) @ axis >= 0 else -axis)

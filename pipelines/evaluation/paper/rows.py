@@ -1,12 +1,12 @@
-"""Measuring the rows of Tables 1 to 3: the figures of each method on each split, and its speed.
+"""Measurement of the rows of Tables 1 to 3: each method's results on each split, and its speed.
 
 A row is one method with one or several runs: three training draws of the paper's variant, each with
-five initial poses where it has only one. Lie-X assumes one object in the depth image and a skeleton
-of "proper scaling" (sections 3 and 4), so the choice of object and its size must not distinguish
-the methods: our default estimator chooses for all. `wrong` marks frames in which the chosen
-component is another object, `wrong_alone` those in which the choice by area and volume, which the
-paper's variant and the baselines would make by themselves, would be. A component is another object
-if its centroid is farther from the middle of the true joints than 0.8 spines. All numbers are mm.
+five initial poses if it has only one. Lie-X assumes one object in the depth image and a skeleton of
+"proper scaling" (sections 3 and 4), so the choice of object and its size must not distinguish the
+methods: our default estimator chooses for all. `wrong` marks frames in which the chosen component
+is another object, `wrong_alone` those in which the choice by area and volume, which the paper's
+variant and the baselines would make, is. A component is another object if its centroid is farther
+from the middle of the true joints than 0.8 spines. All numbers are mm.
 """
 
 from __future__ import annotations
@@ -39,9 +39,9 @@ Tests = Mapping[str, Sequence[TrueRecording]]  # by split
 
 ROWS = ("default", "paper", "paper-one-pose", "paper-no-metric", "rf", "cnn")
 SWEPT = ("paper", "default")  # whose curves (Fig. 7) and failures (Fig. 17) are drawn
-# trainings that a row is pooled over, where there are several
+# number of trainings that a row is pooled over, if several
 TRAINING_DRAWS = {"paper": 3, "paper-one-pose": 3, "paper-no-metric": 3}
-START_DRAWS = 5  # of the only initial pose of each of them
+START_DRAWS = 5  # draws of the only initial pose, for each training
 _RATE_FRAMES = 128
 _RATE_REPEATS = 3
 _QUANTILES = 101
@@ -56,7 +56,7 @@ def runs_of(animal: str, variant: str, progress: Progress = silent) -> list[Subj
     """The runs of a row: its models, from the cache or trained now, with their initial poses.
 
     Raises:
-        MissingPackageError: the CNN is asked for and torch is not installed.
+        MissingPackageError: the row is the CNN and torch is not installed.
     """
     if variant not in TRAINING_DRAWS:
         return [subject_of(animal, variant, progress)]
@@ -69,7 +69,7 @@ def runs_of_models(variant: str, models: Sequence[PoseEstimator]) -> list[Subjec
     """The runs of a row of the paper's variant, from one estimator per training draw.
 
     Raises:
-        PlanError: it is no such row.
+        PlanError: there is no such row.
     """
     if variant == "paper":
         return list(models)
@@ -86,13 +86,13 @@ def runs_of_models(variant: str, models: Sequence[PoseEstimator]) -> list[Subjec
 
 @dataclass(frozen=True)
 class CommonView:
-    """What every row is given in the n frames of one recording.
+    """Input common to all rows in the n frames of one recording.
 
     Attributes:
-        size: the animal's spine over home size, as the default estimator finds it.
+        size: the animal's spine over home size, as estimated by the default estimator.
         second: (n,) bool, the second of two components is measured.
         wrong: (n,) bool, the component that is measured is another object.
-        wrong_alone: (n,) bool, so would be that of the choice by area and volume.
+        wrong_alone: (n,) bool, the component chosen by area and volume is another object.
     """
 
     size: float
@@ -109,10 +109,10 @@ def common_view(
     Args:
         recording: a rendered recording with its truth.
         plan: thresholds of the foreground, and expected sizes.
-        chooser: finds the animal's size, and which of two components it is.
+        chooser: estimates the animal's size and chooses between two components.
 
     Returns:
-        The fitted segmenter, all frames (n, H, W) mm, and what every row is given.
+        The fitted segmenter, all frames (n, H, W) mm, and the rows' common input.
     """
     scene, frames = build_scene(recording, plan, chooser.skeleton, len(recording))
     size = chooser.find_size(frames, scene)
@@ -148,8 +148,8 @@ def measured(
         subject: an estimator or a baseline.
         frames: (n, H, W) float32 depth, mm, 0 where unread.
         scene: the fitted segmenter.
-        view: what every row is given.
-        cut: height maps that other subjects measured already, by size and view; filled.
+        view: the rows' common input.
+        cut: cache of height maps by size and view, shared by subjects; filled.
 
     Returns:
         As `pose.measure`: joints (n, J, 3) mm, camera frame; predicted error (n,) mm; factors (2,).
@@ -178,13 +178,13 @@ def measured_rows(
 
     Args:
         animal: a bundled animal's name, or the path of a skeleton's TOML.
-        runs: estimators and baselines by variant; `default` is among them.
+        runs: estimators and baselines by variant, including `default`.
         chooser: the default estimator.
         tests: recordings with their truth.
-        progress: told recording by recording.
+        progress: called recording by recording.
 
     Returns:
-        By row `splits` and `rate`, `examples` and, of those that Fig. 17 draws, `failures`.
+        By row `splits` and `rate`, `examples` and, for the rows of Fig. 17, `failures`.
     """
     rows: dict[str, dict[str, Any]] = {
         name: {"splits": {}, "examples": [], "failures": []} for name in runs
@@ -222,16 +222,16 @@ def measured_rows(
 
 
 def numbers_of(runs: Sequence[PoseErrors], views: Sequence[CommonView]) -> dict[str, Any]:
-    """The figures of a row on one split.
+    """The results of a row on one split.
 
     Args:
         runs: errors of the n frames of each run.
-        views: what the row was given in each recording.
+        views: the row's input in each recording.
 
     Returns:
         `median_mm`, `mean_mm`, `interval95` (of the median) and `mean_interval95` by bootstrap over
         recordings, `run_median_mm`, `wrong_object`, `wrong_object_alone`, `n_frames`,
-        `n_recordings`, the figures of `PoseErrors.summary` over all runs, error of each joint, and
+        `n_recordings`, the values of `PoseErrors.summary` over all runs, error of each joint, and
         101 quantiles.
     """
     errors = PoseErrors.join(list(runs))
@@ -289,13 +289,13 @@ def example_frames(recordings: Sequence[TrueRecording]) -> list[tuple[int, int]]
     """The example frames of a split: the middle of the first recording and of the one halfway.
 
     Returns:
-        Numbers of recording and frame.
+        Pairs of recording and frame index.
     """
     return [(k, len(recordings[k]) // 2) for k in dict.fromkeys((0, len(recordings) // 2))]
 
 
 def pose_at(split: str, recording: int, frame: int, joints: Array) -> dict[str, Any]:
-    """A measured pose as a row keeps it; `joints_mm` is None if nothing was found."""
+    """A measured pose as stored in a row; `joints_mm` is None if nothing was found."""
     found = bool(np.isfinite(joints).all())
     return {
         "split": split,
@@ -335,7 +335,7 @@ def shown_poses(
     rows: Mapping[str, Sequence[Mapping[str, Any]]],
     tests: Tests,
 ) -> dict[str, list[dict[str, Any]]]:
-    """Depth images, truth and the poses of rows in some frames, as they are drawn.
+    """Depth images, truth and the poses of rows in some frames, for drawing.
 
     Args:
         places: frames, by `split`, `recording` and `frame`.
@@ -345,7 +345,7 @@ def shown_poses(
     Returns:
         By variant, for each frame `head`; `depth` (h, w) float32 mm around the animal, 0 where
         unread; `camera` of that part; `edges`; `spine_mm`; `truth` (J, 3) mm, camera frame; and, if
-        the row has one there, `pose` (J, 3), which is None if nothing was found.
+        the row has one, `pose` (J, 3), which is None if nothing was found.
     """
     found: dict[str, list[dict[str, Any]]] = {name: [] for name in rows}
     for place in places:

@@ -3,9 +3,9 @@
 `liex evaluate tables` measures six rows on an animal's test splits (40 recordings each): our
 default, the paper's variant of Lie-X, its ablations without multiple initial poses and without the
 learned metric, and the baselines RF and CNN. Rows and curves whose models take long to train are
-kept: `datasets/kept_results/ANIMAL.json` has their numbers and how they were made (version,
-command, seeds, day and machine). Nothing checks that today's code would give the same numbers; the
-tables name each row of another version, and they are measured again before a release.
+kept: `datasets/kept_results/ANIMAL.json` has their numbers and provenance (version, command, seeds,
+day and machine). Nothing checks that today's code gives the same numbers; the tables mark each row
+of another version, and these rows are measured again before a release.
 """
 
 from __future__ import annotations
@@ -53,10 +53,10 @@ from . import illustrations, rows
 from .illustrations import Sweep
 from .rows import ROWS, SWEPT, TRAINING_DRAWS, Subject, Tests
 
-CURVES = "fig7"  # stands for the curves among the names of rows
+CURVES = "fig7"  # name of the curves among the names of rows
 PARTS = ("tracking", "actions")
 SCHEMA = 4
-_DIGITS = 6  # significant ones of a kept number
+_DIGITS = 6  # significant digits of a kept number
 _DEEP = re.compile(r"\n {5,}|\n {4}(?=[]}])")  # line breaks within a list or the numbers of a split
 _N_SESSIONS = 40
 _ILLUSTRATED = 128  # images behind the figures of candidates and convergence
@@ -70,7 +70,7 @@ _VERBS = {
 _QUICK_FRAMES = 100
 _QUICK_ILLUSTRATED = 16
 _QUICK_TRACKED = 40
-_QUICK_STRIDE = 12  # every so many-th cut-out sequence
+_QUICK_STRIDE = 12  # use every so many-th cut-out sequence
 _QUICK_IMAGES = {"paper": 1_024, "rf": 2_048, "cnn": 2_048}
 QUICK_SWEEP = Sweep(
     n_images=512,
@@ -87,15 +87,15 @@ QUICK_SWEEP = Sweep(
 
 @dataclass(frozen=True)
 class Budget:
-    """How much is measured, and of what.
+    """What is measured, and on how much data.
 
     Attributes:
         n_frames: frames of each split, rounded up to whole recordings; None means all.
         fresh: rows that are trained and measured now.
-        curves: those of Fig. 7 are, too.
-        kept: the others come from datasets/kept_results; else they are missing.
-        quick: every row is trained on next to nothing, to check that everything runs.
-        sealed: the sealed split is measured instead of the others.
+        curves: whether the curves of Fig. 7 are, too.
+        kept: whether the other rows come from datasets/kept_results; otherwise they are missing.
+        quick: train every row on very little data, to check that everything runs.
+        sealed: measure the sealed split instead of the others.
     """
 
     n_frames: int | None
@@ -109,7 +109,7 @@ class Budget:
     def of(
         n_frames: int | None, quick: bool, fresh: bool, rows: Sequence[str], sealed: bool
     ) -> Budget:
-        """What the options of the command line ask for.
+        """The budget for the options of the command line.
 
         Raises:
             PlanError: there is no such row.
@@ -145,24 +145,24 @@ def measure_paper(
     nyu: Path | None = None,
     progress: Progress = silent,
 ) -> tuple[list[dict[str, Any]], dict[str, Any], list[Path]]:
-    """Measure what the tables and figures show; keep the numbers in a folder.
+    """Measure the contents of the tables and figures; write the numbers into a folder.
 
     Args:
-        out: the folder for results.json and kept/ANIMAL.json; it is made if it is missing.
+        out: the folder for results.json and kept/ANIMAL.json; it is created if missing.
         animals: names of bundled animals.
         n_frames: frames of each split, of which every row is then measured; None means all.
-        quick: few frames, every row trained on next to nothing.
-        fresh: rows are trained and measured now, not taken from kept results.
-        rows: only these rows are, besides the default, or `fig7` for its curves; the others come
-            from kept results. () names none.
+        quick: few frames, every row trained on very little data.
+        fresh: train and measure rows now instead of using kept results.
+        rows: measure only these rows and the default, or `fig7` for its curves; the others come
+            from kept results. () measures as `fresh` states.
         sealed: measure the sealed split instead of the others, once per release.
-        without: parts of other verbs that are left out, `tracking` or `actions`.
+        without: parts of other verbs to leave out, `tracking` or `actions`.
         nyu: folder of the NYU hand data, for Table 2; None leaves it out.
-        progress: told how far the job is.
+        progress: called with the progress of the job.
 
     Returns:
-        What was measured by animal, see `results_of`; what other verbs measured, see
-        `measure_further`; and the files that were written.
+        The results by animal, see `results_of`; the results of other verbs, see `measure_further`;
+        and the files that were written.
 
     Raises:
         PlanError: there is no such row, or part.
@@ -178,7 +178,7 @@ def measure_paper(
     folder.mkdir(parents=True, exist_ok=True)
     results = [results_of(animal, budget, command, progress) for animal in animals]
     written = [keep_results(folder / "kept", one) for one in results]
-    # the poses are with the rows; what is drawn of them holds depth images
+    # poses are kept with the rows; their drawings contain depth images
     numbers = {
         one["animal"]: {k: v for k, v in one.items() if k not in ("examples", "failures")}
         for one in results
@@ -199,7 +199,7 @@ def _command(
     rows: Sequence[str] = (),
     sealed: bool = False,
 ) -> str:
-    """The command line that makes the same numbers."""
+    """The command line that reproduces the numbers."""
     flags = {"--quick": quick, "--fresh": fresh, "--sealed": sealed}
     words = [
         *("liex", "evaluate", "tables", *(f"--animal={animal}" for animal in animals)),
@@ -211,11 +211,11 @@ def _command(
 
 
 def kept_results(animal: str, folder: Path | None = None) -> dict[str, Any]:
-    """What is kept for an animal: `rows` and `sensitivity` by variant, empty if nothing is.
+    """Kept results of an animal: `rows` and `sensitivity` by variant, empty if there are none.
 
     Args:
         animal: name of the skeleton.
-        folder: where results are kept; None means datasets/kept_results.
+        folder: folder of kept results; None means datasets/kept_results.
 
     Raises:
         LiexError: the file is damaged, or of another schema.
@@ -238,10 +238,10 @@ def kept_results(animal: str, folder: Path | None = None) -> dict[str, Any]:
 
 
 def keep_results(folder: Path, results: Mapping[str, Any]) -> Path:
-    """Write the results of an animal as they are kept; in datasets/kept_results they are used.
+    """Write an animal's results as a file for datasets/kept_results.
 
-    A number has six digits, and a list or a pose takes one line. `default` is measured in every run
-    and is not kept.
+    Numbers have six digits, and a list or a pose takes one line. `default` is measured in every run
+    and is not written.
     """
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"{results['animal']}.json"
@@ -261,7 +261,7 @@ def keep_results(folder: Path, results: Mapping[str, Any]) -> Path:
 
 
 def _lasting(entry: Mapping[str, Any]) -> dict[str, Any]:
-    """A row or curve without what is true of one run alone."""
+    """A row or curve without the entries that hold for a single run."""
     return {k: v for k, v in entry.items() if k not in ("origin", "other_processor")}
 
 
@@ -274,14 +274,14 @@ def _rounded(value: Any) -> Any:
 
 
 def processor() -> str:
-    """The kind of processor that numba compiles for, as LLVM names it, such as `znver4`."""
+    """LLVM's name of the processor that numba compiles for, such as `znver4`."""
     import llvmlite.binding as llvm
 
     return str(numba.config.CPU_NAME or llvm.get_host_cpu_name())
 
 
 def _made_by(command: str) -> dict[str, Any]:
-    """How a row or a curve is made now: command, version, day and machine."""
+    """Provenance of a row or a curve of this run: command, version, day and machine."""
     machine = platform.processor() or platform.machine()
     return {
         "command": command,
@@ -299,11 +299,11 @@ def results_of(
 
     Returns:
         `animal`, `joints`, `splits`; `rows` by variant, see `rows.measured_rows`, each with `made`,
-        `origin` and `other_processor`, the one of a row that was measured on another than this
-        run's; `missing`, by variant or by figure and variant, why there is no row or curve;
-        `sealed`; `test_postures`, where those of the test splits come from, '' if seeds say so;
-        `sensitivity`, the curves by variant; `illustration` of the default; `examples` and
-        `failures`, poses by variant, see `rows.shown_poses`.
+        `origin` and `other_processor` (the row's, if it differs from this run's); `missing`, by
+        variant or by figure and variant, why there is no row or curve; `sealed`; `test_postures`,
+        source of the test splits' postures, '' if drawn from seeds; `sensitivity`, the curves by
+        variant; `illustration` of the default; `examples` and `failures`, poses by variant, see
+        `rows.shown_poses`.
     """
     skeleton = Skeleton.load(animal)
     kept = kept_results(skeleton.name) if budget.kept else {"rows": {}, "sensitivity": {}}
@@ -359,7 +359,7 @@ def results_of(
 
 
 def _tests(skeleton: Skeleton, budget: Budget) -> Tests:
-    """The recordings by split."""
+    """The test recordings by split."""
     world = world_of(skeleton)
     n = _N_SESSIONS
     if budget.n_frames is not None:
@@ -394,7 +394,7 @@ def _sensitivities(
     missing: dict[str, str],
     progress: Progress,
 ) -> dict[str, Any]:
-    """Fig. 7 of the paper's variant and of ours, measured now if it is asked for, or kept."""
+    """Fig. 7 of the paper's variant and of ours, measured now if the budget states so, or kept."""
     curves = {}
     for variant in SWEPT[: 1 if budget.quick else None]:
         if budget.curves:
@@ -413,7 +413,7 @@ def quick_runs(animal: str, variant: str, progress: Progress = silent) -> list[S
     """As `rows.runs_of`, trained within seconds to check that every row runs.
 
     Raises:
-        MissingPackageError: the CNN is asked for and torch is not installed.
+        MissingPackageError: the row is the CNN and torch is not installed.
     """
     if variant == "default":
         return [estimator_of(animal, "default")]
@@ -446,13 +446,13 @@ def measure_further(
     quick: bool = False,
     progress: Progress = silent,
 ) -> dict[str, Any]:
-    """What other verbs measure, as small fixed measurements for the same page.
+    """Results of other verbs, as small fixed measurements for the same page.
 
     Returns:
         `tracking` (Fig. 18): the first frames of the easy mouse sequence, with `tracked`, the
         sequence and its rows; `actions` (Figs. 19 and 20): the cut-out sequences of fish, with
         `key_frames`; `nyu` (Table 2, Fig. 12), with `nyu_hands`; empty if left out; `missing`: by
-        part, why it is not there and which command makes it.
+        part, why it was left out and which command makes it.
     """
     further: dict[str, Any] = {"tracking": {}, "actions": {}, "nyu": {}, "nyu_hands": {}}
     further["missing"] = {name: f"it was left out; `{_VERBS[name]}` makes it" for name in without}
