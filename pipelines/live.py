@@ -1,8 +1,8 @@
-"""Live tracking: skeletons of a recording that goes on, and its smoothed track in the end.
+"""Live tracking: skeletons of a growing recording, and its smoothed track at the end.
 
-`liex live` learns background, floor and size from the first frames that arrive, then measures each
-frame and passes it to the online tracker, which has no lag; frames that have waited are measured in
-batches. When the recording is over, the offline tracker makes the track of the whole.
+`liex live` learns background, floor and size from the first frames, then measures each frame and
+passes it to the online tracker, which has no lag; frames that have waited are measured in batches.
+At the end of the recording the offline tracker computes the whole track.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from liex_lab.tracking.track import Track, Tracked
     from liex_lab.tracking.tracker import FrameTracker
 
-# that are waited for: the background, the floor and the animal's size are learned from them
+# first frames, from which the background, the floor and the animal's size are learned
 LEARN_FRAMES = 90
 _AT_ONCE = 16
 _LONG_S = 0.2
@@ -38,13 +38,13 @@ Viewer = Callable[["FrameTracker", "Arriving"], Any]
 def open_live(
     source: str, plan: Plan, *, replay: bool = False, patience_s: float = 3.0
 ) -> Arriving:
-    """What arrives at a source: a growing file, a network address, or a replayed recording.
+    """Open a live source: a growing file, a network address, or a replayed recording.
 
     Args:
         source: path of a file or folder that is being written, or HOST:PORT.
         plan: how recordings are opened; one that is cut short is accepted.
         replay: send the recording at `source` at its own pace instead.
-        patience_s: a growing file is over when nothing has come for so long, s.
+        patience_s: a growing file ends when nothing has arrived for so long, s.
     """
     from liex_lab.recordings.streaming import growing, received, replayed
 
@@ -65,25 +65,24 @@ def follow_live(
     viewer: Viewer | None = None,
     progress: Progress = silent,
 ) -> tuple[dict[str, Any], Tracked]:
-    """Latencies and the smoothed track of a recording whose skeletons are shown as its frames come.
+    """Track a recording as its frames arrive; returns latencies and the smoothed track.
 
-    Latency is from when a frame was there to when its skeleton was known, of every frame from the
-    first on that came when all before it had been answered: until then what was missed while
-    learning is made up for.
+    Latency is from the arrival of a frame to its skeleton, for all frames since the first one that
+    arrived after its predecessors were processed: until then the backlog of learning is processed.
 
     Args:
-        arriving: name, camera and frames as they come.
+        arriving: name, camera and frames as they arrive.
         plan: how the recording is measured.
         learn_frames: frames that background, floor and size are learned from.
-        viewer: makes a viewer from tracker and source, which is shown each frame with its row.
-        progress: reports frame by frame.
+        viewer: makes a viewer from tracker and source, which displays each frame with its row.
+        progress: called frame by frame.
 
     Returns:
         `name`, `n_frames`, `n_live`, `latency_median_ms`, `latency_p95_ms` (None without live
         frames), `n_measured` and `n_bridged`; and the track with its head-tail flips.
 
     Raises:
-        RecordingError: the recording was over before it had a frame.
+        RecordingError: the recording ended before its first frame.
         EstimationError: no animal is found in the frames that are learned from.
     """
     from liex_lab.tracking.observations import Observations
@@ -130,16 +129,16 @@ def follow_live(
 
 
 def _chained(held: list[Arrival], frames: Iterator[Arrival]) -> Iterator[Arrival]:
-    """All arrivals, their frames marked where they repeat the one before."""
+    """All arrivals, with frames marked that repeat their predecessor."""
     arrivals, again = tee(chain(held, frames))
     for frame, arrival in zip(marked(one.frame for one in again), arrivals, strict=True):
         yield arrival._replace(frame=frame)
 
 
 def _together(arrivals: Iterator[Arrival]) -> Iterator[list[Arrival]]:
-    """Frames in batches of up to 16 where they have waited, each alone where they are fresh.
+    """Batches of up to 16 frames that have waited; a fresh frame ends its batch.
 
-    Together each costs half.
+    A frame costs half as much in a batch.
     """
     some: list[Arrival] = []
     for arrival in arrivals:
@@ -152,7 +151,7 @@ def _together(arrivals: Iterator[Arrival]) -> Iterator[list[Arrival]]:
 
 
 def _as_recording(arriving: Arriving, held: list[Arrival]) -> Recording:
-    """The frames that have come, as a recording."""
+    """The frames that have arrived, as a recording."""
     from liex_lab.recordings.recording import Recording
 
     times = np.array([arrival.frame.time_ns for arrival in held], np.int64)

@@ -1,4 +1,4 @@
-"""What a session says of where it comes from: recording, animal, arena and scene, zones, room."""
+"""Provenance of a session: recording, animal, arena and scene, zones, disk space."""
 
 from __future__ import annotations
 
@@ -23,14 +23,15 @@ if TYPE_CHECKING:
     from liex_lab.tracking.tracker import FrameTracker
 
 
-# of the home length: how small and how large an animal of the user's own may be
+# least and largest length of a user's own animal, over the home length
 _SPANS = (0.6, 1.8)
 
 
 def animal_of(plan: Plan) -> Animal:
-    """The plan's animal; of one of the user's own, its skeleton states what the plan does not.
+    """The plan's animal; for a user's own skeleton, with the skeleton's values where the plan has
+    none.
 
-    Its name is the skeleton's then, and its spine 0.6 to 1.8 times the skeleton's own length.
+    Its name is then the skeleton's, and its spine 0.6 to 1.8 times the skeleton's length.
 
     Args:
         plan: its section `animal`.
@@ -46,7 +47,7 @@ def animal_of(plan: Plan) -> Animal:
     skeleton = Skeleton.load(animal.skeleton)
     low, high = (round(factor * skeleton.length, 3) for factor in _SPANS)
     own = {"name": skeleton.name, "spine_min_mm": low, "spine_max_mm": high}
-    usual = type(animal).model_fields  # a plan that was written out states its defaults
+    usual = type(animal).model_fields  # a plan that was written to a file states its defaults
     return animal.model_copy(
         update={k: v for k, v in own.items() if getattr(animal, k) == usual[k].default}
     )
@@ -55,20 +56,20 @@ def animal_of(plan: Plan) -> Animal:
 def build_provenance(
     recording: Recording, plan: Plan, tracker: FrameTracker, progress: Progress = silent
 ) -> Provenance:
-    """What the session says about its origin: recording, camera, plan, model, animal, arena, zones.
+    """The session's provenance: recording, camera, plan, model, animal, arena, zones.
 
     Args:
-        recording: an open recording; hashing its content is the longest wait here.
+        recording: an open recording; hashing its content takes the longest.
         plan: names the model and the zones.
         tracker: the prepared tracker: background, animal's size, girth.
-        progress: reports while the content is hashed.
+        progress: called while the content is hashed.
     """
     from liex_lab.catalog import find_model, sha256
     from liex_lab.sessions import Provenance
 
     recording.digest(
         progress
-    )  # kept by the recording; the longest wait here, so it is the one that is shown
+    )  # cached by the recording; takes the longest, so it shows the progress
     arena, zones = build_arena(tracker.scene, plan)
     return Provenance.of(
         recording,
@@ -85,12 +86,7 @@ def build_provenance(
 
 
 def animal_facts(plan: Plan, tracker: FrameTracker) -> dict[str, Any]:
-    """What session.json says of the animal's size, girth and shape.
-
-    Args:
-        plan: its section `animal`.
-        tracker: the prepared tracker.
-    """
+    """The animal's size, girth and shape for session.json."""
     shared = plan.animal.shared
     origin = "estimated over the recording"
     if tracker.size_origin == "plan":
@@ -107,12 +103,12 @@ def animal_facts(plan: Plan, tracker: FrameTracker) -> dict[str, Any]:
 def build_background(
     recording: Recording, plan: Plan, segmenter: Segmenter
 ) -> NDArray[np.uint16] | None:
-    """The still scene (H, W) mm before which the replay shows cut-outs; None if it shows none.
+    """The still scene (H, W) mm behind the replay's cut-outs; None if the replay has none.
 
     Args:
         recording: an open recording.
         plan: its section `replay`.
-        segmenter: the learned segmentation, which tells an animal at rest from the scene.
+        segmenter: the learned segmentation, which separates an animal at rest from the scene.
     """
     from liex_lab.scene.background_segmenter import BackgroundSubtraction
     from liex_lab.sessions.cutouts import ANIMAL, ARENA, still_scene
@@ -125,7 +121,7 @@ def build_background(
 
 
 def build_described_scene(segmenter: Segmenter, arena: Arena) -> Scene | None:
-    """What stands still before the camera, for session.json; None for a hand, which has no floor.
+    """The still scene for session.json; None for a hand, which has no floor.
 
     Args:
         segmenter: the learned segmentation.
@@ -139,7 +135,7 @@ def build_described_scene(segmenter: Segmenter, arena: Arena) -> Scene | None:
 
 
 def build_arena(scene: Segmenter, plan: Plan) -> tuple[Arena, tuple[Zone, ...]]:
-    """The outline of the arena's floor, and the plan's zones placed in it, arena frame, mm.
+    """The outline of the arena's floor, and the plan's zones in it, arena frame, mm.
 
     Args:
         scene: the learned segmentation; a hand has no arena, so its outline is unknown.
@@ -157,7 +153,7 @@ def build_arena(scene: Segmenter, plan: Plan) -> tuple[Arena, tuple[Zone, ...]]:
 
 
 def build_zones(plan: Plan) -> tuple[DrawnZone, ...]:
-    """The zones of the plan as they were drawn, () where it names none.
+    """The zones of the plan as drawn; () if it names none.
 
     Args:
         plan: its setting `arena.zones`.
@@ -171,11 +167,7 @@ def build_zones(plan: Plan) -> tuple[DrawnZone, ...]:
 
 
 def build_surroundings(provenance: Provenance) -> Surroundings:
-    """What measures of behaviour have to know of arena, zones and water.
-
-    Args:
-        provenance: the session's origin.
-    """
+    """Arena, zones and water surface for the measures of behaviour."""
     from liex_lab.behaviour.places import Surroundings, surface_height_mm
 
     surface = surface_height_mm(provenance.floor_distance_mm, provenance.optics)
@@ -183,7 +175,7 @@ def build_surroundings(provenance: Provenance) -> Surroundings:
 
 
 def session_bytes(recording: Recording, plan: Plan, length_mm: float, distance_mm: float) -> int:
-    """What a session of a recording takes on disk, bytes, within a factor of two.
+    """Size of a recording's session on disk, bytes, within a factor of two.
 
     Args:
         recording: an open recording.

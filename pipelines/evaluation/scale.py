@@ -1,11 +1,12 @@
 """Benchmark of throughput and scaling: sessions per hour, memory by length, time by stage.
 
 `liex evaluate scale` writes virtual mice as 640 x 480 MCAP files and measures `liex run` on them:
-frames/s and ms a frame by stage, against the bound of opening, decoding and writing alone; one
-recording's shards by one process and by two; a study by one Dask worker and by two (processes kept
-on as many cores); peak memory, MB, by length; and whole runs by kind of recording (`recordings`).
-Sessions per hour with up to 1,000 workers are simulated (`ASSUMPTIONS`, `DEFINITIONS`).
-`liex evaluate report` repeats a measured session until it is long and writes its report.
+frames/s and ms per frame by stage, compared with opening, decoding and writing alone; one
+recording's shards by one process and by two; a study by one Dask worker and by two (processes
+restricted to as many cores); peak memory, MB, by length; and whole runs by kind of recording
+(`recordings`). Sessions per hour with up to 1,000 workers are simulated (`ASSUMPTIONS`,
+`DEFINITIONS`). `liex evaluate report` repeats a measured session until it is long and writes its
+report.
 """
 
 from __future__ import annotations
@@ -60,13 +61,13 @@ RunSession = Callable[..., Path]
 
 _VIRTUAL = "synthetic:walk?seed={seed}&frames={n}&sensor={sensor}"
 _WORKERS = (1, 2, 4, 8, 16, 32, 64, 128, 256, 512, 1000)
-_CREWS = {  # name -> processes, and the cores of all of them
+_CREWS = {  # name -> number of processes, and of cores for all of them
     "1": (1, 1),
     "2": (2, 2),
     "1, free": (1, 2),
 }
 _N_SIMULATED = 2000  # sessions
-_COARSER = 8  # of a long session's depth images, which go straight to disk, every so many-th pixel
+_COARSER = 8  # pixel stride of a long session's depth images, which go straight to disk
 _BLOCK = 256  # frames
 _COPIED = ("plan.toml", "session.rrd", "session.mcap")
 ASSUMPTIONS = (
@@ -111,9 +112,9 @@ def evaluate_scale(
 
     Args:
         run: measures a recording, `liex_lab.api.run_session`.
-        n_frames: frames of each virtual recording, 640 x 480; some shards long.
+        n_frames: frames of each virtual recording, 640 x 480; several shards long.
         minutes: lengths of recording whose memory is measured, minutes.
-        progress: told the stage, of six.
+        progress: called with the stage, of six.
 
     Returns:
         The measured numbers, `kinds` (whole runs by kind of recording), `memory_mb_by_length`,
@@ -155,14 +156,14 @@ def evaluate_scale(
 
 
 def _walk(folder: Path, seed: int, n_frames: int) -> Path:
-    """A virtual mouse, written as an MCAP file: reading it costs what reading a recording costs."""
+    """A virtual mouse as an MCAP file, which costs as much to read as any recording."""
     address = _VIRTUAL.format(seed=5 + seed, n=150, sensor="primesense")
     with open_recording(address) as short:
         return as_mcap(looped(short, n_frames, f"walk{seed}"), folder)
 
 
 def _stages(run: RunSession, recording: Path, folder: Path) -> dict[str, Any]:
-    """Where the time of a session goes, after a first one has compiled everything."""
+    """Time of each stage of a session, after a first session has compiled everything."""
     plan = Plan.load("mouse")
     run(recording, plan, folder / "warm")
     kept_estimator.cache_clear()  # a single run has to load its model
@@ -190,7 +191,7 @@ def _stages(run: RunSession, recording: Path, folder: Path) -> dict[str, Any]:
 def _decode_and_write(
     session: Session, recording: Path, plan: Plan, folder: Path
 ) -> dict[str, float]:
-    """The least that any program needs which reads a recording and writes both logs.
+    """Time of the minimum work of any program that reads a recording and writes both logs.
 
     Returns:
         Seconds of `opening` the recording; of opening it and reading all frames (`decode`); and,
@@ -237,7 +238,7 @@ def _decode_and_write(
 
 
 class _Timed:
-    """A worker pool that notes when each shard came, and how many frames it has."""
+    """A worker pool that records the completion time and number of frames of each shard."""
 
     def __init__(self, pool: WorkerPool) -> None:
         self._pool = pool
@@ -255,7 +256,7 @@ class _Timed:
 def _side_by_side(recording: Path, folder: Path) -> dict[str, Any]:
     """Frames per second read, measured and written by one process and by two.
 
-    Each process has done its first shard before the clock runs, as it takes some seconds to begin.
+    The clock starts once each process has done its first shard, as starting takes some seconds.
     """
     plan = Plan.load("mouse")
     with build_recording(recording, plan) as opened:
@@ -278,7 +279,9 @@ def _side_by_side(recording: Path, folder: Path) -> dict[str, Any]:
 
 @contextmanager
 def _on_cores(n: int) -> Iterator[None]:
-    """Keep processes that are started in the block on so many cores, if the system can do that."""
+    """Restrict processes that are started in the block to so many cores, if the system supports
+    it.
+    """
     before = os.sched_getaffinity(0) if hasattr(os, "sched_setaffinity") else set()
     if before:
         os.sched_setaffinity(0, sorted(before)[:n])
@@ -292,11 +295,11 @@ def _on_cores(n: int) -> Iterator[None]:
 def _workers(
     run: RunSession, walks: list[Path], folder: Path
 ) -> tuple[dict[str, Any], list[float], float]:
-    """The same sessions on one worker and on two, by the clock.
+    """Elapsed time of the same sessions on one worker and on two.
 
     Returns:
-        The study's numbers; seconds of each session on one worker; and what the scheduler spends on
-        each, s.
+        The study's numbers; seconds of each session on one worker; and the scheduler's time per
+        session, s.
     """
     sessions = [
         {"animal": path.stem, "session": f"0{k}", "recording": f"rawdata/{path.name}"}
@@ -328,11 +331,11 @@ def simulate(
 ) -> dict[str, float]:
     """Sessions per hour by number of workers, a discrete-event simulation of 2,000 sessions.
 
-    A session begins when a worker is free and the scheduler has handed out all before it.
+    A session begins when a worker is free and the scheduler has assigned all sessions before it.
 
     Args:
         session_s: measured times of sessions, s, drawn with replacement (a bootstrap).
-        scheduler_s: what handing out one session costs, s, one after the other.
+        scheduler_s: time to assign one session, s, one after the other.
         workers: numbers of workers.
         seed: of the draw.
     """
@@ -366,15 +369,15 @@ def write_long(
 ) -> dict[str, Any]:
     """Write a session of so many minutes and return its cost.
 
-    Frames of a short recording go to and fro. Every frame is written, tracked and measured as in
-    `liex run`; only its observations are those of the short recording's frame, because measuring it
-    again would give the same. Depth images are every 8th pixel.
+    Frames of a short recording are repeated forwards and backwards. Every frame is written, tracked
+    and measured as in `liex run`; only its observations are copied from the short recording's
+    frame, because measuring it again would give the same. Depth images have every 8th pixel.
 
     Args:
         minutes: length of the session.
         out: folder in which `long.liex` is written.
         report: makes the report, see `SessionWriter`.
-        told: is told where the job is: `began`, `written`, `tracked`, `closed`.
+        told: called with the stage: `began`, `written`, `tracked`, `closed`.
 
     Returns:
         `peak_memory_mb` of the process and `seconds`.
@@ -401,7 +404,7 @@ def write_long(
 
 
 def _measure_short(plan: Plan) -> _Short:
-    """Render and measure the short recording; its full depth images are not kept."""
+    """Render and measure the short recording, without keeping its full depth images."""
     with open_recording(_VIRTUAL.format(seed=5, n=300, sensor="primesense-qvga")) as opened:
         short = looped(opened, len(opened))
     tracker = build_tracker(short, plan)
@@ -434,10 +437,10 @@ def evaluate_report(
     Args:
         session: the session folder that is repeated.
         minutes: least length of the long session.
-        progress: told the stage.
+        progress: called with the stage.
 
     Returns:
-        `frames`, `minutes`, `seconds` by the clock with the start of Python, `peak_memory_mb` and
+        `frames`, `minutes`, elapsed `seconds` including the start of Python, `peak_memory_mb` and
         `report_mb`.
 
     Raises:
@@ -460,7 +463,7 @@ def evaluate_report(
 
 
 def repeat_session(session: Session, folder: Path, seconds: float) -> tuple[int, float]:
-    """Write a session that repeats another one end to end; its depth is that of one round only.
+    """Write a session that repeats another one end to end; its depth covers one round only.
 
     Args:
         session: the session as it was measured, without corrections.

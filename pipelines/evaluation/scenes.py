@@ -1,9 +1,9 @@
-"""Evaluation of scenes: what stands before a lab's depth camera, and whether the product notices.
+"""Evaluation of scenes: typical set-ups of labs, and whether a run reports its own failures.
 
 `liex evaluate scenes` renders each scene of `simulation.scenes` with exact truth, measures it as
 `liex run` does (the whole session, without report and replay's depth), reads the tables back and
-scores them. Development has seeds of its own; the sealed split has others, which no test and no
-development touches.
+scores them. Development uses seeds of its own; the sealed split uses others, which appear in no
+test and no development.
 """
 
 from __future__ import annotations
@@ -35,10 +35,9 @@ from ..session import measure_session
 
 Array = NDArray[np.float64]
 
-# every other one of another build, the rest of those that models were trained on
+# alternately another build and one of those that models were trained on
 SEEDS: Final = tuple(range(1001, 1013))
-# 931_507_211 to 213 were measured on 25 November 2026, and what was mended after that was chosen by
-# their figures: these are others
+# not 931_507_211 to 213: development after 25 November 2026 used their results
 SEALED_SEEDS: Final = (958_204_331, 958_204_332, 958_204_333)
 N_FRAMES: Final = 300
 
@@ -50,7 +49,7 @@ class Case:
     Attributes:
         scene: name of the scene.
         plan: the bundled plan that it is measured with.
-        beside: the row whose error its own is set against; '' for none.
+        beside: the row whose error its own is divided by; '' for none.
     """
 
     scene: str
@@ -60,10 +59,10 @@ class Case:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a run of the product made of a recording.
+    """Result of a run on a recording.
 
     Attributes:
-        individuals: of all sessions that it wrote; () where it refused.
+        individuals: of all sessions that were written; () if the run was refused.
         said: its problems, or the sentence with which it ended.
         exit_code: of the run.
     """
@@ -99,23 +98,23 @@ def evaluate_scenes(
     draw: Draw | None = None,
     progress: Progress = silent,
 ) -> dict[str, Any]:
-    """The figures of each scene; `liex evaluate scenes`.
+    """Results of each scene; `liex evaluate scenes`.
 
     Args:
-        only: names of rows; () takes all. The row beside which one stands is measured, too.
+        only: names of rows; () uses all. A row's reference row is measured, too.
         n_frames: length of each recording.
         n_recordings: of each scene, each of another seed and animal; the first is of a build that
-            no model was trained on, the second of one like those.
+            no model was trained on, the second of one like the training's.
         sealed: measure on the sealed seeds, which are not for development.
-        draw: is given each row's name, first recording, truth and
-            what was measured, for a picture.
-        progress: told row by row.
+        draw: called with each row's name, first recording, truth and measured individuals, to draw
+            a figure.
+        progress: called row by row.
 
     Returns:
-        `rows` of figures by name, `seeds`, `n_frames` and the protocol.
+        `rows` of results by name, `seeds`, `n_frames` and the protocol.
 
     Raises:
-        LiexError: there is no such row, or not so many seeds.
+        LiexError: there is no such row, or there are too few seeds.
     """
     every = cases()
     for name in only:
@@ -145,14 +144,14 @@ def evaluate_scenes(
 def _measure_row(
     name: str, case: Case, seeds: Sequence[int], n_frames: int, draw: Draw | None
 ) -> dict[str, Any]:
-    """The figures of one row over some recordings."""
+    """Results of one row over some recordings."""
     plan = plan_of(case.plan)
     tally = Tally()
     said: list[str] = []
     exit_code = 0
     for k, seed in enumerate(seeds):
         recording = film(case.scene, seed, n_frames, family="train" if k % 2 else "other")
-        # its content follows from these: it need not be rendered a second time to be hashed
+        # name and length determine the content: it need not be rendered again to be hashed
         recording.files.take_digest(
             hashlib.sha256(f"{recording.name} {n_frames}".encode()).hexdigest()
         )
@@ -175,7 +174,7 @@ def run_product(recording: TrueRecording, plan: Plan) -> Outcome:
         plan: the plan.
 
     Returns:
-        What the tables say in the camera frame, what the run said, and its exit code.
+        The tables' joints in the camera frame, the run's messages, and its exit code.
     """
     quick = plan.with_settings(["replay.depth=none"])
     with tempfile.TemporaryDirectory(prefix="liex-scenes-") as folder:
@@ -204,7 +203,7 @@ def run_product(recording: TrueRecording, plan: Plan) -> Outcome:
 
 
 def _measure(recording: TrueRecording, plan: Plan, folder: str) -> list[LiexError]:
-    """Measure a recording, of several arenas each as a session; returns why arenas were refused."""
+    """Measure a recording, each arena as a session; returns the errors of refused arenas."""
     arenas = propose_arenas(recording, plan)
     if not arenas:
         measure_session(recording, plan, folder)
@@ -214,14 +213,7 @@ def _measure(recording: TrueRecording, plan: Plan, folder: str) -> list[LiexErro
 
 
 def read_individuals(session: Session) -> list[Individual]:
-    """The individuals of a session as its tables say.
-
-    Args:
-        session: an opened session.
-
-    Returns:
-        One each, in the frame of the camera that took the pictures.
-    """
+    """The individuals in a session's tables, in the frame of the camera of the original images."""
     T_camera_arena = session.T_arena_camera.inverse()
     mirrored = bool((session.metadata["camera"].get("optics") or {}).get("mirrored"))
     n_joints = len(session.poses["joint"].unique())

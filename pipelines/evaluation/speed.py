@@ -1,15 +1,15 @@
-"""How fast poses are estimated and told live, and the clocks of all benchmarks.
+"""Speed of pose estimation and of live tracking, and the timers of all benchmarks.
 
 `liex evaluate speed` times rendered frames of the split `clean`, in memory, from foreground to
 final pose (Lie-X Table 3), the best of 5 repeats after one that compiles: frames/s of the default
-on one and on two cores, the ratio to the paper's variant on our engine, to Algorithm 1 as it is
-written, and to the baselines that were trained on this machine; and ms a frame on one core by
-stage, and against the number of joints, of candidates and of pixels.
+on one and on two cores, the ratio to the paper's variant on our engine, to Algorithm 1 as
+published, and to the baselines that were trained on this machine; and ms per frame on one core by
+stage, and by number of joints, of candidates and of pixels.
 
 `liex evaluate live` renders up to 150 frames of a moving virtual animal, keeps them in memory and
-sends them through a local socket at the camera's pace, to and fro: median and 95 % latency, ms, of
-every frame from the first on that came when all before it had been answered, so that learning the
-background is not in it.
+sends them through a local socket at the camera's pace, forwards and backwards: median and 95 %
+latency, ms, of all frames since the first one that arrived after its predecessors were processed,
+which excludes learning the background.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ from ..training.pose_model import estimator_of
 N_FRAMES = 128
 N_REPEATS = 5
 _CANDIDATES = (5, 10, 20, 40)
-_SHRINK = (2, 1)  # every second pixel, every pixel
+_SHRINK = (2, 1)  # every second pixel, and every pixel
 _PROTOCOL = (
     "{n} rendered {pixels} frames in memory, foreground to final pose, best of {repeats}; ratios "
     "on {cores} cores in the same run, `paper` on our engine, `paper_one_by_one` compiled but as "
@@ -72,7 +72,7 @@ _SEED = 78_001
 FPS = 30
 STEP_NS = int(1e9 / FPS)
 _KEPT = 150  # frames rendered
-# frames followed beforehand, and how many times as fast
+# frames tracked beforehand, and their speed-up
 _WARM = 60
 _WARM_SPEED = 1000.0
 _OF_EACH = ("latency_median_ms", "latency_p95_ms", "n_frames", "n_live", "n_measured")
@@ -95,7 +95,7 @@ print(json.dumps(told | (found if isinstance(found, dict) else {})))
 
 
 def best_seconds(job: Callable[[], Any], n_repeats: int = 5) -> float:
-    """Shortest time, s, of several runs after one that compiles: the least disturbed by others."""
+    """Shortest time, s, of several runs after one that compiles: the least disturbed one."""
     job()
     times = []
     for _ in range(n_repeats):
@@ -106,16 +106,16 @@ def best_seconds(job: Callable[[], Any], n_repeats: int = 5) -> float:
 
 
 def isolated(job: str, *arguments: object, one_thread: bool = False) -> dict[str, Any]:
-    """Run a function in a Python process of its own.
+    """Run a function in a separate Python process.
 
     Args:
-        job: "module:function"; what it returns is kept if it is a dict of plain values.
+        job: "module:function"; its result is kept if it is a dict of plain values.
         *arguments: of the function, numbers and texts; others are passed as texts.
-        one_thread: the process has one thread for kernels and image decoders.
+        one_thread: one thread for kernels and image decoders.
 
     Returns:
-        What the function returned, with its `seconds` and the process's `peak_memory_mb`, unless it
-        returned these itself, and `seconds_with_start`, by the clock with the start of Python.
+        The function's result, with its `seconds` and the process's `peak_memory_mb`, unless these
+        are in the result, and `seconds_with_start`, elapsed time including the start of Python.
 
     Raises:
         LiexError: the process failed.
@@ -135,7 +135,7 @@ def isolated(job: str, *arguments: object, one_thread: bool = False) -> dict[str
 
 @contextmanager
 def two_cores() -> Iterator[int]:
-    """Within the block kernels run on at most two cores; gives their number."""
+    """A context in which kernels run on at most two cores; yields their number."""
     cores = min(2, numba.config.NUMBA_NUM_THREADS)
     before = numba.get_num_threads()
     numba.set_num_threads(cores)
@@ -168,7 +168,7 @@ class Footage:
         subject: PoseEstimator | Baseline,
         n_frames: int,
     ) -> Footage:
-        """The first frames, over and over, of the recording with the widest depth images."""
+        """The first frames of the recording with the widest depth images, repeated as needed."""
         recording = max(recordings, key=lambda one: one.width)
         scene, sample = build_scene(recording, plan_of(animal), subject.skeleton, 96)
         frames = recording.depths(0, min(len(recording), n_frames))
@@ -196,15 +196,15 @@ class Footage:
 def evaluate_speed(animal: str = "mouse", *, progress: Progress = silent) -> dict[str, Any]:
     """Frames per second from frames in memory to poses, foreground included; `liex evaluate speed`.
 
-    The paper's variant is trained if it has not been; baselines are timed if they have been.
+    The paper's variant is trained if needed; baselines are timed if they are trained already.
 
     Args:
         animal: a bundled animal's name, or the path of a skeleton's TOML.
-        progress: told the stage, of five.
+        progress: called with the stage, of five.
 
     Returns:
         `frames_per_s_1core`, `frames_per_s_2cores`, `ratio_to_paper`, `ratio_to` by rival,
-        `stages_ms` and `cost_ms` a frame, machine and protocol.
+        `stages_ms` and `cost_ms` per frame, machine and protocol.
     """
     progress(0, 5, "rendering frames")
     default = estimator_of(animal, "default")
@@ -247,13 +247,13 @@ def _rivals(animal: str, progress: Progress) -> dict[str, PoseEstimator | Baseli
     skeleton = Skeleton.load(animal)
     for name in BASELINES:
         if cached_baseline(name, skeleton, training_of(name, skeleton)).is_file():
-            with suppress(MissingPackageError):  # the CNN's, which does not run without it
+            with suppress(MissingPackageError):  # the CNN needs torch
                 rivals[name] = trained_baseline(animal, name)
     return rivals
 
 
 def _one_by_one(paper: PoseEstimator, footage: Footage) -> NDArray[Any]:
-    """Algorithm 1 as it is written, from frames to candidate scores; none share a step."""
+    """Algorithm 1 as published, from frames to candidate scores, without shared steps."""
     from liex_lab.estimation.training import base_at_front
 
     method, skeleton, cascade = paper.model.method, paper.skeleton, paper.model.cascade
@@ -287,7 +287,7 @@ def _one_by_one(paper: PoseEstimator, footage: Footage) -> NDArray[Any]:
 def _stages_and_costs(
     default: PoseEstimator, footage: Footage
 ) -> tuple[dict[str, float], dict[str, dict[str, float]]]:
-    """Milliseconds a frame on one core by stage, and by number of joints, candidates, pixels."""
+    """Milliseconds per frame on one core by stage, and by number of joints, candidates, pixels."""
     scene, size = footage.scene, footage.size
     view = default.model.method.camera_view
     crops = scene.extract(footage.frames, size, camera_view=view)
@@ -338,8 +338,8 @@ def evaluate_live(
         n_frames: frames that each camera sends.
         learn_frames: frames that background, floor and size are learned from.
         rate_hz: frames per second that are sent; None means the camera's own rate.
-        n_cameras: cameras that film at once, each in a process of its own.
-        progress: told how far rendering and following are, if there is one camera.
+        n_cameras: number of simultaneous cameras, each in a separate process.
+        progress: called with the progress of rendering and tracking, if there is one camera.
 
     Returns:
         `rate_hz`, the numbers of `follow_live`, and the protocol; of several cameras the largest
@@ -371,7 +371,7 @@ def _film(
     ready: Barrier | None = None,
     progress: Progress = silent,
 ) -> dict[str, Any]:
-    """The numbers of one camera, which begins to film when the others are ready."""
+    """The numbers of one camera, which starts when all cameras are ready."""
     from liex_lab.recordings.streaming import replayed
 
     from ..live import follow_live
@@ -388,7 +388,7 @@ def _film(
             ready.wait()
     except BaseException:
         if ready is not None:
-            ready.abort()  # the others would wait for ever
+            ready.abort()  # the others would wait forever
         raise
     how: dict[str, Any] = {"learn_frames": learn_frames, "progress": progress}
     numbers, _ = follow_live(replayed(arriving), plan, **how)
@@ -398,7 +398,9 @@ def _film(
 def looped(
     short: Recording, n_frames: int, name: str = "long", step_ns: int = STEP_NS
 ) -> Recording:
-    """A recording of any length: a short one's frames, in memory, to and fro."""
+    """A recording of any length that repeats a short one's frames, in memory, forwards and
+    backwards.
+    """
     depth = [short.frame(row).depth for row in range(len(short))]
     rows = to_and_fro(len(depth), n_frames)
     long = Recording(
@@ -413,5 +415,5 @@ def looped(
 
 
 def to_and_fro(n_short: int, n: int) -> NDArray[np.int64]:
-    """(n,) which of the short recording's frames each one is."""
+    """(n,) index of each frame in the short recording, forwards and backwards."""
     return np.resize([*range(n_short), *range(n_short - 2, 0, -1)], n)

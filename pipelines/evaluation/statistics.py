@@ -1,10 +1,10 @@
 """Monte Carlo evaluation of the group test: type I error, coverage and power on simulated studies.
 
-`liex evaluate statistics` draws studies from a nested normal model (cage, animal in its cage,
-session of its animal) in six designs, `PLANS`, and compares their groups as `liex compare` does.
-Numbers, each a share of studies: p <= 5 % without an effect (the type I error); the same of a t
-test that takes sessions for units; 95 % intervals that hold the true difference; studies in which
-the mixed model was used; and the power at an effect stated in standard deviations between animals.
+`liex evaluate statistics` draws studies from a nested normal model (cage, animal within cage,
+session within animal) in six designs, `PLANS`, and compares their groups as `liex compare` does.
+The results are shares of studies: p <= 5 % without an effect (the type I error); the same for a t
+test with sessions as units; 95 % intervals that contain the true difference; use of the mixed
+model; and the power at an effect in standard deviations between animals.
 """
 
 from __future__ import annotations
@@ -19,24 +19,24 @@ from liex_lab.behaviour.cohort import compare
 from liex_lab.runtime.progress import Progress, silent
 
 ALPHA = 0.05
-_AT_ONCE = 50  # studies that are compared in one go, as measures of the same animals
+_AT_ONCE = 50  # studies per comparison, as measures of the same animals
 
 
 @dataclass(frozen=True)
 class StudyPlan:
-    """A simulated study: its design, and how much each level varies.
+    """A simulated study: its design, and the variation at each level.
 
     Attributes:
         name: of the design.
-        n_cages: cages per group, or in all where `within`.
+        n_cages: cages per group, or in all if `within`.
         n_animals: animals per cage.
         n_sessions: sessions per animal.
         sd_cage: standard deviation of a cage's mean.
-        sd_animal: of an animal in its cage.
+        sd_animal: of an animal within its cage.
         sd_session: of a session of its animal.
-        within: every cage holds both groups.
-        caged: whether the cages are stated in the table.
-        effect: what the second group has more, in standard deviations between animals.
+        within: every cage has animals of both groups.
+        caged: whether the table states the cages.
+        effect: difference of the second group, in standard deviations between animals.
     """
 
     name: str
@@ -54,7 +54,7 @@ class StudyPlan:
         """Independent studies of the design: a row per session, a column study_k per study.
 
         Args:
-            rng: draws all three levels.
+            rng: random number generator for all three levels.
             n_studies: number of columns.
         """
         n_cages = self.n_cages if self.within else 2 * self.n_cages
@@ -95,16 +95,16 @@ def evaluate_statistics(
     """Error rates and power of the group test in every design; `liex evaluate statistics`.
 
     Args:
-        n_studies: simulated studies of each design without an effect; about a quarter of them with
+        n_studies: simulated studies of each design without an effect; about a quarter as many with
             one.
         effect: in standard deviations between animals.
         seed: of the draws.
-        progress: told design by design.
+        progress: called design by design.
 
     Returns:
-        By the designs' names `type_1`, `type_1_sessions_as_units` (a t test that takes every
-        session for a unit), `coverage` of the true difference, `mixed_model` (how often it was
-        used) and `power`; and alpha, n_studies, effect_size and seed.
+        By the designs' names `type_1`, `type_1_sessions_as_units` (a t test with sessions as
+        units), `coverage` of the true difference, `mixed_model` (how often it was used) and
+        `power`; and alpha, n_studies, effect_size and seed.
     """
     found: dict[str, Any] = {
         "alpha": ALPHA,
@@ -123,12 +123,13 @@ def evaluate_statistics(
 
 
 def error_rates(plan: StudyPlan, n_studies: int, rng: np.random.Generator) -> dict[str, float]:
-    """Shares of studies without an effect: p <= 5 %, interval around 0, tested by the model.
+    """Shares of studies without an effect: p <= 5 %, interval contains 0, tested by the mixed
+    model.
 
     Args:
         plan: the design.
         n_studies: number of studies.
-        rng: draws the studies and the permutations' seeds.
+        rng: random number generator for the studies and the permutations' seeds.
     """
     from scipy.stats import ttest_ind
 
@@ -150,13 +151,13 @@ def error_rates(plan: StudyPlan, n_studies: int, rng: np.random.Generator) -> di
 
 
 def power(plan: StudyPlan, effect: float, n_studies: int, rng: np.random.Generator) -> float:
-    """Share of studies with an effect in which the test finds it, p <= 5 %.
+    """Share of studies with an effect in which the test detects it, p <= 5 %.
 
     Args:
         plan: the design.
         effect: in standard deviations between animals.
         n_studies: number of studies.
-        rng: draws the studies and the permutations' seeds.
+        rng: random number generator for the studies and the permutations' seeds.
     """
     real = replace(plan, effect=effect)
     return _share(

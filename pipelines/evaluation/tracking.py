@@ -1,23 +1,24 @@
 """Evaluation of tracking: single frames, Lie-X's particle filter, the default tracker.
 
 `liex evaluate tracking` measures fixed rendered sequences, the counterpart of Lie-X's Fig 18:
-`easy` (511 frames, as a sensor sees them) and `hard` (300 frames with noise, holes, dropped frames,
-a bar before the animal, a second object, an animal lost in floor or glare, and fast motion). Rows:
+`easy` (511 frames, as observed by a sensor) and `hard` (300 frames with noise, holes, dropped
+frames, a bar in front of the animal, a second object, an animal lost in floor or glare, and fast
+motion). Rows:
 
 - single: each frame by itself (Algorithm 1);
 - algorithm3: the paper's particle filter, 200 particles (section 4.2, Algorithm 3), on our
   regressors and our metric;
 - online: the default tracker (association by Viterbi, Kalman smoothing), `ONLINE_LAG` frames late;
 - smoothed: the default tracker over the whole sequence;
-- algorithm1_paper, algorithm3_paper, algorithm3_paper_base_round, if asked for: the paper's own
-  comparison, with the parts of its variant. On two real mouse sequences single frames have 8.42 mm
-  (section 5.3) and the particle filter 7.19 mm. The paper does not say whether the base's
-  regressors run after its Brownian step: either they do not, and a particle's base is where the
-  step put it, or the last of their rounds runs on every particle.
+- algorithm1_paper, algorithm3_paper, algorithm3_paper_base_round (optional): the paper's own
+  comparison, with the parts of its variant. On two real mouse sequences the error is 8.42 mm for
+  single frames (section 5.3) and 7.19 mm for the particle filter. The paper does not state whether
+  the base's regressors run after its Brownian step: either they do not, and a particle keeps the
+  base of that step, or the last of their rounds runs on every particle.
 
-The paper leaves the process noise open. `search_noise` finds it on sequences to develop on, which
-are those of the tracker's own search (seeds 101 to 108) and none that is reported;
-`ProcessNoise.of` has what it found.
+The paper leaves the process noise open. `search_noise` finds it on development sequences, those of
+the tracker's own search (seeds 101 to 108), none of which is reported; `ProcessNoise.of` has the
+result.
 """
 
 from __future__ import annotations
@@ -68,10 +69,10 @@ PAPER_ROWS = (SINGLE, *BASE_ROUNDS)
 ONLINE_LAG = 5  # frames
 _PUBLISHED_MM = (8.42, 7.19)
 _CHUNK = 32
-# chunks that the tracker is timed on, and how often
+# chunks that the tracker is timed on, and repeats
 _TIMED = 3
 _AGAIN = 3
-# the search: numbers that are changed, by which factors, and when it gives up
+# the search: parameters, factors, and the limit of passes
 _SEARCHED = ("turn_rad", "shift_mm", "sigma_mm")
 _FACTORS = (0.5, 2.0)
 _MOST_PASSES = 4
@@ -97,14 +98,14 @@ def evaluate_tracking(
         sequence: `easy` or `hard`.
         model: another pose model than the animal's own.
         paper: also measure the paper's own comparison, with the parts of its variant, which is
-            trained if it has not been.
+            trained if needed.
         seed: of another sequence of the same kind; None means the fixed one.
         n_frames: length of the sequence; None means the usual one.
-        draw: is given the sequence and its rows, for a figure.
-        progress: told chunk by chunk.
+        draw: called with the sequence and its rows, to draw a figure.
+        progress: called chunk by chunk.
 
     Returns:
-        `rows` of figures by name, `row_names`, `speed`, `online_lag_frames`, the protocol, and
+        `rows` of results by name, `row_names`, `speed`, `online_lag_frames`, the protocol, and
         `notes` if there are any.
     """
     world = world_of(Skeleton.load(animal))
@@ -139,13 +140,13 @@ def evaluate_tracking(
 def follow_sequence(
     recording: TestSequence, estimator: PoseEstimator, plan: Plan, progress: Progress = silent
 ) -> tuple[dict[str, Followed], dict[str, float]]:
-    """The rows of a sequence; background, size and animal are found by the product.
+    """The rows of a sequence; background, size and animal are estimated as in a run.
 
     Args:
         recording: the rendered frames with their truth.
         estimator: measures single frames.
         plan: foreground and tracking settings, and the seed of Algorithm 3.
-        progress: told chunk by chunk.
+        progress: called chunk by chunk.
 
     Returns:
         By name, joints in the true arena frame; and the default tracker's speed, see `_speed`.
@@ -166,7 +167,7 @@ def follow_sequence(
         single_s += between - began
         observe_s += time.perf_counter() - between
     observed = Observations.join(parts)
-    tracker.track(parts[0])  # compiled before the clock runs
+    tracker.track(parts[0])  # compile before the clock runs
     _online(tracker, parts[0])
     T = recording.T_arena_camera @ scene.floor.T_arena_camera.inverse()
 
@@ -193,14 +194,16 @@ def _smoothed(tracker: FrameTracker, observed: Observations) -> Track:
 
 
 def _online(tracker: FrameTracker, observed: Observations) -> Track:
-    """The track of the online tracker, which waits for no more than `ONLINE_LAG` frames."""
+    """The track of the online tracker, with a lag of at most `ONLINE_LAG` frames."""
     online = OnlineTracker(tracker.subject, ONLINE_LAG)
     return Track.join([part for part in (online.add(observed), online.close()) if part is not None])
 
 
 def _speed(tracker: FrameTracker, recording: TestSequence) -> dict[str, float]:
-    """Frames/s of the default tracker, from depth images in memory to the smoothed track, on one
-    core and on all: the best of some tries in turn over the sequence's first frames.
+    """Frames/s of the default tracker, on one core and on all.
+
+    From depth images in memory to the smoothed track: the best of alternating repeats over the
+    sequence's first frames.
     """
     chunks = [frames for frames, _ in zip(recording.chunks(_CHUNK), range(_TIMED), strict=False)]
     best = {"frames_per_s_1core": 0.0, "frames_per_s_all_cores": 0.0}
@@ -242,7 +245,7 @@ def follow(
 
     Args:
         recording: the rendered frames with their truth.
-        estimator: whose regressors and metric are used.
+        estimator: provides the regressors and the metric.
         scene: the segmenter of the recording's camera.
         size: the animal's spine over the skeleton's home length.
         noise: process noise of the particles.
@@ -291,7 +294,7 @@ def _followed(
 
 
 def comparison(rows: Mapping[str, Mapping[str, Any]], animal: str) -> str:
-    """Whether the paper's gain by tracking is reproduced by measured `PAPER_ROWS`, in sentences."""
+    """Sentences on whether the measured `PAPER_ROWS` reproduce the paper's gain by tracking."""
     alone = rows[SINGLE].get("mean_joint_error_mm", np.nan)
     ratio = {name: rows[name].get("ratio_to_single", np.inf) for name in BASE_ROUNDS}
     tracked = ", ".join(
@@ -317,7 +320,7 @@ def comparison(rows: Mapping[str, Mapping[str, Any]], animal: str) -> str:
 
 @dataclass(frozen=True)
 class _Prepared:
-    """A sequence to develop on, ready to be tracked."""
+    """A development sequence, ready to be tracked."""
 
     recording: TestSequence
     scene: Segmenter
@@ -329,18 +332,18 @@ def search_noise(
 ) -> dict[str, Any]:
     """Search the process noise of Algorithm 3 with the paper's parts, for both of its readings.
 
-    A pattern search (Hooke and Jeeves 1961): the turn, the shift and the sigma are doubled and
-    halved in turn, and kept if the mean error over all frames in view becomes less, in at most four
-    passes. A frame without a pose counts as an error of half the animal's length.
+    A pattern search (Hooke and Jeeves 1961): the turn, the shift and the sigma are halved and
+    doubled in turn, and kept if the mean error over all frames in view decreases, in at most four
+    passes. A frame without a pose has an error of half the animal's length.
 
     Args:
         animal: a bundled animal's name, or the path of a skeleton's TOML.
-        n_frames: frames of each sequence to develop on; None means the usual length.
-        progress: told setting by setting.
+        n_frames: frames of each development sequence; None means the usual length.
+        progress: called setting by setting.
 
     Returns:
-        `single_mm`, the error of single frames; by row the `noise` that was found, its `error_mm`
-        and all that was `tried`; and on what.
+        `single_mm`, the error of single frames; by row the best `noise`, its `error_mm` and all
+        `tried` settings; and the sequences used.
     """
     estimator = estimator_of(animal, "paper", progress)
     skeleton, plan = estimator.skeleton, plan_of(animal)
@@ -390,7 +393,7 @@ def search_noise(
 def _pattern_search(
     start: ProcessNoise, error_of: Callable[[ProcessNoise], float], name: str, progress: Progress
 ) -> dict[ProcessNoise, float]:
-    """The errors of all settings that were tried from `start` on."""
+    """The errors of all tried settings, beginning with `start`."""
     most = 1 + _MOST_PASSES * len(_SEARCHED) * len(_FACTORS)
     progress(0, most, f"searching the noise of {name}")
     tried = {start: error_of(start)}
