@@ -21,10 +21,10 @@ from liex_lab.runtime.kernel_cache import keep_kernels
 __version__ = "0.2.0"
 
 install_path_finder()
-# kernels' threads that have nothing to do sleep; OpenMP's usual ones spin, on cores on which
+# idle kernel threads sleep; OpenMP's default threads spin, on cores on which
 # recordings are read and logs are written meanwhile (libgomp reads this when it is loaded)
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-_KERNELS_TOLD = keep_kernels()  # a sentence for the command line, where there is something to say
+_KERNELS_TOLD = keep_kernels()  # a message for the command line, or an empty text
 
 _HOMES = {
     "Camera": "liex_lab.optics.camera",

@@ -1,7 +1,7 @@
 """Bundled models with their model cards, and the data sets with their sample recordings.
 
-A model is an .npz file of arrays; its card is the JSON file of the same name, which states the
-model's SHA-256. A model whose bytes do not agree with its card is refused.
+A model is an .npz file of arrays; its card is the JSON file of the same name, which contains the
+model's SHA-256. A model whose SHA-256 differs from its card is refused.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ MODELS = _HERE / "models"
 
 
 def datasets_folder() -> Path:
-    """Path of the folder `datasets`: inside the package once installed, beside it in a clone.
+    """Path of the folder `datasets`: inside the installed package, or next to it in a clone.
 
-    importlib.resources does not find a folder without code in an editable install, so the two
-    places are tried.
+    Both paths are tried, because importlib.resources does not find a folder without code in an
+    editable install.
 
     Raises:
-        LiexError: the folder is in neither place.
+        LiexError: neither path exists.
     """
     for folder in (_HERE / "datasets", _HERE.parent / "datasets"):
         if folder.is_dir():
@@ -37,7 +37,7 @@ def datasets_folder() -> Path:
 
 
 def kept_results_folder() -> Path:
-    """Path of the folder of results that took long to train for, one JSON for each animal."""
+    """Path of the stored results of long trainings, one JSON for each animal."""
     return datasets_folder() / "kept_results"
 
 
@@ -48,7 +48,7 @@ def find_sample(name: str) -> Path:
         name: its file or folder in `datasets`.
 
     Raises:
-        LiexError: there is no such sample; the message lists those that there are.
+        LiexError: there is no such sample; the message lists the samples.
     """
     folder = datasets_folder()
     if name and (folder / name).exists():
@@ -64,12 +64,9 @@ def find_sample(name: str) -> Path:
 
 
 def bundled_models(folder: Path = MODELS) -> dict[str, dict[str, Any]]:
-    """Cards of the bundled models by model name, in alphabetical order.
+    """Cards of the bundled models in `folder` by model name, in alphabetical order.
 
-    The hashes that the cards state are not checked here.
-
-    Args:
-        folder: where the models lie.
+    The hashes in the cards are not checked here.
 
     Raises:
         ModelError: a model lacks its card, or the card cannot be used.
@@ -80,14 +77,14 @@ def bundled_models(folder: Path = MODELS) -> dict[str, dict[str, Any]]:
 
 
 def find_model(model: str | Path, folder: Path = MODELS) -> Path:
-    """Path of a model file, once its SHA-256 agrees with its card.
+    """Path of a model file, after checking its SHA-256 against its card.
 
-    The card is the .json of the same name beside the .npz. A bundled model has one; a model of the
-    user's own may.
+    The card is the .json of the same name next to the .npz. It is required for a bundled model and
+    optional for a user's own.
 
     Args:
         model: a bundled name, such as 'mouse', or the path of an .npz.
-        folder: where the bundled models lie.
+        folder: of the bundled models.
 
     Raises:
         ModelError: there is no such model, or it is damaged or was changed.
@@ -115,11 +112,7 @@ def find_model(model: str | Path, folder: Path = MODELS) -> Path:
 
 
 def sha256(path: Path) -> str:
-    """SHA-256 of a file's bytes, in hexadecimal.
-
-    Args:
-        path: the file.
-    """
+    """SHA-256 of a file's bytes, in hexadecimal."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 

@@ -1,6 +1,6 @@
-"""Errors that a user can put right.
+"""Errors that a user can correct.
 
-Each message is one sentence: what was expected, what came, what to do.
+Each message is one sentence: what was expected, what was found, what to do.
 """
 
 from __future__ import annotations
@@ -10,14 +10,14 @@ from typing import ClassVar
 
 
 def printable(text: object) -> str:
-    """A text as a terminal may show it: no name of a file moves the cursor or hides what follows.
+    """A text that is safe for a terminal: no file name can move the cursor or hide text.
 
     Args:
-        text: anything; what it says of itself may quote names of files and recordings.
+        text: any object; its text may quote names of files and recordings.
 
     Returns:
-        The text; control characters, those that turn the direction of writing, and halves of
-        characters are written as escapes. Line ends and tabs stay.
+        The text; control characters, bidirectional controls and surrogates are escaped. Line ends
+            and tabs stay.
     """
     said = str(text)
     if said.isascii() and said.isprintable():
@@ -32,7 +32,7 @@ _UNSEEN = {"Cc", "Cf", "Cs", "Zl", "Zp"}
 
 
 def how_to_install(extra: str) -> str:
-    """What to type for packages that only some need: a line that works in a clone of liex_lab.
+    """The command that installs optional packages in a clone of liex_lab.
 
     Args:
         extra: its name among the optional dependencies of pyproject.toml.
@@ -44,18 +44,18 @@ def how_to_install(extra: str) -> str:
 
 
 class LiexError(Exception):
-    """Base of every error that the user can put right.
+    """Base of every error that the user can correct.
 
-    The command line prints its message alone, without a traceback.
+    The command line prints only its message, without a traceback.
 
     Attributes:
-        exit_code: that the command line ends with.
+        exit_code: of the command line.
     """
 
     exit_code: ClassVar[int] = 1
 
     def __str__(self) -> str:
-        """The message on one line, whatever it quotes of the user's own."""
+        """The message on one line, with quoted names made safe for a terminal."""
         return printable(" ".join(super().__str__().splitlines()))
 
 
@@ -64,18 +64,18 @@ class RecordingError(LiexError):
 
 
 class UnknownCameraError(RecordingError):
-    """Raised for pictures that do not say what camera took them."""
+    """Raised for depth images without information on their camera."""
 
 
 class UnknownTimesError(RecordingError):
-    """Raised for pictures that do not say when they were taken."""
+    """Raised for depth images without timestamps."""
 
 
 class SeveralKindsError(RecordingError):
-    """Raised for a folder with pictures of several kinds.
+    """Raised for a folder with depth images of several kinds.
 
     Attributes:
-        pattern: names the pictures of one of the kinds, as in `*.tif`.
+        pattern: matches the images of one of the kinds, such as `*.tif`.
     """
 
     def __init__(self, message: str, pattern: str) -> None:
@@ -92,11 +92,11 @@ class ModelError(LiexError):
 
 
 class SessionError(LiexError):
-    """Raised for a session folder that is missing, unfinished or not of liex_lab."""
+    """Raised for a session folder that is missing, unfinished or not made by liex_lab."""
 
 
 class PlaceError(LiexError):
-    """Raised for a place that nothing may be written to, such as one behind a symbolic link."""
+    """Raised for a path that must not be written to, such as one behind a symbolic link."""
 
 
 class StudyError(LiexError):
@@ -108,25 +108,21 @@ class EstimationError(LiexError):
 
 
 class MisfitError(EstimationError):
-    """Raised for a recording that shows something else than the plan's animal.
+    """Raised for a recording of something other than the plan's animal.
 
-    Its exit code is also that of a run whose session someone has to look at.
+    Its exit code is also that of a run whose session needs review.
     """
 
     exit_code = 4
 
 
 class MissingPackageError(LiexError):
-    """Raised where an optional package is needed for what was asked and is not installed."""
+    """Raised if a required optional package is not installed."""
 
 
 def one_line(error: BaseException) -> str:
-    """First line of what an error of another package says, as a part of a sentence.
+    """First line of another package's error message, for use in a sentence.
 
-    Args:
-        error: the error; its type's name stands in for an empty message.
-
-    Returns:
-        At most 200 characters.
+    At most 200 characters; the type's name replaces an empty message.
     """
     return str(error).strip().partition("\n")[0][:200] or type(error).__name__

@@ -1,14 +1,14 @@
 """Viterbi and forward-backward algorithms of a hidden semi-Markov model, expanded to Markov states.
 
-Action k is a row of D_k states that are passed one by one, so a bout lasts at least D_k ticks; in
-the last state it may stay, so the rest of its length is geometric (expanded-state hidden
-semi-Markov model; Yu 2010, Rabiner 1989). With emission scores e_t(k), in the first state of k: v_t
-= e_t(k) + max_j [v_{t-1}(last of j) + leave_j + switch_jk]; within a row v moves on by one state;
-in the last also v_{t-1} + stay_k. Any state may begin or end a recording.
+Action k is a row of D_k states that are passed one by one, so a bout lasts at least D_k ticks; the
+last state may repeat, so the rest of the length is geometric (expanded-state hidden semi-Markov
+model; Yu 2010, Rabiner 1989). With emission scores e_t(k), in the first state of k: v_t = e_t(k) +
+max_j [v_{t-1}(last of j) + leave_j + switch_jk]; within a row v moves on by one state; in the last
+also v_{t-1} + stay_k. Any state may begin or end a recording.
 
 Arrays: scores (m, K) log score of each tick for each action; first (K + 1,) index of each action's
-first state, with the total at the end; stay, leave (K,) log chances of the last state; switch (K,
-K) log chances of what follows, about -inf for itself.
+first state, with the total at the end; stay, leave (K,) log probabilities of the last state; switch
+(K, K) log probabilities of the next action, about -inf for itself.
 """
 
 from __future__ import annotations
@@ -21,19 +21,19 @@ _NEVER = -1e30
 
 @njit(cache=True)
 def go_on(start, stop, scores, first, stay, leave, switch, value, came_from, stayed):
-    """Viterbi recursion from tick `start` to `stop`, piece by piece; fills the back-pointers.
+    """Viterbi recursion over the ticks `start` to `stop` of a block; fills the back-pointers.
 
     Args:
-        start: first tick of the piece; 0 initialises `value`.
+        start: first tick of the block; 0 initialises `value`.
         stop: tick after the last.
         scores: (m, K) log scores.
         first: (K + 1,) index of each action's first state, and the total.
-        stay: (K,) log chance of staying in the last state.
-        leave: (K,) log chance of leaving it.
-        switch: (K, K) log chance of what follows.
-        value: (states,) log score of the best path to each state at tick start - 1; brought on to
-            stop - 1.
-        came_from: (m, K) output, the action before, where one begins at a tick.
+        stay: (K,) log probability of staying in the last state.
+        leave: (K,) log probability of leaving it.
+        switch: (K, K) log probability of the next action.
+        value: (states,) log score of the best path to each state at tick start - 1; updated to stop
+            - 1.
+        came_from: (m, K) output, the previous action, for one that begins at a tick.
         stayed: (m, K) bool output, whether the best path was in the action's last state before.
     """
     n = scores.shape[1]
@@ -43,7 +43,7 @@ def go_on(start, stop, scores, first, stay, leave, switch, value, came_from, sta
         for k in range(n):
             value[first[k] : first[k + 1]] = scores[0, k] - np.log(
                 total
-            )  # it may begin in the middle of one
+            )  # it may begin in the middle of a bout
             came_from[0, k] = 0
             stayed[0, k] = False
     for t in range(max(start, 1), stop):
@@ -106,9 +106,9 @@ def probabilities(scores, first, stay, leave, switch, out):
     Args:
         scores: (m, K) log scores.
         first: (K + 1,) index of each action's first state, and the total.
-        stay: (K,) log chance of staying in the last state.
-        leave: (K,) log chance of leaving it.
-        switch: (K, K) log chance of what follows.
+        stay: (K,) log probability of staying in the last state.
+        leave: (K,) log probability of leaving it.
+        switch: (K, K) log probability of the next action.
         out: (m, K) output, probabilities.
     """
     m, n = scores.shape
@@ -170,7 +170,7 @@ def probabilities(scores, first, stay, leave, switch, out):
 
 @njit(cache=True)
 def _likelihood(scores, t, like):
-    """Likelihoods (K,) of tick t up to a factor: exp(scores less their largest) into `like`."""
+    """Likelihoods (K,) of tick t up to a factor, exp(scores minus their maximum), into `like`."""
     top = scores[t, 0]
     for k in range(1, len(like)):
         top = max(top, scores[t, k])

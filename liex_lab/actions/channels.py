@@ -1,12 +1,13 @@
 """Egocentric kinematic features of a track on a fixed clock, in seconds and body lengths.
 
-A track of any frame rate becomes channels of one rate, so that a recogniser sees the same movement
-whatever the camera: a faster camera is averaged over each tick, a slower one interpolated linearly.
+A track of any frame rate becomes channels of one rate, so that a recogniser gets the same features
+from any camera: a faster camera is averaged over each tick, a slower one interpolated linearly.
 Channels: velocity along and across the heading, yaw rate, pitch, straightness, bends of three parts
 of the chain and their rates, height above the floor, nearness of a wall, predicted error. Rates are
 central differences of values smoothed by the binomial filter (1/4, 1/2, 1/4).
+
 Frames whose trunk points against those within 0.15 s to either side are left out (head and tail
-were exchanged); gaps up to 0.4 s are bridged, longer ones part the track into segments.
+were exchanged). Gaps up to 0.4 s are bridged; longer ones split the track into segments.
 """
 
 from __future__ import annotations
@@ -25,17 +26,17 @@ from liex_lab.tracking.track import Track
 
 Array = NDArray[np.float64]
 
-_FLIP_S = 0.15  # to either side: a body that points the other way for a moment was measured wrongly
-_WALL_BL = 0.6  # a wall this many lengths away hardly matters
-_DOUBT = 1.5  # the usual error's logarithm is one of order one
-_AXIS = {1: 0.75, -1: 0.4}  # of the chain is the trunk, for bases at the rear and at the front
-_GROUPS = 3  # parts of the chain whose bends are added up
-_PIECE = 4096  # ticks whose channels are made at once
+_FLIP_S = 0.15  # to either side: a body that briefly points the other way is an error
+_WALL_BL = 0.6  # decay length of a wall's influence, in body lengths
+_DOUBT = 1.5  # makes the logarithm of the median error of order one
+_AXIS = {1: 0.75, -1: 0.4}  # the trunk's share of the chain, for a base at the rear or front
+_GROUPS = 3  # parts of the chain whose bends are summed
+_PIECE = 4096  # ticks per block
 
 
 @dataclass(frozen=True)
 class Segment:
-    """Channels on a steady clock, from one unbroken segment of a track.
+    """Channels on a fixed clock, from one unbroken segment of a track.
 
     Attributes:
         times_s: (m,) s since the track's first frame.
@@ -47,11 +48,10 @@ class Segment:
 
 
 def channel_names(skeleton: Skeleton) -> list[str]:
-    """The names of the channels; those that end in ~ change sign in a mirror.
+    """The names of the channels; those that end in ~ change sign under reflection.
 
-    Args:
-        skeleton: kinematic tree of the animal; pitches only of joints that have such an axis,
-            heights only of animals that stand on the floor.
+    Pitches exist only for joints with a pitch axis, heights only for animals that stand on the
+    floor.
 
     Returns:
         C names, the columns of `segments_of`'s values.
@@ -84,19 +84,19 @@ def channel_names(skeleton: Skeleton) -> list[str]:
 def segments_of(
     track: Track, rate_hz: float, wall_mm: Array | None = None, allocate: Allocator = np.empty
 ) -> list[Segment]:
-    """The channels of a track, one unbroken segment after the other.
+    """The channels of a track, as unbroken segments.
 
-    Lengths are over the animal's median length in the track, predicted errors over their median:
-    how large errors are depends on camera and animal, and is unrelated to actions.
+    Lengths are relative to the animal's median length in the track, predicted errors to their
+    median: the size of errors depends on camera and animal and is unrelated to actions.
 
     Args:
         track: one animal's track.
-        rate_hz: ticks a second.
+        rate_hz: ticks per second.
         wall_mm: (n,) distance of the animal from the nearest wall, mm; None if unknown.
         allocate: allocator of the channels.
 
     Returns:
-        The segments in order of time; none where no pose was measured.
+        The segments in order of time; empty if no pose was measured.
     """
     time_s = (track.times_ns - track.times_ns[:1]).astype(np.float64) * 1e-9
     good = np.flatnonzero(track.observed)
@@ -104,7 +104,7 @@ def segments_of(
         return []
     good = good[~_reversed(track, good, time_s)]
     length_mm = float(np.median(track.scale[good])) * track.skeleton.length
-    # a doubt is one beside the recording's usual errors: how large these are depends on camera and
+    # errors are relative to the recording's median error, whose size depends on camera and
     # animal, and on how errors are predicted, and is unrelated to actions
     usual_mm = float(np.median(np.nan_to_num(track.predicted_error_mm[good], nan=0.0))) or 1.0
     wall = np.full(len(time_s), np.nan) if wall_mm is None else wall_mm
@@ -128,7 +128,7 @@ def _usual_step(time_s: Array) -> float:
 
 
 def _clock(time_s: Array, rate_hz: float) -> Array:
-    """(m,) s from the first to the last of these times."""
+    """(m,) s from the first to the last of these times, in steps of 1 / `rate_hz`."""
     return (
         time_s[0] + np.arange(max(2, int((time_s[-1] - time_s[0]) * rate_hz + 1e-6) + 1)) / rate_hz
     )
@@ -139,14 +139,14 @@ def _stands(skeleton: Skeleton) -> bool:
 
 
 def _forward(skeleton: Skeleton) -> tuple[int, int]:
-    """The joints from which and to which the trunk points forward."""
+    """The joints (from, to) that define the forward direction of the trunk."""
     way = 1 if skeleton.offsets[1:, 0].sum() > 0 else -1
     end = max(1, round(_AXIS[way] * (skeleton.n_joints - 1)))
     return (0, end) if way > 0 else (end, 0)
 
 
 def _reversed(track: Track, good: NDArray[np.int64], time_s: Array) -> NDArray[np.bool_]:
-    """Which good frames point against those within 0.15 s: head and tail were exchanged."""
+    """Mask of the good frames that point against those within 0.15 s: head and tail exchanged."""
     rear, front = _forward(track.skeleton)
     axis = np.empty((len(good), 3))
     total = np.zeros((len(good) + 1, 3))
@@ -167,8 +167,8 @@ def _reversed(track: Track, good: NDArray[np.int64], time_s: Array) -> NDArray[n
 class _OnClock:
     """Resamples joints, angles, wall distance and error of frames `rows` to a clock's times (m,) s.
 
-    A faster camera is averaged over what falls to each tick, a slower one interpolated, linearly;
-    ends are held.
+    A faster camera is averaged over the frames of each tick, a slower one interpolated linearly;
+    the ends are repeated.
     """
 
     def __init__(
@@ -180,7 +180,7 @@ class _OnClock:
         times = time_s[rows]
         step = clock[1] - clock[0]
         n = len(rows)
-        self._starts: NDArray[np.int64] | None = None  # of the rows that fall to one tick
+        self._starts: NDArray[np.int64] | None = None  # first row of each tick
         if n > 2 and np.median(np.diff(times)) < 0.7 * step:
             tick = np.clip(np.round((times - clock[0]) / step).astype(int), 0, len(clock) - 1)
             starts = np.flatnonzero(np.append(True, np.diff(tick) > 0))
@@ -200,7 +200,7 @@ class _OnClock:
 
         Returns:
             Joints (m, J, 3) mm, joint angles (m, J, 3) rad, distance from a wall (m,) mm, 1e6 if
-            unknown, and predicted error (m,) mm.
+                unknown, and predicted error (m,) mm.
         """
         if self._n == 1:
             out = np.repeat(self._measured(0, 1), ticks.stop - ticks.start, axis=0)
@@ -219,7 +219,7 @@ class _OnClock:
         )
 
     def _measured(self, first: int, stop: int) -> Array:
-        """Columns (k, 6 J + 2) of measurements first to stop, each of a frame or of those of a
+        """Columns (k, 6 J + 2) of measurements first to stop, each of one frame or averaged over a
         tick.
         """
         starts = None if self._starts is None else self._starts[first : stop + 1]
@@ -253,9 +253,9 @@ def _stretch(
     clock: Array,
     allocate: Allocator,
 ) -> Segment:
-    """The channels of an unbroken segment, one piece after the other.
+    """The channels of an unbroken segment, computed in blocks.
 
-    units_mm: the animal's length and the usual error.
+    units_mm: the animal's length and the median error.
     """
     found = _OnClock(track, rows, time_s, wall, clock)
     m = len(clock)
@@ -264,12 +264,12 @@ def _stretch(
     for piece in blocks(m, _PIECE):
         heading[piece], steep[piece] = _direction(track.skeleton, found.at(piece)[0])
     heading = np.unwrap(heading)
-    # a body that stands upright has no heading: it keeps the last one
+    # an upright body has no heading: it keeps the last one
     heading = heading[np.maximum.accumulate(np.where(steep, 0, np.arange(m)))]
     values = allocate((m, len(channel_names(track.skeleton))), np.float64)
     step = clock[1] - clock[0]
     for piece in blocks(m, _PIECE):
-        # a channel looks two ticks to either side
+        # a channel depends on two ticks to either side
         around = slice(max(0, piece.start - 2), min(m, piece.stop + 2))
         channels = _channels(track.skeleton, units_mm, step, heading[around], *found.at(around))
         values[piece] = channels[piece.start - around.start : piece.stop - around.start]
@@ -277,8 +277,8 @@ def _stretch(
 
 
 def _direction(skeleton: Skeleton, joints: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """Where the trunk of a body with these joints (m, J, 3) points on the floor (m,) rad, and
-    whether it is upright.
+    """Heading of the trunk of a body with these joints (m, J, 3), (m,) rad, and whether it is
+    upright.
     """
     rear, front = _forward(skeleton)
     axis = joints[:, front] - joints[:, rear]
@@ -340,9 +340,7 @@ def _channels(
 
 
 def _twist(joints: Array, length_mm: float, step: float) -> Array:
-    """(m,) lengths a second: how fast the joints move against the body's middle, of
-    whatever part.
-    """
+    """(m,) lengths per second: mean speed of the joints relative to the body's middle."""
     own = (joints - joints.mean(axis=1, keepdims=True)) / length_mm
     return np.asarray(
         np.sqrt((_rate(_softened(own.reshape(len(own), -1)), step) ** 2).mean(axis=1) * 3.0)
@@ -350,7 +348,7 @@ def _twist(joints: Array, length_mm: float, step: float) -> Array:
 
 
 def _softened(rows: Array) -> Array:
-    """Binomial filter (1/4, 1/2, 1/4) over rows (m, ...): jitter is not movement."""
+    """Binomial filter (1/4, 1/2, 1/4) over rows (m, ...), which removes jitter."""
     if len(rows) < 3:
         return rows
     inner = 0.25 * rows[:-2] + 0.5 * rows[1:-1] + 0.25 * rows[2:]
@@ -358,7 +356,7 @@ def _softened(rows: Array) -> Array:
 
 
 def _rate(rows: Array, step: float) -> Array:
-    """Change a second of rows (m, ...), by central differences."""
+    """Change per second of rows (m, ...), by central differences."""
     return np.asarray(np.gradient(rows, step, axis=0))
 
 
@@ -373,8 +371,8 @@ RANGE_S = 0.25
 def window_features(segment: Segment, names: Sequence[str]) -> NDArray[np.float32]:
     """Features of every tick of a segment: its channels now, and their mean and spread around it.
 
-    Of channels that change sign in a mirror (their names end in ~) the sizes of the means count,
-    and their signs in the centred windows only.
+    For channels that change sign under reflection (their names end in ~), the absolute values of
+    the means are used, and the signed means in the centred windows only.
 
     Args:
         segment: channels (m, C) of an unbroken segment, m at least 2.
@@ -402,8 +400,8 @@ def window_features(segment: Segment, names: Sequence[str]) -> NDArray[np.float3
 
 
 def _window_mean(total: Array, start_s: float, stop_s: float, step: float) -> Array:
-    """Means (m, C) over [t + start_s, t + stop_s] from running sums (m + 1, C); beyond the ends,
-    the nearest tick.
+    """Means (m, C) over [t + start_s, t + stop_s] from running sums (m + 1, C), clipped to the
+    ends.
     """
     m = len(total) - 1
     rows = np.arange(m)
@@ -413,7 +411,7 @@ def _window_mean(total: Array, start_s: float, stop_s: float, step: float) -> Ar
 
 
 def _extreme(x: Array, half_s: float, step: float) -> Array:
-    """The largest (m, C) within half_s of each tick."""
+    """The maximum (m, C) within half_s of each tick."""
     from scipy.ndimage import maximum_filter1d
 
     return np.asarray(

@@ -1,4 +1,6 @@
-"""Ethogram: what an animal did and when, as half-open labelled intervals (bouts) in nanoseconds."""
+"""Ethogram: an animal's actions over time, as half-open labelled intervals (bouts) in
+nanoseconds.
+"""
 
 from __future__ import annotations
 
@@ -12,8 +14,8 @@ from numpy.typing import NDArray
 from liex_lab.errors import LiexError
 from liex_lab.recordings.timestamps import frames_apart, median_step
 
-UNLABELLED = ""  # the word of a frame that no action names
-LONGEST_GAP_S = 0.4  # that the recogniser bridges; nobody knows what happened in a longer one
+UNLABELLED = ""  # the word of a frame without an action
+LONGEST_GAP_S = 0.4  # that the recogniser bridges
 ACROSS_GAPS = (  # for every reader: in columns.json, the report and the methods
     f"The recogniser continues a bout across gaps of up to {LONGEST_GAP_S:g} s (2.5 frame "
     "intervals of a slower camera), a person's bout may span any gap, and a bout named by a rule "
@@ -23,7 +25,7 @@ ACROSS_GAPS = (  # for every reader: in columns.json, the report and the methods
 
 
 def runs_of(values: NDArray[Any]) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[Any]]:
-    """Run-length encoding: where the runs of equal values start and stop, and their values.
+    """Run-length encoding: starts, stops and values of the runs of equal values.
 
     Args:
         values: (m,) with m at least 1.
@@ -37,10 +39,10 @@ def runs_of(values: NDArray[Any]) -> tuple[NDArray[np.int64], NDArray[np.int64],
 
 @dataclass(frozen=True)
 class Bout:
-    """One interval with a name, half open: the frame at stop_ns is the first outside.
+    """One named interval, half open: the frame at stop_ns is the first outside.
 
     Attributes:
-        start_ns: onset, time stamp of the first frame inside.
+        start_ns: onset, timestamp of the first frame inside.
         stop_ns: time of the first frame outside.
         action: a word of the vocabulary.
         score: probability of its name, mean over its frames.
@@ -96,7 +98,7 @@ class Ethogram:
         """The word of every frame.
 
         Args:
-            times_ns: (n,) time stamps, increasing.
+            times_ns: (n,) timestamps, increasing.
 
         Returns:
             (n,) words, `UNLABELLED` outside all bouts.
@@ -118,20 +120,19 @@ class Ethogram:
         source: str = "model",
         names: Sequence[str] | None = None,
     ) -> Ethogram:
-        """The bouts of frames with these words; frames that are `UNLABELLED` are in none.
+        """The bouts of labelled frames; frames that are `UNLABELLED` belong to none.
 
         Args:
             words: (n,) word of each frame, or its index in `names`.
-            times_ns: (n,) time stamps, increasing.
-            vocabulary: word -> definition; None for none.
+            times_ns: (n,) timestamps, increasing.
+            vocabulary: word -> definition; None if absent.
             score: (n,) probability of each frame's word; None counts as 1.
-            part: (n,) the unbroken segment of the recording that a frame lies in; no bout leaves
-                its part.
+            part: (n,) number of each frame's unbroken segment; no bout crosses segments.
             source: model or human.
-            names: the words, where `words` are indices.
+            names: the words, if `words` are indices.
 
         Returns:
-            The ethogram, each bout scored by the mean over its frames.
+            The ethogram; the score of a bout is the mean over its frames.
         """
         label = np.asarray(words, np.str_ if names is None else np.int64)
         n = len(label)
@@ -153,12 +154,12 @@ class Ethogram:
 
 
 def frame_stops(times_ns: NDArray[np.int64]) -> NDArray[np.int64]:
-    """When each frame's validity ends.
+    """End of each frame's validity.
 
-    At the next frame; before a gap (1.5 usual steps) or at the end, one usual step later.
+    At the next frame; before a gap (1.5 median steps) or at the end, one median step later.
 
     Args:
-        times_ns: (n,) time stamps, increasing.
+        times_ns: (n,) timestamps, increasing.
 
     Returns:
         (n,) ns.

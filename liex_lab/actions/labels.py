@@ -1,7 +1,6 @@
 """Human labels: tables of bouts (CSV or parquet; action, start_s, stop_s) as words of frames.
 
-Tables are ours or anybody's. A track with its labels (`LabelledTrack`) is what recognisers learn
-from and are judged by.
+A track with its labels (`LabelledTrack`) is what recognisers are trained on and evaluated with.
 """
 
 from __future__ import annotations
@@ -24,15 +23,15 @@ Array = NDArray[np.float64]
 
 HUMAN = "human"
 _NEEDED = ("action", "start_s", "stop_s")
-_THOUSANDS = re.compile(r"[1-9]\d{0,2},\d{3}")  # beside 950, 1,034 is no decimal number
+_THOUSANDS = re.compile(r"[1-9]\d{0,2},\d{3}")  # next to 950, 1,034 is not a decimal number
 
 
 def read_labels(path: str | Path) -> pd.DataFrame:
     """Bouts from a table, checked and in order of time.
 
     Args:
-        path: our bouts.parquet, or a table as CSV or as a spreadsheet saves it with the columns
-            action, start_s, stop_s and, where it is of several recordings, session_id.
+        path: our bouts.parquet, or a table as CSV or saved by a spreadsheet with the columns
+            action, start_s, stop_s and, for several recordings, session_id.
 
     Returns:
         The table, with the column source set to human.
@@ -68,7 +67,7 @@ def checked(table: pd.DataFrame, origin: str) -> pd.DataFrame:
         A copy, sorted by start_s.
 
     Raises:
-        LiexError: the first bout that does not start before it stops, in seconds.
+        LiexError: a bout does not start before it stops, in seconds; the message names the first.
     """
     times = pd.DataFrame({name: _numbers(table[name]) for name in ("start_s", "stop_s")})
     start, stop = (times[name].to_numpy() for name in ("start_s", "stop_s"))
@@ -87,7 +86,7 @@ def checked(table: pd.DataFrame, origin: str) -> pd.DataFrame:
 
 
 def _numbers(column: pd.Series) -> NDArray[np.float64]:
-    """A column (n,) of seconds or times as hh:mm:ss as numbers, NaN where there is none."""
+    """A column (n,) of seconds or times as hh:mm:ss as numbers; NaN if not a number."""
     texts = [str(cell) for cell in column]
     commas = [text for text in texts if "," in text]
     thousands = len(commas) < len(texts) and all(map(_THOUSANDS.fullmatch, commas))
@@ -95,18 +94,14 @@ def _numbers(column: pd.Series) -> NDArray[np.float64]:
 
 
 def _seconds(text: str) -> float:
-    """Seconds, or a time as hh:mm:ss in seconds; NaN where it is neither."""
+    """Seconds, or a time as hh:mm:ss in seconds; NaN if neither."""
     with suppress(ValueError):
         return float(clock_s(text) if ":" in text else number(text))
     return float("nan")
 
 
 def sessions_named(table: pd.DataFrame) -> set[str]:
-    """The sessions that labels say they are of; none where they do not say.
-
-    Args:
-        table: bouts, checked.
-    """
+    """The values of session_id in a table of labels; empty without that column."""
     return set(table["session_id"].astype(str)) if "session_id" in table else set()
 
 
@@ -118,10 +113,10 @@ def words_of(
     Args:
         table: bouts, checked.
         time_s: (n,) s since the first frame, increasing.
-        session_id: only bouts of this session; '' or a table without that column takes all.
+        session_id: only bouts of this session; '' or a table without that column uses all.
 
     Returns:
-        (n,) words, `UNLABELLED` outside all bouts; where bouts overlap, the later one.
+        (n,) words, `UNLABELLED` outside all bouts; if bouts overlap, the later one.
     """
     if "session_id" in table and session_id:
         table = table[table["session_id"].astype(str) == session_id]
@@ -141,10 +136,10 @@ class LabelledTrack:
 
     Attributes:
         track: one animal's track.
-        words: (n,) '' where a frame has none.
-        animal: whose it is.
-        wall_mm: (n,) how far its middle is from the nearest wall, mm, NaN if unknown.
-        truth: (n, J, 3) mm, true joints, of rendered animals; None otherwise.
+        words: (n,) '' if a frame has none.
+        animal: the animal's name.
+        wall_mm: (n,) distance of the animal's middle from the nearest wall, mm, NaN if unknown.
+        truth: (n, J, 3) mm, true joints of a rendered animal; None otherwise.
     """
 
     track: Track
@@ -171,14 +166,6 @@ class LabelledTrack:
 
 
 def some_rows(track: Track, rows: slice | NDArray[np.int64] | NDArray[np.bool_]) -> Track:
-    """Some frames of a track.
-
-    Args:
-        track: n rows.
-        rows: a slice, indices, or a mask (n,).
-
-    Returns:
-        A track of those rows.
-    """
+    """A track of some rows (a slice, indices, or a mask (n,)) of a track of n frames."""
     columns = [getattr(track, f.name)[rows] for f in fields(Track) if f.name != "skeleton"]
     return Track(track.skeleton, *columns)

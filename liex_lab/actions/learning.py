@@ -1,8 +1,8 @@
 """Training of the default recogniser: multilayer perceptrons and a semi-Markov model.
 
 Two networks with one hidden layer of 64 rectified units on standardised window features, trained by
-Adam on cross-entropy (`mlp.descend`); durations and transitions by counting bouts. Validation is
-leave-one-animal-out.
+Adam on cross-entropy (`mlp.descend`); durations and transitions come from counts of bouts.
+Validation is leave-one-animal-out.
 """
 
 from __future__ import annotations
@@ -29,19 +29,19 @@ _HIDDEN = 64
 _EPOCHS = 10
 _BATCH = 512
 _MEMBERS = 2
-# of few labels
+# for few labels
 _LEAST_STEPS = 1500
 _MOST_EPOCHS = 200
 _WEIGHT_DECAY = 2e-3
 _RATE = 1.5e-3
 _LEAST_RATE = 1e-5
-_MOST_TICKS = 120_000  # to learn from; of more, every so many-th
+_MOST_TICKS = 120_000  # to train on; more are subsampled
 _SHARPNESS = 0.1
-# quantiles of the speeds of a word, and of its bouts' highest ones
+# quantiles of the speeds of a word, and of its bouts' peak speeds
 _USUAL = (0.005, 0.99)
 _LEAST_PEAK = 0.01
-_FAST = 1.0  # lengths a second, in the mean of a bout: an action that goes fast
-_NEVER = -30.0  # the logit of a word that it has not seen
+_FAST = 1.0  # lengths per second, mean of a bout of a fast action
+_NEVER = -30.0  # the logit of a word without training data
 
 
 def learn(
@@ -52,14 +52,14 @@ def learn(
     sequences: Sequence[LabelledTrack] = (),
     progress: Progress = silent,
 ) -> TimelineModel:
-    """A recogniser from labelled tracks.
+    """A recogniser trained on labelled tracks.
 
     Args:
         tracks: labelled recordings of one kind of animal, at least one.
-        seed: of the first network; the second takes the next.
-        definitions: word -> definition, to be kept in the model.
-        sequences: single actions cut out of somewhere, without their surroundings: they teach the
-            networks, not the order and length of actions.
+        seed: of the first network; the second uses the next.
+        definitions: word -> definition, stored in the model.
+        sequences: single cut-out actions: they train the networks, not the order and length of
+            actions.
         progress: reports three steps.
 
     Returns:
@@ -93,13 +93,7 @@ def learn(
 
 
 def vocabulary_of(tracks: Sequence[LabelledTrack]) -> tuple[str, ...]:
-    """The words of labelled tracks, `UNLABELLED` first, then sorted.
-
-    Args:
-        tracks: labelled tracks.
-
-    Returns:
-        K words.
+    """The K words of labelled tracks, `UNLABELLED` first, then sorted.
 
     Raises:
         LiexError: fewer than two actions, and no frame without one.
@@ -114,14 +108,14 @@ def vocabulary_of(tracks: Sequence[LabelledTrack]) -> tuple[str, ...]:
 
 
 def speeds_of(examples: Examples, n_words: int) -> Array:
-    """Between which speeds nearly all ticks of each word lie: their 0.5 % and 99 % quantiles.
+    """The 0.5 % and 99 % quantiles of the speed of each word's ticks.
 
     Args:
-        examples: what the recogniser learns from.
+        examples: the training data.
         n_words: size K of the vocabulary, `UNLABELLED` first.
 
     Returns:
-        (K, 2) body lengths a second; 0 to infinity for `UNLABELLED` and words without ticks.
+        (K, 2) body lengths per second; 0 to infinity for `UNLABELLED` and words without ticks.
     """
     limits = np.tile([0.0, np.inf], (n_words, 1))
     for k in range(1, n_words):  # 0 is UNLABELLED
@@ -132,18 +126,17 @@ def speeds_of(examples: Examples, n_words: int) -> Array:
 
 
 def peaks_of(examples: Examples, n_words: int) -> Array:
-    """The highest speed that nearly all bouts (99 %) of each fast word reached at some time.
+    """The peak speed that 99 % of the bouts of each fast word exceed.
 
-    A word is fast where its bouts' mean speed has a median above one length a second. Others have
-    0, for another animal may well be stiller than all that were seen, and not run just before or
-    after.
+    A word is fast if the median over its bouts of their mean speed is above one length per second.
+    Other words have 0, because another animal may be slower than all animals of the training data.
 
     Args:
-        examples: what the recogniser learns from.
+        examples: the training data.
         n_words: size K of the vocabulary, `UNLABELLED` first.
 
     Returns:
-        (K,) body lengths a second.
+        (K,) body lengths per second.
     """
     least = np.zeros(n_words)
     starts, stops, codes = runs_of(examples.code + n_words * examples.recording)
@@ -159,12 +152,12 @@ def peaks_of(examples: Examples, n_words: int) -> Array:
 def train_network(examples: Examples, n_words: int, seed: int) -> Network:
     """A multilayer perceptron with one hidden layer, trained by Adam, see `descend`.
 
-    Of more than 120 000 ticks every so many-th is taken. Words without ticks get a logit of -30.
+    More than 120 000 ticks are subsampled. Words without ticks get a logit of -30.
 
     Args:
-        examples: what the recogniser learns from.
+        examples: the training data.
         n_words: size K of the vocabulary.
-        seed: of the weights and of the ticks taken.
+        seed: of the weights and of the subsample.
 
     Returns:
         The network, float32, with the standardisation of its features.
@@ -178,7 +171,7 @@ def train_network(examples: Examples, n_words: int, seed: int) -> Network:
     inputs = np.clip((features - centre) / scale, -LIMIT, LIMIT)
     batch = int(np.clip(len(code) // 8, 1, _BATCH))
     epochs = max(_EPOCHS, min(_MOST_EPOCHS, _LEAST_STEPS * batch // len(code)))
-    present = np.unique(code)  # of the vocabulary; stretches without a name may be missing
+    present = np.unique(code)  # of the vocabulary; unlabelled stretches may be missing
     (first, (weights, bias)) = descend(
         inputs,
         code,
@@ -190,7 +183,7 @@ def train_network(examples: Examples, n_words: int, seed: int) -> Network:
         weight_decay=_WEIGHT_DECAY,
         seed=seed,
     )
-    if len(present) == 2:  # one number decides between two words
+    if len(present) == 2:  # one logit decides between two words
         weights = np.hstack([0 * weights, weights])
         bias = np.hstack([0 * bias, bias])
     last = np.zeros((_HIDDEN, n_words)), np.full(n_words, _NEVER)
@@ -207,7 +200,7 @@ def train_network(examples: Examples, n_words: int, seed: int) -> Network:
 def leave_one_animal_out(
     tracks: Sequence[LabelledTrack], *, seed: int = 0, progress: Progress = silent
 ) -> dict[str, Any]:
-    """Cross-validation: scores on each animal of a recogniser that learned from the others.
+    """Cross-validation: scores on each animal of a recogniser trained on the others.
 
     Args:
         tracks: labelled recordings.
@@ -215,8 +208,8 @@ def leave_one_animal_out(
         progress: reports every animal.
 
     Returns:
-        Number of animals, macro F1 by animal, and `timeline_scores` over all; of one animal alone,
-        a note instead.
+        Number of animals, macro F1 by animal, and `timeline_scores` over all; for one animal alone,
+            a note instead.
     """
     animals = sorted({one.animal for one in tracks})
     if len(animals) < 2:
@@ -245,22 +238,14 @@ def leave_one_animal_out(
 
 
 def with_card(model: TimelineModel, **facts: Any) -> TimelineModel:
-    """The model with more facts on its card.
-
-    Args:
-        model: a trained recogniser.
-        **facts: name -> value, replacing those of the same name.
-
-    Returns:
-        A copy.
-    """
+    """A copy of the model with more facts on its card; they replace facts of the same name."""
     return replace(model, card={**model.card, **facts})
 
 
 # Active learning by uncertainty sampling: which segments of a recording to label next.
 
 
-_STEP = 0.5  # of a window: how far apart windows begin
+_STEP = 0.5  # between the starts of windows, of their length
 
 
 def doubtful_segments(
@@ -268,17 +253,17 @@ def doubtful_segments(
 ) -> list[dict[str, Any]]:
     """The least certain segments, the first of every pair of confused words before any second.
 
-    Windows begin every half of their length; those taken do not overlap.
+    Windows start every half of their length; selected windows do not overlap.
 
     Args:
         found: the result of recognising the recording.
-        times_ns: (n,) time stamps.
-        n: the most segments that are wanted.
+        times_ns: (n,) timestamps.
+        n: the maximum number of segments.
         least_s: length of a segment, s.
 
     Returns:
-        At most n tables of start_s, stop_s, uncertainty (mean entropy of the words' probabilities
-        over its largest value, 0 to 1), guess and or_else (the two most probable words).
+        At most n dicts of start_s, stop_s, uncertainty (mean entropy of the words' probabilities
+            over its largest value, 0 to 1), guess and or_else (the two most probable words).
     """
     p = np.clip(np.nan_to_num(found.probability, nan=0.0), 1e-9, 1.0)
     known = np.isfinite(found.probability[:, 0])

@@ -1,8 +1,8 @@
 """Random forest on temporal-pyramid descriptors of cut-out sequences (Lie-X section 4.3).
 
 The paper's recogniser: 50 trees of depth 20 (Breiman 2001, by scikit-learn) whose averaged leaf
-histograms give the class; the descriptors are those of `descriptors`. Used to repeat the paper's
-evaluation (section 5.4); uncut recordings have `timeline`.
+histograms give the class. Used to reproduce the paper's evaluation (section 5.4); uncut recordings
+use `timeline`.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ _PYRAMID = (4, 2, 1)  # equal parts, each described by its mean and standard dev
 def tangent_descriptor(track: Track) -> Array:
     """The temporal pyramid over a sequence's tangent vectors.
 
-    Frames without a measured pose are left out; of fewer than two the sequence stands still. The
-    end-effector carries no rotation and is left out of the hind half.
+    Frames without a measured pose are left out; a sequence with fewer than two poses has no
+    movement. The end-effector has no rotation and is left out of the hind half.
 
     Args:
         track: the sequence, of a skeleton that is one chain.
@@ -45,7 +45,7 @@ def tangent_descriptor(track: Track) -> Array:
     base = np.concatenate([step, step[-1:]])
     change = np.diff(angles, axis=0)
     change = np.concatenate([change, change[-1:]])
-    # of the fish joints 2 to 10 and 11 to the last in the paper's count, which begins at the base
+    # for the fish, joints 2 to 10 and 11 to the last in the paper's count from the base
     middle = max(2, (track.skeleton.n_joints - 1) // 2)
     halves = [
         rows[:, part].mean(axis=1)
@@ -63,7 +63,7 @@ def position_descriptor(track: Track) -> Array:
 
     Returns:
         (42 J + 6,), 888 for a fish's 21 joints: mm, arena frame, then the base's mean position, mm,
-        and mean rotation vector, rad; zeros where fewer than two poses were measured.
+            and mean rotation vector, rad; zeros if fewer than two poses were measured.
     """
     observed = track.observed
     if observed.sum() < 2:
@@ -88,7 +88,7 @@ def pyramid(rows: Array) -> Array:
 
 
 def _resampled(track: Track) -> tuple[SE3, Array]:
-    """Base T_arena_root (32) along geodesics and joint angles (32, J, 3) of the frames that have a
+    """Base T_arena_root (32) along geodesics and joint angles (32, J, 3) of the frames with a
     pose.
     """
     observed = track.observed
@@ -103,12 +103,12 @@ def _resampled(track: Track) -> tuple[SE3, Array]:
 
 
 def _places(n: int) -> Array:
-    """Where (32,) among n frames the resampled ones lie."""
+    """Fractional indices (32,) of the resampled frames among n frames."""
     return np.linspace(0.0, n - 1.0, N_FRAMES)
 
 
 def _lerp(values: Array, at: Array) -> Array:
-    """Rows of values (n, ...) at fractional places (32,)."""
+    """Rows of values (n, ...) at fractional indices (32,)."""
     low = np.minimum(at.astype(int), len(values) - 2)
     share = (at - low).reshape(-1, *([1] * (values.ndim - 1)))
     return values[low] * (1.0 - share) + values[low + 1] * share
@@ -143,9 +143,6 @@ class SequenceForest:
             rows: (n, D) descriptors.
             words: (n) word of each sequence.
             seed: of the forest.
-
-        Returns:
-            The fitted forest.
         """
         from sklearn.ensemble import RandomForestClassifier
 
@@ -153,25 +150,17 @@ class SequenceForest:
         return SequenceForest(descriptor, forest.fit(rows, list(words)))
 
     def name(self, rows: Array) -> list[str]:
-        """The word of each sequence: the largest class of the averaged leaves.
-
-        Args:
-            rows: (n, D) descriptors.
-
-        Returns:
-            n words.
+        """The words of n sequences with descriptors `rows` (n, D): the largest class of the
+        averaged leaves.
         """
         return [str(word) for word in self.forest.predict(rows)]
 
 
 def describe(descriptor: str, tracks: Sequence[Track]) -> Array:
-    """The descriptors of sequences.
+    """The descriptors (n, D) of n sequences, at least one.
 
     Args:
         descriptor: one of the `DESCRIPTORS`.
-        tracks: n sequences, at least one.
-
-    Returns:
-        (n, D).
+        tracks: the sequences.
     """
     return np.stack([DESCRIPTORS[descriptor](track) for track in tracks])

@@ -1,6 +1,6 @@
 """Scores of recognised actions: frame-wise F1, segmental F1@50, confusion matrix.
 
-F1 = 2 TP / (found + true), by frames or by bouts; a bout is right where its intersection over union
+F1 = 2 TP / (found + true), by frames or by bouts; a bout is correct if its intersection over union
 with a true bout of its action is at least 0.5 (segmental F1@50, Lea et al. 2017). The 95 % interval
 of a share is Wilson's (1927).
 """
@@ -24,7 +24,7 @@ Words = NDArray[np.str_]
 def timeline_scores(
     pairs: Iterable[tuple[LabelledTrack, Words]], words: Sequence[str]
 ) -> dict[str, Any]:
-    """Scores of recognised words beside the labels of their tracks.
+    """Scores of recognised words against the labels of their tracks.
 
     Args:
         pairs: labelled tracks, each with its recognised words (n,).
@@ -32,9 +32,9 @@ def timeline_scores(
 
     Returns:
         macro_f1: mean over the labelled actions of their frame-wise F1; segment_f1_50: F1 of bouts,
-        of which one is right where it and a true bout of its action share at least half of what
-        either covers; per_action: F1, precision and recall of frames, segment F1, and how many
-        bouts there were. NaN where there is nothing to divide by.
+            correct if the intersection over union with a true bout of the action is at least 0.5;
+            per_action: F1, precision and recall of frames, segment F1, and number of bouts. NaN if
+            the denominator is zero.
     """
     named = [word for word in words if word != UNLABELLED]
     hits, found, true = (dict.fromkeys(named, 0) for _ in range(3))
@@ -74,7 +74,7 @@ def timeline_scores(
 def match_bouts(
     true: NDArray[np.bool_], found: NDArray[np.bool_], overlap: float = 0.5
 ) -> tuple[int, int, int]:
-    """How many found bouts match a true one, each of which counts once.
+    """The number of found bouts that match a true one; each true bout counts once.
 
     Args:
         true: (n,) bool, frames of the action by the labels.
@@ -116,15 +116,12 @@ def _f1(hits: int, found: int, true: int) -> float:
 
 
 def confusion(true: Sequence[str], found: Sequence[str], words: Sequence[str]) -> list[list[int]]:
-    """Confusion matrix; rows: what it was; columns: what it was taken for.
+    """Confusion matrix (K, K) as lists; rows: true words; columns: recognised words.
 
     Args:
         true: (n) true word of each, all of them in `words`.
         found: (n) recognised words; those not in `words` are left out.
         words: the K words, in the order of rows and columns.
-
-    Returns:
-        (K, K) counts as lists.
     """
     index = {word: k for k, word in enumerate(words)}
     out = np.zeros((len(words), len(words)), int)
@@ -138,8 +135,8 @@ def interval95(hits: float, n: int) -> tuple[float, float]:
     """Wilson's 95 % interval of a share of hits out of n.
 
     Args:
-        hits: how many were right, or a sum of shares.
-        n: how many there were, at least 1.
+        hits: number of hits, or a sum of shares.
+        n: number of trials, at least 1.
 
     Returns:
         Lower and upper limit, 0 to 1.
@@ -159,15 +156,15 @@ _NORMAL = 1.959964  # of a 95 % interval
 
 @dataclass(frozen=True)
 class Agreement:
-    """How far two raters agree.
+    """Agreement of two raters.
 
     Attributes:
-        n: things that both rated.
-        observed: share of them that both call the same.
-        expected: share on which two who guess would agree.
-        kappa: agreement beyond chance over the most there can be: 1 where they always agree, 0
-            where no more than by chance; NaN where there is nothing to agree on.
-        low: lower limit of its 95 % interval; NaN if it cannot be computed.
+        n: number of items rated by both.
+        observed: share of items with the same rating.
+        expected: share of the same rating by chance.
+        kappa: agreement beyond chance, relative to its maximum: 1 for perfect agreement, 0 for
+            chance; NaN if undefined.
+        low: lower limit of its 95 % interval; NaN if undefined.
         high: upper limit.
     """
 
@@ -180,14 +177,14 @@ class Agreement:
 
 
 def cohens_kappa(first: Sequence[str], second: Sequence[str]) -> Agreement:
-    """Agreement of two raters of the same things.
+    """Agreement of two raters of the same items.
 
     Args:
-        first: what the first rater calls each of them.
-        second: what the second rater calls each of them.
+        first: the first rater's words.
+        second: the second rater's words.
 
     Raises:
-        ValueError: they did not rate the same number of things.
+        ValueError: they did not rate the same number of items.
     """
     if len(first) != len(second):
         raise ValueError(f"two raters of the same things, got {len(first)} and {len(second)}")
@@ -204,7 +201,7 @@ def cohens_kappa(first: Sequence[str], second: Sequence[str]) -> Agreement:
     columns = share.sum(axis=0)
     observed = float(np.trace(share))
     expected = float(rows @ columns)
-    if expected >= 1.0 - 1e-12:  # both call everything the same word
+    if expected >= 1.0 - 1e-12:  # both use one word for everything
         return Agreement(n, observed, expected, nan, nan, nan)
     kappa = (observed - expected) / (1.0 - expected)
     own = np.diag(share) @ ((1.0 - (rows + columns) * (1.0 - kappa)) ** 2)

@@ -2,7 +2,7 @@
 
 A bout of action k lasts d_k + Geometric ticks: at least the shortest usual length (8 % quantile of
 the labelled bouts), on average the mean length; then action j follows with probability follow[k,
-j], counted with half a pseudo-count. Decoding is by Viterbi, posteriors by forward-backward over
+j], estimated with half a pseudo-count. Decoding is by Viterbi, posteriors by forward-backward over
 the expanded states (`_semi_markov_kernels`; Yu 2010).
 """
 
@@ -22,8 +22,8 @@ from liex_lab.runtime.shapes import check_shapes
 Array = NDArray[np.float64]
 
 _SHORT = 0.08  # quantile of an action's lengths that counts as the shortest
-_PIECE = 8192  # ticks whose probabilities are worked out at once ...
-_MARGIN = 512  # ... with so many more on either side
+_PIECE = 8192  # ticks per block of probabilities ...
+_MARGIN = 512  # ... and its margin on either side
 
 
 @dataclass(frozen=True)
@@ -31,8 +31,8 @@ class SemiMarkovModel:
     """Durations and transitions of K actions.
 
     Attributes:
-        shortest_s: (K,) how long each action lasts at least, s.
-        mean_s: (K,) how long it lasts on average, s.
+        shortest_s: (K,) shortest duration, s.
+        mean_s: (K,) mean duration, s.
         follow: (K, K) probability that one follows another, 0 on the diagonal, rows sum to 1.
     """
 
@@ -42,14 +42,12 @@ class SemiMarkovModel:
 
     @staticmethod
     def learn(runs: Sequence[Sequence[tuple[int, float]]], n_words: int) -> SemiMarkovModel:
-        """The model of labelled bouts; words that never occur get usual values (0.1 s and 0.5 s).
+        """The model of labelled bouts; words that never occur get default durations (0.1 s and 0.5
+        s).
 
         Args:
-            runs: of each recording, the bouts (word, length in s) in order.
+            runs: for each recording, the bouts (word, length in s) in order.
             n_words: size K of the vocabulary, at least 2.
-
-        Returns:
-            The model.
         """
         lengths: list[list[float]] = [[] for _ in range(n_words)]
         counts = np.full((n_words, n_words), 0.5)
@@ -104,8 +102,7 @@ class SemiMarkovModel:
     def probabilities(self, scores: Array, step_s: float, allocate: Allocator = np.empty) -> Array:
         """The posterior of each word at every tick (forward-backward).
 
-        Ticks are worked out 8192 at a time, each piece given 512 more on either side instead of all
-        of them.
+        Computed in blocks of 8192 ticks with a margin of 512 on either side.
 
         Args:
             scores: (m, K) log scores of each tick.

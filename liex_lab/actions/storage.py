@@ -1,4 +1,4 @@
-"""Action models on disk: skops files, which hold numbers and words and no code; the bundled ones.
+"""Action models on disk: skops files, which contain numbers and words but no code; bundled models.
 
 Format 2; format 1 had no peaks and is still read.
 """
@@ -25,18 +25,18 @@ from liex_lab.runtime.durable import replacing
 
 _DEEPEST = 20
 _MOST_BYTES = 1 << 28
-_THE_DAY = (1980, 1, 1, 0, 0, 0)  # the first that a zip knows
+_THE_DAY = (1980, 1, 1, 0, 0, 0)  # the earliest date of a zip entry
 _ADDRESS = re.compile(r'("__id__": |"file": ")(\d+)')
 
 
 def write_plain(document: Any, path: str | Path) -> None:
-    """Write a skops file of equal bytes for equal content.
+    """Write a skops file; equal content gives equal bytes.
 
-    skops names what it holds by addresses in memory, and dates it; here names are numbers from 1 on
-    in their order in the file, and the date is one day, 1980-01-01.
+    skops names its objects by memory addresses, and dates them; here names are numbers from 1 in
+    their order in the file, and the date is always 1980-01-01.
 
     Args:
-        document: tables, lists, words, numbers and numpy arrays.
+        document: dicts, lists, words, numbers and numpy arrays.
         path: the file to write.
     """
     from skops import io
@@ -60,17 +60,11 @@ def write_plain(document: Any, path: str | Path) -> None:
 
 
 def read_plain(path: str | Path) -> Any:
-    """The content of a skops file of plain data.
-
-    Args:
-        path: the file.
-
-    Returns:
-        What `write_plain` was given.
+    """The content of a skops file of plain data, as given to `write_plain`.
 
     Raises:
-        ValueError: the file holds anything but plain data, is nested more than 20 deep, or unpacks
-            to more than 256 MB.
+        ValueError: the file contains anything but plain data, is nested more than 20 deep, or
+            unpacks to more than 256 MB.
     """
     with zipfile.ZipFile(path) as packed:
         if sum(entry.file_size for entry in packed.infolist()) > _MOST_BYTES:
@@ -79,7 +73,7 @@ def read_plain(path: str | Path) -> Any:
 
 
 def _value(node: Any, packed: zipfile.ZipFile, depth: int) -> Any:
-    """What a node of the schema stands for; raises ValueError where that is not plain data."""
+    """The value of a schema's node; raises ValueError if it is not plain data."""
     if depth > _DEEPEST:
         raise ValueError("its tables are nested too deeply")
     kind = node["__loader__"]
@@ -101,14 +95,14 @@ def _value(node: Any, packed: zipfile.ZipFile, depth: int) -> Any:
 SUFFIX = ".skops"
 _FORMAT = 2
 _WITHOUT_PEAKS = 1
-_LONGEST_S = 3600.0  # of an action; each tick of the shortest one is a state
+_LONGEST_S = 3600.0  # of an action; each tick of its shortest duration is a state
 _FASTEST_HZ = 1000.0
 
 
 def save_action_model(model: TimelineModel, path: str | Path) -> Path:
     """Write a model; equal models give files of equal content.
 
-    The file is written beside and then put in place, so that it is whole or not there.
+    The file is written under another name and renamed, so it is never incomplete.
 
     Args:
         model: a trained recogniser.
@@ -152,7 +146,7 @@ def load_action_model(name: str | Path, folder: Path = MODELS) -> TimelineModel:
 
     Args:
         name: the animal, or a path.
-        folder: where bundled models are.
+        folder: of the bundled models.
 
     Returns:
         The recogniser, with the file's sha256 on its card.
@@ -205,13 +199,10 @@ def load_action_model(name: str | Path, folder: Path = MODELS) -> TimelineModel:
 
 
 def check_timeline(model: TimelineModel) -> None:
-    """Check that all parts of a model that came from a file are of its words.
-
-    Args:
-        model: the model as it was read.
+    """Check that all parts of a model from a file agree with its words.
 
     Raises:
-        ValueError: what is wrong, as a part of a sentence.
+        ValueError: the mismatch, as a part of a sentence.
     """
     k = len(model.words)
     if k < 2 or len(set(model.words)) != k or UNLABELLED not in model.words:
@@ -245,13 +236,13 @@ def find_action_model(name: str | Path, folder: Path = MODELS) -> Path:
 
     Args:
         name: the animal, or a path.
-        folder: where bundled models are.
+        folder: of the bundled models.
 
     Returns:
         A path that is a file.
 
     Raises:
-        ModelError: there is none; it names the nearest bundled one.
+        ModelError: there is no such file; the message names the closest bundled model.
     """
     bundled = folder / f"{name}{SUFFIX}"
     path = bundled if bundled.is_file() else Path(name)
@@ -267,12 +258,5 @@ def find_action_model(name: str | Path, folder: Path = MODELS) -> Path:
 
 
 def bundled_action_models(folder: Path = MODELS) -> list[str]:
-    """The animals that have a bundled action model, sorted.
-
-    Args:
-        folder: where bundled models are.
-
-    Returns:
-        Their names.
-    """
+    """The animals with a bundled action model in `folder`, sorted."""
     return sorted(path.stem for path in folder.glob(f"*{SUFFIX}"))

@@ -1,14 +1,15 @@
 """Default recogniser of uncut recordings: MLP on window features, then hidden semi-Markov decoding.
 
-1. Channels on a clock of its own, in seconds and body lengths, so at any frame rate from 15 to 120
-   per second (`channels`).
+1. Channels on a fixed clock, in seconds and body lengths, from any frame rate between 15 and 120
+per second (`channels`).
 2. Features over windows around each tick (`window_features`).
 3. An ensemble of small networks gives p(word | tick); scores = sharpness (log p - log prior), a
-   scaled likelihood (hybrid of network and Markov model, Bourlard and Morgan 1994).
+scaled likelihood (hybrid of network and Markov model, Bourlard and Morgan 1994).
 4. A semi-Markov model of durations and transitions is decoded by Viterbi, with posteriors by
-   forward-backward (`semi_markov`).
+forward-backward (`semi_markov`).
 
-Ours; the recogniser of Lie-X section 4.3 names cut-out sequences alone (`recogniser`).
+This method is our own; the recogniser of Lie-X section 4.3 names cut-out sequences only
+(`recogniser`).
 """
 
 from __future__ import annotations
@@ -37,13 +38,13 @@ Broken = Callable[[int, int, str], str]
 
 @dataclass(frozen=True)
 class Refused:
-    """A bout that the network and the chain would have named, but that contradicts its definition.
+    """A bout found by network and chain that contradicts its definition.
 
     Attributes:
         rows: its frames.
-        action: the word that was refused.
-        named: what most of its frames are named instead, '' for nothing.
-        why: what of the definition does not hold.
+        action: the refused word.
+        named: the word of most of its frames instead, '' if unlabelled.
+        why: the contradicted part of the definition.
     """
 
     rows: slice
@@ -56,7 +57,8 @@ class FrameCheck:
     """Checks bouts of ticks by their frames.
 
     Args:
-        broken: returns what frames [start, stop) break of a word's definition; None finds nothing.
+        broken: returns the contradictions of frames [start, stop) to a word's definition; None
+            skips the check.
         first: row of the first frame of the segment.
         tick: (r,) tick of each of its frames, ascending.
     """
@@ -67,7 +69,7 @@ class FrameCheck:
         self._tick = tick
 
     def broken(self, start: int, stop: int, word: str) -> tuple[slice, str]:
-        """The frames of a bout of ticks, and what it breaks of its word's definition.
+        """The frames of a bout of ticks, and its contradictions to its word's definition.
 
         Args:
             start: first tick.
@@ -81,21 +83,12 @@ class FrameCheck:
 
 
 def overlap(one: slice, other: slice) -> bool:
-    """Whether two spans of frames have a frame in common.
-
-    Args:
-        one: a span.
-        other: another one.
-    """
+    """Whether two spans of frames have a frame in common."""
     return one.start < other.stop and other.start < one.stop
 
 
 def commonest(values: NDArray[np.int64]) -> int:
-    """The value that occurs most often, the smallest of several.
-
-    Args:
-        values: (n,) not negative, n at least 1.
-    """
+    """The most frequent of some values (n,), not negative, n at least 1; of equals the smallest."""
     return int(np.bincount(values).argmax())
 
 
@@ -103,19 +96,19 @@ Array = NDArray[np.float64]
 
 CLOCKS_HZ = {"fish": 50.0}
 _CLOCK_HZ = 30.0
-# ticks whose features are made at once
+# ticks per block of features
 _PIECE = 16_384
 _MARGIN_S = 1.5
-# half window; how far beyond is meant, and what it costs
+# half window of the speed; tolerances of its limits; penalty beyond them, nats
 _SPEED_S = 0.2
 _SLACK = 1.25
 _STILL = 0.1
 _UNSEEN = 6.0
-# how often bouts that contradict what their word means are refused, and what that costs a tick
+# number of decodings with refused bouts, and the penalty of a refused tick
 _MOST_DECODED = 6
 _REFUSED = 10.0
-_FRAMES_NEEDED = 3.5  # within a bout for it to be seen at all: fewer than four frames
-_RATE_SLACK_HZ = 1.0  # by which a camera misses its nominal rate
+_FRAMES_NEEDED = 3.5  # within a detectable bout: fewer than four frames are not enough
+_RATE_SLACK_HZ = 1.0  # deviation of a camera from its nominal rate
 
 
 @dataclass(frozen=True)
@@ -124,17 +117,15 @@ class TimelineModel:
 
     Attributes:
         skeleton: name of the animal's skeleton.
-        clock_hz: ticks a second.
-        words: (K) its vocabulary, `UNLABELLED` among them.
+        clock_hz: ticks per second.
+        words: (K) its vocabulary, including `UNLABELLED`.
         share: (K,) share of the training time of each word, the prior.
         networks: the ensemble, whose probabilities are averaged.
         chain: durations and transitions of the words.
-        sharpness: how much one tick counts in the chain, as ticks beside each other tell much the
-            same.
-        speeds: (K, 2) between which speeds, body lengths a second, each word was seen, for a
-            network says anything of what it has not seen.
-        peaks: (K,) the highest speed, body lengths a second, that bouts of a fast word reached at
-            least, for what is never fast is no dart.
+        sharpness: weight of one tick in the chain, because neighbouring ticks are correlated.
+        speeds: (K, 2) range of each word's speed in the training data, body lengths per second,
+            because a network does not extrapolate.
+        peaks: (K,) least peak speed of the bouts of a fast word, body lengths per second.
         definitions: word -> definition.
         card: facts on the training, and the file's sha256.
     """
@@ -154,7 +145,7 @@ class TimelineModel:
     def log_probabilities(
         self, segment: Segment, names: Sequence[str], speed: Array
     ) -> Iterator[tuple[slice, Array]]:
-        """The log probability of each word at each tick by itself, piece by piece.
+        """Yield the log probability of each word at each single tick, in blocks.
 
         Words whose speeds do not fit lose 6 nats.
 
@@ -185,7 +176,8 @@ class TimelineModel:
     def scores(
         self, segment: Segment, names: Sequence[str], speed: Array, allocate: Allocator = np.empty
     ) -> Array:
-        """Log scores for the semi-Markov model: what a tick says beyond how frequent each word is.
+        """Log scores for the semi-Markov model: the evidence of a tick relative to each word's
+        prior.
 
         Args:
             segment: channels of an unbroken segment of m ticks.
@@ -194,7 +186,7 @@ class TimelineModel:
             allocate: allocator of the result.
 
         Returns:
-            (m, K) sharpness times (log probability less log prior).
+            (m, K) sharpness times (log probability minus log prior).
         """
         scores = allocate((len(segment.times_s), len(self.words)), float)
         for ticks, log_p in self.log_probabilities(segment, names, speed):
@@ -214,12 +206,12 @@ class TimelineModel:
             track: one animal's track of n frames.
             wall_mm: (n,) distance of the animal from the nearest wall, mm; None if unknown.
             allocate: allocator of large intermediate arrays and of the probabilities.
-            broken: returns which part of a word's definition does not hold
-                there, '' for nothing; such a bout is refused and the track decoded again, in the
-                end without a name. None refuses only what is never as fast as its word asks for.
+            broken: returns the contradicted part of a word's definition, '' for none; such a bout
+                is refused and the track decoded again, in the end without a name. None refuses only
+                bouts slower than their word's peak speed.
 
         Returns:
-            Ethogram, probabilities, what the frame rate cannot resolve, and what was refused.
+            Ethogram, probabilities, what the frame rate cannot resolve, and refused bouts.
         """
         n = track.n_frames
         probability = allocate((n, len(self.words)), float)
@@ -275,9 +267,9 @@ class TimelineModel:
         broken: Broken,
         refused: list[tuple[slice, int, str]],
     ) -> None:
-        """Take the name from bouts of frames that contradict it: those that ticks did not show.
+        """Remove the name of bouts of frames that contradict it and were not found by ticks.
 
-        A slow camera may have no frame of what lies between two bouts of one word.
+        A slow camera may have no frame between two bouts of one word.
         """
         nothing = self.words.index(UNLABELLED)
         starts, stops, _ = runs_of(code + len(self.words) * part)
@@ -295,11 +287,11 @@ class TimelineModel:
         check: FrameCheck,
         refused: list[tuple[slice, int, str]],
     ) -> NDArray[np.int64]:
-        """The most probable words (m,) of bouts that are what their word asks for.
+        """The most probable words (m,), whose bouts satisfy their definitions.
 
-        Scores (m, K) of bouts that are not are lowered in place and decoded again, at most six
-        times; what contradicts its definition even then loses its name. `refused` gets the frames,
-        word and reason of each bout that contradicted.
+        Scores (m, K) of bouts that do not are lowered in place and decoded again, at most six
+        times; a bout that still contradicts its definition becomes unlabelled. `refused` gets the
+        frames, word and reason of each contradicting bout.
         """
         nothing = self.words.index(UNLABELLED)
         for left in reversed(range(_MOST_DECODED)):
@@ -323,16 +315,16 @@ class TimelineModel:
         return decoded
 
     def unresolved(self, times_ns: NDArray[np.int64]) -> dict[str, str]:
-        """Per word, what this frame rate cannot tell.
+        """Per word, what this frame rate cannot resolve.
 
-        Bouts that hold fewer than four frames, and parts of an action that are over before a camera
-        can follow them (`vocabulary.FASTEST`).
+        Bouts shorter than four frames, and parts of an action that are too fast for the camera
+        (`vocabulary.FASTEST`).
 
         Args:
-            times_ns: (n,) time stamps.
+            times_ns: (n,) timestamps.
 
         Returns:
-            Word -> why, only words that are concerned.
+            Word -> reason, affected words only.
         """
         if len(times_ns) < 2:
             return {}
@@ -358,14 +350,14 @@ class TimelineModel:
         return found
 
     def name(self, track: Track, wall_mm: Array | None = None) -> str:
-        """The one word that fits a cut-out sequence best: the largest sum of log likelihood ratios.
+        """The word that fits a cut-out sequence best: the largest sum of log likelihood ratios.
 
         Args:
             track: the sequence, n frames.
             wall_mm: (n,) distance of the animal from the nearest wall, mm; None if unknown.
 
         Returns:
-            A word; `UNLABELLED` only where nothing was measured.
+            A word; `UNLABELLED` only if nothing was measured.
         """
         total = np.zeros(len(self.words))
         names = channel_names(track.skeleton)
@@ -385,9 +377,9 @@ class Recognised:
     Attributes:
         ethogram: the bouts.
         words: (K) the vocabulary.
-        probability: (n, K) of each word in every frame, NaN where there is no pose.
+        probability: (n, K) of each word in every frame, NaN without a pose.
         unresolved: word -> what the frame rate cannot resolve of it, and why.
-        refused: bouts that were as good as named, but contradict what their word means.
+        refused: bouts that contradict their word's definition.
     """
 
     ethogram: Ethogram
@@ -399,12 +391,12 @@ class Recognised:
 
 @dataclass(frozen=True)
 class Examples:
-    """What a recogniser learns from: m ticks of all recordings, and their bouts.
+    """Training data of a recogniser: m ticks of all recordings, and their bouts.
 
     Attributes:
         features: (m, F) float32, see `window_features`.
         code: (m,) index of each tick's word.
-        speed: (m,) `steady_speed`, body lengths a second.
+        speed: (m,) `steady_speed`, body lengths per second.
         recording: (m,) the recording's number.
         runs: of every recording, its bouts (word, s) in order.
     """
@@ -417,14 +409,14 @@ class Examples:
 
 
 def steady_speed(segment: Segment, names: Sequence[str]) -> Array:
-    """The speed around each tick, without regard to the direction: a moving average over 0.4 s.
+    """The speed around each tick, regardless of direction: a moving average over 0.4 s.
 
     Args:
         segment: channels of an unbroken segment of m ticks.
-        names: of its channels, 'speed' among them.
+        names: of its channels, including 'speed'.
 
     Returns:
-        (m,) body lengths a second.
+        (m,) body lengths per second.
     """
     from scipy.ndimage import uniform_filter1d
 
@@ -436,14 +428,7 @@ def steady_speed(segment: Segment, names: Sequence[str]) -> Array:
 
 
 def clock_of(skeleton: Skeleton) -> float:
-    """Ticks a second of an animal's recogniser: 50 for the fish, else 30.
-
-    Args:
-        skeleton: kinematic tree of the animal.
-
-    Returns:
-        Hz.
-    """
+    """Ticks per second of an animal's recogniser: 50 for the fish, else 30."""
     return CLOCKS_HZ.get(skeleton.name, _CLOCK_HZ)
 
 
@@ -452,11 +437,8 @@ def gather(tracks: Sequence[LabelledTrack], words: Sequence[str], clock_hz: floa
 
     Args:
         tracks: labelled recordings, at least one with a pose.
-        words: the vocabulary; holds every word of the tracks.
-        clock_hz: ticks a second.
-
-    Returns:
-        Features, codes and speeds of all ticks, and the bouts of every recording.
+        words: the vocabulary, including every word of the tracks.
+        clock_hz: ticks per second.
     """
     ticks = []
     runs = []
@@ -480,7 +462,7 @@ def gather(tracks: Sequence[LabelledTrack], words: Sequence[str], clock_hz: floa
 def _runs(
     words: NDArray[np.str_], times_ns: NDArray[np.int64], index: dict[str, int]
 ) -> list[tuple[int, float]]:
-    """The bouts (word, s) of a recording, those without a name among them."""
+    """The bouts (word, s) of a recording, including unlabelled ones."""
     if not len(words):
         return []
     ends = frame_stops(times_ns)

@@ -1,8 +1,8 @@
-"""Vocabularies of the bundled ethograms: what each word means, and what a bout of it has to show.
+"""Vocabularies of the bundled ethograms: definitions of the words, and limits of their bouts.
 
-A `Definition` is a sentence and the limits that can be measured of a bout; the numbers in the
-sentence, the clause that is printed behind it and the check of every bout (`behaviour.checking`)
-all come from these limits. Thresholds are starting values, with the literature's.
+A `Definition` is a sentence and its measurable limits. The numbers in the sentence, the clause
+printed after it and the check of every bout (`behaviour.measures`) all come from these limits.
+Thresholds are starting values, from the literature.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from itertools import cycle
 from typing import NamedTuple
 
-# by so much of itself a number said with "about" may be missed; a bout's ends are less certain
+# relative tolerance of a number given with "about"; a bout's ends are less certain
 ABOUT = 0.25
 ABOUT_TIME = 1.0 / 3.0
 
@@ -23,8 +23,8 @@ class Measure(NamedTuple):
 
     Attributes:
         says: its name in a sentence.
-        unit: the unit that people read, with the space or without it before.
-        kept: of the unit that it is measured in, how many make one that people read.
+        unit: the displayed unit, with its space if any.
+        kept: the size of a displayed unit in the unit of the measure.
     """
 
     says: str
@@ -53,13 +53,13 @@ MEASURES = {
 
 
 class Limit(NamedTuple):
-    """Bounds of a measure that every bout of a word keeps.
+    """Bounds of a measure for every bout of a word.
 
     Attributes:
-        measure: one of `MEASURES`, which names its unit.
+        measure: one of `MEASURES`, whose name contains its unit.
         least: the lower bound, in that unit.
         most: the upper bound.
-        about: a definition that says "about" is kept to within this share of the bound.
+        about: relative tolerance of the bounds, for a definition with "about".
     """
 
     measure: str
@@ -69,32 +69,24 @@ class Limit(NamedTuple):
 
     @property
     def bounds(self) -> tuple[float, float]:
-        """What is checked: the least and the most, in the unit of the measure."""
+        """The checked bounds: least and most, in the unit of the measure."""
         low = self.least - self.about * abs(self.least) if math.isfinite(self.least) else self.least
         high = self.most + self.about * abs(self.most) if math.isfinite(self.most) else self.most
         return low, high
 
     def holds(self, value: float) -> bool:
-        """Whether a value lies within the bounds; one that could not be measured does.
-
-        Args:
-            value: of the measure, in its unit.
-        """
+        """Whether a value, in the unit of the measure, is within the bounds; NaN is."""
         low, high = self.bounds
         return not (value < low or value > high)
 
     def shown(self, value: float) -> str:
-        """A value of the measure, in words and in the unit that people read.
-
-        Args:
-            value: of the measure, in its unit.
-        """
+        """A value, in the unit of the measure, in words and in the displayed unit."""
         measure = MEASURES[self.measure]
         return f"{measure.says} {value / measure.kept:.3g}{measure.unit}"
 
     @property
     def span(self) -> str:
-        """The bounds that are checked, in the unit that people read."""
+        """The checked bounds, in the displayed unit."""
         measure = MEASURES[self.measure]
         low, high = (f"{bound / measure.kept:.3g}" for bound in self.bounds)
         if math.isinf(self.most):
@@ -105,17 +97,17 @@ class Limit(NamedTuple):
 
     @property
     def told(self) -> str:
-        """What is checked, in words."""
+        """The check, in words."""
         return f"{MEASURES[self.measure].says} {self.span}"
 
 
 @dataclass(frozen=True)
 class Definition:
-    """What a word means.
+    """The definition of a word.
 
     Attributes:
         pattern: the sentence; {0}, {1}, ... are the finite bounds of its limits, in order.
-        limits: what can be measured of it.
+        limits: its measurable part.
     """
 
     pattern: str
@@ -123,7 +115,7 @@ class Definition:
 
     @property
     def sentence(self) -> str:
-        """The definition by itself, which virtual animals act by and models keep."""
+        """The definition alone, used by virtual animals and stored in models."""
         bounds = [
             f"{bound / MEASURES[limit.measure].kept:.6g}"
             for limit in self.limits
@@ -134,7 +126,7 @@ class Definition:
 
     @property
     def printed(self) -> str:
-        """The definition with what was checked of every bout."""
+        """The definition with the limits that are checked for every bout."""
         return f"{self.sentence} (checked: {', '.join(limit.told for limit in self.limits)})"
 
 
@@ -251,24 +243,23 @@ _BY_PRINT = {one.printed: one for words in WORDS.values() for one in words.value
 
 
 def limits_of(meaning: str) -> tuple[Limit, ...]:
-    """The limits of a definition as it was printed; none of any other sentence.
+    """The limits of a printed definition; empty for any other sentence.
 
-    What a session's or a person's own words mean is not ours to check, so the sentence decides and
-    not the word.
+    Users' own definitions are not checked, so the sentence decides and not the word.
 
     Args:
-        meaning: the definition that stands beside a word, as `Definition.printed` gives it.
+        meaning: the definition of a word, as `Definition.printed` gives it.
     """
     known = _BY_PRINT.get(meaning)
     return known.limits if known else ()
 
 
 def printed_meanings(skeleton: str, kept: Mapping[str, str]) -> dict[str, str]:
-    """The definitions that a model keeps, those of this vocabulary with what is checked of them.
+    """The definitions of a model; those of this vocabulary with their checked limits.
 
     Args:
         skeleton: name of the animal's skeleton.
-        kept: word -> definition as the model keeps it.
+        kept: word -> definition in the model.
     """
     own = WORDS.get(skeleton, {})
     return {
@@ -278,12 +269,12 @@ def printed_meanings(skeleton: str, kept: Mapping[str, str]) -> dict[str, str]:
 
 
 class Fastest(NamedTuple):
-    """The fastest part of an action, and from which frame rate on it can be followed.
+    """The fastest part of an action, and the frame rate that resolves it.
 
     Attributes:
-        what: what the part is.
-        seconds: how long it takes, s.
-        least_hz: the frame rate from which on it can be followed, 1/s.
+        what: name of the part.
+        seconds: its duration, s.
+        least_hz: the lowest frame rate that resolves it, 1/s.
     """
 
     what: str
@@ -293,7 +284,7 @@ class Fastest(NamedTuple):
 
 _BEAT = Fastest(
     "a beat of the tail", 0.1, 40.0
-)  # up to 10 Hz in adults; a frequency is told up to rate / 4
+)  # up to 10 Hz in adults; frequencies are measured up to rate / 4
 FASTEST: dict[str, dict[str, Fastest]] = {
     "fish": {
         "c_turn": Fastest("its first bend", 0.02, 250.0),
@@ -311,7 +302,7 @@ FASTEST: dict[str, dict[str, Fastest]] = {
 }
 
 
-# Colours of actions: a word has the same in the report, the replay and the dashboard.
+# Colours of actions, the same in the report, the replay and the dashboard.
 
 
 NO_POSE = "#EE6677"
@@ -357,11 +348,7 @@ _OWN = {
 
 
 def action_colours(words: Sequence[str]) -> dict[str, str]:
-    """The colour of each word of a vocabulary, as #rrggbb.
-
-    Args:
-        words: the words; beyond the palette colours come again.
-    """
+    """The colour of each word of a vocabulary, as #rrggbb; colours repeat beyond the palette."""
     chosen: dict[str, str] = {}
     for word in words:
         if word in _OWN and _OWN[word] not in chosen.values():
