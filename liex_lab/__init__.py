@@ -5,8 +5,8 @@ A depth recording goes in; 3D skeletons, a replay and behaviour tables come out:
     session_folder = liex_lab.run_session("recording.mcap", plan=liex_lab.Plan.load("mouse"))
     poses = liex_lab.Session.open(session_folder).poses
 
-Importing the package sees to a place for compiled kernels, no more, and costs little: each public
-name brings its own module along when it is asked for.
+Importing the package only prepares the cache folder of compiled kernels; each public name imports
+its own module on first use.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ __version__ = "0.2.0"
 
 install_path_finder()
 # idle kernel threads sleep; OpenMP's default threads spin, on cores on which
-# recordings are read and logs are written meanwhile (libgomp reads this when it is loaded)
+# recordings are read and logs are written (libgomp reads this when it is loaded)
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 _KERNELS_TOLD = keep_kernels()  # a message for the command line, or an empty text
 

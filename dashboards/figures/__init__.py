@@ -1,1 +1,1 @@
-"""Figures as files: one style, drawn with matplotlib, of a session, of a study, of a comparison."""
+"""Figures as files, drawn with matplotlib in one style, of a session, a study or a comparison."""

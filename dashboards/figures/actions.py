@@ -1,4 +1,4 @@
-"""Figures of what actions sum up to: time budget, activity, transitions, curves about onsets."""
+"""Figures that aggregate actions: time budget, activity, transitions, curves around onsets."""
 
 from __future__ import annotations
 
@@ -36,19 +36,15 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-CERTAIN = 0.05  # of p, corrected
+CERTAIN = 0.05  # level of the corrected p
 _MORE = BLUE
 _LESS = "#d55e00"
 _AROUND = ("speed_mm_s", "nose_height_mm", "tail_beat_hz", "opening")
-_BESIDE = 4  # panels of a row
+_BESIDE = 4  # panels per row
 
 
 def time_budget(seen: Seen) -> Figure | None:
-    """Share of the observed time in each action and without a name; None without actions.
-
-    Args:
-        seen: the animal.
-    """
+    """Share of the observed time in each action and unlabelled; None without actions."""
     row = seen.summary
     colours = {**action_colours(seen.words), "unlabelled": UNLABELLED}
     words = [word for word in colours if row is not None and f"{word}_share" in row]
@@ -83,10 +79,7 @@ def time_budget(seen: Seen) -> Figure | None:
 def activity(seen: Seen) -> Figure | None:
     """Stacked shares of the observed time in each action per interval; None without actions.
 
-    Sessions of schema 7 and before counted lost frames in bouts; their shares are scaled to one.
-
-    Args:
-        seen: the animal.
+    Sessions of schema 7 and earlier counted lost frames in bouts; their shares are scaled to one.
     """
     table = seen.table("activity")
     if table is None or not len(table):
@@ -134,11 +127,7 @@ def activity(seen: Seen) -> Figure | None:
 
 
 def transitions(seen: Seen) -> Figure | None:
-    """What follows upon what: matrix and graph, both against chance; None with under two actions.
-
-    Args:
-        seen: the animal.
-    """
+    """Transitions as matrix and graph, compared with chance; None with fewer than two actions."""
     table = seen.table("transitions")
     if table is None:
         return None
@@ -157,7 +146,7 @@ def transitions(seen: Seen) -> Figure | None:
     wide = 68.0
     figure = sheet(TWO_COLUMNS_MM, wide + 14.0 + (18.0 if side == wide else 0.0))
     _matrix(panel(figure, LEFT_MM - 1.0, 4.0 + 0.4 * (wide - side), side, side), words, found)
-    left = LEFT_MM + wide + 2.0  # as wide as there is room for, since names stand beside the circle
+    left = LEFT_MM + wide + 2.0  # as wide as possible, for the names around the circle
     graph = panel(figure, left, 4.0, TWO_COLUMNS_MM - 1.0 - left, wide - 6.0)
     _graph(graph, words, found, action_colours(seen.words))
     n = int(np.nansum(found["n"]))
@@ -171,7 +160,7 @@ def transitions(seen: Seen) -> Figure | None:
 
 
 def _spread(table: pd.DataFrame, words: list[str], column: str) -> Array:
-    """(k, k) a column of the transitions, from the row's word to the column's; NaN where none."""
+    """(k, k) a column of the transitions, from the row's word to the column's; NaN if absent."""
     place = {word: k for k, word in enumerate(words)}
     own = table[table["from_action"].isin(words) & table["to_action"].isin(words)]
     out = np.full((len(words), len(words)), np.nan)
@@ -181,14 +170,14 @@ def _spread(table: pd.DataFrame, words: list[str], column: str) -> Array:
 
 
 def _against_chance(found: dict[str, Array], i: int, j: int) -> str:
-    """The colour of a pair: more or less often than chance, or neither for certain."""
+    """The colour of a pair: significantly more or less often than chance, or neither."""
     if not found["p_fdr"][i, j] <= CERTAIN:
         return MUTED
     return _MORE if found["probability"][i, j] > found["by_chance"][i, j] else _LESS
 
 
 def _matrix(axes: Axes, words: list[str], found: dict[str, Array]) -> None:
-    """A square for each pair, the fuller the more probable, with share and chance in %."""
+    """A square for each pair, with opacity by probability, and share and chance in %."""
     from matplotlib.patches import Rectangle
 
     k = len(words)
@@ -220,7 +209,7 @@ def _matrix(axes: Axes, words: list[str], found: dict[str, Array]) -> None:
 
 
 def _graph(axes: Axes, words: list[str], found: dict[str, Array], colours: dict[str, str]) -> None:
-    """Actions on a circle, as large as they are frequent; arrows as wide as they are probable."""
+    """Actions on a circle, with area by frequency; arrows with width by probability."""
     from matplotlib.patches import FancyArrowPatch
 
     k = len(words)
@@ -267,11 +256,7 @@ def _graph(axes: Axes, words: list[str], found: dict[str, Array], colours: dict[
 
 
 def aligned_curves(seen: Seen) -> Figure | None:
-    """Median and quartiles of measures about the onsets of actions; None with too few bouts.
-
-    Args:
-        seen: the animal.
-    """
+    """Median and quartiles of measures around the onsets of actions; None with too few bouts."""
     rows = _onsets(seen)
     if not rows:
         return None
@@ -304,7 +289,7 @@ def aligned_curves(seen: Seen) -> Figure | None:
 
 
 def _onsets(seen: Seen) -> list[tuple[str, str, str, Around]]:
-    """(measure, unit, word, curves) of every action with enough bouts, in the unit people read."""
+    """(measure, unit, word, curves) of every action with enough bouts, in the displayed unit."""
     moved = seen.kinematics
     found: list[tuple[str, str, str, Around]] = []
     for curve in drawn_curves(seen) if moved is not None else ():
@@ -313,7 +298,7 @@ def _onsets(seen: Seen) -> list[tuple[str, str, str, Around]]:
             continue
         for word in seen.words:
             if name == "nose_height_mm" and not word.startswith("rear"):
-                continue  # on four feet there is nothing to see
+                continue  # constant without rearing
             one = around_onsets(moved, seen.bouts, word, name)
             if one is not None:
                 low, median, high = (

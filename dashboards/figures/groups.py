@@ -1,4 +1,6 @@
-"""Figures of many sessions: ethograms, budgets and ways by group, comparisons with every animal."""
+"""Figures of several sessions: ethograms, budgets and distances by group, comparisons of
+animals.
+"""
 
 from __future__ import annotations
 
@@ -50,11 +52,11 @@ NO_GROUP = "no group"
 
 
 def by_group(all_seen: Sequence[Seen]) -> dict[str, dict[str, list[Seen]]]:
-    """The sessions of each subject of each group, groups in their order, subjects by their names.
+    """The sessions of each subject of each group, groups in the given order, subjects by name.
 
     Args:
         all_seen: animals of sessions, those of the reference group first; one without a subject's
-            name is a subject of its own.
+            name is its own subject.
     """
     out: dict[str, dict[str, list[Seen]]] = {seen.group or NO_GROUP: {} for seen in all_seen}
     for seen in sorted(all_seen, key=lambda one: one.who):
@@ -63,21 +65,12 @@ def by_group(all_seen: Sequence[Seen]) -> dict[str, dict[str, list[Seen]]]:
 
 
 def group_colour(name: str, names: Sequence[str]) -> str:
-    """The colour of a group among those of a study.
-
-    Args:
-        name: of the group.
-        names: of all groups, the reference first.
-    """
+    """The colour of a group among all groups of a study, the reference first."""
     return GROUP_COLOURS[names.index(name) % len(GROUP_COLOURS)]
 
 
 def ethograms(all_seen: Sequence[Seen]) -> Figure | None:
-    """A row for each session, in order of group; None where no session has bouts.
-
-    Args:
-        all_seen: the animals.
-    """
+    """A row for each session, in order of group; None if no session has bouts."""
     rows = [
         (group, seen)
         for group, subjects in by_group(all_seen).items()
@@ -129,11 +122,7 @@ def ethograms(all_seen: Sequence[Seen]) -> Figure | None:
 
 
 def occupancy_by_subject(all_seen: Sequence[Seen]) -> Figure | None:
-    """Heatmaps of every subject, its sessions added up; None where no place is known.
-
-    Args:
-        all_seen: the animals.
-    """
+    """Heatmaps of every subject, the sum of its sessions; None without a known position."""
     panels = []
     for group, subjects in _occupancies(all_seen).items():
         for who, (session, found) in subjects.items():
@@ -144,11 +133,7 @@ def occupancy_by_subject(all_seen: Sequence[Seen]) -> Figure | None:
 
 
 def occupancy_by_group(all_seen: Sequence[Seen]) -> Figure | None:
-    """Heatmaps of every group: each subject counts alike; None where no place is known.
-
-    Args:
-        all_seen: the animals.
-    """
+    """Heatmaps of every group, with equal weight of its subjects; None without a known position."""
     panels = []
     for group, subjects in _occupancies(all_seen).items():
         own = [found for _, found in subjects.values() if found.n]
@@ -162,10 +147,8 @@ def occupancy_by_group(all_seen: Sequence[Seen]) -> Figure | None:
 
 
 def budgets_by_group(all_seen: Sequence[Seen]) -> Figure | None:
-    """Share of the time in each action: every subject and the groups' means; None without actions.
-
-    Args:
-        all_seen: the animals.
+    """Share of the time in each action: every subject and the groups' means; None without
+    actions.
     """
     groups = by_group(all_seen)
     words = list(dict.fromkeys(word for seen in all_seen for word in seen.words))
@@ -202,11 +185,7 @@ def budgets_by_group(all_seen: Sequence[Seen]) -> Figure | None:
 
 
 def distance_by_group(all_seen: Sequence[Seen]) -> Figure | None:
-    """Cumulative distance of every session, and each group's mean; None where no step is known.
-
-    Args:
-        all_seen: the animals.
-    """
+    """Cumulative distance of every session, and each group's mean; None without a known step."""
     groups = by_group(all_seen)
     walks = {
         group: [
@@ -231,7 +210,7 @@ def distance_by_group(all_seen: Sequence[Seen]) -> Figure | None:
             rows = np.unique(np.linspace(0, len(time_s) - 1, min(len(time_s), 400)).astype(int))
             axes.plot(time_s[rows] / size, metres[rows], color=colour, linewidth=0.5, alpha=0.5)
         if known := [one for one in some if one[2]]:
-            # the mean ends with the shortest session, or it would fall where one drops out
+            # the mean ends with the shortest session, or it would drop where a session ends
             grid = np.linspace(0.0, min(float(time_s[-1]) for time_s, _, _ in known), 400)
             mean = np.mean([np.interp(grid, time_s, metres) for time_s, metres, _ in known], axis=0)
             axes.plot(grid / size, mean, color=colour, linewidth=1.5, label=group)
@@ -255,17 +234,17 @@ def comparison(
     """A measure by group: every session and animal, and the differences with 95 % intervals.
 
     Args:
-        table: one row per session: subject_id, group and the measure, as `liex compare` keeps it in
-            sessions.csv.
+        table: one row per session: subject_id, group and the measure, as in the sessions.csv of
+            `liex compare`.
         stats: rows of the table `stats`.
-        measure: the column that is drawn.
-        unit: its unit in the table; "" for none.
-        accounted: a sentence below the figure that accounts for every session.
-        link: the address of a session by its `key`, a column of the table, which its mark leads to;
-            a description follows after #. None makes no links.
+        measure: the column to draw.
+        unit: its unit in the table; "" if dimensionless.
+        accounted: a sentence below the figure on the included and excluded sessions.
+        link: the address of a session by its `key`, a column of the table; its mark becomes a link,
+            with a description after #. None makes no links.
 
     Returns:
-        The figure; None where no session has a value.
+        The figure; None if no session has a value.
     """
     if measure not in table:
         return None
@@ -304,7 +283,7 @@ def comparison(
 
 
 def effects(stats: pd.DataFrame, units: Mapping[str, str]) -> Figure | None:
-    """Hedges' g of every measure and contrast with its interval; None where none can be given.
+    """Hedges' g of every measure and contrast with its interval; None if absent.
 
     Args:
         stats: the table `stats`.
@@ -340,7 +319,7 @@ def _strip(
     names: Sequence[str],
     link: Callable[[str], str] | None = None,
 ) -> None:
-    """One group: a small mark per session, a large one per animal, a line for the animals' mean."""
+    """One group: a small mark per session, a large one per animal, a line at the animals' mean."""
     animal, animals = pd.factorize(rows["subject_id"].astype(str))
     means = animal_means(values, animal)
     beside = np.linspace(-0.2, 0.2, len(animals)) if len(animals) > 1 else np.zeros(1)
@@ -364,7 +343,7 @@ def _strip(
 
 
 def _differences(axes: Axes, own: pd.DataFrame, factor: float, unit: str) -> None:
-    """Each contrast's difference with its interval; effect size and n, or why there is no test."""
+    """Each contrast's difference with its interval, effect size and n, or "no test"."""
     known = own[np.isfinite(own["estimate"].astype(float))].reset_index(drop=True)
     if known.empty:
         axes.set_axis_off()
@@ -395,7 +374,7 @@ def _differences(axes: Axes, own: pd.DataFrame, factor: float, unit: str) -> Non
 def _intervals(
     axes: Axes, known: pd.DataFrame, middle: str, low: str, high: str, factor: float
 ) -> None:
-    """Marks with their intervals, one row below the other; hollow where there is no test."""
+    """Marks with their intervals, one per row; hollow without a test."""
     spans = factor * known[[middle, low, high]].to_numpy(float)
     for k, ((value, a, b), test) in enumerate(zip(spans, known["test"].astype(str), strict=True)):
         if np.isfinite([a, b]).all():
@@ -408,7 +387,7 @@ def _intervals(
 
 
 def _occupancies(all_seen: Sequence[Seen]) -> dict[str, dict[str, tuple[Session, Occupancy]]]:
-    """Each subject's first session and its occupancy, on a grid that all share, by group."""
+    """Each subject's first session and its occupancy on a common grid, by group."""
     corners = [extent_mm(one.session, one.xy_mm, centred=True) for one in all_seen]
     low = np.min([corner[0] for corner in corners], axis=0)
     high = np.max([corner[1] for corner in corners], axis=0)
@@ -426,12 +405,12 @@ def _occupancies(all_seen: Sequence[Seen]) -> dict[str, dict[str, tuple[Session,
 
 
 def _added(some: Sequence[Occupancy]) -> Occupancy:
-    """Occupancies of one grid, added up."""
+    """The sum of occupancies on one grid."""
     total = np.sum([found.time_s for found in some], axis=0)
     return replace(some[0], time_s=total, n=sum(found.n for found in some))
 
 
 def _budget(sessions: Sequence[Seen], words: Sequence[str]) -> pd.Series[float]:
-    """Share of a subject's time in each action: the mean of its sessions; NaN where unknown."""
+    """Share of a subject's time in each action: the mean of its sessions; NaN if unknown."""
     known = [{} if seen.summary is None else dict(seen.summary) for seen in sessions]
     return pd.DataFrame(known, columns=[f"{word}_share" for word in words], dtype=float).mean()

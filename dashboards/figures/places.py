@@ -34,18 +34,18 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_MOST_PLACES = 20_000  # of a trajectory: five a second of an hour
+_MOST_PLACES = 20_000  # of a trajectory: five per second of an hour
 _PIECES = 64  # colours of a trajectory
-_ACROSS = 3  # panels beside each other
+_ACROSS = 3  # panels per row
 
 
 def aligned(session: Session, xy_mm: Array) -> Array:
-    """Places as counted from the arena's centre, along its sides, so that arenas can be laid upon
-    each other; as they are where the arena's shape is not known.
+    """Positions relative to the arena's centre and sides, so that arenas can be superimposed;
+    unchanged if the arena's shape is unknown.
 
     Args:
         session: the opened session.
-        xy_mm: (n, 2) places, mm, arena frame.
+        xy_mm: (n, 2) positions, mm, arena frame.
     """
     arena = session.arena
     if arena.centre_mm is None:
@@ -56,12 +56,12 @@ def aligned(session: Session, xy_mm: Array) -> Array:
 
 
 def extent_mm(session: Session, xy_mm: Array, centred: bool = False) -> tuple[Array, Array]:
-    """Corners (smallest, largest) of what a figure of the floor shows, mm, arena frame.
+    """Corners (smallest, largest) of a figure of the floor, mm, arena frame.
 
     Args:
-        session: its arena and zones are in view.
-        xy_mm: (n, 2) places that are in view, too; NaN does not count.
-        centred: as `aligned` counts places.
+        session: its arena and zones are included.
+        xy_mm: (n, 2) positions to include; NaN does not count.
+        centred: use the coordinates of `aligned`.
     """
     known = xy_mm[np.isfinite(xy_mm).all(axis=1)]
     shown = [known, session.arena.outline_mm(), *(zone.outline_mm() for zone in session.zones)]
@@ -72,13 +72,13 @@ def extent_mm(session: Session, xy_mm: Array, centred: bool = False) -> tuple[Ar
 
 
 def draw_outlines(axes: Axes, session: Session, named: bool = True, centred: bool = False) -> None:
-    """The arena's walls, where known, and the zones with their names.
+    """Draw the arena's walls, if known, and the zones with their names.
 
     Args:
-        axes: a panel whose axes count millimetres.
+        axes: a panel with axes in millimetres.
         session: the opened session.
-        named: whether the zones' names are written.
-        centred: as `aligned` counts places.
+        named: whether to write the zones' names.
+        centred: use the coordinates of `aligned`.
     """
     walls = session.arena.outline_mm()
     outlines = [("arena", walls)] if len(walls) else []
@@ -96,10 +96,10 @@ def draw_outlines(axes: Axes, session: Session, named: bool = True, centred: boo
 
 
 def draw_region(axes: Axes, session: Session) -> None:
-    """The region outside of which nothing was looked at, on the floor, where it was not all.
+    """Draw the evaluated region on the floor, if it is not the whole image.
 
     Args:
-        axes: a panel whose axes count millimetres.
+        axes: a panel with axes in millimetres.
         session: the opened session.
     """
     corners = session.metadata.get("scene", {}).get("region_px", [])
@@ -108,7 +108,7 @@ def draw_region(axes: Axes, session: Session) -> None:
     rays = session.camera.unproject(np.asarray(corners, float), np.ones(len(corners)))
     place = session.T_arena_camera
     ways = rays @ place.rotation.T
-    if (ways[:, 2] >= 0).any():  # a corner above the horizon is nowhere on the floor
+    if (ways[:, 2] >= 0).any():  # a corner above the horizon is not on the floor
         return
     on_floor = place.translation + ways * (-place.translation[2] / ways[:, 2])[:, None]
     closed = np.vstack([on_floor, on_floor[:1]])
@@ -116,14 +116,14 @@ def draw_region(axes: Axes, session: Session) -> None:
 
 
 def draw_hidden(axes: Axes, session: Session) -> None:
-    """Where animals were last seen before they were hidden, with for how long.
+    """Draw the last positions of hidden animals, with the durations.
 
     Args:
-        axes: a panel whose axes count millimetres.
+        axes: a panel with axes in millimetres.
         session: the opened session.
     """
     gaps = session.gaps
-    if "x_mm" not in gaps:  # sessions of earlier versions do not say where
+    if "x_mm" not in gaps:  # sessions of earlier versions lack the position
         return
     hidden = gaps[(gaps["reason"] == "hidden") & gaps["x_mm"].notna()]
     columns = hidden[["x_mm", "y_mm", "start_s", "stop_s"]].to_numpy(float)
@@ -136,10 +136,10 @@ def draw_hidden(axes: Axes, session: Session) -> None:
 
 
 def draw_occupancy(axes: Axes, found: Occupancy, most: float) -> Any:
-    """The heatmap of an occupancy, cells where the animal never was left empty; returns the image.
+    """Draw the heatmap of an occupancy, unvisited cells empty; returns the image.
 
     Args:
-        axes: a panel whose axes count millimetres.
+        axes: a panel with axes in millimetres.
         found: the occupancy.
         most: time per area of the lightest colour, s/cm².
     """
@@ -157,20 +157,14 @@ def draw_occupancy(axes: Axes, found: Occupancy, most: float) -> Any:
 
 
 def occupancy_of(seen: Seen) -> Occupancy:
-    """The occupancy of an animal, over what its figures of the floor show.
-
-    Args:
-        seen: the animal.
-    """
+    """The occupancy of an animal over the extent of its floor figures."""
     low, high = extent_mm(seen.session, seen.xy_mm)
     return occupancy(seen.xy_mm, seen.hold_s, low, high)
 
 
 def occupancy_map(seen: Seen) -> Figure | None:
-    """Heatmap of the time per area, with walls and zones; None without a place, and for a hand.
-
-    Args:
-        seen: the animal.
+    """Heatmap of the time per area, with walls and zones; None without a position, and for a
+    hand.
     """
     found = occupancy_of(seen)
     if found.n == 0 or _is_hand(seen):
@@ -189,16 +183,14 @@ def occupancy_map(seen: Seen) -> Figure | None:
 
 
 def _is_hand(seen: Seen) -> bool:
-    """Whether the animal is held up before the camera: where it is over the floor says nothing."""
+    """Whether the animal is a hand before the camera, whose position on the floor has no
+    meaning.
+    """
     return axis_of(seen.session.metadata["animal"]).kind == BRANCHES
 
 
 def trajectory(seen: Seen) -> Figure | None:
-    """Path of the body's centre from above by time; None without a place, and for a hand.
-
-    Args:
-        seen: the animal.
-    """
+    """Path of the body's centre from above by time; None without a position, and for a hand."""
     known = np.isfinite(seen.xy_mm).all(axis=1)
     if not known.any() or _is_hand(seen):
         return None
@@ -237,16 +229,16 @@ def trajectory(seen: Seen) -> Figure | None:
 def arena_heights(
     session: Session, depth: Sequence[NDArray[np.uint16]]
 ) -> tuple[Array, Array, Array]:
-    """Heights above the floor of what stands still, seen from above.
+    """Heights of the static scene above the floor, from above.
 
     Args:
         session: the opened session.
-        depth: some pictures (H, W) uint16 mm, 0 where unread, from all over the session; what is
-            there in most of them stands still.
+        depth: some depth images (H, W) uint16 mm, 0 where unread, from all over the session; the
+            median of each pixel is static.
 
     Returns:
-        Heights (ny, nx) mm, NaN where nothing was read, and the edges of the columns (nx + 1,) and
-        rows (ny + 1,), mm, arena frame.
+        Heights (ny, nx) mm, NaN where unread, and the edges of the columns (nx + 1,) and rows (ny +
+            1,), mm, arena frame.
     """
     pictures = np.where(np.stack(depth) > 0, np.stack(depth), np.nan).astype(np.float32)
     with np.errstate(all="ignore"):
@@ -263,7 +255,7 @@ def arena_heights(
     low, high = extent_mm(session, np.empty((0, 2)))
     if not (high > low).all():
         low, high = np.percentile(points[:, :2], [1.0, 99.0], axis=0)
-    # two pixels wide, so that hardly a cell is left without one
+    # two pixels wide, so that few cells are empty
     step = 2.0 * float(np.median(z)) / min(camera.fx, camera.fy)
     margin = 0.06 * float((high - low).max())
     edges = [np.arange(a - margin, b + margin + step, step) for a, b in zip(low, high, strict=True)]
@@ -275,11 +267,12 @@ def arena_heights(
 
 
 def arena_map(session: Session, depth: Sequence[NDArray[np.uint16]]) -> Figure | None:
-    """The arena's heights above the floor with fixtures, walls and zones; None without pictures.
+    """The arena's heights above the floor with fixtures, walls and zones; None without depth
+    images.
 
     Args:
         session: the opened session.
-        depth: pictures as for `arena_heights`.
+        depth: depth images as for `arena_heights`.
     """
     if not len(depth) or not any((picture > 0).any() for picture in depth):
         return None
@@ -316,12 +309,12 @@ def arena_map(session: Session, depth: Sequence[NDArray[np.uint16]]) -> Figure |
 
 
 def occupancy_panels(title: str, panels: Sequence[tuple[str, Session, Occupancy]]) -> Figure | None:
-    """Heatmaps beside each other on one scale; None where no place is known in any.
+    """Heatmaps in a grid on one scale; None without a known position.
 
     Args:
-        title: what all of them are.
-        panels: name, session whose walls and zones are drawn, and occupancy of each, each as time
-            per area of one session (groups: the mean of the animals).
+        title: the common title.
+        panels: name, session whose walls and zones are drawn, and occupancy of each, as time per
+            area of one session (for groups: the mean of the animals).
     """
     known = [one for one in panels if one[2].n]
     if not known:
@@ -349,14 +342,14 @@ def occupancy_panels(title: str, panels: Sequence[tuple[str, Session, Occupancy]
 
 
 def _most(found: Occupancy) -> float:
-    """Time per area that is the lightest: of all but the busiest hundredth of the visited floor."""
+    """Time per area of the lightest colour: the 99 % quantile over the visited floor."""
     density = found.per_cm2
     visited = density[density > 1e-3 * density.max()]
     return float(np.percentile(visited, 99.0)) if len(visited) else 1.0
 
 
 def _floor_sheet(title: str) -> tuple[Figure, Axes]:
-    """One column's figure with a square panel, room for a bar of colours, and a title of n."""
+    """A one-column figure with a square panel, space for a colour bar, and a title."""
     figure = sheet(ONE_COLUMN_MM, 86.0)
     axes = panel(figure, 2.0, 7.0, 69.0, 69.0)
     axes.set_title(title)

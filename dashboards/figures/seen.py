@@ -1,4 +1,4 @@
-"""One animal of one session as figures take it: its rows of the tables, and what to call it."""
+"""One animal of one session for figures: its rows of the tables, and its name."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 Array = NDArray[np.float64]
-# the columns that are drawn, beyond those that every table has
+# the drawn columns, beyond those of every table
 FRAMES = ("frame_index", "time_s", "gap_before", "predicted_error_mm", "spine_mm")
 KINEMATICS = (
     "time_s",
@@ -46,8 +46,8 @@ class Seen:
         session: the opened session.
         individual: the animal's name in its tables.
         alone: whether it is the session's only animal.
-        subject: the subject's name; "" where none is stated.
-        group: the group it is in; "" where none is stated.
+        subject: the subject's name; "" if absent.
+        group: its group; "" if absent.
     """
 
     session: Session
@@ -58,13 +58,13 @@ class Seen:
 
     @property
     def who(self) -> str:
-        """What titles call it: the subject, where one is stated, else the session."""
+        """Its name in titles: the subject if present, else the session."""
         name = self.subject or self.session.name
         return name if self.alone else f"{name}, {self.individual}"
 
     @cached_property
     def words(self) -> list[str]:
-        """The vocabulary, in the order in which it is coloured."""
+        """The vocabulary, in the order of its colours."""
         return list(self.session.metadata.get("actions", {}))
 
     @property
@@ -90,18 +90,14 @@ class Seen:
         return self._own(self.session.kinematics)
 
     def table(self, name: str) -> pd.DataFrame | None:
-        """Its rows of another table; None where the session has none of that name.
-
-        Args:
-            name: of the table, such as 'transitions'.
-        """
+        """Its rows of another table, such as 'transitions'; None if absent."""
         if not self.session.has(f"{name}.parquet"):
             return None
         return self._own(self.session.table(name))
 
     @cached_property
     def summary(self) -> pd.Series[float] | None:
-        """Its row of the summary; None where there is none."""
+        """Its row of the summary; None if absent."""
         if not self.session.has("summary.csv"):
             return None
         own = self._own(self.session.summary)
@@ -111,39 +107,33 @@ class Seen:
     def lost_s(self) -> Array:
         """(k, 2) spans without a pose, or without frames of the camera, s."""
         gaps = self._own(self.session.gaps)
-        empty = gaps[gaps["n_frames_missing"] > 0]  # the others are stamps that were moved
+        empty = gaps[gaps["n_frames_missing"] > 0]  # the others are corrected timestamps
         return empty[["start_s", "stop_s"]].to_numpy(float)
 
     @cached_property
     def xy_mm(self) -> Array:
-        """(n, 2) places of the body's centre, mm, arena frame; NaN without a pose."""
+        """(n, 2) positions of the body's centre, mm, arena frame; NaN without a pose."""
         if self.kinematics is None:
             return np.empty((0, 2))
         return self.kinematics[["x_mm", "y_mm"]].to_numpy(float)
 
     @cached_property
     def hold_s(self) -> Array:
-        """(n,) how long each frame counts, s."""
+        """(n,) duration of each frame, s."""
         if self.kinematics is None or not len(self.kinematics):
             return np.empty(0)
         return hold_times(self.kinematics["time_s"].to_numpy(float))
 
     def column(self, name: str) -> Array:
-        """A column of `kinematics`, broken at gaps of the camera: no line is drawn across them.
-
-        Args:
-            name: of the column.
+        """A column of `kinematics`, interrupted at gaps of the camera, so that no line crosses
+        them.
         """
         if self.kinematics is None or name not in self.kinematics:
             return np.full(len(self.frames), np.nan)
         return self.broken(self.kinematics[name])
 
     def broken(self, values: pd.Series[float]) -> Array:
-        """Values of every frame with the first one after a gap of the camera taken out.
-
-        Args:
-            values: one for every frame.
-        """
+        """Values of every frame, with NaN for the first one after a gap of the camera."""
         whole = self.frames["gap_before"].to_numpy() == 0
         return np.where(whole, values.to_numpy(float), np.nan)
 
@@ -154,11 +144,7 @@ class Seen:
 
 
 def animals(session: Session) -> list[Seen]:
-    """Every animal of a session; of long ones no more is read than what is drawn.
-
-    Args:
-        session: the opened session.
-    """
+    """Every animal of a session; only the drawn columns are read."""
     table = session.table("sessions")
     names = [str(name) for name in table["individual"]] or [str(session.metadata["individual"])]
     alone = len(set(names)) == 1
@@ -174,19 +160,19 @@ def animals(session: Session) -> list[Seen]:
 
 
 def _text(value: object) -> str:
-    """A stated name; "" where there is none."""
+    """A name; "" if absent."""
     return value if isinstance(value, str) else ""
 
 
 def joints_in_picture(all_seen: Sequence[Seen], n: int) -> list[Array]:
-    """Where the joints of each animal of a session lie in its pictures.
+    """Image positions of the joints of each animal of a session.
 
     Args:
         all_seen: the animals of one session, see `animals`.
         n: frames of the session.
 
     Returns:
-        Of each animal (n, J, 2) px; NaN without a pose.
+        For each animal (n, J, 2) px; NaN without a pose.
     """
     names = ["u_px", "v_px", *([] if all_seen[0].alone else ["individual"])]
     table = all_seen[0].session.table("poses", names)
@@ -197,11 +183,11 @@ def joints_in_picture(all_seen: Sequence[Seen], n: int) -> list[Array]:
     return found
 
 
-# Depth pictures of a session for figures and videos, by the one function that reads them.
+# Depth images of a session for figures and videos.
 
 
 class DepthReader:
-    """The depth pictures of a session's replay, open for a while (a context manager).
+    """The depth images of a session's replay (a context manager).
 
     Args:
         session: the opened session.
@@ -223,18 +209,17 @@ class DepthReader:
         self.close()
 
     def close(self) -> None:
-        """Close the file that is open."""
+        """Close the open file."""
         self._frames.close()
 
     @property
     def whole(self) -> bool:
-        """Whether the session's replay keeps depth, beyond the thumbnails of the report."""
+        """Whether the session's replay contains depth, beyond the thumbnails of the report."""
         return meant_to_keep_depth(self._session) and self._session.has("session.mcap")
 
     def picture(self, row: int) -> NDArray[np.uint16] | None:
-        """(H, W) uint16 mm, 0 where unread; None where the session keeps none of this frame.
+        """(H, W) uint16 mm, 0 where unread; None if the session has no depth of this frame.
 
-        Args:
-            row: the frame's row in the table `frames`.
+        `row` is the frame's row in the table `frames`.
         """
         return self._frames.depth(self._session.name, self._session, row)

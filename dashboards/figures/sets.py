@@ -1,4 +1,4 @@
-"""Which figures there are of a session, a study and a comparison, and their files."""
+"""The sets of figures of a session, a study and a comparison, and their files."""
 
 from __future__ import annotations
 
@@ -35,11 +35,11 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 FOLDER = "figures"
-PAGES = "pages"  # the format that is one file of all figures, a page for each
+PAGES = "pages"  # the format with all figures in one file, one per page
 KINDS = (*FORMATS, PAGES)
 _PAGES_FILE = "figures.pdf"
 COMPARISON_FILE = "comparison.json"
-_PICTURES = 9  # from which the arena without the animal is found
+_PICTURES = 9  # frames from which the empty arena is computed
 OF_SESSION: dict[str, tuple[str, Callable[[Seen], Figure | None]]] = {
     "ethogram": ("what the animal did when", times.ethogram),
     "curves": ("speed, heights and predicted error over time", times.curves),
@@ -69,8 +69,8 @@ class Drawn:
 
     Attributes:
         name: of its files.
-        what: it shows.
-        figure: the figure; None where there is nothing to draw.
+        what: its description.
+        figure: the figure; None if there is nothing to draw.
     """
 
     name: str
@@ -79,13 +79,13 @@ class Drawn:
 
 
 def session_figures(session: Session, only: Sequence[str] = ()) -> Iterator[Drawn]:
-    """Every figure of a session, one after the other; call it inside `style.drawing()`.
+    """Yield every figure of a session; call it inside `style.drawing()`.
 
-    Of several animals each has its own, whose names end in the animal's.
+    With several animals, each has its own figures, whose names end in the animal's name.
 
     Args:
         session: the opened session.
-        only: names of `OF_SESSION`; () takes all.
+        only: names of `OF_SESSION`; () draws all.
     """
     for seen in animals(session):
         for name in only or OF_SESSION:
@@ -95,11 +95,11 @@ def session_figures(session: Session, only: Sequence[str] = ()) -> Iterator[Draw
 
 
 def study_figures(sessions: Sequence[Session], only: Sequence[str] = ()) -> Iterator[Drawn]:
-    """Every figure of a study; call it inside `style.drawing()`.
+    """Yield every figure of a study; call it inside `style.drawing()`.
 
     Args:
         sessions: the opened sessions.
-        only: names of `OF_STUDY`; () takes all.
+        only: names of `OF_STUDY`; () draws all.
     """
     yield from _of_many([seen for session in sessions for seen in animals(session)], only)
 
@@ -110,13 +110,13 @@ def comparison_figures(
     sessions: Sequence[Session],
     only: Sequence[str] = (),
 ) -> Iterator[Drawn]:
-    """Every figure of a comparison; call it inside `style.drawing()`.
+    """Yield every figure of a comparison; call it inside `style.drawing()`.
 
     Args:
         table: the comparison's sessions.csv.
         stats: its table `stats`.
-        sessions: the opened sessions; () leaves out what needs them.
-        only: names of `OF_STUDY`, 'effects', or measures of `stats`; () takes all.
+        sessions: the opened sessions; () omits the figures that need them.
+        only: names of `OF_STUDY`, 'effects', or measures of `stats`; () draws all.
     """
     units = _units(sessions)
     said = str(table.attrs.get("accounted", ""))
@@ -147,11 +147,11 @@ def _name_of(measure: str) -> str:
 
 
 def remove_others(folder: Path, measures: Sequence[str]) -> None:
-    """Remove figures of measures that were compared before and are compared no longer.
+    """Remove figures of measures that are no longer compared.
 
     Args:
         folder: the folder of a comparison's figures.
-        measures: what is compared now.
+        measures: the compared measures.
     """
     kept = {_name_of(measure) for measure in measures}
     for path in _files(folder):
@@ -162,16 +162,16 @@ def remove_others(folder: Path, measures: Sequence[str]) -> None:
 def write_figures(
     drawn: Iterator[Drawn], folder: Path, kinds: Sequence[str], progress: Progress = silent
 ) -> tuple[list[Path], list[str]]:
-    """Write figures as files, each whole or not at all.
+    """Write figures as files, each complete or not at all.
 
     Args:
-        drawn: the figures, made while they are written.
-        folder: it is made where it is missing.
+        drawn: the figures, drawn one by one.
+        folder: created if missing.
         kinds: some of `KINDS`.
-        progress: told which figure is drawn.
+        progress: reports the number of the figure.
 
     Returns:
-        The files, and the names of the figures of which there was nothing to draw.
+        The files, and the names of the figures with nothing to draw.
     """
     files: list[Path] = []
     empty: list[str] = []
@@ -194,9 +194,9 @@ def write_figures(
 
 @contextmanager
 def _one_pdf(folder: Path | None) -> Iterator[PdfPages | None]:
-    """All figures of a folder as one PDF, which is written when the block ends; None for none.
+    """All figures of a folder as one PDF, written at the end of the block; None if no folder.
 
-    The font is embedded once: a PDF of its own for each figure takes several times as long.
+    The font is embedded once: separate PDFs take several times as long.
     """
     if folder is None:
         yield None
@@ -215,12 +215,12 @@ def put_figure(folder: Path, name: str, content: bytes) -> Path:
     """Write one file of a figure under another name and rename it; returns its path.
 
     Args:
-        folder: the folder of figures; it is made where it is missing.
+        folder: the folder of figures, created if missing.
         name: of the file.
         content: its bytes.
 
     Raises:
-        PlaceError: a symbolic link lies there.
+        PlaceError: the path is a symbolic link.
     """
     unlinked(folder).mkdir(parents=True, exist_ok=True)
     stem, dot, kind = name.rpartition(".")
@@ -231,10 +231,11 @@ def put_figure(folder: Path, name: str, content: bytes) -> Path:
 
 
 def read_comparison(folder: Path) -> tuple[pd.DataFrame, pd.DataFrame, list[Session]]:
-    """What `liex compare` wrote: its sessions' table, its table `stats`, and the opened sessions.
+    """The output of `liex compare`: its table of sessions, its table `stats`, and the opened
+    sessions.
 
-    A session that has gone from its place is left out. `attrs` of the sessions' table has the
-    sentence that accounts for all sessions.
+    A session that is missing from its path is left out. `attrs` of the sessions' table contains the
+    sentence on included and excluded sessions.
 
     Args:
         folder: the folder of the comparison.
@@ -260,14 +261,14 @@ def read_comparison(folder: Path) -> tuple[pd.DataFrame, pd.DataFrame, list[Sess
 
 
 def check_names(only: Sequence[str], known: Sequence[str]) -> None:
-    """Refuse names of figures that there are not.
+    """Refuse unknown names of figures.
 
     Args:
-        only: the names that are asked for.
-        known: the names that there are.
+        only: the requested names.
+        known: the existing names.
 
     Raises:
-        SessionError: one is not known.
+        SessionError: a name is unknown.
     """
     for name in (one for one in only if one not in known):
         near = difflib.get_close_matches(name, known, 1)
@@ -276,13 +277,10 @@ def check_names(only: Sequence[str], known: Sequence[str]) -> None:
 
 
 def check_kinds(kinds: Sequence[str]) -> None:
-    """Refuse formats that figures are not written in.
-
-    Args:
-        kinds: the formats that are asked for.
+    """Refuse unknown formats of figures.
 
     Raises:
-        SessionError: one is not known.
+        SessionError: a format is unknown.
     """
     if unknown := [kind for kind in kinds if kind not in KINDS]:
         raise SessionError(
@@ -291,14 +289,14 @@ def check_kinds(kinds: Sequence[str]) -> None:
 
 
 def for_the_page(session: Session, folder: Path | None) -> dict[str, str]:
-    """Every figure of a session as an element of a page, by name; written as SVG on the way.
+    """Every figure of a session as an element of a page, by name; also written as SVG.
 
-    Of other formats those are made that the plan asks for (`[report] figures`), and those that lie
-    there already are drawn anew, which show the session as it was before a correction.
+    Other formats are written if the plan requests them (`[report] figures`). Existing files are
+    drawn again, because a correction may have changed the session.
 
     Args:
         session: the opened session.
-        folder: where the files go; None writes none.
+        folder: of the files; None writes none.
     """
     made: dict[str, str] = {}
     there = set() if folder is None else {path.name for path in _files(folder)}
@@ -321,19 +319,19 @@ def for_the_page(session: Session, folder: Path | None) -> dict[str, str]:
             if pages is not None:
                 pages.savefig(one.figure)
     if folder is not None and made:
-        for old in _files(folder):  # of which there is nothing to draw any more
+        for old in _files(folder):  # without a figure any more
             if old.stem.split("-")[0] in OF_SESSION and old.stem not in made:
                 old.unlink()
     return made
 
 
 def _files(folder: Path) -> list[Path]:
-    """The files of figures in a folder, in the order of their names."""
+    """The figure files in a folder, in the order of their names."""
     return sorted(path for kind in FORMATS for path in folder.glob(f"*.{kind}"))
 
 
 def _arena(session: Session) -> Figure | None:
-    """The arena from some pictures of the session's replay; None where it keeps no depth."""
+    """The arena from some frames of the session's replay; None without depth."""
     n = len(session.frames)
     rows = np.unique(np.linspace(0, max(n - 1, 0), _PICTURES).astype(int)) if n else ()
     with DepthReader(session) as reader:
@@ -343,7 +341,7 @@ def _arena(session: Session) -> Figure | None:
 
 
 def _grouped(sessions: Sequence[Session], table: pd.DataFrame) -> list[Seen]:
-    """The animals with the groups that a comparison puts them in; those in none are left out."""
+    """The animals with their groups in a comparison; animals without a group are left out."""
     who = ["session_id", "individual"]
     named = table.astype(dict.fromkeys(who, str)).groupby(who)["group"]
     stated = {key: list(groups_of) for key, groups_of in named}
@@ -353,8 +351,8 @@ def _grouped(sessions: Sequence[Session], table: pd.DataFrame) -> list[Seen]:
     for seen in every:
         key = seen.session.name, seen.individual
         own = stated.get(key, [])
-        # of sessions of one name, in several folders, the rows are in the sessions' order; once one
-        # of them has gone, nobody can say whose row is whose
+        # rows of sessions with one name, in several folders, are in the sessions' order; if one
+        # of them is missing, the rows cannot be assigned
         if len(own) == there[key] or len(set(map(str, own))) == 1:
             group = own[0] if len(own) == 1 else own.pop(0)
             there[key] -= 1

@@ -1,8 +1,8 @@
-"""The one style of all figures: sizes in mm, fonts, colours, panels, scale bars, and their bytes.
+"""The style of all figures: sizes in mm, fonts, colours, panels, scale bars, and file contents.
 
-A figure is one or two columns of a journal wide. Its texts stay text, in SVG and in PDF, so that an
-editor can change them. The four colours of ink and paper are told apart in the SVG, so that a page
-can put its own in their place (dark mode).
+A figure is one or two journal columns wide. Texts stay text in SVG and PDF, so that they can be
+edited. The colours of ink and paper are distinct in the SVG, so that a page can replace them (dark
+mode).
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 FORMATS = ("svg", "pdf", "png")
 ONE_COLUMN_MM = 89.0
 TWO_COLUMNS_MM = 183.0
-LEFT_MM = 27.0  # of all figures over time, so that their axes stand below each other
+LEFT_MM = 27.0  # of all figures over time, so that their axes align
 RIGHT_MM = 5.0
 INK = "#1f2328"
 MUTED = "#626a73"
@@ -34,23 +34,23 @@ PAPER = "#fdfdfb"
 BLUE = "#4477aa"
 GREEN = "#228833"
 PURPLE = "#aa3377"
-# Okabe and Ito's colours, which colour-blind people tell apart; every group has its own mark, too
+# Okabe and Ito's colour-blind safe colours; every group also has its own mark
 # the first group is the reference, in grey
 GROUP_COLOURS = ("#7f7f7f", "#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
 GROUP_MARKS = ("o", "s", "D", "^", "P", "X", "*")
 _PAGE = {INK: "--ink", MUTED: "--muted", LINE: "--line", SOFT: "--soft", PAPER: "--paper"}
 _FACE = "'DejaVu Sans'"  # comes with matplotlib: the same figure on every machine
-_FACES = "Arial, Helvetica, 'DejaVu Sans', sans-serif"  # narrower ones fit, too
-_KEYS = 6  # actions of a row of the key
+_FACES = "Arial, Helvetica, 'DejaVu Sans', sans-serif"  # narrower fonts fit as well
+_KEYS = 6  # actions per row of the key
 _BARS_MM = (10.0, 20.0, 50.0, 100.0, 200.0, 500.0, 1000.0)
-_ONE_AT_A_TIME = threading.RLock()  # matplotlib's settings are the process's
+_ONE_AT_A_TIME = threading.RLock()  # matplotlib's settings are global
 _STYLE: dict[str, Any] = {
     "font.family": ["DejaVu Sans"],
     "font.size": 6.5,
     "axes.titlesize": 7.0,
     "axes.titlelocation": "left",
     "axes.titlepad": 4.0,
-    "axes.titley": 1.0,  # where it is would be looked for at every drawing
+    "axes.titley": 1.0,  # else computed at every drawing
     "axes.labelsize": 6.5,
     "axes.labelpad": 2.0,
     "axes.linewidth": 0.6,
@@ -61,7 +61,7 @@ _STYLE: dict[str, Any] = {
     "axes.facecolor": "none",
     "figure.facecolor": "none",
     "text.color": INK,
-    "text.parse_math": False,  # a dollar in a name is a dollar
+    "text.parse_math": False,  # a dollar sign is literal
     "xtick.color": MUTED,
     "ytick.color": MUTED,
     "xtick.labelcolor": INK,
@@ -92,23 +92,18 @@ _STYLE: dict[str, Any] = {
 def drawing() -> Iterator[None]:
     """The style, while figures are drawn and written.
 
-    A letter that the font lacks is no reason to complain: in an SVG the reader's font has it.
+    Warnings of missing glyphs are suppressed, because an SVG uses the reader's font.
     """
     from matplotlib import rc_context
 
-    style: Any = _STYLE  # matplotlib lists every name that a setting can have
+    style: Any = _STYLE  # matplotlib types every setting's name
     with _ONE_AT_A_TIME, rc_context(style), warnings.catch_warnings():
         warnings.filterwarnings("ignore", "Glyph .* missing from", UserWarning)
         yield
 
 
 def sheet(width_mm: float, height_mm: float) -> Figure:
-    """An empty figure of a size on paper.
-
-    Args:
-        width_mm: its width, mm.
-        height_mm: its height, mm.
-    """
+    """An empty figure of a size in mm."""
     from matplotlib.figure import Figure
 
     return Figure(figsize=(width_mm / 25.4, height_mm / 25.4))
@@ -117,12 +112,12 @@ def sheet(width_mm: float, height_mm: float) -> Figure:
 def panel(
     figure: Figure, left_mm: float, bottom_mm: float, width_mm: float, height_mm: float
 ) -> Axes:
-    """Axes at a place on the paper.
+    """Axes at a position of the figure.
 
     Args:
         figure: the figure.
-        left_mm: left edge of the axes' box from that of the paper, mm.
-        bottom_mm: its lower edge from that of the paper, mm.
+        left_mm: left edge of the axes' box from the figure's left edge, mm.
+        bottom_mm: its lower edge from the figure's lower edge, mm.
         width_mm: its width, mm.
         height_mm: its height, mm.
     """
@@ -132,31 +127,21 @@ def panel(
 
 
 def heading(figure: Figure, text: str) -> None:
-    """A title over the whole width of a figure, at its upper left corner.
-
-    Args:
-        figure: the figure.
-        text: the title, perhaps of several lines.
-    """
+    """A title at the upper left corner of a figure, possibly of several lines."""
     across, up = figure.get_size_inches() * 25.4
     figure.text(2.0 / across, 1.0 - 2.0 / up, text, size=7.0, va="top")
 
 
 def bar_length_mm(extent_mm: float) -> float:
-    """A round length of a scale bar: about a quarter of the extent, mm.
-
-    Args:
-        extent_mm: what the panel shows across, mm.
-    """
+    """A round length of a scale bar, mm: about a quarter of the panel's extent, mm."""
     fitting = [length for length in _BARS_MM if length <= 0.35 * extent_mm]
     return fitting[-1] if fitting else _BARS_MM[0]
 
 
 def scale_bar(axes: Axes) -> float:
-    """Draw a scale bar below a panel whose axes count millimetres; returns its length, mm.
+    """Draw a scale bar below a panel with axes in millimetres; returns its length, mm.
 
-    Args:
-        axes: the panel; its limits have to stand.
+    The panel's limits must already be set.
     """
     left, right = axes.get_xlim()
     low, high = axes.get_ylim()
@@ -177,12 +162,12 @@ def scale_bar(axes: Axes) -> float:
 
 
 def floor_limits(axes: Axes, low_mm: Any, high_mm: Any) -> None:
-    """Let a panel show a square of the floor, without axes.
+    """Show a square of the floor in a panel, without axes.
 
     Args:
         axes: the panel.
-        low_mm: (2,) smallest x and y to be seen, mm.
-        high_mm: (2,) largest.
+        low_mm: (2,) smallest visible x and y, mm.
+        high_mm: (2,) largest visible x and y, mm.
     """
     middle = 0.5 * (np.asarray(low_mm) + np.asarray(high_mm))
     reach = 0.52 * max(float(np.max(np.asarray(high_mm) - np.asarray(low_mm))), 20.0)
@@ -193,10 +178,8 @@ def floor_limits(axes: Axes, low_mm: Any, high_mm: Any) -> None:
 
 
 def time_unit(duration_s: float) -> tuple[str, float]:
-    """Unit of an axis of time and its length: s, min beyond three minutes, h beyond three hours.
-
-    Args:
-        duration_s: what the axis shows, s.
+    """Unit of a time axis and its length in s: s, min beyond three minutes, h beyond three
+    hours.
     """
     if duration_s > 3 * 3600:
         return "h", 3600.0
@@ -204,29 +187,23 @@ def time_unit(duration_s: float) -> tuple[str, float]:
 
 
 def halo(text: Any) -> None:
-    """Let a text be read upon anything: paper behind it, as an outline would make shapes of it.
-
-    Args:
-        text: matplotlib's text.
+    """Make a text readable on any background: a box of paper, because an outline makes shapes of
+    it.
     """
     behind = {"boxstyle": "round,pad=0.15", "facecolor": PAPER, "alpha": 0.75, "linewidth": 0.0}
     text.set_bbox(behind)
 
 
 def key_rows(words: Sequence[str]) -> int:
-    """Rows that the key of some actions takes, of 4 mm each.
-
-    Args:
-        words: the actions.
-    """
+    """Rows of 4 mm in the key of some actions."""
     return -(-len(words) // _KEYS)
 
 
 def action_key(figure: Figure, colours: Mapping[str, str]) -> None:
-    """The colours of actions, at the lower edge of a figure.
+    """The colours of actions, at the lower edge of a figure; its height is that of `key_rows`.
 
     Args:
-        figure: the figure; `key_rows` says how much room is needed.
+        figure: the figure.
         colours: action -> colour.
     """
     from matplotlib.patches import Patch
@@ -237,7 +214,7 @@ def action_key(figure: Figure, colours: Mapping[str, str]) -> None:
 
 
 def image_bytes(figure: Figure, kind: str) -> bytes:
-    """A figure as a file, the same bytes whenever it is drawn; call it inside `drawing()`.
+    """A figure as a file, with reproducible bytes; call it inside `drawing()`.
 
     Args:
         figure: the figure.
@@ -258,12 +235,12 @@ def image_bytes(figure: Figure, kind: str) -> bytes:
 
 
 def on_page(svg: bytes, name: str, title: str) -> str:
-    """A figure's SVG as an element of a page: no ids twice, the page's ink, paper and font.
+    """A figure's SVG as an element of a page: unique ids, the page's ink, paper and font.
 
     Args:
-        svg: what `image_bytes` gave.
-        name: of the figure, unlike all others of the page.
-        title: what it shows, for those who cannot see it.
+        svg: the result of `image_bytes`.
+        name: of the figure, unique on the page.
+        title: its description for screen readers.
     """
     from html import escape
 
@@ -281,7 +258,7 @@ def on_page(svg: bytes, name: str, title: str) -> str:
         count=1,
     )
     text = text.replace("xlink:href=", "href=")
-    # groups are named in the files, for editors; on the page only what is pointed to needs a name
+    # groups have ids in the files, for editors; on the page only referenced ids are needed
     pointed = set(re.findall(r"(?:url\(|href=\")#([^\")]+)", text))
     text = re.sub(
         r' id="([^"]*)"',

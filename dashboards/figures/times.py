@@ -1,4 +1,4 @@
-"""Figures over time: ethogram, curves, cumulative distance; and how speeds and errors spread."""
+"""Figures over time: ethogram, curves, cumulative distance; distributions of speeds and errors."""
 
 from __future__ import annotations
 
@@ -34,23 +34,19 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_MOST_COLUMNS = 1200  # of a curve; more points than that cannot be told apart on a page
+_MOST_COLUMNS = 1200  # of a curve; more points cannot be distinguished on a page
 _LANE_MM = 4.0
 _CURVE_MM = 17.0
-_MOST_DOTS = 600  # frames of a stretch whose values have a mark each
-_BESIDE_S = 0.2  # of a stretch: its curves run to its ends
-_HAIR_MM = 0.05  # bouts nearer than that are one bar on paper
+_MOST_DOTS = 600  # frames of a stretch with a marker for each value
+_BESIDE_S = 0.2  # margin of a stretch, so that its curves reach its ends
+_HAIR_MM = 0.05  # bouts with a smaller distance are one bar
 
 
 Span = tuple[float, float]
 
 
 def drawn_curves(seen: Seen) -> list[Curve]:
-    """The measures that fit the animal and that its session has.
-
-    Args:
-        seen: the animal.
-    """
+    """The curves of the animal that its session contains."""
     moved = seen.kinematics
     if moved is None:
         return []
@@ -58,11 +54,11 @@ def drawn_curves(seen: Seen) -> list[Curve]:
 
 
 def ethogram(seen: Seen, span_s: Span | None = None) -> Figure | None:
-    """A lane for each action, hatched where there is no pose; None without actions and losses.
+    """A lane for each action, hatched without a pose; None without actions and losses.
 
     Args:
         seen: the animal.
-        span_s: the stretch that is shown, s; None shows the whole session.
+        span_s: the displayed stretch, s; None shows the whole session.
     """
     first_s, last_s = span_s or (0.0, seen.duration_s)
     words = seen.words
@@ -86,7 +82,7 @@ def ethogram(seen: Seen, span_s: Span | None = None) -> Figure | None:
     axes.broken_barh(
         [(a / size, (b - a) / size) for a, b in within(seen.lost_s)],
         (-0.5, max(len(words), 1)),
-        facecolor=PAPER,  # over the bars: a bout that continues across a gap has none there
+        facecolor=PAPER,  # over the bars: a bout across a gap has no bar there
         edgecolor=MUTED,
         linewidth=0.0,
         hatch="//////",
@@ -111,11 +107,11 @@ def ethogram(seen: Seen, span_s: Span | None = None) -> Figure | None:
 def curves(
     seen: Seen, span_s: Span | None = None, width_mm: float = TWO_COLUMNS_MM
 ) -> Figure | None:
-    """What the body did, and the expected error, over time; None without any pose.
+    """The measures and the expected error over time; None without any pose.
 
     Args:
         seen: the animal.
-        span_s: the stretch that is shown, s; None shows the whole session.
+        span_s: the displayed stretch, s; None shows the whole session.
         width_mm: width of the figure, mm.
     """
     first_s, last_s = span_s or (0.0, seen.duration_s)
@@ -161,11 +157,7 @@ def curves(
 
 
 def cumulative_distance(seen: Seen) -> Figure | None:
-    """The way that the animal went, summed up; None where no step is known.
-
-    Args:
-        seen: the animal.
-    """
+    """The cumulative distance of the animal; None without a known step."""
     known = seen.kinematics is not None and np.isfinite(seen.column("step_mm")).any()
     if not known or seen.kinematics is None:
         return None
@@ -185,10 +177,9 @@ def cumulative_distance(seen: Seen) -> Figure | None:
 
 
 def walked(seen: Seen) -> tuple[Array, Array, int]:
-    """Times (n,) s, distance until then (n,) m, and the number of frames with a speed.
+    """Times (n,) s, cumulative distance (n,) m, and the number of frames with a speed.
 
-    Args:
-        seen: an animal with kinematics.
+    The animal must have kinematics.
     """
     assert seen.kinematics is not None
     step = seen.kinematics["step_mm"].to_numpy(float)
@@ -198,11 +189,7 @@ def walked(seen: Seen) -> tuple[Array, Array, int]:
 
 
 def speed_distribution(seen: Seen) -> Figure | None:
-    """Share of the observed time at each speed; None where no speed is known.
-
-    Args:
-        seen: the animal.
-    """
+    """Share of the observed time at each speed; None if unknown."""
     if seen.kinematics is None or "speed_mm_s" not in seen.kinematics:
         return None
     values, unit = shown(seen.kinematics["speed_mm_s"].to_numpy(float), "mm/s")
@@ -210,11 +197,7 @@ def speed_distribution(seen: Seen) -> Figure | None:
 
 
 def error_distribution(seen: Seen) -> Figure | None:
-    """Share of the observed time at each predicted error; None where no error is known.
-
-    Args:
-        seen: the animal.
-    """
+    """Share of the observed time at each predicted error; None if unknown."""
     from liex_lab.behaviour.places import hold_times
 
     values = seen.frames["predicted_error_mm"].to_numpy(float)
@@ -225,19 +208,19 @@ def error_distribution(seen: Seen) -> Figure | None:
 def distribution(
     title: str, seen: Seen, values: Array, hold_s: Array, unit: str, colour: str
 ) -> Figure | None:
-    """Histogram of values over the range that holds 99 % of them; a line marks the median.
+    """Histogram of values over the range of 99 % of them; a line marks the median.
 
     Args:
-        title: what the values are.
-        seen: whose they are.
-        values: (n,) not negative; NaN is left out, and larger ones than the 99 % quantile count in
-            the last bin.
-        hold_s: (n,) how long each counts, s.
+        title: name of the values.
+        seen: the animal.
+        values: (n,) not negative; NaN is left out, and values above the 99 % quantile count in the
+            last bin.
+        hold_s: (n,) duration of each, s.
         unit: their unit.
         colour: of the bars.
 
     Returns:
-        The figure; None where no value is known.
+        The figure; None without a finite value.
     """
     known = np.isfinite(values)
     if not known.any():
@@ -273,11 +256,11 @@ def distribution(
 
 
 def joined(spans: Sequence[tuple[float, float]], least_s: float) -> list[tuple[float, float]]:
-    """Spans in order, those joined that are nearer than a hair on paper: an hour has thousands.
+    """Spans in order; spans closer than `least_s` are joined, up to 40 times that length.
 
     Args:
         spans: start and stop of each, s, in order.
-        least_s: how far apart spans have to be to be two, s.
+        least_s: least distance of separate spans, s.
     """
     out: list[tuple[float, float]] = []
     for start, stop in spans:
@@ -289,14 +272,14 @@ def joined(spans: Sequence[tuple[float, float]], least_s: float) -> list[tuple[f
 
 
 def kept_rows(y: Array, n_columns: int) -> NDArray[np.int64]:
-    """(k,) int64 rows of a curve to draw: all, or each column's lowest and highest.
+    """(k,) int64 rows of a curve to draw: all, or each column's minimum and maximum.
 
-    Of a short curve all rows are kept. A column with an unknown value keeps that one, so that the
-    hole is seen (min-max decimation).
+    All rows of a short curve are used. A column with an unknown value includes it, so that the gap
+    remains visible (min-max decimation).
 
     Args:
         y: (n,) the curve; NaN where unknown.
-        n_columns: columns of the paper; a curve of more than twice as many values is long.
+        n_columns: columns of the figure; a curve with more than twice as many values is long.
     """
     if len(y) <= 2 * n_columns:
         return np.arange(len(y))
@@ -306,13 +289,13 @@ def kept_rows(y: Array, n_columns: int) -> NDArray[np.int64]:
         part = y[a:b]
         if np.isfinite(part).all():
             rows += sorted({a + int(part.argmin()), a + int(part.argmax())})
-        else:  # a column with a hole shows the hole
+        else:  # keep the gap
             rows += [a, a + int(np.flatnonzero(~np.isfinite(part))[0])]
     return np.array(rows, np.int64)
 
 
 def _clock(axes: Axes, span_s: Span, last: bool = True) -> None:
-    """The axis of time, the same for all figures of a session; its numbers below the last one."""
+    """The time axis, the same for all figures of a session; labels only at the last one."""
     first_s, last_s = span_s
     unit, size = time_unit(last_s - first_s)
     axes.set_xlim(first_s / size, max(last_s, first_s + 1e-3) / size)

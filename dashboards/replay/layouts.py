@@ -17,15 +17,9 @@ BLUEPRINT_FILE = "replay.rbl"
 
 
 def write_blueprint(session: Session) -> Path:
-    """Write the blueprint as a file of its own, replay.rbl, into a session's folder.
+    """Write the blueprint, replay.rbl, to a session's folder; returns its path.
 
-    Dragged into a viewer, it lays out any replay of ours.
-
-    Args:
-        session: the opened session.
-
-    Returns:
-        Path of the file.
+    It applies to any replay of liex_lab when dragged into a viewer.
     """
     path = session.path / BLUEPRINT_FILE
     with replacing(path) as beside:
@@ -34,10 +28,9 @@ def write_blueprint(session: Session) -> Path:
 
 
 def live_blueprint(body_m: float) -> Any:
-    """The layout of a stream of skeletons: the scene, the picture, and the predicted error below.
+    """The layout of a stream of skeletons: scene, depth image, and the predicted error below.
 
-    Args:
-        body_m: length of the animal's body, m.
+    `body_m` is the length of the animal's body, m.
     """
     import rerun.blueprint as rrb
 
@@ -65,7 +58,7 @@ def live_blueprint(body_m: float) -> Any:
 
 
 def _followed(body_m: float, skeleton: str) -> Any:
-    """The eye that goes with an animal of that length: its skeleton's entity."""
+    """The view that follows an animal of length `body_m` by its skeleton's entity."""
     import rerun.blueprint as rrb
 
     return rrb.EyeControls3D(
@@ -78,8 +71,8 @@ def _followed(body_m: float, skeleton: str) -> Any:
 
 
 def _zoomed(skeleton: str) -> Any:
-    """The cut-out around the animal with its skeleton's entity: it has a camera of its own, which
-    goes with the animal.
+    """The cut-out around the animal with its skeleton's entity; its camera moves with the
+    animal.
     """
     import rerun.blueprint as rrb
 
@@ -93,7 +86,7 @@ def _zoomed(skeleton: str) -> Any:
 
 
 def _in_picture() -> Any:
-    """The frames in which cut-outs lie in the picture, by their entities."""
+    """The coordinate frames of the cut-outs in the image, by their entities."""
     import rerun as rr
 
     from liex_lab.sessions.cutouts import N_BOXES, N_WINDOWS
@@ -107,11 +100,11 @@ def _in_picture() -> Any:
 
 
 def _over_time(at: Callable[[str], str], animal: dict[str, Any]) -> tuple[Any, Any]:
-    """The lanes of actions, and the curves below them with the list of moments.
+    """The lanes of actions, and the curves below them with the list of messages.
 
     Args:
-        at: the entity that is shown for one that was measured.
-        animal: the section of that name of session.json; what is drawn follows from its joints.
+        at: the entity to show for a measured one.
+        animal: the section of that name of session.json; its joints determine the curves.
     """
     import rerun.blueprint as rrb
 
@@ -145,10 +138,10 @@ def _called(curve: Curve) -> str:
 
 
 def replay_blueprint(session: dict[str, Any]) -> Any:
-    """A Rerun blueprint; handed to `SessionWriter` as `blueprint`.
+    """A Rerun blueprint; passed to `SessionWriter` as `blueprint`.
 
-    With corrections the corrected entities are shown; what they are made of is left out of the
-    views, but is still in the replay.
+    With corrections, the corrected entities are shown; the original ones are hidden in the views
+    but remain in the replay.
 
     Args:
         session: the content of session.json.
@@ -159,8 +152,8 @@ def replay_blueprint(session: dict[str, Any]) -> Any:
     from liex_lab.sessions.rrd import OVERLAY, SKELETON, corrected_entity
     from liex_lab.sessions.rrd_depth import CUTOUTS
 
-    # with corrections, what they are made of is left out of the views, but is still there to be
-    # looked at
+    # with corrections, the original entities are hidden in the views but remain in the
+    # replay
     corrected = bool(session.get("corrections"))
     at = corrected_entity if corrected else str
     measured = ["skeleton", "body", "uncertainty", "root"] if corrected else []
@@ -200,7 +193,7 @@ def replay_blueprint(session: dict[str, Any]) -> Any:
     )
 
 
-# Foxglove layout (JSON) of a session's MCAP file, to be imported there as a layout.
+# Foxglove layout (JSON) of a session's MCAP file, for import in Foxglove.
 
 
 LAYOUT_FILE = "foxglove.json"
@@ -214,14 +207,7 @@ _JOINTS = "/skeleton/joints"
 
 
 def write_layout(session: Session) -> Path:
-    """Write foxglove.json into a session's folder.
-
-    Args:
-        session: the opened session.
-
-    Returns:
-        Path of the file.
-    """
+    """Write foxglove.json to a session's folder; returns its path."""
     from liex_lab.runtime.durable import write_whole
 
     path = session.path / LAYOUT_FILE
@@ -230,7 +216,7 @@ def write_layout(session: Session) -> Path:
 
 
 def foxglove_layout(about: dict[str, Any]) -> dict[str, Any]:
-    """The layout: scene and depth above, actions, heights and notes below.
+    """The layout: scene and depth above, actions, heights and messages below.
 
     Args:
         about: the content of session.json.

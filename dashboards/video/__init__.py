@@ -1,1 +1,1 @@
-"""Videos for people: depth as relief with skeleton, trail, action and time; clips beside clips."""
+"""Videos: depth as relief with skeleton, trail, action and time; grids of clips."""

@@ -1,4 +1,4 @@
-"""One session as a film: its picture at any time, with skeletons, trail, action and time."""
+"""One session as a film: its image at any time, with skeletons, trail, action and time."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from .relief import Relief
 
 @lru_cache(maxsize=8)
 def _font(size: int) -> Any:
-    """The font that comes with matplotlib, so that every machine has it."""
+    """The font of matplotlib, which is the same on every machine."""
     from matplotlib.font_manager import findfont
     from PIL import ImageFont
 
@@ -30,7 +30,7 @@ def _font(size: int) -> Any:
 
 @lru_cache(maxsize=512)
 def _stencil(text: str, size: int) -> NDArray[np.float32]:
-    """How much of each pixel a text covers, 0 to 1."""
+    """The coverage of each pixel by a text, 0 to 1."""
     from PIL import Image, ImageDraw
 
     font = _font(size)
@@ -41,12 +41,7 @@ def _stencil(text: str, size: int) -> NDArray[np.float32]:
 
 
 def text_width(text: str, size: int) -> int:
-    """Width of a text, px.
-
-    Args:
-        text: the text.
-        size: of its letters, px.
-    """
+    """Width of a text, px, with letters of `size` px."""
     return int(_stencil(text, size).shape[1])
 
 
@@ -58,7 +53,7 @@ def write(
     size: int,
     colour: tuple[int, int, int] = (240, 240, 240),
 ) -> None:
-    """Write a text into a picture; what does not fit is cut off.
+    """Write a text into an image; it is clipped to the image.
 
     Args:
         picture: (H, W, 3) uint8 RGB, changed in place.
@@ -81,18 +76,18 @@ def write(
 
 
 _TRAIL_S = 2.0
-_LEAST_PX = 24  # half the side of what is around an animal
-_REACH = 1.9  # of the body's length: as much is around an animal
-_MARGIN = 0.05  # about the arena
+_LEAST_PX = 24  # half the side of the view around an animal
+_REACH = 1.9  # side of the view around an animal, in body lengths
+_MARGIN = 0.05  # around the arena
 _LOST = (255, 190, 90)
 
 
 @dataclass(frozen=True)
 class View:
-    """What of a depth picture is shown.
+    """The displayed part of a depth image.
 
     Attributes:
-        left: its first column, px; it may lie outside of the picture.
+        left: its first column, px; may be outside the image.
         top: its first row, px.
         width: columns, px.
         height: rows, px.
@@ -105,15 +100,15 @@ class View:
 
 
 def way_of(joints: Array, camera: Camera) -> tuple[Array, int]:
-    """Where a view that goes smoothly with an animal has its middle, and how far it reaches.
+    """Centre and size of a view that follows an animal smoothly.
 
     Args:
         joints: (n, J, 2) joints of every frame, px; NaN without a pose.
         camera: the depth camera.
 
     Returns:
-        The smoothed middle (n, 2), px, the last known one without a pose, and half the side of a
-        square that holds the animal, px.
+        The smoothed centre (n, 2), px, interpolated without a pose, and half the side of a square
+            around the animal, px.
     """
     middle = joints.mean(axis=1)
     known = np.isfinite(middle).all(axis=1)
@@ -133,14 +128,14 @@ def way_of(joints: Array, camera: Camera) -> tuple[Array, int]:
 
 
 class Film:
-    """The pictures of a session; `close` closes its files.
+    """The images of a session; `close` closes its files.
 
     Args:
         session: the opened session.
         top_mm: height of the lightest colour, mm.
 
     Raises:
-        SessionError: the session keeps no depth.
+        SessionError: the session has no depth.
     """
 
     def __init__(self, session: Session, top_mm: float) -> None:
@@ -159,7 +154,7 @@ class Film:
         self._last: tuple[int, NDArray[np.uint16]] | None = None
 
     def close(self) -> None:
-        """Close the files that are open."""
+        """Close the open files."""
         self._depth.close()
 
     @cached_property
@@ -169,26 +164,22 @@ class Film:
 
     @property
     def fps(self) -> float:
-        """Frames per second, as usual in this session."""
+        """Median frames per second of this session."""
         return float(self.session.metadata["frames"]["fps_median"] or 30.0)
 
     @cached_property
     def uv(self) -> list[Array]:
-        """Of each animal the joints (n, J, 2), px; NaN without a pose."""
+        """The joints of each animal (n, J, 2), px; NaN without a pose."""
         return joints_in_picture(self.seen, len(self.time_s))
 
     def row_at(self, time_s: float) -> int:
-        """The row of the frame that is shown at a time.
-
-        Args:
-            time_s: the time, s.
-        """
+        """The row of the frame displayed at a time, s."""
         return int(
             np.clip(np.searchsorted(self.time_s, time_s + 1e-6) - 1, 0, len(self.time_s) - 1)
         )
 
     def whole_view(self) -> View:
-        """The arena and everywhere the animals were; all of the picture where neither is known."""
+        """The arena and all positions of the animals; the whole image if the arena is unknown."""
         camera = self.session.camera
         points = [joints.reshape(-1, 2) for joints in self.uv]
         outline = self.session.arena.outline_mm()
@@ -211,7 +202,7 @@ class Film:
         return View(x0, y0, max(x1 - x0, 2), max(y1 - y0, 2))
 
     def near_view(self, row: int, animal: int = 0) -> View:
-        """The square about an animal, which goes with it smoothly; the last known without a pose.
+        """The square around an animal, which follows it smoothly.
 
         Args:
             row: the frame's row.
@@ -225,15 +216,11 @@ class Film:
 
     @cached_property
     def _ways(self) -> list[tuple[Array, int]]:
-        """Of each animal the smoothed middle (n, 2), px, and half the side of the square, px."""
+        """For each animal the smoothed centre (n, 2), px, and half the side of the square, px."""
         return [way_of(joints, self.session.camera) for joints in self.uv]
 
     def words_at(self, time_s: float) -> list[str]:
-        """The action of each animal at a time; "" where none is named.
-
-        Args:
-            time_s: the time, s.
-        """
+        """The action of each animal at a time, s; "" if unlabelled."""
         words = []
         for seen, (start, stop) in zip(self.seen, self._spans, strict=True):
             at = int(np.searchsorted(start, time_s + 1e-6)) - 1
@@ -251,13 +238,13 @@ class Film:
     def picture(
         self, time_s: float, view: View, size: tuple[int, int], title: str
     ) -> NDArray[np.uint8]:
-        """The picture at a time.
+        """The image at a time.
 
         Args:
             time_s: the time, s.
-            view: what of the depth picture is shown.
+            view: the displayed part of the depth image.
             size: width and height of the result, px.
-            title: written in its upper left corner.
+            title: in the upper left corner.
 
         Returns:
             (height, width, 3) uint8 RGB.
@@ -281,7 +268,7 @@ class Film:
         return shown
 
     def _draw_animal(self, picture: NDArray[np.uint8], at: Array, row: int, word: str) -> None:
-        """Trail and skeleton; `at` (n, J, 2) are the joints in the picture, px."""
+        """Draw trail and skeleton; `at` (n, J, 2) are the joints in the image, px."""
         import cv2
 
         size = max(picture.shape[1] / 320.0, 0.9)
@@ -309,7 +296,7 @@ class Film:
     def _write(
         self, picture: NDArray[np.uint8], time_s: float, row: int, words: list[str], title: str
     ) -> None:
-        """Title, action, time, and the scale of heights."""
+        """Draw title, action, time, and the height scale."""
         height, width = picture.shape[:2]
         size = max(height // 26, 9)
         edge = size // 2
@@ -333,7 +320,9 @@ class Film:
             write(picture, text, right - 4 - text_width(text, small), y, small)
 
     def _write_length(self, picture: NDArray[np.uint8], pixel_mm: float) -> None:
-        """A bar as long as 1, 2 or 5 times a power of ten mm on the floor; `pixel_mm` is mm/px."""
+        """Draw a scale bar of 1, 2 or 5 times a power of ten mm on the floor; `pixel_mm` is
+        mm/px.
+        """
         height, width = picture.shape[:2]
         size = max(height // 26, 9)
         longest_mm = pixel_mm * width / 5.0

@@ -2,8 +2,8 @@
 
     height(u, v) = n . x(u, v) + d,    x = depth * ((u - cx) / fx, (v - cy) / fy, 1)
 
-n is the arena's vertical seen from the camera and d the camera's height, so a tilted camera's floor
-is as even as an upright one's. Shading is Lambert's, of a light from the upper left.
+n is the arena's vertical in the camera frame and d the camera's height, so the floor of a tilted
+camera is level as well. Shading is Lambert's, with light from the upper left.
 """
 
 from __future__ import annotations
@@ -16,17 +16,17 @@ from numpy.typing import NDArray
 from liex_lab.sessions import Session
 
 Array = NDArray[np.float64]
-_UNREAD = 34  # grey of what was not read, and of walls
-_WALLS_FROM = 1.6  # of the scale: what is higher is no animal
+_UNREAD = 34  # grey of unread pixels
+_WALLS_FROM = 1.6  # of the scale: higher pixels are not the animal
 _SMOOTH_PX = 1.0
-_PLAIN = 128  # of light: as bright as the colour itself
-_WALL_MM = 8.0  # beyond the outline, which is not known better
+_PLAIN = 128  # neutral light
+_WALL_MM = 8.0  # beyond the outline: its uncertainty
 _STRENGTH = 0.3
 _LIGHT = np.array([-0.5, -0.6])
 
 
 class Relief:
-    """The colours of a session's depth pictures.
+    """The colours of a session's depth images.
 
     Args:
         session: its camera and floor are used.
@@ -50,10 +50,8 @@ class Relief:
         self._outside = _beyond_walls(session, np.stack([*rays, np.ones_like(rays[0])], axis=-1))
 
     def heights(self, depth: NDArray[np.uint16]) -> NDArray[np.float32]:
-        """(H, W) heights above the floor, mm; NaN where nothing was read.
-
-        Args:
-            depth: (H, W) uint16 mm, 0 where unread.
+        """(H, W) heights above the floor, mm, of depth (H, W) uint16 mm; NaN where it is 0
+        (unread).
         """
         heights = depth.astype(np.float32) * self._per_mm + self._above_mm
         heights[depth == 0] = np.nan
@@ -67,11 +65,11 @@ class Relief:
         side: tuple[int, int],
         size: tuple[int, int],
     ) -> NDArray[np.uint8]:
-        """A part of a depth picture in colours, enlarged smoothly.
+        """A part of a depth image in colours, enlarged smoothly.
 
         Args:
             depth: (H, W) uint16 mm, 0 where unread.
-            left: first column of the part, px; it may lie outside of the picture.
+            left: first column of the part, px; may be outside the image.
             top: its first row, px.
             side: width and height of the part, px.
             size: width and height of the result, px.
@@ -83,7 +81,7 @@ class Relief:
 
         heights = _part(self.heights(depth), left, top, side)
         read = np.isfinite(heights)
-        # what was not read is the floor while it is enlarged, and painted over afterwards
+        # unread pixels are floor while they are enlarged, and painted over afterwards
         clipped = np.clip(np.where(read, heights, 0.0), -10.0, 3.0 * self.top_mm)
         even = cv2.GaussianBlur(clipped.astype(np.float32), (0, 0), _SMOOTH_PX)
         smooth = cv2.resize(even, size, interpolation=cv2.INTER_CUBIC)
@@ -94,7 +92,7 @@ class Relief:
         )
         colours = cv2.multiply(colours, cv2.merge([light] * 3), scale=1.0 / _PLAIN)
         outside = _part(self._outside, left, top, side) > 0.5
-        # a wall is no animal; one that rears at the wall is seen before it all the same
+        # walls are dimmed; an animal that rears at a wall remains visible in front of it
         wall = outside | (clipped > _WALLS_FROM * self.top_mm)
         dim = _enlarged(wall, size)
         colours[dim] = colours[dim] // 4
@@ -102,28 +100,23 @@ class Relief:
         return np.asarray(colours, np.uint8)
 
     def _light(self, heights: NDArray[np.float32]) -> NDArray[np.uint8]:
-        """How light a slope is, `_PLAIN` where there is none: uint8 of the heights' shape."""
+        """Brightness of a slope, `_PLAIN` if level: uint8 of the heights' shape."""
         slope_y, slope_x = np.gradient(heights, self.pixel_mm)
         light = 1.0 + _STRENGTH * (_LIGHT[0] * slope_x + _LIGHT[1] * slope_y)
         return (_PLAIN * np.clip(light, 0.6, 1.4)).astype(np.uint8)
 
     def scale(self, height: int) -> NDArray[np.uint8]:
-        """The colours from 0 to `top_mm`, the highest on top: (height, 6, 3) uint8 RGB.
-
-        Args:
-            height: of the bar, px.
+        """The colours from 0 to `top_mm`, the highest on top: (height, 6, 3) uint8 RGB; height in
+        px.
         """
         at = np.linspace(255.0, 0.0, height).astype(np.uint8)
         return np.repeat(self._colours[at][:, None], 6, axis=1)
 
 
 def scale_mm(sessions: Sequence[Session]) -> float:
-    """The one scale of heights of some sessions, mm.
+    """The common height scale of some sessions, mm.
 
-    A tenth more than what the joints reach, so that the surface above them has shades.
-
-    Args:
-        sessions: the opened sessions.
+    A tenth more than the joints' heights, so that the surface above them has colours.
     """
     reached = [
         1.1 * float(session.table("poses", ["z_mm"])["z_mm"].quantile(0.995))
@@ -136,13 +129,13 @@ def scale_mm(sessions: Sequence[Session]) -> float:
 def put_back(
     cut: NDArray[np.uint16], left: int, top: int, shape: tuple[int, int]
 ) -> NDArray[np.uint16]:
-    """A depth picture (H, W) with nothing in it but what was cut out of it, 0 elsewhere.
+    """A depth image (H, W) that contains only a cut-out, 0 elsewhere.
 
     Args:
-        cut: (h, w) uint16 mm; what of it lies outside of the picture is left out.
-        left: column of the picture at which it begins, px; it may be negative.
-        top: row at which it begins, px.
-        shape: (H, W) of the picture.
+        cut: (h, w) uint16 mm; its part outside the image is left out.
+        left: its first column in the image, px; may be negative.
+        top: its first row, px.
+        shape: (H, W) of the image.
     """
     depth = np.zeros(shape, np.uint16)
     x0 = max(left, 0)
@@ -157,7 +150,7 @@ def put_back(
 def _part(
     heights: NDArray[np.float32], left: int, top: int, side: tuple[int, int]
 ) -> NDArray[np.float32]:
-    """A part of a map, NaN where it lies outside."""
+    """A part of a map, NaN outside the map."""
     width, height = side
     out = np.full((height, width), np.nan, np.float32)
     x0 = max(left, 0)
@@ -170,7 +163,7 @@ def _part(
 
 
 def _beyond_walls(session: Session, rays: Array) -> NDArray[np.float32]:
-    """(H, W) 1 where a view ray (H, W, 3) meets the floor's plane outside of the arena, else 0."""
+    """(H, W) 1 where a view ray (H, W, 3) meets the floor's plane outside the arena, else 0."""
     T = session.T_arena_camera
     turned = rays @ np.asarray(T.rotation, float).T
     place = np.asarray(T.translation, float)
@@ -181,7 +174,7 @@ def _beyond_walls(session: Session, rays: Array) -> NDArray[np.float32]:
 
 
 def _enlarged(mask: NDArray[np.bool_], size: tuple[int, int]) -> NDArray[np.bool_]:
-    """A mask in another size, with even edges."""
+    """A mask in another size, with smooth edges."""
     import cv2
 
     large = cv2.resize(mask.astype(np.uint8) * 255, size, interpolation=cv2.INTER_LINEAR)

@@ -1,7 +1,7 @@
-"""Videos of sessions: one from beginning to end, several beside each other, or clips of an action.
+"""Videos of sessions: a whole session, several sessions in a grid, or clips of an action.
 
-Clips are aligned: all begin a moment before the onset of their bout, and one that is over stands
-still and dimmed until the longest is. Of many bouts some are taken, evenly over all of them.
+Clips are aligned: all begin a moment before the onset of their bout, and a finished clip is frozen
+and dimmed until the longest ends. Of too many bouts, an evenly spaced selection is used.
 """
 
 from __future__ import annotations
@@ -29,15 +29,15 @@ from .film import Film, write
 from .relief import scale_mm
 
 _CODECS = ("libx264", "libopenh264")
-_CLOCK = Fraction(1, 90_000)  # s, the usual unit of time in MP4
-_THREADS = 2  # always: their number is in what comes out
+_CLOCK = Fraction(1, 90_000)  # s, the common time unit of MP4
+_THREADS = 2  # fixed, because the output depends on it
 
 
 def h264() -> str:
-    """The name of an H.264 encoder that this PyAV has.
+    """The name of an available H.264 encoder of PyAV.
 
     Raises:
-        SessionError: it has none.
+        SessionError: there is none.
     """
     import av
 
@@ -55,18 +55,17 @@ def h264() -> str:
 
 
 class Video:
-    """A video file that is written picture by picture (a context manager).
+    """A video file that is written frame by frame (a context manager).
 
-    It grows under another name and has its own at the end; where the block is left by an error
-    nothing is left.
+    It is written under another name and renamed at the end; after an error no file remains.
 
     Args:
         path: the file to write.
-        fps: pictures per second, as usual in it; each is shown at its own time.
+        fps: its nominal frames per second; each frame is shown at its own time.
 
     Raises:
         SessionError: there is no encoder.
-        PlaceError: a symbolic link lies there.
+        PlaceError: the path is a symbolic link.
     """
 
     def __init__(self, path: Path, fps: float) -> None:
@@ -81,11 +80,11 @@ class Video:
         return self
 
     def add(self, picture: NDArray[np.uint8], time_s: float) -> None:
-        """Append a picture; all are as large as the first.
+        """Append an image; all have the size of the first.
 
         Args:
             picture: (H, W, 3) uint8 RGB; an odd row or column is left out.
-            time_s: when it is shown, s, later than the one before; 0 at the first.
+            time_s: its time, s, later than the previous one; 0 at the first.
         """
         import av
 
@@ -123,18 +122,18 @@ class Video:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        """Close the box, after the last pictures where all went well."""
+        """Close the container, after the last frames if there was no error."""
         if kind is None:
             self._box.mux(self._stream.encode())
         self._box.close()
 
 
 def _box_options() -> dict[str, str]:
-    """The index stands first, for players that begin before they have all; no writer's name."""
+    """The index at the beginning, for streaming players; no writer's name."""
     return {"movflags": "+faststart", "fflags": "+bitexact"}
 
 
-_BEFORE_S = 0.5  # of a bout
+_BEFORE_S = 0.5  # before a bout
 _AFTER_S = 0.5
 _LONGEST_S = 6.0  # of a clip
 _MOST = 12  # clips of a group
@@ -148,14 +147,14 @@ _PAPER = 18
 
 @dataclass(frozen=True)
 class Cell:
-    """A place of the grid: what is shown of a session, and when.
+    """A cell of the grid: a stretch of a session.
 
     Attributes:
         film: the session.
-        start_s: when it begins, s.
-        stop_s: when it ends, s.
-        title: written upon it.
-        animal: number of the animal that it goes with; None shows all of the arena.
+        start_s: its beginning, s.
+        stop_s: its end, s.
+        title: drawn in the cell.
+        animal: number of the animal to follow; None shows the whole arena.
     """
 
     film: Film
@@ -165,7 +164,7 @@ class Cell:
     animal: int | None = None
 
     def picture(self, after_s: float, size: tuple[int, int]) -> NDArray[np.uint8]:
-        """The picture so long after the beginning; dimmed when it is over.
+        """The image at a time after the beginning; dimmed after the end.
 
         Args:
             after_s: time from its beginning, s.
@@ -198,19 +197,19 @@ def write_session(
 ) -> Path:
     """Write a session, or a stretch of it, as a video; returns its path.
 
-    Picture k is row k of the tables (of the stretch), shown at its own time, so the rate varies:
-    the time t of the video of a whole session is the time t of the tables.
+    Frame k of the video is row k of the tables (of the stretch), shown at its own time, so the rate
+    varies: the time t of the video of a whole session is the time t of the tables.
 
     Args:
         session: the opened session.
         path: the file to write.
-        start_s: where the stretch begins, s; None takes the whole session.
-        stop_s: where it ends, s; None goes on to the end.
-        slower: so many times slower than it was; above 1 is slow motion.
-        progress: told how far it is.
+        start_s: start of the stretch, s; None for the beginning.
+        stop_s: end of the stretch, s; None for the end.
+        slower: slow-motion factor; above 1 is slow motion.
+        progress: reports the frames.
 
     Raises:
-        SessionError: the session keeps no depth, the stretch is empty, or there is no encoder.
+        SessionError: the session has no depth, the stretch is empty, or there is no encoder.
     """
     h264()
     with closing(Film(session, scale_mm([session]))) as film:
@@ -223,7 +222,7 @@ def write_session(
                 "no part of it; name other times"
             )
         first, last = np.searchsorted(film.time_s, np.array([low, high]) - 1e-6)
-        rows = range(first, last) or [film.row_at(low)]  # in a gap, the frame before it
+        rows = range(first, last) or [film.row_at(low)]  # in a gap, the frame before the gap
         after_s = film.time_s[rows] - low
         near = start_s is not None or stop_s is not None
         cell = Cell(film, low, high, session.name, 0 if near else None)
@@ -242,19 +241,19 @@ def write_clips(
     slower: float = 1.0,
     progress: Progress = silent,
 ) -> Path:
-    """Write clips of actions, or whole sessions, beside each other as one video; returns its path.
+    """Write clips of actions, or whole sessions, in a grid as one video; returns its path.
 
     Args:
-        sessions: each opened session and its group; "" for none. Groups stand beside each other.
+        sessions: each opened session and its group, "" for none. Groups are next to each other.
         path: the file to write.
-        actions: words, or the beginnings of words (rear is rear_supported, too); () shows the
+        actions: words, or the beginnings of words (rear includes rear_supported); () shows the
             whole sessions.
-        most: clips of a group at most.
-        slower: so many times slower than it was.
-        progress: told how far it is.
+        most: the maximum number of clips per group.
+        slower: slow-motion factor.
+        progress: reports the frames.
 
     Raises:
-        SessionError: no session keeps depth, no bout has such a name, or there is no encoder.
+        SessionError: a session has no depth, no bout has such a name, or there is no encoder.
     """
     h264()
     with ExitStack() as stack:
@@ -281,17 +280,12 @@ def write_clips(
 
 
 def matches(word: str, actions: Iterable[str]) -> bool:
-    """Whether a word is one of some actions, or a kind of one: rear_supported is a rear.
-
-    Args:
-        word: of the vocabulary.
-        actions: what is asked for.
-    """
+    """Whether a word is one of some actions, or a kind of one: rear_supported is a rear."""
     return any(word == action or word.startswith(f"{action}_") for action in actions)
 
 
 class _Grid:
-    """Groups of clips beside each other, under headings with their n."""
+    """Groups of clips next to each other, under headings with their n."""
 
     def __init__(self, chosen: dict[str, list[Cell]], counts: dict[str, int], what: str) -> None:
         self._chosen = chosen
@@ -302,11 +296,7 @@ class _Grid:
         self._rows = -(-n // self._columns)
 
     def picture(self, after_s: float) -> NDArray[np.uint8]:
-        """All cells so long after their beginnings.
-
-        Args:
-            after_s: time from the beginnings, s.
-        """
+        """All cells at a time after their beginnings, s."""
         step = _CELL_PX + _GAP_PX
         wide = self._columns * step + 4 * _GAP_PX
         out = np.full(
@@ -334,7 +324,7 @@ class _Grid:
 
 
 def _cells(film: Film, actions: Sequence[str]) -> list[Cell]:
-    """The bouts of some actions in a session, or all of it where none is named."""
+    """The bouts of some actions in a session, or the whole session without actions."""
     end = float(film.time_s[-1]) + 1.0 / film.fps
     if not actions:
         return [Cell(film, 0.0, end, film.session.name)]
@@ -349,14 +339,14 @@ def _cells(film: Film, actions: Sequence[str]) -> list[Cell]:
 
 
 def _evenly(cells: list[Cell], most: int) -> list[Cell]:
-    """At most so many cells, evenly over all."""
+    """At most `most` cells, evenly spaced over all."""
     if len(cells) <= most:
         return cells
     return [cells[int(k)] for k in np.unique(np.linspace(0, len(cells) - 1, most).round())]
 
 
 def _fitted(width: int, height: int, room: tuple[int, int]) -> tuple[int, int]:
-    """The largest size of this shape in a room, of even numbers of px."""
+    """The largest size of this aspect ratio within `room`, in even numbers of px."""
     scale = min(room[0] / width, room[1] / height)
     return max(int(width * scale) // 2 * 2, 2), max(int(height * scale) // 2 * 2, 2)
 
@@ -369,7 +359,7 @@ def _write(
     picture: Callable[[float], NDArray[np.uint8]],
     progress: Progress,
 ) -> None:
-    """The pictures at some times (n,) s after the beginning, each shown at its time."""
+    """Write the images at the times (n,) s after the beginning, each shown at its time."""
     unlinked(path).parent.mkdir(parents=True, exist_ok=True)
     n = len(after_s)
     with Video(path, fps) as video:

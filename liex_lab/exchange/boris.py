@@ -1,8 +1,7 @@
 """BORIS project file (JSON, format version 7.0) with a session's ethogram as one observation.
 
-The fields are those that BORIS 9 writes. A state event is two rows of the same subject and
-behaviour, start and stop. BORIS refuses a project that is newer than itself, so the oldest version
-that has all of this is written.
+The fields are those of BORIS 9. A state event is two rows of the same subject and behaviour, start
+and stop. BORIS refuses a project newer than itself, so the oldest sufficient version is written.
 """
 
 from __future__ import annotations
@@ -29,28 +28,23 @@ _KEYS = "abcdefghijklmnopqrstuvwxyz0123456789"
 
 
 def write_boris(session: Session, path: Path) -> None:
-    """Write the project.
-
-    Args:
-        session: the session.
-        path: the .boris file to write.
-    """
+    """Write the project as a .boris file."""
     path.write_text(
-        # escapes, for BORIS opens it in the machine's own encoding, which on Windows is not UTF-8
+        # escapes, because BORIS uses the machine's own encoding, which on Windows is not UTF-8
         json.dumps(project(session, path.parent), indent=1) + "\n",
         encoding="ascii",
     )
 
 
 def project(session: Session, folder: Path | None = None) -> dict[str, Any]:
-    """The project as BORIS keeps it, ready for JSON.
+    """The project as a dict for JSON.
 
-    It names the session's video where one was made (`liex export --to video`).
+    It names the session's video if one was made (`liex export --to video`).
 
     Args:
         session: the session.
-        folder: the folder of the project, in which BORIS looks for the video first; None names the
-            video by its whole path.
+        folder: the folder of the project, in which BORIS searches for the video first; None names
+            the video by its absolute path.
     """
     about = session.metadata
     subject = about["individual"]
@@ -100,7 +94,7 @@ def _behaviour(word: str, meaning: str, index: int) -> dict[str, Any]:
 
 
 def _media(session: Session, folder: Path | None) -> str:
-    """The video as BORIS finds it: seen from the project's folder where it lies there.
+    """The video's path: relative if it is in the project's folder.
 
     Without a video the recording's name, which BORIS need not find.
     """
@@ -144,7 +138,7 @@ def _observation(session: Session, subject: str, folder: Path | None) -> dict[st
 
 
 def _date(session: Session) -> str:
-    """The recording's beginning as BORIS writes dates; without a zone, as it knows none."""
+    """The recording's beginning in BORIS's format, without a time zone."""
     stated = session.metadata.get("session_start_time") or "1970-01-01T00:00:00"
     return str(stated)[:19]
 
@@ -160,10 +154,10 @@ def read_boris_project(path: str | Path) -> dict[str, Any]:
     """Read the content of a BORIS project.
 
     Args:
-        path: a .boris file, or one packed with gzip (.boris.gz), of up to 256 MB unpacked.
+        path: a .boris file, or one compressed with gzip (.boris.gz), of up to 256 MB uncompressed.
 
     Raises:
-        LiexError: the file is no such project.
+        LiexError: the file is not a BORIS project.
     """
     source = Path(path)
     try:
@@ -184,17 +178,17 @@ def read_boris_project(path: str | Path) -> dict[str, Any]:
 def boris_labels(path: str | Path) -> pd.DataFrame:
     """State events of a project as labels.
 
-    The observation's time offset is taken off. Point events have no length and are left out.
+    The observation's time offset is subtracted. Point events have no length and are left out.
 
     Args:
         path: a .boris or .boris.gz file.
 
     Returns:
         A table with session_id (the observation), individual, action, start_s, stop_s (s) and
-        source.
+            source.
 
     Raises:
-        LiexError: the file is no BORIS project, or an event has no end; the message names it.
+        LiexError: the file is not a BORIS project, or an event has no end; the message names it.
     """
     document = read_boris_project(path)
     points = {
@@ -217,13 +211,10 @@ def boris_labels(path: str | Path) -> pd.DataFrame:
 
 
 def boris_export_labels(path: str | Path) -> pd.DataFrame:
-    """Labels of BORIS's export 'aggregated events'; see `boris_labels`.
-
-    Args:
-        path: a TSV or CSV file.
+    """Labels of BORIS's export 'aggregated events', a TSV or CSV file; see `boris_labels`.
 
     Raises:
-        LiexError: the file is no such export.
+        LiexError: the file is not such an export.
     """
     source = Path(path)
     try:
@@ -249,11 +240,7 @@ def boris_export_labels(path: str | Path) -> pd.DataFrame:
 
 
 def is_boris_export(path: str | Path) -> bool:
-    """Whether a table's first line is that of BORIS's aggregated-events exports.
-
-    Args:
-        path: a text file.
-    """
+    """Whether a text file's first line is that of BORIS's aggregated-events exports."""
     try:
         lines = split_lines(read_text(Path(path)))[1]
     except ValueError:
@@ -262,7 +249,7 @@ def is_boris_export(path: str | Path) -> bool:
 
 
 def _unpacked(raw: bytes) -> bytes:
-    """What gzip packed. Raises ValueError where it is more than 256 MB."""
+    """The uncompressed content; raises ValueError if it has more than 256 MB."""
     with gzip.open(io.BytesIO(raw)) as file:
         text = file.read(_MOST_BYTES + 1)
     if len(text) > _MOST_BYTES:
@@ -283,9 +270,7 @@ def _offset(observation: dict[str, Any], name: str, path: str | Path) -> float:
 def _pairs(
     events: Sequence[Sequence[Any]], points: set[str], name: str, offset: float, path: str | Path
 ) -> list[dict[str, Any]]:
-    """Rows of labels from the events of one observation: state events alternate between start and
-    stop.
-    """
+    """Labels of the events of one observation; state events alternate between start and stop."""
     begun: dict[tuple[str, str, str], float] = {}
     rows = []
     try:

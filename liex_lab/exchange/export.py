@@ -11,7 +11,7 @@ from liex_lab.runtime.durable import replacing
 from liex_lab.runtime.places import inside
 from liex_lab.sessions import Session
 
-# format -> (module and function that write it, ending of the name, what it is)
+# format -> (module and function of its writer, suffix of the name, description)
 TARGETS: dict[str, tuple[str, str, str]] = {
     "nwb": (
         "nwb.write_nwb",
@@ -53,16 +53,16 @@ def export(
 ) -> Path:
     """Write a session in another program's format; returns the file or folder.
 
-    It is written under another name and renamed, so nothing half-written stays.
+    It is written under another name and renamed, so it is never incomplete.
 
     Args:
         session: the session.
         to: the format, a word of `TARGETS` or `ALIASES`.
-        out: the folder it goes into, made if needed; None takes the session's own.
-        overwrite: replace what is there already.
+        out: the output folder, created if missing; None uses the session's own.
+        overwrite: replace an existing file.
 
     Raises:
-        SessionError: the format is not known, a file is there already, or packages are missing.
+        SessionError: the format is unknown, the file exists, or packages are missing.
     """
     to = ALIASES.get(to, to)
     if to not in TARGETS:

@@ -1,14 +1,14 @@
 """Neurodata Without Borders (NWB) file: poses by the extension ndx-pose, rotations, actions, gaps.
 
-One animal per file. There is no type for rotations in NWB: each joint's is a TimeSeries of rotation
-vectors, rad. Actions and gaps are time intervals (see `nwb_intervals`). Times are true ones, s
-since the session's beginning, which NWB requires with a time zone.
+One animal per file. NWB has no type for rotations: each joint has a TimeSeries of rotation vectors,
+rad. Actions and gaps are time intervals. Times are true times, s since the session's beginning,
+which NWB requires with a time zone.
 
-Species, sex and age are fields of NWB's Subject. Group, cage and batch have none, in NWB or in any
-extension that archives know: the subject's description says them to people (DANDI shows it), and
-`notes`, a field of every NWB file, says to programs all that is known of the animal, a line
-`key: value` for each fact. `scratch` is not meant to be shared, and a type of our own would have to
-be explained to every reader.
+Species, sex and age are fields of NWB's Subject. Group, cage and batch have no field in NWB or in
+any extension known to archives. The subject's description contains them for people (DANDI shows
+it), and `notes`, a field of every NWB file, contains all facts on the animal for programs, as lines
+`key: value`. `scratch` is not meant to be shared, and a type of our own would be unknown to every
+reader.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ _MADE_BY = ("action_model", "rules")  # sections of session.json
 
 
 def add_intervals(made: NWBFile, session: Session, poses: Poses, estimate: Any) -> None:
-    """Add the tables `actions`, `gaps` and `observed`, each where it has a row, and the catalogue.
+    """Add the catalogue and the tables `actions`, `gaps` and `observed`, each if it has rows.
 
     Args:
         made: the file in memory, with a processing module behavior.
@@ -64,7 +64,7 @@ def add_intervals(made: NWBFile, session: Session, poses: Poses, estimate: Any) 
 
 
 def _catalogue(session: Session) -> Any:
-    """Every word with its definition; a row each."""
+    """Every word with its definition, one row each."""
     from ndx_ethogram import Ethogram
 
     meanings = session.metadata.get("actions", {})
@@ -82,7 +82,7 @@ def _catalogue(session: Session) -> Any:
 
 
 def _actions(session: Session, estimate: Any, catalogue: Any, observed: Any) -> Any:
-    """The bouts: half-open intervals with label, score and who named each."""
+    """The bouts: half-open intervals with label, score and source."""
     from ndx_ethogram import EthogramBouts
 
     bouts = session.bouts
@@ -103,7 +103,7 @@ def _actions(session: Session, estimate: Any, catalogue: Any, observed: Any) -> 
         **links,
     )
     table.add_column("score", "how well the bout fits its action, 0 to 1")
-    # not `source`: so ndx-ethogram calls a link
+    # not `source`, which is a link in ndx-ethogram
     table.add_column("named_by", "who named it: rule, model or human")
     columns = ("start_s", "stop_s", "action", "score", "source")
     for start, stop, word, score, source in zip(*(bouts[name] for name in columns), strict=True):
@@ -119,7 +119,7 @@ def _actions(session: Session, estimate: Any, catalogue: Any, observed: Any) -> 
 
 
 def _intervals(name: str, description: str, spans: NDArray[Any], reasons: Sequence[str]) -> Any:
-    """A table of spans (m, 2) s; with why each is, where there are reasons."""
+    """A table of spans (m, 2) s; gaps also have a reason."""
     from pynwb.epoch import TimeIntervals
 
     table = TimeIntervals(name=name, description=description)
@@ -133,9 +133,6 @@ def _intervals(name: str, description: str, spans: NDArray[Any], reasons: Sequen
 
 def observed_spans(poses: Poses) -> NDArray[np.float64]:
     """Spans of time in which every frame has a pose and none is missing.
-
-    Args:
-        poses: the session's poses.
 
     Returns:
         (m, 2) s: start and stop, exclusive, in order.
@@ -151,7 +148,7 @@ def observed_spans(poses: Poses) -> NDArray[np.float64]:
 
 
 _SPECIES = {"mouse": "Mus musculus", "fish": "Danio rerio", "hand": "Homo sapiens"}
-_FACTS = ("group", "cage", "batch")  # what has no field of its own
+_FACTS = ("group", "cage", "batch")  # facts without a field of their own
 _FRAME = (
     "the arena: z up from the floor, origin at the foot of the camera's perpendicular, x along "
     "the picture's rows; joints lie on the body's mid-axis"
@@ -170,13 +167,11 @@ def write_nwb(session: Session, path: Path) -> None:
         path: the .nwb file to write.
 
     Raises:
-        SessionError: the session does not say when it began, with time zone.
+        SessionError: the session has no start time with time zone.
     """
     from pynwb import NWBHDF5IO
 
-    made = build(
-        session
-    )  # before the file is opened: it takes the types that are known by then, and no extension's
+    made = build(session)  # before the file is opened, which only registers the types known by then
     with hdf5_file(path) as hdf5, NWBHDF5IO(file=hdf5, mode="w") as file:
         file.write(made)
 
@@ -184,11 +179,8 @@ def write_nwb(session: Session, path: Path) -> None:
 def build(session: Session) -> NWBFile:
     """The session as an NWB file in memory.
 
-    Args:
-        session: the session.
-
     Raises:
-        SessionError: the session does not say when it began, with time zone.
+        SessionError: the session has no start time with time zone.
     """
     from pynwb import NWBFile
 
@@ -233,8 +225,8 @@ def _start(session: Session) -> datetime:
 
 
 def _subject(session: Session) -> Any:
-    """The animal. Its sex is one of NWB's letters, and its id holds no slash: DANDI makes a path of
-    it.
+    """The animal. Its sex is one of NWB's letters, and its id has no slash, because DANDI makes a
+    path of it.
     """
     from pynwb.file import Subject
 
@@ -252,15 +244,13 @@ def _subject(session: Session) -> Any:
 
 
 def _notes(session: Session) -> str:
-    """What is known of the animal, a line for each fact."""
+    """The facts on the animal, one line each."""
     about = {"individual": session.metadata["individual"], **session.metadata["subject"]}
     return "\n".join(f"{name}: {' '.join(str(value).split())}" for name, value in about.items())
 
 
 def _add_poses(made: NWBFile, module: Any, session: Session, poses: Poses, version: str) -> Any:
-    """Skeleton and one series per joint; the first one's times are the others' too. Returns the
-    PoseEstimation.
-    """
+    """Add skeleton and one series per joint with shared times; returns the PoseEstimation."""
     from ndx_pose import PoseEstimation, PoseEstimationSeries, Skeleton, Skeletons
     from pynwb import TimeSeries
 

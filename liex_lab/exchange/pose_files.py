@@ -1,8 +1,8 @@
-"""HDF5 files that are made in memory and written in one go.
+"""Writers of pose files for DeepLabCut, SLEAP and movement.
 
-HDF5 does not survive a disk that gets full under it: what it could not write it tries again at the
-interpreter's exit, with tracebacks from its own code and sometimes a crash. In memory it meets no
-disk, and the one write that does is Python's, whose error is a sentence.
+HDF5 files are made in memory and written at once. HDF5 does not handle a full disk: it tries to
+write again at the interpreter's exit, with tracebacks of its own and sometimes a crash. Here the
+only write to disk is Python's, which raises an ordinary error.
 """
 
 from __future__ import annotations
@@ -27,10 +27,7 @@ if TYPE_CHECKING:
 
 @contextmanager
 def hdf5_file(path: Path) -> Iterator[h5py.File]:
-    """An empty HDF5 file to fill, which is written when it has been filled without an error.
-
-    Args:
-        path: where it is written.
+    """An empty HDF5 file to fill, written to `path` if the block ends without an error.
 
     Raises:
         OSError: it cannot be written there.
@@ -50,12 +47,7 @@ SCORER = "liex_lab"
 
 
 def write_dlc(session: Session, path: Path) -> None:
-    """Write a folder with both tables, the times and the bouts.
-
-    Args:
-        session: the session.
-        path: the folder to make.
-    """
+    """Write a new folder with both tables, the times and the bouts."""
     poses = session.pose_arrays()
     path.mkdir()
     write_csv(dlc_table(poses, poses.xyz_mm, "xyz"), path / "poses_3d.csv", index=True)
@@ -74,7 +66,7 @@ def dlc_table(poses: Poses, values: Array, coords: str | tuple[str, ...]) -> pd.
         coords: names of the k coordinates; a str is one letter each.
 
     Returns:
-        (n, J k) table, indexed by the number of the frame in the recording.
+        (n, J k) table, indexed by the frame index of the recording.
     """
     columns = pd.MultiIndex.from_product(
         [[SCORER], list(poses.joints), list(coords)], names=["scorer", "bodyparts", "coords"]
@@ -83,7 +75,7 @@ def dlc_table(poses: Poses, values: Array, coords: str | tuple[str, ...]) -> pd.
 
 
 def _write_times(path: Path, poses: Poses) -> None:
-    """Write a CSV with the true time of each row, for formats that do not hold times.
+    """Write a CSV with the true time of each row, for formats without times.
 
     Args:
         path: the CSV file to write: frame_index, time_s with nine decimals, pulse_index.
@@ -94,17 +86,13 @@ def _write_times(path: Path, poses: Poses) -> None:
     path.write_text("\n".join(["frame_index,time_s,pulse_index", *lines]) + "\n", encoding="utf-8")
 
 
-# SLEAP's analysis file (HDF5), in its own order of axes, which is Matlab's.
+# SLEAP's analysis file (HDF5), in its own order of axes (Matlab's).
 
 
 def write_sleap(session: Session, path: Path) -> None:
-    """Write one track with every recorded frame.
+    """Write one track with every recorded frame as an .analysis.h5 file.
 
-    Pixels are counted as SLEAP counts them, from the centre of the top-left one.
-
-    Args:
-        session: the session.
-        path: the .analysis.h5 file to write.
+    Pixel coordinates are SLEAP's, from the centre of the top-left pixel.
     """
     import h5py
 
@@ -153,11 +141,6 @@ def write_sleap(session: Session, path: Path) -> None:
 
 
 def write_movement(session: Session, path: Path) -> None:
-    """Write netCDF 4.
-
-    Args:
-        session: the session.
-        path: the .nc file to write.
-    """
-    # in memory, see `hdf5`
+    """Write netCDF 4 (.nc)."""
+    # in memory, see `hdf5_file`
     path.write_bytes(session.to_xarray().to_netcdf(engine="h5netcdf"))

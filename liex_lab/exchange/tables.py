@@ -1,6 +1,6 @@
 """Every table of a session as CSV, for programs that do not read Parquet.
 
-Units are in the columns' names; columns.json describes every column.
+Column names contain their units; columns.json describes every column.
 """
 
 from __future__ import annotations
@@ -25,12 +25,7 @@ if TYPE_CHECKING:
 
 
 def write_csv_folder(session: Session, path: Path) -> None:
-    """Write a folder with one file per table, numbers in full precision, and columns.json.
-
-    Args:
-        session: the session.
-        path: the folder to make.
-    """
+    """Write a new folder with one file per table, numbers in full precision, and columns.json."""
     path.mkdir()
     for name in sorted(
         {file.name for file in session.path.glob("*.parquet")} | set(session.log.files)
@@ -44,27 +39,27 @@ def write_csv_folder(session: Session, path: Path) -> None:
     shutil.copyfile(session.file("columns.json"), path / "columns.json")
 
 
-# Every table of a session as one Excel workbook, a sheet for each, for those who ask for it.
+# Every table of a session as one Excel workbook, one sheet per table, on request.
 
 
 MAX_ROWS = 1_048_576  # of a sheet, its headings included
 _MOST_CHARACTERS = 32_767  # of a cell
 _UNWRITABLE = re.compile("[\\0-\\x08\\x0b\\x0c\\x0e-\\x1f\\ud800-\\udfff\\ufffe\\uffff]")  # in XML
-_CELL_BYTES = 60  # of a sheet before it is packed, at most: 40 are usual
-_OTHER_BYTES = 1 << 21  # of what does not grow with the recording
-_EXACT = 10**15  # Excel has 15 digits; a longer whole number, a time in ns, is a text
+_CELL_BYTES = 60  # of an uncompressed sheet, at most; 40 are typical
+_OTHER_BYTES = 1 << 21  # independent of the recording's length
+_EXACT = 10**15  # Excel has 15 digits; a longer integer, such as a time in ns, is text
 
 
 def write_xlsx(session: Session, path: Path) -> None:
-    """Write a workbook: the summary first, then every table, and what every column means.
+    """Write a workbook: the summary first, then every table, and the descriptions of the columns.
 
     Args:
         session: the session.
         path: the file to write.
 
     Raises:
-        SessionError: a table is longer than a sheet can be, or there is no room for temporary
-            files.
+        SessionError: a table is longer than a sheet can be, or there is not enough space for
+            temporary files.
     """
     import pyarrow.parquet as pq
     from openpyxl import Workbook
@@ -85,16 +80,16 @@ def write_xlsx(session: Session, path: Path) -> None:
     for name in names:
         _add(book, name, session.table(name))
     _add(book, "columns", session.columns)
-    # openpyxl does not survive a disk that gets full under it: in memory it meets none
+    # openpyxl crashes on a full disk, so the workbook is made in memory
     packed = io.BytesIO()
     book.save(packed)
     path.write_bytes(packed.getbuffer())
 
 
 def _check_room(n_cells: int) -> None:
-    """Refuse where the folder for temporary files cannot hold the sheets before they are packed.
+    """Refuse if the folder for temporary files has not enough space for the uncompressed sheets.
 
-    openpyxl writes them there, and does not survive that it gets full.
+    openpyxl writes them there, and crashes if it becomes full.
     """
     folder = Path(tempfile.gettempdir())
     needed, free = n_cells * _CELL_BYTES + _OTHER_BYTES, shutil.disk_usage(folder).free
@@ -115,7 +110,7 @@ def _add(book: Workbook, name: str, table: pd.DataFrame) -> None:
 
 
 def _cell(sheet: Any, value: Any) -> Any:
-    """A value as Excel has it: empty for what is missing, a text for what it has no kind for."""
+    """A value for Excel: empty if missing, text if Excel has no type for it."""
     from openpyxl.cell import WriteOnlyCell
 
     if hasattr(value, "item"):

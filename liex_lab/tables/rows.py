@@ -1,9 +1,9 @@
 """Rows of a session's tables (frames, poses, rotations, gaps, flips, bouts) from a track.
 
-Intervals are half open: a frame is valid until the next, before a gap or the end one median step
-more. A joint's score is P(|e| < r) of an isotropic Gaussian in space, the chi distribution with 3
-degrees of freedom: erf(x / sqrt(2)) - sqrt(2 / π) x exp(-x^2 / 2), x = r / sd. The columns are
-described in `schema`.
+Intervals are half open: a frame is valid until the next one; before a gap or at the end, for one
+median step. A joint's score is P(|e| < r) of an isotropic Gaussian in space, the chi distribution
+with 3 degrees of freedom: erf(x / sqrt(2)) - sqrt(2 / π) x exp(-x^2 / 2), x = r / sd. The columns
+are described in `schema`.
 """
 
 from __future__ import annotations
@@ -47,21 +47,21 @@ _Found = tuple[
 _SPAN_NAMES = ("start_s", "stop_s", "start_frame", "stop_frame")
 _NOWHERE = (float("nan"), float("nan"))
 HIDDEN = "hidden"
-LOST = ("no_depth", "repeated", HIDDEN, "tracker_lost")  # reasons of gaps that are not the camera's
-_NEAR = 0.1  # of the spine: how near a joint must be to count in its score
+LOST = ("no_depth", "repeated", HIDDEN, "tracker_lost")  # reasons of gaps not caused by the camera
+_NEAR = 0.1  # radius of a joint's score, as a share of the spine
 
 
 @dataclass(frozen=True)
 class Rows:
-    """A track with what its rows also carry: numbers of the frames, names, and the arena.
+    """A track with the further contents of its rows: frame indices, names, and the arena.
 
     Attributes:
         track: one animal's track of n frames.
-        frame_index: (n,) number of each frame in the recording.
+        frame_index: (n,) index of each frame in the recording.
         session_id: name of the session.
         individual: name of the animal within the session.
-        camera_gaps: where the recording's time is not a steady camera's.
-        arena: outline of the floor, where the animal can be.
+        camera_gaps: irregularities of the recording's time.
+        arena: outline of the floor, within which the animal can be.
         zones: zones of the plan, arena frame.
     """
 
@@ -99,13 +99,13 @@ class Rows:
     def rotations(self) -> Iterator[Block]:
         """The table `rotations`: per frame a row of the root, then one row per joint.
 
-        The root's row is its rigid transform T_arena_root. Blocks have about 100 000 rows.
+        The root's row contains its rigid transform T_arena_root. Blocks have about 100 000 rows.
         """
         return (self._rotation_rows(part) for part in self._parts(self.track.skeleton.n_joints + 1))
 
     @cached_property
     def _frame_columns(self) -> Block:
-        """The columns (n,) of the table `frames`, made once for all who read or write it."""
+        """The columns (n,) of the table `frames`, computed once."""
         track = self.track
         wall, zone = self._in_arena()
         missing = self.missing_before()
@@ -185,7 +185,7 @@ class Rows:
         }
 
     def missing_before(self) -> NDArray[np.int64]:
-        """(n,) frames that the camera did not deliver just before each frame."""
+        """(n,) number of frames that the camera did not deliver just before each frame."""
         missing = np.zeros(self.track.n_frames, np.int64)
         for gap in self.camera_gaps:
             after = int(np.searchsorted(self.track.times_ns, gap.stop_ns))
@@ -196,8 +196,8 @@ class Rows:
     def gaps(self) -> Block:
         """The table `gaps`, in order of time.
 
-        Frames never delivered, frames whose time stamps had to be moved, and stretches of frames in
-        which no pose was measured.
+        Undelivered frames, frames with corrected timestamps, and stretches of frames without a
+        measured pose.
         """
         time = self.time_s
         count = frame_count(self.frame_index)
@@ -222,13 +222,10 @@ class Rows:
         }
 
     def flips(self, flips: Sequence[Flip]) -> Block:
-        """The table `flips`.
+        """The table `flips`, a block with one row for each flip.
 
         Args:
             flips: spans of exchanged or uncertain head and tail, in order of time.
-
-        Returns:
-            A block with one row for each.
         """
         time = self.time_s
         count = frame_count(self.frame_index)
@@ -246,7 +243,7 @@ class Rows:
         }
 
     def _camera_gaps(self) -> list[_Found]:
-        """Where the recording's time is not a steady camera's, as rows of the table `gaps`."""
+        """Irregularities of the recording's time, as rows of the table `gaps`."""
         time = self.time_s
         found = []
         stops = stop_times(time)
@@ -263,10 +260,10 @@ class Rows:
         return found
 
     def _last_place(self, observed_rows: NDArray[np.int64], row: int) -> tuple[float, float]:
-        """Where (x, y) mm the animal was seen last before a row, or first after it.
+        """Last observed position (x, y) mm of the animal before a row, or the first one after it.
 
         Args:
-            observed_rows: rows in which a pose was measured, in order.
+            observed_rows: rows with a measured pose, in order.
             row: the first row of a gap.
         """
         if not len(observed_rows):
@@ -290,12 +287,12 @@ class Rows:
         return {name: np.repeat(column, repeat) for name, column in columns.items()}
 
     def _parts(self, rows_per_frame: int) -> Iterator[slice]:
-        """Blocks of frames that give about 100 000 rows."""
+        """Blocks of frames with about 100 000 rows."""
         return blocks(max(self.track.n_frames, 1), max(1, ROWS_PER_GROUP // rows_per_frame))
 
 
 def _some_rows(columns: Block, part: slice) -> Block:
-    """Some rows of a block; what stands for all rows stands for these."""
+    """Some rows of a block; values for all rows are unchanged."""
     return {
         name: column if isinstance(column, str) else column[part]
         for name, column in columns.items()
@@ -307,7 +304,7 @@ def _xyz(name: str, values: Array) -> dict[str, Array]:
 
 
 def _log(rotation: Array) -> Array:
-    """Rotation vectors (n, 3) of rotations (n, 3, 3), NaN where the rotation is."""
+    """Rotation vectors (n, 3) of rotations (n, 3, 3), NaN where the rotation is NaN."""
     known = np.isfinite(rotation).all(axis=(1, 2))
     omega = np.full((len(rotation), 3), np.nan)
     omega[known] = so3.log(rotation[known])
@@ -315,7 +312,7 @@ def _log(rotation: Array) -> Array:
 
 
 def nearness(sd: Array, radius: Array) -> Array:
-    """Probability that a Gaussian point in space lies within a radius of its mean.
+    """Probability that a Gaussian point in space is within a radius of its mean.
 
     The chi distribution with 3 degrees of freedom, see the module.
 
@@ -324,7 +321,7 @@ def nearness(sd: Array, radius: Array) -> Array:
         radius: mm, a shape that broadcasts with `sd`.
 
     Returns:
-        Probabilities; NaN where `sd` or `radius` is.
+        Probabilities; NaN where `sd` or `radius` is NaN.
     """
     from scipy.special import erf
 
@@ -333,25 +330,18 @@ def nearness(sd: Array, radius: Array) -> Array:
 
 
 def seconds(times_ns: NDArray[np.int64]) -> Array:
-    """Seconds since the first of some time stamps.
-
-    Args:
-        times_ns: (n,) integer nanoseconds.
-
-    Returns:
-        (n,) s.
-    """
+    """Seconds (n,) since the first of some timestamps (n,), integer nanoseconds."""
     return (times_ns - times_ns[:1]).astype(np.float64) * 1e-9
 
 
 def median_step(time_s: Array) -> float:
-    """The usual time from one frame to the next, s; 0 for a single frame.
+    """The median time between frames, s; 0 for a single frame.
 
     Args:
         time_s: (n,) s, increasing.
 
     Returns:
-        Median of the steps, s; of rounded stamps their mean, see `timestamps.rounded_step`.
+        Median of the steps, s; for rounded timestamps their mean, see `timestamps.rounded_step`.
     """
     if len(time_s) < 2:
         return 0.0
@@ -363,7 +353,7 @@ def _in_ns(time_s: Array) -> NDArray[np.int64]:
 
 
 def gap_follows(time_s: Array) -> NDArray[np.bool_]:
-    """After which frames others are missing: the step is longer than 1.5 usual ones.
+    """Whether frames are missing after a frame: the next step is longer than 1.5 median steps.
 
     Args:
         time_s: (n,) s, increasing.
@@ -377,7 +367,7 @@ def gap_follows(time_s: Array) -> NDArray[np.bool_]:
 
 
 def stop_times(time_s: Array) -> Array:
-    """When each frame's validity ends: at the next frame, or one median step later.
+    """End of each frame's validity: at the next frame, or one median step later.
 
     The latter before a gap and at the end of the recording.
 
@@ -394,53 +384,33 @@ def stop_times(time_s: Array) -> Array:
 
 
 def frame_count(frame_index: NDArray[np.int64]) -> NDArray[np.int64]:
-    """The frame number of every row and of the row after the last.
+    """The frame index of every row and of the row after the last, (n + 1,) int64.
 
     Args:
-        frame_index: (n,) number of each frame in the recording.
-
-    Returns:
-        (n + 1,) int64.
+        frame_index: (n,) index of each frame in the recording.
     """
     return np.append(frame_index, frame_index[-1:] + 1)
 
 
 def constant_runs(labels: NDArray[Any]) -> list[tuple[int, int, Any]]:
-    """Runs of equal labels, see `runs_of`.
-
-    Args:
-        labels: (n,) of any kind.
-
-    Returns:
-        (start, stop, label) of each run, stop exclusive; none for no labels.
-    """
+    """Runs of equal labels (n,), as (start, stop, label), stop exclusive; empty for no labels."""
     if len(labels) == 0:
         return []
     return [(int(a), int(b), label) for a, b, label in zip(*runs_of(labels), strict=True)]
 
 
 def rows_only(rows: Rows) -> pd.DataFrame:
-    """A kinematics table without any measure: the names and times of every frame.
-
-    Args:
-        rows: a track's rows.
-
-    Returns:
-        The first five columns of the table `frames`.
-    """
+    """A kinematics table without measures: the first five columns of the table `frames`."""
     return rows.frames_table.iloc[:, :5]
 
 
 def bout_rows(ethogram: Ethogram, frames: pd.DataFrame, model_hash: str) -> pd.DataFrame:
-    """The columns that every table `bouts` has.
+    """The columns of the table `bouts` that every session has, one row for each bout.
 
     Args:
         ethogram: one animal's bouts.
         frames: the table `frames` of the ethogram's times, at least one row.
         model_hash: hash of the model that named the bouts; '' for a rule.
-
-    Returns:
-        One row for each bout.
     """
     times_ns = frames["time_ns"].to_numpy(np.int64)
     count = frame_count(frames["frame_index"].to_numpy(np.int64))

@@ -1,8 +1,8 @@
 """Schema of all tables (Apache Parquet): every column, its dtype, unit and meaning.
 
-Every column is one line of columns.csv. `when` states in which sessions it exists: always, once
-behaviour is measured, for some kinds of body, for each action or zone, or where rears of several
-kinds are distinguished. Writers, readers, columns.json, the report and the manual read this list;
+Every column is one line of columns.csv. `when` states which sessions have it: all, those with
+behaviour measures, those of some kinds of body, each action or zone, or those that distinguish
+kinds of rears. Writers, readers, columns.json, the report and the manual read this list;
 `write_table` refuses a column without an entry.
 """
 
@@ -33,25 +33,24 @@ if TYPE_CHECKING:
     from liex_lab.scene.zones import Zone
 
 
-ROWS_PER_GROUP = 100_000  # a block of the widest table then takes some 20 MB
+ROWS_PER_GROUP = 100_000  # about 20 MB per block of the widest table
 _TEXTS = ("name", "dtype", "unit", "meaning", "formula", "source")
 Block = Mapping[str, Any]  # column -> one value for all rows, or an array
 
 
 @dataclass(frozen=True)
 class Column:
-    """One column of a table, and what a reader has to know about it.
+    """One column of a table and its description.
 
     Attributes:
         table: name of the table.
         name: name of the column.
         dtype: 'string', 'float64', 'int64' or 'bool'.
-        unit: its unit; empty for a number without one.
-        meaning: what it is, in words.
-        formula: how it is worked out, where that is not obvious.
-        source: what it comes from.
-        unreliable_below_fps: frame rate, 1/s, below which it should not be trusted; None without
-            one.
+        unit: its unit; empty for a dimensionless number.
+        meaning: its meaning in words.
+        formula: its computation, if not obvious.
+        source: its origin.
+        unreliable_below_fps: frame rate, 1/s, below which it is unreliable; None if absent.
         since: version of liex_lab that introduced it.
     """
 
@@ -68,7 +67,7 @@ class Column:
 
 @cache
 def _listed() -> dict[str, list[dict[str, str]]]:
-    """The lines of columns.csv by table; `when` states in which sessions a column exists."""
+    """The lines of columns.csv by table."""
     tables: dict[str, list[dict[str, str]]] = {}
     with Path(__file__).with_name("columns.csv").open(encoding="utf-8", newline="") as file:
         for line in csv.DictReader(file):
@@ -83,7 +82,7 @@ def table_columns(
 
     Args:
         table: name of the table.
-        kind: of body, one of `behaviour.body.KINDS`; '' leaves out what is measured of behaviour.
+        kind: of body, one of `behaviour.body.KINDS`; '' leaves out measures of behaviour.
         words: the actions' names.
         zones: the zones' names.
     """
@@ -104,20 +103,20 @@ def table_columns(
 
 
 def _column(line: Mapping[str, str], names: Mapping[str, str]) -> Column:
-    """The column that a line describes, with the names of an action or a zone filled in."""
+    """The column of a line, with the name of an action or zone filled in."""
     texts = {one: line[one].format(across_gaps=ACROSS_GAPS, **names) for one in _TEXTS}
     fps = line["unreliable_below_fps"]
     return Column(line["table"], **texts, unreliable_below_fps=float(fps) if fps else None)
 
 
 def rears_of(words: Sequence[str]) -> tuple[str, ...]:
-    """The kinds of rearing that a vocabulary distinguishes; none where it has rear itself."""
+    """The kinds of rears that a vocabulary distinguishes; empty if it contains rear itself."""
     return () if "rear" in words else tuple(word for word in words if word.startswith("rear_"))
 
 
 @dataclass(frozen=True)
 class Vocabulary:
-    """What decides which columns the behaviour tables of a session have.
+    """Determines the columns of a session's behaviour tables.
 
     Attributes:
         words: the actions' names.
@@ -135,7 +134,7 @@ class Vocabulary:
 
     @property
     def columns(self) -> tuple[Column, ...]:
-        """Every column of the behaviour tables, of bouts those beyond `BOUTS`."""
+        """Every column of the behaviour tables; for bouts only those beyond `BOUTS`."""
         every = [column for name in BEHAVIOUR for column in self.table(name)]
         return tuple(column for column in every if column not in BOUTS)
 
@@ -151,7 +150,7 @@ ROOT_COVARIANCES = tuple(column.name for column in ROTATIONS if column.name.star
 
 
 def all_columns() -> dict[str, Column]:
-    """Every column that a session can have, of every kind of body, by `table.name`."""
+    """Every possible column of a session, for every kind of body, by `table.name`."""
     walking, swimming, branching = (
         Vocabulary(tuple(WORDS.get(animal, ())), (), kind).columns
         for animal, kind in (("mouse", "stands"), ("fish", "swims"), ("hand", "branches"))
@@ -161,16 +160,14 @@ def all_columns() -> dict[str, Column]:
 
 
 def dictionary(*extra: Sequence[Column]) -> list[dict[str, Any]]:
-    """The content of columns.json: every column of `TABLES`, then those of other packages.
+    """The content of columns.json: every column of `TABLES`, then those of other packages, as
+    dicts.
 
     Args:
         *extra: columns of further tables.
 
-    Returns:
-        Each column once, as a plain dict.
-
     Raises:
-        SessionError: a column is described twice and differently.
+        SessionError: two different descriptions of one column.
     """
     entries = [column for rows in TABLES.values() for column in rows] + [
         column for rows in extra for column in rows
@@ -189,7 +186,7 @@ def arrow_schema(schema: Sequence[Column], metadata: Mapping[str, Any]) -> pa.Sc
 
     Args:
         schema: the columns.
-        metadata: what else the table's metadata shall hold, JSON values.
+        metadata: further metadata of the table, JSON values.
 
     Returns:
         The schema, fields in the order of the columns.
@@ -213,19 +210,16 @@ def write_table(
     """Write a Parquet table block by block and return its number of rows.
 
     Row groups have at most `ROWS_PER_GROUP` rows. Equal blocks give equal bytes: zstd, strings as
-    dictionaries, no time stamps.
+    dictionaries, no timestamps.
 
     Args:
         path: the file.
         schema: the columns, in the order in which they are written.
         blocks: consecutive rows, each block with every column.
-        metadata: goes into the file, see `arrow_schema`.
-
-    Returns:
-        How many rows were written.
+        metadata: of the file, see `arrow_schema`.
 
     Raises:
-        SessionError: a block's columns are not exactly those of the schema.
+        SessionError: a block's columns differ from those of the schema.
     """
     import pyarrow.parquet as pq
 
@@ -239,7 +233,7 @@ def write_table(
             batch = _arrow_block(block, schema, arrow)
             n_rows += batch.num_rows
             writer.write_table(batch, row_group_size=ROWS_PER_GROUP)
-            del block, batch  # before the next one is made
+            del block, batch  # to free memory for the next block
     return n_rows
 
 
@@ -255,7 +249,7 @@ def _arrow_block(block: Block, schema: Sequence[Column], arrow: pa.Schema) -> pa
 
 
 def check_described(names: Iterable[str], schema: Sequence[Column], table: str = "") -> None:
-    """Refuse a table whose columns are not exactly those of its schema.
+    """Refuse a table whose columns differ from those of its schema.
 
     Args:
         names: the table's columns.
@@ -263,7 +257,7 @@ def check_described(names: Iterable[str], schema: Sequence[Column], table: str =
         table: the table's name in the error; '' takes the schema's.
 
     Raises:
-        SessionError: a column lacks a description, or a described column lacks.
+        SessionError: a column lacks a description, or a described column is missing.
     """
     written = list(names)
     described = [column.name for column in schema]
@@ -281,7 +275,7 @@ def _is_array(value: Any) -> bool:
 
 
 def _arrow_column(value: Any, kind: pa.DataType, n: int) -> pa.Array:
-    """One column: a scalar stands for all rows, a `Words` for repeated names."""
+    """One column: a scalar is repeated for all rows, `Words` are a dictionary encoding."""
     import pyarrow as pa
 
     if isinstance(value, Words):
@@ -297,9 +291,9 @@ def _arrow_column(value: Any, kind: pa.DataType, n: int) -> pa.Array:
 
 @dataclass(frozen=True)
 class Words:
-    """A column of few different names, as in a dictionary encoding: `words[codes]`.
+    """A column with few different names, as a dictionary encoding: `words[codes]`.
 
-    There is no Python string per row.
+    It avoids a Python string per row.
 
     Attributes:
         codes: (n,) index of each row's word.
@@ -318,15 +312,12 @@ class Words:
 
 
 def to_pandas(schema: Sequence[Column], block: Block, copy: bool = True) -> pd.DataFrame:
-    """A block as a data frame of the schema's dtypes, as reading the table back would give it.
+    """A block as a data frame of the schema's dtypes, equal to the table read back.
 
     Args:
-        schema: the columns; those that the block lacks are left out.
+        schema: the columns; those missing in the block are left out.
         block: column -> one value for all rows, an array, or `Words`.
-        copy: False where the block's arrays may go on as the table's columns, wherever they lie.
-
-    Returns:
-        The data frame.
+        copy: False if the table may share the block's arrays.
     """
     import pandas as pd
 
@@ -345,22 +336,12 @@ def to_pandas(schema: Sequence[Column], block: Block, copy: bool = True) -> pd.D
 
 
 def empty_table(schema: Sequence[Column]) -> pd.DataFrame:
-    """A data frame without rows, of the right dtypes.
-
-    Args:
-        schema: the columns.
-
-    Returns:
-        A data frame of 0 rows.
-    """
+    """A data frame of 0 rows with the schema's dtypes."""
     return to_pandas(schema, {column.name: [] for column in schema})
 
 
 def from_pandas(table: pd.DataFrame) -> Iterator[Block]:
-    """A data frame's columns as blocks for `write_table`; an empty one gives one empty block.
-
-    Args:
-        table: any data frame.
+    """Yield a data frame's columns as blocks for `write_table`; an empty one gives one empty block.
 
     Yields:
         Column -> values of at most `ROWS_PER_GROUP` rows.
@@ -373,7 +354,7 @@ def _pandas_dtype(column: Column) -> str:
     return "str" if column.dtype == "string" else column.dtype
 
 
-# Units that people read: cm/s and degrees on pages and in replays; tables keep mm/s and rad.
+# Displayed units: cm/s and degrees on pages and in replays; tables use mm/s and rad.
 
 
 _SHOWN = {
@@ -385,32 +366,32 @@ _SHOWN = {
 
 
 def shown(value: Any, unit: str) -> tuple[Any, str]:
-    """A number, or an array of them, in the unit that people read, and that unit.
+    """A number, or an array, in the displayed unit, and that unit.
 
     Args:
         value: in the unit of the files.
-        unit: as columns.json names it; others than speeds and angles stay as they are.
+        unit: as in columns.json; only speeds and angles are converted.
     """
     name, factor = _SHOWN.get(unit, (unit, 1.0))
     return (value * factor if factor != 1.0 else value), name
 
 
 def titled(column: str, unit: str) -> str:
-    """The name of a column as people read it: without its unit, which stands beside the number.
+    """The displayed name of a column, without its unit.
 
     Args:
         column: name of the column, such as `mean_speed_mm_s`.
-        unit: as columns.json names it.
+        unit: as in columns.json.
     """
     tail = "_" + unit.replace("/", "_").replace("²", "2")
     return (column.removesuffix(tail) if unit else column).replace("_", " ")
 
 
-# Protocol of a measured session's tables: what lower layers may read of `sessions.Session`.
+# Protocol of a session's tables: the part of `sessions.Session` that lower layers may read.
 
 
 class SessionTables(Protocol):
-    """The tables of one session folder, and what its session.json states."""
+    """The tables of one session folder, and its session.json."""
 
     @property
     def metadata(self) -> dict[str, Any]:
@@ -422,7 +403,7 @@ class SessionTables(Protocol):
 
     @property
     def zones(self) -> Sequence[Zone]:
-        """The zones that were drawn, arena frame, mm."""
+        """The zones of the session, arena frame, mm."""
 
     @property
     def frames(self) -> pd.DataFrame:
@@ -441,31 +422,28 @@ class SessionTables(Protocol):
         """One row per animal."""
 
     def table(self, name: str, columns: list[str] | None = None) -> pd.DataFrame:
-        """Any table by its name, or some of its columns.
+        """A table by its name, in memory.
 
         Args:
             name: of the table, such as 'poses'.
-            columns: those that are wanted; None for all.
-
-        Returns:
-            The table in memory.
+            columns: the columns to read; None for all.
         """
 
 
-# Checks of a session's tables that somebody else may have written, before anything is computed.
+# Checks of a session's tables, which another program may have written, before computing.
 
 
-# columns that tables of schema 1 do not have; one that a later schema adds is listed here, too
+# columns that schema 1 lacks; columns added by later schemas are listed here as well
 _LATER = {
     "frames": {"wall_distance_mm", "zone", "p_flip", "bridged", "pulse_index"},
     "poses": {"sd_xy_mm", "sd_z_mm"},
     "rotations": set(ROOT_COVARIANCES),
     "gaps": {"x_mm", "y_mm"},
 }
-_ROWS_PER_BYTE = 8  # a frame's time stamp alone takes more
+_ROWS_PER_BYTE = 8  # more is impossible: each frame has a timestamp
 _FEW = 10_000
 _SPANS = {"bouts", "gaps", "flips"}
-# how Parquet stores our types, and what pandas calls them
+# our types in Parquet, and their kinds in pandas
 _STORED = {"string": "BYTE_ARRAY", "float64": "DOUBLE", "int64": "INT64", "bool": "BOOLEAN"}
 _KINDS = {"string": "O", "float64": "f", "int64": "i", "bool": "b"}
 
@@ -480,7 +458,7 @@ def check_footer(path: Path, name: str, n_frames: int, n_joints: int) -> None:
         n_joints: joints of the animal.
 
     Raises:
-        ValueError: they are not those of a session with so many frames and joints.
+        ValueError: they do not match a session with these numbers of frames and joints.
     """
     import pyarrow.parquet as pq
 
@@ -514,7 +492,7 @@ def check_footer(path: Path, name: str, n_frames: int, n_joints: int) -> None:
 
 
 def check_rows(name: str, table: pd.DataFrame, joints: Sequence[str]) -> None:
-    """Check the rows of a table, as far as its columns were read.
+    """Check the rows of a table, in the columns that were read.
 
     Args:
         name: the table's name.
@@ -522,8 +500,8 @@ def check_rows(name: str, table: pd.DataFrame, joints: Sequence[str]) -> None:
         joints: names of the animal's joints.
 
     Raises:
-        ValueError: a name is missing, frames are out of order, times are not finite, or rows are
-            not those of the joints.
+        ValueError: a name is missing, frames are out of order, times are not finite, or rows do not
+            match the joints.
     """
     for column in TABLES.get(name, ()):
         if column.name not in table:
@@ -549,7 +527,7 @@ def check_rows(name: str, table: pd.DataFrame, joints: Sequence[str]) -> None:
 
 
 def _check_frames(table: pd.DataFrame) -> None:
-    """Raises ValueError where frames or times do not go on."""
+    """Raises ValueError if frames or times do not increase."""
     for column in ("frame_index", "time_ns", "time_s"):
         if column in table:
             values = table[column].to_numpy()
