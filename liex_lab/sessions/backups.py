@@ -1,9 +1,9 @@
-"""Older copies of a session that lie beside it, and the corrections in them.
+"""Older copies of a session next to it, and the corrections in them.
 
-NAME.old is the session that a new one takes the place of; it is there for a moment only, but stays
-where the writer is killed in that moment. NAME.outdated is the session that was there before a
-study's run of it failed; one whose corrections no later session has taken over is never removed,
-but gets a number: NAME.outdated-2, NAME.outdated-3 and so on.
+NAME.old is the session being replaced by a new one; it exists only for a moment, but remains if the
+writer is killed in that moment. NAME.outdated is the session from before a study's run of it
+failed. A copy with corrections that no later session contains is never removed, but numbered:
+NAME.outdated-2, NAME.outdated-3 and so on.
 """
 
 from __future__ import annotations
@@ -18,17 +18,17 @@ from liex_lab.sessions.checkpoint import hold
 from liex_lab.sessions.corrections import FOLDER, LOG, corrected_folder, read_log
 from liex_lab.sessions.folder import FAILED_FILE, aside_folder, part_folder
 
-_TAKEN = "corrected.taken"  # in an outdated copy: corrections that a later session has, too
+_TAKEN = "corrected.taken"  # in an outdated copy: corrections inherited by a later session
 
 
 def put_back_session(path: Path) -> bool:
-    """Put the session back that a killed writer had put aside, unless a writer is at work.
+    """Restore a session that a killed writer had moved aside, unless a writer is active.
 
     Args:
         path: the session folder.
 
     Returns:
-        Whether it was put back.
+        Whether it was restored.
 
     Raises:
         OSError: it cannot be renamed.
@@ -48,15 +48,15 @@ def put_back_session(path: Path) -> bool:
 
 
 def put_back_held(path: Path) -> bool:
-    """Put a session back that was put aside; for who holds the lock of NAME.part.
+    """Restore a session that was moved aside; the caller holds the lock of NAME.part.
 
-    Where a failure was noted in its place since, it becomes an outdated copy.
+    If a failure was recorded in its folder since, it becomes an outdated copy.
 
     Args:
         path: the session folder.
 
     Returns:
-        Whether it was put back.
+        Whether it was restored.
 
     Raises:
         OSError: it cannot be renamed.
@@ -71,12 +71,12 @@ def put_back_held(path: Path) -> bool:
 
 
 def set_outdated(path: Path) -> None:
-    """Clear the place of a session that failed: what was measured before becomes NAME.outdated.
+    """Clear the folder of a session that failed: an existing session becomes NAME.outdated.
 
-    The outdated copy before it goes, unless it holds corrections that are not in this one.
+    The previous outdated copy is removed, unless it has corrections that this one lacks.
 
     Args:
-        path: the session folder, with a session or a failed.json in it, or not there.
+        path: the session folder, with a session or a failed.json in it, or absent.
 
     Raises:
         OSError: it cannot be renamed.
@@ -96,10 +96,10 @@ def set_outdated(path: Path) -> None:
 
 
 def corrections_for(path: Path) -> Path | None:
-    """Folder of the corrections that a new session of a place takes over; None if absent.
+    """Folder of the corrections that a new session inherits; None if absent.
 
-    They are those of the session that is there; where it has none, those of its newest outdated
-    copy that has some which can be read and were not taken over before.
+    They are those of the existing session; without any, those of its newest outdated copy with
+    readable corrections that were not inherited before.
 
     Args:
         path: the session folder.
@@ -111,17 +111,17 @@ def corrections_for(path: Path) -> Path | None:
         try:
             if read_log(copy).entries:
                 return corrected_folder(copy)
-        except SessionError:  # it is damaged, and stays where it is
+        except SessionError:  # damaged: left unchanged
             continue
     return None
 
 
 def note_taken(made: Path, path: Path) -> None:
-    """Note in an outdated copy that its corrections are in the session now.
+    """Mark the corrections of an outdated copy as inherited by the session.
 
     Args:
         made: the folder that `corrections_for` returned.
-        path: the session folder, in place with these corrections in it.
+        path: the session folder, complete with these corrections.
 
     Raises:
         OSError: it cannot be renamed.
@@ -135,7 +135,7 @@ def note_taken(made: Path, path: Path) -> None:
 
 
 def taken_from(path: Path) -> str:
-    """Name of the outdated copy that a session took its corrections over from; "" for none.
+    """Name of the outdated copy from which a session inherited its corrections; "" if absent.
 
     Args:
         path: the session folder.
@@ -148,19 +148,19 @@ def taken_from(path: Path) -> str:
 
 
 def _waits(path: Path) -> bool:
-    """Whether a session was put aside and none is in its place."""
+    """Whether a session was moved aside and not replaced."""
     there = (path / "session.json").is_file()
     return not there and (aside_folder(path) / "session.json").is_file()
 
 
 def _free(path: Path) -> Path:
-    """A name NAME.outdated-2, NAME.outdated-3 ... that is not taken, after all that are."""
+    """The next unused name NAME.outdated-2, NAME.outdated-3 ..."""
     taken = [_number(path, copy) for copy in _outdated(path)]
     return path.with_name(f"{path.name}.outdated-{max([1, *taken]) + 1}")
 
 
 def _outdated(path: Path) -> list[Path]:
-    """The outdated copies of a session, the newest first."""
+    """The outdated copies of a session, newest first."""
     if not path.parent.is_dir():
         return []
     begin = f"{path.name}.outdated"
@@ -175,13 +175,13 @@ def _outdated(path: Path) -> list[Path]:
 
 
 def _number(path: Path, copy: Path) -> int:
-    """The number of an outdated copy; 0 where it has none."""
+    """The number of an outdated copy; 0 if it has none."""
     number = copy.name[len(f"{path.name}.outdated-") :]
     return int(number) if number.isascii() and number.isdigit() else 0
 
 
 def _has_more(older: Path, path: Path) -> bool:
-    """Whether a copy may hold corrections that a session does not."""
+    """Whether a copy may have corrections that a session lacks."""
     try:
         return not set(read_log(older).entries) <= set(read_log(path).entries)
     except SessionError:

@@ -1,8 +1,8 @@
-"""Corrections as a person states them, checked against the session and made into log entries.
+"""Corrections as entered by a person, checked against the session and made into log entries.
 
 Seconds become frames, a pixel becomes a point of the arena frame (back-projection through the
-pinhole camera at the depth read there), words are looked up in the ethogram's vocabulary. Times are
-taken to be typed with three decimals. Used by `liex correct` and by the dashboard.
+pinhole camera at the depth read there), and words are checked against the ethogram's vocabulary.
+Times are assumed to have three decimals. Used by `liex correct` and by the dashboard.
 """
 
 from __future__ import annotations
@@ -36,15 +36,14 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 _ROUNDED_S = 5e-4  # times are typed with three decimals
-_INSET_FRAMES = 24  # in so many frames it is looked up how deep under the skin a joint lies
+_INSET_FRAMES = 24  # sampled for the depth of a joint below the skin
 _WORD_LENGTH = 60
-# of the animal's length: what stands out less from the still scene is not the animal, nor is what
-# lies farther from every joint; where the session shows no scene, it stands on the floor, and half
-# of that distance counts
+# shares of the animal's length: its least distance in front of the still scene, and its largest
+# from the nearest joint (half of that if the scene is unknown and the floor is used instead)
 _STANDS_OUT = 0.05
 _BESIDE = 0.5
-_SCENE_FRAMES = 256  # in so many frames the still scene is looked for
-_APART_S = 0.5  # after a longer time without a pose a turn contradicts nothing
+_SCENE_FRAMES = 256  # sampled for the still scene
+_APART_S = 0.5  # turns after a longer time without a pose are ignored
 SENTENCES = (  # seconds since the first frame; a pixel u v, or a position x y z in mm of the arena
     "flip FROM TO",
     "joint NAME FRAME U V",
@@ -60,15 +59,15 @@ OFF_THE_ANIMAL = "height kept: the pixel is not on the animal"
 def parse_correction(
     session: Session, sentence: str | Sequence[object], at_s: float | None = None
 ) -> Correction:
-    """The correction in a sentence such as `joint nose 810 212 148`.
+    """Parse a correction such as `joint nose 810 212 148`.
 
-    The forms are those of `SENTENCES`; `here` stands for the moment or the frame that is shown, and
-    `new` at the end of `rename` and `add` allows an action that the ethogram has no word for.
+    The forms are those of `SENTENCES`; `here` is the time or frame on display, and `new` at the end
+    of `rename` and `add` allows an action that is not in the ethogram's vocabulary.
 
     Args:
         session: the session.
         sentence: the sentence, or its words; a word with spaces is quoted in a sentence.
-        at_s: the moment that is shown, s since the first frame; None if none is.
+        at_s: the time on display, s since the first frame; None if absent.
 
     Raises:
         SessionError: the sentence has none of the forms, or the correction cannot be made.
@@ -100,7 +99,7 @@ def parse_correction(
                 return joint_move_at_pixel(session, frame(row), str(name), *numbers(u, v))
             case ["joint", name, row, x, y, z]:
                 return joint_move(session, frame(row), str(name), numbers(x, y, z))
-    except ValueError:  # a word that should be a number, or an open quote
+    except ValueError:  # a word that is not a number, or an open quote
         pass
     raise SessionError(f"a correction is written as one of: {'; '.join(SENTENCES)}")
 
@@ -114,7 +113,7 @@ def flip_span(session: Session, start_s: float, stop_s: float) -> FlipSpan:
         stop_s: stop, s, exclusive.
 
     Raises:
-        SessionError: the span holds no frame, or none with a pose, or the animal is no chain of
+        SessionError: the span has no frame, or none with a pose, or the skeleton is not a chain of
             joints with a head and a tail.
     """
     first, last = rows_between(session, start_s, stop_s, "a span to flip")
@@ -132,17 +131,18 @@ def flip_span(session: Session, start_s: float, stop_s: float) -> FlipSpan:
 
 
 def disagreements(session: Session) -> list[str]:
-    """Sentences on exchanges of head and tail that contradict the frames around them.
+    """Exchanges of head and tail that contradict the frames around them, in sentences.
 
     At an end of such an exchange the body turns by more than 90 degrees from one frame with a pose
-    to the next. The nearest span that agrees begins and ends where the body turns so without the
-    exchange, where the pose is lost for longer than 0.5 s, or where the recording does.
+    to the next. The nearest consistent span begins and ends where the body makes such a turn
+    without the exchange, where the pose is missing for longer than 0.5 s, or at the recording's
+    ends.
 
     Args:
         session: the session with its corrections.
 
     Returns:
-        One sentence for each exchange that stands and disagrees, with the commands to change it.
+        One sentence for each active exchange that disagrees, with the commands to change it.
     """
     exchanges = [
         (one.number, one.what) for one in session.log.standing if isinstance(one.what, FlipSpan)
@@ -166,7 +166,7 @@ def disagreements(session: Session) -> list[str]:
         at = [row for row in ends.tolist() if row in half_turns]
         if not at:
             continue
-        # an exchange makes half turns of its ends, and unmakes those that are there
+        # an exchange adds half turns at its ends, or removes existing ones
         free = np.array(sorted({0, len(index)} | apart | (half_turns ^ set(ends.tolist()))))
         start = free[np.abs(free[:-1] - ends[0]).argmin()]
         stop = free[free > start][np.abs(free[free > start] - ends[1]).argmin()]
@@ -183,7 +183,7 @@ def disagreements(session: Session) -> list[str]:
 
 
 def _joints(session: Session) -> Array:
-    """(n, J, 3) places of the joints of every frame, mm, arena frame; NaN without a pose."""
+    """(n, J, 3) positions of the joints of every frame, mm, arena frame; NaN without a pose."""
     places = session.poses[["x_mm", "y_mm", "z_mm"]].to_numpy(float)
     return places.reshape(len(session.frames), -1, 3)
 
@@ -198,7 +198,7 @@ def _ahead(session: Session) -> Array:
 def joint_move(
     session: Session, frame: int, joint: str, place_mm: Any, note: str = ""
 ) -> JointMove:
-    """Correction that puts a joint of one frame to a position.
+    """Correction that moves a joint of one frame to a position.
 
     Args:
         session: the session.
@@ -209,7 +209,7 @@ def joint_move(
 
     Raises:
         SessionError: there is no such frame, joint or pose, or the position is below the floor or
-            farther from where the joint was than the animal is long.
+            farther from the measured one than the length of the animal.
     """
     row, was = _joint_row(session, frame, joint)
     place = np.asarray(place_mm, float)
@@ -237,13 +237,12 @@ def joint_move(
 def joint_move_at_pixel(
     session: Session, frame: int, joint: str, u_px: float, v_px: float
 ) -> JointMove:
-    """Correction that puts a joint of one frame under a pixel of the depth image.
+    """Correction that moves a joint of one frame under a pixel of the depth image.
 
-    Where the pixel shows the animal, the depth read there is that of its skin (the median over
-    3 x 3 pixels), and the joint is put as deep under it as it usually lies: the median over up to
-    24 frames of the recording in which the pose is trusted. Elsewhere, on the floor, a wall or an
-    unread pixel, the joint keeps its height above the floor and moves along the pixel's ray. It is
-    never put below the floor.
+    On the animal, the depth at the pixel is that of the skin (the median over 3 x 3 pixels), and
+    the joint is placed at its usual depth below the skin: the median over up to 24 frames with a
+    trusted pose. Elsewhere, on the floor, a wall or an unread pixel, the joint keeps its height
+    above the floor and moves along the pixel's ray. It never moves below the floor.
 
     Args:
         session: the session.
@@ -253,8 +252,8 @@ def joint_move_at_pixel(
         v_px: row, px; 0 is the centre of the first one.
 
     Raises:
-        SessionError: the pixel is outside the image, the session keeps no depth, the pixel's ray
-            does not reach the joint's height, or see `joint_move`.
+        SessionError: the pixel is outside the image, the session has no depth, the pixel's ray does
+            not reach the joint's height, or see `joint_move`.
     """
     from liex_lab.sessions.cutouts import Kept, open_pictures
 
@@ -293,10 +292,10 @@ def joint_move_at_pixel(
 def _skin_under(
     session: Session, recording: Recording, kept: Kept, row: int, u_px: float, v_px: float
 ) -> float:
-    """Depth of the animal's skin under a pixel of a frame, mm; NaN where it shows something else.
+    """Depth of the animal's skin at a pixel of a frame, mm; NaN if the pixel is not on the animal.
 
-    The animal stands out from the still scene, or from the floor where the session shows no scene
-    at the pixel, and lies beside the posed joints.
+    The animal is in front of the still scene, or above the floor if the still scene is unknown at
+    the pixel, and close to the joints of the pose.
     """
     if not kept.holds(row, u_px, v_px):
         return math.nan  # the still scene
@@ -315,7 +314,7 @@ def _skin_under(
 
 
 def depth_under(depth: NDArray[Any], u_px: float, v_px: float) -> float:
-    """Median depth (mm) read in the 3 x 3 pixels around one; NaN where nothing was read.
+    """Median depth (mm) of the 3 x 3 pixels around one; NaN if all are unread.
 
     Args:
         depth: (H, W) mm, 0 where unread.
@@ -329,7 +328,7 @@ def depth_under(depth: NDArray[Any], u_px: float, v_px: float) -> float:
 
 
 def _inset_mm(session: Session, recording: Recording, kept: Kept, joint: str) -> float:
-    """How much farther from the camera than the skin seen at its pixel a joint usually is, mm."""
+    """Usual depth of a joint below the skin at its pixel, along the optical axis, mm."""
     frames = session.frames
     poses = session.poses[session.poses["joint"] == joint]
     usable = np.flatnonzero(
@@ -347,21 +346,21 @@ def _inset_mm(session: Session, recording: Recording, kept: Kept, joint: str) ->
     found = [
         (into @ places[row])[2] - depth_under(recording.frame(row).depth, *uv[row])
         for row in chosen.tolist()
-        if kept.holds(row, *uv[row])  # else the still scene is seen there
+        if kept.holds(row, *uv[row])  # else it shows the still scene
     ]
     known = np.array(found)[np.isfinite(found)]
     return max(0.0, float(np.median(known))) if len(known) else 0.0
 
 
 def bout_at(session: Session, at_s: float) -> dict[str, Any]:
-    """Row of the table `bouts` that a time lies in.
+    """Row of the table `bouts` at a given time.
 
     Args:
         session: the session.
         at_s: time, s since the first frame.
 
     Raises:
-        SessionError: no bout holds the time; the message names the nearest ones.
+        SessionError: there is no bout at this time; the message names the nearest ones.
     """
     bouts = session.bouts
     inside = bouts[(bouts["start_s"] <= at_s + _ROUNDED_S) & (bouts["stop_s"] > at_s + _ROUNDED_S)]
@@ -381,17 +380,17 @@ def bout_at(session: Session, at_s: float) -> dict[str, Any]:
 def add_bout(
     session: Session, action: str, start_s: float, stop_s: float, *, new_word: bool = False
 ) -> BoutEdit:
-    """Edit that adds a bout; what other bouts say of that time goes.
+    """Edit that adds a bout; other bouts lose that time.
 
     Args:
         session: the session.
-        action: what the animal does.
+        action: the action.
         start_s: start, s since the first frame.
         stop_s: stop, s, exclusive.
-        new_word: the action need not be one of the ethogram's words.
+        new_word: allow an action that is not in the vocabulary.
 
     Raises:
-        SessionError: the span holds no frame, or the word is not known.
+        SessionError: the span has no frame, or the word is unknown.
         LiexError: the action is not a printable word of up to 60 letters.
     """
     word = _word(session, action, new_word)
@@ -399,16 +398,16 @@ def add_bout(
 
 
 def rename_bout(session: Session, at_s: float, action: str, *, new_word: bool = False) -> BoutEdit:
-    """Edit that gives a bout another action; the word that it has already confirms it.
+    """Edit that changes the action of a bout; the same action confirms it.
 
     Args:
         session: the session.
         at_s: a time within the bout, s since the first frame.
-        action: what the animal does.
-        new_word: the action need not be one of the ethogram's words.
+        action: the action.
+        new_word: allow an action that is not in the vocabulary.
 
     Raises:
-        SessionError: no bout holds the time, or the word is not known.
+        SessionError: there is no bout at this time, or the word is unknown.
         LiexError: the action is not a printable word of up to 60 letters.
     """
     bout = bout_at(session, at_s)
@@ -418,16 +417,16 @@ def rename_bout(session: Session, at_s: float, action: str, *, new_word: bool = 
 
 
 def recut_bout(session: Session, at_s: float, start_s: float, stop_s: float) -> BoutEdit:
-    """Edit that gives a bout another start and stop.
+    """Edit that changes start and stop of a bout.
 
     Args:
         session: the session.
-        at_s: a time within the bout as it is, s since the first frame.
+        at_s: a time within the present bout, s since the first frame.
         start_s: new start, s.
         stop_s: new stop, s, exclusive.
 
     Raises:
-        SessionError: no bout holds the time, or the new span holds no frame.
+        SessionError: there is no bout at this time, or the new span has no frame.
     """
     bout = bout_at(session, at_s)
     word = str(bout["action"])
@@ -444,7 +443,7 @@ def delete_bout(session: Session, at_s: float) -> BoutEdit:
         at_s: a time within the bout, s since the first frame.
 
     Raises:
-        SessionError: no bout holds the time.
+        SessionError: there is no bout at this time.
     """
     bout = bout_at(session, at_s)
     span = _span_of(session, bout)
@@ -458,12 +457,12 @@ def labelled_bouts(session: Session, labels: Any) -> list[BoutEdit]:
 
     Args:
         session: the session.
-        labels: a table of `liex_lab.actions.labels`, of this session alone or with its name as
+        labels: a table of `liex_lab.actions.labels`, of this session only or with its name as
             session_id.
 
     Raises:
-        SessionError: the labels are of several recordings and not of this one, or none of them
-            lies within the session.
+        SessionError: the labels are of several recordings without this one, or none of them is
+            within the session.
     """
     from liex_lab.actions.ethogram import Ethogram
     from liex_lab.actions.labels import sessions_named, words_of
@@ -499,10 +498,10 @@ def rows_between(session: Session, start_s: float, stop_s: float, what: str) -> 
         session: the session.
         start_s: start, s since the first frame.
         stop_s: stop, s, exclusive.
-        what: what the span is, for the error message.
+        what: name of the span, for the error message.
 
     Raises:
-        SessionError: the span holds no frame.
+        SessionError: the span has no frame.
     """
     time_s = session.frames["time_s"].to_numpy()
     first, last = (int(np.searchsorted(time_s, at - _ROUNDED_S)) for at in (start_s, stop_s))
@@ -529,7 +528,7 @@ def span_ns(session: Session, start_s: float, stop_s: float) -> tuple[int, int]:
         (start, stop), ns.
 
     Raises:
-        SessionError: the span holds no frame.
+        SessionError: the span has no frame.
     """
     first, last = rows_between(session, start_s, stop_s, "a bout")
     times = session.frames["time_ns"].to_numpy(np.int64)
@@ -537,19 +536,19 @@ def span_ns(session: Session, start_s: float, stop_s: float) -> tuple[int, int]:
 
 
 def _end_ns(session: Session) -> int:
-    """When the last frame ends, on the recording's clock."""
+    """End of the last frame on the recording's clock, ns."""
     time_s = session.frames["time_s"].to_numpy(float)
     return int(session.frames["time_ns"].iloc[0]) + round(1e9 * float(stop_times(time_s)[-1])) + 1
 
 
 def _span_of(session: Session, bout: dict[str, Any]) -> tuple[int, int]:
-    """When a bout of the table begins and ends, on the recording's clock."""
+    """Start and stop of a bout of the table on the recording's clock, ns."""
     first = int(session.frames["time_ns"].iloc[0])
     return first + round(1e9 * bout["start_s"]), first + round(1e9 * bout["stop_s"])
 
 
 def _word(session: Session, action: str, new_word: bool) -> str:
-    """A word for an action, checked."""
+    """The word of an action, validated."""
     word = action.strip()
     known = list(session.metadata.get("actions") or {})
     if not word or len(word) > _WORD_LENGTH or not word.isprintable():
@@ -565,7 +564,7 @@ def _word(session: Session, action: str, new_word: bool) -> str:
 
 
 def _joint_row(session: Session, frame: int, joint: str) -> tuple[int, Array]:
-    """Row of a frame, and the position (3,) mm of a joint of it, arena frame."""
+    """Row of a frame, and the position (3,) mm of one of its joints, arena frame."""
     joints = list(session.metadata["animal"]["joints"])
     if joint not in joints:
         raise SessionError(f"there is no joint '{joint}'; known are {', '.join(joints)}")
@@ -585,14 +584,14 @@ def _joint_row(session: Session, frame: int, joint: str) -> tuple[int, Array]:
 
 
 def descriptions(facts: Mapping[str, str]) -> list[Correction]:
-    """What is known of the animal and the session, as corrections.
+    """Facts about the animal and the session, as corrections.
 
     Args:
         facts: any of `DESCRIBED`; an empty text is unknown.
 
     Raises:
-        SessionError: there is no such fact, or none is given.
-        PlanError: a value cannot be used, as a start time without a time zone.
+        SessionError: a fact is not one of `DESCRIBED`, or none is given.
+        PlanError: a value is invalid, such as a start time without a time zone.
     """
     if not facts:
         raise SessionError(f"nothing to describe; give any of {', '.join(DESCRIBED)} as KEY=VALUE")

@@ -1,24 +1,24 @@
-"""Cut-outs: what a session keeps of every depth image, and the still scene behind it.
+"""Cut-outs: the depth that a session keeps of every frame, and the still scene behind it.
 
-The background of the scene is the farthest depth that keeps recurring in each pixel (see
-`foreground.background`). An animal that hardly moves would become part of it for good, but the
-segmentation knows what is behind such an animal (see `foreground.resting`). In every frame, the
-boxes around the two likeliest things are kept as the camera read them, unread pixels as 0; outside
-of them a kept image shows the background. A frame without any such thing is kept whole, so that
-people can find out why. A box contains the joints of the thing's pose, projected, and a square of
-1.4 square roots of its pixels about its centroid, with a margin of 15 % of the spine all around:
+The background is the farthest depth that keeps recurring in each pixel (see `scene.background`). An
+animal that hardly moves would become part of it, but the segmentation knows the depth behind such
+an animal. In every frame, the boxes around the two likeliest objects are kept as the camera read
+them, unread pixels as 0; outside of them a kept image shows the background. A frame without any
+such object is kept whole, so that people can find out why. A box contains the projected joints of
+the object's pose, and a square of 1.4 square roots of its pixels about its centroid, with a margin
+of 15 % of the spine all around:
 
     box = hull(joints, centroid -+ 0.7 sqrt(n_px)) -+ (0.15 spine f / z + 4 px).
 
-It depends on the single frame alone, so any process makes the same one.
+It depends on the single frame only, so it is the same in every process.
 
-Rerun's viewer reports images that change their size as a broken film. So in its replay cut-outs
+Rerun's viewer reports images of changing size as a broken video. In its replay, cut-outs therefore
 have few sizes, `windows`: from the length of the animal's box on the floor,
 
     a = 1.3 spine f / z + 8 px,
 
 sides of 1, 1.15 and 1.4 times that (animals rear and swim above the floor), and whole images. A
-cut-out lies in the middle of the smallest window that contains it, before the still scene.
+cut-out is centred in the smallest window that contains it, in front of the still scene.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ _THUMBNAILS = 16
 _THUMBNAIL_SIDE = 2.3  # lengths of the animal
 _CUTOUT_SIDE = 1.1
 _CUTOUT_PX = 8.0
-_LEVEL = 3  # of Zstandard, as the logs are packed
+_LEVEL = 3  # of Zstandard, as in the logs
 
 Depth = NDArray[np.uint16]
 Boxes = NDArray[np.int16]
@@ -62,10 +62,10 @@ ANIMAL = "animal"
 ARENA = "arena"
 ALL = "all"
 NONE = "none"
-N_BOXES = 2  # things that a frame may hold
-_FRAMES = 16  # that show the background
-_LARGEST = 4.0  # usual areas of the animal; what is larger is no animal that rests
-_REACH = 0.7  # of the square root of a thing's pixels, to each side of its centroid
+N_BOXES = 2  # objects per frame
+_FRAMES = 16  # from which the background is learned
+_LARGEST = 4.0  # usual areas of the animal; larger objects are not resting animals
+_REACH = 0.7  # of the square root of an object's pixels, to each side of its centroid
 _MARGIN = 0.15  # of the spine
 _MARGIN_PX = 4.0
 _SIDES = (1.0, 1.15, 1.4)  # of windows, in lengths of the animal's box on the floor
@@ -73,35 +73,35 @@ N_WINDOWS = len(_SIDES) ** 2 + 1  # at most; the last is the whole image
 
 
 def still_scene(recording: Recording, known: StillScene | None = None) -> Depth:
-    """The background of the whole image, outside of any region too, from 16 frames.
+    """The background of the whole image, including pixels outside of any region, from 16 frames.
 
     Args:
         recording: an open recording.
-        known: the segmentation's own scene, learned from more frames, which tells an animal that
-            rests; None for a hand.
+        known: the segmentation's own scene, learned from more frames, which can identify a resting
+            animal; None for a hand.
 
     Returns:
-        (H, W) uint16 mm, smoothed by a median of 3 x 3 pixels, 0 where nothing keeps coming back.
+        (H, W) uint16 mm, smoothed by a median of 3 x 3 pixels, 0 where no depth recurs.
     """
     import cv2
 
     from liex_lab.scene.background import learn_background, sample_frames
 
     learned = to_millimetres(learn_background(sample_frames(recording, _FRAMES))[0])
-    # specks of 16 frames are no scene
+    # remove specks of the small sample
     smooth: Depth = np.asarray(cv2.medianBlur(learned, 3), np.uint16)
     return smooth if known is None else _without_animals(smooth, known)
 
 
 def _without_animals(image: Depth, known: StillScene) -> Depth:
-    """An image in which what the segmentation would take for the animal is its background.
+    """Replace what the segmentation would take for the animal by the background.
 
-    Things of more than four times the animal's usual area stay: where the bare plane is all that is
-    known of the floor, so does what always stands on it.
+    Objects of more than four times the animal's usual area stay: if only the bare plane is known of
+    the floor, so do permanent objects on it.
 
     Args:
         image: (H, W) uint16 mm.
-        known: the segmentation's scene, of every so many-th of its pixels.
+        known: the segmentation's scene, on a subsampled pixel grid.
     """
     import cv2
 
@@ -115,8 +115,8 @@ def _without_animals(image: Depth, known: StillScene) -> Depth:
     _, labels = cv2.connectedComponents(stands.astype(np.uint8))
     areas = np.bincount(labels.ravel(), image.ravel().astype(np.float64) ** 2)
     rests = areas / (known.camera.fx * known.camera.fy) < _LARGEST * known.area_mm2
-    rests[0] = False  # what does not stand out
-    # its edge stands out by less than what counts as the animal
+    rests[0] = False  # the background itself
+    # the animal's edge is below the segmentation's limit
     around = np.ones((2 * step + 3, 2 * step + 3), np.uint8)
     own = cv2.dilate(rests[labels].astype(np.uint8), around).astype(bool)
     behind = to_millimetres(background)
@@ -124,10 +124,10 @@ def _without_animals(image: Depth, known: StillScene) -> Depth:
 
 
 class DepthKeeper:
-    """What is kept of a session's depth images, as its plan says.
+    """Selects the depth that a session keeps, according to its plan.
 
     Args:
-        origin: camera, animal, background, and how much of the depth is to be kept.
+        origin: camera, animal, background, and extent of the depth to keep.
     """
 
     def __init__(self, origin: Provenance) -> None:
@@ -137,10 +137,10 @@ class DepthKeeper:
         self._arena = _arena(origin) if self._kept == ARENA else (0, 0, 0, 0)
 
     def boxes(self, seen: Observations | None) -> Boxes | None:
-        """Where the images of some frames are kept as they are read, and not as the background.
+        """Boxes in which images are kept as read; the background replaces the rest.
 
         Args:
-            seen: the hypotheses of these n frames; None if nobody looked for an animal.
+            seen: the hypotheses of these n frames; None without a search for an animal.
 
         Returns:
             (n, K, 4) int16 of left, top, right and bottom (px, the latter two exclusive, all 0 for
@@ -155,11 +155,11 @@ class DepthKeeper:
         boxes = boxes_around(seen, self._origin)
         camera = self._origin.camera
         nothing = ~boxes.any(axis=(1, 2))
-        boxes[nothing, 0] = (0, 0, camera.width, camera.height)  # to be looked at why
+        boxes[nothing, 0] = (0, 0, camera.width, camera.height)  # for people to find out why
         return boxes
 
     def keep(self, depth: Sequence[NDArray[np.float32]], boxes: Boxes | None) -> list[Depth]:
-        """The images as they are kept; none where no depth is.
+        """The images to keep; empty if no depth is kept.
 
         Args:
             depth: n images (H, W) float32 mm, 0 where unread.
@@ -179,7 +179,7 @@ class DepthKeeper:
 
 
 def _region(origin: Provenance) -> NDArray[np.bool_] | None:
-    """(H, W) the arena's region; None is the whole image."""
+    """(H, W) mask of the arena's region; None for the whole image."""
     from liex_lab.recordings.frame import region_mask
 
     if origin.scene is None or not origin.scene.region_px:
@@ -198,14 +198,13 @@ def _arena(origin: Provenance) -> tuple[int, int, int, int]:
 
 
 def windows(origin: Provenance) -> list[tuple[int, int]]:
-    """Sizes in which cut-outs stand in the Rerun replay; they follow from these facts alone.
+    """Sizes of cut-outs in the Rerun replay, determined by the provenance.
 
     Args:
-        origin: camera, its distance from the floor, the animal's length, and what is kept.
+        origin: camera, its distance from the floor, the animal's length, and extent of the depth.
 
     Returns:
-        At most `N_WINDOWS` times (width, height) px, the smallest area first; the last is the whole
-        image.
+        At most `N_WINDOWS` of (width, height) px, smallest area first; the last is the whole image.
     """
     camera = origin.camera
     sizes = {(camera.width, camera.height)}
@@ -223,14 +222,14 @@ def windows(origin: Provenance) -> list[tuple[int, int]]:
 def window_around(
     box: Sequence[int], sizes: Sequence[tuple[int, int]]
 ) -> tuple[int, tuple[int, int, int, int]]:
-    """The smallest window that holds a box, around its middle.
+    """The smallest window that contains a box, centred on it where the image allows.
 
     Args:
         box: left, top, right, bottom, px, in the image.
         sizes: of windows, see `windows`.
 
     Returns:
-        Which size it is, and left, top, right, bottom, px.
+        Index of the size, and left, top, right, bottom, px.
     """
     left, top, right, bottom = box
     width = right - left
@@ -247,21 +246,21 @@ def _spine_mm(origin: Provenance) -> float:
 
 
 def boxes_around(seen: Observations, origin: Provenance) -> Boxes:
-    """The boxes around the things that single frames took for the animal.
+    """The boxes around the likely animals of single frames.
 
     Args:
         seen: the hypotheses of n frames.
-        origin: camera, its place, and the animal's length.
+        origin: camera, its pose, and the animal's length.
 
     Returns:
-        (n, 2, 4) int16 left, top, right, bottom, px; all 0 where there is no such thing.
+        (n, 2, 4) int16 left, top, right, bottom, px; all 0 for no object.
     """
     camera = origin.camera
     into = origin.T_arena_camera.inverse()
     spine_mm = _spine_mm(origin)
     found = np.zeros((len(seen), N_BOXES, 4), np.int16)
     for k in range(N_BOXES):
-        h = 2 * k  # the other hypothesis of each thing is the same one turned round
+        h = 2 * k  # the other hypothesis of each object is the same one reversed
         rows = np.flatnonzero(seen.known[:, h] & (seen.n_px[:, h] > 0))
         if not len(rows):
             continue
@@ -293,7 +292,7 @@ def composed(depth: NDArray[np.float32], boxes: Boxes, background: Depth) -> Dep
         background: (H, W) uint16 mm.
 
     Returns:
-        (H, W) uint16 mm, an image of its own.
+        (H, W) uint16 mm, a new array.
     """
     picture = background.copy()
     for left, top, right, bottom in boxes.tolist():
@@ -302,27 +301,22 @@ def composed(depth: NDArray[np.float32], boxes: Boxes, background: Depth) -> Dep
 
 
 def write_boxes(folder: Path, boxes: Boxes) -> None:
-    """Write cutouts.npz.
-
-    Args:
-        folder: the session's folder.
-        boxes: (n, K, 4) of every frame.
-    """
+    """Write the boxes (n, K, 4) of every frame to cutouts.npz in the session's folder."""
     np.savez_compressed(folder / FILE, boxes=boxes)
 
 
 def meant_to_keep_depth(session: Session) -> bool:
-    """Whether a session's plan lets its replay keep depth.
+    """Whether a session's plan keeps depth in its replay.
 
     Args:
-        session: the session; plans of earlier versions say true or false, or nothing.
+        session: the session; plans of earlier versions have a boolean, or no value.
     """
     plan = session.metadata.get("plan", {})
     return plan.get("replay", {}).get("depth", ALL) not in (NONE, False)
 
 
 def open_pictures(session: Session) -> Recording:
-    """The depth images that a session keeps, as a recording; a session's images are read here.
+    """The depth images that a session keeps, as a recording.
 
     Outside of its boxes an image shows the still scene, see `Kept`.
 
@@ -351,14 +345,14 @@ def open_pictures(session: Session) -> Recording:
 
 
 class Kept:
-    """Where the images of a session are what the camera read, and not the still scene.
+    """Where a session's images are as the camera read them, instead of the still scene.
 
     Args:
         session: the session.
 
     Attributes:
-        boxes: (n, K, 4) left, top, right and bottom of every frame's cut-outs, px; None of a
-            session that keeps whole images, or none.
+        boxes: (n, K, 4) left, top, right and bottom of every frame's cut-outs, px; None for a
+            session with whole images, or none.
 
     Raises:
         SessionError: its file is damaged.
@@ -375,7 +369,7 @@ class Kept:
                 self.boxes = boxes
 
     def holds(self, row: int, u_px: float, v_px: float) -> bool:
-        """Whether a pixel of a frame was kept as it was read.
+        """Whether a pixel of a frame was kept as read.
 
         Args:
             row: the frame's row in the table `frames`.
@@ -397,21 +391,21 @@ def needed_bytes(
     length_px: float,
     kept: str = ANIMAL,
 ) -> int:
-    """Bytes that a session takes, within a factor of two.
+    """Estimated size of a session, bytes, within a factor of two.
 
     bytes = once + n_frames (1,000 + 260 J + 2 (c A + 1,500))
 
     Every frame has rows of tables and messages, some 260 bytes per joint, and two copies of the
-    depth that is kept (session.rrd, session.mcap): A pixels that compress to c bytes each, as the
-    recording's own depth images do. A report, figures, descriptions and sixteen thumbnails come on
-    top. The numbers were measured on sessions of mice, fish and hands of 100 to 1,500 frames.
+    kept depth (session.rrd, session.mcap): A pixels that compress to c bytes each, as the
+    recording's own depth images do. A report, figures, descriptions and sixteen thumbnails are
+    added. The numbers were measured on sessions of mice, fish and hands of 100 to 1,500 frames.
 
     Args:
         images: some depth images (H, W) of the recording, mm.
         n_frames: frames of the recording.
         n_joints: joints of the animal.
         length_px: length of the animal in the image.
-        kept: how much of the depth is kept, as in `[replay] depth`.
+        kept: extent of the kept depth, as in `[replay] depth`.
     """
     import zstandard
 

@@ -1,8 +1,8 @@
-"""What a session was made of, read back: observations, skeleton, track, provenance, recording.
+"""Intermediate results of a session, read back: observations, skeleton, track, provenance,
+recording.
 
-The file observations.npz contains the pose hypotheses of every single frame, before association and
-smoothing, and the animal and camera that they are of. The track is made again from them after a
-correction.
+The file observations.npz contains the pose hypotheses of every frame, before association and
+smoothing, and their animal and camera. After a correction, the track is recomputed from them.
 """
 
 from __future__ import annotations
@@ -41,22 +41,22 @@ _ADDRESS = "synthetic:"
 Array = NDArray[np.float64]
 
 FILE = "observations.npz"
-# columns that sessions of earlier versions do not hold
+# columns that sessions of earlier versions lack
 _LATER = ("covered", "beside", "behind", "part_mm", "repeats")
-_BYTES_PER_JOINT = 1 << 10  # of a frame; several times what there are
+_BYTES_PER_JOINT = 1 << 10  # upper limit per frame, several times the true size
 _SPARE_BYTES = 1 << 26  # for the skeleton and its mesh
-_BLOCK = 16_384  # frames that are in memory at a time
+_BLOCK = 16_384  # frames in memory at a time
 
 
 def write_evidence(folder: Path, seen: Observations, subject: Subject) -> None:
     """Write observations.npz, a compressed NumPy archive without pickle.
 
-    Blocks of frames are written in turn, so that hours of recording need little memory.
+    Frames are written in blocks, so that long recordings need little memory.
 
     Args:
-        folder: the folder that the file goes into.
+        folder: the folder of the file.
         seen: the hypotheses of every frame.
-        subject: animal and camera that they are of.
+        subject: their animal and camera.
     """
     facts = {
         "skeleton": subject.skeleton.table,
@@ -72,7 +72,7 @@ def write_evidence(folder: Path, seen: Observations, subject: Subject) -> None:
     columns = {"subject": told, **{name: getattr(seen, name) for name in COLUMNS}}
     with zipfile.ZipFile(
         folder / FILE, "w", zipfile.ZIP_DEFLATED
-    ) as kept:  # as np.savez_compressed, a part at a time
+    ) as kept:  # as np.savez_compressed, in parts
         for name, values in columns.items():
             with kept.open(f"{name}.npy", "w", force_zip64=True) as file:
                 kind = np.lib.format.dtype_to_descr(values.dtype)
@@ -83,7 +83,7 @@ def write_evidence(folder: Path, seen: Observations, subject: Subject) -> None:
 
 
 def read_skeleton(session: Session) -> Skeleton | None:
-    """The skeleton that a session was made with; None for a session that does not hold it.
+    """The skeleton of a session's observations; None for a session without observations.
 
     Args:
         session: the session.
@@ -103,17 +103,17 @@ def read_skeleton(session: Session) -> Skeleton | None:
 
 
 def read_evidence(session: Session) -> tuple[Observations, Subject]:
-    """Read what `write_evidence` wrote.
+    """Read the file written by `write_evidence`.
 
     Args:
         session: the session.
 
     Returns:
-        The hypotheses of every frame, and the animal and camera that they are of.
+        The hypotheses of every frame, and their animal and camera.
 
     Raises:
-        SessionError: the session holds no observations, as those of earlier versions, or the file
-            is damaged.
+        SessionError: the session has no observations, as in earlier versions, or the file is
+            damaged.
     """
     path = session.path / FILE
     if not path.is_file():
@@ -137,7 +137,7 @@ def read_evidence(session: Session) -> tuple[Observations, Subject]:
             ),
         )
         _check_shapes(seen, len(session.frames))
-        # sessions of earlier versions do not tell
+        # missing in sessions of earlier versions
         stretch = facts.get("stretch_sd")
         unseen = facts.get("unseen")
         subject = Subject(
@@ -156,14 +156,14 @@ def read_evidence(session: Session) -> tuple[Observations, Subject]:
 
 
 def read_things(session: Session) -> NDArray[np.float64] | None:
-    """Where the two likeliest things of every frame are, of the observations no more than that.
+    """Positions of the two likeliest objects of every frame, without the rest of the observations.
 
     Args:
         session: the session.
 
     Returns:
-        (n, 2, 3) centre of the best and of the second thing of about the animal's size, arena
-        frame, mm; NaN where there is none. None for a session that does not hold its observations.
+        (n, 2, 3) centre of the best and of the second object of about the animal's size, arena
+        frame, mm; NaN if absent. None for a session without observations.
 
     Raises:
         SessionError: the file is damaged.
@@ -176,7 +176,7 @@ def read_things(session: Session) -> NDArray[np.float64] | None:
         _opened(path, session) as file,
         np.load(file, allow_pickle=False) as kept,
     ):
-        centre = kept["centroid_mm"][:, ::2].astype(np.float64)  # h ^ 1 is the same thing
+        centre = kept["centroid_mm"][:, ::2].astype(np.float64)  # h ^ 1 is the same object
         centre[~np.isfinite(kept["score"]).reshape(len(centre), -1, 2).any(axis=2)] = np.nan
         if centre.shape != (session.metadata["frames"]["n_frames"], 2, 3):
             raise ValueError(f"centres of things are {centre.shape}, not those of every frame")
@@ -184,7 +184,7 @@ def read_things(session: Session) -> NDArray[np.float64] | None:
 
 
 def _opened(path: Path, session: Session) -> IO[bytes]:
-    """The file, open, once it is known to be no larger than so many frames and joints make it."""
+    """Open the file after checking its size against the numbers of frames and joints."""
     n_joints = len(session.metadata["animal"]["joints"])
     n_frames = session.metadata["frames"]["n_frames"]
     check_npz(path, _SPARE_BYTES + n_frames * (n_joints + 1) * _BYTES_PER_JOINT)
@@ -192,7 +192,7 @@ def _opened(path: Path, session: Session) -> IO[bytes]:
 
 
 def _check_shapes(seen: Observations, n_frames: int) -> None:
-    """Raises ValueError where the arrays are not of so many frames."""
+    """Raises ValueError if the arrays do not match the number of frames."""
     wanted = Observations.empty(seen.skeleton, np.zeros(n_frames, np.int64))
     for name in COLUMNS:
         found = getattr(seen, name)
@@ -225,11 +225,11 @@ def read_flips(session: Session) -> list[Flip]:
 
 
 def provenance_of(session: Session, skeleton: Skeleton) -> Provenance:
-    """Provenance of a session, as it was stated when the session was first written.
+    """Provenance of a session, as stated when it was first written.
 
     Args:
         session: the session.
-        skeleton: the skeleton that it was made with.
+        skeleton: its skeleton.
     """
     about = session.metadata
     camera = session.metadata["camera"]
@@ -261,7 +261,7 @@ def provenance_of(session: Session, skeleton: Skeleton) -> Provenance:
 
 
 def _camera_gaps(session: Session) -> list[Gap]:
-    """Frames that the camera did not deliver and moved timestamps, out of the table `gaps`."""
+    """Frames that the camera did not deliver and moved timestamps, from the table `gaps`."""
     times, index = (session.frames[name].to_numpy() for name in ("time_ns", "frame_index"))
     found = []
     for row in _rows_of(session.gaps[~session.gaps["reason"].isin(LOST)]):
@@ -287,11 +287,11 @@ def _rows_of(table: pd.DataFrame) -> list[dict[str, Any]]:
 
 
 def link_to(recording: str | Path, folder: Path) -> dict[str, Any]:
-    """The link for the section `input` of session.json, beside the recording's hash.
+    """The link for the section `input` of session.json, next to the recording's hash.
 
     Args:
         recording: path of the recording, or address of a virtual one.
-        folder: where the session will be.
+        folder: final path of the session.
     """
     if str(recording).startswith(_ADDRESS):
         return {"path": str(recording)}
@@ -303,13 +303,11 @@ def link_to(recording: str | Path, folder: Path) -> dict[str, Any]:
 
 
 def linked_recording(session: Session) -> str | None:
-    """Path or address of the recording, whether it is there or not.
+    """Path or address of the recording, which may not exist; None if not stated, as in earlier
+    versions.
 
     Args:
         session: the session.
-
-    Returns:
-        None of a session that does not say, as those of earlier versions.
     """
     stated = session.metadata["input"].get("path")
     if not isinstance(stated, str) or not stated:
@@ -318,7 +316,7 @@ def linked_recording(session: Session) -> str | None:
 
 
 def skeleton_of(session: Session) -> Skeleton:
-    """Skeleton of a session: as it was then or, for an older session, as it is now.
+    """Skeleton of a session: the stored one or, for an older session, the current one.
 
     Args:
         session: the session.
@@ -333,14 +331,14 @@ def skeleton_of(session: Session) -> Skeleton:
 
 
 def track_of(session: Session, skeleton: Skeleton | None = None) -> Track:
-    """The whole track of a session; what an older session does not tell is as in `Track.empty`.
+    """The whole track of a session; values missing in older sessions are as in `Track.empty`.
 
     Args:
         session: the session.
-        skeleton: its skeleton; None reads it.
+        skeleton: its skeleton; None to read it.
 
     Raises:
-        SessionError: the tables have other numbers of rows than the frames and joints need.
+        SessionError: the tables do not have the number of rows for the frames and joints.
     """
     skeleton = skeleton or skeleton_of(session)
     frames = session.frames
@@ -381,7 +379,7 @@ def track_of(session: Session, skeleton: Skeleton | None = None) -> Track:
 def _covariance(roots: pd.DataFrame, sd: Array) -> Array:
     """Covariances (n, 6, 6) of the root from its rows and its standard deviations (n, 6).
 
-    Of an older session the standard deviations alone are known; the rest is NaN.
+    An older session only has the standard deviations; the rest is NaN.
     """
     out = np.zeros((len(sd), 6, 6))
     out[:, range(6), range(6)] = sd**2
@@ -405,7 +403,7 @@ def wall_of(session: Session) -> Array:
 
 
 def _columns(table: pd.DataFrame, names: list[str]) -> Array:
-    """Columns side by side, NaN where an older table lacks one."""
+    """Columns as one array, NaN if an older table lacks one."""
     lacking = np.full(len(table), np.nan)
     return np.column_stack(
         [table[name].to_numpy(float) if name in table else lacking for name in names]

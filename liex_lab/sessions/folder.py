@@ -1,4 +1,4 @@
-"""Folder of a session: its name, whether it may be written, failed.json, space on the disk."""
+"""Folder of a session: its name, write checks, failed.json, and free disk space."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ _REPORT = "report it to the makers of liex_lab with the lines under traceback"
 
 
 def describe_failure(error: BaseException, stage: str, frame: int | None) -> dict[str, Any]:
-    """Table of what is to be said about an error, the content of failed.json.
+    """Description of an error, the content of failed.json.
 
-    Errors that are not of a user's making carry their traceback.
+    Errors that the user did not cause include their traceback.
 
     Args:
         error: the error.
-        stage: what was being done.
+        stage: the current stage of the work.
         frame: the last frame that was measured; None if none was.
 
     Returns:
@@ -73,8 +73,8 @@ def write_failure(folder: Path, failure: dict[str, Any]) -> None:
     """Write failed.json into a session's folder, whole or not at all.
 
     Args:
-        folder: the session folder; made if needed.
-        failure: what `describe_failure` returned.
+        folder: the session folder; created if needed.
+        failure: the result of `describe_failure`.
     """
     unlinked(folder).mkdir(parents=True, exist_ok=True)
     told = storable_document(failure)
@@ -84,11 +84,13 @@ def write_failure(folder: Path, failure: dict[str, Any]) -> None:
 def read_failure(folder: Path) -> dict[str, Any] | None:
     """The failed.json in a folder; None if absent.
 
+    A damaged file is reported as the failure's reason.
+
     Args:
         folder: the session folder.
 
     Returns:
-        What `describe_failure` returned; of a damaged file a table that states it as its reason.
+        The result of `describe_failure`.
     """
     path = folder / FAILED_FILE
     if not path.is_file():
@@ -112,16 +114,16 @@ _HASHED = {".parquet", ".csv", ".json", ".toml"}
 
 
 def part_folder(path: Path) -> Path:
-    """Folder NAME.part in which a session lies until it is whole.
+    """Folder NAME.part of a session until it is complete.
 
     Args:
-        path: the session folder to be.
+        path: final path of the session.
     """
     return _named(path).with_name(f"{_named(path).name}.part")
 
 
 def aside_folder(path: Path) -> Path:
-    """Folder NAME.old in which a session waits while a new one takes its place.
+    """Folder NAME.old of a session while a new one replaces it.
 
     Args:
         path: the session folder.
@@ -130,22 +132,22 @@ def aside_folder(path: Path) -> Path:
 
 
 def _named(path: Path) -> Path:
-    """The folder by a name of its own, which "." and ".." are not."""
+    """The folder with an explicit name, unlike "." and ".."."""
     return path if path.name not in ("", "..") else path.resolve()
 
 
 def check_writable(path: Path, overwrite: bool) -> None:
-    """Refuse to write over what must not be lost, or where no folder can be.
+    """Refuse to overwrite what must not be lost, or to write where no folder can be created.
 
-    A folder with nothing in it but failed.json may be replaced.
+    A folder that contains only failed.json may be replaced.
 
     Args:
-        path: the session folder to be.
-        overwrite: whether a session that is there already may be replaced.
+        path: final path of the session.
+        overwrite: whether an existing session may be replaced.
 
     Raises:
         SessionError: the session may not be written there.
-        PlaceError: the session's place, or one beside it that is needed, is a symbolic link.
+        PlaceError: the session's path, or NAME.part or NAME.old, is a symbolic link.
     """
     for place in (path, part_folder(path), aside_folder(path)):
         unlinked(place)
@@ -158,7 +160,7 @@ def check_writable(path: Path, overwrite: bool) -> None:
     if not path.exists() or (
         path.is_dir() and {entry.name for entry in path.iterdir()} <= {FAILED_FILE}
     ):
-        return  # what failed before may be replaced
+        return  # a failed session may be replaced
     if not (path / "session.json").is_file():
         raise SessionError(
             f"{path} exists and is not a session, so it is left alone; choose another place "
@@ -172,9 +174,9 @@ def check_writable(path: Path, overwrite: bool) -> None:
 
 
 def file_facts(folder: Path) -> dict[str, Any]:
-    """Bytes of every table, log and small file of a folder by its name, for `liex verify`.
+    """Bytes of every table, log and small file of a folder by name, for `liex verify`.
 
-    All but the logs have their SHA-256, too.
+    All but the logs also have their SHA-256.
     """
     found: dict[str, Any] = {}
     for path in sorted(folder.iterdir()):
@@ -185,21 +187,21 @@ def file_facts(folder: Path) -> dict[str, Any]:
     return found
 
 
-# Room on disk that a session takes, estimated before its first frame.
+# Disk space of a session, estimated before its first frame.
 
 
-_SURE = 0.5  # of the estimate: with less room than that it is no use to begin
+_SURE = 0.5  # of the estimate: least free space to begin with
 
 
 def check_room(folder: Path, needed: int) -> None:
-    """Refuse to begin a session that the disk has not enough room for.
+    """Refuse to begin a session for which the disk does not have enough space.
 
-    What an unfinished session of that place has written already is there. Whoever has between half
-    and all of the estimate may begin, for it is no more than that.
+    Bytes already written by an unfinished session of the same path count as available. Between half
+    and all of the estimate is accepted, because it is only an estimate.
 
     Args:
-        folder: the session folder to be.
-        needed: what it takes, bytes.
+        folder: final path of the session.
+        needed: estimated size, bytes.
 
     Raises:
         SessionError: the disk has less than half of that.
@@ -217,18 +219,10 @@ def check_room(folder: Path, needed: int) -> None:
 
 
 def folder_bytes(folder: Path) -> int:
-    """Bytes of all files of a folder; 0 of one that is not there.
-
-    Args:
-        folder: the folder.
-    """
+    """Bytes of all files of a folder; 0 if it does not exist."""
     return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
 
 
 def megabytes(size: float) -> str:
-    """A size for people, in MB or GB.
-
-    Args:
-        size: bytes.
-    """
+    """A size in bytes as text, in MB or GB."""
     return f"{size / 1e9:.1f} GB" if size >= 1e9 else f"{size / 1e6:.1f} MB"

@@ -2,10 +2,9 @@
 
 Messages follow Foxglove's schemas (RawImage 16UC1 in mm, CameraCalibration, FrameTransforms,
 SceneUpdate, PosesInFrame, ImageAnnotations, Log) and JSON schemas of our own for actions and the
-predicted error.
-Images are whole, for Foxglove shows a single one. Zstandard finds the still scene behind cut-outs
-in the previous image, some 50 images to a chunk. Depth streams in as it comes; everything small is
-written at the end from the same track the tables are made of.
+predicted error. Images are whole, because Foxglove shows a single one. Zstandard finds the still
+scene behind cut-outs in the previous image, some 50 images per chunk. Depth is streamed; everything
+small is written at the end from the same track as the tables.
 """
 
 from __future__ import annotations
@@ -35,8 +34,8 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 _SECOND = 10**9
-_BLOCK = 8192  # frames of a track that are in memory
-_DATA = b"\x32"  # tag of the field of RawImage that holds the pixels: number 6, bytes
+_BLOCK = 8192  # frames of a track in memory at a time
+_DATA = b"\x32"  # tag of the pixels' field of RawImage: number 6, bytes
 _TIME = {
     "type": "object",
     "title": "time",
@@ -86,13 +85,13 @@ _JOINT = messages.Color(r=1.0, g=0.31, b=0.24, a=1.0)
 
 
 class _Packing(NamedTuple):
-    """How images are packed.
+    """Compression of images.
 
     Attributes:
         level: of Zstandard.
         chunk_size: bytes packed together.
-        repetition: bytes of what is looked for far back, see `McapLog`.
-        window: bytes in which that is looked for.
+        repetition: least length of a distant repetition, bytes, see `McapLog`.
+        window: bytes searched for repetitions.
     """
 
     level: int
@@ -102,10 +101,9 @@ class _Packing(NamedTuple):
 
 
 def _packing_of(origin: Provenance) -> _Packing:
-    """Whole images one to a chunk; or those that are alike but for a cut-out.
+    """Whole images one per chunk, or many images that only differ in a cut-out.
 
-    The still scene of these is in the image before, and short repetitions would end where it goes
-    on.
+    The latter repeat the still scene of the previous image; short repetitions would split it.
     """
     if origin.background is None:
         return _Packing(level=3, chunk_size=128 * 1024, repetition=0, window=1 << 23)
@@ -135,9 +133,9 @@ class McapWriter:
         Args:
             path: the file to write.
             origin: camera, its position and the skeleton.
-            level: Zstandard compression level, 0 for the usual one, 22 for the smallest file; None
-                takes what suits the images that are kept.
-            chunk_size: bytes packed at once; None as well.
+            level: Zstandard compression level, 0 for the default, 22 for the smallest file; None
+                chooses by the kept images.
+            chunk_size: bytes packed at once; None as for level.
             resume: append to a file that ends after `flushed`.
         """
         usual = _packing_of(origin)
@@ -172,10 +170,10 @@ class McapWriter:
 
         Args:
             times_ns: times of the n frames, ns.
-            depth: n images (H, W) uint16 mm, 0 where unread; none where depth is not kept.
+            depth: n images (H, W) uint16 mm, 0 where unread; empty if depth is not kept.
 
         Raises:
-            OSError: the system refused to write.
+            OSError: a write failed.
         """
         with _naming(self._path):
             for time_ns, image in zip_longest(map(int, times_ns), depth):
@@ -190,13 +188,13 @@ class McapWriter:
         """Write skeleton, transforms, actions and notes of the whole track, and close the file.
 
         Args:
-            rows: the track as the tables see it.
+            rows: the track in the form of the tables.
             bouts: the table `bouts`.
-            words: the ethogram's vocabulary; a word's place in it is its index in the messages.
+            words: the ethogram's vocabulary; a word's position is its index in the messages.
             problems: sentences about the recording, logged as warnings at the first frame.
 
         Raises:
-            OSError: the system refused to write.
+            OSError: a write failed.
         """
         track = rows.track
         with _naming(self._path):
@@ -229,10 +227,10 @@ class McapWriter:
                 self._log_json("/predicted_error", time_ns, {"predicted_error_mm": error_mm})
 
     def flushed(self) -> int:
-        """Hand everything to the operating system; returns the file's bytes.
+        """Pass everything to the operating system; returns the file's bytes.
 
         Raises:
-            OSError: the system refused to write.
+            OSError: a write failed.
         """
         with _naming(self._path):
             self._log.flush()
@@ -243,7 +241,7 @@ class McapWriter:
         """Close the file, whole or not.
 
         Raises:
-            OSError: the system refused to write.
+            OSError: a write failed.
         """
         with _naming(self._path), closing(self._file):
             self._log.close()
@@ -268,8 +266,8 @@ class McapWriter:
         self._log_message("/tf", time_ns, messages.FrameTransforms(transforms=[transform]))
 
     def _scene_update(self, time_ns: int, joints_m: Array, seen: bool) -> messages.SceneUpdate:
-        """Bones as lines and joints as spheres under one entity id; the entity goes when the animal
-        is lost.
+        """Bones as lines and joints as spheres under one entity id, which is deleted without a
+        pose.
         """
         stamp = _stamp(time_ns)
         if not seen:
@@ -318,7 +316,7 @@ class McapWriter:
         return messages.ImageAnnotations(points=[lines])
 
     def _log_actions(self, rows: Rows, bouts: pd.DataFrame, words: Sequence[str]) -> None:
-        """One message per change, at the time of the frame where it happens."""
+        """One message per change, at the time of its frame."""
         changes: dict[int, str] = {}
         for start_s, stop_s, action in zip(
             bouts["start_s"], bouts["stop_s"], bouts["action"], strict=True
@@ -346,7 +344,7 @@ class McapWriter:
 
 @contextmanager
 def _naming(path: Path) -> Iterator[None]:
-    """Add the file's name to errors of the system within the block; writing leaves it out."""
+    """Add the file's name, missing in errors of writing, to OSErrors within the block."""
     try:
         yield
     except OSError as error:
@@ -385,10 +383,9 @@ def _quaternion(transform: SE3) -> Array:
 
 
 def _picture(time_ns: int | np.int64, image: NDArray[np.uint16]) -> list[bytes | memoryview]:
-    """A depth image as a `RawImage`, in parts: the pixels are not copied into it.
+    """A depth image as a `RawImage`, in parts, without a copy of the pixels.
 
-    Protobuf's fields follow each other by their numbers, and only that of the frame comes after the
-    pixels.
+    Protobuf's fields are in order of their numbers, and only the frame id follows the pixels.
     """
     height, width = image.shape
     pixels = np.ascontiguousarray(image, "<u2")
@@ -404,7 +401,7 @@ def _picture(time_ns: int | np.int64, image: NDArray[np.uint16]) -> list[bytes |
 
 
 def _varint(number: int) -> bytes:
-    """A number as Protobuf writes lengths: seven bits a byte, the lowest first."""
+    """A number in Protobuf's varint encoding: seven bits per byte, lowest first."""
     out = bytearray()
     while number > 127:
         out.append(number & 127 | 128)

@@ -1,10 +1,10 @@
 """Append-only writer of MCAP files; a file that was cut after a flush can be resumed.
 
-Foxglove's own writer packs while it holds Python's lock, which stops everything else for a
-millisecond per depth image. It also lacks long-distance matching, which finds the still scene in
-the previous image at a quarter of the cost. Records are encoded by the `mcap` library; their order
-follows the format (https://mcap.dev/spec): header, chunks each followed by the indexes of their
-messages, end of data, summary with offsets, footer.
+Foxglove's own writer holds the GIL while compressing, which stops everything else for a millisecond
+per depth image. It also lacks long-distance matching, which finds the still scene in the previous
+image at a quarter of the cost. Records are encoded by the `mcap` library; their order follows the
+format (https://mcap.dev/spec): header, chunks each followed by the indexes of their messages, end
+of data, summary with offsets, footer.
 """
 
 from __future__ import annotations
@@ -43,13 +43,13 @@ from liex_lab.errors import SessionError
 from liex_lab.recordings.formats.messages.mcap import MAGIC, MESSAGE, RECORD
 
 _WINDOW = 1 << 23
-_LEAST, _MOST = 10, 27  # log2 of the windows that every reader of Zstandard takes
+_LEAST, _MOST = 10, 27  # log2 of the windows that every Zstandard reader accepts
 
 
 @dataclass(frozen=True)
 class MessageType:
     """Schema of a topic's messages, such as "foxglove.RawImage" in "protobuf" or "jsonschema", and
-    the encoding of the messages themselves, "protobuf" or "json".
+    the encoding of the messages, "protobuf" or "json".
     """
 
     name: str
@@ -59,7 +59,7 @@ class MessageType:
 
 
 class _Chunk:
-    """A chunk in progress: messages are compressed as they come, so none waits in memory."""
+    """A chunk in progress: messages are compressed as they arrive, so none waits in memory."""
 
     def __init__(self, packer: zstandard.ZstdCompressor) -> None:
         self._packing = packer.compressobj()
@@ -109,16 +109,16 @@ class McapLog:
         """Write the beginning of the file, unless it is resumed.
 
         Args:
-            sink: where bytes are appended; it is left open.
-            profile: what the messages are for.
+            sink: binary stream for appending; it stays open.
+            profile: purpose of the messages.
             library: name and version of the writing program.
             level: Zstandard level, 1 to 22.
             chunk_size: bytes of messages that are compressed together.
-            repetition: shortest distant repetition to look for, bytes; 0 for Zstandard's 64.
+            repetition: shortest distant repetition to find, bytes; 0 for Zstandard's 64.
             window: bytes searched for repetitions, rounded up to a power of two, 1 kB to 128 MB; a
                 window larger than the processor's cache is slow.
-            written: what `sink` holds already, a file of the same topics that ends after a flush;
-                it is read once.
+            written: the present content of `sink`, a file of the same topics that ends after a
+                flush; it is read once.
         """
         self._sink = sink
         self._at = 0
@@ -177,7 +177,7 @@ class McapLog:
     def log(
         self, topic: str, kind: MessageType, data: Sequence[bytes | memoryview], time_ns: int
     ) -> None:
-        """Add a message that was logged and published at a time, encoded, in one or more parts."""
+        """Add an encoded message, in one or more parts, logged and published at a time."""
         channel = self.declare(topic, kind)
         chunk = self._open
         if channel.id not in self._introduced:  # in the chunk of its first message
@@ -193,12 +193,12 @@ class McapLog:
             self.flush()
 
     def flush(self) -> None:
-        """Write the waiting messages; a file that ends here can be read up to here."""
+        """Write the waiting messages; a file that ends here is readable up to here."""
         chunk = self._open
         if not chunk.indexes:
             return
         record = chunk.record()
-        self._open = _Chunk(self._packer)  # not before: it takes the packer's state
+        self._open = _Chunk(self._packer)  # not earlier: it resets the packer's state
         start = self._at
         self._write(_bytes_of(record))
         self._index_chunk(record, start)
@@ -273,7 +273,7 @@ class McapLog:
 def append_chunks(source: Path, log: Path) -> None:
     """Append the chunks of an MCAP file without an end to another one of the same topics."""
     with source.open("rb") as file, log.open("ab") as whole:
-        if whole.tell():  # its magic bytes and header are there
+        if whole.tell():  # magic bytes and header exist already
             file.seek(len(MAGIC))
             _, length = RECORD.unpack(file.read(RECORD.size))
             file.seek(length, os.SEEK_CUR)

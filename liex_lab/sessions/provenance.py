@@ -53,35 +53,35 @@ _PACKAGES = (
 
 @dataclass(frozen=True)
 class Provenance:
-    """What is known about a recording before its first frame is written.
+    """Facts about a recording and its measurement, known before the first frame is written.
 
     Attributes:
         name: the session's id.
-        skeleton: the skeleton that is fitted.
-        camera: the depth camera; the ideal one where lens or water were undone.
-        T_arena_camera: carries the camera frame (mm) into the arena frame.
+        skeleton: the fitted skeleton.
+        camera: the depth camera; the ideal one if lens or water were corrected.
+        T_arena_camera: transform from the camera frame (mm) to the arena frame.
         floor_distance_mm: distance of the camera from the floor, mm.
         input_sha256: SHA-256 of the recording's bytes.
-        plan_toml: the plan as resolved, TOML text.
+        plan_toml: the resolved plan, TOML text.
         format: the recording's format.
-        profile: how its stored numbers were read, where a profile states it.
+        profile: interpretation of the stored numbers, if a profile states it.
         individual: the animal's name in the session.
-        n_frames: frames to be expected; None when unknown.
-        gaps: frames that the camera did not deliver, and timestamps that were moved.
+        n_frames: expected number of frames; None if unknown.
+        gaps: frames that the camera did not deliver, and moved timestamps.
         problems: sentences about the recording.
         truncated: whether the recording ends in the middle of a frame.
         subject: any of subject_id, group, cage, sex, batch, species and age (ISO 8601).
-        session_start_time: ISO 8601 with time zone; empty when unknown.
+        session_start_time: ISO 8601 with time zone; empty if unknown.
         model: name and sha256 of the pose model.
-        animal_size: spine_mm, its origin, and girth over what is usual for that length.
-        optics: what was undone of lens and water.
+        animal_size: spine_mm, its origin, and girth relative to the usual one for that length.
+        optics: corrections of lens and water.
         arena: the shape of the floor.
-        zones: those that a person has drawn on it.
-        scene: floor, region, fixtures and how many animals move; None if there is no floor.
-        replay_depth: how much of the depth the replay is to hold: 'animal', 'arena', 'all', 'none'.
-        replay_candidates: whether it is to hold every hypothesis of single frames.
-        background: (H, W) uint16 mm, the still scene before which cut-outs are shown; None if
-            whole images are kept, or none.
+        zones: the zones drawn on it.
+        scene: floor, region, fixtures and number of moving animals; None if there is no floor.
+        replay_depth: extent of the depth in the replay: 'animal', 'arena', 'all' or 'none'.
+        replay_candidates: whether the replay includes every hypothesis of single frames.
+        background: (H, W) uint16 mm, the still scene behind cut-outs; None if whole images are
+            kept, or none.
     """
 
     name: str
@@ -114,14 +114,14 @@ class Provenance:
     def of(
         recording: Recording, floor: Floor, skeleton: Skeleton, plan: Plan, **more: Any
     ) -> Provenance:
-        """Provenance of a recording, the floor it was taken above and the plan.
+        """Provenance of a recording, its floor and the plan.
 
         Args:
             recording: the open recording.
-            floor: the floor that was found in it.
-            skeleton: the skeleton that is fitted.
-            plan: all settings of the run; what it states goes before what the recording states.
-            **more: further fields, or others than these.
+            floor: the floor found in it.
+            skeleton: the fitted skeleton.
+            plan: all settings of the run; its values override those in the recording.
+            **more: further fields, or replacements for these.
         """
         entries = recording.metadata
         stated = plan.session
@@ -161,20 +161,20 @@ class Provenance:
 
     @property
     def calibration_hash(self) -> str:
-        """Hash of the camera's numbers, its pose in the arena and what of the optics was undone."""
+        """Hash of the camera's parameters, its pose in the arena and its optical corrections."""
         place = {**self.camera.to_dict(), "T_arena_camera": self.T_arena_camera.matrix.tolist()}
         return _hash({**place, "optics": self.optics} if self.optics else place)
 
     @property
     def recording_id(self) -> str:
-        """Id of the replay, the same for the same recording, plan and model.
+        """Id of the replay, equal for the same recording, plan and model.
 
-        Rerun merges files whose id is equal.
+        Rerun merges files with equal ids.
         """
         return f"{self.name}-{_hash([self.input_sha256, self.plan_toml, self.model])}"
 
     def table_metadata(self) -> dict[str, Any]:
-        """What every Parquet file says about itself, besides its columns."""
+        """Metadata of every Parquet file, besides its columns."""
         return {
             "version": package_version("liex_lab"),
             "schema_version": SCHEMA_VERSION,
@@ -245,10 +245,10 @@ def plan_table(plan_toml: str) -> dict[str, Any]:
 
 @cache
 def package_version(name: str) -> str:
-    """Installed version of a package, or 'unknown' when it runs from a plain folder.
+    """Installed version of a package, or 'unknown' if it runs from a plain folder.
 
     Args:
-        name: the package's name as pip knows it.
+        name: the package's name in pip.
     """
     try:
         return version(name)
@@ -257,7 +257,7 @@ def package_version(name: str) -> str:
 
 
 def versions() -> dict[str, str]:
-    """Versions of Python and of the packages that a result depends on, by name."""
+    """Versions of Python and of the packages that results depend on, by name."""
     return {
         "python": platform.python_version(),
         **{name: package_version(name) for name in _PACKAGES},

@@ -1,9 +1,10 @@
-"""Blinded review: clips of a study in random order, named by people who do not see whose they are.
+"""Blinded review: clips of a study in random order, labelled by raters who do not know their
+origin.
 
-A review is one JSON file. It holds the clips that were drawn, by whom each was called what, and
-what the program called the middle of each; it is written again, as a whole, with every answer, so
-that one left in the middle goes on where it was. A rater sees the clips in an order of their own,
-which follows from the review's seed and their name.
+A review is one JSON file with the drawn clips, each rater's labels, and the program's label for the
+middle of each clip. It is rewritten, as a whole, with every answer, so that an interrupted review
+can resume. Each rater gets the clips in an individual order, derived from the review's seed and the
+rater's name.
 """
 
 from __future__ import annotations
@@ -30,23 +31,23 @@ if TYPE_CHECKING:
 FOLDER = "reviews"
 ENDING = ".review.json"
 SCHEMA_VERSION = 1
-NO_NAME = ""  # what has no name
+NO_NAME = ""  # time without an action
 PROGRAM = "the program"
 MOST_CLIPS = 500
 _NAME_LENGTH = 60
-_LEAST_S = 0.3  # a shorter time between bouts is not asked about
+_LEAST_S = 0.3  # shorter intervals between bouts are not drawn
 
 
 @dataclass(frozen=True)
 class Clip:
-    """A moment of a session that is to be named, with some time before and after it.
+    """A moment of a session to label, with some time before and after it.
 
     Attributes:
-        session: the session's name in the study; no rater sees it.
+        session: the session's name in the study; hidden from raters.
         at_s: the moment, s since the session's first frame.
-        start_s: start of what is shown, s.
+        start_s: start of the clip, s.
         stop_s: its stop, s.
-        program: what the program calls the moment; "" is no name.
+        program: the program's label for the moment; "" for no name.
     """
 
     session: str
@@ -58,15 +59,15 @@ class Clip:
 
 @dataclass(frozen=True)
 class Review:
-    """The clips of a review, and what its raters called them.
+    """The clips of a review, and the labels of its raters.
 
     Attributes:
         name: name of the review.
-        seed: the clips and their orders follow from it.
-        words: the words that may be given; NO_NAME comes besides.
+        seed: determines the clips and their orders.
+        words: the possible labels, besides NO_NAME.
         clips: the clips, in the order in which they were drawn.
         answers: rater -> number of the clip -> word.
-        made_at: when it was begun, ISO 8601.
+        made_at: time of creation, ISO 8601.
     """
 
     name: str
@@ -77,25 +78,17 @@ class Review:
     made_at: str = ""
 
     def order(self, rater: str) -> list[int]:
-        """Numbers of the clips in the order in which a rater sees them.
-
-        Args:
-            rater: the rater's name.
-        """
+        """Numbers of the clips in the order for a rater."""
         mark = hashlib.sha256(f"{self.seed}\n{rater}".encode()).digest()
         rng = np.random.default_rng(int.from_bytes(mark[:8], "little"))
         return [int(k) for k in rng.permutation(len(self.clips))]
 
     def done_by(self, rater: str) -> bool:
-        """Whether a rater has named every clip.
-
-        Args:
-            rater: the rater's name.
-        """
+        """Whether a rater has labelled every clip."""
         return len(self.answers.get(rater, {})) == len(self.clips)
 
     def answered(self, rater: str, clip: int, word: str) -> Review:
-        """The review with an answer more, or another one in its place.
+        """The review with one answer added or replaced.
 
         Args:
             rater: the rater's name.
@@ -103,7 +96,7 @@ class Review:
             word: one of the review's words, or "" for no name.
 
         Raises:
-            SessionError: the name, the clip or the word cannot be.
+            SessionError: the name, the clip or the word is invalid.
         """
         rater = checked_name(rater, "a rater")
         if rater == PROGRAM:
@@ -147,13 +140,13 @@ class Review:
 
     @staticmethod
     def from_json(text: str) -> Review:
-        """The review that `to_json` made into text.
+        """Inverse of `to_json`.
 
         Args:
             text: the content of a review's file.
 
         Raises:
-            ValueError: a value cannot be used.
+            ValueError: a value is invalid.
             KeyError: a key is missing.
             TypeError: a value is of another type.
         """
@@ -182,22 +175,22 @@ class Review:
 def drawn_review(
     name: str, sessions: Mapping[str, Session], n: int, seed: int, around_s: float = 1.0
 ) -> Review:
-    """A review whose clips are drawn from some sessions.
+    """A review with clips drawn from some sessions.
 
-    The words of the program are taken in turn as long as they have bouts left, "no name" among
-    them, and of each word a bout at random, whatever the session; the moment lies at random in the
-    middle half of the bout. So rare actions are seen, too, and kappa is that of such a choice, not
-    of all the time.
+    The program's words, including "no name", take turns as long as they have bouts left. For each
+    turn a bout of the word is drawn at random from all sessions; the moment is random in the middle
+    half of the bout. Rare actions are thus represented, and kappa refers to this sample, not to all
+    of the time.
 
     Args:
         name: name of the review.
         sessions: the opened sessions by their names in the study.
-        n: how many clips are wanted.
-        seed: of the choice.
-        around_s: how much is shown before and after the moment, s.
+        n: number of clips.
+        seed: of the random draw.
+        around_s: time shown before and after the moment, s.
 
     Raises:
-        SessionError: the name or the number cannot be, or there are fewer bouts.
+        SessionError: the name or the number is invalid, or there are fewer bouts.
     """
     if not 1 <= n <= MOST_CLIPS:
         raise SessionError(f"a review has 1 to {MOST_CLIPS} clips, got {n}")
@@ -229,7 +222,7 @@ def drawn_review(
 
 
 def _bouts_of(session: Session) -> list[tuple[str, float, float, float]]:
-    """Word, start, stop and the session's end, s; what lies between bouts has no name."""
+    """Word, start, stop and the session's end, s; time between bouts has no name."""
     table = session.bouts.sort_values("start_s")
     last_s = float(session.frames["time_s"].iloc[-1])
     found = []
@@ -247,14 +240,14 @@ def _bouts_of(session: Session) -> list[tuple[str, float, float, float]]:
 
 
 def checked_name(name: str, of: str) -> str:
-    """A name without spaces around it.
+    """A name, stripped and validated.
 
     Args:
-        name: the name as somebody typed it.
-        of: what it is the name of, for the error message.
+        name: the name as typed.
+        of: the named object, for the error message.
 
     Raises:
-        SessionError: it is empty, too long, or cannot be printed.
+        SessionError: it is empty, too long, or not printable.
     """
     plain = name.strip()
     if not plain or len(plain) > _NAME_LENGTH or not plain.isprintable():
@@ -263,10 +256,10 @@ def checked_name(name: str, of: str) -> str:
 
 
 def write_review(folder: Path, review: Review) -> Path:
-    """Write a review over what it was before; returns its file.
+    """Write or replace a review; returns its file.
 
     Args:
-        folder: where the reviews of a study lie; made where it is not there.
+        folder: the study's folder of reviews; created if needed.
         review: the review.
     """
     folder.mkdir(exist_ok=True)
@@ -279,11 +272,11 @@ def read_review(folder: Path, name: str) -> Review:
     """Read a review.
 
     Args:
-        folder: where the reviews of a study lie.
+        folder: the study's folder of reviews.
         name: its name.
 
     Raises:
-        SessionError: there is none, or it is damaged.
+        SessionError: it does not exist, or is damaged.
     """
     path = inside(folder, name, ENDING)
     try:
@@ -297,10 +290,10 @@ def read_review(folder: Path, name: str) -> Review:
 
 
 def review_names(folder: Path) -> Sequence[str]:
-    """Names of the reviews in a folder, those that cannot be read left out.
+    """Names of the readable reviews in a folder.
 
     Args:
-        folder: where the reviews of a study lie; it need not be there.
+        folder: the study's folder of reviews; it may not exist.
     """
     found: list[Any] = []
     for path in sorted(folder.glob(f"*{ENDING}")):

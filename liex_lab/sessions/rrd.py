@@ -1,7 +1,7 @@
 """Rerun replay log (.rrd): depth, skeleton, scalars and actions on timelines `frame` and `time`.
 
-Lengths are metres, the arena is right-handed with z up. Depth streams in as it comes (see
-`rrd_depth`); everything small is written at the end from the same track the tables are made of.
+Lengths are metres, the arena is right-handed with z up. Depth is streamed (see `rrd_depth`);
+everything small is written at the end from the same track as the tables.
 """
 
 from __future__ import annotations
@@ -60,8 +60,8 @@ UNCERTAINTY = "arena/uncertainty"
 CANDIDATES = "arena/candidates"
 ACTIONS = "ethogram/predicted"
 TRACKING = "ethogram/tracking"
-_BLOCK = 8192  # frames of small things sent in one go
-# turns in which a flush is waited for, and how long a file may stand still, where the disk has room
+_BLOCK = 8192  # frames of small data sent at once
+# time per turn of waiting for a flush, and longest time without growth of the file
 _TURN_S = 2.0
 _PATIENCE_S = 60.0
 
@@ -87,10 +87,10 @@ class ReplayWriter:
 
     Args:
         path: the file to write.
-        origin: camera, arena, zones and skeleton, and what the replay is to hold.
+        origin: camera, arena, zones and skeleton, and the extent of the replay.
         blueprint: the layout, a Rerun blueprint; None if absent.
-        corrected: write the replay of what people corrected, to be shown with that one: it has
-            neither depth nor the scene, and its own entities (see `corrected_entity`).
+        corrected: write the replay of the corrections, to be shown with the original one: it has
+            neither depth nor scene, and separate entities (see `corrected_entity`).
     """
 
     def __init__(
@@ -135,15 +135,15 @@ class ReplayWriter:
         depth: DepthBatch,
         boxes: Boxes | None = None,
     ) -> None:
-        """Write depth of consecutive frames; nothing where there is none.
+        """Write depth of consecutive frames; nothing without depth.
 
         Args:
             frame_index: the camera's count of the n frames.
             times_ns: their times, ns.
-            depth: n images (H, W) uint16 mm, 0 where unread, outside of their cut-outs the still
-                scene; none where depth is not kept.
+            depth: n images (H, W) uint16 mm, 0 where unread, with the still scene outside of
+                cut-outs; empty if depth is not kept.
             boxes: (n, K, 4) left, top, right and bottom of the cut-outs, px, all 0 if absent; None
-                where whole images are kept. It is the same for all frames of a replay.
+                if whole images are kept. It is the same for all frames of a replay.
         """
         if not depth:
             return
@@ -157,7 +157,7 @@ class ReplayWriter:
                 self._send_depth()
 
     def _send_depth(self) -> None:
-        """Write the depth that waits."""
+        """Write the waiting depth."""
         n_messages = self._depth.send(self._stream)
         if n_messages:
             self._flush()
@@ -175,15 +175,15 @@ class ReplayWriter:
         """Write skeleton, scalars, lanes and notes of the whole track, and close the file.
 
         Args:
-            rows: the track as the tables see it.
+            rows: the track in the form of the tables.
             kinematics: the table `kinematics`.
             bouts: the table `bouts`.
             words: the ethogram's vocabulary, coloured by `actions.colours`.
             problems: sentences about the recording, logged as warnings.
-            candidates: the pose hypotheses of single frames, where they are to be shown, too.
+            candidates: the pose hypotheses of single frames, to be shown as well; None if absent.
 
         Raises:
-            SessionError: the file was not written whole.
+            SessionError: the file was not written completely.
             OSError: the disk is full.
         """
         self._send_depth()
@@ -201,7 +201,7 @@ class ReplayWriter:
                 ((curve, rr.Scalars.columns(scalars=curves[curve][part])) for curve in curves),
             ):
                 self._send(entity, part, columns)
-            self._flush()  # or hours of it wait in memory
+            self._flush()  # limits the memory of a long recording
         self._log_lanes(rows, bouts, words)
         self._log_worst(track.predicted_error_mm)
         if not self._corrected:
@@ -222,9 +222,9 @@ class ReplayWriter:
             raise self._why_unwritten()
 
     def flushed(self) -> int:
-        """Hand everything to the operating system; returns the file's bytes.
+        """Pass everything to the operating system; returns the file's bytes.
 
-        Rerun does not tell when the disk is full, so the messages on disk are counted.
+        Rerun does not report a full disk, so the messages on disk are counted.
 
         Raises:
             SessionError: messages are missing.
@@ -238,23 +238,23 @@ class ReplayWriter:
         return self._checked
 
     def _count(self) -> None:
-        """Count the messages that are new on disk.
+        """Count new messages on disk.
 
         Raises:
-            SessionError: the last of them is not there as a whole.
+            SessionError: the last one is incomplete.
         """
         for at, length in rrd_messages(self._path, self._checked):
             self._checked = at + length
             self._n_found += 1
 
     def _flush(self) -> None:
-        """Wait until Rerun's thread has written what it was given.
+        """Wait until Rerun's thread has written its queue.
 
-        If the disk is full the thread dies, and a flush may then wait for ever, so it waits in
-        short turns.
+        On a full disk the thread dies, and a flush may then block forever, so it waits in short
+        turns.
 
         Raises:
-            SessionError: the file was not written whole.
+            SessionError: the file was not written completely.
             OSError: the disk is full.
         """
 
@@ -262,7 +262,7 @@ class ReplayWriter:
             began = time.monotonic()
             try:
                 self._stream.flush(timeout_sec=_TURN_S)
-            except Exception as error:  # Rerun gives no more than a sentence
+            except Exception as error:  # Rerun raises no specific type
                 if time.monotonic() - began < 0.5 * _TURN_S:
                     raise self._unwritten() from error
                 return False
@@ -282,7 +282,7 @@ class ReplayWriter:
                 raise self._unwritten()
 
     def _unwritten(self) -> Exception:
-        """What to raise where Rerun has not written everything; it writes no more from now on."""
+        """The error to raise if Rerun has not written everything; it writes nothing from now on."""
         if not self._broken:
             self._broken = True
             _let_go(self._stream)
@@ -295,7 +295,7 @@ class ReplayWriter:
         )
 
     def _ended(self) -> bool:
-        """Whether the closed file holds its end, with the index that Rerun writes last of all."""
+        """Whether the closed file is complete, with the index that Rerun writes last."""
         try:
             self._count()
         except SessionError:
@@ -305,10 +305,10 @@ class ReplayWriter:
     def abandon(self) -> None:
         """Close the file, whole or not.
 
-        A file that Rerun failed to write is let go without waiting for it.
+        A file that Rerun failed to write is abandoned without waiting.
 
         Raises:
-            SessionError: the file was not written whole.
+            SessionError: the file was not written completely.
             OSError: the disk is full.
         """
         if self._broken:
@@ -324,12 +324,12 @@ class ReplayWriter:
         self._wait(closed)
 
     def _send(self, entity: str, rows: slice | NDArray[np.int64], columns: Any) -> None:
-        """Columns of an entity in some rows of the track."""
+        """Send columns of an entity for some rows of the track."""
         when = timeline(self._index[rows], self._elapsed[rows])
         self._stream.send_columns(entity, when, [*columns])
 
     def _log_curves(self, rows: Rows, kinematics: pd.DataFrame) -> dict[str, Array]:
-        """Log how curves over time look; returns their values by entity."""
+        """Log the style of the curves over time; returns their values by entity."""
         error = rows.track.predicted_error_mm
         drawn = [("error/predicted", "predicted error (mm)", vocabulary.PREDICTED_ERROR, error)]
         skeleton = self._origin.skeleton
@@ -344,7 +344,7 @@ class ReplayWriter:
         return {entity: values for entity, _, _, values in drawn}
 
     def _log_looks(self, track: Track, n_candidates: int) -> list[int]:
-        """Log how all that moves looks; returns the joints that carry a part of the body."""
+        """Log the style of all moving entities; returns the joints that carry part of the body."""
         skeleton = track.skeleton
         names = [rr.AnnotationInfo(id=j, label=name) for j, name in enumerate(skeleton.names)]
         whole = rr.AnnotationInfo(id=1, label=skeleton.name, color=BONE_COLOUR)
@@ -375,7 +375,7 @@ class ReplayWriter:
         return log_body(self._stream, skeleton, animal) if skeleton.surface else []
 
     def _send_root(self, track: Track, part: slice) -> None:
-        """Axes of the body's base; while the animal is lost they stay where it was last."""
+        """Send the axes of the body's base; they keep their last pose while the animal is lost."""
         posed = part.start + np.flatnonzero(track.posed[part])
         if len(posed):
             xyzw = np.roll(so3.quaternion(track.root_rotation[posed]), -1, axis=-1)
@@ -383,7 +383,7 @@ class ReplayWriter:
             self._send(ROOT, posed, rr.Transform3D.columns(translation=place, quaternion=xyzw))
 
     def _log_worst(self, predicted_error_mm: Array) -> None:
-        """The frames with the largest predicted error, as notes to jump to."""
+        """Log the frames with the largest predicted error, as notes to jump to."""
         error = np.nan_to_num(predicted_error_mm)
         worst = np.sort(np.argsort(-error, kind="stable")[:_WORST])
         worst = worst[error[worst] > 0]
@@ -397,7 +397,7 @@ class ReplayWriter:
             )
 
     def _log_lanes(self, rows: Rows, bouts: pd.DataFrame, words: Sequence[str]) -> None:
-        """The lane of the actions, and the lane of frames to distrust."""
+        """Log the lane of the actions, and the lane of flagged frames."""
         columns = ["start_frame", "stop_frame", "start_s", "stop_s", "action"]
         spans = [*bouts[columns].itertuples(index=False, name=None)]
         stop = stop_times(rows.time_s)
@@ -415,7 +415,7 @@ class ReplayWriter:
     def _log_lane(
         self, entity: str, spans: Sequence[Any], colours: dict[str, int], end: tuple[int, float]
     ) -> None:
-        """One lane of half-open spans in order of time.
+        """Log one lane of half-open spans in order of time.
 
         A span is (start_frame, stop_frame, start_s, stop_s, word).
         """
@@ -441,9 +441,9 @@ class ReplayWriter:
 
 
 def corrected_entity(entity: str) -> str:
-    """Entity path in the replay of corrections of what the session's own replay keeps at `entity`.
+    """Entity path, in the replay of corrections, for `entity` of the session's own replay.
 
-    It lies below the same camera or arena, so that both are drawn in one scene.
+    It is below the same camera or arena, so that both are drawn in one scene.
 
     Args:
         entity: the path in the session's own replay.
@@ -455,9 +455,10 @@ def corrected_entity(entity: str) -> str:
 
 
 def _let_go(stream: Any) -> None:
-    """Never close a stream whose thread has died, for that would wait for it for ever.
+    """Never close a stream whose thread has died, because closing would block forever.
 
-    Neither when nobody uses it any more nor at the end of the process, which closes its file.
+    Neither garbage collection nor the end of the process closes it; the process's end closes its
+    file.
 
     Args:
         stream: a Rerun stream.
@@ -467,7 +468,7 @@ def _let_go(stream: Any) -> None:
 
 
 class _Renamed:
-    """A Rerun stream whose entities are those of corrections."""
+    """A Rerun stream that writes to the entities of corrections."""
 
     def __init__(self, stream: rr.RecordingStream) -> None:
         self._to = stream
@@ -483,7 +484,7 @@ class _Renamed:
 
 
 def _skeleton_columns(track: Track) -> Iterator[tuple[str, Any]]:
-    """Joints, bones and ellipsoids that hold the joints with 95 %; none without a pose.
+    """Joints, bones and ellipsoids that contain the joints with 95 %; empty without a pose.
 
     Half axes are 2.795 standard deviations of a Gaussian in space (a chi distribution with 3
     degrees of freedom).
@@ -495,7 +496,7 @@ def _skeleton_columns(track: Track) -> Iterator[tuple[str, Any]]:
     joints = track.joints_mm[posed] / MM_PER_UNIT
     for entity, dot, line, points in (
         (SKELETON, rr.Points3D, rr.LineStrips3D, joints),
-        # the 2D view counts from the image's corner, we from a pixel's centre
+        # the 2D view counts from the image's corner; our pixels count from their centre
         (OVERLAY, rr.Points2D, rr.LineStrips2D, track.uv_px[posed] + 0.5),
     ):
         size = points.shape[-1]

@@ -1,18 +1,18 @@
-"""Depth images of a Rerun replay: whole ones, or cut-outs before the still scene.
+"""Depth images of a Rerun replay: whole ones, or cut-outs in front of the still scene.
 
 Depth is stored without loss: RVL (Wilson 2017, run-length and variable-length coding), or PNG if
-sensor noise makes that smaller. A cut-out belongs to a pinhole camera of its own, whose principal
-point is that of the camera less the corner (left, top) of its window (see `cutouts.windows`):
+sensor noise makes that smaller. A cut-out belongs to its own pinhole camera, whose principal point
+is that of the camera minus the corner (left, top) of its window (see `cutouts.windows`):
 
     K' = K - [[0, 0, left], [0, 0, top], [0, 0, 0]].
 
-The still scene is stored once. The entities below `PLACES` give the place of every cut-out in the
-image, see `cutout_frame`.
+The still scene is stored once. The entities below `PLACES` position every cut-out in the image, see
+`cutout_frame`.
 
-Rerun 0.41 treats what an entity shows over time as a film (rerun-io/rerun#12801). It reports no
-problem if all images of an entity have one size and one packing, and the packing is logged once for
-all times. So every size of window and every packing has an entity of its own, and only one of those
-that belong together shows an image at a time. Without a time only PNG is accepted.
+Rerun 0.41 treats the images of an entity over time as a video (rerun-io/rerun#12801). It reports no
+problem if all images of an entity have one size and one encoding, and the encoding is logged once
+for all times. So every window size and every encoding has its own entity, and only one of each
+group shows an image at a time. Without a time only PNG is accepted.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ BACKGROUND = f"{IMAGE}/background"
 PLACES = f"{IMAGE}/places"
 CUTOUTS = "arena/camera/cutouts"
 MM_PER_UNIT = 1000.0  # our depth is in mm, the scene in metres
-# one above the other in the image; whole images may be shown over the cut-outs
+# drawing order in the image; whole images may cover the cut-outs
 _BACKMOST = -40.0
 _BEHIND = -30.0
 _WHOLE = -20.0
@@ -48,21 +48,21 @@ _WHOLE = -20.0
 _RVL = "application/rvl"
 _PNG = "image/png"
 _LARGE = 0.54  # bytes per pixel: 166 kB for 640 x 480
-_PACKED_FURTHER = 0.93  # by Rerun, which packs what it writes: RVL so much, PNG not at all
+_PACKED_FURTHER = 0.93  # by Rerun's own compression: RVL by this factor, PNG not at all
 _NOISY_PNG = (
     16,
     1,
     17,
     2,
 )  # OpenCV's IMWRITE_PNG_COMPRESSION 1 and IMWRITE_PNG_STRATEGY 2, HUFFMAN_ONLY
-# images, and their bytes, in one message: for each message the index that ends the file takes
-# some 5 kB of memory
+# images, and their bytes, per message: the index at the file's end needs some 5 kB of memory
+# per message
 _TOGETHER = 128
 _TOGETHER_BYTES = 1 << 23
 
 
 class DepthColumns:
-    """Depth images that wait to be written together.
+    """Depth images to be written together.
 
     Args:
         origin: camera, its distance from the floor, and the still scene.
@@ -74,14 +74,14 @@ class DepthColumns:
         self._n_bytes = 0
         self._n_messages = 0
         self._introduced: set[str] = set()
-        self._shown: set[str] = set()  # entities that show an image of frames before
+        self._shown: set[str] = set()  # entities that show an image of earlier frames
 
     @cached_property
     def _windows(self) -> list[tuple[int, int]]:
         return windows(self._origin)
 
     def resume(self) -> None:
-        """Continue another file, of which it is not known what it shows at its end."""
+        """Continue another file, whose last visible entities are unknown."""
         cut_out = self._origin.background is not None
         self._shown = set(cutout_entities() if cut_out else (DEPTH, NOISY))
 
@@ -92,17 +92,17 @@ class DepthColumns:
         depth: NDArray[np.uint16],
         boxes: Boxes | None,
     ) -> bool:
-        """Take the next image.
+        """Add the next image.
 
         Args:
             frame_index: the camera's count of the frame.
             elapsed_ns: time since the first frame, ns.
-            depth: (H, W) uint16 mm, 0 where unread; outside of its cut-outs the still scene.
+            depth: (H, W) uint16 mm, 0 where unread; the still scene outside of its cut-outs.
             boxes: (K, 4) left, top, right and bottom of its cut-outs, px, all 0 if absent; None for
                 a whole image.
 
         Returns:
-            Whether it is time to `send` what waits.
+            Whether to `send` the waiting images.
         """
         if boxes is None:
             blob, media_type = packed(depth)
@@ -117,9 +117,9 @@ class DepthColumns:
     def _cut_out(
         self, depth: NDArray[np.uint16], boxes: Sequence[Sequence[int]]
     ) -> tuple[dict[str, NDArray[np.uint8]], list[tuple[int, int, int, int]]]:
-        """Packed windows around boxes by their entities, and where they lie; all 0 for no box.
+        """Packed windows around boxes by their entities, and their bounds; all 0 for no box.
 
-        Always RVL: it is several times as quick as PNG, and no larger.
+        Always RVL: it is several times as fast as PNG, and not larger.
         """
         parts = {}
         places = []
@@ -134,13 +134,13 @@ class DepthColumns:
         return parts, places
 
     def send(self, stream: Any) -> int:
-        """Write what waits.
+        """Write the waiting images.
 
         Args:
             stream: the Rerun stream.
 
         Returns:
-            How many messages of images that made.
+            Number of messages with images.
         """
         waiting = self._waiting
         self._waiting = []
@@ -156,7 +156,7 @@ class DepthColumns:
         return self._n_messages
 
     def _send_pictures(self, stream: Any, entity: str, waiting: Sequence[_Picture]) -> None:
-        """Images of an entity, and from when on it shows none."""
+        """Send the images of an entity, and the frame from which it shows none."""
         blobs = []
         rows = []
         counts = []
@@ -177,7 +177,7 @@ class DepthColumns:
         self._n_messages += 1
 
     def _send_lens(self, stream: Any, k: int, waiting: Sequence[_Picture]) -> None:
-        """Lenses of the k-th cut-out of frames, and where in the image it lies."""
+        """Send the intrinsics of the k-th cut-out of frames, and its position in the image."""
         boxes = np.array([picture.windows[k] for picture in waiting], np.float64)
         there = boxes[:, 2] > boxes[:, 0]
         if not there.any() and k:
@@ -200,7 +200,7 @@ class DepthColumns:
         stream.send_columns(f"{PLACES}/{k + 1}", when, [*places])
 
     def _introduce(self, stream: Any, entity: str) -> None:
-        """Log what holds for all cut-outs of an entity; every part of a replay says the same."""
+        """Log the static properties of a cut-out entity, equal in every part of a replay."""
         assert self._origin.background is not None
         look = self._look(self._origin.background)
         kind = rr.EncodedDepthImage.from_fields(**look, media_type=_RVL, draw_order=_BEHIND)
@@ -208,7 +208,8 @@ class DepthColumns:
         self._introduced.add(entity)
 
     def log_kind(self, stream: Any, first: NDArray[np.uint16], *, whole: bool) -> None:
-        """Log what holds for whole images: packing, unit, colours, layout; or the still scene.
+        """Log the static properties of whole images (encoding, unit, colours, layout), or the still
+        scene.
 
         Args:
             stream: the Rerun stream.
@@ -235,7 +236,7 @@ class DepthColumns:
         stream.log(BACKGROUND, scene, static=True)
 
     def _look(self, depth: NDArray[np.uint16]) -> dict[str, Any]:
-        """Unit and colours of images that are like this one."""
+        """Unit and colours of images similar to this one."""
         return {
             "meter": MM_PER_UNIT,
             "colormap": "viridis",
@@ -246,8 +247,8 @@ class DepthColumns:
 
 @dataclass(frozen=True)
 class _Picture:
-    """What is kept of a frame's depth: its packed parts by entity, and the windows of its cut-outs
-    (left, top, right, bottom, px; all 0 if absent), none for a whole one.
+    """Kept depth of a frame: its packed parts by entity, and the windows of its cut-outs
+    (left, top, right, bottom, px; all 0 if absent), empty for a whole image.
     """
 
     index: int
@@ -267,7 +268,7 @@ def _when(pictures: Sequence[_Picture]) -> list[rr.TimeColumn]:
 def cutout_entity(k: int, which: int) -> str:
     """Entity of the k-th cut-out in a window.
 
-    The smallest window's is that of every cut-out in replays of earlier versions.
+    Replays of earlier versions use that of the smallest window for every cut-out.
 
     Args:
         k: counted from 0.
@@ -285,8 +286,8 @@ def cutout_entities() -> list[str]:
 def cutout_frame(k: int) -> str:
     """Rerun's name of the coordinate frame of the k-th cut-out in the image.
 
-    In space a cut-out is seen by a pinhole camera of its own; in a view of the image its entity
-    is put into this frame instead, for Rerun shows what one camera sees in no other's image.
+    In space a cut-out has its own pinhole camera; in a view of the image its entity is placed into
+    this frame instead, because Rerun does not show one camera's image in another's.
 
     Args:
         k: counted from 0.
@@ -297,9 +298,8 @@ def cutout_frame(k: int) -> str:
 def packed(depth: NDArray[np.uint16]) -> Packed:
     """Encode a depth image without loss.
 
-    RVL takes half of what raw images do and is quick. Where noise makes it large, beyond 0.54
-    bytes per pixel, PNG is taken if it is smaller (Huffman coding alone: noise has no runs to look
-    for).
+    RVL is fast and halves the size of raw images. If noise makes it large, beyond 0.54 bytes per
+    pixel, PNG is used if smaller (Huffman coding only: noise has no runs).
 
     Args:
         depth: (H, W) uint16 mm, 0 where unread.
@@ -318,7 +318,7 @@ def packed(depth: NDArray[np.uint16]) -> Packed:
 
 
 def colour_range(depth: NDArray[np.uint16], floor_distance_mm: float) -> tuple[float, float]:
-    """Range of depth over which the colours spread: the floor of the first frame, and 80 mm above.
+    """Depth range of the colour map: the floor of the first frame, and 80 mm above.
 
     A floor tilted by 10 degrees is covered, but not the walls.
 

@@ -1,6 +1,6 @@
 """Scene and animal body in a Rerun replay: camera, arena, zones, region, fixtures, skinned surface.
 
-The scene is static. Of the body, every triangle follows one joint, so a frame costs a few rigid
+The scene is static. Every triangle of the body follows one joint, so a frame costs a few rigid
 transforms instead of a mesh: the trunk at home pose is cut at its joints, and each vertex belongs
 to its nearest bone.
 """
@@ -45,12 +45,12 @@ _SKIN = [176, 190, 205, 150]
 
 
 def rgba(colours: Iterable[int]) -> NDArray[np.uint32]:
-    """0xRRGGBB as the colours that Rerun does not mistake for a list of channels."""
+    """0xRRGGBB as uint32 colours, which Rerun cannot confuse with a list of channels."""
     return np.array([colour << 8 | 0xFF for colour in colours], np.uint32)
 
 
 def log_camera(stream: Any, camera: Camera, T_arena_camera: SE3) -> None:
-    """Log the arena's axes, the camera's place in it and its lens."""
+    """Log the arena's axes, the camera's pose in it and its intrinsics."""
     pose = rr.Transform3D(
         translation=T_arena_camera.translation / MM_PER_UNIT, mat3x3=T_arena_camera.rotation
     )
@@ -84,7 +84,7 @@ def log_outlines(stream: Any, origin: Provenance) -> None:
 
 
 def log_surroundings(stream: Any, scene: Scene) -> None:
-    """Log the region outside of which nothing is measured, and the fixtures on the floor."""
+    """Log the region, outside of which nothing is measured, and the fixtures on the floor."""
     if scene.region_px:
         ring = np.array([*scene.region_px, scene.region_px[0]]) + 0.5
         outline = rr.LineStrips2D(
@@ -99,7 +99,7 @@ def log_surroundings(stream: Any, scene: Scene) -> None:
 
 
 def log_hidden_places(stream: Any, rows: Rows) -> None:
-    """Log where the animal was last observed before it was hidden, with the time of each place."""
+    """Log the last position of the animal before each time it was hidden, with the times."""
     gaps = rows.gaps()
     hidden = (gaps["reason"] == "hidden") & np.isfinite(gaps["x_mm"])
     if not hidden.any():
@@ -113,7 +113,7 @@ def log_hidden_places(stream: Any, rows: Rows) -> None:
 
 @dataclass(frozen=True)
 class BodyPart:
-    """A piece of the surface, in the frame of the joint that carries it.
+    """A piece of the surface, in the frame of its joint.
 
     Attributes:
         joint: the joint's index.
@@ -129,14 +129,14 @@ class BodyPart:
 
 
 def body_of(skeleton: Skeleton, animal: Mapping[str, Any]) -> tuple[Surface, float]:
-    """The session's body: that of the shape it kept, or the average one at its best girth.
+    """The session's body: the fitted shape if kept, or the average one at its best girth.
 
     Args:
         skeleton: the skeleton, which has a surface.
         animal: section `animal` of session.json.
 
     Returns:
-        The surface, and the girth over what is usual for its length.
+        The surface, and the girth relative to the usual one for its length.
     """
     shape = animal.get("shape") or {}
     average = Surface.of(skeleton)
@@ -149,11 +149,11 @@ def body_of(skeleton: Skeleton, animal: Mapping[str, Any]) -> tuple[Surface, flo
 def body_parts(surface: Surface, girth: float = 1.0) -> list[BodyPart]:
     """Trunk of an animal at home pose, cut at its joints.
 
-    Each part reaches one ring of faces farther, so that a bent body shows no gap.
+    Each part is extended by one ring of faces, so that a bent body shows no gap.
 
     Args:
         surface: of the animal.
-        girth: of the animal, over what is usual for its length.
+        girth: of the animal, relative to the usual one for its length.
 
     Returns:
         One part per joint that carries any face.
@@ -250,7 +250,7 @@ def _body_entity(skeleton: Skeleton, joint: int) -> str:
     return f"{BODY}/{rr.escape_entity_path_part(skeleton.names[joint])}"
 
 
-# How thick a skeleton is drawn in replays, so that no animal vanishes behind its own joints.
+# Size of a skeleton in replays, so that no animal vanishes behind its own joints.
 
 
 _MOST_MM = 3.0
@@ -260,19 +260,11 @@ _LEAST_PT = 1.5
 
 
 def dot_mm(skeleton: Skeleton) -> float:
-    """Radius of a joint in space, mm: three tenths of the usual bone, at most 3.
-
-    Args:
-        skeleton: the animal's skeleton, at home size.
-    """
+    """Radius of a joint in space, mm: 0.3 of the median bone of the skeleton, at most 3."""
     bones = np.linalg.norm(skeleton.offsets[1:], axis=1)
     return float(min(_MOST_MM, _OF_BONE * np.median(bones)))
 
 
 def dot_pt(skeleton: Skeleton) -> float:
-    """Radius of a joint over an image, in points of the screen: 3.5, and 1.5 at least.
-
-    Args:
-        skeleton: the animal's skeleton, at home size.
-    """
+    """Radius of a joint over an image, in screen points: at most 3.5, at least 1.5."""
     return max(_LEAST_PT, _MOST_PT * float(np.sqrt(dot_mm(skeleton) / _MOST_MM)))

@@ -1,8 +1,8 @@
-"""Shards of a recording, measured by several processes side by side, each in its own folder.
+"""Shards of a recording, measured by several processes in parallel, each in its own folder.
 
-They lie inside the unfinished session until it takes them over, in order. A shard may be written
-twice, by a worker that died and by another one: it becomes whole by an atomic rename, and both say
-the same.
+They are inside the unfinished session until it appends them, in order. If a worker dies, another
+one may write its shard a second time: a shard is published by an atomic rename, and both versions
+are equal.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _SEEN = "seen"
 
 
 def shard_folder(unfinished: Path, start: int, stop: int) -> Path:
-    """Path where a shard of an unfinished session lies when it is whole.
+    """Path of a complete shard of an unfinished session.
 
     Args:
         unfinished: the folder of the unfinished session.
@@ -41,7 +41,7 @@ def shard_folder(unfinished: Path, start: int, stop: int) -> Path:
 
 
 def is_whole(folder: Path) -> bool:
-    """Whether a shard is there with all that it says it has.
+    """Whether a shard exists with files of the recorded sizes.
 
     Args:
         folder: the shard's folder.
@@ -54,12 +54,12 @@ def is_whole(folder: Path) -> bool:
 
 
 def append_shard(held: Checkpoint, folder: Path, n_frames: int, seconds: float) -> None:
-    """Append a whole shard to an unfinished session; its folder is removed.
+    """Append a complete shard to an unfinished session, and remove its folder.
 
     Args:
-        held: the unfinished session, held by this process.
+        held: the unfinished session, locked by this process.
         folder: the shard's folder.
-        n_frames: frames that the session has then.
+        n_frames: frames of the session including the shard.
         seconds: time spent on them, s.
     """
     held.seen.append(Columns(folder / _SEEN).read())
@@ -70,16 +70,16 @@ def append_shard(held: Checkpoint, folder: Path, n_frames: int, seconds: float) 
 class ShardWriter:
     """Writer of a shard: depth of consecutive frames and their observations.
 
-    In a `with` block the shard is whole at its end, or not there.
+    After a `with` block the shard is complete, or absent on an error.
     """
 
     def __init__(self, folder: Path, origin: Provenance, first_ns: int | None) -> None:
-        """Begin the shard in a folder beside its own.
+        """Begin the shard in a temporary folder next to its own.
 
         Args:
             folder: the shard's folder.
-            origin: what is known about the recording.
-            first_ns: time of the recording's first frame, ns; None if that is in this shard.
+            origin: provenance of the recording.
+            first_ns: time of the recording's first frame, ns; None if it is in this shard.
         """
         from liex_lab.sessions.mcap import McapWriter
         from liex_lab.sessions.rrd import ReplayWriter
@@ -131,11 +131,11 @@ class ShardWriter:
             shutil.rmtree(self._folder, ignore_errors=True)
 
     def _become_whole(self, sizes: dict[str, int]) -> None:
-        """What was written up to now counts; what closing the logs adds to them does not."""
+        """Publish the shard, with the logs truncated to `sizes`: what closing added is dropped."""
         for log, size in sizes.items():
             os.truncate(self._folder / log, size)
         write_whole(self._folder / _SIZES, json.dumps(sizes))
-        if is_whole(self._whole):  # somebody else was quicker
+        if is_whole(self._whole):  # another worker was faster
             return
         shutil.rmtree(self._whole, ignore_errors=True)
         sync_tree(self._folder)

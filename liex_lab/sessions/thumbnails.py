@@ -1,6 +1,6 @@
-"""Thumbnails of depth images, cut around the animal, so that the report can show what was fitted.
+"""Thumbnails of depth images, cut around the animal, for the report.
 
-They are an evenly spaced sample of a stream of unknown length: when too many frames are held, every
+They are an evenly spaced sample of a stream of unknown length: when too many frames are kept, every
 second one is dropped and the spacing doubles.
 """
 
@@ -19,7 +19,7 @@ from liex_lab.tables.rows import Rows
 from liex_lab.tracking.observations import Observations
 
 FOLDER = "thumbnails"
-_KEPT = 32  # whole frames held at most while a recording of unknown length goes by
+_KEPT = 32  # most whole frames kept of a recording of unknown length
 _SHOWN = 16
 _HALF_SPINES = 1.15  # half the side of a thumbnail, in spine lengths
 
@@ -33,7 +33,7 @@ class Thumbnails:
         self._kept: dict[int, NDArray[np.uint16]] = {}  # row -> depth
 
     def add(self, depth: NDArray[np.float32]) -> None:
-        """Take the next frame, depth (H, W) float32 mm, 0 where unread."""
+        """Add the next frame, depth (H, W) float32 mm, 0 where unread."""
         if self._n_frames % self._every == 0:
             self._kept[self._n_frames] = to_millimetres(depth)
         self._n_frames += 1
@@ -42,10 +42,10 @@ class Thumbnails:
             self._kept = {row: image for row, image in self._kept.items() if row % self._every == 0}
 
     def resume(self, n_frames: int, read: Callable[[int], NDArray[np.float32]]) -> None:
-        """Sample as if so many frames had been added.
+        """Sample as if n_frames frames had been added.
 
         Args:
-            n_frames: how many frames.
+            n_frames: number of frames.
             read: depth (H, W) float32 mm of one of them by its row.
         """
         while n_frames > _KEPT * self._every:
@@ -57,8 +57,8 @@ class Thumbnails:
         """Write up to sixteen 16-bit PNG images, mm, 0 where unread, of frames with a pose.
 
         Args:
-            folder: the session folder, which gets the folder `thumbnails`.
-            rows: the track as the tables see it.
+            folder: the session folder, in which the folder `thumbnails` is created.
+            rows: the track in the form of the tables.
             camera: the depth camera, for the size of the animal in px.
 
         Returns:
@@ -75,18 +75,18 @@ class Thumbnails:
         ]
 
     def save_whole(self, folder: Path, rows: Rows, seen: Observations) -> dict[str, Any] | None:
-        """Write the whole depth image that best shows another thing of the animal's size.
+        """Write the whole depth image that best shows another object of the animal's size.
 
         Call it after `save`.
 
         Args:
             folder: the session folder.
-            rows: the track as the tables see it.
+            rows: the track in the form of the tables.
             seen: the observations: the animal is one of their two components.
 
         Returns:
-            Its entry as `save` gives it, and `beside_px`, [u, v] of the middle of the other thing;
-            None if no kept frame shows one.
+            Its entry as in `save`, and `beside_px`, [u, v] of the centre of the other object; None
+            if no kept frame shows one.
         """
         best: tuple[int, int, NDArray[np.float64]] | None = None
         for row in self._usable(rows):

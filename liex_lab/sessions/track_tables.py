@@ -26,12 +26,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Results:
-    """A track as rows, and where it comes from.
+    """A track as rows, with its provenance.
 
     Attributes:
-        origin: what is known about the recording.
-        rows: the track as the tables see it.
-        flips: where head and tail may have been exchanged.
+        origin: provenance of the recording.
+        rows: the track in the form of the tables.
+        flips: intervals in which head and tail may be exchanged.
     """
 
     origin: Provenance
@@ -42,7 +42,7 @@ class Results:
         """Write the tables of the track itself: frames, poses, rotations, gaps, flips, sessions.
 
         Args:
-            folder: the folder that the Parquet files go into.
+            folder: the folder of the Parquet files.
         """
         rows = self.rows
         described = self.origin.table_metadata()
@@ -63,8 +63,8 @@ class Results:
         """Write the tables of behaviour, summary.csv, and columns.json, which describes all tables.
 
         Args:
-            folder: the folder that the files go into.
-            results: tables by name; a table without any column described is left out.
+            folder: the folder of the files.
+            results: tables by name; a table without any described column is left out.
             columns: descriptions of columns beyond those of `tables.TABLES`.
 
         Raises:
@@ -108,7 +108,7 @@ class Results:
         }
 
     def counts(self) -> dict[str, Any]:
-        """Counts of frames and of how they were measured: section `frames` of session.json."""
+        """Counts of frames and of their flags: section `frames` of session.json."""
         rows = self.rows
         track = self.rows.track
         row = self.session_row()
@@ -131,8 +131,8 @@ class Results:
 Array = NDArray[np.float64]
 
 
-_KEPT = 0.6  # the usual cut at a likelihood: what is trusted reaches it
-_UNSURE = 0.5  # the highest likelihood of what is not
+_KEPT = 0.6  # the usual threshold of likelihoods: least value in trusted frames
+_UNSURE = 0.5  # the highest likelihood in other frames
 
 
 @dataclass(frozen=True, repr=False)
@@ -148,8 +148,7 @@ class Poses:
         time_s: (n,) s since the first frame.
         xyz_mm: (n, J, 3) mm, arena frame.
         uv_px: (n, J, 2) px of the depth image; (0, 0) is the centre of the top-left pixel.
-        score: (n, J) probability that the joint lies within 10 % of the spine's length of the
-            truth.
+        score: (n, J) probability that the joint is within 10 % of the spine's length of the truth.
         trusted: (n,) bool, whether the pose was measured and nothing contradicts it, or a person
             corrected it.
         sd_mm: (n, J, 3) standard deviation of x, y and z, mm; see the columns sd_xy_mm and sd_z_mm.
@@ -175,10 +174,10 @@ class Poses:
 
     @property
     def likelihood(self) -> Array:
-        """(n, J) what exports give as likelihood or confidence; NaN where there is no pose.
+        """(n, J) likelihood or confidence for exports; NaN where there is no pose.
 
-        The field's usual cut at 0.6 keeps what is trusted: it is 0.6 + 0.4 x score in a trusted
-        frame and 0.5 x score in any other.
+        It is 0.6 + 0.4 x score in a trusted frame and 0.5 x score in any other, so that the field's
+        usual threshold of 0.6 keeps trusted frames.
         """
         sure = self.trusted[:, None]
         return np.where(sure, _KEPT + (1.0 - _KEPT) * self.score, _UNSURE * self.score)
@@ -217,10 +216,10 @@ class Poses:
 
 
 def spreads(poses: pd.DataFrame) -> Array:
-    """Standard deviations (m, 3) of x, y and z of the table `poses`, mm; of an older one `sd_mm`.
+    """Standard deviations (m, 3) of x, y and z, mm; `sd_mm` for each in older tables.
 
     Args:
-        poses: all columns, m rows.
+        poses: all columns of the table `poses`, m rows.
     """
     names = [f"sd_{axes}_mm" for axes in ("xy", "xy", "z")]
     told = [poses[name if name in poses else "sd_mm"].to_numpy(float) for name in names]
@@ -230,7 +229,7 @@ def spreads(poses: pd.DataFrame) -> Array:
 def dataset_of(
     poses: Poses, bouts: pd.DataFrame, about: Mapping[str, Any], source: str
 ) -> xarray.Dataset:
-    """A session as the poses data set of the Python package movement, see `Session.to_xarray`.
+    """A session as a poses data set of the Python package movement, see `Session.to_xarray`.
 
     The dimensions are time (s since the first frame), space (x, y, z; mm, arena frame), keypoints
     and individuals; the variables position, confidence (`Poses.likelihood`), score, sd_mm and
@@ -283,7 +282,7 @@ def dataset_of(
 
 
 def _actions(poses: Poses, bouts: pd.DataFrame) -> np.ndarray[Any, Any]:
-    """(n,) the action of every frame, empty where it has none."""
+    """(n,) the action of every frame; empty if it has none."""
     out = np.full(len(poses.frame_index), "", dtype=object)
     starts = np.searchsorted(poses.frame_index, bouts["start_frame"].to_numpy())
     stops = np.searchsorted(poses.frame_index, bouts["stop_frame"].to_numpy())

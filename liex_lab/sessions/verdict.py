@@ -1,9 +1,9 @@
-"""The verdict on a session: how it went in one sentence, and whether someone has to look at it.
+"""The verdict on a session: its quality in one sentence, and whether it needs review.
 
-A run that measured the wrong thing looks, from its tables alone, like any other. So a session says
-of itself what share of the frames with an animal in view was measured and is trusted, whether the
-scene fits the plan, and what to distrust: on the terminal, in `verdict` of session.json, at the top
-of the report, and in the list of a study.
+A run that measured the wrong object has tables like any other. So a session reports the share of
+frames with an animal in view that was measured and is trusted, whether the scene fits the plan, and
+other doubts: on the terminal, in `verdict` of session.json, at the top of the report, and in the
+session list of a study.
 """
 
 from __future__ import annotations
@@ -25,29 +25,29 @@ if TYPE_CHECKING:
 
 LOOK_AT_IT = "look at it"
 CAUTION = "note"
-OTHER_ANIMAL = "the recording names another animal"  # how that caution begins
-_MEASURED_SHARE = 0.5  # of the frames in which something of the animal's size is in view
-_LEAST_SHARE = 0.2  # of all frames that hold depth
+OTHER_ANIMAL = "the recording names another animal"  # start of that caution
+_MEASURED_SHARE = 0.5  # of the frames with an object of the animal's size in view
+_LEAST_SHARE = 0.2  # of all frames with depth
 _DOUBTFUL_SHARE = 0.05
 _BLOCK = 16_384
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """How a session went; `verdict` of session.json holds these fields and `sentence`.
+    """Quality of a session; `verdict` of session.json contains these fields and `sentence`.
 
     Attributes:
         n_frames: frames recorded.
-        n_in_view: frames in which something of the animal's size is in view.
+        n_in_view: frames with an object of the animal's size in view.
         n_posed: frames with a measured pose.
         n_trusted: frames with a measured pose that nothing contradicts.
         expected_error_mm: median predicted joint error of the measured poses, mm; None without any.
-        n_animals: how many things of the animal's size move in view at once; 0 where no frame has
+        n_animals: number of moving objects of the animal's size in view at once; 0 if no frame has
             a pose.
-        reasons: why someone has to look at it, such as that the scene does not fit the plan; empty
-            where nobody has to.
-        cautions: what else to distrust.
-        accepted: whether the plan says to measure all the same (`estimation.accept_misfit`).
+        reasons: why the session needs review, such as a scene that does not fit the plan; empty if
+            it does not.
+        cautions: further doubts.
+        accepted: whether the plan accepts misfits (`estimation.accept_misfit`).
         n_hidden: frames in which the animal is behind or under something.
     """
 
@@ -79,10 +79,10 @@ class Verdict:
             track: one row for every frame.
             seen: the observations.
             misfits: how the scene does not fit the plan.
-            doubts: why its scene or its clock is not to be relied on.
-            n_animals: how many animals were counted in the frames that were learned from.
-            cautions: what is to be said besides.
-            accepted: whether the plan says to measure all the same.
+            doubts: why its scene or its clock is unreliable.
+            n_animals: number of animals in the frames used for learning the scene.
+            cautions: further doubts.
+            accepted: whether the plan accepts misfits.
         """
         n_in_view = 0
         n_depth = 0
@@ -96,7 +96,7 @@ class Verdict:
         errors = track.predicted_error_mm[track.observed]
         doubtful = int((track.flag == "doubtful").sum())
         n_hidden = int((track.flag == "hidden").sum())
-        n_depth -= n_hidden  # it is known why there is no pose
+        n_depth -= n_hidden  # there is a reason for the missing pose
         n_in_view = min(n_in_view, n_depth)
         reasons = [*misfits, *doubts]
         if n_trusted < _LEAST_SHARE * n_depth:
@@ -128,12 +128,12 @@ class Verdict:
 
     @property
     def look_at_it(self) -> bool:
-        """Whether someone has to look at the session before it is used."""
+        """Whether the session needs review before it is used."""
         return bool(self.reasons)
 
     @property
     def sentence(self) -> str:
-        """How it went, in one line."""
+        """The verdict in one line."""
         share = f"{self.n_posed / self.n_frames:.0%}" if self.n_frames else "none"
         parts = [
             f"{self.n_frames:,} frames, {self.n_posed:,} with a pose ({share}), "
@@ -149,7 +149,7 @@ class Verdict:
         return ". ".join(parts)
 
     def to_dict(self) -> dict[str, Any]:
-        """The fields and the sentence, as session.json holds them."""
+        """The fields and the sentence, as in session.json."""
         return {
             **asdict(self),
             "reasons": list(self.reasons),
@@ -160,14 +160,13 @@ class Verdict:
 
 
 def read_verdict(folder: Path) -> Mapping[str, Any]:
-    """The verdict in a session's folder, or what stands for it in sessions of earlier versions.
+    """The verdict in a session's folder, or a default for sessions of earlier versions.
 
     Args:
         folder: the session folder.
 
     Returns:
-        At least `look_at_it`, `accepted`, `reasons`, `cautions` and `sentence` ("" where nothing
-        was said).
+        At least `look_at_it`, `accepted`, `reasons`, `cautions` and `sentence` ("" if absent).
     """
     try:
         document = json.loads((folder / "session.json").read_text(encoding="utf-8"))
@@ -177,11 +176,7 @@ def read_verdict(folder: Path) -> Mapping[str, Any]:
 
 
 def verdict_in(document: Mapping[str, Any]) -> Mapping[str, Any]:
-    """The verdict in the content of a session.json, as `read_verdict` gives it.
-
-    Args:
-        document: content of session.json.
-    """
+    """The verdict in the content of a session.json, as in `read_verdict`."""
     unsaid = {"look_at_it": False, "accepted": False, "reasons": [], "cautions": [], "sentence": ""}
     found = document.get("verdict")
     if not isinstance(found, Mapping):
@@ -194,24 +189,24 @@ def verdict_in(document: Mapping[str, Any]) -> Mapping[str, Any]:
     }
 
 
-# Entry of a study's session list, shared by the jobs that make it and the views that show it.
+# Entry of a study's session list, shared by jobs and views.
 
 
 WHO = ("subject_id", "group", "cage", "sex", "batch")
-ALSO = ("species", "age")  # what archives ask for as well; nothing is grouped by them
+ALSO = ("species", "age")  # also required by archives; not used for grouping
 
 
 @dataclass(frozen=True)
 class Entry:
-    """A session as the study lists it.
+    """A session in the list of a study.
 
     Attributes:
         key: its name in the study.
         state: done, failed, new, begun, changed or excluded.
         reason: why it is in this state.
-        remedy: what to do about it.
+        remedy: how to resolve it.
         folder: the session folder; None if it was not measured.
-        who: those of `WHO` (subject, group, cage, sex, batch) that are known.
+        who: the known ones of `WHO` (subject, group, cage, sex, batch).
     """
 
     key: str
@@ -223,11 +218,11 @@ class Entry:
 
 
 def state_in_words(state: str, reason: str) -> str:
-    """The state of a session for people: of one that is done, whether all is well with it.
+    """The state of a session for people; a finished one may need review or have cautions.
 
     Args:
         state: done, failed, new, begun, changed or excluded.
-        reason: why it is in this state, or what to look at although it is done.
+        reason: why it is in this state, or why it needs review although it is done.
     """
     if state == "done" and reason.startswith(LOOK_AT_IT):
         return f"done, {LOOK_AT_IT}"

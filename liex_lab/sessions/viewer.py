@@ -1,4 +1,4 @@
-"""Rerun viewer: launching it, showing a session's replay in it, and streaming live to it."""
+"""Rerun viewer: starting it, opening a session's replay, and live streaming."""
 
 from __future__ import annotations
 
@@ -29,17 +29,17 @@ from liex_lab.sessions.rrd_depth import DEPTH, MM_PER_UNIT, colour_range
 from liex_lab.sessions.rrd_scene import dot_mm, log_camera
 from liex_lab.tracking.track import Track
 
-_PATIENCE_S = 30.0  # for a viewer to come up
+_PATIENCE_S = 30.0  # for a viewer to start
 Made = TypeVar("Made")
 
 
 @dataclass(frozen=True)
 class Shown:
-    """A viewer that shows a replay.
+    """A viewer with an open replay.
 
     Attributes:
         process: the viewer's process.
-        client: Rerun's client that commands it.
+        client: Rerun's client that controls it.
     """
 
     process: subprocess.Popen[bytes]
@@ -50,22 +50,22 @@ class Shown:
         self.process.wait()
 
     def close(self) -> None:
-        """End the viewer."""
+        """Terminate the viewer."""
         _end(self.process)
 
 
 def has_screen() -> bool:
-    """Whether a window can be shown here."""
+    """Whether a window can be opened on this machine."""
     return sys.platform != "linux" or bool(
         os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
     )
 
 
 def need_screen(instead: str) -> None:
-    """Go on only where a window can be shown.
+    """Continue only if a window can be opened.
 
     Args:
-        instead: what to do where it cannot.
+        instead: the remedy without a screen, for the error message.
 
     Raises:
         LiexError: there is no screen.
@@ -77,10 +77,10 @@ def need_screen(instead: str) -> None:
 def replays_with(replay: Path, more: Sequence[Path] = ()) -> list[Path]:
     """Files to open for a session's replay, in order.
 
-    Where there are corrections, their replay comes first, for the first file's layout holds.
+    With corrections, their replay is first, because the first file determines the layout.
 
     Args:
-        replay: the session's own .rrd, or one that lies somewhere by itself.
+        replay: the session's own .rrd, or a separate one.
         more: further files of the same replay.
     """
     from liex_lab.sessions.corrections import REPLAY
@@ -88,7 +88,7 @@ def replays_with(replay: Path, more: Sequence[Path] = ()) -> list[Path]:
 
     try:
         corrected = Session.open(replay.parent).file(REPLAY)
-    except LiexError:  # a replay that lies somewhere by itself
+    except LiexError:  # a separate replay
         return [replay, *more]
     return [*([corrected] if corrected.is_file() else []), replay, *more]
 
@@ -96,18 +96,18 @@ def replays_with(replay: Path, more: Sequence[Path] = ()) -> list[Path]:
 def show_replay(
     replay: Path, at_s: float, more: Sequence[Path] = (), *, headless: bool = False
 ) -> Shown:
-    """Open a replay in a window at a moment; returns the viewer.
+    """Open a replay in a window at a given time; returns the viewer.
 
-    The viewer listens on 127.0.0.1 alone and ends with this process.
+    The viewer listens on 127.0.0.1 only and ends with this process.
 
     Args:
         replay: the .rrd file.
-        at_s: the moment, s since its first frame.
+        at_s: time, s since its first frame.
         more: further files of the same replay.
-        headless: show no window, for tests.
+        headless: open no window, for tests.
 
     Raises:
-        LiexError: there is no such file, no screen, or the viewer does not come up within 30 s.
+        LiexError: there is no such file, no screen, or the viewer does not start within 30 s.
     """
     if not replay.is_file():
         raise LiexError(f"there is no replay {replay}; run `liex run` on the recording again")
@@ -128,13 +128,13 @@ def show_replay(
 
 
 def begin_viewer() -> str:
-    """Open a viewer that shows what is sent to it, and stays when this process ends.
+    """Open a viewer for streamed data that keeps running when this process ends.
 
     Returns:
-        Its address. It listens on 127.0.0.1 alone.
+        Its address. It listens on 127.0.0.1 only.
 
     Raises:
-        LiexError: there is no screen, or the viewer does not come up within 30 s.
+        LiexError: there is no screen, or the viewer does not start within 30 s.
     """
     need_screen("have it written to a file, or name the address of a viewer elsewhere")
     port, process = _begin(stays=True)
@@ -145,17 +145,17 @@ def begin_viewer() -> str:
 
 
 def _once_up(process: subprocess.Popen[bytes], attempt: Callable[[], Made], failed: str) -> Made:
-    """What an attempt returns that is repeated until the viewer is up.
+    """Repeat an attempt until the viewer has started; returns the attempt's result.
 
     Raises:
-        LiexError: the viewer ended, or is not up within 30 s.
+        LiexError: the viewer ended, or did not start within 30 s.
     """
     ends = time.monotonic() + _PATIENCE_S
     why = "it ended at once"
     while time.monotonic() < ends and process.poll() is None:
         try:
             return attempt()
-        except Exception as error:  # not up yet; what Rerun raises then is not documented
+        except Exception as error:  # not started yet; Rerun's exception is not documented
             why = str(error).partition("\n")[0][:200]
             time.sleep(0.2)
     _end(process)
@@ -170,7 +170,7 @@ def _begin(*arguments: str, stays: bool = False) -> tuple[int, subprocess.Popen[
         port = int(probe.getsockname()[1])
     given = ("--port", str(port), "--hide-welcome-screen", "--bind", "127.0.0.1")
     command = own_python("-m", "rerun", *given, *arguments)
-    # RERUN_ANALYTICS: a laboratory's data are nobody else's business
+    # RERUN_ANALYTICS: no telemetry from a laboratory's data
     viewer = subprocess.Popen(
         command,
         env={**os.environ, "RERUN_ANALYTICS": "0"},
@@ -185,7 +185,7 @@ def _begin(*arguments: str, stays: bool = False) -> tuple[int, subprocess.Popen[
 
 
 def _end(viewer: subprocess.Popen[bytes]) -> None:
-    """End a viewer with what it has started: `rerun` is a wrapper around the real one."""
+    """Terminate a viewer and its child processes: `rerun` is a wrapper around the real viewer."""
     if viewer.poll() is None:
         if hasattr(os, "killpg"):
             os.killpg(viewer.pid, signal.SIGTERM)
@@ -202,12 +202,12 @@ _DEPTH_EVERY = 5  # frames; an image takes longer to send than a skeleton
 
 
 class LiveView:
-    """A stream of depth and skeletons while the recording goes on.
+    """A stream of depth and skeletons during a recording.
 
     Args:
         name: the recording's name.
         camera: the depth camera.
-        T_arena_camera: carries the camera frame (mm) into the arena frame.
+        T_arena_camera: transform from the camera frame (mm) to the arena frame.
         skeleton: the animal's skeleton.
         to: 'viewer' starts a viewer on this machine; a name ending in .rrd is a file to write; else
             the address of a viewer.
@@ -251,7 +251,7 @@ class LiveView:
 
         Args:
             frame: the frame.
-            row: its track of one row; without a pose the last skeleton goes.
+            row: its track of one row; without a pose the last skeleton is cleared.
         """
         self._first_ns = frame.time_ns if self._first_ns is None else self._first_ns
         self._stream.set_time("frame", sequence=frame.index)
@@ -274,6 +274,6 @@ class LiveView:
             self._stream.log(DEPTH, picture)
 
     def close(self) -> None:
-        """Send what is held back, and end the stream."""
+        """Send buffered data, and end the stream."""
         self._stream.flush()
         self._stream.disconnect()

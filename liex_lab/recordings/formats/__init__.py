@@ -1,1 +1,1 @@
-"""Readers and writers of depth formats, by family; `recordings.open` chooses among them."""
+"""Readers and writers of depth formats, by family; selected by `recordings.open`."""

@@ -1,8 +1,8 @@
 """Reader of MoSeq sessions: depth.dat, depth.avi or depth.mkv with stamps and metadata.
 
 A session is a folder or a .tar.gz. depth.dat is raw uint16, frame after frame, without a header.
-The camera is stated, or from the factory's calibration in the video, or typical of a Kinect v2 or
-an Azure Kinect; stamps lie beside the depth, or are the video's own, or follow a constant rate.
+The camera is stated, or from the factory calibration in the video, or typical of a Kinect v2 or an
+Azure Kinect; stamps are in a file next to the depth, or in the video, or follow a constant rate.
 
 The factory of an Azure Kinect (or Orbbec Femto, its successor) states normalised intrinsics of the
 whole sensor; a depth mode is a crop of it, perhaps binned two by two:
@@ -66,9 +66,9 @@ class Mode(NamedTuple):
         name: its name in the Azure Kinect sensor SDK.
         width: columns of its images, px.
         height: rows of its images, px.
-        side: side of the sensor once binned, px.
-        left: column of the image's corner on it, px.
-        top: row of the image's corner on it, px.
+        side: side of the sensor after binning, px.
+        left: column of the image's corner on the sensor, px.
+        top: row of the image's corner on the sensor, px.
     """
 
     name: str
@@ -95,7 +95,7 @@ _DEPTH_CAMERA = ("CALIBRATION_CameraLocationD0", "CALIBRATION_CameraPurposeDepth
 
 
 class FactoryLens(NamedTuple):
-    """What a factory calibration says of the depth camera.
+    """Factory calibration of the depth camera.
 
     Attributes:
         shares: cx, cy, fx, fy as shares of the sensor's side.
@@ -107,15 +107,7 @@ class FactoryLens(NamedTuple):
 
 
 def mode_of(width: int, height: int) -> Mode | None:
-    """The depth mode with images of a given size.
-
-    Args:
-        width: columns, px.
-        height: rows, px.
-
-    Returns:
-        The mode; None if absent.
-    """
+    """The depth mode with images of a given size, px; None if absent."""
     return next((mode for mode in MODES if (mode.width, mode.height) == (width, height)), None)
 
 
@@ -123,10 +115,10 @@ def read_calibration(data: bytes) -> FactoryLens | None:
     """The depth camera in the calibration (JSON) that recorders attach to their files.
 
     Args:
-        data: the JSON, perhaps with zeros at its end.
+        data: the JSON, perhaps with trailing zeros.
 
     Returns:
-        The lens; None if the data do not state one.
+        The lens; None if the data do not contain one.
     """
     try:
         cameras = json.loads(data.rstrip(b"\0"))["CalibrationInformation"]["Cameras"]
@@ -147,15 +139,15 @@ def read_calibration(data: bytes) -> FactoryLens | None:
 def azure_camera(mode: Mode, lens: FactoryLens | None) -> Camera:
     """The camera of a depth mode, in pixels of its images.
 
-    Pixel (0, 0) is the centre of the top-left pixel, hence the half that is taken off.
+    Pixel (0, 0) is the centre of the top-left pixel, hence the half that is subtracted.
 
     Args:
         mode: the depth mode.
-        lens: the factory's calibration; None for typical numbers, which differ by about 1 % from
-            unit to unit.
+        lens: the factory calibration; None for typical values, which differ by about 1 % between
+            units.
 
     Returns:
-        The camera, with distortion where lens is given.
+        The camera, with distortion if lens is given.
     """
     cx, cy, fx, fy = _TYPICAL if lens is None else lens.shares
     facts: dict[str, Any] = {
@@ -177,8 +169,8 @@ def azure_camera(mode: Mode, lens: FactoryLens | None) -> Camera:
 DEPTH = "depth.dat"
 VIDEOS = ("depth.avi", "depth.mkv")
 DEPTHS = (DEPTH, *VIDEOS)
-_NOMINAL_HZ = 30.0  # what every camera that MoSeq records from delivers when nothing is lost
-_SURPLUS = 0.05  # of the stamps: recorders write those of frames whose infrared was lost
+_NOMINAL_HZ = 30.0  # rate of every camera that MoSeq supports
+_SURPLUS = 0.05  # share of extra stamps: recorders also write those of frames without infrared
 _KINECT_V2_SIZE = (512, 424)
 _OTHER_SIZES = (
     (640, 480),
@@ -193,9 +185,9 @@ _OTHER_SIZES = (
 
 @dataclass
 class RawFrames(Stack):
-    """Frames one after the other in a file without a header, read with `seek`; a `Stack`.
+    """Consecutive frames in a file without a header, read with `seek`; a `Stack`.
 
-    Not a memory map: mapped pages count as the process's memory, and a long session would look like
+    Not a memory map: mapped pages count as the process's memory, so a long session would appear as
     a leak.
 
     Attributes:
@@ -203,10 +195,10 @@ class RawFrames(Stack):
         width: columns of a frame, px.
         height: rows of a frame, px.
         dtype: of the stored values, "<u2" or ">u2".
-        n: how many whole frames there are.
+        n: number of whole frames.
         truncated: True if the file ends in the middle of a frame, or its archive is cut.
         problems: sentences about the file.
-        once: True of a file that was unpacked for this, and is read from front to back.
+        once: True for a file unpacked for this recording, which is read from front to back.
     """
 
     path: Path
@@ -221,7 +213,7 @@ class RawFrames(Stack):
     def __post_init__(self) -> None:
         self._file = self.path.open("rb")
         self._lock = Lock()
-        self._kept_from = 0  # what lies before may have been given up
+        self._kept_from = 0  # earlier pages may have been released
 
     def __len__(self) -> int:
         return self.n
@@ -243,7 +235,7 @@ class RawFrames(Stack):
             self._file.seek(index * n_bytes)
             raw = self._file.read(n_bytes)
             end = self._file.tell()
-            # no more than a stretch of what was read stays in the system's memory
+            # limits what the system caches of the file
             if self.once and not 0 <= end - self._kept_from < STRETCH:
                 let_go(self._file, min(self._kept_from, end), end)
                 self._kept_from = end
@@ -254,14 +246,7 @@ class RawFrames(Stack):
         return np.frombuffer(raw, self.dtype).reshape(self.height, self.width)
 
     def label(self, index: int) -> str:
-        """Name of a frame, for a sentence.
-
-        Args:
-            index: number of the frame.
-
-        Returns:
-            The frame and the file.
-        """
+        """Name of a frame, for a message: the frame and the file."""
         return f"frame {index} of {self.path.name}"
 
     def close(self) -> None:
@@ -278,15 +263,12 @@ def open_moseq(
 
     Args:
         path: the folder or file.
-        camera: comes before whatever the files state.
-        fps: frame rate, Hz; used only where there are no time stamps.
-        progress: reports how far unpacking and indexing are.
-
-    Returns:
-        The recording.
+        camera: overrides the camera in the files.
+        fps: frame rate, Hz; used only if there are no time stamps.
+        progress: reports the progress of unpacking and indexing.
 
     Raises:
-        RecordingError: there is no whole frame, or the camera is not known.
+        RecordingError: there is no whole frame, or the camera is unknown.
     """
     names = (*STAMPS, METADATA, CAMERA_FILE)
     if path.suffix.lower() == ".dat":
@@ -310,7 +292,7 @@ def open_moseq(
         opened.callback(scratch.close)
         found = unpack(path, (*DEPTHS, *names), scratch.folder, progress)
         beside = path.parent / CAMERA_FILE
-        if CAMERA_FILE not in found.files and beside.is_file():  # others may open what came out
+        if CAMERA_FILE not in found.files and beside.is_file():  # so that the folder opens as well
             shutil.copy(beside, scratch.folder)
         inside = next((found.files[name] for name in DEPTHS if name in found.files), None)
         if inside is None:
@@ -329,9 +311,7 @@ def open_moseq(
 
 
 class _Session:
-    """A session while it is opened: its depth file, what lies beside it, and what was odd
-    so far.
-    """
+    """A session being opened: its depth file, the files next to it, and problems so far."""
 
     def __init__(
         self,
@@ -363,12 +343,9 @@ class _Session:
 
         Args:
             name: its name.
-            sources: the input's files.
-            opened: what closing the recording closes, added to.
+            sources: the input files.
+            opened: resources that closing the recording closes, added to.
             unpacked: folder of unpacked files; None if nothing was unpacked.
-
-        Returns:
-            The recording.
         """
         stack, track = self._open_depth(once=unpacked is not None)
         opened.callback(stack.close)
@@ -443,9 +420,7 @@ class _Session:
         return (stated.width, stated.height) if stated.width and stated.height else None
 
     def _guess_size(self, n_bytes: int) -> tuple[int, int]:
-        """That of a Kinect v2, unless the stamps say that another camera's size fits and this one
-        does not.
-        """
+        """The size of a Kinect v2; an error if the stamps only match another camera's size."""
         n = 0 if self.stamps is None else len(self.stamps)
         kinect_bytes = 2 * _KINECT_V2_SIZE[0] * _KINECT_V2_SIZE[1]
         other = next(((w, h) for w, h in _OTHER_SIZES if n and n_bytes == 2 * w * h * n), None)
@@ -460,8 +435,8 @@ class _Session:
         return _KINECT_V2_SIZE
 
     def _camera(self, stack: Stack, track: DepthTrack | None) -> Camera:
-        """Stated, or else from the factory's calibration in the file, or else typical of the camera
-        that recorded.
+        """The stated camera, or else the factory calibration in the file, or else a typical camera
+        of the recorded kind.
         """
         width, height = stack.width, stack.height
         if self.stated_camera is not None or self.camera_file.intrinsics:
@@ -471,7 +446,7 @@ class _Session:
         lens = next(filter(None, map(read_calibration, attached)), None)
         if mode is not None and lens is not None:
             return azure_camera(mode, lens)
-        # where the files do not name the camera, only a Kinect v2 has images of its size
+        # no other camera has a Kinect v2's size
         kind = self.metadata.camera or KINECT
         if track is not None and any(name.startswith("K4A_") for name in track.tags):
             kind = AZURE
@@ -500,7 +475,7 @@ class _Session:
         )
 
     def _times(self, stack: Stack, track: DepthTrack | None) -> Times:
-        """The stamps beside the depth, or else its own, or else a constant rate."""
+        """The stamps next to the depth, or else its own, or else a constant rate."""
         n = len(stack)
         own = None if track is None or not len(track.times_ns) else track
         hz = rate(self.fps, "the call") or self.camera_file.fps
@@ -537,7 +512,7 @@ class _Session:
         return from_rate(n, hz or _NOMINAL_HZ)
 
     def _continue(self, stamps: Times, n: int) -> Times:
-        """Stamps for the frames whose own were cut off: a whole frame is worth more than its exact
+        """Stamps for frames whose own were cut off: a frame is worth keeping without its exact
         time.
         """
         step = max(1, median_step(stamps))

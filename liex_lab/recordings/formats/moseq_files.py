@@ -1,10 +1,10 @@
 """Files of a MoSeq session: extraction from .tar or .tar.gz, metadata.json and time stamps.
 
-The archive is decompressed in order (DEFLATE has no random access): once, by ISA-L on a thread of
-its own, nearly three times as fast as zlib, if it is whole. One that is cut or damaged is unpacked
-once more by zlib, whose state can be copied: smaller and smaller pieces are tried up to the last
-good byte; the tar walk then reads zeros, and each file is written only as far as its bytes are
-real. Stamps are in depth_ts.txt (ms) or timestamps.csv (s).
+The archive is decompressed in order (DEFLATE has no random access). A whole one is unpacked once,
+by ISA-L on a separate thread, nearly three times as fast as zlib. A cut or damaged one is unpacked
+again by zlib, whose state can be copied: smaller and smaller pieces are tried up to the last good
+byte; the tar walk then reads zeros, and each file is written only up to its last real byte. Stamps
+are in depth_ts.txt (ms) or timestamps.csv (s).
 """
 
 from __future__ import annotations
@@ -31,14 +31,12 @@ from liex_lab.runtime.places import write_through
 from liex_lab.runtime.progress import Progress
 from liex_lab.runtime.text_files import read_text
 
-_PACKED = 1 << 18  # bytes read at once
-_UNPACKED = 1 << 17  # and unpacked at once: an empty image is a thousand times its packed size
-_PIECE = 256  # packed bytes tried at once where there is damage
-_ENOUGH_ZEROS = (
-    1 << 22
-)  # far more than the end of any tar; a walk that asks for more skips over what is missing
-_ALWAYS = 1 << 29  # bytes that are unpacked whatever they were packed to
-_MOST_TIMES = 200  # what more than that unpacks to: true images have noise
+_PACKED = 1 << 18  # packed bytes read at once
+_UNPACKED = 1 << 17  # bytes unpacked at once: an empty image is a thousand times its packed size
+_PIECE = 256  # packed bytes tried at once near damage
+_ENOUGH_ZEROS = 1 << 22  # far more than the end of any tar; a longer walk skips missing data
+_ALWAYS = 1 << 29  # bytes unpacked at any compression ratio
+_MOST_TIMES = 200  # compression ratio beyond that: true images have noise
 _MOST_HEADER = 1 << 20  # bytes of a member's name and notes
 _MOST_NOTES = 1 << 28  # bytes of any file but the images: stamps of days
 _GZIP_MAGIC = b"\x1f\x8b"
@@ -46,7 +44,7 @@ Pieces = Generator[bytes | memoryview, None, None]
 
 
 class _Member(tarfile.TarInfo):
-    """A member of an archive; tarfile reads long names and notes into memory, of any size."""
+    """A member of an archive, with size limits: tarfile reads any name or note into memory."""
 
     _LONG = (
         tarfile.GNUTYPE_LONGNAME,
@@ -73,10 +71,10 @@ class _Member(tarfile.TarInfo):
 
 @dataclass(frozen=True)
 class Unpacked:
-    """What came out of an archive.
+    """Result of unpacking an archive.
 
     Attributes:
-        files: where the wanted files were written, by their plain names.
+        files: paths of the wanted files, by their plain names.
         seen: plain names of all files in the archive.
         cut: True if the archive is cut or damaged.
     """
@@ -87,21 +85,21 @@ class Unpacked:
 
 
 class _Damaged(Exception):
-    """ISA-L has found damage; zlib is to say where."""
+    """ISA-L found damage; zlib then locates it."""
 
 
 class _Patient:
-    """The unpacked bytes of a tar, followed by zeros without end once the archive breaks off.
+    """The unpacked bytes of a tar, followed by endless zeros after the archive's last good byte.
 
-    tarfile throws away the block in which an archive ends too early. Here it never ends, and
-    `n_true` says how many of the bytes were real; a tar ends in zeros by itself, so the walk over
-    its members ends too. It is walked forwards alone.
+    tarfile discards the block in which an archive ends too early. This stream never ends, and
+    `n_true` counts the real bytes; a tar ends in zeros itself, so the walk over its members ends
+    too. It can only be read forwards.
 
     Args:
         file: the open archive.
         size: its bytes.
         progress: reports how many MB were unpacked.
-        fast: by ISA-L, which raises `_Damaged` where there is damage.
+        fast: use ISA-L, which raises `_Damaged` on damage.
     """
 
     def __init__(self, file: IO[bytes], size: int, progress: Progress, fast: bool) -> None:
@@ -114,22 +112,22 @@ class _Patient:
         self._coming = (
             _read(file) if not self.zipped else _by_isal(file) if fast else self._by_zlib()
         )
-        self._piece = memoryview(b"")  # what is left of the last one
+        self._piece = memoryview(b"")  # rest of the last one
         self._at = 0
         self.n_true = 0
 
     def tell(self) -> int:
-        """How many bytes were handed out, zeros included."""
+        """Number of bytes read, including zeros."""
         return self._at
 
     def seek(self, to: int) -> None:
-        """Leave out what lies before a place further on."""
+        """Skip to a later position."""
         for _ in self._parts(to - self._at):
             pass
         self._at = max(self._at, to)
 
     def read(self, n: int) -> bytes:
-        """Exactly n bytes, zeros where the archive has broken off."""
+        """Exactly n bytes, padded with zeros after the archive's last good byte."""
         block = b"".join([bytes(part) for part in self._parts(n)])
         missing = n - len(block)
         self._at += missing
@@ -138,33 +136,33 @@ class _Patient:
         return block + bytes(missing)
 
     def copy(self, n: int, to: IO[bytes]) -> int:
-        """Write the next n bytes into a file, as far as they are real; how many were."""
+        """Write the next n bytes into a file, up to the last real one; returns their number."""
         return write_through(self._parts(n), to)
 
     def finish(self) -> None:
         """Read to the end.
 
-        A tar is over before the gzip around it is, and only gzip's end tells that it is whole.
+        A tar ends before the gzip around it, and only gzip's end shows that it is whole.
         """
         while self._next(_UNPACKED):
             pass
 
     def close(self) -> None:
-        """Unpack no more."""
+        """Stop unpacking."""
         self._coming.close()
 
     def _parts(self, n: int) -> Iterator[memoryview]:
-        """The next n bytes as far as they are real, each part until the next is asked for."""
+        """The next real bytes, at most n; each part is valid until the next is requested."""
         while n > 0 and (part := self._next(n)):
             self._at += len(part)
             n -= len(part)
             yield part
 
     def _next(self, most: int) -> memoryview:
-        """The next real bytes, some, at most so many; none where there are no more.
+        """Some of the next real bytes, at most `most`; empty at their end.
 
         Raises:
-            RecordingError: more comes out than of any recording, of what is packed.
+            RecordingError: the compression ratio is implausible for a recording.
         """
         while not self._piece:
             piece = next(self._coming, None)
@@ -185,12 +183,12 @@ class _Patient:
         return part
 
     def _by_zlib(self) -> Pieces:
-        """What zlib makes of the archive, up to the last good byte."""
+        """The archive unpacked by zlib, up to the last good byte."""
         inflate = zlib.decompressobj(31)
         while packed := self._file.read(_PACKED):
             while packed:
                 if inflate.eof:
-                    # a gzip file may be several, one after the other; anything else behind it is
+                    # a gzip file may have several members; anything else after it is
                     # padding
                     if len(packed) < len(_GZIP_MAGIC):
                         packed += self._file.read(_PACKED)
@@ -211,15 +209,15 @@ class _Patient:
 
 
 def _read(file: IO[bytes]) -> Pieces:
-    """The bytes of a tar that is not packed."""
+    """The bytes of an uncompressed tar."""
     while piece := file.read(_PACKED):
         yield piece
 
 
 def _by_isal(file: IO[bytes]) -> Pieces:
-    """What ISA-L makes of a whole archive, each piece until the next is asked for.
+    """A whole archive unpacked by ISA-L; each piece is valid until the next is requested.
 
-    It unpacks on a thread of its own, while what came out is written.
+    It unpacks on a separate thread, in parallel to writing.
     """
     room = bytearray(_UNPACKED)
     try:
@@ -231,7 +229,7 @@ def _by_isal(file: IO[bytes]) -> Pieces:
 
 
 def _salvaged(inflate: zlib._Decompress, packed: bytes) -> bytes:
-    """What comes out before the damage: zlib keeps back all of a piece in which it finds some."""
+    """The bytes before the damage: zlib withholds the whole piece in which it finds some."""
     found = bytearray()
     for size in (_PIECE, 1):
         with suppress(zlib.error):
@@ -249,11 +247,11 @@ def unpack(archive: Path, wanted: Sequence[str], folder: Path, progress: Progres
     Args:
         archive: the .tar, .tar.gz or .tgz file.
         wanted: plain names of the members to write.
-        folder: where they are written.
+        folder: the output folder.
         progress: reports how many MB were unpacked.
 
     Returns:
-        The files written, all names met, and whether the archive is cut.
+        The files written, all names, and whether the archive is cut.
 
     Raises:
         RecordingError: nothing can be unpacked, a wanted name occurs twice, or the disk is full.
@@ -270,7 +268,7 @@ def unpack(archive: Path, wanted: Sequence[str], folder: Path, progress: Progres
 def _unpack(
     archive: Path, wanted: Sequence[str], folder: Path, progress: Progress, fast: bool
 ) -> Unpacked | None:
-    """The same by ISA-L or by zlib; None if ISA-L came to no end, and zlib may tell more."""
+    """`unpack` by ISA-L or by zlib; None if ISA-L found damage and zlib may recover more."""
     files: dict[str, Path] = {}
     seen: set[str] = set()
     cut = False
@@ -291,7 +289,7 @@ def _unpack(
                         )
                     seen.add(name)
                     if name in wanted:
-                        (folder / name).unlink(missing_ok=True)  # it needs its room
+                        (folder / name).unlink(missing_ok=True)  # frees its disk space
                         _check_size(archive, member, folder)
                         files[name] = folder / name
                         cut = _copy(member, files[name], stream)
@@ -310,7 +308,7 @@ def _unpack(
 
 
 def _check_size(archive: Path, member: tarfile.TarInfo, folder: Path) -> None:
-    """Raises RecordingError where a member is too large for what it is, or for the disk."""
+    """Raises RecordingError if a member is too large for its type, or for the disk."""
     name = PurePosixPath(member.name).name
     if member.issparse():
         raise RecordingError(
@@ -332,7 +330,7 @@ def _check_size(archive: Path, member: tarfile.TarInfo, folder: Path) -> None:
 
 
 def _copy(member: tarfile.TarInfo, to: Path, stream: _Patient) -> bool:
-    """Write the member that comes next as far as its bytes are real; True if some miss."""
+    """Write the next member up to its last real byte; True if bytes are missing."""
     stream.seek(member.offset_data)
     try:
         with to.open("wb") as out:
@@ -352,7 +350,7 @@ def _copy(member: tarfile.TarInfo, to: Path, stream: _Patient) -> bool:
 
 STAMPS = {"depth_ts.txt": 10**6, "timestamps.csv": 10**9}  # file: nanoseconds in its unit
 METADATA = "metadata.json"
-# cameras, as far as they are told apart
+# kinds of cameras
 AZURE = "Azure Kinect"
 KINECT = "Kinect v2"
 OTHER = "other"
@@ -366,7 +364,7 @@ _CAMERA_KEYS = (
     "devicemodel",
     "sensor",
 )
-_CAMERA_WORDS = {  # word in a camera's name: which one it is; the first that is found counts
+_CAMERA_WORDS = {  # word in a camera's name: its kind; the first match counts
     "azure": AZURE,
     "k4a": AZURE,
     "femto": AZURE,
@@ -379,15 +377,15 @@ _CAMERA_WORDS = {  # word in a camera's name: which one it is; the first that is
 
 @dataclass(frozen=True)
 class Metadata:
-    """What metadata.json says.
+    """Contents of metadata.json.
 
     Attributes:
-        size: (width, height), px; None when unstated.
+        size: (width, height), px; None if absent.
         dtype: of the stored depths, "<u2" or ">u2".
-        camera: `AZURE`, `KINECT`, `OTHER`, or None when it does not say.
-        camera_name: the camera in the file's own words; empty when unstated.
+        camera: `AZURE`, `KINECT` or `OTHER`; None if absent.
+        camera_name: the camera's name in the file; empty if absent.
         facts: for `Recording.metadata`.
-        problems: sentences about what was not used.
+        problems: sentences about ignored values.
     """
 
     size: tuple[int, int] | None
@@ -402,14 +400,11 @@ def read_metadata(path: Path | None, cut: bool) -> Metadata:
     """Parse metadata.json, which is often missing.
 
     Args:
-        path: the file; None if absent, and then nothing is stated.
-        cut: True if its archive is cut; a broken file is then left out instead of refused.
-
-    Returns:
-        What it says.
+        path: the file; None for empty metadata.
+        cut: True if its archive is cut; a broken file is then ignored instead of refused.
 
     Raises:
-        RecordingError: the file is no JSON object, or its DepthResolution cannot be.
+        RecordingError: the file is not a JSON object, or its DepthResolution is invalid.
     """
     nothing = Metadata(None, "<u2", None, "", {}, [])
     if path is None:
@@ -460,9 +455,7 @@ def _stated_size(value: Any) -> tuple[int, int] | None:
 
 
 def _stated_camera(document: dict[str, Any]) -> tuple[str | None, str]:
-    """Which camera the metadata name, and in which words: programs that record for MoSeq have no
-    common key for it.
-    """
+    """Kind and stated name of the camera: programs for MoSeq have no common key for it."""
     entries = {
         key.lower().replace("_", "").replace(" ", ""): value for key, value in document.items()
     }
@@ -480,30 +473,30 @@ def read_session_stamps(
     problems: list[str],
     doubts: list[str],
 ) -> Stamps | None:
-    """Read the file of time stamps beside the depth.
+    """Read the file of time stamps next to the depth.
 
-    depth_ts.txt counts milliseconds and timestamps.csv seconds, unless their first line names a
-    column in another unit, or camera.toml does. Of a cut archive, half a number at the end is
-    dropped, from the file too.
+    depth_ts.txt is in milliseconds and timestamps.csv in seconds, unless their first line names a
+    column in another unit, or camera.toml does. In a cut archive, half a number at the end is
+    dropped, also from the file.
 
     Args:
         files: the session's files by name.
         cut: True if their archive is cut.
         camera_file: may state the column of times and its unit.
-        problems: sentences, appended to where the stamps are missing or give an unlikely rate.
-        doubts: reasons not to rely on the times, appended to.
+        problems: sentences, appended to if there are no stamps.
+        doubts: reasons why the times are unreliable, appended to.
 
     Returns:
         The stamps; None if absent.
 
     Raises:
-        RecordingError: a line has no stamp where one was expected.
+        RecordingError: a line has no valid stamp.
     """
     name = next((name for name in STAMPS if name in files), None)
     if name is None:
         return None
     path = files[name]
-    if cut:  # the archive may have broken off inside this file: half a number is a wrong number
+    if cut:  # the archive may end inside this file: half a number is a wrong number
         text = path.read_bytes()
         path.write_bytes(text[: text.rfind(b"\n") + 1])
     stated = (camera_file.time_column, camera_file.time_unit, STAMPS[name])

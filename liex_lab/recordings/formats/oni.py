@@ -1,13 +1,13 @@
 """Reader of PrimeSense and OpenNI recordings (.oni): 16-bit depth, raw or in OpenNI's 16z codecs.
 
-A file header, then one record after the other: magic, kind, node, size of header and fields, size
-of payload, and the position it undoes; little endian. Before version 1.0.1.0, positions have 32
-bits, then 64. All records are scanned, which shows what is whole; the seek table is not used. A
-damaged file is read on from the next record magic that fits. Source: OpenNI2's own player.
+A file header is followed by records: magic, kind, node, size of header and fields, size of payload,
+and an undo position; little endian. Before version 1.0.1.0, positions have 32 bits, then 64. All
+records are scanned, which shows what is whole; the seek table is not used. After damage, reading
+resumes at the next valid record magic. Source: OpenNI2's own player.
 
 Intrinsics come from the caller, a camera.toml, a property that earlier versions of liex wrote, or
-the stated field of view: f = (n / 2) / tan(fov / 2), with the optical axis at half the size, as
-OpenNI has it. Mirrored frames are turned back, and a cropped one is put into its full frame.
+the stated field of view: f = (n / 2) / tan(fov / 2), with the optical axis at half the size, as in
+OpenNI. Mirrored frames are flipped back, and cropped frames are padded to the full frame.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ _FRAME_FIELDS = struct.Struct("<QI")  # time in µs, number of the frame, counte
 _NODE_FIELDS = struct.Struct("<i4s")  # kind, codec
 _UNKNOWN_COUNT = 0xFFFFFFFF
 _USUAL_FIELDS = 64
-_MOST_FIELDS = 4096  # bytes that are read of names and numbers
+_MOST_FIELDS = 4096  # bytes read of names and numbers
 _BLOCK = 1 << 20
 
 MODE = "xnMapOutputMode"
@@ -67,17 +67,17 @@ FIELD_OF_VIEW = "xnFOV"
 OLD_LENS = "xnRealWorldTranslationData"
 PLANE_DISTANCE = "ZPD"
 PLANE_PIXEL = "ZPPS"
-# fx, fy, cx, cy: the format itself knows no optical axis, and earlier versions of liex wrote it
+# fx, fy, cx, cy: written by earlier versions of liex, as the format has no optical axis
 INTRINSICS = "liexIntrinsics"
 _OF_FORMAT = (MODE, CROPPING, MIRROR, UNIT)
 _USED = (*_OF_FORMAT, FIELD_OF_VIEW, OLD_LENS, PLANE_DISTANCE, PLANE_PIXEL, INTRINSICS)
-_LARGEST_VALUE = 64  # bytes; the properties that are used have at most 32
+_LARGEST_VALUE = 64  # bytes; the used properties have at most 32
 _MANY = 100
 _MILLIMETRES = 100  # the pixel format if none is stated
 
 
 class Record(NamedTuple):
-    """One record; `size` is that of its header and fields, of which 4096 bytes are read."""
+    """One record; `size` is that of its header and fields, of which up to 4096 bytes are read."""
 
     at: int
     kind: int
@@ -93,7 +93,7 @@ class Record(NamedTuple):
 
     @property
     def end(self) -> int:
-        """Position at which the next record begins, bytes."""
+        """Position of the next record, bytes."""
         return self.payload + self.payload_size
 
 
@@ -102,7 +102,7 @@ class OniFile:
 
     Attributes:
         size: its size, bytes.
-        whole: True if it ends as it should and nothing is damaged; known after a walk.
+        whole: True if it has its end record and no damage; valid after a walk.
     """
 
     def __init__(self, path: Path) -> None:
@@ -141,10 +141,10 @@ class OniFile:
         self._file.close()
 
     def walk(self, progress: Progress) -> Iterator[Record]:
-        """Every record in file order, continued after damage at the next record that can be found.
+        """Every record in file order, resumed after damage at the next valid record.
 
-        A record counts only if another one, or the end of the file, begins where it ends. The last
-        one of a cut file is left out.
+        A record is valid only if another one, or the end of the file, follows directly. The last
+        one of a cut file is skipped.
         """
         record = self._search(_FILE_HEADER.size)
         ended = False
@@ -156,9 +156,9 @@ class OniFile:
             if following is None and record.end != self.size:
                 following = self._search(record.at + self._header.size)
                 if following is None and (ended or record.end > self.size):
-                    break  # some bytes after the end, or the record that was cut
+                    break  # bytes after the end, or a cut record
                 self.whole = False
-                # its own size is damaged, not its neighbour
+                # its size is damaged, not the next record
                 if following is not None and following.at < record.end:
                     size = max(0, following.at - record.payload)
                     record = record._replace(payload_size=size)
@@ -185,7 +185,7 @@ class OniFile:
         return Record(at, kind, node, size, payload_size, raw[header.size : size])
 
     def _search(self, start: int) -> Record | None:
-        """The first record from a position on that lies within the file."""
+        """The first record from a position that is within the file."""
         magic = _RECORD_MAGIC.to_bytes(4, "little")
         while start + self._header.size <= self.size:
             block = self.read(start, _BLOCK)
@@ -206,7 +206,7 @@ class FrameFormat:
     Attributes:
         width: columns of the full frame, px.
         height: rows of the full frame, px.
-        part: x, y, width, height of what was recorded of it, px.
+        part: x, y, width, height of the recorded part, px.
         mirrored: True if left and right are exchanged.
         pixel_format: OpenNI's number for the unit (100: 1 mm, 101: 0.1 mm).
         fps: stated, not measured, frame rate, Hz.
@@ -221,7 +221,7 @@ class FrameFormat:
 
     @property
     def constant(self) -> tuple[int, int, int]:
-        """What may not change within a recording: width, height and unit."""
+        """Constants of a recording: width, height and unit."""
         return self.width, self.height, self.pixel_format
 
 
@@ -233,12 +233,12 @@ class DepthNode:
         name: name of the node, such as "Depth".
         codec: four bytes, `NONE`, `16zT` or `16zP`.
         n_stated: number of frames by the node's own count; None if not stated.
-        properties: the property values that hold now, by name.
+        properties: the current property values by name.
         times_us: (n,) time of each frame, µs.
         positions: (n,) position of each payload, bytes.
         sizes: (n,) size of each payload, bytes.
         format_of: (n,) number of each frame's format in `formats`.
-        formats: the frame formats with their numbers; None is one whose size was never stated.
+        formats: the frame formats with their numbers; None for frames without a stated size.
     """
 
     name: str
@@ -256,13 +256,13 @@ class DepthNode:
         return len(self.positions)
 
     def set_property(self, name: str, value: bytes) -> None:
-        """Note a property, which holds from here on."""
+        """Set a property for the frames that follow."""
         self.properties[name] = value
         if name in _OF_FORMAT:
             self._format_now = None
 
     def add(self, record: Record) -> None:
-        """Note a frame."""
+        """Add a frame."""
         if self._format_now is None:
             self._format_now = self.formats.setdefault(self._format(), len(self.formats))
         self.times_us.append(_FRAME_FIELDS.unpack(record.fields)[0])
@@ -271,7 +271,7 @@ class DepthNode:
         self.format_of.append(self._format_now)
 
     def number(self, name: str) -> int | None:
-        """Value of an integer property; None if it is not stated."""
+        """Value of an integer property; None if absent."""
         value = self.properties.get(name)
         return int.from_bytes(value[:8], "little") if value else None
 
@@ -295,7 +295,7 @@ class DepthNode:
 def index_file(file: OniFile, progress: Progress) -> tuple[list[DepthNode], set[str]]:
     """The depth nodes, and the names of at most 100 other nodes.
 
-    The file's `whole` says afterwards whether anything was damaged.
+    Afterwards, the file's `whole` is False if anything was damaged.
     """
     depth: dict[int, DepthNode] = {}
     others: set[str] = set()
@@ -369,9 +369,9 @@ class OniFrames:
         Args:
             file: the open file.
             node: the depth node with the positions of its frames.
-            form: the image format that frames must agree with to be of this recording.
-            how: a camera.toml beside the file, for its unit_mm (a further factor) and unread.
-            problems: the recording's sentences, appended to when a damaged frame is met.
+            form: the format of the recording's frames.
+            how: a camera.toml next to the file, for its unit_mm (a further factor) and unread.
+            problems: the recording's sentences, appended to for damaged frames.
         """
         self._file = file
         self._node = node
@@ -385,7 +385,7 @@ class OniFrames:
         self._lock = Lock()
 
     def read(self, number: int) -> Depth:
-        """Depth of one frame; one that is damaged or of another size is wholly unread.
+        """Depth of one frame; all unread if it is damaged or of another size.
 
         Args:
             number: index of the frame in the node.
@@ -405,13 +405,13 @@ class OniFrames:
         return np.zeros((self._form.height, self._form.width), np.float32)
 
     def decode(self, number: int) -> Depth | None:
-        """Depth of one frame, without a replacement for damaged ones.
+        """Depth of one frame; None if it is damaged or of another size.
 
         Args:
             number: index of the frame in the node.
 
         Returns:
-            (H, W) float32 mm, 0 where unread; None if it is damaged or of another size.
+            (H, W) float32 mm, 0 where unread.
         """
         form = self._formats[self._node.format_of[number]]
         if form is None or form.constant != self._form.constant:
@@ -430,7 +430,7 @@ class OniFrames:
         return np.ascontiguousarray(depth[:, ::-1]) if form.mirrored else depth
 
     def _payload(self, number: int, n_pixels: int) -> bytes:
-        """The stored bytes of a frame; none where they cannot be so many pixels."""
+        """The stored bytes of a frame; empty if their number is implausible for its pixels."""
         size = self._node.sizes[number]
         # the code, the longest table, and the counts before both
         most = WORST_BYTES_A_PIXEL * n_pixels + (1 << 17) + 4
@@ -454,16 +454,15 @@ def open_oni(
 
     Args:
         path: the .oni file.
-        camera: comes before whatever the files state.
-        fps: frame rate, Hz; used only where every frame has the same time.
+        camera: overrides the camera in the files.
+        fps: frame rate, Hz; used only if all frames have the same time.
         progress: reports how many MB were indexed.
 
     Returns:
-        The recording, of the first depth node that holds frames.
+        The recording of the first depth node with frames.
 
     Raises:
-        RecordingError: there are no depth frames, they cannot be decoded, or the camera is not
-            known.
+        RecordingError: there are no depth frames, they cannot be decoded, or the camera is unknown.
     """
     file = OniFile(path)
     try:
@@ -525,7 +524,7 @@ def _open(
 def _choose(
     path: Path, file: OniFile, depth: list[DepthNode], others: set[str], problems: list[str]
 ) -> DepthNode:
-    """The first depth node with frames; nodes are chosen by kind, for names may be anything."""
+    """The first depth node with frames, chosen by kind: names are arbitrary."""
     nodes = [node for node in depth if len(node)]
     cut = "" if file.whole else "the file is cut or damaged, and "
     if not nodes:
@@ -549,7 +548,7 @@ def _choose(
 
 
 def _format(path: Path, node: DepthNode, problems: list[str]) -> FrameFormat:
-    """The format that most frames have; those with another size or unit will be unread."""
+    """The format of most frames; frames of another size or unit become unread."""
     count = np.bincount(
         np.frombuffer(node.format_of, node.format_of.typecode), minlength=len(node.formats)
     )
@@ -600,7 +599,7 @@ def _format(path: Path, node: DepthNode, problems: list[str]) -> FrameFormat:
 def _times(
     node: DepthNode, form: FrameFormat, fps: float | None, problems: list[str]
 ) -> MonotoneTimes:
-    """Microseconds as ns; a rate where the clock stood still."""
+    """Microseconds as ns; a constant rate if the clock stood still."""
     stamps = np.frombuffer(node.times_us, node.times_us.typecode)
     n = len(stamps)
     if n > 1 and np.all(stamps == stamps[0]):
@@ -637,8 +636,8 @@ def _camera(
     stated: Lens | None,
     problems: list[str],
 ) -> Camera:
-    """Stated by the caller, or else in a camera.toml beside the file, or else what the camera said
-    of itself.
+    """The camera given by the caller, or else in a camera.toml next to the file, or else in the
+    file.
     """
     # a camera.toml comes first here: what is in the file is the design of the make and no
     # calibration of this camera
@@ -674,9 +673,7 @@ def _camera(
 def _stated_focal(
     node: DepthNode, form: FrameFormat, problems: list[str]
 ) -> tuple[tuple[float, float] | None, str]:
-    """Focal lengths (fx, fy) px and where they come from; (None, "") where the file states none
-    that can be.
-    """
+    """Focal lengths (fx, fy) px and their source; (None, "") without plausible ones in the file."""
     size = form.width, form.height
     found: list[tuple[tuple[float, float], str]] = []
     if (view := node.numbers(FIELD_OF_VIEW, "<dd")) is not None and all(
@@ -703,7 +700,7 @@ def _stated_focal(
 
 
 def _can_be(focal: tuple[float, float], size: tuple[int, int]) -> bool:
-    """Whether focal lengths belong to a lens, and to pixels about as wide as high."""
+    """Whether focal lengths are plausible for a lens, with roughly square pixels."""
     if not all(math.isfinite(f) and f > 0 for f in focal) or not 0.5 < focal[0] / focal[1] < 2.0:
         return False
     views = [2 * math.atan(n / 2 / f) for n, f in zip(size, focal, strict=True)]

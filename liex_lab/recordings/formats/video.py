@@ -1,10 +1,10 @@
 """Random access to depth videos: FFV1 or raw 16-bit grey frames in AVI or Matroska.
 
-PyAV reads the header (streams, tags, attachments). The frames are found by one walk over the
-chunks of the file that reads none of their bytes and needs no index, so that cut files can be read,
-too. FFV1 frames build on the ones before them back to the last key frame (one in twelve, usually):
-reading in order decodes each once, and reading at random some more. An AVI knows no times but a
-constant rate. In Matroska a frame's time is (cluster time + block time) * timecode scale.
+PyAV reads the header (streams, tags, attachments). The frames are found by one walk over the chunks
+of the file, which reads no frame data and needs no index, so cut files can be read as well. FFV1
+frames depend on the previous ones back to the last key frame (one in twelve, usually): reading in
+order decodes each once, random access decodes some more. AVI has a constant rate instead of times.
+In Matroska a frame's time is (cluster time + block time) * timecode scale.
 """
 
 from __future__ import annotations
@@ -33,17 +33,17 @@ from liex_lab.runtime.progress import Progress
 
 _FFV1 = "ffv1"
 _RAW = {"gray16be": ">u2", "gray16le": "<u2"}  # FFmpeg's name of the pixels: NumPy's
-# an FFV1 frame that needs none before it begins with at least this: its first coded bit is 1
+# least start value of an FFV1 key frame: its first coded bit is 1
 _KEY = 0x7F80
 _N_PROBED = 3  # key frames, one of which must be depth: the first may be damaged
 
 _CHUNK = struct.Struct("<4sI")  # name, length of what follows
-_LISTS = (b"AVI ", b"AVIX", b"hdrl", b"strl", b"movi", b"rec ")  # descended into
+_LISTS = (b"AVI ", b"AVIX", b"hdrl", b"strl", b"movi", b"rec ")  # traversed
 
 _SEGMENT = 0x18538067
 _CLUSTER = 0x1F43B675
 _GROUP = 0xA0
-_DESCENDED = (_SEGMENT, _CLUSTER, _GROUP)  # a live recording leaves their sizes open
+_DESCENDED = (_SEGMENT, _CLUSTER, _GROUP)  # of unknown size in a live recording
 _CLUSTER_TIME = 0xE7
 _BLOCKS = (0xA3, 0xA1)
 _OTHERS = (
@@ -51,24 +51,24 @@ _OTHERS = (
     *(0x1549A966, 0x1654AE6B, 0x1254C367, 0x1941A469),  # information, tracks, tags, attachments
     *(0xA7, 0xAB, 0x5854, 0x9B, 0xFB, 0xFA, 0xA4, 0x75A1, 0x75A2, 0x8E),  # in clusters and groups
 )
-_LACING = 0x06  # flags of a block that holds several frames, which no recorder of depth makes
+_LACING = 0x06  # flags of a block with several frames, which depth recorders do not write
 _MOST_TICKS = 2**60  # a clock beyond that is damage
 
 
 @dataclass
 class DepthTrack:
-    """What an AVI or a Matroska file states of its depth frames.
+    """Header and frame index of the depth track of an AVI or a Matroska file.
 
     Attributes:
         width: columns of the frames, px.
         height: rows of the frames, px.
-        dtype: how raw numbers are stored, ">u2" or "<u2"; "" for FFV1.
+        dtype: type of raw numbers, ">u2" or "<u2"; "" for FFV1.
         private: the codec's own header.
-        offsets: (n,) positions of the frames that lie whole in the file, bytes.
+        offsets: (n,) positions of the whole frames in the file, bytes.
         sizes: (n,) their sizes, bytes.
         times_ns: (n,) their times, ns.
-        even: True if the times are steps of a constant rate, for the container knows no others.
-        whole: True if the file ends where it should and holds as many frames as it says.
+        even: True if the times are steps of a constant rate, as the container has no others.
+        whole: True if the file is complete and has the stated number of frames.
         tags: tags of the whole file and of the track.
         attachments: bytes of the attached files.
         session_start: ISO 8601 if the file states it.
@@ -89,7 +89,7 @@ class DepthTrack:
 
 
 class _Span(NamedTuple):
-    """Where the payload of a chunk (AVI) or element (Matroska) lies."""
+    """Position of the payload of a chunk (AVI) or element (Matroska)."""
 
     id: Any
     start: int
@@ -97,7 +97,7 @@ class _Span(NamedTuple):
 
 
 class _Walk:
-    """The frames of one stream that have been met so far."""
+    """The frames of one stream that were found so far."""
 
     def __init__(self, file: IO[bytes], size: int) -> None:
         self.file = file
@@ -106,21 +106,21 @@ class _Walk:
         self.offsets = array("q")
         self.sizes = array("q")
         self.ticks = array("q")
-        self.n_slots = 0  # with those of dropped frames
+        self.n_slots = 0  # including dropped frames
         self._cluster_time = 0
 
     def avi(self, number: int) -> Iterator[_Span]:
-        """Notes the frames of one stream; every chunk that lies whole in the file."""
+        """Record the frames of one stream; yields every whole chunk of the file."""
         names = (b"%02ddc" % number, b"%02ddb" % number)
         for chunk in self._chunks():
             if chunk.id in names:
-                if chunk.size:  # an empty chunk stands for a dropped frame
+                if chunk.size:  # an empty chunk marks a dropped frame
                     self._add(chunk.start, chunk.size, self.n_slots)
                 self.n_slots += 1
             yield chunk
 
     def mkv(self, number: int) -> Iterator[_Span]:
-        """Notes the frames of one track; every element that lies whole in the file."""
+        """Record the frames of one track; yields every whole element of the file."""
         for element in self._elements():
             if element.id == _CLUSTER_TIME:
                 self._cluster_time = int.from_bytes(self._read(element, 8), "big")
@@ -157,7 +157,7 @@ class _Walk:
                 self.whole = False
                 return
             if name in (b"RIFF", b"LIST") and self.file.read(4) in _LISTS:
-                # a program that was stopped leaves the length of its lists at 0
+                # an interrupted program leaves the length of its lists at 0
                 self.whole = self.whole and 4 <= length <= self.size - start
                 at = start + 4
                 continue
@@ -193,7 +193,7 @@ class _Walk:
 
 
 def _vint(data: bytes, at: int) -> tuple[int, int]:
-    """The number of variable length at `at`, and where it ends; -1 if it is open or missing."""
+    """The variable-length number at `at`, and its end; -1 if it is open or missing."""
     if at >= len(data) or not data[at]:
         return -1, at
     n = 9 - data[at].bit_length()
@@ -211,7 +211,7 @@ def _index(path: Path, progress: Progress) -> DepthTrack:
     """
     is_mkv = path.suffix.lower() == ".mkv"
     try:
-        # the format is stated, for others name further files, which would be opened
+        # a fixed format: others can refer to further files, which would be opened
         with av.open(str(path), format="matroska" if is_mkv else "avi") as container:
             videos = list(container.streams.video)
             titled = [one for one in videos if _title(one).upper() == "DEPTH"]
@@ -273,7 +273,7 @@ def _title(stream: Any) -> str:
 
 
 def _dtype(stream: Any) -> str | None:
-    """How raw numbers are stored, "" for FFV1, None for what is not read."""
+    """Type of raw numbers, "" for FFV1, None for unsupported streams."""
     codec = stream.codec_context
     if codec is None or codec.name == _FFV1:
         return None if codec is None else ""
@@ -281,9 +281,9 @@ def _dtype(stream: Any) -> str | None:
 
 
 class Ffv1:
-    """Decoder (RFC 9043) of 16-bit grey frames, fed in order from a key frame on.
+    """Decoder (RFC 9043) of 16-bit grey frames, fed in order from a key frame.
 
-    FFmpeg's decoder does not check the CRC-32 of slices, so damage would come out as depth.
+    FFmpeg's decoder does not check the CRC-32 of slices, so damage would appear as depth.
     """
 
     def __init__(self, width: int, height: int, private: bytes) -> None:
@@ -291,23 +291,23 @@ class Ffv1:
         self._size = (width, height)
         self._private = private
         self._table = crc_table()
-        self._summed = False  # whether this stream has check sums, once a frame has shown it
+        self._summed = False  # whether this stream has check sums, once detected
         self._codec = self.fresh()
 
     def fresh(self) -> Any:
-        """A decoder that has been given no frame."""
+        """A new decoder."""
         codec: Any = av.CodecContext.create(_FFV1, "r")
         codec.width, codec.height = self._size
         codec.extradata = self._private or None
         return codec
 
     def decode(self, data: bytes) -> NDArray[np.uint16] | None:
-        """Stored values (H, W) of one frame; after a damaged one, the next must be a key frame.
+        """Stored values (H, W) of one frame; None if it is damaged or not 16-bit grey.
 
-        None if it is damaged or not 16-bit grey.
+        After a damaged frame, the next must be a key frame.
         """
         agree = slices_agree(np.frombuffer(data, np.uint8), self._table)
-        self._summed = self._summed or agree  # chance agrees once in four thousand million times
+        self._summed = self._summed or agree  # a chance match has a probability of 1 in 4e9
         if self._summed and not agree:
             return None
         try:
@@ -375,7 +375,7 @@ class DepthVideo(Stack):
         return not self.track.whole
 
     def read(self, index: int) -> NDArray[np.uint16] | None:
-        """Stored values (H, W) of a frame; None if it, or one that it builds on, is damaged."""
+        """Stored values (H, W) of a frame; None if it, or one that it depends on, is damaged."""
         with self._lock:
             if self._ffv1 is None:
                 data = self._bytes(index)
@@ -403,7 +403,7 @@ class DepthVideo(Stack):
         return self._file.read(size if at_most is None else min(size, at_most))
 
     def label(self, index: int) -> str:
-        """Name of a frame, for a sentence."""
+        """Name of a frame, for a message."""
         return f"frame {index} of {self._path.name}"
 
     def close(self) -> None:
