@@ -1,4 +1,4 @@
-// The page to correct in: picture, bands of time and panel, keys and mouse. Every text is set as text, never as markup.
+// The correction page: depth image, timelines and panel, keys and mouse. All texts are set as text, never as markup.
 
 import { Clerk } from "./desk_clerk.mjs";
 import { Crossings } from "./desk_crossings.mjs";
@@ -10,13 +10,13 @@ import { Source, json } from "./desk_source.mjs";
 import { Stage } from "./desk_stage.mjs";
 import { Strip } from "./desk_strip.mjs";
 
-const TOLD_MS = 160;  // the page's other figures follow when the moment has stood so long
+const TOLD_MS = 160;  // delay before the page's other figures follow the moment
 
-const WHOLE = [0, 0, 1 << 16, 1 << 16];  // is cut to the picture
+const WHOLE = [0, 0, 1 << 16, 1 << 16];  // clipped to the image
 
 let open = null;
 
-export async function start(key, at, page) {  // the desk; page.moment and page.corrected are told what happens on it
+export async function start(key, at, page) {  // the desk; it calls page.moment and page.corrected
   const place = document.getElementById("desk"), desk = open = new Desk(place, key, page);
   try {
     await desk.begin(at);
@@ -27,7 +27,7 @@ export async function start(key, at, page) {  // the desk; page.moment and page.
   return desk;
 }
 
-export function drawn(row, joint, scale = false) {  // where a joint is on the canvas, CSS pixels; or pixels for one of the picture
+export function drawn(row, joint, scale = false) {  // a joint's position on the canvas, CSS pixels; or canvas pixels per image pixel
   const { stage } = open, dots = stage.canvas.width / stage.canvas.getBoundingClientRect().width;
   if (scale) return stage.view.scale / dots;
   const seen = stage.source.at(row), uv = seen && seen.animals[0].uv;
@@ -52,7 +52,7 @@ class Desk {
   async begin(at) {
     const opening = this.source.open();
     await this.source.timed;
-    if (this.source.times.length) {  // the first picture is asked for before all else is known
+    if (this.source.times.length) {  // the first image is requested before everything else
       const row = this.source.rowAt(at);
       this.source.want(row, WHOLE);
       this.source.load(this.source.chunkOf(row));
@@ -123,14 +123,14 @@ class Desk {
         make("p", { class: "muted" }, "Drag a joint to put it elsewhere; drag the picture to move it. Drag over the upper band to mark a span."),
         make("dl", {}, ...KEYS.flatMap(([name, does]) => [make("dt", {}, make("kbd", {}, name)), make("dd", {}, does)]))));
     this.place.replaceChildren(make("div", { class: "desk-left" }, this.canvas, bar, ...bands), side);
-    this.place.addEventListener("click", (event) => {  // after a click the keys are the page's again
+    this.place.addEventListener("click", (event) => {  // after a click the page gets the keys again
       if (event.detail && event.target.closest("button, summary")) this.canvas.focus({ preventScroll: true });
     });
   }
 
   time() { return this.source.times[this.player.row]; }
 
-  stop(time) {  // and look at the frame at this time
+  stop(time) {  // and show the frame at this time
     this.player.play(false);
     this.player.go(this.source.rowAt(time));
   }
@@ -151,7 +151,7 @@ class Desk {
     if (!this.player.playing) this.tell();
   }
 
-  tell() {  // the page's other figures follow, once the moment stands
+  tell() {  // the page's other figures follow, once the moment is steady
     clearTimeout(this.telling);
     this.telling = setTimeout(() => {
       if (this.player.playing || this.player.closed) return;
@@ -160,7 +160,7 @@ class Desk {
     }, TOLD_MS);
   }
 
-  moment(at) {  // another moment was chosen elsewhere on the page
+  moment(at) {  // another moment was selected elsewhere on the page
     if (!this.player) return;
     if (this.heard !== undefined && Math.abs(at - this.heard) < 1e-6) return;
     clearTimeout(this.telling);
@@ -175,7 +175,7 @@ class Desk {
     this.bouts = await json(`${this.source.base}/bouts`);
     this.strips.forEach((strip) => { strip.bouts = this.bouts; });
     const known = new Set(this.actions.map((one) => one.word));
-    if (this.bouts.some((one) => !known.has(one.action))) {  // a new word was given
+    if (this.bouts.some((one) => !known.has(one.action))) {  // a new word was used
       const about = await json(`${this.source.base}/about`);
       this.strips.forEach((strip) => { strip.colours = new Map(about.actions.map((one) => [one.word, one.colour])); });
     }
@@ -235,7 +235,7 @@ class Desk {
     return this.clerk.correct(this.moved(row, joint, to), known);
   }
 
-  async tryJoint(dragged) {  // where the joint would be, height included: one question at a time
+  async tryJoint(dragged) {  // the joint's position, including its height: one request at a time
     dragged.asked = dragged.to;
     if (this.trying) return;
     this.trying = true;
@@ -277,4 +277,4 @@ class Desk {
   }
 }
 
-function quoted(word) { return `'${word.replaceAll("'", `'"'"'`)}'`; }  // one word of a sentence, as a shell has it
+function quoted(word) { return `'${word.replaceAll("'", `'"'"'`)}'`; }  // one word of a sentence, with shell quoting

@@ -1,19 +1,19 @@
-// Corrections on their way: taken, saved, taken back; what is not saved yet, and what went wrong.
+// Queued corrections: accepted, saved, undone; unsaved ones, and errors.
 
 import { json } from "./desk_source.mjs";
 import { button, make } from "./desk_parts.mjs";
 
-const ASK_MS = 250;  // how often it is asked whether all is saved
+const ASK_MS = 250;  // polling interval until all is saved
 const REPORT_MS = 1500;
 
 export class Clerk {
   constructor(desk) {
     this.desk = desk;
     this.tickets = [];
-    this.mine = [];  // what this visit did, to be taken back by U
+    this.mine = [];  // corrections of this visit, which U undoes
     this.unsaved = 0;
     this.told = make("p", { class: "muted desk-saved", role: "status" });
-    this.list = document.getElementById("correct-made");  // none where nothing may be corrected
+    this.list = document.getElementById("correct-made");  // absent if nothing may be corrected
     this.sentence = document.getElementById("correct-sentence");
     if (!this.sentence) return;
     this.sentence.form.addEventListener("submit", async (event) => {
@@ -22,12 +22,12 @@ export class Clerk {
     });
   }
 
-  addPixel(pixel) {  // to a sentence that is being written
+  addPixel(pixel) {  // to the sentence in the text field
     if (!this.sentence || !this.sentence.value.trim()) return;
     this.sentence.value = `${this.sentence.value.trim()} ${pixel.map((one) => one.toFixed(2)).join(" ")}`;
   }
 
-  async correct(sentence, placed) {  // true once it is taken
+  async correct(sentence, placed) {  // true once it is accepted
     const { desk } = this;
     if (!desk.about.may_correct) return false;
     const { here } = desk.doubts;
@@ -58,7 +58,7 @@ export class Clerk {
     await this.change("taking back …", { undo: true, ...last });
   }
 
-  async redo() {  // what was taken back last, in this visit or before
+  async redo() {  // the correction that was last undone, in this visit or before
     const told = await this.change("making again …", { redo: true });
     if (told) this.mine.push({ number: told.number });
   }
@@ -91,7 +91,7 @@ export class Clerk {
     this.asking = setTimeout(() => this.ask().catch((error) => this.desk.say(error.message, true)), ASK_MS);
   }
 
-  async ask() {  // how far the corrections are
+  async ask() {  // state of the corrections
     const { desk } = this, state = await json(`${desk.source.base}/state`);
     const done = this.tickets.filter((one) => ["saved", "failed"].includes((state.tickets[one.ticket] || { state: "failed" }).state));
     this.tickets = this.tickets.filter((one) => !done.includes(one));
@@ -115,7 +115,7 @@ export class Clerk {
     else if (state.report_old) this.asking = setTimeout(() => this.ask().catch(() => {}), REPORT_MS);
   }
 
-  show({ log, redo }) {  // the corrections that stand, each with a button that takes it back
+  show({ log, redo }) {  // the corrections in effect, each with a button that undoes it
     if (!this.list) return;
     const back = (number) => button("Take back", "", () => this.change("taking back …", { undo: true, number }));
     const lines = log.map((one) => make("li", {}, `${one.number}: ${one.said} (${one.author}, ${one.made_at}) `, back(one.number)));

@@ -1,30 +1,30 @@
-// Crossings: places where head and tail, or two animals, were or may have been taken for one another.
+// Crossings: stretches in which head and tail, or two animals, were or may have been exchanged.
 
 import { button, make } from "./desk_parts.mjs";
 import { json } from "./desk_source.mjs";
 
-const NEAR_S = 1e-3;  // so near to its beginning one stands at a crossing
+const NEAR_S = 1e-3;  // tolerance of being at a crossing's beginning
 
 export class Crossings {
   constructor(desk) {
     this.desk = desk;
-    this.all = null;  // until they have come
-    this.asked = 0;  // the way that was asked for before they had come
-    this.turn = 0;  // how often they were forgotten
+    this.all = null;  // until they are loaded
+    this.asked = 0;  // the direction requested before they were loaded
+    this.turn = 0;  // number of reloads
     this.count = make("span", { class: "muted desk-crossings" });
     this.parts = [make("div", { class: "desk-bar" },
       button("◀", "Shift and X", () => this.next(-1), { "aria-label": "previous crossing" }),
       button("Next crossing", "X", () => this.next(1)), this.count)];
   }
 
-  forget() {  // what was corrected may be another list
+  forget() {  // a correction may change the list
     this.all = null;
     this.turn += 1;
   }
 
   async read() {
     const turn = this.turn, all = await json(`${this.desk.source.base}/crossings`);
-    if (turn !== this.turn) return;  // corrected meanwhile, and read again
+    if (turn !== this.turn) return;  // corrected in the meantime, and reloaded
     this.all = all;
     this.count.textContent = this.all.length ? `${this.all.length} in all` : "none";
     const asked = this.asked;

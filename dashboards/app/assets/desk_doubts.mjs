@@ -1,4 +1,4 @@
-// Places in doubt: a list to work off, one after the other; what has been looked at stays so in this browser.
+// Doubtful stretches: a list to review one by one; this browser remembers the reviewed ones.
 
 import { button, kept, make } from "./desk_parts.mjs";
 import { json } from "./desk_source.mjs";
@@ -21,7 +21,7 @@ export class Doubts {
 
   get here() { return this.all[this.at]; }
 
-  async read() {  // poses at once; actions take a model
+  async read() {  // poses at once; actions need a model
     const { base } = this.desk.source;
     const poses = await json(`${base}/doubts`);
     this.take(poses);
@@ -81,7 +81,7 @@ export class Doubts {
     this.next(1);
   }
 
-  corrected(one, time) {  // a correction at this time settles the place that was being looked at
+  corrected(one, time) {  // a correction at this time completes the review of the current stretch
     if (one && one.start_s - 0.5 <= time && time <= one.stop_s + 0.5) this.done(one);
   }
 

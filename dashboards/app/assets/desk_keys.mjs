@@ -1,4 +1,4 @@
-// The keys of the page to correct in: what each does, as a list for people and as acts.
+// The keys of the correction page: a list for users, and their actions.
 
 export const KEYS = [
   ["space", "play or pause"], ["← →", "one frame; with Shift one second"], ["↑ ↓", "bout before, bout after"],
@@ -9,7 +9,7 @@ export const KEYS = [
   ["+ − Z", "zoom in, out; all of the picture"], ["S", "skeleton on, off"],
 ];
 
-export function typing(event) {  // a key that belongs to a field or a list, not to the page
+export function typing(event) {  // a key for a field or a list, not for the page
   const at = event.target;
   if (event.ctrlKey || event.metaKey || event.altKey || event.defaultPrevented) return true;
   if (at.closest && at.closest("input, textarea, select, [contenteditable]")) return true;
@@ -18,7 +18,7 @@ export function typing(event) {  // a key that belongs to a field or a list, not
 
 export function keyOf(k) { return k < 9 ? String(k + 1) : k < 18 ? `⇧${k - 8}` : ""; }  // of the k-th action
 
-export function actOf(desk, event) {  // what a key does on the desk; undefined where it does nothing
+export function actOf(desk, event) {  // the action of a key on the desk; undefined if there is none
   const { player, stage } = desk;
   const seconds = (by) => desk.source.rowAt(desk.time() + by);
   const go = (row) => { player.play(false); player.go(row); };

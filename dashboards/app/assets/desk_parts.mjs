@@ -1,4 +1,4 @@
-// What the pages to correct in and to review on are built of. Every text is set as text, never as markup.
+// Building blocks of the correction and review pages. All texts are set as text, never as markup.
 
 export function make(name, attributes, ...inside) {
   const made = document.createElement(name);
@@ -14,7 +14,7 @@ export function button(text, title, act, more) {
   return make("button", { type: "button", title, onclick: act, ...more }, text);
 }
 
-export function kept(name, value) {  // a browser that keeps nothing still works
+export function kept(name, value) {  // works without local storage as well
   try {
     if (value === undefined) return window.localStorage.getItem(name);
     window.localStorage.setItem(name, value);

@@ -1,8 +1,8 @@
-// Time goes on: which frame is shown, at 0.25 to 4 times the pace of the recording.
+// Playback: selects the displayed frame, at 0.25 to 4 times the speed of the recording.
 
 export const SPEEDS = [0.25, 0.5, 1, 2, 4];
-const AHEAD = 14;  // pictures that are asked for before they are shown
-const LONGEST_S = 0.1;  // a slower screen lets the time stand
+const AHEAD = 14;  // images that are requested ahead
+const LONGEST_S = 0.1;  // longest time step per screen update
 
 export class Player {
   constructor(source, stage) {
@@ -12,7 +12,7 @@ export class Player {
     this.speed = 1;
     this.playing = false;
     this.time = 0;
-    this.loop = null;  // [first, last] rows, played again and again
+    this.loop = null;  // [first, last] rows of the loop
     this.shown = () => {};
     this.stopped = () => {};
     this.closed = false;
@@ -32,7 +32,7 @@ export class Player {
 
   get last() { return this.source.times.length - 1; }
 
-  get step() {  // of fast playing not every frame is fetched
+  get step() {  // fast playback skips frames
     return Math.max(1, Math.round(this.speed * (1 / this.source.about.frame_s) / 30));
   }
 
@@ -77,7 +77,7 @@ export class Player {
       next = this.loop[0];  // from the beginning
       this.time = this.source.times[next];
     } else {
-      if (!this.stage.ready(next)) {  // the time stands until its picture has come
+      if (!this.stage.ready(next)) {  // the time stops until its image is loaded
         this.source.want(next, this.stage.boxOf(this.stage.wanted(next)), true);
         return;
       }

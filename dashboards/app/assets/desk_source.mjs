@@ -1,9 +1,9 @@
-// What a page shows of the frames of a session or of a clip: pictures and joints, asked for ahead and kept for a while.
+// The frames of a session or of a clip: images and joints, requested ahead and cached.
 
-const ROWS = 512;  // joints of so many frames are asked for at a time
-const PICTURES = 240;  // that are kept
-const AT_ONCE = 4;  // pictures that are on their way
-const STEP = 16;  // boxes begin and end at multiples of so many pixels
+const ROWS = 512;  // frames per request of joints
+const PICTURES = 240;  // in the cache
+const AT_ONCE = 4;  // images that are loading
+const STEP = 16;  // boxes begin and end at multiples of this, pixels
 
 export async function json(address, options) {
   const answer = await fetch(address, options);
@@ -41,7 +41,7 @@ export class Source {
     return this.about;
   }
 
-  rowAt(time) {  // the frame whose time is nearest
+  rowAt(time) {  // the frame nearest in time
     let low = 0, high = this.times.length - 1;
     while (low < high) {
       const middle = (low + high) >> 1;
@@ -64,7 +64,7 @@ export class Source {
     return coming;
   }
 
-  at(row) {  // what is known of a frame; null until it has come
+  at(row) {  // the data of a frame; null until loaded
     const chunk = this.chunkOf(row), rows = this.chunks.get(chunk);
     if (!rows || rows instanceof Promise) {
       this.load(chunk);
@@ -78,7 +78,7 @@ export class Source {
     };
   }
 
-  forgetRows() {  // after a correction; the ones of before are shown until the new ones come
+  forgetRows() {  // after a correction; the old ones are shown until the new ones are loaded
     const before = [...this.chunks.keys()];
     const old = this.chunks;
     this.chunks = new Map([...old].filter(([, rows]) => !(rows instanceof Promise)));
@@ -88,7 +88,7 @@ export class Source {
     })).then(() => this.changed());
   }
 
-  boxOf(view) {  // the part of the picture that a view needs, on a grid, so that one box serves many frames
+  boxOf(view) {  // the part of the image that a view needs, on a grid, so that many frames share one box
     const { width, height } = this.about;
     const left = Math.max(0, Math.floor(view.left / STEP) * STEP), top = Math.max(0, Math.floor(view.top / STEP) * STEP);
     const right = Math.min(width, Math.ceil((view.left + view.width) / STEP) * STEP);
@@ -96,7 +96,7 @@ export class Source {
     return [left, top, Math.max(1, right - left), Math.max(1, bottom - top)];
   }
 
-  picture(row, box) {  // {image, box} that covers the box; null until it has come
+  picture(row, box) {  // {image, box} that covers the box; null until loaded
     const known = this.pictures.get(row);
     if (known && covers(known.box, box)) {
       this.pictures.delete(row);
@@ -124,7 +124,7 @@ export class Source {
       this.pictures.set(row, kept);
       this.loading += 1;
       const done = () => { this.loading -= 1; this.changed(); this.pump(); };
-      image.addEventListener("load", () => {  // it was cut to the picture
+      image.addEventListener("load", () => {  // it was clipped to the image
         kept.box.splice(2, 2, image.naturalWidth, image.naturalHeight);
         done();
       });

@@ -1,8 +1,8 @@
-// The picture of one frame on a canvas: height relief, zoomed smoothly, with the skeleton over it, whose joints can be dragged.
+// One frame on a canvas: height relief, zoomed smoothly, with the skeleton over it, whose joints can be dragged.
 
-const GRAB_PX = 16;  // so near to a joint the pointer takes it
+const GRAB_PX = 16;  // distance within which the pointer grabs a joint
 const EASE_S = 0.09;
-const MARGIN = 1.25;  // of the view: so much of the picture is asked for
+const MARGIN = 1.25;  // the requested part of the image, relative to the view
 const MOST_ZOOM = 24;
 const PATIENCE_MS = 4000;
 
@@ -15,16 +15,16 @@ export class Stage {
     this.follow = true;
     this.zoomBy = 1;
     this.goal = null;
-    this.view = null;  // u, v: the picture's pixel in the middle; scale: pixels of the screen for one of the picture
+    this.view = null;  // u, v: the image pixel in the middle; scale: screen pixels per image pixel
     this.dragged = null;
-    this.placed = new Map();  // "row/joint" -> where a person put it, until that is saved
+    this.placed = new Map();  // "row/joint" -> position set by the user, until saved
     this.skeleton = true;
     this.lit = false;
     this.onPlace = () => {};
     this.onDrag = () => {};
     this.onPick = () => {};
     this.last = null;
-    this.first = new Promise((seen) => {  // the first picture, or that there is none
+    this.first = new Promise((seen) => {  // resolves with the first image, or without one
       this.seen = seen;
       setTimeout(seen, PATIENCE_MS);
     });
@@ -33,12 +33,12 @@ export class Stage {
     canvas.addEventListener("pointermove", (event) => this.move(event));
     canvas.addEventListener("pointerup", (event) => this.up(event));
     canvas.addEventListener("pointercancel", () => { this.dragged = null; });
-    canvas.addEventListener("touchstart", (event) => {  // a finger on a joint drags it, elsewhere it scrolls the page
+    canvas.addEventListener("touchstart", (event) => {  // a touch on a joint drags it, elsewhere it scrolls the page
       const touch = event.touches[0];
       if (event.touches.length === 1 && this.near(touch.clientX, touch.clientY, 2)) event.preventDefault();
     }, { passive: false });
     canvas.addEventListener("wheel", (event) => {
-      if (document.activeElement !== canvas && !event.ctrlKey) return;  // a page that is scrolled past is not zoomed
+      if (document.activeElement !== canvas && !event.ctrlKey) return;  // scrolling the page does not zoom
       event.preventDefault();
       this.zoom(Math.exp(-0.0016 * event.deltaY));
     }, { passive: false });
@@ -60,7 +60,7 @@ export class Stage {
 
   zoom(by) { this.zoomBy = Math.min(Math.max(this.zoomBy * by, 0.1), 8); }
 
-  wanted(row) {  // the view that a frame asks for
+  wanted(row) {  // the view of a frame
     const { width, height } = this.size(), about = this.source.about;
     const whole = Math.min(width / about.width, height / about.height);
     const seen = this.source.at(row), middle = seen && seen.animals[0].middle;
@@ -83,7 +83,7 @@ export class Stage {
     return Boolean(seen && this.source.picture(row, this.tight(this.wanted(row))));
   }
 
-  tight(view) {  // what is really seen of the picture
+  tight(view) {  // the visible part of the image
     const { width, height } = this.size(), about = this.source.about;
     const left = Math.max(0, Math.floor(view.u + 0.5 - width / 2 / view.scale));
     const top = Math.max(0, Math.floor(view.v + 0.5 - height / 2 / view.scale));
@@ -130,7 +130,7 @@ export class Stage {
       v + ((clientY - box.top) * dots - this.canvas.height / 2) / scale];
   }
 
-  uvOf(animal) {  // its joints, those that a person put elsewhere where they were put
+  uvOf(animal) {  // its joints, with the positions set by the user
     const seen = this.source.at(this.row), uv = seen && seen.animals[animal].uv;
     if (!uv || uv.some((one) => one[0] === null)) return null;
     return uv.map((one, j) => this.placed.get(`${this.row}/${j}`)
@@ -248,7 +248,7 @@ export class Stage {
     } else if (this.panned) {
       const away = Math.hypot(event.clientX - this.panned.began[0], event.clientY - this.panned.began[1]);
       if (!this.panned.moved && away < 5) return;
-      if (!this.panned.moved) {  // the view is the person's from here on, as far in as it is
+      if (!this.panned.moved) {  // from here on the user controls the view, at its current zoom
         this.panned.moved = true;
         const now = this.view.scale;
         this.follow = false;

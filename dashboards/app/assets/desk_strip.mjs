@@ -1,4 +1,4 @@
-// Two bands of time below the picture: the whole session, and the seconds around the moment, with bouts, doubts and a mark.
+// Two timelines below the image: the whole session, and the seconds around the moment, with bouts, doubtful stretches and a mark.
 
 const AROUND_S = 5;
 const GREY = "#c9cbc6";

@@ -1,4 +1,4 @@
-// Ethograms side by side: a click opens the session at that moment, a drag enlarges a stretch.
+// Ethograms of several sessions: a click opens the session at that moment, a drag enlarges a stretch.
 
 import { timed } from "./timed.mjs";
 
@@ -18,7 +18,7 @@ if (place) {
     zoom: show,
     click: (at, target) => {
       const row = target.closest(".row");
-      clearTimeout(opening);  // the second click of two shows all
+      clearTimeout(opening);  // a double-click shows all
       if (row) opening = setTimeout(() => { window.location = `/session/${encodeURIComponent(row.dataset.key)}?t=${at.toFixed(3)}`; }, 250);
     },
   });

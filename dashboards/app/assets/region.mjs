@@ -1,9 +1,9 @@
-// A region is drawn over a depth picture, by mouse, finger or keys, and saved into the plan. Every text is set as text.
+// A region is drawn over a depth image, by mouse, touch or keys, and saved to the plan. All texts are set as text.
 
 import { json } from "./desk_source.mjs";
 import { button, make } from "./desk_parts.mjs";
 
-const GRAB_PX = 12;  // so near to a corner, or a side, the pointer takes it
+const GRAB_PX = 12;  // distance within which the pointer grabs a corner or a side
 const CORNER_PX = 6;
 const SVG = "http://www.w3.org/2000/svg";
 const KEYS = [
@@ -40,7 +40,7 @@ class Region {
 
   take(about) { this.about = about; }
 
-  show(corners) {  // what the plan states
+  show(corners) {  // the region in the plan
     this.shape = { corners: (corners || []).map((one) => [...one]), closed: Boolean(corners && corners.length > 2) };
     this.paint();
   }
@@ -85,7 +85,7 @@ class Region {
 
   picture(of) {
     const address = `${this.base}/picture.png?of=${of}`;
-    this.image.addEventListener("error", async () => {  // why, in words
+    this.image.addEventListener("error", async () => {  // the reason, in words
       const answer = await fetch(address);
       if (!answer.ok) this.say(await answer.text(), true);
     }, { once: true });
@@ -140,7 +140,7 @@ class Region {
     return [fit(u, this.about.width), fit(v, this.about.height)];
   }
 
-  scale() { return 1 / this.stage.getScreenCTM().a; }  // pixels of the picture for one of the screen
+  scale() { return 1 / this.stage.getScreenCTM().a; }  // image pixels per screen pixel
 
   near([u, v]) {  // the corner under the pointer
     let best = null, least = GRAB_PX * this.scale();

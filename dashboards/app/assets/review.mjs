@@ -1,4 +1,4 @@
-// Blinded review: clips one after the other, each played again and again until it has a name. Every text is set as text.
+// Blinded review: one clip at a time, repeated until it is named. All texts are set as text.
 
 import { typing } from "./desk_keys.mjs";
 import { button, make } from "./desk_parts.mjs";
@@ -6,7 +6,7 @@ import { Player } from "./desk_player.mjs";
 import { Source, json } from "./desk_source.mjs";
 import { Stage } from "./desk_stage.mjs";
 
-const LIT_S = 0.12;  // so near to the moment that is to be named the picture has a frame
+const LIT_S = 0.12;  // time around the moment to be named in which the image has a border
 class Review {
   constructor(place) {
     this.place = place;

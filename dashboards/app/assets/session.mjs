@@ -1,4 +1,4 @@
-// The page of a session: desk, moment, curves, numbers, tables and replay follow each other. Every text is set as text.
+// The page of a session: desk, moment, curves, numbers, tables and replay are synchronised. All texts are set as text.
 
 import { start } from "./desk.mjs";
 import { make } from "./desk_parts.mjs";
@@ -11,7 +11,7 @@ const { key } = part("desk").dataset, path = encodeURIComponent(key), field = pa
 const axes = { whole: null, around: null };
 let at = Number(field.value) || 0, stretch = "", asked = false, busy = false, ready = false;
 
-function show(time) {  // everything but the desk
+function show(time) {  // everything except the desk
   at = time;
   field.value = String(time);
   part("moment-link").firstElementChild.href = `/session/${path}?t=${time.toFixed(3)}`;
@@ -42,7 +42,7 @@ function refused(error) {
   part("whole").replaceChildren(make("p", { class: "problems", role: "alert" }, error.message));
 }
 
-async function follow() {  // curves and numbers of the moment; of many in a row the last
+async function follow() {  // curves and numbers of the moment; of several requests only the last
   asked = true;
   if (busy || !ready) return;
   busy = true;
@@ -69,7 +69,7 @@ function zoom(from, to) {
 }
 
 const desk = await start(key, at, { moment: show, corrected: () => { whole(); follow(); refreshAll(); } });
-ready = true;  // figures keep a browser busy: they come after the first picture
+ready = true;  // figures keep a browser busy: they are loaded after the first image
 whole().then(follow);
 timed(part("whole"), () => axes.whole, { click: (time) => go(Number(time.toFixed(4))), zoom });
 timed(part("around"), () => axes.around, { click: (time) => go(Number(time.toFixed(4))) });

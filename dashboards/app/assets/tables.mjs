@@ -1,4 +1,4 @@
-// Tables come as HTML from this server; a heading sorts, a word filters. A choice of a form is shown at once.
+// Tables are HTML from this server; a heading sorts, a word filters. A form's selection applies at once.
 
 const WAIT_MS = 250;
 
@@ -9,7 +9,7 @@ export async function refresh(block) {
   const place = block.querySelector(".scroll"), at = document.activeElement;
   const focused = place.contains(at) ? at.dataset.column : undefined;
   place.innerHTML = await answer.text();  // rendered and escaped by this server
-  if (focused !== undefined) {  // sorting must not take a keyboard's user back to the top
+  if (focused !== undefined) {  // sorting must keep the keyboard focus
     const again = [...place.querySelectorAll("th button")].find((one) => one.dataset.column === focused);
     if (again) again.focus();
   }

@@ -1,4 +1,4 @@
-// A figure over time is clicked at a moment, or dragged over to enlarge a stretch; a double-click shows all of it.
+// Figures over time: a click selects a moment, a drag enlarges a stretch; a double-click shows all.
 
 const DRAGGED_PX = 6;
 
