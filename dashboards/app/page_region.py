@@ -102,7 +102,7 @@ class _Scenes:
         return self._whole(key)[0] if session is None or of == "recording" else self.usual(key)
 
     def usual(self, key: str) -> NDArray[np.uint16]:
-        """(H, W) uint16 mm: the usual depth of the frames that the session keeps."""
+        """(H, W) uint16 mm: the usual depth of the session's frames."""
         session = self._data.session(key)
         n = len(session.frames)
         rows = np.unique(np.linspace(0, n - 1, min(n, _N_PICTURES)).astype(int))

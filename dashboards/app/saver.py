@@ -156,7 +156,7 @@ class Saver:
                         if (ticket.folder, ticket.author) != (first.folder, first.author):
                             break
                         if ticket.what is None and any(one.what for one in batch):
-                            break  # a step of the log undoes first
+                            break  # a step of the log begins with its undos
                         batch.append(ticket)
                     for ticket in batch:
                         ticket.state = SAVING

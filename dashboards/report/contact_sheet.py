@@ -82,7 +82,7 @@ def scene_marks(session: Session) -> list[Mark]:
 
 
 def _in_picture(session: Session, xy_mm: Array, height_mm: float = 0.0) -> Array:
-    """Positions (n, 2) mm above the floor -> (n, 2) px; empty if any lies behind the camera."""
+    """Positions (n, 2) mm above the floor -> (n, 2) px; empty if any is behind the camera."""
     if not len(xy_mm):
         return np.empty((0, 2))
     place = np.column_stack([xy_mm, np.full(len(xy_mm), height_mm)])
@@ -102,13 +102,13 @@ def svg_marks(
     """Marks as SVG over a part of the image.
 
     Args:
-        marks: to be drawn; those outside the part are left out.
+        marks: the marks; those outside the part are left out.
         left: first column of the part, px.
         top: its first row, px.
         width: of the part, px.
         height: of the part, px.
         unit: length of the drawing, px; lines are 0.8 units wide and letters 4 units high.
-        lettered: whether to write a mark's label; a tooltip is always there.
+        lettered: whether to write a mark's label; its tooltip is always included.
     """
     parts = []
     for one in marks:

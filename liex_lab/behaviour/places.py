@@ -237,7 +237,9 @@ class Occupancy:
 
 
 def hold_times(time_s: ArrayLike) -> Array:
-    """(n,) the duration of each frame, s: until the next one; the last one lasts a median step."""
+    """(n,) the duration of each frame, s: until the next frame; before a gap or at the end, a
+    median step.
+    """
     time = np.asarray(time_s, float)
     return np.asarray(stop_times(time) - time)
 

@@ -1,17 +1,17 @@
 """Permutation test, linear mixed model, Welch's t interval and Hedges' g for two groups of animals.
 
-All of them take the units of a design (`design.Units`: cages, animals or an animal's own
-difference), never sessions or bouts.
+All of them use the units of a design (`Units`: cages, animals or an animal's own difference), never
+sessions or bouts.
 
 - Permutation test (Fisher 1935, Pitman 1937): the groups are reassigned to the units as the design
-  allows, p = share of the arrangements with |difference| >= the observed one; exact up to
-  `MOST_EXACT` arrangements, beyond that Monte Carlo with p = (1 + b) / (1 + m) (Phipson and Smyth
-  2010). Paired units have their signs flipped; blocks are permuted within themselves.
+allows, p = share of the arrangements with |difference| >= the observed one; exact up to
+`MOST_EXACT` arrangements, beyond that Monte Carlo with p = (1 + b) / (1 + m) (Phipson and Smyth
+2010). For paired units the signs are flipped; blocks are permuted separately.
 - Linear mixed model (Laird and Ware 1982): value ~ group + (1 | cage) or (1 | animal), by
-  restricted maximum likelihood (REML), t with units - 2 degrees of freedom.
+restricted maximum likelihood (REML), t with units - 2 degrees of freedom.
 - Confidence interval: Welch's t with Welch and Satterthwaite's degrees of freedom, a paired t, or
-  least squares with a mean per block. A bootstrap of three to six units, which is what many studies
-  have, gives intervals that are far too short.
+least squares with a mean per block. A bootstrap is not used, because its intervals are far too
+short for three to six units, which are common.
 - Hedges' g (1981): J x difference / pooled sd, with J = 1 - 3 / (4 df - 1).
 
 `liex_lab.behaviour.cohort` calls all of them.
@@ -34,7 +34,9 @@ Array = NDArray[np.float64]
 
 
 class NotComparable(Exception):
-    """Why the design does not allow a test; the text is one sentence for the table's reader."""
+    """Raised if the design does not allow a test; the message is one sentence for the table's
+    reader.
+    """
 
 
 @dataclass(frozen=True)
@@ -42,12 +44,12 @@ class Units:
     """The n units of one comparison of two groups.
 
     Attributes:
-        unit: what a unit is: cage, animal, or an animal's own difference (`PAIRED`).
-        values: (n,) value of each unit, in the measure's own unit; second group minus first where
+        unit: cage, animal, or an animal's own difference (`PAIRED`).
+        values: (n,) value of each unit, in the measure's own unit; second group minus first if
             paired.
-        second: (n,) whether the unit is of the second group; all True where paired.
+        second: (n,) whether the unit is in the second group; all True if paired.
         block: (n,) number of the block within which the unit may be exchanged.
-        n_animals: (n,) animals that each value stands for.
+        n_animals: (n,) number of animals in each value.
     """
 
     unit: str
@@ -72,20 +74,20 @@ def find_units(
 ) -> Units:
     """The units of a comparison of two groups, from one row per session.
 
-    Sessions are averaged per animal. Animals in both groups give paired differences; cages of one
-    group each become the units; where a cage holds both groups it is a block, as are the known
-    columns of `blocks`.
+    Sessions are averaged per animal. Animals in both groups give paired differences. If all cages
+    contain one group each, they become the units; if a cage contains both groups, cages are blocks,
+    like the known columns of `blocks`.
 
     Args:
         rows: one row per session: subject_id, group, cage, value, and the columns named in
-            `blocks`; an empty cage or block is not known. Rows of other groups or without a value
-            are left out.
+            `blocks`; an empty cage or block is unknown. Rows of other groups or without a value are
+            left out.
         groups: names of the first and the second group.
-        blocks: columns within which animals are exchanged; those unknown or constant are ignored.
+        blocks: columns within which animals are exchanged; unknown or constant ones are ignored.
 
     Raises:
         NotComparable: sessions do not name their animal, only some animals were in both groups, a
-            group has fewer than two animals, cages are known for some only, an animal or cage is in
+            group has fewer than two animals, only some cages are known, an animal or cage is in
             more than one block, or group and block cannot be distinguished.
     """
     rows = rows[rows["group"].isin(groups) & np.isfinite(rows["value"].to_numpy(float))]
@@ -128,7 +130,7 @@ def find_units(
 
 
 def _animals(rows: pd.DataFrame, blocks: Sequence[str]) -> pd.DataFrame:
-    """One row per animal, its value the mean of its sessions' values."""
+    """One row per animal, with the mean of its sessions' values."""
     animal, names = pd.factorize(rows["subject_id"], sort=True)
     first = np.unique(animal, return_index=True)[1]
     columns: dict[str, Any] = {
@@ -154,17 +156,17 @@ def animal_means(values: Array, animal: NDArray[np.int64]) -> Array:
 
 
 def _hold_both(names: NDArray[Any], second: NDArray[np.bool_]) -> bool:
-    """Whether any of the cages or blocks holds animals of both groups."""
+    """Whether any of the cages or blocks contains animals of both groups."""
     return any(0 < second[names == one].sum() < (names == one).sum() for one in np.unique(names))
 
 
 def _blocks(
     animals: pd.DataFrame, names: Sequence[str], second: NDArray[np.bool_]
 ) -> NDArray[np.int64]:
-    """(n,) number of the block of each animal: what it may be exchanged within.
+    """(n,) number of each animal's block, within which it may be exchanged.
 
-    A block of one group is no use; if all are so, group and block cannot be distinguished, and the
-    comparison is refused.
+    A block of one group carries no information; if all blocks are such, group and block cannot be
+    distinguished, and the comparison is refused.
     """
     known = [
         name
@@ -217,18 +219,18 @@ def _own_differences(rows: pd.DataFrame, groups: tuple[str, str]) -> Units:
     return Units(PAIRED, values, np.ones(n, bool), np.zeros(n, np.int64), np.ones(n, np.int64))
 
 
-MOST_EXACT = 20_000  # arrangements that are gone through one by one; of more, so many are drawn
+MOST_EXACT = 20_000  # arrangements of an exact test, or random ones beyond that number
 FEWEST_FOR_MODEL = 6  # units per group; with fewer, a model's variances are guesses
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """Second group minus first group, with the interval's two ends.
+    """Second group minus first group, with its confidence interval.
 
     Attributes:
         difference: difference of the groups, in the measure's own unit.
-        low: lower end of the confidence interval; NaN where a group has fewer than two units.
-        high: upper end of the confidence interval; NaN where a group has fewer than two units.
+        low: lower limit of the interval; NaN if a group has fewer than two units.
+        high: upper limit of the interval; NaN if a group has fewer than two units.
     """
 
     difference: float
@@ -240,8 +242,8 @@ def estimate(units: Units, level: float = 0.95) -> Estimate:
     """Difference of the two groups with its t interval, in the measure's own unit.
 
     Paired units: the mean of the animals' own differences, t with n - 1 degrees of freedom. More
-    than one block: least squares with a mean per block. Otherwise Welch's t, whose degrees of
-    freedom are Welch and Satterthwaite's: (va + vb)^2 / (va^2 / (na - 1) + vb^2 / (nb - 1)), v =
+    than one block: least squares with a mean per block. Otherwise Welch's t with Welch and
+    Satterthwaite's degrees of freedom: (va + vb)^2 / (va^2 / (na - 1) + vb^2 / (nb - 1)), v =
     variance / n.
 
     Args:
@@ -249,8 +251,7 @@ def estimate(units: Units, level: float = 0.95) -> Estimate:
         level: coverage of the interval, 0 to 1.
 
     Returns:
-        The estimate; its interval is NaN where an unpaired, unblocked group has fewer than two
-        units.
+        The estimate; its interval is NaN if an unpaired, unblocked group has fewer than two units.
     """
     from scipy.stats import t
 
@@ -298,16 +299,16 @@ def _within_blocks(units: Units) -> tuple[float, float, float]:
 def spread_of_animals(values: Array, second: NDArray[np.bool_]) -> tuple[float, float]:
     """Pooled standard deviation between animals within groups, and Hedges' correction factor J.
 
-    J = 1 - 3 / (4 df - 1) with df = n - 2 takes out most of the bias that Cohen's d has with few
-    animals (Hedges 1981).
+    J = 1 - 3 / (4 df - 1) with df = n - 2 removes most of the bias of Cohen's d with few animals
+    (Hedges 1981).
 
     Args:
-        values: (n,) one mean per animal; an animal that was in both groups counts in both.
-        second: (n,) bool, whether the animal is of the second group.
+        values: (n,) one mean per animal; an animal in both groups counts in both.
+        second: (n,) bool, whether the animal is in the second group.
 
     Returns:
         The pooled standard deviation, in the measure's own unit (NaN without degrees of freedom),
-        and J, which is 1 with fewer than two degrees of freedom.
+            and J, which is 1 with fewer than two degrees of freedom.
     """
     a = values[~second]
     b = values[second]
@@ -321,13 +322,10 @@ def spread_of_animals(values: Array, second: NDArray[np.bool_]) -> tuple[float, 
 
 
 def arrangements(units: Units) -> int:
-    """Number of ways in which the groups could have been given to the units.
+    """Number of possible assignments of the groups to the units.
 
-    2^n for n paired units; otherwise the product over the blocks of C(n, k), k of a block's n units
-    being of the second group.
-
-    Args:
-        units: the units of the comparison.
+    2^n for n paired units; otherwise the product over the blocks of C(n, k), where k of a block's n
+    units are in the second group.
     """
     if units.paired:
         return int(2 ** len(units.values))
@@ -335,7 +333,7 @@ def arrangements(units: Units) -> int:
 
 
 def _mixed_blocks(units: Units) -> Iterator[tuple[NDArray[np.int64], int]]:
-    """The units of each block that holds both groups, and how many are of the second group."""
+    """The units of each block that contains both groups, and the number of the second group."""
     for block in np.unique(units.block):
         inside = np.flatnonzero(units.block == block)
         k = int(units.second[inside].sum())
@@ -344,15 +342,12 @@ def _mixed_blocks(units: Units) -> Iterator[tuple[NDArray[np.int64], int]]:
 
 
 def smallest_p(units: Units) -> float:
-    """The smallest two-sided p that a permutation test of these units can give.
+    """The smallest possible two-sided p of a permutation test of these units.
 
-    It is 2 / `arrangements` where every arrangement has its mirror image (paired units, or equally
-    many of both groups in every block that has both), else 1 / `arrangements`. A block of one group
-    can be arranged in one way only and does not count. Where arrangements are drawn, it is at least
-    1 / (1 + `MOST_EXACT`).
-
-    Args:
-        units: the units of the comparison.
+    It is 2 / `arrangements` if every arrangement has a mirror image (paired units, or equal numbers
+    of both groups in every block that has both), else 1 / `arrangements`. A block of one group has
+    one arrangement and does not count. For random arrangements it is at least 1 / (1 +
+    `MOST_EXACT`).
     """
     even = units.paired or all(2 * k == len(inside) for inside, k in _mixed_blocks(units))
     n_ways = arrangements(units)
@@ -364,24 +359,22 @@ def smallest_p(units: Units) -> float:
 def permutation(units: Units, rng: np.random.Generator) -> float:
     """Two-sided p of the permutation test that the design allows (Fisher 1935, Pitman 1937).
 
-    The statistic is the blocked difference of the groups, as least squares gives it, or for paired
-    units the sum of the differences, whose signs are flipped. Up to `MOST_EXACT` arrangements all
-    are gone through; of more, `MOST_EXACT` are drawn and p = (1 + b) / (1 + m), b of the m being at
-    least as large as the observed one.
+    The statistic is the blocked difference of the groups, as in least squares, or for paired units
+    the sum of the differences, whose signs are flipped. Up to `MOST_EXACT` arrangements, all are
+    enumerated; beyond that, m = `MOST_EXACT` are drawn and p = (1 + b) / (1 + m), where b of them
+    are at least as large as the observed one.
 
     Args:
         units: the units of the comparison.
-        rng: draws the arrangements where there are too many; unused in an exact test.
+        rng: draws the random arrangements; unused in an exact test.
 
     Returns:
-        p, 0 to 1: how often a difference at least as large comes from reassigning the groups.
+        p, 0 to 1: probability of a difference at least as large if the groups are reassigned.
     """
     weight = _weights(units)
     observed = abs(float(weight @ units.values) if not units.paired else float(units.values.sum()))
     n_ways = arrangements(units)
-    least = (
-        observed * (1.0 - 1e-9) - 1e-12
-    )  # the same difference in another order of adding up is the same
+    least = observed * (1.0 - 1e-9) - 1e-12  # tolerance for rounding in another order of summation
     if n_ways <= MOST_EXACT:
         return float(np.mean(np.abs(_differences(units, None)) >= least))
     drawn = np.abs(_differences(units, rng))
@@ -398,7 +391,7 @@ def _weights(units: Units) -> Array:
 
 
 def _differences(units: Units, rng: np.random.Generator | None) -> Array:
-    """The statistic for every arrangement; with a generator, for `MOST_EXACT` drawn at random."""
+    """The statistic for every arrangement; with a generator, for `MOST_EXACT` random ones."""
     y = units.values
     if units.paired:
         if rng is not None:
@@ -421,12 +414,12 @@ def _differences(units: Units, rng: np.random.Generator | None) -> Array:
 
 @dataclass(frozen=True)
 class ModelResult:
-    """What a linear mixed model found.
+    """Result of a linear mixed model.
 
     Attributes:
         found: the fixed effect of the group with its 95 % interval.
         p: two-sided p of that effect.
-        random: what had a random intercept: cage or animal.
+        random: the factor with a random intercept: cage or animal.
     """
 
     found: Estimate
@@ -437,19 +430,19 @@ class ModelResult:
 def mixed_model(rows: pd.DataFrame, units: Units, groups: tuple[str, str]) -> ModelResult | None:
     """Linear mixed model of a group difference, fitted by restricted maximum likelihood (REML).
 
-    value ~ group + (1 | cage) on the animals' means where whole cages were assigned, otherwise
-    value ~ group + (1 | animal) on the sessions' values. p and interval are of t with as many
-    degrees of freedom as there are clusters beyond the two fixed effects.
+    value ~ group + (1 | cage) on the animals' means if whole cages were assigned, otherwise value ~
+    group + (1 | animal) on the sessions' values. p and interval use t with the number of clusters
+    minus two degrees of freedom.
 
     Args:
         rows: one row per session, as for `find_units`.
-        units: the units that `find_units` made of these rows.
+        units: the result of `find_units` for these rows.
         groups: names of the first and the second group.
 
     Returns:
-        None for paired units, where nothing is nested or the units are exchanged within blocks (the
-        permutation test is enough), and where the model does not converge or its random
-        variance lies at zero, so that its errors are not to be trusted.
+        None for paired units, if nothing is nested or the units are exchanged within blocks (the
+            permutation test is sufficient), and if the model does not converge or its random
+            variance is zero, which makes its errors unreliable.
     """
     from scipy.stats import t
 
@@ -464,7 +457,7 @@ def mixed_model(rows: pd.DataFrame, units: Units, groups: tuple[str, str]) -> Mo
         )
     clusters = data["cage" if units.unit == CAGE else "subject_id"].to_numpy(str)
     if len(np.unique(clusters)) == len(clusters) or len(np.unique(units.block)) > 1:
-        # nothing is nested, or animals are shuffled within blocks: the permutation test is enough
+        # nothing is nested, or animals are exchanged within blocks: permutation is sufficient
         return None
     fitted = _fit(
         data["value"].to_numpy(float), (data["group"] == groups[1]).to_numpy(float), clusters
@@ -483,7 +476,7 @@ def mixed_model(rows: pd.DataFrame, units: Units, groups: tuple[str, str]) -> Mo
 
 
 def _fit(values: Array, second: Array, clusters: NDArray[np.str_]) -> tuple[float, float] | None:
-    """Difference and standard error of the REML fit; None where it cannot be trusted."""
+    """Difference and standard error of the REML fit; None if unreliable."""
     from statsmodels.regression.mixed_linear_model import MixedLM
 
     scale = float(values.std())
@@ -494,7 +487,7 @@ def _fit(values: Array, second: Array, clusters: NDArray[np.str_]) -> tuple[floa
         with warnings.catch_warnings():
             warnings.simplefilter(
                 "ignore"
-            )  # whether it converged is asked below; lbfgs fails on singular matrices
+            )  # convergence is checked below; lbfgs fails on singular matrices
             result = MixedLM(values / scale, exog, clusters).fit(reml=True, method=["powell"])
     except (np.linalg.LinAlgError, ValueError):
         return None
@@ -511,7 +504,7 @@ def _fit(values: Array, second: Array, clusters: NDArray[np.str_]) -> tuple[floa
 
 
 def check_reachable(units: Units, alpha: float, groups: tuple[str, str]) -> None:
-    """Refuse a permutation test that cannot come out significant, however large the difference is.
+    """Refuse a permutation test that cannot be significant, however large the difference is.
 
     Args:
         units: the units of the comparison.
@@ -519,8 +512,8 @@ def check_reachable(units: Units, alpha: float, groups: tuple[str, str]) -> None
         groups: names of the first and the second group.
 
     Raises:
-        NotComparable: the smallest p that these units can give is above `alpha`; the text says how
-            many units there are and that more are needed.
+        NotComparable: the smallest possible p is above `alpha`; the message states the number of
+            units and that more are needed.
     """
     least = smallest_p(units)
     if least <= alpha:
@@ -547,7 +540,7 @@ def false_discovery(p: ArrayLike) -> NDArray[np.float64]:
     """Benjamini and Hochberg's corrected p of a family of tests.
 
     Args:
-        p: (n,) p values; NaN, a test not done, is not of the family.
+        p: (n,) p values; NaN, a test not done, does not belong to the family.
 
     Returns:
         (n,) corrected p, 0 to 1; NaN where `p` is NaN.

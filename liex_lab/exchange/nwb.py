@@ -5,10 +5,9 @@ rad. Actions and gaps are time intervals. Times are true times, s since the sess
 which NWB requires with a time zone.
 
 Species, sex and age are fields of NWB's Subject. Group, cage and batch have no field in NWB or in
-any extension known to archives. The subject's description contains them for people (DANDI shows
-it), and `notes`, a field of every NWB file, contains all facts on the animal for programs, as lines
-`key: value`. `scratch` is not meant to be shared, and a type of our own would be unknown to every
-reader.
+any extension that archives accept. They are in the subject's description (which DANDI displays),
+and all facts on the animal are in `notes`, a field of every NWB file, as lines `key: value`.
+`scratch` is not meant for sharing, and other programs could not read a type of our own.
 """
 
 from __future__ import annotations
