@@ -311,9 +311,8 @@ def _turned_round(
     seen, subject = read_evidence(session)
     rows_of_spans = (np.searchsorted(index, (one.start_frame, one.stop_frame)) for one in spans)
     wanted = [Flip(int(start), int(stop), 1.0, True, HUMAN) for start, stop in rows_of_spans]
-    earlier = [
-        flip for flip in read_flips(session) if flip.source == HUMAN
-    ]  # from versions that wrote into the table
+    # from versions that wrote into the table
+    earlier = [flip for flip in read_flips(session) if flip.source == HUMAN]
     again = track_whole(subject, seen, [*earlier, *wanted])
     ends = ends_of((flip.start, flip.stop) for flip in wanted)
     exchanged = np.cumsum(np.bincount(ends, minlength=len(index) + 1))[:-1] % 2 == 1

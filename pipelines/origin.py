@@ -67,9 +67,8 @@ def build_provenance(
     from liex_lab.catalog import find_model, sha256
     from liex_lab.sessions import Provenance
 
-    recording.digest(
-        progress
-    )  # cached by the recording; takes the longest, so it shows the progress
+    # cached by the recording; takes the longest, so it shows the progress
+    recording.digest(progress)
     arena, zones = build_arena(tracker.scene, plan)
     return Provenance.of(
         recording,

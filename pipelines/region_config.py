@@ -1,9 +1,9 @@
-"""The region of an arena as the plan of a recording states it: found, checked and saved there.
+"""The region of an arena in a recording's plan: find, check and save it.
 
-Of a study it may stand in the study's file (of all recordings, of an animal, of an arena, of one
-recording) or in a plan that it names; of a session outside of a study a plan is written beside it.
-A file is changed in place, with every comment kept, after its new content was read as a run reads
-it, and is replaced as a whole.
+In a study it may be in the study's file (for all recordings, an animal, an arena, or one recording)
+or in a plan that it names; for a session outside of a study a plan is written next to it. A file is
+edited in place, with all comments kept; its new content is first parsed as a run would, and the
+file is replaced as a whole.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ from liex_lab.sessions.evidence import linked_recording
 
 from .build import build_recording
 
-Keys = tuple[str | int, ...]  # keys, and the numbers of tables in lists
+Keys = tuple[str | int, ...]  # keys, and indices of tables in lists
 
 
 def with_value(text: str, path: Keys, value: Any, origin: str = "the file") -> str:
@@ -48,13 +48,13 @@ def with_value(text: str, path: Keys, value: Any, origin: str = "the file") -> s
 
     Args:
         text: the text.
-        path: keys, and numbers from 0 for tables in lists, as in ("sessions", 2, "set", "arena",
+        path: keys, and indices from 0 of tables in lists, as in ("sessions", 2, "set", "arena",
             "region").
         value: a table, list, text, number or bool; None removes it.
         origin: names the file in errors.
 
     Raises:
-        PlanError: the text is not TOML, or it is written in a way that cannot be changed in place.
+        PlanError: the text is not TOML, or is written in a form that cannot be edited in place.
     """
     try:
         wanted = tomllib.loads(text)
@@ -91,7 +91,7 @@ def _set(table: Any, path: Keys, value: Any) -> None:
     if value is None:
         table.pop(path[-1], None)
         return
-    # tomlkit counts the comments above the next header to the table before them
+    # tomlkit assigns comments above the next header to the table before them
     body = getattr(getattr(table, "value", None), "body", [])
     trailing: list[Any] = []
     while path[-1] not in table and body and body[-1][0] is None:
@@ -101,7 +101,7 @@ def _set(table: Any, path: Keys, value: Any) -> None:
 
 
 def _drop_empty(table: Any, path: Keys) -> None:
-    """Remove the empty tables on a path: they state nothing."""
+    """Remove empty tables along a path, as they state nothing."""
     if path and (isinstance(path[0], int) or path[0] in table):
         _drop_empty(table[path[0]], path[1:])
         if table[path[0]] == {} and isinstance(table, dict):
@@ -109,12 +109,12 @@ def _drop_empty(table: Any, path: Keys) -> None:
 
 
 def _candidates(text: str, path: Keys, value: Any) -> Iterator[str]:
-    """Texts that may state the value, the one with the smallest change first."""
+    """Texts that may state the value, smallest change first."""
     import tomlkit
     from tomlkit.exceptions import TOMLKitError
 
     told = None if value is None else toml_value(value)
-    if told is not None:  # `Plan.to_toml` writes `# key =` for what is not set
+    if told is not None:  # `Plan.to_toml` writes `# key =` for an unset value
         header, key = (re.escape(name) for name in (".".join(map(str, path[:-1])), str(path[-1])))
         unset = rf"(^\[{header}\](?:(?!^\[).)*?^)# {key} =[ \t]*(?=\r?$)"
         stated = f"{path[-1]} = {told}"
@@ -131,19 +131,19 @@ def _candidates(text: str, path: Keys, value: Any) -> Iterator[str]:
 
 _MOST_CORNERS = 200
 _REGION = ("arena", "region")
-_N_PICTURES = 9  # of which each pixel's usual depth is shown
+_N_PICTURES = 9  # number of sampled frames for each pixel's usual depth
 
 
 @dataclass(frozen=True)
 class Place:
-    """Where a region may stand.
+    """A value that may state a region.
 
     Attributes:
         name: all, arena, animal, recording or beside.
-        title: whose region it is.
-        file: the file; it need not be there.
-        path: of the value in the file, see `editing.with_value`.
-        stated: what stands there now; None where nothing does.
+        title: the recordings that the region applies to.
+        file: the file; it may not exist yet.
+        path: of the value in the file, see `with_value`.
+        stated: the current value; None if there is none.
     """
 
     name: str
@@ -154,9 +154,7 @@ class Place:
 
 
 class StatedRegions:
-    """The regions of a study's recordings, or of the sessions in a folder.
-
-    It may be used from several threads at once.
+    """The regions of a study's recordings, or of the sessions in a folder. Thread-safe.
 
     Args:
         place: a study's .toml file, or a folder with a study.toml or sessions in it.
@@ -170,20 +168,20 @@ class StatedRegions:
 
     @property
     def of_recordings(self) -> bool:
-        """Whether recordings are known that were not measured: those of a study."""
+        """Whether unmeasured recordings are included, as in a study."""
         return self._study is not None
 
     def about(self, key: str, session: Session | None) -> dict[str, Any]:
-        """What is told of the region of a recording.
+        """Facts about the region of a recording.
 
         Args:
             key: its name in the study.
-            session: its results; None where it was not measured.
+            session: its results; None if it was not measured.
 
         Returns:
-            places (name, title, file, stated), place (the name of the one that counts), region
-            (corners, px; None where none is stated), said (why it cannot be shown), recording (as
-            commands name it), has_recording (whether its whole picture can be asked for).
+            places (name, title, file, stated), place (the name of the one that applies), region
+            (corners, px; None if none is stated), said (why it cannot be displayed), recording (its
+            name in commands), has_recording (whether its whole image is available).
 
         Raises:
             LiexError: there is no such recording, or the study cannot be read.
@@ -215,17 +213,17 @@ class StatedRegions:
         corners: Sequence[Any] | None,
         was: Any,
     ) -> str:
-        """State a region, or take it out; returns what was done and what to do next.
+        """State or remove a region; returns a message on the change and the next command.
 
         Args:
             key: the recording's name in the study.
-            session: its results; None where it was not measured.
-            place: the name of the place.
-            corners: (u, v) px; None takes out what is stated.
-            was: what the person saw stated there.
+            session: its results; None if it was not measured.
+            place: name of the `Place` to change.
+            corners: (u, v) px; None removes the stated region.
+            was: the value that the user was shown, to detect other changes.
 
         Raises:
-            LiexError: the region is none, or the file cannot be changed.
+            LiexError: the region is not valid, or the file cannot be changed.
         """
         with self._lock:
             places = self._places(key, session)
@@ -250,7 +248,7 @@ class StatedRegions:
         return f"{found.file.name} {done}; measure again: {self._next(key, session, found)}"
 
     def picture(self, key: str) -> tuple[NDArray[np.uint16], Camera]:
-        """The usual depth of every pixel of a study's recording, in the whole picture.
+        """The usual depth of every pixel of a study's recording, in the whole image.
 
         Args:
             key: the recording's name in the study.
@@ -259,7 +257,7 @@ class StatedRegions:
             (H, W) uint16 mm, 0 where unread, and the camera.
 
         Raises:
-            LiexError: it is no study's, or it cannot be read.
+            LiexError: the recording is not in a study, or cannot be read.
         """
         with self._lock:
             return self._seen_whole(key)
@@ -283,7 +281,7 @@ class StatedRegions:
         raise StudyError(f"the study has no recording {key}; load the page again")
 
     def _places(self, key: str, session: Session | None) -> list[Place]:
-        """Where the region may stand; a later one goes before an earlier one."""
+        """The values that may state the region; later ones override earlier ones."""
         if self._study is not None:
             k, planned, study = self._planned(key)
             return _of_study(k, planned, study)
@@ -296,7 +294,7 @@ class StatedRegions:
         return [Place("beside", "this recording, in a plan beside it", file, _REGION, stated)]
 
     def _shown(self, place: Place, session: Session | None) -> list[list[float]] | None:
-        """The corners of what is stated, px."""
+        """The corners of the stated region, px; None if there is none."""
         if place.stated is None:
             return None
         region = _region(place.stated)
@@ -315,12 +313,12 @@ class StatedRegions:
     def _checked(
         self, key: str, session: Session | None, corners: Sequence[Any]
     ) -> list[list[float]]:
-        """The corners as they are written, if they are a region of the picture."""
+        """The rounded corners, if they form a region of the image; raises PlanError otherwise."""
         if not isinstance(corners, list) or len(corners) > _MOST_CORNERS:
             raise PlanError(f"a region is a list of at most {_MOST_CORNERS} corners [x, y]")
         region = _region(corners)
         camera = self._seen_whole(key)[1] if session is None else session.camera
-        # says what is wrong where it is none
+        # raises an error if it is not valid
         region_mask(region_corners_px(region), camera.width, camera.height)
         return [[round(float(value), 1) for value in corner] for corner in region.polygon or ()]
 
@@ -335,14 +333,14 @@ class StatedRegions:
             raise PlanError(f"{place.file} cannot be read ({one_line(error)})") from None
 
     def _check(self, place: Place, text: str) -> None:
-        """Whether the file says what a run can take, for every recording that it is of."""
+        """Check that the file is valid for a run, for every recording it applies to."""
         if self._study is not None and place.path != _REGION:
             _ = Study.from_table(parse_toml(text), place.file).sessions  # every plan resolved
         else:
             Plan.from_toml(text, place.file.name)
 
     def _recording(self, key: str, session: Session | None) -> str:
-        """The recording as a command names it."""
+        """The recording's name in a command."""
         if self._study is not None:
             return shlex.quote(self._planned(key)[1].recording)
         linked = linked_recording(session) if session is not None else None
@@ -385,10 +383,10 @@ def _of_study(k: int, planned: PlannedSession, study: Study) -> list[Place]:
 
 
 def _region(stated: Any) -> Region:
-    """A region as a plan has it.
+    """A region as a plan parses it.
 
     Raises:
-        PlanError: it is none.
+        PlanError: it is not valid.
     """
     region = Plan.from_table({"arena": {"region": stated}}, "the region").arena.region
     if region is None:
@@ -414,16 +412,16 @@ def _table(file: Path) -> dict[str, Any]:
 
 
 def _usual(recording: Any) -> NDArray[np.uint16]:
-    """Each pixel's median over frames of a whole recording, of those that read it."""
+    """Each pixel's median depth over sampled frames that read it."""
     sample = sample_frames(recording, _N_PICTURES)
     return usual_depth(np.clip(np.rint(sample), 0, 65_535).astype(np.uint16))
 
 
 def _write(file: Path, text: str) -> None:
-    """Put the file in place whole, with the rights that it has.
+    """Replace the file as a whole, with its permissions kept.
 
     Raises:
-        PlanError: it cannot be.
+        PlanError: it cannot be written.
     """
     try:
         with replacing(file) as part:

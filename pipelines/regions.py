@@ -1,9 +1,9 @@
-"""Regions that a plan states, placed in the pictures of a recording, and arenas that it proposes.
+"""Regions that a plan states, in the images of a recording, and proposed arenas.
 
-An arena is cut out of a picture by making everything outside of its region unread: the size of the
-picture and its camera stay, so that whatever is measured within keeps its place and a session of an
-arena among several is that of a recording which shows nothing else. Regions in millimetres need the
-floor, which is found in the whole picture, or stated.
+An arena is cut out by making all pixels outside its region unread. Image size and camera stay the
+same, so measurements keep their coordinates, and the session of one arena of several equals that of
+a recording that contains nothing else. Regions in millimetres need the floor, which is estimated
+from the whole image, or stated.
 """
 
 from __future__ import annotations
@@ -34,14 +34,14 @@ _N_SAMPLED = 96
 
 
 def cut_out(recording: Recording, plan: Plan) -> Recording:
-    """The recording with all but the plan's region unread; itself where the plan states none.
+    """The recording with all but the plan's region unread; unchanged if the plan states none.
 
     Args:
         recording: an ideal pinhole's recording.
         plan: its setting `arena.region`.
 
     Raises:
-        PlanError: the region is none in this picture.
+        PlanError: the region lies outside the image.
         EstimationError: it is stated in millimetres, and no floor is found.
     """
     if plan.arena.region is None or recording.region_px:
@@ -50,10 +50,10 @@ def cut_out(recording: Recording, plan: Plan) -> Recording:
 
 
 def stated_corners(recording: Recording, plan: Plan, region: Region) -> Corners:
-    """The corners (u, v) px of a region in the pictures of a recording.
+    """The corners (u, v) px of a region in the images of a recording.
 
     Args:
-        recording: an ideal pinhole's recording, of the whole picture.
+        recording: an ideal pinhole's recording, of the whole image.
         plan: states the floor, or the animals that stand on it.
         region: the region.
     """
@@ -62,12 +62,7 @@ def stated_corners(recording: Recording, plan: Plan, region: Region) -> Corners:
 
 
 def pinned(plan: Plan, recording: Recording) -> Plan:
-    """The plan with its region in pixels, where it is stated in another way.
-
-    Args:
-        plan: the plan.
-        recording: the recording, cut out.
-    """
+    """The plan with the region of a recording, which was cut out, in pixels."""
     if not recording.region_px:
         return plan
     corners = [list(corner) for corner in recording.region_px]
@@ -75,7 +70,7 @@ def pinned(plan: Plan, recording: Recording) -> Plan:
 
 
 def stated_floor(camera: Camera, plan: Plan) -> Floor | None:
-    """The floor that the plan states, None where it is to be found.
+    """The floor that the plan states; None if it is to be found.
 
     Args:
         camera: the ideal pinhole camera of the recording.
@@ -89,14 +84,14 @@ def stated_floor(camera: Camera, plan: Plan) -> Floor | None:
 
 
 def region_of(recording: Recording, plan: Plan) -> NDArray[np.bool_] | None:
-    """Where (H, W) in the picture is looked at; None where everywhere.
+    """The pixels (H, W) bool of the plan's region; None for all.
 
     Args:
         recording: an ideal pinhole's recording, cut out or not.
         plan: its setting `arena.region`.
 
     Raises:
-        PlanError: the region is none in this picture.
+        PlanError: the region lies outside the image.
     """
     corners = recording.region_px
     if not corners and plan.arena.region is not None:
@@ -105,7 +100,7 @@ def region_of(recording: Recording, plan: Plan) -> NDArray[np.bool_] | None:
 
 
 def _floor_of_picture(recording: Recording, plan: Plan) -> Floor:
-    """The floor on which animals stand in the whole picture, or the one that the plan states."""
+    """The floor that the plan states, or the one on which animals stand in the whole image."""
     stated = stated_floor(recording.camera, plan)
     if stated is not None:
         return stated
@@ -134,14 +129,14 @@ def _sampled(recording: Recording, plan: Plan) -> tuple[SampledScene, int]:
 
 
 def arenas_of(recording: Recording, plan: Plan) -> list[SeveralArenas]:
-    """The several arenas of a picture, as the plan lists them or as they are proposed.
+    """The arenas of a recording, as listed in the plan or as proposed.
 
     Args:
-        recording: an ideal pinhole's recording, of the whole picture.
+        recording: an ideal pinhole's recording, of the whole image.
         plan: its setting `arenas`.
 
     Raises:
-        PlanError: it says 'auto', and fewer than two are seen.
+        PlanError: the setting is 'auto', and fewer than two are found.
     """
     if plan.arenas != "auto":
         return list(plan.arenas or ())
@@ -156,14 +151,14 @@ def arenas_of(recording: Recording, plan: Plan) -> list[SeveralArenas]:
 
 
 def propose_arenas(recording: Recording, plan: Plan) -> list[SeveralArenas]:
-    """The arenas in which animals are seen moving, from left to right and top to bottom.
+    """The arenas in which animals move, from left to right and top to bottom.
 
     Args:
-        recording: an ideal pinhole's recording, of the whole picture.
+        recording: an ideal pinhole's recording, of the whole image.
         plan: the animals' sizes and the foreground's thresholds.
 
     Returns:
-        Two to eight of them with a polygon each that touches no other; [] where only one is seen.
+        Two to eight of them, with disjoint polygons; [] if only one is found.
     """
     view = Skeleton.load(plan.animal.skeleton).view
     if view.frame != VIEWS[0] or recording.region_px:

@@ -1,8 +1,8 @@
 """The bundled sample recording: a rendered mouse as a camera's MCAP file, and its card.
 
 154 frames of a walk in which the animal turns, crosses its arena and rears once, 320 x 240 px, four
-of them left out as a camera would; 16-bit depth, mm, in Foxglove messages. From a seed, so the same
-code and package versions write the same bytes.
+of them dropped as by a camera; 16-bit depth, mm, in Foxglove messages. It is rendered from a seed,
+so the same code and package versions write the same bytes.
 """
 
 from __future__ import annotations
@@ -19,27 +19,23 @@ from liex_lab.runtime.progress import Progress, silent
 if TYPE_CHECKING:
     from liex_lab.simulation.recording import SyntheticSession
 
-SEED = 341  # of a walk in which the animal turns, crosses its arena and rears once
+SEED = 341  # a walk in which the animal turns, crosses its arena and rears once
 SPINE_MM = 65.0
 N_FRAMES = 154
-LEFT_OUT = (
-    40,
-    101,
-    102,
-    103,
-)  # frames that "the camera did not deliver", so that a sample has gaps as recordings have
-_START_NS = 10**9  # the clock of a camera that was switched on a second ago: no date is claimed
-# packed once, downloaded often
+# frames dropped as by a camera, so that the sample has gaps like real recordings
+LEFT_OUT = (40, 101, 102, 103)
+_START_NS = 10**9  # the clock of a camera switched on a second ago: no date is implied
+# slow but strong compression: packed once, downloaded often
 _CHUNK_BYTES = 1 << 20
 _LEVEL = 19
 
 
 def write_sample(path: str | Path, *, progress: Progress = silent) -> Path:
-    """Write the sample recording, and its card beside it (.toml).
+    """Write the sample recording, and its card (.toml) next to it.
 
     Args:
-        path: the MCAP file; one that is there is replaced.
-        progress: told how far the writing is.
+        path: the MCAP file; an existing one is replaced.
+        progress: called with the number of written frames.
 
     Returns:
         The path of the recording.
@@ -72,7 +68,7 @@ def write_sample(path: str | Path, *, progress: Progress = silent) -> Path:
 
 
 def virtual_mouse() -> SyntheticSession:
-    """The animal of the sample, its arena and its camera, with the exact truth of every frame."""
+    """The animal of the sample, with arena, camera and the exact truth of every frame."""
     from liex_lab.simulation.locomotion import walking_session
     from liex_lab.simulation.species import PRIMESENSE_QVGA_SENSOR
 

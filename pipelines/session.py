@@ -1,9 +1,9 @@
 """Measurement of a recording, `liex run`: a depth recording in, a session folder out.
 
-The whole line on one page: recording -> foreground -> candidate poses of single frames -> track
+The whole pipeline on one page: recording -> foreground -> candidate poses of single frames -> track
 (association, smoothing) -> actions -> behaviour tables. Single frames are measured in chunks and
-written as they come, so an interrupted run goes on where it was; the track and all that follows is
-made of all frames at once.
+written at once, so an interrupted run resumes where it stopped; the track and all later stages use
+all frames at once.
 """
 
 from __future__ import annotations
@@ -67,14 +67,14 @@ Observed = tuple["list[DepthFrame]", "Observations"]
 def observed(
     tracker: FrameTracker, stretches: Iterable[list[DepthFrame]]
 ) -> Generator[Observed, None, None]:
-    """Stretches of frames with what single frames say, in their order.
+    """Stretches of frames with their single-frame observations, in order.
 
     Args:
         tracker: prepared for their recording.
-        stretches: consecutive frames; so many are taken ahead as are looked at at once.
+        stretches: consecutive frames; as many are read ahead as are measured concurrently.
 
     Yields:
-        Each stretch with its observations; what goes wrong with one is raised in its turn.
+        Each stretch with its observations; an error in one is raised in its turn.
     """
     import numba
 
@@ -84,7 +84,7 @@ def observed(
             yield frames, tracker.observe(frames)
         return
     waiting: deque[tuple[list[DepthFrame], Future[Observations]]] = deque()
-    # products are serial all the while: the limit is one of the process, not of a thread
+    # matrix products are serial meanwhile: the limit is per process, not per thread
     with (
         serial_products(),
         ThreadPoolExecutor(
@@ -104,14 +104,16 @@ def observed(
 
 
 def _first(waiting: deque[tuple[list[DepthFrame], Future[Observations]]]) -> Observed:
-    """The stretch that was taken first, once it has been looked at."""
+    """The oldest stretch, once it is measured."""
     frames, coming = waiting.popleft()
     return frames, coming.result()
 
 
 def _may_share() -> bool:
-    """Whether several threads may run parallel kernels at once: numba's own layer ends a process
-    in which they do. False where none has been run yet.
+    """Whether several threads may run parallel kernels at once.
+
+    numba's own threading layer aborts a process in which they do. False if no parallel kernel has
+    run yet.
     """
     import numba
 
@@ -138,32 +140,32 @@ def measure_session(
     """Measure every frame of a recording and write the session folder.
 
     An unfinished session of the same recording and plan is continued. A plan that the recording
-    does not fit is refused before anything is measured; where none is named the bundled one that
-    fits is used. Where a pool of workers is
-    given and the recording is long (more than two shards, and than the pool says) and stated by
-    its path, its shards are measured side by side; the tables are the same.
+    does not fit is refused before anything is measured; if none is named, the bundled one that fits
+    is used. With a worker pool, shards of a long recording (more than two shards, and more frames
+    than the pool's minimum) that is given by its path are measured in parallel; the tables are the
+    same.
 
     Args:
-        recording: a path or address, or a recording that is open already.
-        plan: everything that the run depends on; None takes the bundled plan that fits.
+        recording: a path or address, or an open recording.
+        plan: everything that the run depends on; None uses the bundled plan that fits.
         out: folder of the session, which is named after the plan's session or the recording.
-        settings: changes of a plan that was not named, as `Plan.with_settings` takes them.
+        settings: changes to the plan if none was named, as for `Plan.with_settings`.
         folder: the session folder itself, instead of `out/NAME.liex`.
-        overwrite: replace a session that is there already, once the new one is whole.
-        notes: what session.json is to hold besides, see `SessionWriter.note`.
+        overwrite: replace an existing session, once the new one is complete.
+        notes: additional contents of session.json, see `SessionWriter.note`.
         blueprint: makes the layout of the replay, see `SessionWriter`.
         report: makes the report in the folder, see `SessionWriter`.
-        pool: pool of workers for the shards of a long recording.
-        progress: reports frame by frame.
+        pool: workers for the shards of a long recording.
+        progress: called frame by frame.
 
     Returns:
         The session folder.
 
     Raises:
-        SessionError: a session is there already, or another process writes it.
+        SessionError: a session exists already, or another process writes it.
         RecordingError: the recording cannot be opened or read.
         PlanError: the plan, or a file that it names, cannot be used.
-        MisfitError: the recording shows something else than the plan's animal.
+        MisfitError: the recording does not show the plan's animal.
         EstimationError: no animal is found.
     """
     started = time.perf_counter()
@@ -206,8 +208,10 @@ def measure_session(
 
 
 def _check_subject(opened: Recording, path: Path, plan: Plan) -> list[str]:
-    """Note the animal that metadata, folders or the file name give where the plan names none; a
-    caution where it names another one than the metadata.
+    """Compare the animal's name in the plan with that in metadata, folders or the file name.
+
+    Without a name in the plan, the other one is noted in the metadata; a caution is returned if the
+    plan's differs from the metadata's.
     """
     from liex_lab.plan.subject import animal_part, find_subject, letters, same
     from liex_lab.sessions.verdict import OTHER_ANIMAL
@@ -221,20 +225,20 @@ def _check_subject(opened: Recording, path: Path, plan: Plan) -> list[str]:
         opened.metadata["subject_id"] = named
         return []
     differ = in_metadata and same(found.id) != same(letters(animal_part(stated)))
-    # of several arenas the metadata name one animal at most
+    # for several arenas the metadata name one animal at most
     alone = plan.arena.region is None
     return [f"{OTHER_ANIMAL}, {told} instead of {stated}"] if differ and alone else []
 
 
 def check_unused(folder: Path, overwrite: bool) -> None:
-    """Refuse a session folder that is there already, or that another process writes.
+    """Refuse a session folder that exists already, or that another process writes.
 
     Args:
-        folder: the session folder to be.
-        overwrite: replace a session that is there already.
+        folder: the planned session folder.
+        overwrite: replace an existing session.
 
     Raises:
-        SessionError: it may not be written there.
+        SessionError: the session cannot be written there.
     """
     from liex_lab.sessions.backups import put_back_session
     from liex_lab.sessions.checkpoint import check_free
@@ -247,12 +251,12 @@ def check_unused(folder: Path, overwrite: bool) -> None:
 
 @dataclass
 class Prepared:
-    """A session whose scene is learned, ready to take frames.
+    """A session whose scene is learned, ready to measure frames.
 
     Attributes:
         fitted: plan, recording and tracker.
         origin: provenance of the session.
-        folder: the session folder to be.
+        folder: the planned session folder.
         timings: seconds of `prepare` and `track`.
     """
 
@@ -267,12 +271,7 @@ class Prepared:
         return self.fitted.recording
 
     def measure(self, frames: list[DepthFrame], writer: SessionWriter) -> None:
-        """Measure consecutive frames and hand them to the session's writer.
-
-        Args:
-            frames: as this recording shows them.
-            writer: of the session.
-        """
+        """Measure consecutive frames of this recording and pass them to the session's writer."""
         began = time.perf_counter()
         seen = self.fitted.tracker.observe(frames)
         self.timings["track"] += time.perf_counter() - began
@@ -281,12 +280,12 @@ class Prepared:
     def measure_all(
         self, stretches: Iterable[list[DepthFrame]], writer: SessionWriter, progress: Progress
     ) -> None:
-        """Measure consecutive stretches of frames, some at once, and hand them to the writer.
+        """Measure consecutive stretches of frames, some concurrently, and pass them to the writer.
 
         Args:
-            stretches: as this recording shows them.
+            stretches: of this recording.
             writer: of the session.
-            progress: reports frame by frame.
+            progress: called frame by frame.
         """
         with closing(observed(self.fitted.tracker, stretches)) as coming:
             began = time.perf_counter()
@@ -301,9 +300,9 @@ class Prepared:
 
         Args:
             pool: the workers.
-            recording: path or address, which each of them opens; of an archive that is unpacked
-                here, workers of this machine open what came out.
-            progress: reports shard by shard.
+            recording: path or address, which each of them opens; if an archive is unpacked here,
+                workers on this machine open the unpacked files.
+            progress: called shard by shard.
         """
         n = len(self.recording)
         if n <= max(2 * LENGTH, pool.fewest):
@@ -319,13 +318,13 @@ class Prepared:
         source: str | Path | Recording,
         notes: Mapping[str, Any] | None = None,
     ) -> Session:
-        """Make track, behaviour and tables, and put the session in its place.
+        """Make track, behaviour and tables, and move the session to its folder.
 
         Args:
             writer: has all frames.
-            source: path or address of the recording, to which the session links; one that was
-                handed over open has none.
-            notes: what session.json is to hold besides.
+            source: path or address of the recording, to which the session links; there is no link
+                to an open recording.
+            notes: additional contents of session.json.
         """
         from liex_lab.sessions.evidence import link_to
 
@@ -340,18 +339,18 @@ class Prepared:
 
 
 def prepare(fitted: Fitted, folder: Path, started: float, progress: Progress) -> Prepared:
-    """A session that is ready to take frames; a slip in the recogniser's name is told before.
+    """Prepare a session for measuring; raises early if the recogniser is unknown.
 
     Args:
         fitted: plan, recording and tracker.
-        folder: the session folder to be.
+        folder: the planned session folder.
         started: when its preparation began, by `time.perf_counter`.
-        progress: reports while the recording is hashed.
+        progress: called while the recording is hashed.
 
     Raises:
         ModelError: there is no such recogniser.
-        PlanError: it was made for another skeleton.
-        SessionError: the disk has not enough room for it.
+        PlanError: the recogniser was made for another skeleton.
+        SessionError: there is not enough disk space.
     """
     from liex_lab.sessions.checkpoint import hash_once
     from liex_lab.sessions.folder import check_room, megabytes, part_folder
@@ -387,14 +386,14 @@ def read_ahead(opened: Recording, first: int) -> Generator[list[DepthFrame], Non
 
 
 def make_track(writer: SessionWriter, fitted: Fitted) -> Verdict:
-    """Make the track of a session whose frames have all been measured, and hand it to the writer.
+    """Make the track of a session whose frames have all been measured, and pass it to the writer.
 
     Args:
-        writer: holds the observations, and allocates the track's arrays.
+        writer: has the observations, and allocates the track's arrays.
         fitted: the plan and its tracker that measured the frames.
 
     Returns:
-        How it went.
+        The verdict on the session.
     """
     from liex_lab.optics.camera import unusual_centre, unusual_lens
     from liex_lab.sessions.verdict import Verdict
@@ -410,7 +409,7 @@ def make_track(writer: SessionWriter, fitted: Fitted) -> Verdict:
     fast = why_too_fast(tracked.track, subject.length_mm)
     frozen, copied = copies_told(whole.times_ns, whole.repeats, tracker.noisy)
     water = build_water(fitted.plan)
-    # water makes an ideal camera with a focal length of its own
+    # with water the ideal camera has another focal length
     lens = unusual_lens(recording.camera) if water is None else ""
     jumps = [gap.start_frame for gap in recording.gaps if gap.reason == JUMPED]
     centre, at_edge = unusual_centre(recording.camera)
@@ -444,10 +443,10 @@ def make_track(writer: SessionWriter, fitted: Fitted) -> Verdict:
 
 
 def conclude(writer: SessionWriter, plan: Plan, timings: dict[str, float]) -> Session:
-    """The finished session: its behaviour is measured and the session put in its place.
+    """Measure the behaviour and move the session to its folder; returns the finished session.
 
     Args:
-        writer: holds the track as rows.
+        writer: has the track as rows.
         plan: rules and action model.
         timings: seconds of `prepare` and `track`, for session.json.
     """
@@ -464,14 +463,14 @@ def measure_behaviour(
     allocate: Allocator = np.empty,
     seams: Sequence[int] = (),
 ) -> tuple[Behaviour, dict[str, Any]]:
-    """The behaviour of a track as the plan names it, and notes on the recogniser for session.json.
+    """The behaviour of a track by the plan's recogniser or rules, and notes for session.json.
 
     Args:
         rows: the track as table rows.
         plan: rules and action model.
         origin: skeleton, arena, zones and water.
         allocate: allocator of large arrays, such as one of files on disk.
-        seams: where nothing is measured across, see `Surroundings`.
+        seams: rows across which nothing is measured, see `Surroundings`.
     """
     from liex_lab.behaviour.summary import measure_rows, moving_rows
     from liex_lab.tables.schema import BOUTS, empty_table
@@ -497,15 +496,15 @@ def name_actions(
     """The ethogram of a track by a recogniser, and notes for session.json.
 
     Args:
-        recogniser: names the frames.
+        recogniser: assigns an action to each frame.
         rows: the track as table rows, with the distance of the animal from the nearest wall, mm.
-        moved: the table `kinematics` of the track, which bouts are checked by.
+        moved: the table `kinematics` of the track, for checking bouts.
         allocate: allocator of large arrays.
 
     Returns:
-        `bouts` and the definitions of `actions`, as `behaviour.measure` takes them; and notes:
-        which recogniser it was, which actions the frame rate cannot tell, and which bouts were
-        refused since they contradict their definition.
+        `bouts` and the definitions of `actions`, as for `measure_rows`; and notes: the recogniser,
+        the actions that cannot be resolved at the frame rate, and the bouts that were refused since
+        they contradict their definition.
     """
     from liex_lab.actions.vocabulary import printed_meanings
     from liex_lab.behaviour.measures import recognise
@@ -528,7 +527,7 @@ def name_actions(
 
 
 def _told_refused(notes: dict[str, Any]) -> list[str]:
-    """That bouts were refused, as a sentence for the session's problems; none where none was."""
+    """A sentence on refused bouts for the session's problems; [] if there are none."""
     n = len(notes.get("refused_bouts", {}).get("bouts", []))
     if not n:
         return []

@@ -1,9 +1,9 @@
-"""Sharded measurement of one long recording: spans of frames, measured side by side.
+"""Sharded measurement of one long recording: spans of frames, measured in parallel.
 
-What single frames say does not depend on their neighbours, and the track is made of all frames at
-once afterwards; so there is no seam, and the tables are those of one process. Shards begin at
-multiples of `LENGTH` frames and lie in folders of their own until they are taken over in order, so
-an interruption costs no more than the shards under way.
+Single-frame observations do not depend on neighbouring frames, and the track is made of all frames
+at once afterwards; so there are no seams, and the tables are those of one process. Shards begin at
+multiples of `LENGTH` frames and have folders of their own until they are appended in order, so an
+interruption only costs the shards in progress.
 """
 
 from __future__ import annotations
@@ -28,21 +28,21 @@ if TYPE_CHECKING:
     from liex_lab.sessions import Provenance
     from liex_lab.tracking.tracker import FrameTracker
 
-LENGTH = 500  # frames of a stretch: some seconds of work, which is what an interruption costs
+LENGTH = 500  # frames per shard: some seconds of work, the cost of an interruption
 CHUNK = 32  # frames in memory at a time
 MEASURING = "measuring poses"
 
 
 @dataclass(frozen=True)
 class Shard:
-    """A span of frames of a recording, and all that a worker elsewhere has to know to measure it.
+    """A span of frames of a recording, with all that a remote worker needs to measure it.
 
     Attributes:
         recording: path or address of the recording.
         plan: how it is measured.
-        tracker: the prepared tracker; a pickle leaves out its estimator, which is large.
+        tracker: the prepared tracker; a pickle omits its estimator, which is large.
         origin: provenance of the session.
-        folder: where the result will be.
+        folder: folder of the result.
         start: first frame.
         stop: frame after the last one.
     """
@@ -56,7 +56,7 @@ class Shard:
     stop: int
 
     def __getstate__(self) -> dict[str, Any]:
-        """State without the large model: a worker has the file, and keeps what it loaded."""
+        """State without the large model: a worker loads it from the file and caches it."""
         return {**vars(self), "tracker": replace(self.tracker, estimator=None)}  # type: ignore[arg-type]
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -65,13 +65,13 @@ class Shard:
 
 
 def measure_shard(shard: Shard) -> Shard:
-    """Measure a shard and write it: the task of a worker. Done twice it does the same.
+    """Measure a shard and write it: the task of a worker. It may safely run twice.
 
     Args:
         shard: the span of frames.
 
     Returns:
-        The same shard, when its folder is whole.
+        The same shard, once its folder is complete.
     """
     from liex_lab.sessions.shards import ShardWriter
 
@@ -87,24 +87,24 @@ def measure_shard(shard: Shard) -> Shard:
 
 @lru_cache(maxsize=1)
 def _opened(recording: str, plan_toml: str, input_sha256: str) -> Recording:
-    """The recording, kept open for this process's next shards; another hash is another one."""
+    """The recording, kept open for this process's next shards; the hash distinguishes versions."""
     return build_recording(recording, Plan.from_toml(plan_toml))
 
 
 def measure_shards(pool: WorkerPool, whole: Shard, path: Path, progress: Progress) -> None:
-    """Measure all frames of a recording that its unfinished session does not have yet.
+    """Measure all frames of a recording that its unfinished session lacks.
 
-    Afterwards the session goes on as one that was interrupted after its last frame. Whatever
-    happens, shards that are whole are kept.
+    Afterwards the session resumes as if interrupted after its last frame. Completed shards are
+    kept, even after an error.
 
     Args:
-        pool: the pool of workers.
-        whole: the recording as one shard; its folder does not matter.
-        path: the session folder that is to be; what is unfinished lies beside it.
-        progress: reports shard by shard.
+        pool: the worker pool.
+        whole: the recording as one shard; its folder is not used.
+        path: the planned session folder; the unfinished session is next to it.
+        progress: called shard by shard.
 
     Raises:
-        SessionError: a worker ended without a word, or another process writes the session.
+        SessionError: a worker died, or another process writes the session.
     """
     from liex_lab.sessions.shards import append_shard, is_whole, shard_folder
     from liex_lab.sessions.writer import open_unfinished
@@ -134,7 +134,9 @@ def measure_shards(pool: WorkerPool, whole: Shard, path: Path, progress: Progres
 
 
 def _cuts(first: int, stop: int) -> Iterator[tuple[int, int]]:
-    """Frames first to stop cut at multiples of `LENGTH`, so that every run cuts them alike."""
+    """Frames first to stop cut at multiples of `LENGTH`, so that every run makes the same
+    shards.
+    """
     while first < stop:
         last = min(stop, (first // LENGTH + 1) * LENGTH)
         yield first, last

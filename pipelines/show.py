@@ -1,7 +1,7 @@
-"""Whole depth images beside a session's replay, `liex show --depth all`.
+"""Whole depth images for a session's replay, `liex show --depth all`.
 
-A session keeps cut-outs of the depth; the recording that it is linked to has all of it. Its
-images are written into a replay of their own, which Rerun shows as one with the session's.
+A session keeps cut-outs of the depth; the linked recording has all of it. Its images are written
+into a separate replay, which Rerun displays together with the session's.
 """
 
 from __future__ import annotations
@@ -31,15 +31,15 @@ def whole_pictures(
     Args:
         session: the session folder.
         out: the .rrd file to write.
-        recording: path of the recording, where it is no longer where the session says.
-        progress: reports while the recording is hashed and read.
+        recording: path of the recording, if it has moved since the session was measured.
+        progress: called while the recording is hashed and read.
 
     Returns:
         `out`.
 
     Raises:
-        SessionError: the session does not say where its recording is, it is not there any more, or
-            it is another one.
+        SessionError: the session does not link to its recording, the recording is missing, or it
+            has another hash.
         RecordingError: the recording cannot be read.
     """
     from liex_lab.recordings.depth_kernels import to_millimetres
@@ -67,7 +67,7 @@ def whole_pictures(
 
 
 def _recording_of(session: Session, stated: str | None, progress: Progress) -> Recording:
-    """The recording of a session, opened as it was when it was measured; its hash is the same."""
+    """The recording of a session, opened with the session's plan after its hash is checked."""
     from liex_lab.sessions.evidence import linked_recording
 
     where = stated or linked_recording(session)

@@ -1,8 +1,8 @@
 """Verification of a session, `liex verify`: its hashes, logs, model, plan, and reproducibility.
 
-Every file is held against its size and SHA-256 in session.json, replay and messages against their
-own check sums and lengths. With the recording given, it is measured again and the tables compared,
-byte by byte or else row by row.
+Every file is checked against its size and SHA-256 in session.json, replay and messages against
+their own checksums and lengths. If the recording is given, it is measured again and the tables are
+compared byte by byte, or else row by row.
 """
 
 from __future__ import annotations
@@ -40,11 +40,12 @@ _TABLES = (".parquet", ".csv")
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing that was looked at.
+    """Result of one check.
 
     Attributes:
-        state: `ok`; `wrong`: the session is not what it says; `note`: worth knowing.
-        sentence: what was found.
+        state: `ok`; `wrong`: the session differs from its description; `note`: additional
+            information.
+        sentence: the finding.
     """
 
     state: str
@@ -54,13 +55,13 @@ class Finding:
 def verify_session(
     path: str | Path, run: RunAgain, recording: str | None = None, progress: Progress = silent
 ) -> list[Finding]:
-    """Findings on everything that a session says about itself.
+    """Check all statements of a session about itself.
 
     Args:
-        path: the session folder; what was measured is looked at, and the log of corrections.
+        path: the session folder; the original measurements and the log of corrections are checked.
         run: measures a recording, `liex_lab.api.run_session`.
-        recording: it is measured again, which takes as long as the first time; None leaves it out.
-        progress: reports while the recording is measured.
+        recording: is measured again, which takes as long as the first time; None leaves it out.
+        progress: called while the recording is measured.
 
     Raises:
         SessionError: there is no session at all.
@@ -79,7 +80,7 @@ def verify_session(
 
 
 def _provenance(session: Session) -> Iterator[Finding]:
-    """Whether everything is there that is needed to make the session again."""
+    """Whether session.json has all that is needed to reproduce the session."""
     missing = [name for name in _NEEDED if _at(session.metadata, name) in (None, "", {})]
     if missing:
         yield Finding(
@@ -95,7 +96,7 @@ def _provenance(session: Session) -> Iterator[Finding]:
 
 
 def _files(session: Session) -> Iterator[Finding]:
-    """Every file against its bytes and its hash."""
+    """Check the size and hash of every file."""
     stated = session.metadata.get("files")
     if not isinstance(stated, dict):
         return
@@ -106,7 +107,7 @@ def _files(session: Session) -> Iterator[Finding]:
 
 
 def _changed(folder: Path, stated: Mapping[str, Any]) -> list[str]:
-    """What is wrong with files of a folder whose bytes and hashes are stated."""
+    """Errors in files of a folder with stated sizes and hashes."""
     from liex_lab.catalog import sha256
 
     wrong = []
@@ -122,9 +123,7 @@ def _changed(folder: Path, stated: Mapping[str, Any]) -> list[str]:
 
 
 def _corrections(session: Session) -> Iterator[Finding]:
-    """What people corrected: whether the log can be read, and its tables are those that were made
-    with it.
-    """
+    """Whether the log of corrections can be read and its tables are unchanged."""
     from liex_lab.sessions.corrections import applies, corrected_folder, read_log
 
     try:
@@ -152,7 +151,7 @@ def _corrections(session: Session) -> Iterator[Finding]:
 
 
 def _logs(session: Session) -> Iterator[Finding]:
-    """Whether replay and messages are whole, by their own check sums and lengths."""
+    """Whether replay and messages are complete, by their own checksums and lengths."""
     from liex_lab.sessions.checkpoint import rrd_messages
 
     try:
@@ -175,7 +174,7 @@ def _logs(session: Session) -> Iterator[Finding]:
 
 
 def _depth_messages(session: Session) -> int:
-    """How many depth images the summary of session.mcap lists."""
+    """Number of depth images in the summary of session.mcap."""
     from mcap.exceptions import McapError
     from mcap.reader import make_reader
 
@@ -213,7 +212,7 @@ def _model(session: Session) -> Iterator[Finding]:
 def _again(
     session: Session, run: RunAgain, recording: str, progress: Progress
 ) -> Iterator[Finding]:
-    """Measure the recording once more and compare the tables byte by byte."""
+    """Measure the recording again and compare the tables."""
     from liex_lab.recordings import open_recording
     from liex_lab.sessions import Session
 
@@ -248,18 +247,15 @@ def _tables(session: Session) -> list[Path]:
 
 
 def _same_rows(path: Path, other: Path) -> bool:
-    """Whether two tables hold the same numbers; what is said about them, such as versions, may
-    differ.
-    """
+    """Whether two tables have the same rows; their metadata, such as versions, may differ."""
     import pandas as pd
 
     if not other.is_file():
         return False
     if path.read_bytes() == other.read_bytes():
         return True
-    return path.suffix == ".parquet" and pd.read_parquet(path).equals(
-        pd.read_parquet(other)
-    )  # empty equals empty
+    # `equals` treats empty cells as equal
+    return path.suffix == ".parquet" and pd.read_parquet(path).equals(pd.read_parquet(other))
 
 
 def _versions(session: Session, other: Session) -> str:

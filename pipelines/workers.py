@@ -1,7 +1,7 @@
 """Worker pool of processes of this machine, for the shards of one recording.
 
-Processes are spawned, as numba's threads do not survive a fork, and share the cores. The workers of
-a study are Dask's, see `study.crew`.
+Processes are spawned, as numba's threads do not survive a fork, and share the cores. A study's
+workers belong to Dask, see `study.crew`.
 """
 
 from __future__ import annotations
@@ -18,33 +18,33 @@ from typing import Protocol, TypeVar
 from liex_lab.errors import SessionError
 from liex_lab.runtime.processes import end_children, end_with_parent
 
-# that one process keeps busy: it uses more than one and a half
+# cores per process, which uses more than one and a half
 _CORES = 2
-# each takes some 400 MB
+# maximum number of processes, each of about 400 MB
 _MOST = 4
-# frames; a process takes two seconds to begin
+# frames; a process takes two seconds to start
 _WORTH_SHARING = 6000
 Work = TypeVar("Work")
 Done = TypeVar("Done")
 
 
 class WorkerPool(Protocol):
-    """Whoever can do several tasks at once, such as processes or the workers of a cluster."""
+    """A pool that runs several tasks at once, such as processes or the workers of a cluster."""
 
     @property
     def fewest(self) -> int:
-        """Recordings of no more frames are measured by one process: sharing them takes longer."""
+        """Up to this number of frames a recording is measured by one process, which is faster."""
 
     @property
     def here(self) -> bool:
-        """Its workers read this machine's temporary files."""
+        """Whether its workers can read this machine's temporary files."""
 
     def each(self, do: Callable[[Work], Done], works: Sequence[Work]) -> Iterator[Done]:
-        """What `do` makes of each of the tasks, as soon as it is there, in any order.
+        """Results of `do` for each task, as they arrive, in any order.
 
         Args:
             do: the task; it and its argument can be pickled.
-            works: the arguments, one a task.
+            works: the arguments, one per task.
         """
 
 
@@ -53,10 +53,10 @@ class Processes:
     """A pool of processes of this machine.
 
     Attributes:
-        n: how many, at most one for each task.
-        threads: cores of each; 0 takes an equal share.
-        fewest: recordings of no more frames are not worth the start of processes.
-        here: they read this machine's temporary files.
+        n: maximum number, at most one for each task.
+        threads: cores of each; 0 means an equal share.
+        fewest: number of frames up to which processes are not worth their start.
+        here: True, as they can read this machine's temporary files.
     """
 
     n: int
@@ -65,20 +65,20 @@ class Processes:
     here: bool = True
 
     def each(self, do: Callable[[Work], Done], works: Sequence[Work]) -> Iterator[Done]:
-        """What `do` makes of each of the tasks, as soon as it is there, in any order.
+        """Results of `do` for each task, as they arrive, in any order.
 
         Args:
             do: the task; it and its argument can be pickled.
-            works: the arguments, one a task; without any, no process is started.
+            works: the arguments, one per task; without any, no process is started.
 
         Raises:
-            SessionError: a process ended without a word, perhaps for want of memory.
+            SessionError: a process died, perhaps from lack of memory.
         """
         if not works:
             return
         count = min(self.n, len(works))
         threads = self.threads or max(1, n_cores() // count)
-        context = multiprocessing.get_context("spawn")  # numba's threads do not live through a fork
+        context = multiprocessing.get_context("spawn")  # numba's threads do not survive a fork
         others = {child.pid for child in multiprocessing.active_children() if child.pid}
         with (
             _cores_for_each(threads),
@@ -93,7 +93,7 @@ class Processes:
                     "same command again, it goes on where it was, or give fewer --workers"
                 ) from None
             except BaseException as error:
-                if not isinstance(error, Exception):  # it has to end, and a shard takes minutes
+                if not isinstance(error, Exception):  # end at once, as a shard takes minutes
                     end_children(but=others)
                 raise
             finally:
@@ -101,11 +101,11 @@ class Processes:
 
 
 def processes_for(workers: int) -> Processes | None:
-    """The pool of so many workers; None where one process does the work.
+    """The pool of so many workers; None if one process does the work.
 
     Args:
-        workers: how many; 0 takes one for every two cores, four at most, for recordings that are
-            long enough.
+        workers: number of workers; 0 means one for every two cores, four at most, for recordings
+            that are long enough.
     """
     if workers:
         return Processes(workers) if workers > 1 else None
@@ -119,7 +119,7 @@ def n_cores() -> int:
 
 
 def worker_environment(n_threads: int) -> dict[str, str]:
-    """Environment variables by which workers share the cores instead of each taking all of them.
+    """Environment variables that make workers share the cores instead of each using all of them.
 
     Args:
         n_threads: threads of numba, OpenMP and OpenBLAS in each worker.
@@ -132,7 +132,7 @@ def worker_environment(n_threads: int) -> dict[str, str]:
 
 @contextmanager
 def _cores_for_each(n_threads: int) -> Iterator[None]:
-    """Within the block, processes that are started use so many cores."""
+    """A context in which newly started processes use so many cores."""
     before = dict(os.environ)
     os.environ.update(worker_environment(n_threads))
     try:

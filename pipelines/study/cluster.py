@@ -1,6 +1,6 @@
 """The Dask cluster of a study: processes of this machine, a running scheduler, or Slurm jobs.
 
-Dask is imported here and in `crew` alone.
+Only this module and `crew` import Dask.
 """
 
 from __future__ import annotations
@@ -34,24 +34,24 @@ if TYPE_CHECKING:
     from distributed.deploy.cluster import Cluster
 
 
-_FORGOTTEN_S = 8.0  # a nanny whose process has been gone for so long starts no other by itself
-_NONE_LEFT_S = 60.0  # and so long none of a study's worker processes was there at all
+_FORGOTTEN_S = 8.0  # a nanny whose process is gone for so long does not start another one by itself
+_NONE_LEFT_S = 60.0  # give up after all worker processes of a study are gone for so long
 _CLOSING = ("closing", "closed", "closing_gracefully")
 
 
 class Watch(ABC):
-    """Within the block, a look at the cluster every so often, by a thread.
+    """A context in which a thread checks the cluster periodically.
 
     Attributes:
-        gave_up: why the study is ended; empty while there is no reason.
+        gave_up: why the study is ended; empty if it is not.
     """
 
     def __init__(self, client: Client, every_s: float) -> None:
-        """Nothing is looked at yet.
+        """Prepare the thread.
 
         Args:
-            client: of the cluster; its pending futures are the sessions that are left.
-            every_s: between two looks, s.
+            client: of the cluster; its pending futures are the remaining sessions.
+            every_s: interval between two checks, s.
         """
         self.gave_up = ""
         self._client, self._every_s = client, every_s
@@ -60,10 +60,10 @@ class Watch(ABC):
 
     @abstractmethod
     def look(self) -> None:
-        """Look once: mend what can be mended, or state in `gave_up` why nothing can."""
+        """Check once: repair what can be repaired, or state in `gave_up` why it cannot."""
 
     def __enter__(self) -> Self:
-        """Begin to look."""
+        """Start checking."""
         self._thread.start()
         return self
 
@@ -73,10 +73,10 @@ class Watch(ABC):
         error: BaseException | None,
         tb: TracebackType | None,
     ) -> None:
-        """No more looking.
+        """Stop checking.
 
         Raises:
-            StudyError: the study was ended by this.
+            StudyError: this thread ended the study.
         """
         self._over.set()
         self._thread.join()
@@ -96,23 +96,23 @@ class Watch(ABC):
 class KeptWorkers(Watch):
     """Worker processes of this machine.
 
-    Its nanny starts a worker again when it has died, but for one that died while it was started.
+    Dask's nanny restarts a worker that died, unless it died while starting.
     """
 
     def __init__(self, client: Client, cluster: Any, every_s: float = 5.0) -> None:
-        """Look at the workers of a cluster.
+        """Watch the workers of a cluster.
 
         Args:
             client: of the cluster.
             cluster: a `distributed.LocalCluster`.
-            every_s: between two looks, s.
+            every_s: interval between two checks, s.
         """
         super().__init__(client, every_s)
         self._cluster = cluster
         self._gone_since: dict[Any, float] = {}  # by nanny
 
     def look(self) -> None:
-        """Start workers again that nobody does, and give up where none comes for a minute."""
+        """Restart workers that their nannies do not, and give up if there are none for a minute."""
         nannies = list(self._cluster.workers.values())
         now = time.monotonic()
         gone = [nanny for nanny in nannies if not _is_alive(nanny)]
@@ -130,7 +130,7 @@ class KeptWorkers(Watch):
 
 
 def _is_alive(nanny: Any) -> bool:
-    """Whether the process that a nanny of Dask looks after is there."""
+    """Whether the process of a Dask nanny is running."""
     import psutil
 
     pid = nanny.pid
@@ -142,26 +142,26 @@ def _is_alive(nanny: Any) -> bool:
         return False
 
 
-# Settings for workers on Slurm: a small TOML file, `pipelines/plans/slurm.toml` to begin from.
+# Settings for workers on Slurm: a small TOML file; `pipelines/plans/slurm.toml` is a template.
 
 
-# one line of a job script each: nothing in the file may begin another line
+# one line of a job script each: a value must not start another line
 Line = Annotated[str, Field(pattern=r"^[^\r\n\x00]*$", max_length=1000)]
 Word = Annotated[str, Field(pattern=r"^[A-Za-z0-9_.:/@+-]+$", max_length=200)]
 
 
 class SlurmTable(BaseModel):
-    """Every setting of the file; the comments in slurm.toml say what each is for.
+    """Every setting of the file, as explained in slurm.toml.
 
     Attributes:
-        jobs: jobs at most; each measures one session after the other.
+        jobs: maximum number of jobs; each measures one session after the other.
         cores_per_job: cores of a job.
-        memory: memory of a job, as Slurm writes it.
+        memory: memory of a job, in Slurm's notation.
         walltime: time after which Slurm ends a job, HH:MM:SS.
-        partition: the partition, if one is to be named.
-        account: the account, if one is to be named.
-        interface: network interface on which jobs and the command see each other.
-        shared_folder: folder that all nodes see; keys made for this run go there.
+        partition: the partition, optional.
+        account: the account, optional.
+        interface: network interface between the jobs and the command.
+        shared_folder: folder that all nodes can access, for the keys of this run.
         local_folder: folder on the nodes for temporary files.
         log_folder: folder for the jobs' own logs.
         prologue: lines of the job script before the worker starts.
@@ -185,13 +185,13 @@ class SlurmTable(BaseModel):
 
     @staticmethod
     def load(path: str | Path) -> SlurmTable:
-        """The settings in a TOML file.
+        """Read the settings from a TOML file.
 
         Args:
             path: the file; `slurm` is the bundled one.
 
         Raises:
-            StudyError: there is no such file, or something in it cannot be used.
+            StudyError: there is no such file, or a setting is not valid.
         """
         file = plans_folder() / "slurm.toml" if str(path) == "slurm" else Path(path)
         if not file.is_file():
@@ -200,7 +200,7 @@ class SlurmTable(BaseModel):
             )
         try:
             return SlurmTable.model_validate(read_toml(file))
-        except ValidationError as error:  # which is a ValueError, too
+        except ValidationError as error:  # a subclass of ValueError
             first = error.errors(include_url=False)[0]
             where = ".".join(str(part) for part in first["loc"])
             raise StudyError(
@@ -210,20 +210,20 @@ class SlurmTable(BaseModel):
             raise StudyError(f"{file} should be a TOML file, but: {error}; correct it") from None
 
 
-# Jobs of a Slurm cluster, asked for anew where one has ended before the study has.
+# Jobs of a Slurm cluster, requested again if one ends before the study does.
 
 
-# between two looks: longer than the 15 s after which Dask forgets a worker that is gone, so that a
-# new job never bears the name of one that is still being forgotten
+# between two checks: longer than the 15 s after which Dask forgets a lost worker, so that a new job
+# never has the name of one that is still being forgotten
 EVERY_S = 20.0
-# jobs that end before their worker has answered, for each that was asked for: something is wrong
+# limit, per requested job, of jobs that end before their worker has connected
 MOST_IN_VAIN = 3
 
 
 def queued() -> set[str] | None:
-    """Numbers of this account's jobs that wait or run; None where Slurm does not say."""
+    """Numbers of this account's waiting or running jobs; None if Slurm does not answer."""
     try:
-        told = subprocess.run(  # nosec B607: Slurm is where the cluster put it
+        told = subprocess.run(  # nosec B607: Slurm is on the cluster's PATH
             ["squeue", "--me", "--noheader", "--format=%A"],
             capture_output=True,
             text=True,
@@ -236,7 +236,7 @@ def queued() -> set[str] | None:
 
 
 class KeptJobs(Watch):
-    """Within the block, as many jobs as sessions are left, but not more than were asked for."""
+    """A context with as many jobs as sessions are left, up to the requested number."""
 
     def __init__(
         self,
@@ -246,24 +246,24 @@ class KeptJobs(Watch):
         log_folder: str | None,
         ask: Callable[[], set[str] | None] = queued,
     ) -> None:
-        """Look at the jobs of a cluster.
+        """Watch the jobs of a cluster.
 
         Args:
-            client: of the cluster; its pending futures are the sessions that are left.
+            client: of the cluster; its pending futures are the remaining sessions.
             cluster: a `dask_jobqueue.SLURMCluster`.
-            n_jobs: how many jobs it was asked for.
-            log_folder: where the jobs' logs are, if a folder was named.
-            ask: what tells the jobs that wait or run.
+            n_jobs: number of requested jobs.
+            log_folder: folder of the jobs' logs, if one was named.
+            ask: returns the waiting and running jobs.
         """
         super().__init__(client, EVERY_S)
         self._cluster, self._n_jobs = cluster, n_jobs
         self._logs = log_folder or "the folder where the command was started"
         self._ask = ask
-        self._missing: set[str] = set()  # jobs that were in no queue at the last look
+        self._missing: set[str] = set()  # jobs that were not queued at the last check
         self._in_vain = 0
 
     def look(self) -> None:
-        """Forget jobs that have ended without a word, and ask for others where some are wanted."""
+        """Forget jobs that ended without connecting, and request others if needed."""
         cluster = self._cluster
         there = self._ask()
         if there is None:
@@ -272,7 +272,7 @@ class KeptJobs(Watch):
             self._in_vain = 0
         numbers = {name: str(job.job_id) for name, job in dict(cluster.workers).items()}
         gone = {name for name, number in numbers.items() if number not in there}
-        # one whose worker was connected is forgotten by Dask between two looks
+        # Dask forgets a job whose worker was connected before the next check
         silent = gone & self._missing
         self._missing = gone - silent
         self._in_vain += len(silent)
@@ -290,7 +290,7 @@ class KeptJobs(Watch):
             cluster.scale(self._n_jobs)
 
 
-_ENCRYPTED, _OPEN = ("tls", "wss"), ("tcp", "ws", "ucx")  # how a scheduler can be spoken to
+_ENCRYPTED, _OPEN = ("tls", "wss"), ("tcp", "ws", "ucx")  # protocols of a scheduler's address
 
 
 def measure_cohort(
@@ -304,21 +304,21 @@ def measure_cohort(
     told: Told = lambda *_: None,
     finished: Finished = lambda _: None,
 ) -> list[dict[str, Any]]:
-    """Measure the sessions of a study; returns how each went, as `measure_one` does.
+    """Measure the sessions of a study; returns a result per session, see `measure_one`.
 
     Args:
-        todo: the sessions that are to be measured.
+        todo: the sessions to measure.
         run: measures a recording, `liex_lab.api.run_session`.
-        workers: processes on this machine; 0 takes one for every two cores.
-        threads: cores of each; 0 takes an equal share.
+        workers: processes on this machine; 0 means one for every two cores.
+        threads: cores of each; 0 means an equal share.
         scheduler: address of a running Dask scheduler.
-        slurm: how to ask a Slurm cluster for workers.
-        told: is told id, pieces done, pieces in all, and what is being done.
-        finished: is given each result as soon as it is there.
+        slurm: how to request workers from a Slurm cluster.
+        told: called with id, pieces done, pieces in total, and the current step.
+        finished: called with each result as it arrives.
 
     Raises:
         StudyError: no scheduler answers, or it ends before the study does.
-        MissingPackageError: Slurm is asked for and dask-jobqueue is not installed.
+        MissingPackageError: workers on Slurm need dask-jobqueue, which is not installed.
     """
     if not todo:
         return []
@@ -337,33 +337,33 @@ def crew_of(
     scheduler: str | None = None,
     slurm: SlurmTable | None = None,
 ) -> Iterator[Crew]:
-    """Workers for the sessions of a study, within the block.
+    """A context with workers for the sessions of a study.
 
     Args:
-        n_tasks: the most sessions that there are to do at once.
-        workers: processes on this machine; 0 takes one for every two cores.
-        threads: cores of each; 0 takes an equal share.
+        n_tasks: the largest number of sessions to process at once.
+        workers: processes on this machine; 0 means one for every two cores.
+        threads: cores of each; 0 means an equal share.
         scheduler: address of a running Dask scheduler.
-        slurm: how to ask a Slurm cluster for workers.
+        slurm: how to request workers from a Slurm cluster.
 
     Raises:
         StudyError: no scheduler answers, or it ends before the study does.
-        MissingPackageError: Slurm is asked for and dask-jobqueue is not installed.
+        MissingPackageError: workers on Slurm need dask-jobqueue, which is not installed.
     """
     with _client(n_tasks, workers, threads, scheduler, slurm) as client:
         yield Crew(client, slurm.jobs if slurm else 0)
 
 
 def is_encrypted(scheduler: str) -> bool:
-    """Whether what is sent to a scheduler is encrypted.
+    """Whether traffic to a scheduler is encrypted.
 
     Args:
         scheduler: its address, as in tcp://10.0.0.1:8786.
 
     Raises:
-        StudyError: it is no address of a scheduler.
+        StudyError: it is not the address of a scheduler.
     """
-    kind, found, place = scheduler.rpartition("://")  # tcp where it says nothing
+    kind, found, place = scheduler.rpartition("://")  # tcp if not stated
     if not place or (found and kind not in _ENCRYPTED + _OPEN):
         raise StudyError(
             f"{scheduler!r} is no address of a Dask scheduler; expected one as in "
@@ -376,21 +376,23 @@ def is_encrypted(scheduler: str) -> bool:
 def _client(
     n_tasks: int, workers: int, threads: int, scheduler: str | None, slurm: SlurmTable | None
 ) -> Iterator[Client]:
-    """A client of the cluster that was asked for."""
+    """A client of the requested cluster."""
     import dask
     from distributed import Client
 
-    logging.getLogger("distributed.client").setLevel(logging.CRITICAL)  # we say what is lost
-    # one session at a worker at a time: what waits there is held to have killed it, too
+    # lost sessions are reported by `Crew`
+    logging.getLogger("distributed.client").setLevel(logging.CRITICAL)
+    # one session at a worker at a time: Dask would also blame sessions that wait there for its
+    # death
     settings = {
         "distributed.scheduler.allowed-failures": DEATHS,
         "distributed.scheduler.worker-saturation": 1.0,
         "distributed.logging.distributed": "critical",
         "distributed.worker.memory.terminate": False,
-        # a machine that is busy or was put to sleep is not a dead one
+        # a machine that is busy or asleep is not dead
         "distributed.scheduler.worker-ttl": "3600s",
         "distributed.comm.timeouts.connect": "120s",
-        # plain HTTP that would tell ids and paths to every account of the machine
+        # plain HTTP, which would expose ids and paths to every account of the machine
         "distributed.scheduler.http.routes": [],
         "distributed.worker.http.routes": [],
     }
@@ -429,23 +431,24 @@ def _client(
 
 
 def _end_workers(cluster: Any) -> None:
-    """Kill the worker processes of this machine: asked to end, they would first finish a kernel,
-    and a session goes on from its checkpoint either way.
+    """Kill the worker processes of this machine.
+
+    A request to end would wait for a kernel, and a session resumes from its checkpoint either way.
     """
     for nanny in cluster.workers.values():
-        nanny.close_gracefully()  # or it would start another one
+        nanny.close_gracefully()  # otherwise it starts another one
         if nanny.pid:
             with suppress(ProcessLookupError):
                 os.kill(nanny.pid, signal.SIGKILL)
 
 
 def local_cluster(n_tasks: int, workers: int, threads: int, scratch: str) -> Cluster:
-    """Worker processes on this machine, reached through this machine alone, with keys for this run.
+    """Worker processes on this machine, reachable only from it, with keys for this run.
 
     Args:
-        n_tasks: sessions to measure; there are no more workers than that.
-        workers: processes; 0 takes one for every two cores.
-        threads: cores of each; 0 takes an equal share.
+        n_tasks: sessions to measure, and the maximum number of workers.
+        workers: processes; 0 means one for every two cores.
+        threads: cores of each; 0 means an equal share.
         scratch: folder for temporary files.
     """
     from distributed import LocalCluster, Security
@@ -460,7 +463,7 @@ def local_cluster(n_tasks: int, workers: int, threads: int, scratch: str) -> Clu
         dashboard_address=None,
         scheduler_kwargs={
             "dashboard": False,
-            "dashboard_address": "127.0.0.1:0",  # any port: another study's may have the usual one
+            "dashboard_address": "127.0.0.1:0",  # any port: another study may use the default one
         },
         memory_limit=0,
         local_directory=scratch,
@@ -471,11 +474,11 @@ def local_cluster(n_tasks: int, workers: int, threads: int, scratch: str) -> Clu
 
 
 def slurm_cluster(table: SlurmTable, scratch: str) -> Any:
-    """A cluster whose workers are jobs of Slurm; the scheduler is this process.
+    """A cluster whose workers are Slurm jobs; the scheduler is this process.
 
     Args:
-        table: how to ask for jobs.
-        scratch: folder for temporary files where the table names none.
+        table: how to request jobs.
+        scratch: folder for temporary files if the table names none.
 
     Raises:
         MissingPackageError: dask-jobqueue is not installed.
@@ -503,8 +506,8 @@ def slurm_options(table: SlurmTable, scratch: str) -> dict[str, Any]:
     """The options of one job: a worker that measures a session at a time on all its cores.
 
     Args:
-        table: how to ask for jobs.
-        scratch: folder for temporary files where the table names none.
+        table: how to request jobs.
+        scratch: folder for temporary files if the table names none.
     """
     exports = [
         f"export {name}={value}" for name, value in worker_environment(table.cores_per_job).items()

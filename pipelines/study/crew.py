@@ -1,9 +1,9 @@
-"""The workers of a study: sessions are looked at and measured by them, each as one task.
+"""The workers of a study: they inspect and measure sessions, each as one task.
 
-A task may run twice (a worker dies, and another takes over): it leaves its results on disk, goes on
-where it was, and done twice it does the same. Sessions are measured side by side, each by one
-worker; where fewer are left than there are workers, these share the shards of each. A session that
-more than three workers died of is quarantined.
+A task may run twice (a worker dies, and another takes over): it stores its results on disk, resumes
+where it stopped, and a second run gives the same result. Sessions are measured in parallel, each by
+one worker; if fewer sessions than workers are left, the workers share the shards of each. A session
+during which more than three workers died is quarantined.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from distributed import Client
 
 
-# measures a recording into a session folder, and returns it: `liex_lab.api.run_session`
+# measures a recording into a session folder, which it returns: `liex_lab.api.run_session`
 RunSession = Callable[..., Path]
 
 
@@ -42,22 +42,22 @@ def measure_one(
     run_id: str = "",
     pool: WorkerPool | None = None,
 ) -> dict[str, Any]:
-    """Measure a session, or quarantine it, and tell how it went.
+    """Measure a session, or quarantine it, and report the result.
 
-    Done twice it does the same: what was interrupted goes on, and what is there is replaced when
-    the new one is whole.
+    It may safely run twice: an interrupted session resumes, and an existing one is replaced once
+    the new one is complete.
 
     Args:
-        session: what is measured, how and where to.
+        session: recording, plan and folder.
         run: measures the recording.
-        progress: told frame by frame.
-        run_id: of the study's run; a session that it has ended already is not measured again.
-        pool: pool of workers for the session's shards.
+        progress: called frame by frame.
+        run_id: of the study's run; a session that ended in this run is not measured again.
+        pool: workers for the session's shards.
 
     Returns:
-        `id`, `state` (`done` or `failed`), `seconds`, `failure` (None where it is done),
-        `corrections_taken_from` (the outdated copy that people had corrected; "" for none), and
-        `look_at_it` (what there is to look at or to distrust although it is done; "" for nothing).
+        `id`, `state` (`done` or `failed`), `seconds`, `failure` (None if done),
+        `corrections_taken_from` (the outdated session whose manual corrections were copied; "" for
+        none), and `look_at_it` (why a session that is done needs review; "" for nothing).
     """
     if run_id and (ended := _ended(session, run_id)):
         return ended
@@ -98,7 +98,7 @@ def measure_one(
 
 
 def _ended(session: PlannedSession, run_id: str) -> dict[str, Any] | None:
-    """How the session ended in this run of the study already, before its worker could tell."""
+    """The session's result if it ended in this run already, before its worker could report it."""
     failure = read_failure(session.folder)
     if failure and failure.get("run_id") == run_id:
         return {"id": session.id, "state": "failed", "seconds": 0.0, "failure": failure}
@@ -111,11 +111,11 @@ def _ended(session: PlannedSession, run_id: str) -> dict[str, Any] | None:
 
 
 def quarantine(session: PlannedSession, failure: dict[str, Any]) -> None:
-    """Leave failed.json in the session's place, with plan and input so that changes show.
+    """Write failed.json into the session's folder, with plan and input to detect changes.
 
     Args:
         session: the session that failed; its older results are set aside.
-        failure: what `describe_failure` tells of the error.
+        failure: from `describe_failure`.
     """
     known = {
         "session_id": session.id,
@@ -128,13 +128,12 @@ def quarantine(session: PlannedSession, failure: dict[str, Any]) -> None:
 
 
 TOPIC = "liex-progress"
-DEATHS = 3  # of workers, before a session is held to be what kills them
+DEATHS = 3  # deaths of workers that are tolerated before a session is blamed
 _TOLD_EVERY_S = 0.5
 
-Told = Callable[
-    [str, int, int | None, str], None
-]  # session, pieces done, pieces in all, what is being done
-Finished = Callable[[dict[str, Any]], None]  # what `measure_one` returns
+# session, pieces done, pieces in total, current step
+Told = Callable[[str, int, int | None, str], None]
+Finished = Callable[[dict[str, Any]], None]  # the result of `measure_one`
 
 
 class Crew:
@@ -142,7 +141,7 @@ class Crew:
 
     Args:
         client: of their cluster.
-        n_jobs: how many of them are to come; 0 where they are there.
+        n_jobs: number of workers that are yet to connect; 0 if all are connected.
     """
 
     def __init__(self, client: Client, n_jobs: int = 0) -> None:
@@ -157,13 +156,13 @@ class Crew:
         told: Told = lambda *_: None,
         finished: Finished = lambda _: None,
     ) -> list[dict[str, Any]]:
-        """Measure sessions; returns how each went, as `measure_one` does.
+        """Measure sessions; returns a result per session, see `measure_one`.
 
         Args:
             todo: the sessions.
             run: measures a recording, `liex_lab.api.run_session`.
-            told: is told id, pieces done, pieces in all, and what is being done.
-            finished: is given each result as soon as it is there.
+            told: called with id, pieces done, pieces in total, and the current step.
+            finished: called with each result as it arrives.
         """
         shared = n_shared(len(todo), self._n_jobs or len(self._client.nthreads()))
         planned = [one.session for one in todo]
@@ -177,13 +176,13 @@ class Crew:
         told: Told = lambda *_: None,
         finished: Finished = lambda _: None,
     ) -> list[dict[str, Any]]:
-        """Look at sessions; returns what was found of each animal, see `sharing.look_at`.
+        """Inspect sessions; returns the findings on each animal, see `sharing.look_at`.
 
         Args:
             sessions: the sessions.
-            look: looks at one, `sharing.look_at`.
-            told: is told id, pieces done, pieces in all, and what is being done.
-            finished: is given each look as soon as it is there.
+            look: inspects one session, `sharing.look_at`.
+            told: called with id, pieces done, pieces in total, and the current step.
+            finished: called with each result as it arrives.
         """
         task = partial(_look_on_worker, look)
         return self._each(sessions, task, LOOKING, _not_seen, told, finished)
@@ -198,7 +197,7 @@ class Crew:
         finished: Finished,
         shared: int = 0,
     ) -> list[dict[str, Any]]:
-        """Results of the task of each session, or of `died` if its workers ended in this stage."""
+        """Result of the task for each session, or of `died` if its workers ended in this stage."""
         from distributed import CancelledError, as_completed
 
         self._told = told
@@ -214,18 +213,18 @@ class Crew:
         results = []
         for future in completed:
             session = sessions[future.key]
-            try:  # a result that a dying worker took with it is waited for until it is made again
+            try:  # waits until a result lost with its worker is computed again
                 error = future.exception()
                 result = (
                     future.result() if error is None else died(session, _why_died(error, stage))
                 )
-            except CancelledError:  # by the client, as nobody here takes a session back
+            except CancelledError:  # by the client, as nothing here cancels a session
                 raise StudyError(
                     "the Dask scheduler ended before the study did; the sessions that were "
                     "measured are kept, and the same command goes on with the rest once a "
                     "scheduler answers"
                 ) from None
-            future.release()  # what a worker holds would be made again if it died
+            future.release()  # otherwise it would be computed again if the worker died
             finished(result)
             results.append(result)
         return results
@@ -234,12 +233,8 @@ class Crew:
 def n_shared(n: int, n_workers: int) -> int:
     """How many of n sessions, the last ones, are cut into shards for all workers to measure.
 
-    As many as would leave workers idle if each were measured by one. Cutting costs: what each
-    worker wrote is copied into one.
-
-    Args:
-        n: number of sessions.
-        n_workers: number of workers.
+    These would leave workers idle if each were measured by one. Sharding has a cost: the workers'
+    outputs are copied into one.
     """
     return n % max(n_workers, 1)
 
@@ -270,8 +265,8 @@ def _why_died(error: BaseException, stage: str) -> dict[str, Any]:
 def _on_worker(
     run: RunSession, session: PlannedSession, run_id: str, shared: bool
 ) -> dict[str, Any]:
-    """The task: one session, its progress sent to whoever started the study. shared: by all
-    workers.
+    """The task: measure one session, its shards by all workers if `shared`; reports to the
+    client.
     """
     return measure_one(session, run, _teller(session), run_id, Workers() if shared else None)
 
@@ -279,19 +274,19 @@ def _on_worker(
 def _look_on_worker(
     look: LookAtSession, session: PlannedSession, run_id: str, shared: bool
 ) -> dict[str, Any]:
-    """The task of a look, which is short: no other worker has a share in it."""
+    """The task: inspect one session, which is too short to share among workers."""
     return look(session, _teller(session))
 
 
 def _teller(session: PlannedSession) -> Progress:
-    """What a task tells its progress; it is sent to whoever started the study."""
+    """A progress callback that reports to the client of the study."""
     from distributed import get_worker
 
     worker = get_worker()
     last = 0.0
 
     def tell(done: int, total: int | None, what: str) -> None:
-        """Send `done`, `total` and `what` to whoever started the study, at most twice a second."""
+        """Send `done`, `total` and `what` to the client, at most twice a second."""
         nonlocal last
         now = time.monotonic()
         if now - last > _TOLD_EVERY_S:
@@ -302,29 +297,30 @@ def _teller(session: PlannedSession) -> Progress:
 
 
 class Workers:
-    """All workers of the cluster that a task runs on, as a pool for the shards of its session.
+    """All workers of the current task's cluster, as a pool for the shards of its session.
 
     Attributes:
-        fewest: any session of more than two shards is shared, as workers would be idle else.
-        here: they may be on other machines, without this one's temporary files.
+        fewest: 0, so any session of more than two shards is shared, as workers would otherwise be
+            idle.
+        here: False, as they may be on other machines, without this one's temporary files.
     """
 
     fewest = 0
     here = False
 
     def each(self, do: Callable[[Work], Done], works: Sequence[Work]) -> Iterator[Done]:
-        """Results of a task per shard as they come; see `workers.WorkerPool`.
+        """Results of a task per shard, as they arrive; see `workers.WorkerPool`.
 
-        The calling task steps aside meanwhile, and its worker measures shards like the others.
+        The calling task yields its worker meanwhile, which measures shards like the others.
 
         Args:
             do: the task.
-            works: its arguments, one a task.
+            works: its arguments, one per task.
         """
         from distributed import as_completed, worker_client
 
         with worker_client() as client:
-            # before any other session, or all of them would be begun at once
+            # priority over other sessions, otherwise all of them would be started at once
             futures = [client.submit(do, work, priority=10, pure=False) for work in works]
             for future in as_completed(futures, loop=client.loop):
                 yield future.result()

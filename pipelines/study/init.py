@@ -1,8 +1,8 @@
-"""A study file to begin from, made of the recordings found in a folder: `liex cohort init`.
+"""A study file template from the recordings in a folder: `liex cohort init`.
 
-Animals and sessions are named by the recordings' metadata, BIDS-like folders (`sub-m01`,
-`ses-01_date-20260821`), other folders and file names, see `plan.subject`. A recording that is there
-twice is listed once.
+Names of animals and sessions come from the recordings' metadata, BIDS-like folders (`sub-m01`,
+`ses-01_date-20260821`), other folders and file names, see `plan.subject`. Duplicate recordings are
+listed once.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from liex_lab.runtime.durable import write_whole
 from liex_lab.runtime.progress import Progress, silent
 
 _FILES = (".mcap", ".bag", ".db3", ".oni", ".tar.gz", ".tgz", ".mkv", ".avi")
-_DEPTHS = ("depth.dat", "depth.avi", "depth.mkv")  # each marks a folder as a recording
-_NOTES = ("camera.toml", "raytrix.toml")  # these, too, where they are not beside files of depth
-_COMPARED_BYTES = 1 << 20  # of the beginning and the end of two files of one size
+_DEPTHS = ("depth.dat", "depth.avi", "depth.mkv")  # each marks its folder as a recording
+_NOTES = ("camera.toml", "raytrix.toml")  # these, too, if the folder has no files of depth
+_COMPARED_BYTES = 1 << 20  # compared at the beginning and the end of files of the same size
 _MOST_LISTED = 4  # sessions of an animal
-Named = tuple[str, str, Path, str]  # animal, session, recording, what names the animal
+Named = tuple[str, str, Path, str]  # animal, session, recording, origin of the animal's name
 _SKIPPED = {"derivatives", "thumbnails"}
 _HEADER = """\
 # A study of liex_lab: which animals, in which groups, recorded in which sessions. Correct what is wrong here, then
@@ -67,9 +67,10 @@ def begin_study(
 
     Args:
         folder: the study's folder.
-        overwrite: replace a study file that is there already.
-        say: gets the animals with their sessions, and what to check, line by line.
-        progress: told recording by recording.
+        overwrite: replace an existing study file.
+        say: called with each line of a summary: the animals with their sessions, and notes to
+            check.
+        progress: called recording by recording.
 
     Returns:
         The path of the study file.
@@ -113,7 +114,7 @@ def begin_study(
 
 
 def _listed(named: Sequence[Named]) -> list[str]:
-    """The animals with their sessions, for a person to check."""
+    """The animals with their sessions, for the user to check."""
     animals = list(dict.fromkeys(animal for animal, *_ in named))
     counts = f"{len(named)} recording{'s' * (len(named) != 1)}, {len(animals)} animal"
     lines = [f"{counts}{'s' * (len(animals) != 1)}: is that so?"]
@@ -125,10 +126,10 @@ def _listed(named: Sequence[Named]) -> list[str]:
 
 
 def find_twins(recordings: Sequence[Path]) -> dict[Path, Path]:
-    """Recordings that are there twice: the one to leave out, and the one that stays.
+    """Duplicate recordings: the one to leave out, and the one to keep.
 
-    Two are the same where they lie in one folder and differ by the ending of their names alone, as
-    an archive beside the folder that was packed, or where their largest files have the same size,
+    Two recordings are duplicates if they are in one folder and their names differ only by the
+    suffix, like an archive and its unpacked folder, or if their largest files have the same size,
     beginning and end.
 
     Args:
@@ -136,7 +137,7 @@ def find_twins(recordings: Sequence[Path]) -> dict[Path, Path]:
     """
     kept: dict[object, Path] = {}
     twins: dict[Path, Path] = {}
-    packed = (".gz", ".tgz", ".mkv", ".avi")  # the folder or container beside it is read instead
+    packed = (".gz", ".tgz", ".mkv", ".avi")  # the folder or container next to it is preferred
     ranks = {path: (path.suffix.lower() in packed, len(path.name), path) for path in recordings}
     for path in sorted(recordings, key=ranks.__getitem__):  # copies have longer names
         keys = ((path.parent, CONTAINER.sub("", path.name).lower()), _content(path))
@@ -147,7 +148,7 @@ def find_twins(recordings: Sequence[Path]) -> dict[Path, Path]:
 
 
 def _content(path: Path) -> tuple[object, ...]:
-    """Size, beginning and end of a recording's largest file, () of an empty one."""
+    """Size and hash of beginning and end of a recording's largest file; () if it is empty."""
     files = [path] if path.is_file() else [file for file in path.rglob("*") if file.is_file()]
     sizes = [(file.name in _DEPTHS, file.stat().st_size, file) for file in files]
     _, size, largest = max(sizes, default=(False, 0, path))
@@ -160,10 +161,10 @@ def _content(path: Path) -> tuple[object, ...]:
 
 
 def find_recordings(folder: Path) -> list[Path]:
-    """Every recording below a folder, in order of name; results and hidden files are left out.
+    """Every recording below a folder, in order of name, without results and hidden files.
 
     Args:
-        folder: searched with all folders in it; one that is a recording itself is not looked into.
+        folder: searched recursively, except inside folders that are recordings.
     """
     found = []
     for inside, folders, names in os.walk(folder):
@@ -185,17 +186,17 @@ def find_recordings(folder: Path) -> list[Path]:
 
 
 def name_sessions(stated: Mapping[Path, str], raw: Path) -> tuple[list[Named], list[str]]:
-    """Animal and session of each recording, no pair of names twice, and what to check.
+    """Animal and session of each recording, each pair unique, and notes to check.
 
-    Names that differ in capitals, spaces, _ or - alone are one animal.
+    Names that differ only in capitals, spaces, _ or - are one animal.
 
     Args:
         stated: recordings below `raw`, and the animal's name in the metadata of each; may be empty.
-        raw: the folder that the names count from.
+        raw: the folder that names are relative to.
 
     Returns:
-        Animal, session, recording and what names the animal (metadata, folder or file name; '' for
-        nothing), in the recordings' order; and sentences.
+        Animal, session, recording and origin of the animal's name (metadata, folder or file name;
+        '' for none), in the recordings' order; and notes as sentences.
     """
     named: list[Named] = []
     taken = set()
@@ -228,7 +229,7 @@ def name_sessions(stated: Mapping[Path, str], raw: Path) -> tuple[list[Named], l
 
 
 def _pairs(text: str) -> str:
-    """A session's name: as it is where it is made of key-value pairs, otherwise its letters and
+    """A session's name: unchanged if it consists of key-value pairs, otherwise its letters and
     digits.
     """
     kept = re.fullmatch(r"[A-Za-z0-9]{1,32}(?:_[A-Za-z0-9]{1,32}-[A-Za-z0-9]{1,64}){0,5}", text)
@@ -258,5 +259,5 @@ def _text(root: Path, named: Sequence[Named], notes: Sequence[str]) -> str:
 
 
 def _quoted(text: str) -> str:
-    """A TOML string; JSON's escapes are TOML's, but for DEL."""
+    """A TOML string; JSON's escapes are TOML's, except for DEL."""
     return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")

@@ -1,4 +1,4 @@
-"""The sessions of a study as the dashboard lists them, looked up on disk each time."""
+"""The sessions of a study for the dashboard, read from disk each time."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ from .status import SessionStatus, standings, to_look_at
 
 
 def list_sessions(place: str | Path) -> tuple[str, Callable[[], Sequence[Entry]]]:
-    """The name of a study, and a function that lists its sessions anew each time.
+    """The name of a study, and a function that lists its sessions from disk at each call.
 
     Args:
         place: a study's .toml file, a folder with a study.toml, or a folder with sessions in it.
 
     Raises:
-        StudyError: there is no such place.
-        SessionError: the folder has no session in it.
+        StudyError: there is no such file or folder.
+        SessionError: the folder contains no session.
     """
     path = Path(place)
     if path.is_file() or (path / STUDY_FILE).is_file():
@@ -39,7 +39,7 @@ def list_sessions(place: str | Path) -> tuple[str, Callable[[], Sequence[Entry]]
         raise StudyError(
             f"there is no study {path}; name a study's .toml file, or a folder with sessions in it"
         )
-    find_sessions([path])  # says what is missing where there is none
+    find_sessions([path])  # raises an error if there is none
     return path.resolve().name, lambda: _of_folder(path)
 
 
@@ -54,8 +54,9 @@ def _of_study(one: SessionStatus) -> Entry:
 
 
 def _of_folder(path: Path) -> list[Entry]:
-    """Every session in a folder, and every one that failed; each by its name, or its place where
-    names recur.
+    """Every session in a folder, measured or failed.
+
+    Keys are session names, or relative paths where names recur.
     """
     entries = [_measured(folder) for folder in find_sessions([path])]
     for file in sorted(path.rglob(FAILED_FILE)):
@@ -91,7 +92,8 @@ def _measured(folder: Path) -> Entry:
         return Entry(folder.name, "failed", str(error))
 
 
-# The study's table: every session with its status, as CSV for people and Parquet for programs.
+# The study's table: every session with its status, as CSV for spreadsheets and Parquet for
+# programs.
 
 
 TABLE = "study"
@@ -99,11 +101,8 @@ STUDY_SESSIONS = table_columns(TABLE)
 
 
 def write_study_table(study: Study, standings: Sequence[SessionStatus]) -> Path:
-    """Write study.parquet, study.csv and study_columns.json of a study; returns the CSV.
-
-    Args:
-        study: the study.
-        standings: the status of its sessions.
+    """Write study.parquet, study.csv and study_columns.json of a study; returns the path of the
+    CSV.
     """
     import csv
     import io
@@ -128,10 +127,10 @@ def write_study_table(study: Study, standings: Sequence[SessionStatus]) -> Path:
 
 
 def study_rows(study: Study, standings: Sequence[SessionStatus]) -> list[dict[str, Any]]:
-    """One row per session, its keys the columns of `STUDY_SESSIONS`.
+    """One row per session, with the columns of `STUDY_SESSIONS` as keys.
 
     Args:
-        study: the study; paths are stated from its folder.
+        study: the study; paths are relative to its folder.
         standings: the status of its sessions.
     """
     return [_row(study, one) for one in standings]

@@ -1,8 +1,8 @@
-"""Run of a study, `liex cohort`: measure the sessions that are to be done, write its table.
+"""Run of a study, `liex cohort`: measure the pending sessions, write the study's table.
 
-Where sessions of one animal share size and shape, these are looked at first (`sharing`).
+If sessions of one animal share size and shape, these are estimated first (`sharing`).
 
-A lock in the study's cohort folder keeps a second run out.
+A lock in the study's cohort folder prevents a second run.
 """
 
 from __future__ import annotations
@@ -46,33 +46,33 @@ def run_study(
     describe: DescribeSession,
     look: LookAtSession = look_at,
 ) -> list[SessionStatus]:
-    """Measure the sessions of a study that are to be done; returns every session's status.
+    """Measure the pending sessions of a study; returns every session's status.
 
     Args:
         study: the study.
         run: measures a recording, `liex_lab.api.run_session`.
-        workers: processes on this machine; 0 takes one for every two cores.
+        workers: processes on this machine; 0 means one for every two cores.
         scheduler: address of a running Dask scheduler; None starts workers.
-        slurm: TOML file that says how to ask Slurm for workers; None does not.
+        slurm: TOML file with the settings of Slurm jobs; None does not use Slurm.
         retry: measure failed sessions again.
         again: measure all sessions again.
-        only: ids of sessions, the others are left out; () takes all.
-        dry_run: only look.
+        only: ids of sessions, the others are left out; () means all.
+        dry_run: only return the status.
         board: opens the display of so many sessions' progress.
         describe: writes descriptions into a session, `liex_lab.api.correct_session`.
-        look: looks at a session's animal.
+        look: inspects a session's animal.
 
     Raises:
         StudyError: both scheduler and slurm are given, or no scheduler answers at that address.
         SessionError: another process measures the study.
-        LiexError: an id in `only` is none of the study's.
+        LiexError: an id in `only` is not in the study.
     """
     if scheduler and slurm:
         raise StudyError(
             "the workers are found either with --scheduler or with --slurm; leave one of them out"
         )
     if scheduler:
-        is_encrypted(scheduler)  # an address that is none ends here
+        is_encrypted(scheduler)  # raises an error for an invalid address
     table = SlurmTable.load(slurm) if slurm else None
     ask = partial(standings, study, retry=retry, only=only, again=again)
     before = ask()
@@ -110,16 +110,16 @@ def _to_measure(found: Sequence[SessionStatus]) -> list[SessionStatus]:
 def _crew(
     found: Sequence[SessionStatus], unseen: Sequence[PlannedSession], **where: Any
 ) -> Iterator[Crew | None]:
-    """Workers for what is to be done; None where nothing is."""
+    """Workers for the pending sessions; None if there are none."""
     todo = [one.session for one in _to_measure(found)]
     if not todo and not unseen:
         yield None
         return
 
-    if not where["scheduler"] and not where["slurm"]:  # once, and not in every worker
+    if not where["scheduler"] and not where["slurm"]:  # once, instead of in every worker
         for animal in sorted({session.plan.animal.skeleton for session in [*todo, *unseen]}):
             compile_ahead(animal)
-    # what was looked at may have others of its animal measured again
+    # inspecting one session may make others of its animal pending
     most = sum(one.state != "excluded" for one in found) if unseen else len(todo)
     with crew_of(max(most, len(unseen)), **where) as crew:
         yield crew
@@ -131,12 +131,12 @@ def _look(
     crew: Crew,
     board: Callable[[int], AbstractContextManager[Board]],
 ) -> None:
-    """Look at sessions, and keep what was found."""
+    """Inspect sessions, and store the findings."""
     known = {session.id: session for session in sessions}
     with board(len(sessions)) as shown:
 
         def finished(found: dict[str, Any]) -> None:
-            """Keep what was `found`, and tell the board what was seen."""
+            """Store the findings on a session, and report them to the board."""
             id = found["session_id"]
             write_look(known[id], found)
             failure = found.get("failure")
@@ -159,7 +159,7 @@ def _measure(
     with board(len(todo)) as shown:
 
         def finished(result: dict[str, Any]) -> None:
-            """Tell the board how a session went: its `result`."""
+            """Report the `result` of a session to the board."""
             failure = result["failure"]
             copy = result.get("corrections_taken_from")
             taken = f", with the corrections of {copy}" if copy else ""

@@ -1,10 +1,10 @@
-"""What sessions of one animal share: size and shape, where the study says shared = "subject".
+"""Size and shape that sessions of one animal share, if the study states shared = "subject".
 
-First every session of the animal is looked at: its sampled frames tell size and shape, and
-look.json beside its results keeps them. What these agree on then stands in the plan of each
-(`animal.shared`), so that plan and recording alone say what comes out, whoever measures it and in
-whatever order. A session that cannot be looked at, or does not show the animal, keeps to itself,
-and where the lengths lie too far apart all do.
+First every session of the animal is inspected: size and shape are estimated from sampled frames and
+stored in look.json next to its results. The values that these agree on are then written into the
+plan of each (`animal.shared`), so that the result depends only on plan and recording, not on who
+measures it or in which order. A session that cannot be inspected, or does not show the animal, uses
+its own values; so do all if their lengths differ too much.
 """
 
 from __future__ import annotations
@@ -45,27 +45,21 @@ from ..shards import MEASURING
 LOOK_FILE = "look.json"
 LOOKING = "looking at the animal"
 _MM_DECIMALS = 3
-_DECIMALS = 4  # of a shape, relative to the length or to the average animal's
+_DECIMALS = 4  # of a shape, relative to the length or to the average animal
 LookAtSession = Callable[[PlannedSession, Progress], dict[str, Any]]  # the content of look.json
-_SAYS = {
-    ".toml",
-    ".txt",
-    ".csv",
-    ".json",
-    ".yaml",
-    ".yml",
-}  # files beside a recording that say what is in it
+# files with metadata next to a recording
+_SAYS = {".toml", ".txt", ".csv", ".json", ".yaml", ".yml"}
 
 
 def what_changed(session: PlannedSession, document: dict[str, Any]) -> str:
-    """Why a stored session is not the planned one any more; '' if it is.
+    """Why a stored session differs from the planned one; '' if it does not.
 
     Args:
         session: the planned session.
-        document: what was stored: session.json, failed.json or look.json.
+        document: the stored session.json, failed.json or look.json.
 
     Raises:
-        PlanError: the stored plan is none.
+        PlanError: the stored plan is not valid.
     """
     return (
         _version_changed(document)
@@ -85,15 +79,15 @@ def _version_changed(document: dict[str, Any]) -> str:
 
 
 def plan_changed(plan: Plan, stored: dict[str, Any]) -> str:
-    """What a plan says otherwise than the one that a session was measured by, '' if nothing.
+    """How a plan differs from the one that a session was measured with; '' if it does not.
 
     Args:
-        plan: the plan of today.
+        plan: the current plan.
         stored: the plan in session.json.
     """
     then = Plan.from_table(stored).model_dump()
     now = plan.model_dump()
-    if plan.recording.mirrored is None:  # then it is found, and stored as it was found
+    if plan.recording.mirrored is None:  # then it is estimated, and the result is stored
         now["recording"]["mirrored"] = then["recording"]["mirrored"]
     if now["animal"]["shared"] != then["animal"]["shared"]:
         shared = plan.animal.shared
@@ -107,7 +101,7 @@ def plan_changed(plan: Plan, stored: dict[str, Any]) -> str:
         for key in (now[section] if isinstance(now[section], dict) else [""])
         if (now[section][key] != then[section][key] if key else now[section] != then[section])
         and not (section == "session" and key in DESCRIBED)
-        and section != "report"  # nothing that is measured
+        and section != "report"  # does not affect measurements
     ]
     more = f" and {len(differing) - 3} more" if len(differing) > 3 else ""
     return f"plan changed: {', '.join(differing[:3])}{more}" if differing else ""
@@ -119,7 +113,7 @@ def _model_changed(plan: Plan, stored: dict[str, Any]) -> str:
 
 
 def _input_changed(session: PlannedSession, stored: dict[str, Any]) -> str:
-    """By the files' sizes and times; where those differ, by their content."""
+    """Compare the input by its files' sizes and times; if these differ, by content."""
     if stored.get("stamp") == input_stamp(session.recording):
         return ""
     if session.recording.startswith(VIRTUAL):
@@ -127,21 +121,22 @@ def _input_changed(session: PlannedSession, stored: dict[str, Any]) -> str:
     if not stored.get("sha256"):
         return "input changed: sizes or times of its files"
     if not session.recording_exists:
-        return ""  # its results are all there is left of it; they are kept
+        return ""  # keep the results, as the recording is gone
     with open_planned(session.recording, session.plan) as recording:
         return "" if recording.digest() == stored["sha256"] else "input changed: its content"
 
 
 def input_stamp(recording: str) -> str:
-    """A short hash of names, sizes and times of a recording's files and of the notes beside them.
+    """A short hash of names, sizes and times of a recording's files and of the metadata next to
+    them.
 
-    Cheap to look up. Notes are files such as .toml, .csv and .json.
+    It is cheap, as no content is read. Metadata are files such as .toml, .csv and .json.
 
     Args:
-        recording: a path, or the address of a virtual recording, which is returned as it is.
+        recording: a path, or the address of a virtual recording, which is returned unchanged.
 
     Returns:
-        32 hexadecimal digits; '' where there is no recording.
+        32 hexadecimal digits; '' if there is no recording.
     """
     if recording.startswith(VIRTUAL):
         return recording
@@ -178,7 +173,7 @@ class _ShapeFound(_Part):
 
     @property
     def stated(self) -> dict[str, Any]:
-        """As a plan states it."""
+        """The shape in the format of a plan."""
         return self.model_dump(include={"width", "height", "joints_moved"})
 
 
@@ -189,7 +184,7 @@ class _AnimalFound(_Part):
 
 
 class _Look(_Part):
-    """What is read of look.json where the animal was seen."""
+    """The entries of look.json that are read if an animal was found."""
 
     animal: _AnimalFound
     log_sd: float = Field(ge=0.0)
@@ -199,13 +194,12 @@ class _Look(_Part):
 
 @dataclass(frozen=True)
 class Shared:
-    """A session with what it shares.
+    """A session with its shared size and shape.
 
     Attributes:
-        session: the planned session; its plan holds what it shares, its remark why it shares
-            nothing.
-        waits_for: id of a session of its animal that is to be looked at first; empty where all
-            were.
+        session: the planned session; its plan has the shared values, or its remark states why there
+            are none.
+        waits_for: id of a session of its animal that has to be inspected first; empty if all were.
     """
 
     session: PlannedSession
@@ -213,10 +207,8 @@ class Shared:
 
 
 def shared_sessions(study: Study) -> list[Shared]:
-    """The sessions of a study, in its order, with what they share according to the stored looks.
-
-    Args:
-        study: the study.
+    """The sessions of a study, in order, with size and shape shared according to the stored
+    findings.
     """
     known = {session.id: Shared(session) for session in study.sessions}
     for group in _groups(study):
@@ -230,13 +222,13 @@ def shared_sessions(study: Study) -> list[Shared]:
 def to_be_looked_at(
     study: Study, only: Sequence[str] = (), retry: bool = False, again: bool = False
 ) -> list[PlannedSession]:
-    """Sessions that are to be looked at before others of their animal are measured.
+    """Sessions to inspect before others of their animal are measured.
 
     Args:
         study: the study.
-        only: ids of the sessions that are measured; () takes all.
-        retry: those that could not be looked at are tried again.
-        again: all are looked at again.
+        only: ids of the sessions to measure; () means all.
+        retry: inspect failed ones again.
+        again: inspect all again.
     """
     found = []
     for group in _groups(study):
@@ -250,7 +242,7 @@ def to_be_looked_at(
 
 
 def _groups(study: Study) -> list[list[PlannedSession]]:
-    """The sessions of each animal that may share, two or more of one skeleton and model."""
+    """The sessions of each animal that may share: two or more with one skeleton and model."""
     if study.table.shared == "off":
         return []
     groups: dict[tuple[str, str, str], list[PlannedSession]] = {}
@@ -265,11 +257,11 @@ def _groups(study: Study) -> list[list[PlannedSession]]:
 def together(
     group: Sequence[PlannedSession], looks: Mapping[str, dict[str, Any]]
 ) -> list[PlannedSession]:
-    """The sessions of one animal with what they agree on in their plans, or why they do not.
+    """The sessions of one animal with the shared values in their plans, or why they do not share.
 
     Args:
         group: sessions of one animal.
-        looks: of each of them, by id, as `look_at` gives it.
+        looks: findings on each of them, by id, from `look_at`.
     """
     subject = group[0].animal.id
     taking_part = {s.id: found_in(looks[s.id]) for s in group if not _why_not(looks[s.id])}
@@ -308,7 +300,7 @@ def _with(plan: Plan, body: SharedBody) -> Plan:
 
 
 def _why_not(look: Mapping[str, Any]) -> str:
-    """Why a session takes no part in what its animal's share; '' where it does."""
+    """Why a session is not used for its animal's shared values; '' if it is."""
     if "failure" in look:
         return str(look["failure"].get("reason", ""))
     return ", and ".join(map(str, look["misfits"]))
@@ -322,10 +314,10 @@ def _left_out(session: PlannedSession, look: Mapping[str, Any]) -> str:
 
 
 def found_in(look: Mapping[str, Any]) -> Found:
-    """What a look says of the animal.
+    """The findings on an animal, from a look.
 
     Args:
-        look: as `look_at` gives it, of a session that shows the animal.
+        look: from `look_at`, of a session that shows the animal.
 
     Raises:
         ValueError: it is damaged.
@@ -340,7 +332,7 @@ def found_in(look: Mapping[str, Any]) -> Found:
         told.n_frames,
         told.animal.girth,
         None if stated is None else shape_labels(stated),
-        # a shape was tried, and the frames that were held out spoke against it
+        # a shape was tried, and rejected on held-out frames
         not shape.kept and shape.residual_mm is not None,
         shape.n_frames,
     )
@@ -356,7 +348,7 @@ def _stated(labels: Any) -> SharedShape:
 
 
 class Stage:
-    """Passes progress on, and remembers the stage and the frame for the report of a failure.
+    """Forwards progress, and stores stage and frame for the report of a failure.
 
     Attributes:
         name: the stage.
@@ -369,24 +361,22 @@ class Stage:
         self._progress = progress
 
     def __call__(self, done: int, total: int | None, what: str) -> None:
-        """Note the stage, and pass everything on."""
+        """Store the stage, and forward the progress."""
         self.name = what
         self.frame = done if what == MEASURING else self.frame
         self._progress(done, total, what)
 
 
 def look_at(session: PlannedSession, progress: Progress = silent) -> dict[str, Any]:
-    """What a session's sampled frames tell of its animal, or why they tell nothing.
-
-    Nothing is written.
+    """Estimate the animal's size and shape from a session's sampled frames, without writing files.
 
     Args:
         session: the planned session.
-        progress: told what is being done.
+        progress: called with the current step.
 
     Returns:
-        The content of look.json: plan, model and input it goes by, and `animal`, `log_sd`,
-        `n_frames`, `stated` and `misfits`, or `failure`.
+        The content of look.json: plan, model and input, and `animal`, `log_sd`, `n_frames`,
+            `stated` and `misfits`, or `failure`.
     """
     stage = Stage(progress)
     try:
@@ -396,11 +386,7 @@ def look_at(session: PlannedSession, progress: Progress = silent) -> dict[str, A
 
 
 def about(session: PlannedSession) -> dict[str, Any]:
-    """What a look at a session goes by: version, plan and input.
-
-    Args:
-        session: the planned session.
-    """
+    """The inputs of an inspection: version, plan and input."""
     return {
         "session_id": session.id,
         "schema_version": SCHEMA_VERSION,
@@ -435,33 +421,21 @@ def _found(session: PlannedSession, progress: Progress) -> dict[str, Any]:
 
 
 def look_file(session: PlannedSession) -> Path:
-    """Where the look at a session is kept: beside its results.
-
-    Args:
-        session: the planned session.
-    """
+    """The path of a session's look.json, next to its results."""
     return session.folder.with_name(LOOK_FILE)
 
 
 def write_look(session: PlannedSession, look: dict[str, Any]) -> None:
-    """Keep the look at a session, whole or not at all.
-
-    Args:
-        session: the planned session.
-        look: as `look_at` gives it.
-    """
+    """Write the findings on a session atomically."""
     file = look_file(session)
     unlinked(file.parent).mkdir(parents=True, exist_ok=True)
     write_whole(file, json.dumps(storable_document(look), indent=1, default=str) + "\n")
 
 
 def read_look(session: PlannedSession) -> dict[str, Any] | None:
-    """The look at a session that was kept; None where there is none that still holds.
+    """The stored findings on a session; None if there are none, or they are outdated.
 
-    One at a recording that is gone holds on: its results are all there is left of it.
-
-    Args:
-        session: the planned session.
+    If the recording is gone, they remain valid as long as the rest is unchanged.
     """
     try:
         look = json.loads(look_file(session).read_text(encoding="utf-8"))

@@ -1,7 +1,7 @@
-"""Status of a study's sessions: done, failed, or to be done (again) and why; looked up on disk.
+"""Status of a study's sessions: done, failed, or pending (again) and why; read from disk.
 
-Nothing is remembered: a session is done while versions, plan, model and input in its session.json
-are those of today.
+No state is kept: a session is done while versions, plan, model and input in its session.json are
+current.
 """
 
 from __future__ import annotations
@@ -32,12 +32,12 @@ class SessionStatus:
     Attributes:
         session: the planned session.
         state: done, failed, new, begun, changed or excluded.
-        reason: why it is to be done, was not, or what there is to look at or to distrust although
-            it is done.
+        reason: why it is pending or was not measured, or why a session that is done needs review or
+            caution.
         failure: of the last attempt, if it failed.
-        described: what the study says otherwise of the animal than its results; then nothing else
-            changed, and nothing is measured anew.
-        input: hash of the recording of one that is done; empty for others.
+        described: description of the animal in the study that differs from the results; if not
+            empty, nothing else changed and nothing needs to be measured again.
+        input: hash of the recording if done; empty otherwise.
     """
 
     session: PlannedSession
@@ -49,17 +49,17 @@ class SessionStatus:
 
     @property
     def in_words(self) -> str:
-        """The state as a person is told it: of one that is done, whether all is well with it."""
+        """The state for display; for a session that is done, also whether it needs review."""
         return "recording missing" if self.missing else state_in_words(self.state, self.reason)
 
     @property
     def missing(self) -> bool:
-        """Whether its recording is not there, although its results may be."""
+        """Whether its recording is missing, even if there are results."""
         return self.state not in ("failed", "excluded") and not self.session.recording_exists
 
     @property
     def to_do(self) -> bool:
-        """Whether a run of the study has to do with it: it is new, begun or changed."""
+        """Whether it is pending: new, begun or changed."""
         return self.state in ("new", "begun", "changed")
 
 
@@ -70,12 +70,12 @@ def standings(
 
     Args:
         study: the study.
-        retry: failed sessions are to be done.
-        only: ids of sessions, the others are left out; () takes all.
-        again: done and failed sessions are to be done.
+        retry: treat failed sessions as pending.
+        only: ids of sessions, the others are left out; () means all.
+        again: treat done and failed sessions as pending.
 
     Raises:
-        LiexError: an id in `only` is none of the study's.
+        LiexError: an id in `only` is not in the study.
     """
     known = [session.id for session in study.sessions]
     if absent := [id for id in only if id not in known]:
@@ -100,11 +100,11 @@ def _asked_again(one: SessionStatus, retry: bool, again: bool) -> SessionStatus:
 
 
 def standing(session: PlannedSession, waits_for: str = "") -> SessionStatus:
-    """The status of one session, by what lies in its folder.
+    """The status of one session, from the files in its folder.
 
     Args:
-        session: the planned session, with what it shares with others of its animal.
-        waits_for: id of one of these that nobody has looked at, so that this is not known yet.
+        session: the planned session, with the values it shares with others of its animal.
+        waits_for: id of one of these that has not been inspected, so that the values are unknown.
     """
     if session.exclude:
         return SessionStatus(session, "excluded", session.exclude)
@@ -126,7 +126,7 @@ def standing(session: PlannedSession, waits_for: str = "") -> SessionStatus:
 
 
 def _measured(session: PlannedSession, file: Path) -> SessionStatus:
-    """The status of a session that has results: whether they are those of today's study."""
+    """The status of a session that has results: whether these are up to date."""
     said: dict[str, str] = {}
     try:
         document = json.loads(file.read_text(encoding="utf-8"))
@@ -144,11 +144,7 @@ def _measured(session: PlannedSession, file: Path) -> SessionStatus:
 
 
 def to_check(found: Sequence[SessionStatus]) -> list[str]:
-    """What may be wrong with the animals of a study: two names of one, or a recording listed twice.
-
-    Args:
-        found: the status of its sessions.
-    """
+    """Possible errors in a study's animals: two names of one, or a recording listed twice."""
     import pandas as pd
 
     from liex_lab.behaviour.cohort import unified
@@ -166,10 +162,10 @@ def to_check(found: Sequence[SessionStatus]) -> list[str]:
 
 
 def misnamed(sessions: Sequence[PlannedSession]) -> list[str]:
-    """Sessions whose recordings are named after another animal of the study, in sentences.
+    """Sentences on sessions whose recordings are named after another animal of the study.
 
     Args:
-        sessions: those of the study; ones in one of several arenas are not judged.
+        sessions: those of the study; sessions with a region, as one of several arenas, are skipped.
     """
     known = {same(one.animal.id): one.animal.id for one in sessions}
     notes = []
@@ -185,13 +181,13 @@ def misnamed(sessions: Sequence[PlannedSession]) -> list[str]:
 
 
 def to_look_at(verdict: Mapping[str, Any]) -> str:
-    """Why someone has to look at a session that is done, and what to distrust in it.
+    """Why a session that is done needs review, and cautions about it.
 
     Args:
-        verdict: as `sessions.verdict.read_verdict` gives it.
+        verdict: from `sessions.verdict.read_verdict`.
 
     Returns:
-        As the session itself says it; '' where there is nothing to say.
+        The session's own wording; '' if there is nothing to report.
     """
     said = []
     if verdict["look_at_it"]:
@@ -203,7 +199,9 @@ def to_look_at(verdict: Mapping[str, Any]) -> str:
 
 
 def _described_anew(session: PlannedSession, document: dict[str, Any]) -> dict[str, str]:
-    """What the plan says otherwise of animal and session than the results; '' takes it back."""
+    """Descriptions of animal and session in the plan that differ from the results; '' removes
+    one.
+    """
     stated = session.plan.session.model_dump()
     then = Plan.from_table(document.get("plan", {})).session.model_dump()
     described = read_log(session.folder).described

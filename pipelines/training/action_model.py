@@ -1,10 +1,10 @@
 """Training of action recognisers, and active learning: `liex train actions`, `liex suggest`.
 
-The recogniser (a network on windowed features under a semi-Markov model, `liex_lab.actions`) learns
-from sessions that people labelled, and is then scored by leave-one-animal-out cross-validation; or,
-without any, from generated recordings of a virtual animal at several frame rates. Labels come from
+The recogniser (a network on windowed features under a semi-Markov model, `liex_lab.actions`) is
+trained on manually labelled sessions and scored by leave-one-animal-out cross-validation; or,
+without any, on generated recordings of a virtual animal at several frame rates. Labels come from
 our tables, from CSV, from BORIS projects and from BORIS's exports. `suggest` is uncertainty
-sampling: it names what a person should label next by the entropy of the recogniser's words.
+sampling: it ranks the segments to label next by the entropy of the recogniser's actions.
 """
 
 from __future__ import annotations
@@ -36,25 +36,23 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 _SEED = 6
-_SLOWER_HZ = (
-    15.0,
-    30.0,
-)  # of the generated recordings a model learns from, some as slower cameras see them
+# lower frame rates at which some of the generated training recordings are repeated
+_SLOWER_HZ = (15.0, 30.0)
 
 
 def learning_set(
     animal: str, estimator: PoseEstimator, progress: Progress = silent
 ) -> tuple[list[LabelledTrack], list[LabelledTrack]]:
-    """Generated recordings of an animal to learn from, and cut-out sequences of single actions.
+    """Generated recordings of an animal for training, and cut-out sequences of single actions.
 
     Args:
         animal: `fish` or `mouse`.
         estimator: measures the rendered frames.
-        progress: told how far rendering and measuring is.
+        progress: called with the progress of rendering and measuring.
 
     Returns:
-        The labelled tracks of uncut recordings, a third of the usual camera's once more as slower
-        ones (15 Hz, and 30 Hz for fish) see them; and the cut-out sequences, of fish only.
+        The labelled tracks of uncut recordings, a third of the usual camera's repeated at lower
+        rates (15 Hz, and 30 Hz for fish); and the cut-out sequences, of fish only.
 
     Raises:
         LiexError: no actions are generated for this animal.
@@ -90,16 +88,16 @@ def train_actions(
 
     Args:
         out: where the model is written.
-        animal: `fish` or `mouse`, where it learns from generated recordings.
+        animal: `fish` or `mouse`, for generated recordings.
         sessions: labelled session folders.
         labels: tables of bouts, BORIS projects or BORIS exports; without any, the sessions' own
-            bouts whose source is `human` are taken.
+            bouts whose source is `human` are used.
         pose_model: measures the generated recordings, instead of the animal's own.
-        progress: told how far the job is.
+        progress: called with the progress of the job.
 
     Returns:
-        The model's path and, for sessions, its scores on each animal when it learned from the
-        others only; an empty dict for generated recordings.
+        The model's path and, for sessions, its scores on each animal when trained on the others
+        only; an empty dict for generated recordings.
 
     Raises:
         LiexError: the animal has no generated actions, or labels and sessions do not fit.
@@ -137,12 +135,12 @@ def train_actions(
 def labelled_sessions(
     sessions: Sequence[str | Path], labels: Sequence[str | Path]
 ) -> list[LabelledTrack]:
-    """The tracks of sessions with the word that people gave each frame.
+    """The tracks of sessions with the manual label of each frame.
 
     Args:
         sessions: session folders.
-        labels: files of labels; () takes the sessions' own human bouts. Where there are several
-            sessions, `session_id` in the labels says which one a bout is of.
+        labels: files of labels; () uses the sessions' own human bouts. If there are several
+            sessions, `session_id` in the labels assigns bouts to sessions.
 
     Returns:
         One labelled track per session, named by its subject, else by the session.
@@ -185,7 +183,8 @@ def read_any_labels(path: str | Path) -> pd.DataFrame:
     """Labels from our table, a CSV, a BORIS project or BORIS's export of aggregated events.
 
     Args:
-        path: the file; `.boris` and `.boris.gz` are projects, a `.csv` or `.tsv` is looked into.
+        path: the file; `.boris` and `.boris.gz` are projects; the format of a `.csv` or `.tsv` is
+            detected from its content.
 
     Returns:
         One row per bout.
@@ -209,20 +208,20 @@ def read_any_labels(path: str | Path) -> pd.DataFrame:
 def suggest(
     session: str | Path, *, model: str | Path | None = None, n: int = 10, least_s: float = 0.5
 ) -> pd.DataFrame:
-    """The segments of a session most worth labelling next: where the recogniser is least sure.
+    """The segments of a session most worth labelling next: where the recogniser is least certain.
 
-    Segments are ranked by mean entropy, but of every pair of confused words the worst comes first,
-    so that no single confusion fills the list.
+    Segments are ranked by mean entropy, but the worst of every pair of confused actions comes
+    first, so that no single confusion fills the list.
 
     Args:
         session: the session folder.
-        model: an action model's name or path; None takes that of the session's animal.
-        n: how many segments at most.
+        model: an action model's name or path; None uses that of the session's animal.
+        n: maximum number of segments.
         least_s: length of a segment, s.
 
     Returns:
-        Columns `start_s`, `stop_s`, `guess`, `or_else` (the two likeliest words) and `uncertainty`
-        (entropy over its largest value, 0 to 1).
+        Columns `start_s`, `stop_s`, `guess`, `or_else` (the two likeliest actions) and
+        `uncertainty` (entropy over its largest value, 0 to 1).
 
     Raises:
         LiexError: the model is of another animal.
@@ -273,8 +272,8 @@ _TEST_SET = tuple(range(301, 307))
 _FAST_SET = {"fish": tuple(range(225, 233))}
 _SECONDS = 40.0
 _FAST_SECONDS = 20.0
-_TEST_SECONDS = 300.0  # of a test recording, about: fewer minutes are fewer of the same recordings
-_FAST_SHARE = 1.0 / 6.0  # of every test recording is filmed by a faster camera as well
+_TEST_SECONDS = 300.0  # of a test recording, about; fewer minutes use fewer recordings
+_FAST_SHARE = 1.0 / 6.0  # share of every test recording that is also filmed by a faster camera
 
 
 def cut_sequences(animal: str, test: bool) -> list[Scenario]:
@@ -299,10 +298,8 @@ def cut_sequences(animal: str, test: bool) -> list[Scenario]:
 
 
 def training_recordings(animal: str) -> list[Scenario]:
-    """Uncut recordings to learn from, 40 s each; a fish's last 8 by a 100 Hz camera, 20 s each.
-
-    Args:
-        animal: `fish` or `mouse`.
+    """Uncut training recordings of a `fish` or `mouse`, 40 s each; also 8 of fish at 100 Hz, 20 s
+    each.
     """
     usual = [Scenario(animal, one, 1, RATE_HZ[animal], _SECONDS) for one in _TRAIN_SET]
     return usual + [
@@ -311,22 +308,18 @@ def training_recordings(animal: str) -> list[Scenario]:
 
 
 def by_usual_camera(recordings: Sequence[Recorded]) -> list[Recorded]:
-    """Those by the animal's usual camera, the first 24.
-
-    Args:
-        recordings: one entry for each of `training_recordings`, in that order.
-    """
+    """The entries of the animal's usual camera, the first 24 of `training_recordings`."""
     return list(recordings[: len(_TRAIN_SET)])
 
 
 def test_recordings(animal: str, fast: bool, minutes: float) -> list[Scenario]:
-    """Uncut test recordings of individuals whose traits no other individual has.
+    """Uncut test recordings of individuals whose traits are outside the training's.
 
     Args:
         animal: `fish` or `mouse`.
         fast: the first sixth of the same recordings by a 100 Hz camera, instead of all of them by
             the usual one.
-        minutes: length in all; about 5 minutes come from each of at most 6 individuals.
+        minutes: total length; about 5 minutes come from each of at most 6 individuals.
     """
     n = int(np.clip(round(60.0 * minutes / _TEST_SECONDS), 1, len(_TEST_SET)))
     seconds = 60.0 * minutes / n

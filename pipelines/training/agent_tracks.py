@@ -1,10 +1,10 @@
 """Labelled tracks of acting virtual animals: behaviour generated, rendered, measured and tracked.
 
-An agent strings actions together by their kinematic definitions; each frame is rendered in depth,
-and what single frames say is measured as in a recording. These observations are kept in the cache
-folder, recording by recording, by scenario, model and the code of the generator, so that a job that
-was stopped goes on where it was. The track is made from them anew, by the present tracker. All is
-drawn from seeds.
+An agent strings actions together by their kinematic definitions; each frame is rendered in depth
+and measured as in a recording. These single-frame observations are kept in the cache folder, one
+recording after the other, by scenario, model and the generator's code, so that an interrupted job
+resumes where it stopped. The track is always computed from them by the present tracker. Everything
+is drawn from seeds.
 """
 
 from __future__ import annotations
@@ -43,18 +43,18 @@ from .pose_model import cache_folder
 Array = NDArray[np.float64]
 
 _SOURCES = ("agent.py", "render.py")  # and the animal's own agent
-_WALL_ERROR_MM = 4.0  # of the arena as it was found
+_WALL_ERROR_MM = 4.0  # error of the estimated arena
 _FISH_STRIDE = 4
 _FISH_WINDOW = 128
 _MOUSE_WINDOW = 112
 _SIZE_FRAMES = 128  # frames in which an animal's size is measured
-_WAYS = 2  # hypotheses a frame: nothing but the animal is in view
+_WAYS = 2  # hypotheses per frame: only the animal is in view
 _CAMERA = ("fx", "fy", "cx", "cy", "width", "height")
 
 
 @dataclass(frozen=True)
 class Scenario:
-    """One recording to be acted.
+    """A recording to generate.
 
     Attributes:
         animal: `fish` or `mouse`.
@@ -63,8 +63,8 @@ class Scenario:
         rate_hz: frames per second of the camera.
         seconds: length of an uncut recording, s; 0 for a cut-out action.
         word: the cut-out action, '' for an uncut recording.
-        novel: the individual has traits that no other has.
-        filmed_s: only so much of its beginning is filmed, s; 0 films all of it.
+        novel: the individual has traits outside the training's.
+        filmed_s: length of the beginning that is filmed, s; 0 films all of it.
     """
 
     animal: str
@@ -79,17 +79,17 @@ class Scenario:
 
 @dataclass(frozen=True)
 class AgentTrack:
-    """An acted recording of n frames as its single frames saw it, with labels and truth.
+    """The single-frame observations of a generated recording of n frames, with labels and truth.
 
     Attributes:
         seen: hypotheses of all frames, arena frame.
         subject: the animal and its camera.
-        words: (n,) what the animal really did.
-        animal: who it is.
-        wall_mm: (n,) distance of its middle from the nearest wall, mm; NaN where nobody knows.
+        words: (n,) true actions.
+        animal: name of the individual.
+        wall_mm: (n,) distance of its middle from the nearest wall, mm; NaN if unknown.
         truth: (n, J, 3) float32 true joints, mm, arena frame.
-        cut: the word of a cut-out action, of which a little before and after is seen as well; ''
-            for an uncut recording.
+        cut: the cut-out action, which has some frames before and after it as well; '' for an uncut
+            recording.
     """
 
     seen: Observations
@@ -101,11 +101,11 @@ class AgentTrack:
     cut: str = ""
 
     def tracked(self, rate_hz: float = 0.0) -> LabelledTrack:
-        """The labelled track of the recording, of a cut-out action the frames of that action alone.
+        """The labelled track of the recording; for a cut-out action, only its frames.
 
         Args:
-            rate_hz: as a camera of so many frames per second would have seen it, which has only the
-                frames nearest to its times to go by; 0 takes all frames.
+            rate_hz: frame rate of a slower camera, simulated by the frames nearest to its times; 0
+                uses all frames.
         """
         rows = np.arange(len(self.words)) if not rate_hz else thinned(self.seen.times_ns, rate_hz)
         seen = Observations(
@@ -119,7 +119,7 @@ class AgentTrack:
 
 
 def thinned(times_ns: NDArray[np.int64], rate_hz: float) -> NDArray[np.int64]:
-    """Rows (m,) of the frames that lie nearest to those of a camera of another rate; none twice.
+    """Unique rows (m,) of the frames nearest to those of a camera with another rate.
 
     Args:
         times_ns: (n,) int64 times of the frames, ns.
@@ -134,27 +134,21 @@ def thinned(times_ns: NDArray[np.int64], rate_hz: float) -> NDArray[np.int64]:
 def acted_tracks(
     scenarios: Sequence[Scenario], estimator: PoseEstimator, progress: Progress = silent
 ) -> list[LabelledTrack]:
-    """The labelled tracks of scenarios, by the present tracker; see `acted`.
-
-    Args:
-        scenarios: what is to be acted.
-        estimator: measures the frames.
-        progress: told recording by recording.
-    """
+    """The labelled tracks of scenarios, by the present tracker; see `acted`."""
     return [one.tracked() for one in acted(scenarios, estimator, progress)]
 
 
 def acted(
     scenarios: Sequence[Scenario], estimator: PoseEstimator, progress: Progress = silent
 ) -> list[AgentTrack]:
-    """All scenarios as single frames saw them, from the cache or measured now.
+    """Single-frame observations of all scenarios, from the cache or measured now.
 
     Cut-outs of one individual share its measured size and one file of the cache.
 
     Args:
         scenarios: all uncut, or all cut-out actions, of one animal.
-        estimator: measures the frames; its model's digest is a part of the cache key.
-        progress: told recording by recording, where one has to be measured.
+        estimator: measures the frames; its model's digest is part of the cache key.
+        progress: called recording by recording, if any has to be measured.
 
     Returns:
         One for each scenario, in their order.
@@ -184,13 +178,13 @@ def acted(
 def act(
     scenario: Scenario, estimator: PoseEstimator, sizes: dict[int, float] | None = None
 ) -> AgentTrack:
-    """One scenario acted, rendered and measured frame by frame.
+    """Generate, render and measure one scenario frame by frame.
 
     Args:
-        scenario: what is to be acted.
+        scenario: the recording to generate.
         estimator: measures the frames.
-        sizes: size over home size by individual; those in it are taken, others are measured over up
-            to 128 frames and added. None starts without any.
+        sizes: cache of size over home size by individual; others are measured over up to 128 frames
+            and added. None starts empty.
     """
     rng = np.random.default_rng([scenario.individual, scenario.seed])
     motion, rows, pose, girth, walls, species, camera, shape, wall_mm = staged(scenario, rng)
@@ -249,11 +243,11 @@ Staged = tuple[
 
 
 def staged(scenario: Scenario, rng: np.random.Generator) -> Staged:
-    """A scenario acted, before anything is rendered.
+    """Generate a scenario, without rendering it.
 
     Args:
-        scenario: what is to be acted.
-        rng: source of randomness, of the individual and the scenario.
+        scenario: the recording to generate.
+        rng: random number generator, of the individual and the scenario.
 
     Returns:
         The motion on its 5 ms clock; its steps (n,) that are frames; poses (n), arena frame; girth
@@ -295,9 +289,8 @@ def _mouse(scenario: Scenario, rng: np.random.Generator) -> Staged:
     sensor = species.sensors[int(rng.integers(len(species.sensors)))]
     camera = CameraPath.draw(rng, species, sensor, shape.fur, float(rng.uniform(650.0, 850.0)), 1)
     wall_mm = (half - np.abs(middle)).min(axis=1) + rng.normal(0.0, _WALL_ERROR_MM)
-    known = (
-        scenario.novel or rng.random() < 0.75
-    )  # of some to learn from nobody knows where the walls are
+    # in some training recordings the walls are unknown
+    known = scenario.novel or rng.random() < 0.75
     return (
         motion,
         rows,
@@ -388,22 +381,22 @@ def _load(path: Path, estimator: PoseEstimator, group: Sequence[Scenario]) -> li
     return found
 
 
-# A cut-out action as a camera sees it: poses of all its frames, and what is seen in some of them.
+# A filmed cut-out action: poses of all its frames, and the visible points in some of them.
 
 
 _WINDOW_PX = 128
-_ABOVE_GROUND_MM = 4.0  # a pixel so far before the empty ground shows the animal or is noise
-_NEAR = 0.25  # of the body's length: what is farther from every joint is noise
+_ABOVE_GROUND_MM = 4.0  # a pixel less far above the empty ground is noise
+_NEAR = 0.25  # of the body's length: points farther from every joint are noise
 
 
 @dataclass(frozen=True)
 class Film:
-    """An action of n frames.
+    """A filmed action of n frames.
 
     Attributes:
         joints: (n, J, 3) true joints, mm, arena frame.
         rows: (k,) the key frames among them.
-        points: of each key frame (m, 3) what the camera sees of the animal, mm, arena frame.
+        points: for each key frame, the visible points (m, 3) of the animal, mm, arena frame.
         edges: pairs of joints that a bone connects.
     """
 
@@ -414,11 +407,11 @@ class Film:
 
 
 def filmed_at(scenario: Scenario, n_key_frames: int) -> Film:
-    """An action acted, and rendered at key frames that are evenly spread over it.
+    """Generate an action, and render it at evenly spaced key frames.
 
     Args:
-        scenario: a cut-out action; what comes before and after it is left out.
-        n_key_frames: number of key frames, the first and the last frame among them.
+        scenario: a cut-out action; frames before and after it are left out.
+        n_key_frames: number of key frames, including the first and the last frame.
     """
     rng = np.random.default_rng([scenario.individual, scenario.seed])
     motion, steps, pose, girth, walls, species, camera, shape, _ = staged(scenario, rng)
@@ -437,7 +430,7 @@ def filmed_at(scenario: Scenario, n_key_frames: int) -> Film:
 
 
 def _points(seen: Patches, k: int, T_arena_camera: SE3) -> Array:
-    """What patch k shows before the ground, (m, 3) mm, arena frame."""
+    """Points of patch k above the ground, (m, 3) mm, arena frame."""
     depth = seen.depth[k].astype(float)
     v, u = np.nonzero((depth > 0) & (seen.background[k] - depth > _ABOVE_GROUND_MM))
     fx, fy, cx, cy = seen.intrinsics[k]
@@ -448,6 +441,6 @@ def _points(seen: Patches, k: int, T_arena_camera: SE3) -> Array:
 
 
 def _beside(points: Array, joints: Array, reach_mm: float) -> Array:
-    """Those of the points (m, 3) that are near a joint."""
+    """The points (m, 3) within `reach_mm` of a joint."""
     off = np.linalg.norm(points[:, None] - joints[None], axis=-1).min(axis=1)
     return np.asarray(points[off < reach_mm])

@@ -1,7 +1,7 @@
 """Training of the paper's baselines RF and CNN (Lie-X section 5.2), kept in the user's cache.
 
-RF is a pair of regression forests, CNN an AlexNet that regresses all joints. Both learn when they
-are first asked for, from the rendered pictures that the paper's variant learns from (`recipe_of`).
+RF is a pair of regression forests, CNN an AlexNet that regresses all joints. Both are trained on
+first use, on the rendered images of the paper's variant (`recipe_of`).
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Training:
-    """What a baseline is trained on, and how.
+    """Training images and parameters of a baseline.
 
     Attributes:
         recipe: the rendered images.
-        plan: numbers of the forests or of the network.
+        plan: parameters of the forests or of the network.
     """
 
     recipe: Recipe
@@ -45,7 +45,7 @@ class Training:
     def to_dict(self) -> dict[str, Any]:
         """Plain values of the training, a cache key: equal values mean equal training.
 
-        A turn of the home pose that is none is left out, for plans did not always have one.
+        A zero turn of the home pose is omitted, so that keys of older plans stay the same.
         """
         plan = {
             name: value
@@ -57,15 +57,15 @@ class Training:
 
 
 BASELINES: dict[str, ForestPlan | CnnPlan] = {"rf": ForestPlan(), "cnn": CnnPlan()}
-_SEEN = 122_880  # views of the CNN in all, whatever the number of images
+_SEEN = 122_880  # total views of the CNN, whatever the number of images
 
 
 def training_of(variant: str, skeleton: Skeleton) -> Training:
-    """The training of a baseline: the pictures that the paper's variant learns from.
+    """The training of a baseline, on the images of the paper's variant.
 
     They are the same in number, noise and sizes (40,960 for the mouse, 20,480 for the hand, 16,384
-    for others, half of them degraded); the CNN sees about 122,880 in all, over as many epochs as
-    that takes.
+    for others, half of them degraded); the CNN gets about 122,880 views in total, over as many
+    epochs as needed.
 
     Args:
         variant: `rf` or `cnn`, a key of `BASELINES`.
@@ -90,10 +90,10 @@ def trained_baseline(animal: str, variant: str, progress: Progress = silent) -> 
     Args:
         animal: a bundled animal's name, or the path of a skeleton's TOML.
         variant: `rf` or `cnn`.
-        progress: told how far the training is.
+        progress: called with the progress of the training.
 
     Raises:
-        MissingPackageError: the CNN is asked for and torch is not installed.
+        MissingPackageError: the variant is `cnn` and torch is not installed.
     """
     from liex_lab.body.skeleton import Skeleton
 
@@ -110,12 +110,12 @@ def trained_baseline(animal: str, variant: str, progress: Progress = silent) -> 
 
 
 def cached_baseline(variant: str, skeleton: Skeleton, training: Training) -> Path:
-    """The path at which the cache keeps a baseline (.npz); its card lies beside it as .json.
+    """The path of a baseline in the cache (.npz), with its card next to it (.json).
 
     Args:
         variant: `rf` or `cnn`.
         skeleton: the animal's skeleton.
-        training: what it is trained on; a hash of it and of the program's version is in the name.
+        training: its images and parameters; their hash with the program's version is in the name.
     """
     from liex_lab.sessions.provenance import package_version
 
@@ -131,14 +131,14 @@ def cached_baseline(variant: str, skeleton: Skeleton, training: Training) -> Pat
 def train_baseline(
     variant: str, skeleton: Skeleton, training: Training, path: Path, progress: Progress
 ) -> None:
-    """Train a baseline and write it with its card, under its own name only when it is whole.
+    """Train a baseline and write it with its card; it gets its name only once it is complete.
 
     Args:
         variant: `rf` or `cnn`.
         skeleton: the animal's skeleton.
-        training: images and numbers.
-        path: where the model is written (.npz); the card goes beside it (.json).
-        progress: told how far rendering and training are.
+        training: images and parameters.
+        path: where the model is written (.npz); the card is next to it (.json).
+        progress: called with the progress of rendering and training.
     """
     import numba
 
@@ -147,7 +147,7 @@ def train_baseline(
     from .pose_model import rendered_set
 
     recipe = training.recipe
-    # the paper's view of an animal whose size nobody knows
+    # the paper's view of an animal of unknown size
     method = replace(method_of("paper", skeleton), session_size=False)
     data = rendered_set(skeleton, method, recipe, 0, recipe.n_images, progress)
     began = time.perf_counter()
@@ -180,7 +180,7 @@ def fit(
     """Train a baseline on rendered images.
 
     Raises:
-        MissingPackageError: the CNN is asked for and torch is not installed.
+        MissingPackageError: the plan is of the CNN and torch is not installed.
     """
     rng = np.random.default_rng(training.recipe.seed)
     if isinstance(training.plan, CnnPlan):

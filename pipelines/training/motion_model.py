@@ -1,20 +1,20 @@
 """Fit of the tracker's motion model and error calibration on rendered sequences with truth.
 
-`liex train tracking` measures sequences of the kinds that tracking is evaluated on, with other
-seeds, frame by frame once. Three fits follow on these observations:
+`liex train tracking` measures sequences of the kinds used for evaluation, with other seeds, once
+frame by frame. These fits follow on the observations:
 
-- If asked for, a random search (hill climbing): up to three numbers of association and motion are
-  multiplied by log-normal factors, sd 0.5, and kept where the tracks come nearer to the truth.
+- An optional random search (hill climbing): up to three parameters of association and motion are
+  multiplied by log-normal factors, sd 0.5, and kept if the tracks come closer to the truth.
 - Calibration factors of the joints (`calibration`) at three levels of the stated error, by
   bisection, together with the standard deviation of the body's stretch over a grid of two
-  coefficients, so that nine errors in ten lie within the 90 % interval, in all sequences and in
+  coefficients, so that nine errors in ten lie within the 90 % interval, over all sequences and in
   each of them.
 - The same factors for the root's six coordinates and for the bend angles about three axes, and,
   over all of these sequences and animals of other builds, one for each joint.
-- What nobody sees of a build, on animals of builds that no forest was trained on: the spread of
-  heights and of places along the body (`unseen_height`, `unseen_shift`).
+- The unobservable part of a build, from animals of builds that no forest was trained on: the spread
+  of heights and of positions along the body (`unseen_height`, `unseen_shift`).
 
-Everything starts from fixed seeds, so `tunings.toml` is byte for byte the same on every run.
+Everything starts from fixed seeds, so `tunings.toml` is byte-identical on every run.
 """
 
 from __future__ import annotations
@@ -58,14 +58,14 @@ Knots = tuple[tuple[float, float], ...]
 SEEDS = dict.fromkeys(("easy", "hard"), tuple(range(101, 109)))
 BUILD_SEEDS = tuple(range(201, 230))  # of animals of other builds
 _BUILD_FRAMES = 120
-_EASY_WEIGHT = 2.0  # never worse than single frames where these are good
-_STEP = 0.5  # sd of the logarithm of a number that is changed
+_EASY_WEIGHT = 2.0  # a track must not be worse than single frames where these are good
+_STEP = 0.5  # sd of the logarithm of a changed parameter
 _BINS = 3
 _Z90 = 1.645
 _FACTORS = (0.3, 3.0)
-_HELD = (0.85, 0.96)  # by each joint's 90 % intervals in each kind of sequences
+_HELD = (0.85, 0.96)  # bounds of the coverage of each joint's 90 % intervals, by kind
 _LEAST = 0.01
-# how fast a session's stretch may grow with what it is told by, see `Motion.stretch`
+# grids of the stretch's coefficients, see `Motion.stretch`
 _PER_BLUR = np.arange(0.0, 6.5, 0.5)
 _PER_SPREAD = np.arange(0.0, 3.5, 0.5)
 _FOUND_OTHERWISE = (
@@ -85,17 +85,17 @@ _CHUNK = 32
 
 @dataclass(frozen=True)
 class Seen:
-    """A rendered sequence as it was measured: what frames say, of whom, and the truth.
+    """A measured rendered sequence: observations, subject and truth.
 
     Attributes:
-        kind: `easy` or `hard`.
+        kind: `easy`, `hard` or `other`.
         seen: hypotheses of all n frames, arena frame.
         subject: the animal and its camera.
         pose: (n) true poses, in the same arena frame.
         truth: (n, J, 3) true joints, mm, in the same arena frame.
-        events: what happens in the sequence, such as occlusions.
+        events: events of the sequence, such as occlusions.
         blur: median distance of body and depth over the body's length, see `FrameTracker`.
-        size_spread: standard deviation of the log size that frames tell, see `FrameTracker`.
+        size_spread: standard deviation of the log size estimated by frame, see `FrameTracker`.
     """
 
     kind: str
@@ -108,11 +108,11 @@ class Seen:
     size_spread: float
 
     def errors(self, joints: Array) -> Array:
-        """Errors (m,) over the length of the frames in view, as `in_view_ratio` counts them.
+        """Errors (m,) over the length of the frames in view, as in `in_view_ratio`.
 
         Args:
-            joints: (n, J, 3) joints of a track, mm, arena frame; NaN where there is no pose, which
-                counts as an error of half the length.
+            joints: (n, J, 3) joints of a track, mm, arena frame; NaN without a pose, which has an
+                error of half the length.
         """
         length = self.subject.length_mm
         return Followed(joints, self.truth, joints, 1.0).in_view(self.events, length) / length
@@ -128,19 +128,19 @@ def train_tracking(
     workers: int = 0,
     progress: Progress = silent,
 ) -> Path:
-    """Write `tunings.toml` with an animal's table fitted again; the same bytes on every run.
+    """Write `tunings.toml` with an animal's table fitted again; byte-identical on every run.
 
-    Association and motion are those of the file, or the best of `n_tries` changes of them; how far
-    off the track may be is always measured anew.
+    Association and motion are those of the file, or the best of `n_tries` changes of them; the
+    calibration of errors is always fitted again.
 
     Args:
         animal: a bundled animal's name, or the path of a skeleton's TOML.
-        out: path of the file that is written; it holds the other animals' tables as they are.
-        n_tries: steps of the random search; 0 leaves association and motion alone.
-        n_frames: frames of each sequence; None takes its usual length.
+        out: path of the file to write; the other animals' tables are copied unchanged.
+        n_tries: steps of the random search; 0 leaves association and motion unchanged.
+        n_frames: frames of each sequence; None means its usual length.
         seeds: of the sequences, instead of `SEEDS`.
-        workers: threads of the kernels; 0 takes all.
-        progress: told how far the job is.
+        workers: threads of the kernels; 0 means all.
+        progress: called with the progress of the job.
 
     Returns:
         `out`.
@@ -165,17 +165,17 @@ def train_tracking(
 def measure(
     animal: str, kind: str, seed: int, n_frames: int | None, progress: Progress = silent
 ) -> Seen:
-    """One rendered sequence, measured frame by frame; background and size are found by the product.
+    """Measure one rendered sequence frame by frame; background and size are estimated as in a run.
 
     Args:
         animal: a bundled animal's name, or the path of a skeleton's TOML.
         kind: `easy` or `hard`.
         seed: of the sequence.
-        n_frames: its length; None takes the usual one.
-        progress: told frame by frame.
+        n_frames: its length; None means the usual one.
+        progress: called frame by frame.
 
     Returns:
-        Observations and truth in the arena frame that the product found.
+        Observations and truth in the estimated arena frame.
     """
     recording = tracking_sequence(
         world_of(Skeleton.load(animal)), kind, seed=seed, n_frames=n_frames
@@ -191,11 +191,11 @@ def other_builds(
 
     Args:
         animal: a bundled animal's name, or the path of a skeleton's TOML.
-        progress: told frame by frame.
+        progress: called frame by frame.
         seeds: of the recordings.
 
     Returns:
-        One each; none of an animal whose simulator knows one build only, as the hand's.
+        One per seed; [] if the animal's simulator has one build only, like the hand's.
     """
     world = world_of(Skeleton.load(animal))
     if not isinstance(world, BodySimulator):
@@ -214,15 +214,15 @@ def observed(
     events: Sequence[Event] = (),
     progress: Progress = silent,
 ) -> Seen:
-    """A rendered recording, measured frame by frame; background and size are found by the product.
+    """Measure a rendered recording frame by frame; background and size are estimated as in a run.
 
     Args:
         estimator: the animal's.
         plan: thresholds of the foreground, and expected sizes.
-        kind: a word for what it is.
+        kind: label of the recording, see `Seen`.
         recording: with its truth.
-        events: what happens in it.
-        progress: told frame by frame.
+        events: events of the recording.
+        progress: called frame by frame.
 
     Raises:
         EstimationError: no floor or no animal is found.
@@ -256,17 +256,17 @@ def search(
     rng: np.random.Generator,
     progress: Progress = silent,
 ) -> TrackingParameters:
-    """The best tuning of a random search; a step changes up to three numbers of the best so far.
+    """The best tuning of a random search; a step changes up to three parameters of the best so far.
 
     Args:
         measured: the sequences.
         tuning: where the search starts.
         n_tries: number of steps.
-        rng: draws the changes.
-        progress: told the step and the cost.
+        rng: random number generator.
+        progress: called with the step and the cost.
 
     Returns:
-        The tuning with the least cost; `tuning` itself where nothing is better.
+        The tuning with the least cost; `tuning` itself if nothing is better.
     """
     alone = {kind: _of_kind(measured, kind, None) for kind in SEEDS}
     best = _cost(measured, alone, tuning)
@@ -283,13 +283,14 @@ def search(
 
 
 def changed(tuning: TrackingParameters, rng: np.random.Generator) -> TrackingParameters:
-    """The same tuning with one number multiplied by a log-normal factor, sd of the logarithm 0.5.
+    """The tuning with one parameter multiplied by a log-normal factor, sd of the logarithm 0.5.
 
-    Numbers that have a fit of their own (`_FOUND_OTHERWISE`, such as the calibration factors) stay.
+    Parameters that are fitted separately (`_FOUND_OTHERWISE`, such as the calibration factors)
+    stay.
 
     Args:
         tuning: what is changed; of association in 35 % of the cases, else of motion.
-        rng: draws the number and the factor.
+        rng: random number generator for the parameter and the factor.
     """
     factor = float(np.exp(rng.normal(0.0, _STEP)))
     part = "chain" if rng.random() < 0.35 else "motion"
@@ -302,7 +303,7 @@ def changed(tuning: TrackingParameters, rng: np.random.Generator) -> TrackingPar
 
 
 def _scaled(value: Any, factor: float, rng: np.random.Generator) -> Any:
-    """A number times the factor, or one of several numbers."""
+    """A number times the factor, or a tuple or dataclass with one of its numbers scaled."""
     if isinstance(value, tuple):
         at = int(rng.integers(len(value)))
         return tuple(
@@ -315,7 +316,7 @@ def _scaled(value: Any, factor: float, rng: np.random.Generator) -> Any:
 
 
 def _of_kind(measured: Sequence[Seen], kind: str, tuning: TrackingParameters | None) -> Array:
-    """Errors over all sequences of a kind: of single frames without a tuning."""
+    """Errors over all sequences of a kind, of single frames if `tuning` is None."""
     found = []
     for each in measured:
         if each.kind == kind:
@@ -332,8 +333,8 @@ def _track(each: Seen, tuning: TrackingParameters | None) -> Track:
 def _cost(measured: Sequence[Seen], alone: dict[str, Array], tuning: TrackingParameters) -> float:
     """Cost of a tuning: its errors over those of single frames, in four statistics.
 
-    The ratios of mean, median, 75 % and 95 % quantile are summed, those of easy sequences with a
-    weight of 2: a track must never be worse than single frames where these are good.
+    It is the sum of the ratios of mean, median, 75 % and 95 % quantile; easy sequences have a
+    weight of 2, since a track must not be worse than single frames where these are good.
     """
     total = 0.0
     for kind, weight in (("easy", _EASY_WEIGHT), ("hard", 1.0)):
@@ -346,12 +347,7 @@ def _cost(measured: Sequence[Seen], alone: dict[str, Array], tuning: TrackingPar
 
 
 def with_motion(tuning: TrackingParameters, **changes: Any) -> TrackingParameters:
-    """The same tuning with some numbers of its motion replaced.
-
-    Args:
-        tuning: what is changed.
-        **changes: fields of `Motion` by their names.
-    """
+    """The tuning with some fields of its `Motion` replaced."""
     return replace(tuning, motion=replace(tuning.motion, **changes))
 
 
@@ -365,7 +361,7 @@ class _Claim:
         said: (n,) stated mean joint error.
         sd: (n, J) stated standard deviation of each joint.
         away: (n, J) standard deviation that a stretch of 1 gives each joint, see `stretch_of`.
-        deviation: (n, J, 3) how far off the joints are.
+        deviation: (n, J, 3) absolute errors of the joints.
     """
 
     blur: float
@@ -394,11 +390,11 @@ class _Claim:
 
 
 def calibrate_joints(measured: Sequence[Seen], tuning: TrackingParameters) -> TrackingParameters:
-    """The same tuning with factors and stretch by which the joints' 90 % intervals hold 90 %.
+    """The tuning with factors and stretch for which the joints' 90 % intervals cover 90 %.
 
     Over a grid of both stretch coefficients (`_PER_BLUR` x `_PER_SPREAD`) the factors are fitted to
-    all sequences together; the pair is taken by which each sequence alone comes nearest, in the
-    mean squared logarithm of the factor that it still lacks.
+    all sequences together; the chosen pair minimises, over the sequences, the mean squared
+    logarithm of the factor that each would still need.
 
     Args:
         measured: the sequences.
@@ -450,13 +446,14 @@ def _claim(each: Seen, plain: TrackingParameters) -> _Claim:
 
 
 def calibrate_builds(builds: Sequence[Seen], tuning: TrackingParameters) -> TrackingParameters:
-    """The same tuning with what nobody sees of a build: how high and how far along its joints lie.
+    """The tuning with the unobservable part of a build: height of its joints, and position along
+    it.
 
-    A joint that is off by e, upwards or along the body, more than 1.645 sd needs a further spread
-    of sqrt((e / 1.645)^2 - sd^2); the 90 % quantile of what all need is that of the animal.
+    A joint whose error e, upwards or along the body, is more than 1.645 sd needs an additional
+    spread of sqrt((e / 1.645)^2 - sd^2); the animal's spread is the 90 % quantile over all joints.
 
     Args:
-        builds: recordings of builds that no forest was trained on; none leaves 0.
+        builds: recordings of builds that no forest was trained on; without any, the spread is 0.
         tuning: what is changed: `unseen_height` and `unseen_shift` of its motion.
     """
     plain = with_motion(tuning, unseen_height=0.0, unseen_shift=0.0)
@@ -485,13 +482,13 @@ def calibrate_builds(builds: Sequence[Seen], tuning: TrackingParameters) -> Trac
 def calibrate_each_joint(
     measured: Sequence[Seen], tuning: TrackingParameters
 ) -> TrackingParameters:
-    """The same tuning with factors by which no joint's 90 % intervals hold far more or far less.
+    """The tuning with factors that correct joints whose 90 % intervals cover far more or far less.
 
-    The factors of `calibrate_joints` are of all joints together: of some the intervals are too wide
-    then, and of others too narrow. A joint's own factor is as near to 1 as it may be so that its
-    intervals hold 85 to 96 % of the coordinates in each kind of sequences; where no factor does
-    that, the geometric mean of the bounds. Where an animal's intervals are mostly what nobody sees
-    of a build (`unseen_height`, `unseen_shift`), they stay as they are.
+    The factors of `calibrate_joints` are common to all joints, so some intervals are too wide and
+    others too narrow. A joint's own factor is as close to 1 as possible while its intervals cover
+    85 to 96 % of the coordinates in each kind of sequences; if no factor does, it is the geometric
+    mean of the bounds. If the unobservable part of a build dominates an animal's intervals
+    (`unseen_height`, `unseen_shift`), they stay as they are.
 
     Args:
         measured: the sequences, and recordings of other builds.
@@ -520,8 +517,8 @@ def calibration_knots(claims: Sequence[_Claim], stretch: tuple[float, float]) ->
     """Calibration factors at three levels of the stated error, by bisection; see
     `Motion.calibration`.
 
-    The frames are cut into `_BINS` groups of equal size by their stated error. In each the factor f
-    is sought at which nine errors in ten lie within 1.645 sqrt((f sd)^2 + stretch^2).
+    The frames are split into `_BINS` groups of equal size by their stated error. For each, f is the
+    factor at which nine errors in ten lie within 1.645 sqrt((f sd)^2 + stretch^2).
 
     Args:
         claims: stated and true errors of all sequences.
@@ -553,7 +550,7 @@ def calibration_knots(claims: Sequence[_Claim], stretch: tuple[float, float]) ->
 
 
 def calibrate_roots(measured: Sequence[Seen], tuning: TrackingParameters) -> TrackingParameters:
-    """The same tuning with factors by which 90 % intervals of root and bends hold 90 %.
+    """The tuning with factors for which the 90 % intervals of root and bends cover 90 %.
 
     The root's error is the twist log(g_est^-1 g_true), rotation and then translation in its own
     frame.
@@ -596,5 +593,5 @@ def calibrate_roots(measured: Sequence[Seen], tuning: TrackingParameters) -> Tra
 
 
 def _nine_in_ten(z: Array) -> float:
-    """By how much standard deviations are too small, from errors (...) over them."""
+    """The factor that standard deviations lack, from errors (...) over them."""
     return float(np.quantile(np.abs(z), 0.9)) / _Z90

@@ -1,16 +1,15 @@
 """Training of a pose model: Algorithm 2 of Lie-X (section 4.1) on rendered depth, `liex train`.
 
-Per skeleton joint and round a regression forest learns the twist that is still missing,
-`d_theta = log(g_est^-1 g_true)` (Eq 11), from the state that its predecessors leave behind; a
-further forest, boosted in the default variant, learns the mean joint error of a pose without the
-truth (the learned metric Rm). Images that no tree has seen teach, in this order, the correction of
-the chosen pose of an animal that is one chain (a boosted forest, a ridge regression, or neither),
-the calibration of the predicted error with its 90 % interval, and the head-tail classifier.
+Per skeleton joint and round a regression forest learns the twist that is still missing, `d_theta =
+log(g_est^-1 g_true)` (Eq 11), from the state after its predecessors; a further forest, boosted in
+the default variant, learns the mean joint error of a pose without the truth (the learned metric
+Rm). Held-out images are then used to learn, in this order, the correction of the chosen pose of an
+animal that is one chain (a boosted forest, a ridge regression, or neither), the calibration of the
+predicted error with its 90 % interval, and the head-tail classifier.
 
-Images are rendered from a seed, cut out by the product's own foreground segmentation, and made in
-numbered blocks. The forests grow from seeds and BLAS runs on one thread, so the same command
-writes the same bytes whenever it is run. `Recipe` says how much of what a model sees; `RECIPES` and
-`_OWN` hold one for each animal and variant.
+Images are rendered from a seed in numbered blocks and segmented as in a run. The forests grow from
+seeds and BLAS runs on one thread, so training is deterministic. `Recipe` states the numbers of
+images; `RECIPES` and `_OWN` have one for each animal and variant.
 """
 
 from __future__ import annotations
@@ -46,19 +45,19 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Recipe:
-    """How many rendered images a model is trained on, and of which animals.
+    """Number of rendered images that a model is trained on, and sizes of their animals.
 
     Features do not depend on the animal's size, but pixels and noise do, so the images cover
-    several sizes, one after the other by block.
+    several sizes, alternating by block.
 
     Attributes:
         seed: seed of the images and of the forests.
         n_images: images for the cascade and the learned metric.
         n_correction: further images for the correction of the chosen pose; 0 leaves it out.
         n_calibration: further images for the predicted error; 0 leaves the calibration out.
-        degraded_share: share of the images that have up to 2.5 times the noise (METHOD lesson 5).
-        sizes: (mean spine length mm, patch width px that holds the animal), for one block of images
-            after the other; a length of 0 is the skeleton's own.
+        degraded_share: share of the images that have up to 2.5 times the noise.
+        sizes: (mean spine length mm, width px of the patch around the animal), for one block of
+            images after the other; a length of 0 is the skeleton's own.
     """
 
     seed: int = 20
@@ -76,30 +75,29 @@ class Recipe:
     )
 
 
-# the pictures of the last training by what they depend on, see `shared_pictures`; None keeps none
+# images of the last training by their inputs, see `shared_pictures`; None keeps none
 _shared: ContextVar[list[tuple[Any, TrainingSet]] | None] = ContextVar("_shared", default=None)
-# numbers of their own random numbers, so that each can be made again by itself
+# separate random streams, so that each step can be repeated by itself
 _CALIBRATION = 1
 _CORRECTION = 2
 _DRAW = 3
-# of the images that an animal's predicted error is calibrated on show bodies that vary as
-# individuals do; intervals for bodies that vary far more, as the others do, are wider than most
+# share of the images for calibrating an animal's predicted error that show bodies that vary as
+# individuals do; with the others alone, which vary far more, intervals would be wider than most
 # animals need
 _ORDINARY_SHARE = {"mouse": 0.5}
-_AREAS_MM2 = {
-    "mouse": 1070.0
-}  # of home-sized animals seen from above, where it is not that of the home pose
+# of home-sized animals from above, if it differs from the home pose's
+_AREAS_MM2 = {"mouse": 1070.0}
 
-# the paper's variant and the baselines learn from the same pictures, noise and sizes: of animals
-# near home size, with as much noise as the default's
+# the paper's variant and the baselines learn from the same images, noise and sizes: of animals near
+# home size, with as much noise as the default's
 RECIPES = {
     "default": Recipe(),
     "paper": Recipe(n_images=40_960, n_correction=0, n_calibration=4_096, sizes=((0.0, 144),)),
 }
 _AMOUNTS = ("n_images", "n_correction", "n_calibration", "degraded_share")
-_OWN_SIZES = (1.0, 0.8, 1.0, 1.25)  # of an animal of the user's own, over its home length
+_OWN_SIZES = (1.0, 0.8, 1.0, 1.25)  # sizes of a user's own animal, over its home length
 _FISH_SIZES = ((0.0, 272), (21.0, 192), (0.0, 272), (36.0, 328))
-# of an animal and a variant, where it is not the mouse's
+# recipes by animal and variant that differ from the mouse's
 _OWN: dict[tuple[str, str], Recipe] = {
     ("fish", "default"): Recipe(
         seed=31, n_images=16_384, n_correction=4_096, n_calibration=4_096, sizes=_FISH_SIZES
@@ -117,18 +115,14 @@ _OWN: dict[tuple[str, str], Recipe] = {
 
 
 def recipe_of(variant: str, skeleton: Skeleton) -> Recipe:
-    """The recipe of a variant for an animal: its own where it has one, else that of the variant.
+    """The recipe of a variant for an animal: its own if it has one, else that of the variant.
 
-    An animal of the user's own (a skeleton from TOML) gets as many images as the fish, of sizes
-    around its home length: 1, 0.8, 1 and 1.25 times it, and of the paper's variant the first of
-    these alone.
+    A user's own animal (a skeleton from TOML) gets as many images as the fish, of sizes around its
+    home length: 1, 0.8, 1 and 1.25 times it; for the paper's variant only the first.
 
     Args:
         variant: `default` or `paper`, a key of `RECIPES`.
         skeleton: the animal's skeleton.
-
-    Returns:
-        The recipe.
     """
     from liex_lab.simulation.simulator import GenericSimulator, world_of
 
@@ -153,21 +147,20 @@ def train_model(
     draw: int = 0,
     progress: Progress = silent,
 ) -> Path:
-    """Train an animal's pose model and write it with its card beside it (`.json`).
+    """Train an animal's pose model and write it with its card next to it (`.json`).
 
-    The model is written under another name and renamed when it is whole. The card holds how it was
-    made, its SHA-256 and its number of bytes.
+    The model is written under another name and renamed once it is complete. The card states its
+    provenance, its SHA-256 and its number of bytes.
 
     Args:
         animal: a bundled animal's name, or the path of a skeleton's TOML.
         variant: `default` or `paper`.
-        out: path of the model file (.npz); missing folders are made.
-        workers: threads of the kernels, at most those of the machine; 0 takes all of them.
-        n_images: images to train on instead of what the recipe says, and a quarter of that each for
+        out: path of the model file (.npz); missing folders are created.
+        workers: threads of the kernels, at most those of the machine; 0 means all of them.
+        n_images: number of training images instead of the recipe's, and a quarter of that each for
             the correction and for the calibration.
-        draw: number of the draw of everything random in training but the pictures, see
-            `make_model`.
-        progress: told how far the job is.
+        draw: number of the random draw in training, see `make_model`.
+        progress: called with the progress of the job.
 
     Returns:
         The path of the model.
@@ -203,21 +196,20 @@ def train_model(
 def make_model(
     skeleton: Skeleton, method: Method, recipe: Recipe, progress: Progress, draw: int = 0
 ) -> Model:
-    """A trained model: cascade, learned metric, and what held-out images teach of its choices.
+    """Train a model: cascade, learned metric, and the parts learned from held-out images.
 
-    The cascade and the metric are Algorithm 2 of Lie-X. Images that no tree has seen then teach the
+    The cascade and the metric are Algorithm 2 of Lie-X. Held-out images are then used for the
     correction of the chosen pose, the calibration of the predicted error and the head-tail
-    classifier, where method and recipe have them. Images are numbered in blocks, and amounts that
-    are whole blocks share no image.
+    classifier, if method and recipe have them. Images are numbered in blocks, and amounts that are
+    whole blocks share no image.
 
     Args:
         skeleton: the animal's skeleton.
-        method: the variant's numbers: rounds, candidates, growth of the forests.
-        recipe: how many images of what.
-        progress: told how far the job is.
-        draw: number of the draw of all that is random in growing the forests: initial poses, bags
-            and tests; the pictures are the same. Models of several draws tell how much of an
-            error is luck.
+        method: the variant's parameters: rounds, candidates, growth of the forests.
+        recipe: numbers and sizes of images.
+        progress: called with the progress of the job.
+        draw: number of the random draw for growing the forests: initial poses, bags and tests; the
+            images are the same. Models of several draws show how much of an error is chance.
 
     Returns:
         The model with its card, in memory.
@@ -287,16 +279,16 @@ def rendered_set(
 ) -> TrainingSet:
     """Training images from number `first` on, segmented, with the truth in their view frames.
 
-    Images come in whole blocks, so there are at least n of them before those are left out in which
-    animal and distractor have run together; of each picture up to two objects are cut.
+    Images come in whole blocks, so there are at least n of them before removing those in which
+    animal and distractor have merged; up to two objects are cut from each image.
 
     Args:
         skeleton: the animal's skeleton.
         method: the variant: camera or height view, session size or none.
         recipe: seed, sizes and share of degraded images.
         first: number of the first image; it is rounded up to whole blocks.
-        n: how many images are rendered; it is rounded up to whole blocks.
-        progress: told block by block.
+        n: number of rendered images; it is rounded up to whole blocks.
+        progress: called block by block.
         family: family of body shapes, `augmented` (more varied than individuals are) or `train`.
 
     Returns:
@@ -305,7 +297,7 @@ def rendered_set(
     shared = _shared.get()
     if shared is None or first:
         return _rendered(skeleton, method, recipe, first, n, progress, family)
-    # what pictures and labels depend on
+    # the inputs of images and labels
     key = (skeleton.table, method.camera_view, method.session_size, vars(recipe), n, family)
     for known, data in shared:
         if known == key:
@@ -317,9 +309,9 @@ def rendered_set(
 
 @contextmanager
 def shared_pictures() -> Iterator[None]:
-    """Within the block the pictures of a training are kept for the next one that learns from them.
+    """A context that keeps a training's images for the next training with the same ones.
 
-    Those of the last training that learned from others only, for they take a gigabyte.
+    Only those of the last different training are kept, as they take a gigabyte.
     """
     before = _shared.set([])
     try:
@@ -363,16 +355,16 @@ def _rendered(
 
 
 def calibration_set(skeleton: Skeleton, method: Method, recipe: Recipe, first: int) -> TrainingSet:
-    """Held-out images as a model's predicted error is calibrated on them.
+    """Held-out images for calibrating a model's predicted error.
 
     A share of them (`_ORDINARY_SHARE`, half for the mouse) shows bodies that vary as individuals
-    do, the rest bodies as varied as those the model was trained on: intervals from the latter alone
-    would be wider than most animals need.
+    do, the rest bodies as varied as in training: intervals from the latter alone would be wider
+    than most animals need.
 
     Args:
         skeleton: the animal's skeleton.
         method: the variant.
-        recipe: seed, sizes, and `n_calibration`, the number of images in all.
+        recipe: seed, sizes, and `n_calibration`, the total number of images.
         first: number of the first image.
 
     Returns:
@@ -391,19 +383,19 @@ def calibration_set(skeleton: Skeleton, method: Method, recipe: Recipe, first: i
 
 
 def cut_out(skeleton: Skeleton, method: Method, windows: TrainingPatches) -> TrainingSet:
-    """Training images of the two largest finds of the product's segmentation in each patch.
+    """Training images of the two largest components of the segmentation in each patch.
 
     A hand is segmented by distance (`HandPatches`), every other animal by background subtraction
-    (`Patches`) with the patch's own estimated floor and, where the sensor's noise is known, a
+    (`Patches`) with the patch's own estimated floor and, if the sensor's noise is known, a
     threshold of `SPREADS` standard deviations of the background's readings.
 
     Args:
-        skeleton: the animal's skeleton; its view says which segmentation is used.
+        skeleton: the animal's skeleton; its view selects the segmentation.
         method: the variant; whether crops follow the camera's axis, and whether the size is known.
         windows: rendered patches with their background and truth.
 
     Returns:
-        The images of the first finds of all patches, then those of the second ones.
+        The images of the first components of all patches, then those of the second ones.
     """
     from liex_lab.body.skeleton import FOREGROUNDS
     from liex_lab.estimation.training import TrainingSet
@@ -424,7 +416,7 @@ def cut_out(skeleton: Skeleton, method: Method, windows: TrainingPatches) -> Tra
         )
         cut = Patches(depth, background, windows.intrinsics, origin, windows.floor, skeleton.view)
         area = home_area_mm2(skeleton) * size**2  # only ranks the blobs of a window
-        # a scene learned from a recording knows how much its readings spread
+        # a scene learned from a recording has an estimate of its readings' spread
         least = np.maximum(skeleton.view.min_height_mm, SPREADS * windows.spread_mm)
         crops, crop_cameras = cut.extract(shown, area, least, method.camera_view, n_candidates=2)
     n = len(size)
@@ -446,19 +438,19 @@ def with_truth(
     """Training images of segmented blobs, labelled as animal or other object by the true pose.
 
     A blob within 0.4 spine lengths of the true middle (in the image plane and, in the camera's
-    view, in depth) is the animal, one beyond 0.8 of it is another object, which teaches the learned
-    metric alone. In between the two have run together; such images are left out, as they teach
-    nothing.
+    view, in depth) is the animal, one beyond 0.8 is another object, which is used by the learned
+    metric only. In between the two have merged; such images are left out, as they are not
+    informative.
 
     Args:
         skeleton: the animal's skeleton.
         method: the variant; whether crops follow the camera's axis.
         windows: the patches (n) that the blobs were cut from, with root poses, angles and scales.
-        crops: the blobs' height maps (n), one a patch.
-        crop_cameras: (n, 17) crop cameras, which give the view frame of each.
+        crops: the blobs' height maps (n), one per patch.
+        crop_cameras: (n, 17) crop cameras, which define the view frames.
 
     Returns:
-        The images that are left, poses in their view frames, mm.
+        The remaining images, poses in their view frames, mm.
     """
     from liex_lab.body.pose import Pose
     from liex_lab.estimation.cascade import ImageSet, Truth
@@ -478,15 +470,14 @@ def with_truth(
     middle = joints.mean(axis=1)
     blob = crops.blobs
     distance = np.linalg.norm(np.stack([blob.x, blob.y], axis=1) - middle[:, :2], axis=1)
-    if method.camera_view:  # what is beside it in depth is another thing as well
+    if method.camera_view:  # an object at another depth is another object as well
         distance = np.maximum(
             distance, np.abs(blob.volume_mm3 / np.maximum(blob.area_mm2, 1e-9) - middle[:, 2])
         )
     animal = distance < 0.4 * windows.spine_mm
     other = distance > 0.8 * windows.spine_mm
-    good = crops.found & (
-        animal | other
-    )  # in between the two have run together, which teaches nothing
+    # in between the two have merged, which is not informative
+    good = crops.found & (animal | other)
     return TrainingSet(
         ImageSet(crops.heights[good], crop_cameras[good], crops.moments[good]),
         Truth(frames.rotation[good], joints[good], pose.scale[good]),
@@ -496,13 +487,9 @@ def with_truth(
 
 
 def home_area_mm2(skeleton: Skeleton) -> float:
-    """About the area, mm^2, of a home-sized animal seen from above; it only ranks blobs by size.
+    """Approximate area, mm^2, of a home-sized animal from above; it only ranks blobs by size.
 
-    Args:
-        skeleton: the animal's skeleton.
-
-    Returns:
-        A stated value for the mouse, else the area of the skeleton's surface in the home pose.
+    A fixed value for the mouse, else the area of the skeleton's surface in the home pose.
     """
     from liex_lab.body.surface import Surface
 
@@ -512,13 +499,13 @@ def home_area_mm2(skeleton: Skeleton) -> float:
 def cached_model(animal: str, variant: str, progress: Progress = silent, draw: int = 0) -> Path:
     """The path of a model that is not bundled: trained once, kept in the user's cache folder.
 
-    Its name holds a hash of the program's version, method, recipe and skeleton; where one of these
+    Its name contains a hash of the program's version, method, recipe and skeleton; if one of these
     changes, a new model is trained.
 
     Args:
         animal: a bundled animal's name, or the path of a skeleton's TOML.
         variant: `default` or `paper`.
-        progress: told how far the training is, where there is one.
+        progress: called with the progress of a training.
         draw: number of the draw, see `make_model`.
 
     Returns:
@@ -531,7 +518,7 @@ def cached_model(animal: str, variant: str, progress: Progress = silent, draw: i
 
 
 def cache_path(animal: str, variant: str, draw: int = 0) -> Path:
-    """Where the cache keeps a model that is not bundled, whether or not it is there yet.
+    """The path in the cache of a model that is not bundled, trained or not.
 
     Args:
         animal: a bundled animal's name, or the path of a skeleton's TOML.
@@ -558,7 +545,7 @@ def cache_path(animal: str, variant: str, draw: int = 0) -> Path:
 
 
 def cache_folder() -> Path:
-    """The user's folder for what can be made again: `LIEX_CACHE`, or the system's cache folder."""
+    """The user's folder for reproducible files: `LIEX_CACHE`, or the system's cache folder."""
     if stated := os.environ.get("LIEX_CACHE"):
         return Path(stated)
     if sys.platform == "win32":
@@ -581,9 +568,9 @@ def estimator_of(
         animal: a bundled animal's name, or the path of a skeleton's TOML.
         variant: `default` is the bundled model if there is one; every other is trained now, or
             comes from the cache.
-        progress: told how far the training is.
-        model: name or path of a model file, which comes before the variant.
-        draw: number of the draw of a model that is trained, see `make_model`.
+        progress: called with the progress of a training.
+        model: name or path of a model file, which overrides the variant.
+        draw: number of the draw of a trained model, see `make_model`.
 
     Raises:
         ModelError: there is no such model, or its file is damaged.

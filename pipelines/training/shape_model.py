@@ -1,11 +1,11 @@
 """Fit of an animal's shape prior on rendered mini-sessions, `liex train shape`.
 
-A mini-session is some frames of one animal before one camera; of a wide family of builds many are
-rendered, measured by the animal's pose model as a session is (its size is found, too), and each
-gives the clues of its mean cross-sections, the poses' mean error, and the animal's build. What the
-fitted regression leaves on builds of a family that neither it nor the forests have seen says how
-far off the joints may still be. Everything is drawn from seeds, so the same command writes the same
-bytes whenever it is run.
+A mini-session consists of some frames of one animal and one camera. Many are rendered from a wide
+family of builds and measured by the animal's pose model as a session is, including its size; each
+yields the features of its mean cross-sections, the poses' mean error, and the animal's build. The
+residual of the fitted regression on builds of another family, which neither it nor the forests were
+trained on, estimates the remaining error of the joints. Everything is drawn from seeds, so training
+is deterministic.
 """
 
 from __future__ import annotations
@@ -38,17 +38,17 @@ Array = NDArray[np.float64]
 
 N_SESSIONS = 512
 PER_SESSION = 16
-SEEDS = {"wide": 41, "other": 42}  # of a family's pictures
-_SIZE_SD = 0.06  # how far off (log) the size is where its search begins
+SEEDS = {"wide": 41, "other": 42}  # of a family's images
+_SIZE_SD = 0.06  # sd of the initial error (log) of the size
 _SIZE_PASSES = 2
-_PER_PASS = 2.0  # a pass of the search goes a third of the way; so much farther goes this one
-_LEAST_GOOD = 8  # of a mini-session's frames
-_FAR = 0.12  # of the length: a pose that is farther off is lost, and no error of the build's
+_PER_PASS = 2.0  # a pass of the search covers a third of the way; this exponent extends it
+_LEAST_GOOD = 8  # frames per mini-session
+_FAR = 0.12  # of the length: a pose with a larger error is lost, and not an error of the build
 
 
 @dataclass(frozen=True)
 class MiniSession:
-    """What a rendered mini-session tells, and its truth.
+    """Features of a rendered mini-session, and its truth.
 
     Attributes:
         clues: (F,) see `session_clues`.
@@ -68,20 +68,20 @@ def train_shape(
     workers: int = 0,
     progress: Progress = silent,
 ) -> Path:
-    """Write an animal's shape prior; the same bytes on every run.
+    """Write an animal's shape prior; byte-identical on every run.
 
     Args:
         animal: a bundled animal's name, or the path of a skeleton's TOML.
         out: path of the file that is written.
-        n_sessions: mini-sessions of the wide family; None takes the usual number.
-        workers: threads of the kernels; 0 takes all.
-        progress: told block by block.
+        n_sessions: mini-sessions of the wide family; None means the usual number.
+        workers: threads of the kernels; 0 means all.
+        progress: called block by block.
 
     Returns:
         `out`.
 
     Raises:
-        LiexError: the animal is no chain with a tube as its body.
+        LiexError: the animal is not a chain with a tube as its body.
     """
     import numba
 
@@ -104,11 +104,11 @@ def train_shape(
 
 
 def left_over(prior: ShapePrior, others: Sequence[MiniSession]) -> tuple[float, float]:
-    """What a prior leaves of the joints' height and place along the body on other builds.
+    """Residuals of a prior on other builds: the joints' height and position along the body.
 
     Args:
         prior: fitted to other families.
-        others: mini-sessions of builds that it has not seen, at least one.
+        others: mini-sessions of builds that it was not fitted to, at least one.
 
     Returns:
         Standard deviations over the length, of all joints together.
@@ -127,16 +127,16 @@ def left_over(prior: ShapePrior, others: Sequence[MiniSession]) -> tuple[float, 
 def mini_sessions(
     estimator: PoseEstimator, family: str, n: int, progress: Progress = silent
 ) -> Iterator[MiniSession]:
-    """Rendered mini-sessions of a family of builds, measured; those that are lost are left out.
+    """Measured rendered mini-sessions of a family of builds, without lost ones.
 
     Args:
         estimator: the animal's.
         family: of body shapes.
-        n: how many are rendered; it is rounded up to whole blocks.
-        progress: told block by block.
+        n: number of rendered mini-sessions; it is rounded up to whole blocks.
+        progress: called block by block.
 
     Raises:
-        LiexError: the animal is no chain with a tube as its body.
+        LiexError: the animal is not a chain with a tube as its body.
     """
     from liex_lab.body.shape import BodyShape
     from liex_lab.simulation.simulator import BodySimulator, world_of
@@ -190,7 +190,7 @@ def _measured(
 
 
 def _cut(estimator: PoseEstimator, windows: TrainingPatches) -> tuple[HeightMaps, Array]:
-    """Height maps of the animals in patches, cut out by the product's own segmentation."""
+    """Height maps of the animals in patches, segmented as in a run."""
     from liex_lab.scene.background_segmenter import SPREADS
     from liex_lab.scene.height_maps import Patches
 
@@ -223,7 +223,7 @@ def _mini_session(
     true_size: float,
     begin: float,
 ) -> MiniSession | None:
-    """One mini-session, its size found from `begin` on; None where too few frames are measured.
+    """One mini-session, its size estimated from `begin` on; None if too few frames are measured.
 
     truth (n, J, 3) mm are its true joints in the view frames.
     """
@@ -243,7 +243,7 @@ def _mini_session(
     pose = estimates.chosen.pose.moved(view_of(crop_cameras))
     off = truth - pose.joints(skeleton)
     length = skeleton.length * size
-    good = np.linalg.norm(off, axis=-1).mean(axis=1) < _FAR * length  # not where it is not finite
+    good = np.linalg.norm(off, axis=-1).mean(axis=1) < _FAR * length  # False if not finite
     if good.sum() < _LEAST_GOOD:
         return None
     use = estimates.found
@@ -253,7 +253,7 @@ def _mini_session(
 
 
 def _labels(skeleton: Skeleton, offset: Array, body: BodyShape, grown: float) -> Array:
-    """Labels of a mini-session, whose animal is larger than it was taken for by `grown`."""
+    """Labels of a mini-session; `grown` is the animal's true over its estimated size."""
     from liex_lab.body.shape import BodyShape
     from liex_lab.estimation.session_shape import PLACES, labels_of
 
