@@ -1,4 +1,4 @@
-"""The verbs of `liex correct`: what people correct in a session, and what they take back."""
+"""The commands of `liex correct`: add corrections to a session, and undo them."""
 
 from __future__ import annotations
 

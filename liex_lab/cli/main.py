@@ -1,6 +1,4 @@
-"""`liex`: a table of verbs. Each brings its job along when it is asked for, so that `liex --help`
-stays quick.
-"""
+"""`liex`: the table of commands. Jobs are imported on demand, so that `liex --help` is fast."""
 
 from __future__ import annotations
 
@@ -51,7 +49,7 @@ from liex_lab.runtime.progress import progress_bar
 if TYPE_CHECKING:
     from liex_lab.pipelines.arenas import ArenaOutcome
 
-# the exit code of our own faults (EX_SOFTWARE); what the user can put right is 1, a wrong call 2
+# exit code of internal errors (EX_SOFTWARE); errors that the user can correct are 1, usage errors 2
 FAULT = 70
 _USERS_TO_MEND = {
     errno.EACCES,
@@ -60,7 +58,7 @@ _USERS_TO_MEND = {
     errno.ENAMETOOLONG,
     errno.ENOTDIR,
 }
-# what Rerun's writer says of a full disk is said by our own sentence
+# hide Rerun's messages about a full disk, as ours replaces them
 _RUST_LOG = "warn,re_log_encoding=off,re_sdk=off"
 
 app = group_of_verbs(
@@ -105,7 +103,7 @@ def demo(out: OutFolder = Path()) -> None:
         session = run_demo(out, progress=progress)
         try:
             video = f"video:   {export_video(session, progress=progress)}"
-        except LiexError as error:  # the session is whole without it
+        except LiexError as error:  # the session is complete without it
             video = f"note: there is no video, for {error}"
     _tell_session(session, video)
 
@@ -156,7 +154,7 @@ def run(
     asked = [] if topic is None else [f"recording.topic={topic}"]
     asked += ["replay.depth=none"] * no_depth + ["replay.candidates=true"] * candidates
     asked += [*["estimation.accept_misfit=true"] * accept, *(settings or [])]
-    # first: a wrong plan or setting is told at once
+    # first: report a wrong plan or setting at once
     chosen = Plan.load(plan or "mouse").with_settings(asked)
     from liex_lab.api import run_arenas, run_session
 
@@ -358,11 +356,13 @@ def info(
 
 
 def main() -> None:
-    """The command line. What the user can put right is one sentence and exit code 1; a fault of
-    ours shows itself.
+    """Run the command line.
+
+    Errors that the user can correct are one sentence with exit code 1; internal errors show a
+    traceback.
     """
     os.environ.setdefault("RUST_LOG", _RUST_LOG)
-    atexit.register(gc.freeze)  # else all there is would be gone through twice more, for a second
+    atexit.register(gc.freeze)  # else two collections at exit take a second
     if told := liex_lab._KERNELS_TOLD:
         typer.echo(f"note: {printable(told)}", err=True)
     try:
@@ -399,7 +399,7 @@ def _fault(error: Exception) -> NoReturn:
 
 
 def _tell_arenas(outcomes: Sequence[ArenaOutcome]) -> None:
-    """What became of each arena; ends with the largest of their exit codes."""
+    """Print the result of each arena; exits with the largest of their exit codes."""
     code = 0
     for one in outcomes:
         say(f"arena {one.name}")
@@ -413,13 +413,13 @@ def _tell_arenas(outcomes: Sequence[ArenaOutcome]) -> None:
 
 
 def _tell_session(session: Path, further: str = "") -> None:
-    """Where the session is, and how it went; exit code 4 where someone has to look at it."""
+    """Print the session's path and result; exits with code 4 if the session needs review."""
     if code := _told_session(session, further):
         raise typer.Exit(code)
 
 
 def _told_session(session: Path, further: str = "") -> int:
-    """Say where the session is, and how it went; returns the exit code."""
+    """Print the session's path and result; returns the exit code."""
     from liex_lab.sessions.backups import taken_from
     from liex_lab.sessions.folder import folder_bytes, megabytes
     from liex_lab.sessions.verdict import read_verdict

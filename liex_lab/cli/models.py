@@ -166,7 +166,7 @@ def _train_pose(animal: str, variant: str, out: Path, workers: int, n_images: in
     say(f"model: {model}")
 
 
-# `liex evaluate`: every figure of the product, measured again.
+# `liex evaluate`: reproduces every published number.
 
 
 evaluate = group_of_verbs("Measure the method; --json FILE keeps the numbers.")
@@ -177,18 +177,18 @@ OwnModel = Annotated[
 
 
 def show_numbers(result: Result) -> None:
-    """Every number on the screen."""
+    """Print all numbers."""
     tell_numbers(result, None)
 
 
 def benchmark(
     name: str, show: Callable[[Result], None] = show_numbers
 ) -> Callable[[Callable[..., Result]], Callable[..., Result]]:
-    """Register a function as the verb `liex evaluate NAME`; its parameters are the options.
+    """Register a function as the command `liex evaluate NAME`; its parameters are the options.
 
     Args:
-        name: of the verb.
-        show: what of its numbers the screen shows.
+        name: of the command.
+        show: prints a selection of the numbers.
     """
 
     def register(measure: Callable[..., Result]) -> Callable[..., Result]:
@@ -213,7 +213,7 @@ def benchmark(
 
 
 def show_poses(result: Result) -> None:
-    """The numbers of a split; of other-build, a row for each kind of build."""
+    """Print the numbers of a split; for other-build, a row for each kind of build."""
     if "usual" not in result:
         tell_numbers(result, None)
         return
@@ -447,7 +447,7 @@ def evaluate_tracking(
 
 
 def show_scenes(result: Result) -> None:
-    """A row for each scene."""
+    """Print a row for each scene."""
     tell_rows(result["rows"])
 
 
@@ -549,7 +549,7 @@ def evaluate_report(
 
 
 def show_hands(result: Result) -> None:
-    """One line for each method."""
+    """Print one line for each method."""
     from liex_lab.pipelines.evaluation import nyu
 
     tell_numbers(nyu.in_short(result), None)
@@ -580,7 +580,7 @@ def evaluate_nyu(
 
 
 def show_motion(result: Result) -> None:
-    """One measure a row."""
+    """Print one measure per row."""
     from liex_lab.pipelines.evaluation import motion
 
     tell_rows(motion.in_short(result))

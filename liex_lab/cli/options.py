@@ -1,4 +1,4 @@
-"""Options that several verbs of `liex` share, and how they tell numbers."""
+"""Options shared by several commands of `liex`, and the output of numbers."""
 
 from __future__ import annotations
 
@@ -57,11 +57,11 @@ JsonFile = Annotated[
 
 
 def region_setting(region: str | None) -> list[str]:
-    """The setting of a plan that a region stands for; none where none is given.
+    """The plan setting of a region; empty if there is none.
 
     Args:
-        region: "x,y x,y x,y", the corners of a polygon, or "circle x,y radius"; a last word mm says
-            that they count millimetres on the floor, not pixels.
+        region: "x,y x,y x,y", the corners of a polygon, or "circle x,y radius"; a final word mm
+            means millimetres on the floor instead of pixels.
 
     Raises:
         PlanError: it is neither.
@@ -93,12 +93,12 @@ def region_setting(region: str | None) -> list[str]:
 
 
 def say(text: object) -> None:
-    """A line on the screen, whatever names of files it quotes."""
+    """Print a line, with unprintable characters escaped."""
     typer.echo(printable(text))
 
 
 def tell_numbers(result: dict[str, Any], json_file: Path | None) -> None:
-    """The numbers as a table on the screen, and as JSON where a file was named."""
+    """Print numbers as a table, and write them as JSON if a file is given."""
     if json_file is not None:
         keep_numbers(result, json_file)
     from rich.console import Console
@@ -114,7 +114,7 @@ def tell_numbers(result: dict[str, Any], json_file: Path | None) -> None:
 
 
 def tell_rows(rows: dict[str, dict[str, Any]]) -> None:
-    """Rows of figures by name as a Markdown table on the screen, one line a row."""
+    """Print rows of results by name as a Markdown table."""
     columns = [*dict.fromkeys(name for row in rows.values() for name in row)]
     lines = [["", *(name.replace("_", " ") for name in columns)], ["---"] * (len(columns) + 1)]
     lines += [[name, *(_cell(row.get(column)) for column in columns)] for name, row in rows.items()]
@@ -144,10 +144,10 @@ def to_json(result: Any) -> str:
 
 
 def tell_scores(report: dict[str, Any]) -> None:
-    """Scores of recognised actions (`actions.scores.timeline_scores`): a sentence and a table.
+    """Print scores of recognised actions (`actions.scores.timeline_scores`).
 
     Args:
-        report: the scores of leave-one-animal-out; empty where there are none.
+        report: the scores of leave-one-animal-out; empty if there are none.
     """
     if "macro_f1" not in report:
         for name, value in report.items():
@@ -168,17 +168,17 @@ def tell_scores(report: dict[str, Any]) -> None:
     Console().print(table)
 
 
-# `--help` of a group of verbs: plain text, in sections, in the order in which people need them.
+# `--help` of a group of commands: plain text, in sections, in the order of use.
 
 
-# the order in which `liex --help` shows them; a verb names its own with `rich_help_panel`
+# the order in `liex --help`; a command selects its section with `rich_help_panel`
 START = "Start here"
 SESSIONS = "One session"
 STUDIES = "Many sessions"
 RECORDINGS = "Recordings"
 MODELS = "Models and accuracy"
 _ORDER = (START, SESSIONS, STUDIES, RECORDINGS, MODELS)
-# within its section a verb stands where people need it; one that is not named here stands last
+# commands of a section in the order of use; those not listed here are last
 _OF_WORK = (
     *("demo", "doctor", "run", "show"),
     *("report", "figures", "correct", "describe", "suggest", "export", "verify"),
@@ -189,10 +189,10 @@ _OF_WORK = (
 
 
 class SectionedGroup(TyperGroup):
-    """Verbs under the headings that they name; verbs without one stand last."""
+    """Commands under their headings; commands without one are last."""
 
     def list_commands(self, ctx: Any) -> list[str]:
-        """The verbs' names in the order of work.
+        """The commands' names in the order of work.
 
         Args:
             ctx: click's context of the command line.
@@ -200,13 +200,13 @@ class SectionedGroup(TyperGroup):
         names = super().list_commands(ctx)
         return sorted(names, key=lambda name: _OF_WORK.index(name) if name in _OF_WORK else 99)
 
-    # the types are click's, or those of the copy of click that newer Typers carry
+    # the types are click's, or those of the copy of click in newer Typers
     def format_commands(self, ctx: Any, formatter: Any) -> None:
-        """Write each section's verbs with the first sentence of their help.
+        """Write each section's commands with the first sentence of their help.
 
         Args:
             ctx: click's context of the command line.
-            formatter: click's formatter, which takes the text.
+            formatter: click's formatter, which receives the text.
         """
         sections: dict[str, list[tuple[str, str]]] = {name: [] for name in _ORDER}
         names = self.list_commands(ctx)
@@ -229,8 +229,8 @@ def group_of_verbs(help: str, name: str | None = None) -> typer.Typer:
     """A `typer.Typer` whose help is plain text in sections.
 
     Args:
-        help: what the group is for, one sentence.
-        name: of the program; sub-groups are named where they are added.
+        help: purpose of the group, one sentence.
+        name: of the program; sub-groups are named when they are added.
     """
     return typer.Typer(
         name=name,

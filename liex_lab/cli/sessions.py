@@ -74,7 +74,7 @@ def compare(
         numbers = f"{row['estimate']:.4g}"
         if not isnan(row["ci_low"]):
             numbers += f" [{row['ci_low']:.3g}, {row['ci_high']:.3g}]"
-        if not isnan(row["effect_size"]):  # of values that are all the same there is none
+        if not isnan(row["effect_size"]):  # identical values have none
             numbers += f", g {row['effect_size']:.2g}"
         if not isnan(row["estimate"]):
             say(f"{row['measure']}, {row['contrast']}: {numbers}; {counted_units(row)}")
@@ -82,7 +82,7 @@ def compare(
             say(f"    p {row['p']:.2g}, corrected {row['p_fdr']:.2g}: {row['test']}")
         else:
             refused.setdefault(row["refused"], []).append(row["measure"])
-    for why, names in refused.items():  # said once, not once for each measure
+    for why, names in refused.items():  # once, not for each measure
         say(f"not tested: {', '.join(dict.fromkeys(names))}\n    {why}")
     say(found["sessions"])
     say(f"tables: {found['folder']}   (sentences to paste: results.txt, methods.txt)")
@@ -212,7 +212,7 @@ def export(
         say(f"export: {job(Session.open(place), to, out, overwrite=overwrite)}")
 
 
-# The verb `liex show`: a session's replay in Rerun, with whole depth pictures where asked for.
+# The command `liex show`: a session's replay in Rerun, optionally with full depth images.
 
 
 _HERE = "127.0.0.1"
@@ -260,7 +260,7 @@ def show(
 
 
 def _whole_depth(session: Path, scratch: Path, recording: str | None) -> list[Path]:
-    """A replay of a session's whole depth pictures; none, said, where its recording is gone."""
+    """A replay of a session's full depth images; empty, with a note, if there is no recording."""
     from liex_lab.pipelines.show import whole_pictures
 
     try:
@@ -280,8 +280,7 @@ def _show(replay: Path, more: list[Path], at_s: float | None, web: bool) -> None
     if at_s is not None:
         show_replay(replay, at_s, more).wait()
         return
-    # RERUN_ANALYTICS: what a laboratory looks at is nobody else's business; the viewer in a browser
-    # does not heed it
+    # RERUN_ANALYTICS: no usage data leaves the laboratory; the viewer in a browser ignores it
     hosted: list[str] = []
     if web:
         say(
@@ -294,13 +293,13 @@ def _show(replay: Path, more: list[Path], at_s: float | None, web: bool) -> None
         hosted = ["--web-viewer", "--web-viewer-port", str(page), "--port", str(data)]
     shown = [str(file) for file in replays_with(replay, more)]
     command = own_python("-m", "rerun", *shown, "--bind", _HERE, *hosted)
-    quiet = {"RUST_LOG": "warn"} if web else {}  # its own lines would hide the address
+    quiet = {"RUST_LOG": "warn"} if web else {}  # its log would hide the address
     around = {**quiet, **os.environ, "RERUN_ANALYTICS": "0"}
     raise typer.Exit(subprocess.run(command, env=around, check=False).returncode)
 
 
 def _free_ports(n: int) -> list[int]:
-    """Ports of this machine that nobody listens at."""
+    """Unused ports of this machine."""
     with ExitStack() as held:
         sockets = [held.enter_context(socket.socket()) for _ in range(n)]
         for one in sockets:
@@ -308,7 +307,7 @@ def _free_ports(n: int) -> list[int]:
         return [int(one.getsockname()[1]) for one in sockets]
 
 
-# The verbs of `liex` that write recordings: for other programs, and as archives.
+# The commands of `liex` that write recordings: for other programs, and as archives.
 
 
 def convert(

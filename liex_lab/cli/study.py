@@ -1,4 +1,4 @@
-"""The verbs of `liex` for whole studies."""
+"""The commands of `liex` for studies."""
 
 from __future__ import annotations
 
@@ -117,9 +117,9 @@ def dashboard(
     with progress_bar() as progress, ExitStack() as stack:
 
         def told(address: str) -> None:
-            """Say the dashboard's `address`, and open it where that was asked for."""
+            """Print the dashboard's `address`, and open it if requested."""
             say(f"dashboard: {address}   (Ctrl+C ends it)")
-            if open_browser:  # by a file: other accounts see what a program is started with
+            if open_browser:  # by a file: other accounts can read a program's arguments
                 folder = stack.enter_context(TemporaryDirectory(prefix="liex-"))
                 webbrowser.open(page_that_opens(address, Path(folder)).as_uri())
 
@@ -127,10 +127,10 @@ def dashboard(
 
 
 def page_that_opens(address: str, folder: Path) -> Path:
-    """Write a page that leads on to an address; returns its path.
+    """Write a page that redirects to an address; returns its path.
 
     Args:
-        address: where to, with what nobody else may know.
+        address: the target, which includes a secret.
         folder: a folder that only this account can read.
     """
     page = folder / "dashboard.html"
@@ -161,8 +161,9 @@ def verify(
 
 
 def _tell_study(standings: list[SessionStatus], all_of_them: bool) -> int:
-    """Every session that is not simply done, and how many are in each state; returns how many
-    failed or lack their recording.
+    """Print sessions that are not done, and the number in each state.
+
+    Returns the number of sessions that failed or whose recording is missing.
     """
     from liex_lab.pipelines.study.status import to_check
 

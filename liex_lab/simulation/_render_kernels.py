@@ -1,9 +1,9 @@
 """Depth renderer: floor and wall by ray casting, meshes by z-buffer, then the sensor model.
 
-A ray (x, y, 1) of a pixel, turned into the arena frame, meets the floor at depth height / -d_z and
-a vertical wall at distance / (outward . d_xy); meshes keep the largest 1 / z under each pixel's
+The ray (x, y, 1) of a pixel, rotated into the arena frame, meets the floor at depth height / -d_z
+and a vertical wall at distance / (outward . d_xy); meshes keep the largest 1 / z at each pixel's
 centre. `draw_windows` makes training patches with their learned background, `frames_parallel` whole
-pictures.
+depth images.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from liex_lab.simulation._sensor_kernels import (
 
 
 class Wall(NamedTuple):
-    """A straight wall, in the order in which its numbers are packed.
+    """A straight wall; the fields are in the order of the packed array.
 
     Attributes:
         normal_x: x of its outward normal in the floor.
@@ -36,7 +36,7 @@ class Wall(NamedTuple):
         distance: from the arena's origin, mm; 0 is no wall.
         height: mm.
         rounding: depth of the rounding that multiple reflections leave at its foot, mm.
-        rounding_reach: how far that reaches, mm.
+        rounding_reach: its extent, mm.
     """
 
     normal_x: Any
@@ -51,7 +51,7 @@ WALL_COLUMNS = len(Wall._fields)
 
 
 class SensorNoise(NamedTuple):
-    """A sensor and its noise; of many pictures, parameters and seed have a leading axis (n,).
+    """A sensor and its noise; for many images, parameters and seed have a leading axis (n,).
 
     Attributes:
         parameters: (N_PARAMETERS,) of the sensor.
@@ -65,12 +65,12 @@ class SensorNoise(NamedTuple):
 
 
 class PatchCamera(NamedTuple):
-    """The camera of a picture or of a patch of it; of many, all with a leading axis (n,).
+    """The camera of an image or of a patch of it; for many, all with a leading axis (n,).
 
     Attributes:
         intrinsics: (4,) fx, fy, cx, cy, px.
-        picture: (2,) int64 width and height of the whole picture, px; outside it nothing is read.
-        origin: (2,) int64 pixel (u, v) of the whole picture that comes to lie at (0, 0).
+        picture: (2,) int64 width and height of the whole image, px; pixels outside are unread.
+        origin: (2,) int64 pixel (u, v) of the whole image at (0, 0) of the patch.
     """
 
     intrinsics: Any
@@ -79,14 +79,14 @@ class PatchCamera(NamedTuple):
 
 
 class Meshes(NamedTuple):
-    """An animal and perhaps an object; of many pictures, all but faces with a leading axis (n,).
+    """An animal and an optional object; for many images, all but faces with a leading axis (n,).
 
     Attributes:
         animal: (V, 3) mesh of the animal, mm, arena frame.
         faces: (F, 3) int32 its triangles.
-        thing: (W, 3) mesh of the object beside it, mm, arena frame.
+        thing: (W, 3) mesh of the object next to it, mm, arena frame.
         thing_faces: (G, 3) int32 its triangles.
-        has_thing: whether the object is there.
+        has_thing: whether the object exists.
     """
 
     animal: Any
@@ -97,7 +97,7 @@ class Meshes(NamedTuple):
 
 
 class ArenaView(NamedTuple):
-    """A camera above a floor with at most one wall; of many patches, all with a leading axis (n,).
+    """A camera above a floor with at most one wall; for many patches, all with a leading axis (n,).
 
     Attributes:
         R_arena_camera: (3, 3) rotation of the camera.
@@ -114,19 +114,19 @@ class ArenaView(NamedTuple):
 
 @njit(cache=True)
 def noise_of(noises, i):
-    """The `SensorNoise` of picture i."""
+    """The `SensorNoise` of image i."""
     return SensorNoise(noises.parameters[i], noises.seed[i], noises.table)
 
 
 @njit(cache=True)
 def camera_of(cameras, i):
-    """The `PatchCamera` of picture i."""
+    """The `PatchCamera` of image i."""
     return PatchCamera(cameras.intrinsics[i], cameras.picture[i], cameras.origin[i])
 
 
 @njit(cache=True)
 def _meshes_of(meshes, i):
-    """The `Meshes` of picture i."""
+    """The `Meshes` of image i."""
     return Meshes(
         meshes.animal[i],
         meshes.faces,
@@ -147,17 +147,17 @@ def floor_and_wall(u0, v0, picture, intrinsics, rotation, height, wall, uneven, 
     """Ideal depth and kind of a patch (H, W) on a floor with at most one straight wall.
 
     Args:
-        u0: column of the patch's first pixel in the whole picture.
+        u0: column of the patch's first pixel in the whole image.
         v0: its row.
-        picture: (2,) width and height of the whole picture, px; outside it nothing is read.
+        picture: (2,) width and height of the whole image, px; pixels outside are unread.
         intrinsics: (4,) fx, fy, cx, cy, px.
         rotation: (3, 3) of T_arena_camera.
         height: of the camera above the floor, mm.
         wall: the wall.
         uneven: (H, W) heights of the floor, over `rough`.
-        rough: mm that a unit of `uneven` raises the floor.
-        depth: (H, W) float32 mm, filled, 0 = nothing.
-        what: (H, W) uint8 kinds, filled with NOTHING or STILL.
+        rough: height of the floor per unit of `uneven`, mm.
+        depth: (H, W) float32 mm, output, 0 = nothing.
+        what: (H, W) uint8 kinds, output, NOTHING or STILL.
     """
     rows, columns = depth.shape
     for r in range(rows):
@@ -193,9 +193,9 @@ def floor_and_wall(u0, v0, picture, intrinsics, rotation, height, wall, uneven, 
 
 @njit(cache=True)
 def merge(inverse, label, top, left, depth, what):
-    """Put a drawn mesh (inverse depth, h, w) at row `top`, column `left` before what is farther.
+    """Merge a rendered mesh (inverse depth, h, w) at row `top`, column `left`, by z-buffer.
 
-    The pixels that it takes get the kind `label` in `what`.
+    The pixels that it covers get the kind `label` in `what`.
     """
     for r in range(inverse.shape[0]):
         for c in range(inverse.shape[1]):
@@ -208,7 +208,7 @@ def merge(inverse, label, top, left, depth, what):
 
 @njit(cache=True)
 def draw_onto(vertices, faces, rotation, translation, intrinsics, u0, v0, label, depth, what):
-    """Rasterise a mesh over a picture or patch, touching only the mesh's own bounding box.
+    """Rasterise a mesh into an image or patch, within the mesh's bounding box only.
 
     Args:
         vertices: (V, 3) mm.
@@ -216,9 +216,9 @@ def draw_onto(vertices, faces, rotation, translation, intrinsics, u0, v0, label,
         rotation: (3, 3) from the vertices' frame into the camera frame.
         translation: (3,) likewise, mm.
         intrinsics: (4,) fx, fy, cx, cy, px.
-        u0: column of the first pixel in the whole picture.
+        u0: column of the first pixel in the whole image.
         v0: its row.
-        label: kind of the pixels that are drawn.
+        label: kind of the rendered pixels.
         depth: (H, W) float32 mm, changed in place.
         what: (H, W) uint8 kinds, changed in place.
     """
@@ -266,7 +266,7 @@ def draw_onto(vertices, faces, rotation, translation, intrinsics, u0, v0, label,
 
 @njit(cache=True)
 def _draw_meshes(meshes, rotation, translation, intrinsics, u0, v0, depth, what):
-    """Rasterise the animal and, where it is there, the object over a picture or patch."""
+    """Rasterise the animal and, if present, the object into an image or patch."""
     draw_onto(
         meshes.animal,
         meshes.faces,
@@ -296,7 +296,7 @@ def _draw_meshes(meshes, rotation, translation, intrinsics, u0, v0, depth, what)
 
 @njit(cache=True)
 def _window(meshes, camera, view, noise, depth_out, background_out):
-    """One training patch: still scene, its learned background, animal, perhaps an object, noise."""
+    """One training patch: still scene, its learned background, animal, optional object, noise."""
     shape = depth_out.shape
     intrinsics = camera.intrinsics
     origin = camera.origin
@@ -323,8 +323,7 @@ def _window(meshes, camera, view, noise, depth_out, background_out):
     smooth_field(state, table, 9.0, field)
     for r in range(shape[0]):
         for c in range(shape[1]):
-            # a background is learned from many frames: nearly free of noise, a little off in
-            # patches
+            # a background is learned from many frames: low noise, with small smooth errors
             error = sensor[BACKGROUND] * (0.4 * field[r, c] + 0.3 * normal(state, table))
             background_out[r, c] = (
                 int((depth[r, c] + error) / sensor[UNIT] + 0.5) if depth[r, c] > 0.0 else 0
@@ -356,14 +355,14 @@ def _window(meshes, camera, view, noise, depth_out, background_out):
 
 @njit(cache=True, parallel=True)
 def draw_windows(meshes, cameras, views, noises, depth_out, background_out):
-    """Render n training patches and their learned backgrounds, one thread a patch.
+    """Render n training patches and their learned backgrounds, one thread per patch.
 
     Args:
         meshes: `Meshes` of the patches.
         cameras: `PatchCamera` of the patches.
         views: `ArenaView` of the patches.
         noises: `SensorNoise` of the patches.
-        depth_out: (n, S, S) uint16 in steps of the sensor's unit, filled, 0 = unread.
+        depth_out: (n, S, S) uint16 in steps of the sensor's unit, output, 0 = unread.
         background_out: (n, S, S) uint16 likewise, the still scene as learned from many frames.
     """
     for i in prange(len(depth_out)):
@@ -380,7 +379,7 @@ def draw_windows(meshes, cameras, views, noises, depth_out, background_out):
 
 @njit(cache=True)
 def frame(still, meshes, rotation, translation, intrinsics, noise, out):
-    """Render one full frame: the still scene, the animal, perhaps an object, and the sensor.
+    """Render one full frame: the still scene, the animal, an optional object, and the sensor.
 
     Args:
         still: (H, W) float32 mm, the ideal still scene, 0 = nothing.
@@ -389,7 +388,7 @@ def frame(still, meshes, rotation, translation, intrinsics, noise, out):
         translation: (3,) of T_camera_arena, mm.
         intrinsics: (4,) fx, fy, cx, cy, px.
         noise: `SensorNoise` of the frame.
-        out: (H, W) uint16 in steps of the sensor's unit, filled, 0 = unread.
+        out: (H, W) uint16 in steps of the sensor's unit, output, 0 = unread.
     """
     state = np.array([noise.seed], np.uint64)
     depth = still.copy()
@@ -412,7 +411,7 @@ def frame(still, meshes, rotation, translation, intrinsics, noise, out):
 
 @njit(cache=True, parallel=True)
 def frames_parallel(still, meshes, rotation, translation, intrinsics, noises, out):
-    """Render n full frames of one scene, one thread a frame; see `frame`.
+    """Render n full frames of one scene, one thread per frame; see `frame`.
 
     Args:
         still: (H, W) float32 mm, shared.
@@ -421,7 +420,7 @@ def frames_parallel(still, meshes, rotation, translation, intrinsics, noises, ou
         translation: (3,) of T_camera_arena, mm, shared.
         intrinsics: (4,) fx, fy, cx, cy, px, shared.
         noises: `SensorNoise` of the frames.
-        out: (n, H, W) uint16 in steps of the sensor's unit, filled, 0 = unread.
+        out: (n, H, W) uint16 in steps of the sensor's unit, output, 0 = unread.
     """
     for i in prange(len(out)):
         frame(
@@ -439,7 +438,7 @@ def frames_parallel(still, meshes, rotation, translation, intrinsics, noises, ou
 
 
 class HandMeshes(NamedTuple):
-    """A hand and what is about it; of many pictures, all but faces with a leading axis (n,).
+    """A hand and its surroundings; for many images, all but faces with a leading axis (n,).
 
     Attributes:
         hand: (V, 3) mesh, mm, camera frame.
@@ -450,7 +449,7 @@ class HandMeshes(NamedTuple):
         body_faces: (K, 3) int32 its triangles.
         thing: (W, 3) mesh of the object, mm, camera frame.
         thing_faces: (L, 3) int32 its triangles.
-        has_thing: whether the object is there.
+        has_thing: whether the object exists.
     """
 
     hand: Any
@@ -466,21 +465,21 @@ class HandMeshes(NamedTuple):
 
 @njit(cache=True)
 def _put(vertices, faces, intrinsics, u0, v0, label, depth, what):
-    """Rasterise a mesh of the camera frame over a picture or patch; see `draw_onto`."""
+    """Rasterise a mesh in the camera frame into an image or patch; see `draw_onto`."""
     draw_onto(vertices, faces, np.eye(3), np.zeros(3), intrinsics, u0, v0, label, depth, what)
 
 
 @njit(cache=True)
 def picture(meshes, wall, camera, noise, out):
-    """Render one picture or patch (H, W) of a hand.
+    """Render one depth image or patch (H, W) of a hand.
 
     Args:
-        meshes: `HandMeshes` of the picture.
+        meshes: `HandMeshes` of the image.
         wall: (4,) a, b, c of 1 / z = a u + b v + c behind everything, and its unevenness, mm; c =
-            0: nothing is in range there.
-        camera: `PatchCamera` of the picture.
-        noise: `SensorNoise` of the picture.
-        out: (H, W) uint16 mm, filled, 0 = unread.
+            0: nothing in range.
+        camera: `PatchCamera` of the image.
+        noise: `SensorNoise` of the image.
+        out: (H, W) uint16 mm, output, 0 = unread.
     """
     shape = out.shape
     intrinsics = camera.intrinsics
@@ -527,14 +526,14 @@ def picture(meshes, wall, camera, noise, out):
 
 @njit(cache=True, parallel=True)
 def pictures(meshes, walls, cameras, noises, out):
-    """Render n pictures or patches of hands, one thread a picture; see `picture`.
+    """Render n depth images or patches of hands, one thread per image; see `picture`.
 
     Args:
-        meshes: `HandMeshes` of the pictures.
+        meshes: `HandMeshes` of the images.
         walls: (n, 4) planes behind everything, as in `picture`.
-        cameras: `PatchCamera` of the pictures.
-        noises: `SensorNoise` of the pictures.
-        out: (n, H, W) uint16 mm, filled, 0 = unread.
+        cameras: `PatchCamera` of the images.
+        noises: `SensorNoise` of the images.
+        out: (n, H, W) uint16 mm, output, 0 = unread.
     """
     for i in prange(len(out)):
         drawn = HandMeshes(

@@ -3,10 +3,11 @@
 PrimeSense: disparity f b / z, quantised to eighths of a pixel, with projector shadow. Kinect v2:
 axial noise that grows as z^2 with radial and slope terms, and flying pixels at edges. Light field:
 smooth range noise growing as z^2, texture-less gaps and mismatches. Before any of them, `soften`
-lets fur blur the outline; `sense` chooses the model.
+blurs the outline of fur; `sense` selects the model.
 
-Every random number comes from a xorshift64 generator (Marsaglia 2003) whose state (1,) uint64
-belongs to one picture, so a picture depends on its seed alone, never on threads or on order.
+All random numbers come from a xorshift64 generator (Marsaglia 2003) whose state (1,) uint64 belongs
+to one image, so an image depends on its seed alone, never on threads or order.
+
 Arguments that all kernels share: depth (H, W) float32 mm, 0 = nothing in range; what (H, W) uint8:
 NOTHING, STILL (background), ANIMAL, OBJECT; `p`: one row (N_PARAMETERS,) of sensor parameters,
 indexed as below.
@@ -26,7 +27,7 @@ PRIMESENSE_KIND = 0
 KINECT_V2_KIND = 1
 LIGHT_FIELD_KIND = 2
 BASELINE_MM = 75.0  # between the projector and the camera of a PrimeSense
-SUBPIXEL = 8.0  # it reads disparity in eighths of a pixel
+SUBPIXEL = 8.0  # its disparity is quantised to eighths of a pixel
 
 # columns of a row of sensor parameters
 (
@@ -46,12 +47,12 @@ SUBPIXEL = 8.0  # it reads disparity in eighths of a pixel
     JITTER,
     FLYING,
 ) = range(15)
-# mm a step of the picture; error of a learned background; outliers' rarity
+# step of the depth image, mm; error of a learned background; rarity of outliers
 UNIT = 15
 BACKGROUND = 16
 OUTLIERS = 17
 N_PARAMETERS = 18
-# from a light field's main lens: its parameters hold there, its range noise grows with z^2
+# distance from a light field's main lens to which its parameters refer; range noise grows with z^2
 TYPICAL_MM = 250.0
 
 _TABLE_BITS = 13
@@ -94,13 +95,13 @@ def normal(state, table):
 
 @njit(cache=True)
 def smooth_field(state, table, spacing, out):
-    """Value noise: normal numbers at nodes `spacing` pixels apart, bilinear between them.
+    """Value noise: normal numbers at nodes `spacing` pixels apart, interpolated bilinearly.
 
     Args:
         state: (1,) uint64 of the generator, advanced.
         table: (2^13,) float32 normal quantiles.
         spacing: of the nodes, px; the lattice's offset is random.
-        out: (H, W) float32, filled; of unit deviation at its nodes.
+        out: (H, W) float32, output; unit standard deviation at the nodes.
     """
     height, width = out.shape
     n_columns = int(width / spacing) + 3
@@ -136,10 +137,10 @@ def smooth_field(state, table, spacing, out):
 
 @njit(cache=True)
 def soften(depth, what, p, state, table, field):
-    """What fur does before any sensor: lumps, a bias of dark hair, an outline that returns less.
+    """Effects of fur before any sensor: lumps, a bias of dark hair, a weaker outline.
 
-    `p[EROSION]` pixels of the animal's outline go to whatever stands behind, and a share 0.5
-    `p[FUR]` of the next ones.
+    `p[EROSION]` pixels of the animal's outline take the depth of the surface behind, and a share
+    0.5 `p[FUR]` of the next ones.
 
     Args:
         depth: (H, W) float32 mm, changed in place.
@@ -192,7 +193,7 @@ def _outside(depth, what, v, u):
 
 @njit(cache=True)
 def _step(depth, v, u):
-    """Largest difference in mm to the four neighbours that exist, with its sign."""
+    """Largest signed depth difference to the existing neighbours (up to four), mm."""
     height, width = depth.shape
     here = depth[v, u]
     worst = np.float32(0.0)
@@ -211,8 +212,8 @@ def _step(depth, v, u):
 def primesense(depth, what, p, focal, state, table, out):
     """Structured light: disparity f b / z with smooth noise, quantised to eighths of a pixel.
 
-    Disparity is read over a window (smooth errors, outlines displaced by about a pixel); what the
-    projector cannot see, beside anything that stands up, is unread, and so are grazing surfaces.
+    Disparity is estimated over a window (smooth errors, outlines displaced by about a pixel);
+    points hidden from the projector next to raised objects are unread, and so are grazing surfaces.
 
     Args:
         depth: (H, W) float32 mm, 0 = nothing in range.
@@ -221,7 +222,7 @@ def primesense(depth, what, p, focal, state, table, out):
         focal: px.
         state: (1,) uint64 of the generator, advanced.
         table: (2^13,) float32 normal quantiles.
-        out: (H, W) uint16 mm, filled, 0 = unread.
+        out: (H, W) uint16 mm, output, 0 = unread.
     """
     height, width = depth.shape
     field = np.empty((height, width), np.float32)
@@ -257,11 +258,10 @@ def primesense(depth, what, p, focal, state, table, out):
 
 @njit(cache=True)
 def _shadow(row, fb, side, shadow):
-    """Which pixels of one row of depths (W,) the projector cannot see; it stands to the right (side
-    > 0) or left.
+    """Mark pixels of a row of depths (W,) that are hidden from the projector.
 
-    Seen from the projector a point moves by its disparity; points that come to lie behind an
-    already passed, nearer one are hidden by it.
+    The projector is to the right of the camera (side > 0) or to the left. In its view a point is
+    shifted by its disparity; points that fall behind a nearer one are hidden by it.
     """
     width = len(row)
     front = 1e9
@@ -270,7 +270,7 @@ def _shadow(row, fb, side, shadow):
         shadow[u] = False
         if row[u] > 0:
             seen = (u if side > 0 else -u) - fb / row[u]
-            # a pixel of slack: slopes seen at a grazing angle are not a shadow's edge
+            # tolerance: slopes at a grazing angle are not a shadow's edge
             shadow[u] = seen > front + 0.7
             front = min(front, seen)
 
@@ -291,7 +291,7 @@ def kinect_v2(depth, what, p, focal, centre_u, centre_v, state, table, out):
         centre_v: row of the optical axis, px of the window.
         state: (1,) uint64 of the generator, advanced.
         table: (2^13,) float32 normal quantiles.
-        out: (H, W) uint16 mm, filled, 0 = unread.
+        out: (H, W) uint16 mm, output, 0 = unread.
     """
     height, width = depth.shape
     field = np.empty((height, width), np.float32)
@@ -324,10 +324,9 @@ def kinect_v2(depth, what, p, focal, centre_u, centre_v, state, table, out):
 def light_field(depth, what, p, state, table, out):
     """A plenoptic camera: depth from matched texture, with large and mostly smooth range noise.
 
-    Outlines lie some pixels off, often outwards; where the surface bears no texture (DARK of the
-    animal's, HOLES of the rest) there is no reading, or (FLYING > 0.5) what lies around was drawn
-    over it; patches are matched wrongly, the rarer the larger OUTLIERS. Range noise grows with (z /
-    TYPICAL_MM)^2.
+    Outlines are some pixels off, often outwards; texture-less surfaces (DARK of the animal's, HOLES
+    of the rest) are unread or (FLYING > 0.5) interpolated from their surroundings; patches are
+    mismatched, less often for larger OUTLIERS. Range noise grows with (z / TYPICAL_MM)^2.
 
     Args:
         depth: (H, W) float32 mm, 0 = nothing in range.
@@ -335,7 +334,7 @@ def light_field(depth, what, p, state, table, out):
         p: (N_PARAMETERS,) of the sensor.
         state: (1,) uint64 of the generator, advanced.
         table: (2^13,) float32 normal quantiles.
-        out: (H, W) uint16 in steps of `p[UNIT]` mm, filled, 0 = unread.
+        out: (H, W) uint16 in steps of `p[UNIT]` mm, output, 0 = unread.
     """
     height, width = depth.shape
     fields = np.empty((6, height, width), np.float32)
@@ -384,19 +383,19 @@ def light_field(depth, what, p, state, table, out):
 
 @njit(cache=True)
 def sense(depth, what, p, focal, centre_u, centre_v, state, table, field, out):
-    """One picture through `soften` and its sensor's model; depth and what are consumed.
+    """Apply `soften` and the sensor's model to one image; depth and what are overwritten.
 
     Args:
         depth: (H, W) float32 mm, 0 = nothing in range; changed.
         what: (H, W) uint8 kinds; changed.
-        p: (N_PARAMETERS,) of the sensor; `p[KIND]` chooses the model.
+        p: (N_PARAMETERS,) of the sensor; `p[KIND]` selects the model.
         focal: px.
         centre_u: column of the optical axis, px of the window.
         centre_v: row of the optical axis, px of the window.
         state: (1,) uint64 of the generator, advanced.
         table: (2^13,) float32 normal quantiles.
         field: (H, W) float32 scratch space.
-        out: (H, W) uint16 in steps of `p[UNIT]` mm, filled, 0 = unread.
+        out: (H, W) uint16 in steps of `p[UNIT]` mm, output, 0 = unread.
     """
     soften(depth, what, p, state, table, field)
     if int(p[KIND]) == PRIMESENSE_KIND:

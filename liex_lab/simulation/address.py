@@ -1,7 +1,7 @@
 """Addresses of synthetic recordings, `synthetic:<kind>?<key>=<value>&...`, opened like a file.
 
-Example: synthetic:walk?seed=3&frames=300. The query part is parsed as that of a URL; every key is
-checked against those that the kind knows, with the nearest one named in the error.
+Example: synthetic:walk?seed=3&frames=300. The query part is parsed as that of a URL; an error about
+an unknown key names the nearest valid one.
 """
 
 from __future__ import annotations
@@ -27,33 +27,34 @@ _SCENE: Final = "scene"
 _KINDS: Final = (*_ANIMALS, "move", *_SEQUENCES, _SCENE)
 _SENSORS: Final = {"walk": ("kinect-v2", "primesense", "primesense-qvga"), "swim": ("raytrix-r5",)}
 _EXAMPLE = "synthetic:walk?seed=3&frames=300&sensor=kinect-v2&spine_mm=65"
-_MOST_FRAMES = 100_000  # an hour; the truth of every frame is held in memory
-_MOST_SCENE_FRAMES = 20_000  # cables and bedding are held in memory, too
+_MOST_FRAMES = 100_000  # an hour; the truth of every frame is in memory
+_MOST_SCENE_FRAMES = 20_000  # cables and bedding are also in memory
 _SIZES = (0.5, 2.9)  # of the home length
-_BUILDS = ("other", "train")  # of animals in scenes: a build that no model was trained on, or one
+_BUILDS = ("other", "train")  # builds of animals in scenes: not used in training, or used
 
 
 def open_synthetic(address: str, camera: Lens | None = None) -> Recording:
-    """The virtual recording of an address.
+    """Open the virtual recording at an address.
 
     An example is synthetic:walk?seed=3&frames=300&sensor=kinect-v2&spine_mm=65. Kinds: walk, a
     mouse; swim, a fish; gesture, a hand; move, the animal of a skeleton's TOML, animal=snake.toml.
-    Each setting may be left out: seed 0, 300 frames, the animal's usual sensor, and a size drawn
-    from the seed. track-easy and track-hard are the test sequences of
+    Every setting is optional: the defaults are seed 0, 300 frames, the animal's usual sensor, and a
+    size drawn from the seed. track-easy and track-hard are the test sequences of
     `simulation.tracking_sequences`, of a mouse, or with animal=fish or animal=hand of those; with a
-    seed or more frames they are others of their kind. scene is one of `simulation.scenes`, such as
-    synthetic:scene?name=raised&seed=3; build=train takes a body like those of the training.
+    seed or more frames they are new sequences of the same kind. scene is one of
+    `simulation.scenes`, such as synthetic:scene?name=raised&seed=3; build=train uses a training
+    body.
 
     Args:
-        address: of the recording, beginning with synthetic:.
-        camera: taken for the one that made the pictures, to see what a wrong one does; None is the
-            true one.
+        address: the recording's address, starting with synthetic:.
+        camera: overrides the true camera, to test the effect of a wrong one; None uses the true
+            one.
 
     Returns:
         A recording with truth (a `TrueRecording`).
 
     Raises:
-        RecordingError: the kind, a setting or its value is not known, or the animal is lacking.
+        RecordingError: the kind, a setting or its value is invalid, or the animal is missing.
     """
     kind, _, query = address.removeprefix("synthetic:").partition("?")
     if kind not in _KINDS:
@@ -90,7 +91,7 @@ def open_synthetic(address: str, camera: Lens | None = None) -> Recording:
 
 
 def _stated_camera(session: Recording, camera: Lens | None) -> Recording:
-    """The recording with the camera that was stated, where one was."""
+    """The recording with the user's camera, if given."""
     if camera is not None:
         session.camera = fitting(
             camera, session.width, session.height, "the camera that was stated"
@@ -99,7 +100,7 @@ def _stated_camera(session: Recording, camera: Lens | None) -> Recording:
 
 
 def _open_scene(address: str, stated: dict[str, str]) -> Recording:
-    """The recording of a scene's address."""
+    """Open the recording of a scene's address."""
     from liex_lab.simulation.scenes.catalogue import SCENES, SEALED_FROM, film
 
     named = stated.pop("name", "plain")
@@ -132,7 +133,7 @@ def _open_scene(address: str, stated: dict[str, str]) -> Recording:
 
 
 def _values(address: str, stated: dict[str, str], settings: dict[str, _Setting]) -> dict[str, Any]:
-    """The values of an address's settings, each checked against those that the kind knows."""
+    """The values of an address's settings, validated against the settings of its kind."""
     for key in stated:
         if key not in settings:
             near = difflib.get_close_matches(key, settings, 1, cutoff=0.0)[0]
@@ -146,7 +147,7 @@ _Setting = tuple[Callable[[str], Any], Callable[[Any], bool], str]
 
 
 def _settings(kind: str, home_mm: float) -> dict[str, _Setting]:
-    """Of each setting: how to read it, what holds for it, what to say otherwise."""
+    """For each setting: its parser, its check, and the expected value for the error message."""
     low, high = (
         (30.0, 150.0)
         if kind == "walk"
@@ -171,7 +172,7 @@ def _settings(kind: str, home_mm: float) -> dict[str, _Setting]:
 
 
 def _value(address: str, key: str, text: str, setting: _Setting) -> Any:
-    """The value of one setting of an address."""
+    """Parse the value of one setting of an address."""
     read, holds, expected = setting
     try:
         value = read(text)

@@ -1,10 +1,10 @@
 """Corruptions of depth recordings as a script: holes, occluders, distractors, lost frames.
 
-A script deals shuffled decks of the events in `EVENTS`, so that each kind keeps coming back: discs
-without readings (holes), a bar across the line of sight (occluder), a second object (object), an
-animal that sinks into the floor's noise or into glare (faint), stretches at two to three times the
-speed (fast), and frames that are missing (dropped). Objects enter the rendered scene; `Loss` is
-applied to the finished pictures; `visible_share` tells how much of the animal an occluder leaves.
+A script deals shuffled decks of the events in `EVENTS`, so that each kind recurs: discs without
+readings (holes), a bar across the line of sight (occluder), a second object (object), an animal
+that disappears in the floor's noise or in glare (faint), stretches at two to three times the speed
+(fast), and missing frames (dropped). Objects are rendered with the scene; `Loss` is applied to the
+finished depth images; `visible_share` measures how much of the animal an occluder leaves visible.
 """
 
 from __future__ import annotations
@@ -33,17 +33,17 @@ EVENTS = {
     "dropped": (3, 0.1, 0.35),
 }
 _CALM_S = (0.1, 0.5)  # between two events
-_LONE_DROP = 0.02  # of the frames are dropped on their own
-_FAST = (2, 3)  # times as fast as the animal otherwise moves
-_FAINT_MM = (0.2, 0.4)  # of the animal's length: what is lower than this is lost in the floor
-_FAINT_LOST = (0.4, 0.75)  # of the readings of an animal that floats
+_LONE_DROP = 0.02  # share of single dropped frames
+_FAST = (2, 3)  # range of the speed factor
+_FAINT_MM = (0.2, 0.4)  # of the animal's length: smaller heights are lost in the floor
+_FAINT_LOST = (0.4, 0.75)  # lost share of the readings of a floating animal
 _HOLE = (0.1, 0.26)  # radius, of the animal's length
-_CELL = 3  # pixels a side that come and go together
-# an occluder: half its width and how far it comes from, of the animal's length; how long it is
+_CELL = 3  # side of the cells of dropout, px
+# an occluder: half its width, its initial distance and its length, over the animal's length
 _BAR_HALF = (0.12, 0.5)
 _BAR_FROM = 2.0
 _BAR_LONG = 2.5
-# a thing held beside a hand: half its sides, and how far from the hand, of the hand's length
+# an object next to a hand: its half sides and its distance, over the hand's length
 _HELD = (0.08, 0.3)
 _HELD_ASIDE = (0.1, 0.5)
 _AWAY = np.array([0.0, 0.0, 1e6])  # behind the camera
@@ -53,11 +53,11 @@ TWO_FACES = np.concatenate([THING_FACES, THING_FACES + np.int32(THING_FACES.max(
 
 @dataclass(frozen=True)
 class Event:
-    """Something that happens in frames `start` to `stop`.
+    """An event in frames `start` to `stop`.
 
     Attributes:
-        kind: a word of `EVENTS`, or 'hidden', the frames in which less than half of the animal can
-            be seen.
+        kind: a key of `EVENTS`, or 'hidden', frames in which less than half of the animal is
+            visible.
         start: first frame.
         stop: one past the last frame.
     """
@@ -72,22 +72,22 @@ def draw_script(
 ) -> tuple[list[Event], NDArray[np.int64]]:
     """Events over n frames, and the camera's clock steps before each frame.
 
-    The events come in shuffled decks, the first with one of each, so that none is long absent.
-    Frames that are dropped are missing afterwards: an event 'dropped' is the one frame after them.
-    Besides, 2 % of the frames follow a single frame that is missing.
+    The events come in shuffled decks, the first with one of each, so that none is absent for long.
+    Dropped frames are removed: an event 'dropped' is the one frame after them. In addition, 2 % of
+    the frames follow a single dropped frame.
 
     Args:
-        rng: source of randomness.
-        n_frames: length of the recording as it is kept.
+        rng: random number generator.
+        n_frames: length of the recording without dropped frames.
         step_s: between two frames, s.
 
     Returns:
-        The events in order of time, and (n_frames,) int64 steps before each frame, 1 as a rule.
+        The events in order of time, and (n_frames,) int64 steps before each frame, usually 1.
     """
     events = []
     steps = np.ones(n_frames, np.int64)
     deck = [str(name) for name in rng.permutation(list(EVENTS))]
-    at = round(1.0 / step_s)  # a second of calm to begin with
+    at = round(1.0 / step_s)  # one second without events at the start
     while at < n_frames:
         if not deck:
             names = [name for name, (share, *_) in EVENTS.items() for _ in range(share)]
@@ -105,11 +105,11 @@ def draw_script(
 
 
 def pace(rng: np.random.Generator, events: list[Event], n_frames: int) -> NDArray[np.int64]:
-    """How many times as fast the animal moves in each frame.
+    """Speed factor of the animal in each frame.
 
     Args:
-        rng: source of randomness.
-        events: the script; those of kind 'fast' count.
+        rng: random number generator.
+        events: the script; only 'fast' is used.
         n_frames: length of the recording.
 
     Returns:
@@ -131,11 +131,11 @@ def draw_things(
     beside: Beside,
     floats: bool = True,
 ) -> Array:
-    """Meshes of the occluder and of a second object in each frame; far behind the lens if none.
+    """Meshes of the occluder and of a second object in each frame; far behind the camera if absent.
 
     Args:
-        rng: source of randomness.
-        events: the script; those of kind 'occluder' and 'object' count.
+        rng: random number generator.
+        events: the script; only 'occluder' and 'object' are used.
         eye: (3,) position of the camera, mm, arena frame.
         joints: (n, J, 3) of the animal, mm, arena frame.
         length_mm: of the animal, mm.
@@ -160,10 +160,10 @@ def draw_things(
 def _passing(
     rng: np.random.Generator, eye: Array, joints: Array, length_mm: float, floats: bool
 ) -> Array:
-    """A bar (n, V, 3) mm that is moved across the view between the camera and the animal."""
+    """A bar (n, V, 3) mm that moves across the view between the camera and the animal."""
     height = 0.65 * eye[2] if floats else min(3.0 * length_mm, 0.5 * eye[2])
     target = joints[len(joints) // 2].mean(axis=0)
-    share = (eye[2] - height) / (eye[2] - target[2])  # on the ray from the lens to the animal
+    share = (eye[2] - height) / (eye[2] - target[2])  # on the ray from the camera to the animal
     over = eye[:2] + (target[:2] - eye[:2]) * share
     direction = rng.uniform(-np.pi, np.pi)
     half = rng.uniform(*_BAR_HALF) * length_mm * share
@@ -190,17 +190,17 @@ def beside_animal(
     length_mm: float,
     kinds: tuple[str, ...],
 ) -> Array:
-    """An object that stands beside the animal's path for a while, near it where there is space.
+    """A stationary object near the animal's path, close to it if there is space.
 
-    Of 60 random positions the one is taken whose gap to the path is nearest to half a body length,
-    at a cost for reaching over the walls or standing on the path.
+    Of 60 random positions, the one whose gap to the path is nearest to half a body length is used,
+    with penalties for overlapping the walls or the path.
 
     Args:
-        rng: source of randomness.
+        rng: random number generator.
         scene: the scene with its walls.
-        joints: (n, J, 3) of the animal over the event, mm, arena frame.
+        joints: (n, J, 3) of the animal during the event, mm, arena frame.
         length_mm: of the animal, mm.
-        kinds: of objects to choose from, see `objects.draw_thing`.
+        kinds: kinds of objects to choose from, see `objects.draw_thing`.
 
     Returns:
         (n, V, 3) mm, arena frame, the same in every frame.
@@ -225,11 +225,11 @@ def beside_animal(
 
 
 def beside_hand(rng: np.random.Generator, joints: Array, length_mm: float) -> Array:
-    """A block or a ball that is held beside a hand for a while, at about its depth.
+    """A stationary block or ball next to a hand, at about its depth.
 
     Args:
-        rng: source of randomness.
-        joints: (n, J, 3) of the hand over the event, mm, arena frame.
+        rng: random number generator.
+        joints: (n, J, 3) of the hand during the event, mm, arena frame.
         length_mm: of the hand, mm.
 
     Returns:
@@ -256,12 +256,12 @@ def beside_hand(rng: np.random.Generator, joints: Array, length_mm: float) -> Ar
 
 @dataclass(frozen=True)
 class Loss:
-    """Readings that are lost in n frames.
+    """Lost readings in n frames.
 
     Attributes:
-        discs: of frame i in discs[i]: (k, 3) centre u, v and radius, px, in which nothing is read.
-        faint_mm: (n,) what stands out from the still scene by less is read as the still scene, mm.
-        dropout: (n,) share of the animal's surroundings that is not read.
+        discs: for frame i, discs[i]: (k, 3) centre u, v and radius, px, of unread discs.
+        faint_mm: (n,) smaller heights above the still scene are replaced by it, mm.
+        dropout: (n,) unread share of the animal's surroundings.
     """
 
     discs: tuple[Array, ...]
@@ -277,16 +277,16 @@ class Loss:
         length_mm: float,
         floats: bool,
     ) -> Loss:
-        """What is lost in the frames of a script.
+        """Draw the lost readings of a script.
 
         Args:
-            rng: source of randomness.
-            events: the script; those of kind 'faint' and 'holes' count.
+            rng: random number generator.
+            events: the script; only 'faint' and 'holes' are used.
             camera: the camera.
             joints: (n, J, 3) of the animal, mm, camera frame.
             length_mm: of the animal, mm.
-            floats: 'faint' is then dropout of 40 to 75 % of the readings; else what is lower than
-                0.2 to 0.4 body lengths is lost in the floor.
+            floats: 'faint' is then dropout of 40 to 75 % of the readings; else heights below 0.2 to
+                0.4 body lengths are lost in the floor.
 
         Returns:
             The loss of n frames.
@@ -323,15 +323,15 @@ class Loss:
         middle_px: Array,
         reach_px: Array,
     ) -> None:
-        """Take the readings out of depth pictures, in place.
+        """Remove the lost readings from depth images, in place.
 
         Args:
             depths: (k, H, W) float32 mm, the frames from `first` on; changed.
-            still: (H, W) float32 mm, the still scene; None where there is none to be lost in.
-            first: number of the first picture's frame.
+            still: (H, W) float32 mm, the still scene; None if there is none.
+            first: number of the first frame.
             seeds: (n,) uint64 of all frames, for the dropout's pattern.
-            middle_px: (n, 2) the animal's centre in the picture, px.
-            reach_px: (n,) radius about it within which dropout happens, px.
+            middle_px: (n, 2) the animal's centre in the image, px.
+            reach_px: (n,) radius of the dropout around it, px.
         """
         height, width = depths.shape[1:]
         v, u = np.mgrid[:height, :width]
@@ -351,16 +351,16 @@ class Loss:
 
 
 def visible_share(vertices: Array, things: Array, camera: Camera, rows: NDArray[np.int64]) -> Array:
-    """Share of the animal's vertices that no object hides, 1 in frames other than `rows`.
+    """Share of the animal's vertices that are not occluded, 1 in frames other than `rows`.
 
-    A vertex counts as hidden where it projects into the convex hull of the occluder's projection,
-    for the occluder lies nearer.
+    A vertex counts as occluded if it projects into the convex hull of the occluder's projection, as
+    the occluder is nearer.
 
     Args:
         vertices: (n, V, 3) of the animal, mm, camera frame.
         things: (n, W, 3) of the occluder, mm, camera frame.
         camera: the camera.
-        rows: frames in which there is an occluder.
+        rows: frames with an occluder.
 
     Returns:
         (n,) from 0 to 1.
@@ -376,7 +376,7 @@ def visible_share(vertices: Array, things: Array, camera: Camera, rows: NDArray[
 
 
 def hidden_spans(share: Array) -> list[Event]:
-    """The spans of frames in which less than half of the animal is seen.
+    """The spans of frames in which less than half of the animal is visible.
 
     Args:
         share: (n,) visible share of the animal.

@@ -1,9 +1,9 @@
 """Pose prior of a zebrafish in a tank: bodies, travelling waves of bending, depth in the water.
 
-The midline's yaw at arc length s (0 at the base joint, 1 at the end of the chain) is two arcs,
-joined by a logistic step, plus a travelling wave whose amplitude grows along the body, A (0.35 +
-0.65 s) sin(2 pi s / L - phase), plus four small standing waves (`bend_profile`). The kinds of
-posture are those of zebrafish ethograms: glide, scoot, J-turn, C-turn and S-bend.
+The midline's yaw at arc length s (0 at the base joint, 1 at the end of the chain) consists of two
+arcs, joined by a logistic step, plus a travelling wave whose amplitude grows along the body, A
+(0.35 + 0.65 s) sin(2 pi s / L - phase), plus four small standing waves (`bend_profile`). The kinds
+of posture are those of zebrafish ethograms: glide, scoot, J-turn, C-turn and S-bend.
 """
 
 from __future__ import annotations
@@ -32,26 +32,26 @@ TANK = SceneSpec(
     clutter=("pellet", "plant"),
     scale=0.3,
 )
-# at rest or gliding, scooting with waves down the body, J: the hind half bent, C: both halves, S:
-# against each other
+# at rest or gliding; scooting with waves down the body; J: the hind half bent, C: both halves, S:
+# in opposite directions
 KINDS = ("glide", "scoot", "j", "c", "s")
 SHARES = (0.28, 0.30, 0.14, 0.14, 0.14)
-_NEAREST_MM = 180.0  # to the camera: nearer, a large fish is not in the picture as a whole
-_FLOOR_SHARE = 0.12  # of the fish are just above the floor
-_FRONT = 0.47  # of the body bends as one arc, the rest as another (as in people's annotations)
+_NEAREST_MM = 180.0  # to the camera: nearer, a large fish does not fit in the image
+_FLOOR_SHARE = 0.12  # share of fish just above the floor
+_FRONT = 0.47  # front arc's share of the body (as in human annotations)
 
 
 @dataclass(frozen=True)
 class FishSpecies:
-    """A zebrafish that swims anywhere in a tank, seen from above by a Raytrix R5.
+    """A zebrafish that swims anywhere in a tank, recorded from above by a Raytrix R5.
 
     Attributes:
-        skeleton: of the fish, the preset's if not given.
-        sensors: makes of cameras that look at it.
+        skeleton: of the fish; by default the preset's.
+        sensors: makes of cameras.
         setting: ranges of its tank.
-        things: kinds of distractors beside it.
+        things: kinds of distractors.
         sizes: smallest and largest fish over the nominal size, 25 and 40 mm over 30.
-        floats: True, for it is anywhere above the floor.
+        floats: True, as it can be anywhere above the floor.
         frame_ns: between two frames of a recording, ns.
     """
 
@@ -67,9 +67,9 @@ class FishSpecies:
         """Fish of a family of shapes.
 
         Args:
-            rng: source of randomness.
+            rng: random number generator.
             family: one of `body.shape.FAMILIES`.
-            n: how many.
+            n: number of fish.
 
         Returns:
             A batch of n bodies.
@@ -79,14 +79,14 @@ class FishSpecies:
     def postures(
         self, rng: np.random.Generator, size: Array, shape: Body, camera_mm: Array
     ) -> Postures:
-        """Fish that glide, scoot and turn, mostly level, at any height over the floor.
+        """Fish that glide, scoot and turn, mostly level, at any height above the floor.
 
         Args:
-            rng: source of randomness.
+            rng: random number generator.
             size: (n,) of the fish over home size.
             shape: (n) their bodies.
-            camera_mm: (n,) heights of the cameras above the floor, mm; no fish comes nearer to one
-                than 180 mm.
+            camera_mm: (n,) heights of the cameras above the floor, mm; the fish stay at least 180
+                mm from them.
 
         Returns:
             The poses with girths and kinds, indices into `KINDS`.
@@ -105,27 +105,19 @@ class FishSpecies:
         return Postures(pose, size, kind)
 
     def bends(self, rng: np.random.Generator, n: int) -> Array | None:
-        """None, for the tail is part of the skeleton.
-
-        Args:
-            rng: not used.
-            n: not used.
-
-        Returns:
-            None.
-        """
+        """None, as the tail is part of the skeleton."""
         return None
 
 
 def draw_bends(rng: np.random.Generator, skeleton: Skeleton, kind: NDArray[np.int64]) -> Array:
     """Yaw at each joint for kinds of posture, within the skeleton's limits.
 
-    Two arcs, a wave that travels down the body, and a little of every part's own. Degrees are those
-    of a chain of 20 bones; the hind half bends about twice as much as the front half, up to some 7
-    degrees a joint in a turn.
+    Two arcs, a wave that travels down the body, and small independent bends. Degrees are those of a
+    chain of 20 bones; the hind half bends about twice as much as the front half, up to some 7
+    degrees per joint in a turn.
 
     Args:
-        rng: source of randomness.
+        rng: random number generator.
         skeleton: of the fish.
         kind: (n,) int64, indices into `KINDS`.
 
@@ -176,20 +168,20 @@ def bend_profile(
     middle: Array,
     own: Array,
 ) -> Array:
-    """Yaw at each joint of two arcs with a travelling wave over them.
+    """Yaw at each joint of two arcs with a travelling wave.
 
     With s the joint's share of the body's length, the arcs join in a logistic step of width 0.05 at
     `middle`; the wave is amplitude (0.35 + 0.65 s) sin(2 pi s / length - phase).
 
     Args:
-        skeleton: of the fish; only joints that can yaw bend, within their limits.
-        front: (n,) bend of the front arc, degrees a joint of 20.
-        hind: (n,) bend of the hind arc, degrees a joint of 20.
-        amplitude: (n,) of the travelling wave, degrees a joint of 20.
+        skeleton: of the fish; only joints with a yaw axis bend, within their limits.
+        front: (n,) bend of the front arc, degrees per joint of 20.
+        hind: (n,) bend of the hind arc, degrees per joint of 20.
+        amplitude: (n,) of the travelling wave, degrees per joint of 20.
         phase: (n,) of the travelling wave, rad.
         length: (n,) of the travelling wave, over the body's length.
-        middle: (n,) where the arcs meet, over the body's length.
-        own: (n, 4) amplitudes of standing waves, degrees a joint of 20.
+        middle: (n,) position where the arcs meet, over the body's length.
+        own: (n, 4) amplitudes of standing waves, degrees per joint of 20.
 
     Returns:
         (n, J) rad, 0 at the base joint.
@@ -210,7 +202,7 @@ def bend_profile(
 
 
 def hung(skeleton: Skeleton, yaw: Array, rotation: Array, size: Array) -> Pose:
-    """Poses with given bends and orientations, the mean of their joints at the origin.
+    """Poses with given bends and orientations and the mean of their joints at the origin.
 
     Args:
         skeleton: of the animal.
@@ -229,7 +221,7 @@ def hung(skeleton: Skeleton, yaw: Array, rotation: Array, size: Array) -> Pose:
 
 
 def clearance(skeleton: Skeleton, pose: Pose, shape: Body, size: Array) -> tuple[Array, Array]:
-    """How far bodies reach below and above the origin, at most.
+    """Upper bounds of the extent of bodies below and above the origin.
 
     Args:
         skeleton: of the animal.
@@ -238,7 +230,7 @@ def clearance(skeleton: Skeleton, pose: Pose, shape: Body, size: Array) -> tuple
         size: (n,) over home size.
 
     Returns:
-        Reach below (n,) and above (n,), mm.
+        Extent below (n,) and above (n,), mm.
     """
     assert isinstance(shape, BodyShape)
     z = pose.joints(skeleton)[..., 2]

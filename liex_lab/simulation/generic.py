@@ -1,9 +1,9 @@
-"""Pose prior and locomotion of any animal of which only a skeleton and a surface are known.
+"""Pose prior and locomotion of any animal with only a skeleton and a surface.
 
-Joint angles are drawn by a Gaussian copula over the kinematic tree: a standard normal number runs
-down every chain as an AR(1) process (correlation 0.75 with the parent's), and its quantile says
-where between the limits the joint stands (`draw_angles`). An animal on the floor falls into the
-lowest of eight tilts, as gravity would have it; one with view frame 'camera' hangs at any height.
+Joint angles are drawn by a Gaussian copula over the kinematic tree: a standard normal number
+follows an AR(1) process down every chain (correlation 0.75 with the parent's), and its quantile
+sets the joint's position between its limits (`draw_angles`). An animal on the floor takes the
+lowest of eight tilts, as gravity would have it; one with view frame 'camera' floats at any height.
 """
 
 from __future__ import annotations
@@ -26,28 +26,28 @@ from liex_lab.simulation.species import RAYTRIX_R5_SENSOR, SENSORS, Postures, Se
 
 Array = NDArray[np.float64]
 
-_SMALL_MM = 35.0  # a shorter animal takes a camera made for the near
+_SMALL_MM = 35.0  # a shorter animal uses a close-range camera
 _LIKE_NEXT = 0.75  # correlation of a joint's bend with its parent's
-_UNLIMITED_RAD = np.radians(100.0)  # an axis with a wider range was given no limits
-_USUAL_RAD = np.radians(45.0)  # and is taken to turn by this much
-# of an animal that falls onto the floor, some lie lower than others
+_UNLIMITED_RAD = np.radians(100.0)  # an axis with a wider range counts as unlimited
+_USUAL_RAD = np.radians(45.0)  # and turns by this much
+# tilts from which the resting orientation on the floor is chosen
 _TILTS = 8
 _TILT_RAD = 0.35
-_REARED_SHARE = 0.15  # and not all lie as low as they can
-_NEAR_SHARE = 0.55  # of the camera's height: no animal that floats comes nearer
-_CHANGE_S = 0.5  # a posture is held about this long
+_REARED_SHARE = 0.15  # share of animals that do not lie as low as possible
+_NEAR_SHARE = 0.55  # of the camera's height: upper limit of floating animals
+_CHANGE_S = 0.5  # mean duration of a posture
 
 
 @dataclass(frozen=True)
 class GenericSpecies:
-    """An animal that lies on the floor, or (view frame 'camera') hangs above it, in any posture.
+    """An animal that lies on the floor or (view frame 'camera') floats above it, in any posture.
 
-    Its joints' limits are all that restricts the postures; other attributes are as in `Species`.
+    Postures are restricted only by the joints' limits; other attributes are as in `Species`.
 
     Attributes:
         skeleton: of the animal.
         sizes: smallest and largest animal over the nominal size.
-        things: kinds of distractors beside it.
+        things: kinds of distractors.
         frame_ns: between two frames of a recording, ns.
     """
 
@@ -58,7 +58,7 @@ class GenericSpecies:
 
     @cached_property
     def floats(self) -> bool:
-        """Whether it is somewhere above the floor: its view frame is 'camera'."""
+        """Whether it is above the floor: its view frame is 'camera'."""
         return self.skeleton.view.frame != VIEWS[0]
 
     @cached_property
@@ -68,11 +68,10 @@ class GenericSpecies:
 
     @cached_property
     def setting(self) -> SceneSpec:
-        """A scene in which it is seen as a whole from anywhere, and not too small."""
+        """A scene in which the whole animal is visible from anywhere, at a sufficient size."""
         length = self.skeleton.length
         scale = float(np.clip(self.skeleton.relative_size, 0.3, 2.0))
-        # seen across the picture, with room to go about; no camera of this kind reads nearer than
-        # its least distance
+        # large in the image, with space to move, and not below the cameras' minimum distance
         least = ARENA.camera_mm[0] if self.sensors == SENSORS else 230.0
         near = max(
             least,
@@ -82,7 +81,7 @@ class GenericSpecies:
         return SceneSpec(camera_mm=(near, 1.6 * near), walls_mm=walls, scale=scale)
 
     def window_px(self, length_mm: float) -> int:
-        """Side of a square patch, px, that holds an animal of this mean length wherever it is.
+        """Side of a square patch, px, that contains an animal of this mean length at any position.
 
         Args:
             length_mm: mean length of the animals, mm.
@@ -99,9 +98,9 @@ class GenericSpecies:
         """Bodies of a family, varied in girth and proportions.
 
         Args:
-            rng: source of randomness.
+            rng: random number generator.
             family: one of `body.shape.FAMILIES`.
-            n: how many.
+            n: number of bodies.
 
         Returns:
             A batch of n bodies.
@@ -113,12 +112,11 @@ class GenericSpecies:
     ) -> Postures:
         """Postures within the joints' limits, smooth along the chains.
 
-        On the floor they lie as low as they can, 85 % of them, and up to 2 mm (times the scene's
-        scale) above it; those that float are anywhere from the floor to 0.55 of the camera's
-        height.
+        On the floor, 85 % lie as low as possible, up to 2 mm (times the scene's scale) above it;
+        floating animals are anywhere from the floor to 0.55 of the camera's height.
 
         Args:
-            rng: source of randomness.
+            rng: random number generator.
             size: (n,) over home size.
             shape: (n) their bodies.
             camera_mm: (n,) heights of the cameras above the floor, mm.
@@ -144,15 +142,7 @@ class GenericSpecies:
         return Postures(pose, size, np.zeros(n, np.int64))
 
     def bends(self, rng: np.random.Generator, n: int) -> Array | None:
-        """None, for its tail, if it has one, is part of the skeleton.
-
-        Args:
-            rng: not used.
-            n: not used.
-
-        Returns:
-            None.
-        """
+        """None, as a tail is part of the skeleton."""
         return None
 
     def _extent(self, pose: Pose, shape: Body, size: Array) -> tuple[Array, Array]:
@@ -161,7 +151,7 @@ class GenericSpecies:
         return z.min(axis=1), z.max(axis=1)
 
     def _fallen(self, rng: np.random.Generator, angles: Array, heading: Array, size: Array) -> Pose:
-        """Of some ways to lie the lowest one: what gravity would do; now and then any of them."""
+        """The lowest of several random tilts, as under gravity; sometimes any of them."""
         n = len(size)
         tilts = rng.normal(0.0, _TILT_RAD, (_TILTS, 2, n))
         tilts[0] = 0.0
@@ -181,17 +171,17 @@ class GenericSpecies:
 
 
 def draw_angles(rng: np.random.Generator, skeleton: Skeleton, n: int) -> Array:
-    """Joint angles about the free axes, within the limits, each like its parent's.
+    """Joint angles about the free axes, within the limits, correlated with the parent's.
 
-    A standard normal number goes down every chain; its quantile says where between the limits the
-    joint stands. A factor from a beta distribution pulls each body towards its home pose, so that
-    some are nearly straight. An axis whose range is wider than 200 degrees counts as unlimited and
-    turns by up to 45 degrees either way.
+    A standard normal number follows an AR(1) process down every chain; its quantile sets the
+    joint's position between its limits. A factor from a beta distribution pulls each body towards
+    its home pose, so that some are nearly straight. An axis whose range is wider than 200 degrees
+    counts as unlimited and turns by up to 45 degrees either way.
 
     Args:
-        rng: source of randomness.
+        rng: random number generator.
         skeleton: of the animal.
-        n: how many.
+        n: number of postures.
 
     Returns:
         (n, J, 3) rad, 0 at the base joint.
@@ -203,7 +193,7 @@ def draw_angles(rng: np.random.Generator, skeleton: Skeleton, n: int) -> Array:
     wide = high - low > 2.0 * _UNLIMITED_RAD
     low = np.where(wide, -_USUAL_RAD, low)
     high = np.where(wide, _USUAL_RAD, high)
-    bent = rng.beta(1.2, 1.0, (n, 1, 1))  # how far this body leaves its home pose
+    bent = rng.beta(1.2, 1.0, (n, 1, 1))  # deviation of this body from its home pose
     number = rng.standard_normal((n, skeleton.n_joints, 3))
     for j in range(1, skeleton.n_joints):
         p = skeleton.parents[j]
@@ -236,20 +226,20 @@ def moving_session(
     spine_mm: float | None = None,
     name: str = "moving",
 ) -> SyntheticSession:
-    """A recording of one animal that goes about and changes its posture.
+    """A recording of one animal that moves around and changes its posture.
 
-    A posture is held for about half a second and blended into the next by a Gaussian kernel; the
-    path is that of `locomotion.wander`.
+    A posture lasts about half a second and is blended into the next by a Gaussian kernel; the path
+    is that of `locomotion.wander`.
 
     Args:
-        seed: or seeds, that everything is drawn from.
+        seed: seed or seeds of all random numbers.
         n_frames: length of the recording, at the rate of `species.frame_ns`.
         species: the species.
         sensor: the camera's make; None is the last of the species'.
         family: of body shapes, see `vary_body`.
         noise: multiplies the sensor's random errors and its rate of holes.
         erosion_px: pixels stripped off the animal's outline.
-        thing_share: of the frames with a distractor in view.
+        thing_share: share of frames with a distractor.
         spine_mm: length of the animal, mm; None draws it.
         name: of the recording.
 

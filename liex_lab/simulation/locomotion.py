@@ -1,10 +1,10 @@
 """Locomotion models of a walking mouse and a swimming fish: random walks in an arena.
 
 Headings follow a correlated random walk, an AR(1) turning rate or a script of turns, with a pull
-towards the middle that grows near walls; a step that would leave the arena is not taken. Postures
+towards the centre that grows near walls; a step that would leave the arena is rejected. Postures
 are drawn stretch by stretch from the animal's pose prior and blended by a Gaussian kernel. The
 mouse walks, turns, pauses, rears, hunches and curls. The fish swims burst and glide: its speed
-decays as exp(-t / 0.35 s) between bouts, a bend begins in front and a wave runs from head to tail
+decays as exp(-t / 0.35 s) between bouts, bends begin in front and a wave runs from head to tail
 while it scoots, glides, turns, rises, dives and rests.
 """
 
@@ -29,8 +29,8 @@ Script = Callable[[np.random.Generator, int], tuple[NDArray[np.int64], Array]]
 Path = Callable[[np.random.Generator, SimulatedScene, float, Array], tuple[Array, Array]]
 
 _RATE_HZ = 30.0
-# the stretches of a walk: how many in a shuffled deck, shortest and longest duration in s, speed in
-# spines a second
+# stretches of a walk: number in a shuffled deck, shortest and longest duration in s, speed in
+# spines per second
 _WALK, _CURL, _REAR, _HUNCH, _REACH = range(len(KINDS))
 _STRETCHES = {
     _WALK: (4, 0.7, 3.0, (0.6, 2.8)),
@@ -39,21 +39,21 @@ _STRETCHES = {
     _HUNCH: (1, 1.0, 3.0, (0.0, 0.0)),
     _REACH: (2, 0.4, 1.2, (0.0, 0.4)),
 }
-_BLEND_S = 0.12  # postures flow into one another over about this long
+_BLEND_S = 0.12  # time constant of the blend between postures
 _STRIDE_HZ_PER_SPINE = 1.6
 
-_NEAREST_MM = 180.0  # to the camera
-# of beating, and of gliding or hanging still between
+_NEAREST_MM = 180.0  # smallest distance to the camera
+# durations of beating, and of gliding or resting in between
 _BOUT_S = (0.15, 0.6)
 _REST_S = (0.1, 1.2)
-_GLIDE_S = 0.35  # a glide has slowed down by a factor e after this long
+_GLIDE_S = 0.35  # time constant of a glide's speed
 _LENGTHS_S = (1.0, 5.0)  # speed that a bout reaches
 _BEAT_HZ = (4.0, 9.0)
-# of the bouts begin with a turn, which lasts _TURN_S
+# share of bouts that begin with a turn, which lasts _TURN_S
 _TURN_SHARE = 0.35
 _TURN_RAD_S = (4.0, 16.0)
 _TURN_S = 0.14
-_BEND_PER_TURN = 0.55  # degrees a joint for each rad/s of turning
+_BEND_PER_TURN = 0.55  # degrees per joint for each rad/s of turning
 _CLIMB_RAD = np.radians(25.0)
 
 
@@ -70,18 +70,18 @@ def walking_session(
     species: MouseSpecies | None = None,
     name: str = "walking",
 ) -> SyntheticSession:
-    """A recording of one mouse that goes about at 30 frames/s, drawn from the seed.
+    """A recording of one mouse that moves around at 30 frames/s, drawn from the seed.
 
     Args:
-        seed: or seeds, that everything is drawn from.
+        seed: seed or seeds of all random numbers.
         n_frames: length of the recording.
         sensor: the camera's make.
         family: of body shapes, see `draw_shapes`.
         noise: multiplies the sensor's random errors and its rate of holes.
         erosion_px: pixels stripped off the animal's outline.
-        thing_share: of the frames with a distractor in view.
+        thing_share: share of frames with a distractor.
         spine_mm: length of the animal, mm; None draws it.
-        species: the species; None the preset mouse.
+        species: the species; None is the preset mouse.
         name: of the recording.
 
     Returns:
@@ -129,18 +129,18 @@ def walk(
     script: Script | None = None,
     path: Path | None = None,
 ) -> tuple[Pose, Array]:
-    """How one mouse goes about in an arena, frame by frame at 30 frames/s.
+    """The motion of one mouse in an arena, at 30 frames/s.
 
     Args:
-        rng: source of randomness; postures are drawn before the path, so that one seed gives the
+        rng: random number generator; postures are drawn before the path, so that one seed gives the
             same postures in every arena.
         scene: the arena.
         species: the species.
         shape: its body, a batch of one.
         spine_mm: its length, mm.
-        n_frames: how many frames.
-        script: what it does and how fast it goes, see `walk_script`, the usual one where None.
-        path: where it goes at that speed, see `free_path`, the usual one where None.
+        n_frames: number of frames.
+        script: its activity and speed; None is `walk_script`.
+        path: its path at that speed; None is `free_path`.
 
     Returns:
         Poses (n_frames) in the arena frame, and girths (n_frames,).
@@ -171,11 +171,11 @@ def walk(
 
 
 def walk_script(rng: np.random.Generator, n: int) -> tuple[NDArray[np.int64], Array]:
-    """What a mouse does in each frame, and how fast it goes: stretches of all kinds of posture.
+    """Activity and speed of a mouse in each frame: stretches of all kinds of posture.
 
     Args:
-        rng: source of randomness.
-        n: how many frames.
+        rng: random number generator.
+        n: number of frames.
 
     Returns:
         Kinds of posture (n,), indices into `pose_prior.KINDS`, and speeds (n,), spines/s.
@@ -185,7 +185,7 @@ def walk_script(rng: np.random.Generator, n: int) -> tuple[NDArray[np.int64], Ar
     deck: list[int] = []
     at = 0
     while at < n:
-        if not deck:  # dealt out before it is shuffled again, so that nothing is long absent
+        if not deck:  # used up before it is shuffled again, so that no kind is absent for long
             deck = [
                 int(k)
                 for k in rng.permutation(
@@ -204,9 +204,7 @@ def walk_script(rng: np.random.Generator, n: int) -> tuple[NDArray[np.int64], Ar
 def _flow(
     rng: np.random.Generator, skeleton: Skeleton, shape: BodyShape, kinds: NDArray[np.int64]
 ) -> Posture:
-    """One posture a stretch, held with slow changes within it, and blended where the next
-    begins.
-    """
+    """One posture per stretch, with slow changes within it, blended into the next."""
     drawn = draw_postures(rng, skeleton, kinds, shape)
     n = len(kinds)
     change = np.concatenate([[True], (kinds[1:] != kinds[:-1]) | (rng.random(n - 1) < 0.04)])
@@ -217,7 +215,7 @@ def _flow(
 
 
 def _smooth(rows: Array) -> Array:
-    """Columns of (n, k) passed through a bell of _BLEND_S, ends held."""
+    """Columns of (n, k) convolved with a Gaussian of _BLEND_S, with constant extension."""
     reach = int(4 * _BLEND_S * _RATE_HZ)
     bell = np.exp(-0.5 * (np.arange(-reach, reach + 1) / (_BLEND_S * _RATE_HZ)) ** 2)
     padded = np.pad(rows, ((reach, reach), (0, 0)), mode="edge")
@@ -229,16 +227,16 @@ def _smooth(rows: Array) -> Array:
 def free_path(
     rng: np.random.Generator, scene: SimulatedScene, spine_mm: float, speed: Array
 ) -> tuple[Array, Array]:
-    """A mouse that wanders, and turns back before a wall.
+    """The path of a mouse that wanders and turns back before walls.
 
     Args:
-        rng: source of randomness.
+        rng: random number generator.
         scene: the arena.
         spine_mm: length of the animal, mm.
         speed: (n,) mm/s.
 
     Returns:
-        Positions (n, 2) of the body's middle, mm, arena frame, and headings (n,) rad.
+        Positions (n, 2) of the body's centre, mm, arena frame, and headings (n,) rad.
     """
     n = len(speed)
     camera = scene.camera
@@ -259,7 +257,7 @@ def free_path(
         back = np.arctan2(home[1] - at[1], home[0] - at[0])
         away = (back - azimuth + np.pi) % (2 * np.pi) - np.pi
         close = np.clip(1.0 - (scene.freedom(at) - margin) / (0.8 * spine_mm), 0.0, 1.0)
-        # it turns back faster the faster it goes, and stays within a mouse's turning rate
+        # it turns back faster at higher speed, within a mouse's turning rate
         pull = 6.0 * close * np.clip(away, -1.0, 1.0) * min(speed[i] / spine_mm, 1.0)
         azimuth += (
             np.clip(rate * (0.2 + min(speed[i] / spine_mm, 1.0)) + pull, -7.0, 7.0) / _RATE_HZ
@@ -288,15 +286,15 @@ def swimming_session(
     """A recording of one fish that swims in bouts at 50 frames/s, drawn from the seed.
 
     Args:
-        seed: or seeds, that everything is drawn from.
+        seed: seed or seeds of all random numbers.
         n_frames: length of the recording.
         sensor: the camera's make.
         family: of body shapes, see `vary_body`.
         noise: multiplies the sensor's random errors and its rate of holes.
         erosion_px: pixels stripped off the animal's outline.
-        thing_share: of the frames with a distractor in view.
+        thing_share: share of frames with a distractor.
         spine_mm: length of the fish, mm; None draws it.
-        species: the species; None the preset zebrafish.
+        species: the species; None is the preset zebrafish.
         name: of the recording.
 
     Returns:
@@ -315,7 +313,7 @@ def swimming_session(
     step_s = species.frame_ns * 1e-9
     speed, turning, amplitude, beat = _swim_script(rng, n_frames, step_s)
     middle = np.full(n_frames, 0.47)
-    # a turn begins in front and leaves the body at the tail; the wave runs from head to tail
+    # turns and waves run from head to tail
     hind = np.concatenate([np.zeros(2), turning[:-2]]) if n_frames > 2 else turning
     yaw = bend_profile(
         skeleton,
@@ -363,8 +361,9 @@ def swimming_session(
 def _swim_script(
     rng: np.random.Generator, n: int, step_s: float
 ) -> tuple[Array, Array, Array, Array]:
-    """Speed (n,) in lengths/s, turning (n,) rad/s, amplitude (n,) degrees a joint and phase (n,)
-    rad of the tail.
+    """Speed, turning, and the tail's amplitude and phase, each (n,).
+
+    In body lengths/s, rad/s, degrees per joint and rad.
     """
     speed, turning, amplitude, rate = np.zeros((4, n))
     at = 0
@@ -409,21 +408,21 @@ def wander(
 ) -> tuple[Array, Array]:
     """Path of an animal through a scene, between two heights, and its headings.
 
-    The heading integrates `turning` and a pull towards the middle of the picture near walls and the
-    picture's border; where there is no way on, the animal stays.
+    The heading integrates `turning` and a pull towards the image centre near walls and the image
+    border; a step without free space is rejected.
 
     Args:
-        rng: source of randomness.
+        rng: random number generator.
         scene: the scene with walls and camera.
         length: of the animal, mm.
         speed: (n,) body lengths/s.
         turning: (n,) rad/s, positive to the left.
         pitch: (n,) rad, positive upwards.
-        water: lowest and highest middle of the body, mm above the floor.
+        water: lowest and highest position of the body's centre, mm above the floor.
         step_s: between two frames, s.
 
     Returns:
-        Positions (n, 3) of the body's middle, mm, arena frame, and headings (n,) rad.
+        Positions (n, 3) of the body's centre, mm, arena frame, and headings (n,) rad.
     """
     n = len(speed)
     centre = scene.camera.unproject(
@@ -457,7 +456,7 @@ def wander(
 
 
 def smoothed(rows: Array, frames: float) -> Array:
-    """Columns convolved with a Gaussian kernel, the end values held beyond both ends.
+    """Columns convolved with a Gaussian kernel, with the end values extended.
 
     Args:
         rows: (n, k) samples.

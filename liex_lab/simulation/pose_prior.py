@@ -1,9 +1,9 @@
-"""Pose prior of a mouse-like animal: a mixture of five kinds of posture that stand on the floor.
+"""Pose prior of a mouse-like animal: a mixture of five kinds of posture on the floor.
 
-A posture is drawn as bone elevations and turns, going about, curled up, reared up, hunched or
-reaching (`KINDS`, with the weights `SHARES`), and then put on the plane z = 0 by forward
-kinematics: the rear of the trunk touches the floor, and a front that would sink below it tips the
-animal up around its rump (`stand`). Stretch preserves volume: girth is size / sqrt(stretch).
+A posture is drawn as bone elevations and turns: walking, curled up, reared up, hunched or reaching
+(`KINDS`, with the weights `SHARES`). It is then placed on the plane z = 0 by forward kinematics:
+the rear of the trunk touches the floor, and if the front would be below it, the animal is tilted up
+around its rump (`stand`). Stretch preserves volume: girth is size / sqrt(stretch).
 """
 
 from __future__ import annotations
@@ -22,19 +22,18 @@ from liex_lab.geometry import SE3, so3
 
 Array = NDArray[np.float64]
 
-# share of frames: going about, curled up, reared up, hunched (grooming, eating), reaching with the
-# head
+# share of frames: walking, curled up, reared up, hunched (grooming, eating), reaching with the head
 KINDS = ("walk", "curl", "rear", "hunch", "reach")
 SHARES = (0.42, 0.17, 0.17, 0.10, 0.14)
 STRETCH = (0.93, 1.07)  # of the spine, from frame to frame
 SIZE_RANGE = (0.9, 1.1)  # of animals, over the skeleton's own size
-_REAR_PART = 0.35  # of the tube, from the tail: what carries a reared animal
+_REAR_PART = 0.35  # rear part of the trunk that supports a reared animal
 _MAX_GAP_MM = 3.0  # between the floor and the lowest point of the body
 
 
 @dataclass(frozen=True)
 class Posture:
-    """What a posture is before it stands anywhere, n of them.
+    """n postures without position and heading.
 
     Attributes:
         elevation: (n, J - 1) of the bones above the floor, rad.
@@ -62,11 +61,11 @@ def sample_postures(
     A stretched animal is thinner, a compressed one fatter.
 
     Args:
-        rng: source of randomness.
+        rng: random number generator.
         skeleton: of the animal.
-        n: how many.
+        n: number of postures.
         size: (n,) of the animals over home size, or one for all.
-        shape: (n) their bodies; None the default one.
+        shape: (n) their bodies; None is the default one.
         kinds: (n,) int64, indices into `KINDS`; None draws them by `SHARES`.
 
     Returns:
@@ -87,13 +86,13 @@ def draw_postures(
     """Postures of given kinds, for bodies of given shapes.
 
     Args:
-        rng: source of randomness.
+        rng: random number generator.
         skeleton: of the animal.
         kinds: (n,) int64, indices into `KINDS`.
-        shape: (n) the bodies, whose thickness sets how high the mid-axis lies.
+        shape: (n) the bodies, whose thickness sets the height of the mid-axis.
 
     Returns:
-        n postures that do not stand anywhere yet; see `stand`.
+        n postures that are not placed yet; see `stand`.
     """
     n = len(kinds)
     n_bones = skeleton.n_joints - 1
@@ -101,18 +100,11 @@ def draw_postures(
     rest = resting_heights(skeleton, shape)
 
     def is_kind(name: str) -> NDArray[np.bool_]:
-        """Which postures are of a kind.
-
-        Args:
-            name: a word of `KINDS`.
-
-        Returns:
-            (n, 1) bool.
-        """
+        """Mask (n, 1) of the postures of a kind, a word of `KINDS`."""
         return (kinds == KINDS.index(name))[:, None]
 
-    # going about: the mid-axis lies as high as the body is thick, a little more towards the front;
-    # the nose is low
+    # walking: the mid-axis is at half the body's thickness, slightly higher in front; the nose is
+    # low
     height = rest + np.linspace(0.5, 4.0, n_bones + 1) * rng.random((n, n_bones + 1))
     height[:, -1] = rng.uniform(4.0, 15.0, n)
     low = np.arcsin(np.clip(np.diff(height, axis=1) / bones, -0.9, 0.9))
@@ -144,8 +136,9 @@ def _draw_turns(
     curled: NDArray[np.bool_],
     reaching: NDArray[np.bool_],
 ) -> Array:
-    """Turns (n, J) rad to the left at the joints: slight, or up to 100 degrees in all, and the
-    head's own.
+    """Turns (n, J) rad to the left at the joints: slight or curled, plus those of the head.
+
+    A curl is 30 to 100 degrees in total.
     """
     n = len(curled)
     inner = skeleton.n_joints - 2
@@ -162,7 +155,7 @@ def _draw_turns(
 
 
 def resting_heights(skeleton: Skeleton, shape: BodyShape) -> Array:
-    """Heights at which the joints lie when the trunk just touches the floor under each.
+    """Heights of the joints when the trunk just touches the floor below each.
 
     Args:
         skeleton: of the animal, with stations in its [surface] table.
@@ -179,10 +172,10 @@ def resting_heights(skeleton: Skeleton, shape: BodyShape) -> Array:
 def stand(
     skeleton: Skeleton, posture: Posture, heading: Array, size: Array, shape: BodyShape, gap: Array
 ) -> tuple[Pose, Array]:
-    """Put postures on the floor z = 0, rump above the origin.
+    """Place postures on the floor z = 0, rump above the origin.
 
-    The rear part of the trunk comes to lie `gap` above the floor; where the front would go below
-    it, the whole animal tips up around the rump, in at most six rounds.
+    The rear part of the trunk is `gap` above the floor; if the front would be below it, the whole
+    animal is tilted up around the rump, in at most six iterations.
 
     Args:
         skeleton: of the animal.
@@ -233,7 +226,7 @@ def stand(
 
 
 def root_rotation(heading: Array, elevation: Array, roll: Array) -> Array:
-    """Rotations of a base that heads, then rises, then rolls: Rz(heading) Ry(-elevation) Rx(roll).
+    """Rotations of a base: Rz(heading) Ry(-elevation) Rx(roll).
 
     Args:
         heading: (n,) about the vertical, rad.
@@ -251,7 +244,7 @@ def root_rotation(heading: Array, elevation: Array, roll: Array) -> Array:
 
 @njit(cache=True, parallel=True)
 def _lowest_points(joints, rotations, girth, stations, half_width, half_height, out):
-    """Fill out (n, R) mm with the lowest point of the trunk's ellipse at every station.
+    """Fill out (n, R) with the lowest point of the trunk's ellipse at every station, mm.
 
     Args:
         joints: (n, J, 3) mm.
@@ -260,7 +253,7 @@ def _lowest_points(joints, rotations, girth, stations, half_width, half_height, 
         stations: (R,) along the spine, over its length.
         half_width: (n, R) mm.
         half_height: (n, R) mm.
-        out: (n, R) filled, mm.
+        out: (n, R) output, mm.
     """
     for i in prange(len(joints)):
         arc = np.empty(joints.shape[1])

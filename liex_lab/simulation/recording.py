@@ -1,11 +1,11 @@
 """Synthetic depth recordings with exact truth: a posed mesh in an arena through a sensor model.
 
-A `SyntheticSession` ray-casts the floor and walls once, rasterises the animal's mesh over them
-frame by frame with a z-buffer, and passes each ideal picture through the sensor's noise model.
-Frames are made when asked for, from a seed, in any order. `test_split` holds the fixed splits on
-which accuracy is reported: 'clean', 'hard' (twice the noise, an eroded outline, other objects),
-'other-body' (builds that no model is trained on), 'other-camera' (focal lengths and resolutions
-that no model is trained on), and 'sealed', which is measured once.
+A `SyntheticSession` ray-casts the floor and walls once, rasterises the animal's mesh frame by frame
+with a z-buffer, and passes each ideal depth image through the sensor's noise model. Frames are
+rendered on demand from a seed, in any order. `test_split` makes the fixed splits for which accuracy
+is reported: 'clean', 'hard' (twice the noise, an eroded outline, other objects), 'other-body'
+(builds not used in training), 'other-camera' (focal lengths and resolutions not used in training),
+and the held-out split 'sealed'.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ Array = NDArray[np.float64]
 FRAME_NS = MouseSpecies.frame_ns
 N_SESSIONS = 40
 N_FRAMES = 50
-OTHER_CAMERA = "other-camera"  # focal lengths and resolutions that no model was trained on
+OTHER_CAMERA = "other-camera"  # focal lengths and resolutions not used in training
 # name: (own seed, shape family, noise, eroded pixels, share of frames with another object in view)
 SPLITS = {
     "clean": (71_001, "train", 1.0, 0, 0.0),
@@ -42,15 +42,15 @@ SPLITS = {
     "other-body": (74_001, "other", 1.0, 0, 0.0),
     OTHER_CAMERA: (75_001, "train", 1.0, 0, 0.0),
 }
-# no test, no training and no development looks at these recordings: they are measured once, when
-# an issue ends. Like the splits above in turn, each drawn from a seed of its own
+# held-out recordings, not used in tests, training or development: evaluated once per issue. They
+# are like the splits above in turn, each with its own seed
 SEALED = "sealed"
 _SEALED_SEED = 970_413
 
 
 @dataclass(frozen=True)
 class FrameContents:
-    """Everything that moves before a virtual camera, and the camera's own errors, in n frames.
+    """All moving contents of n frames of a virtual camera, and the sensor's noise.
 
     Attributes:
         skeleton: of the animal.
@@ -58,9 +58,9 @@ class FrameContents:
         pose: (n) arena frame.
         girth: (n,) factor of all lengths across the body.
         shape: body of the one animal.
-        bends: (n, TAIL_RINGS) rad, how its tail lies; None without a tail of its own.
+        bends: (n, TAIL_RINGS) bends of its tail, rad; None without a separate tail.
         things: (n, V, 3) meshes of the distractors, mm, arena frame.
-        shown: (n,) bool, in which frames the distractors are there.
+        shown: (n,) bool, whether the distractors are present.
         parameters: (n, N_PARAMETERS) of the sensor.
         seeds: (n,) uint64, of the sensor's noise.
         thing_faces: (F, 3) int32, triangles of the distractors' meshes.
@@ -90,7 +90,7 @@ class TrueRecording(Recording):
         joints_camera: (n, J, 3) joints, mm, camera frame.
         joints_arena: (n, J, 3) joints, mm, arena frame.
         T_arena_camera: exact transform from the camera frame into the arena frame.
-        floor: the exact plane, or what stands for it.
+        floor: the exact floor plane, or its substitute.
     """
 
     skeleton: Skeleton
@@ -103,23 +103,23 @@ class TrueRecording(Recording):
     floor: Floor
 
     def depths(self, start: int, stop: int) -> NDArray[np.float32]:
-        """Depth pictures of a range of frames, made on all threads.
+        """Depth images of a range of frames, rendered on all threads.
 
         Args:
             start: first frame.
             stop: one past the last frame.
 
         Returns:
-            (stop - start, H, W) float32 mm, 0 where unread.
+            (stop - start, H, W) float32 mm, 0 if unread.
         """
         raise NotImplementedError
 
     def chunks(self, n_frames: int, first: int = 0) -> Iterator[list[DepthFrame]]:
-        """The frames in lists, each list made on all threads.
+        """The frames in lists, each list rendered on all threads.
 
         Args:
-            n_frames: frames a list; the last may be shorter.
-            first: frame to begin with.
+            n_frames: frames per list; the last may be shorter.
+            first: first frame.
 
         Yields:
             Lists of depth frames in order of time.
@@ -137,7 +137,7 @@ class SyntheticSession(TrueRecording):
 
     Attributes:
         scene: the still scene and its camera.
-        contents: what moves in it, and the sensor's errors.
+        contents: the moving contents, and the sensor's noise.
         shape: the animal's body.
     """
 
@@ -148,12 +148,12 @@ class SyntheticSession(TrueRecording):
         contents: FrameContents,
         times_ns: NDArray[np.int64] | None = None,
     ) -> None:
-        """Put moving contents into a still scene.
+        """Combine moving contents with a still scene.
 
         Args:
             name: of the recording.
             scene: the still scene and its camera.
-            contents: what moves in it, n frames.
+            contents: the moving contents, n frames.
             times_ns: (n,) int64 time stamps, ns; None counts steps of `FRAME_NS`.
         """
         n = len(contents.seeds)
@@ -180,14 +180,14 @@ class SyntheticSession(TrueRecording):
         return self.depths(index, index + 1)[0]
 
     def depths(self, start: int, stop: int) -> NDArray[np.float32]:
-        """Depth pictures of a range of frames, made on all threads.
+        """Depth images of a range of frames, rendered on all threads.
 
         Args:
             start: first frame.
             stop: one past the last frame.
 
         Returns:
-            (stop - start, H, W) float32 mm, 0 where unread.
+            (stop - start, H, W) float32 mm, 0 if unread.
         """
         contents = self.contents
         part = slice(start, stop)
@@ -238,16 +238,16 @@ class SyntheticSession(TrueRecording):
         Camera, arena and animal are the same in all frames.
 
         Args:
-            seed: or seeds, that everything is drawn from.
+            seed: seed or seeds of all random numbers.
             n_frames: length of the session.
             sensor: the camera's make; None draws one of the animal's.
             family: of body shapes, see `draw_shapes`.
             noise: multiplies the sensor's random errors and its rate of holes, see `Sensor.draw`.
             erosion_px: pixels stripped off the animal's outline, see `Sensor.draw`.
-            thing_share: of the frames with a distractor in view.
+            thing_share: share of frames with a distractor.
             spine_mm: length of the animal, mm; None draws it.
-            species: the species; None a mouse.
-            name: of the recording; None takes one after the sensor.
+            species: the species; None is a mouse.
+            name: of the recording; None names it after the sensor.
 
         Returns:
             The session with its truth.
@@ -299,24 +299,24 @@ def assemble(
     thing_share: float,
     scatter: bool,
 ) -> FrameContents:
-    """Put postures of one animal into a scene, with a distractor beside it and its sensor's errors.
+    """Place postures of one animal in a scene, with a distractor and the sensor's noise.
 
     Args:
-        rng: source of randomness.
+        rng: random number generator.
         scene: the still scene.
         sensor: the camera's make, of which one unit is drawn.
         species: the species.
         spine_mm: length of the animal, mm.
         shape: its body, a batch of one.
-        pose: (n) arena frame; the root translations are changed in place where `scatter` is set.
+        pose: (n) arena frame; root translations are changed in place if `scatter` is set.
         girth: (n,) factor of all lengths across the body.
         noise: multiplies the sensor's random errors and its rate of holes.
         erosion_px: pixels stripped off the animal's outline.
-        thing_share: of the frames with a distractor in view.
-        scatter: move each posture to a free position of its own on the floor.
+        thing_share: share of frames with a distractor.
+        scatter: move each posture to its own free position on the floor.
 
     Returns:
-        What moves in front of the camera in n frames.
+        The moving contents of n frames.
     """
     n = len(girth)
     surface = Surface.of(species.skeleton)
@@ -345,10 +345,10 @@ def _beside(
     species: Species,
     stride: int,
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """One distractor for a session, at a free position of its own in every frame.
+    """One distractor for a session, at an individual free position in every frame.
 
     Returns:
-        Its meshes (n, V, 3) mm and where it is shown (n,).
+        Its meshes (n, V, 3) mm and whether it is shown (n,).
     """
     mesh = draw_thing(rng, str(rng.choice(species.things)), spine_mm)
     n = len(trunk)
@@ -361,7 +361,7 @@ def _beside(
             shift = scene.centre + rng.uniform(-1.0, 1.0, 2) * reach
             outline = mesh[::3, :2] + shift
             gap = np.linalg.norm(outline[:, None] - own, axis=-1).min()
-            # a hand reaches over the wall; anything else stands within
+            # a hand reaches over the wall; other objects are inside
             within = mesh[:, 2].max() > 0.6 * spine_mm or scene.wall_clearance(shift) > 0
             free = bool(gap > 8.0 * species.setting.scale and within)
             if free and not _covers(scene, things[i] + [*shift, 0.0], trunk[i], 4.0 * stride):
@@ -373,7 +373,7 @@ def _beside(
 
 
 def _covers(scene: SimulatedScene, thing: Array, trunk: Array, margin_px: float) -> bool:
-    """Whether the distractor and the animal overlap in the picture or nearly so."""
+    """Whether the distractor and the animal overlap in the image, or nearly so."""
     T_camera_arena = scene.T_arena_camera.inverse()
     a = scene.camera.project(T_camera_arena @ thing)
     b = scene.camera.project(T_camera_arena @ trunk)
@@ -390,16 +390,15 @@ def test_split(
     species: Species | None = None,  # noqa: PT028
     seed: int | None = None,  # noqa: PT028
 ) -> list[SyntheticSession]:
-    """The sessions of a fixed split: 40 of 50 frames, as many from each sensor.
+    """The sessions of a fixed split: 40 of 50 frames, equally from each sensor.
 
     Args:
         name: 'clean', 'hard', 'other-body' or 'other-camera', a key of `SPLITS`; or 'sealed', see
             `SEALED`.
         spine_mm: length of every animal, mm; None draws it.
-        n_sessions: takes only the first so many.
-        species: the species; None a mouse.
-        seed: another one makes recordings like those of the split, to develop on; None is the
-            split's own.
+        n_sessions: number of sessions, from the first on.
+        species: the species; None is a mouse.
+        seed: another seed makes similar recordings for development; None is the split's own.
 
     Returns:
         The sessions, session k named after the split and k.
@@ -434,7 +433,7 @@ def test_split(
 
 
 def split_of(name: str, k: int) -> str:
-    """The split that recording k of a split is like: itself, but of 'sealed' each split in turn.
+    """The kind of recording k of a split: the split itself; for 'sealed', each split in turn.
 
     Args:
         name: of the split.

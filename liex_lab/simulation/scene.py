@@ -1,10 +1,10 @@
-"""Ray-cast model of an arena before a depth camera: floor, walls, clutter, free positions.
+"""Ray-cast model of an arena in front of a depth camera: floor, walls, clutter, free positions.
 
 Floor and walls are intersected analytically with the ray of every pixel: the plane z = 0 raised by
-a few long sine waves, a vertical cylinder or a turned box for the walls, and a rounding
-exp(-distance / spread) at their foot, as multi-path reflections leave it. Clutter is rasterised on
+a few long sine waves, a vertical cylinder or a rotated box for the walls, and a rounding
+exp(-distance / spread) at their foot, as caused by multi-path reflections. Clutter is rasterised on
 top. Free positions for an animal are found by rejection sampling against the signed distance from
-the walls, the clutter and the border of the picture.
+the walls, the clutter and the image border.
 
 Arena frame: z up from the floor, the origin at the foot of the camera's perpendicular.
 """
@@ -46,12 +46,12 @@ PART_FACES = joined_faces([(_RINGS, _SEGMENTS)])
 
 
 def rounded(centre: Array, radii: Array, yaw: Array, power: Array) -> Array:
-    """Vertices of superellipsoids, turned about the vertical.
+    """Vertices of superellipsoids, rotated about the vertical.
 
     Args:
         centre: (..., 3) centres, mm.
         radii: (..., 3) half axes, mm.
-        yaw: (...) turn about the z axis, rad.
+        yaw: (...) rotation about the z axis, rad.
         power: (...) exponent; 2 is an ellipsoid, a large power a block.
 
     Returns:
@@ -76,7 +76,7 @@ def rounded(centre: Array, radii: Array, yaw: Array, power: Array) -> Array:
 def _pellet(
     rng: np.random.Generator, spine_mm: float, centre: Array, radii: Array, yaw: Array
 ) -> None:
-    """A lump of food on its way down."""
+    """A sinking lump of food."""
     radii[0] = spine_mm * rng.uniform(0.04, 0.13) * rng.uniform(0.7, 1.0, 3)
     centre[0, 2] = radii[0, 2] + spine_mm * rng.uniform(0.0, 2.0)
 
@@ -84,7 +84,7 @@ def _pellet(
 def _plant(
     rng: np.random.Generator, spine_mm: float, centre: Array, radii: Array, yaw: Array
 ) -> None:
-    """A tuft of thin leaves that stand in the water."""
+    """A tuft of thin leaves in the water."""
     for k in range(N_PARTS):
         tall = spine_mm * rng.uniform(0.3, 0.9)
         radii[k] = [spine_mm * rng.uniform(0.02, 0.05), spine_mm * rng.uniform(0.03, 0.10), tall]
@@ -95,7 +95,7 @@ def _plant(
 def _fish(
     rng: np.random.Generator, spine_mm: float, centre: Array, radii: Array, yaw: Array
 ) -> None:
-    """Another fish, well smaller than the animal: a body and a tail."""
+    """Another fish, much smaller than the animal: a body and a tail."""
     long = spine_mm * rng.uniform(0.30, 0.55)
     heading = rng.uniform(-np.pi, np.pi)
     ahead = np.array([np.cos(heading), np.sin(heading)])
@@ -112,16 +112,15 @@ _IN_WATER = {"pellet": _pellet, "plant": _plant, "fish": _fish}
 
 
 def draw_thing(rng: np.random.Generator, kind: str, spine_mm: float) -> Array:
-    """Vertices of one random object that stands on the floor around the origin.
+    """Vertices of one random object on the floor around the origin.
 
-    Blocks and balls are from a third of to somewhat over the animal's size; pellets sink, plants
-    stand and another fish swims in a tank. Unused parts shrink to nothing.
+    Blocks and balls are from a third of to slightly over the animal's size; in a tank there are
+    sinking pellets, plants and another swimming fish. Unused parts have zero size.
 
     Args:
-        rng: source of randomness.
+        rng: random number generator.
         kind: 'block', 'ball', 'cable', 'pellet', 'plant' or 'fish'; anything else is a hand.
-        spine_mm: length of the animal, mm, which sets the size; cable and hand have one of their
-            own.
+        spine_mm: length of the animal, mm, which sets the size; cables and hands have their own.
 
     Returns:
         (N_PARTS * V, 3) mm, arena frame, with triangles as in `THING_FACES`.
@@ -171,22 +170,22 @@ def draw_thing(rng: np.random.Generator, kind: str, spine_mm: float) -> Array:
 
 ROUND = "round"
 BOX = "box"
-_EDGE_PX = 6.0  # an animal stays this far inside the picture
-_WALL_MM = 3.0  # and its trunk this far from walls
-_CLUTTER_MM = 12.0  # and from what stands around
+_EDGE_PX = 6.0  # minimum distance of an animal from the image border
+_WALL_MM = 3.0  # and of its trunk from walls
+_CLUTTER_MM = 12.0  # and from clutter
 _TRIES = 64
 
 
 @dataclass(frozen=True)
 class SceneSpec:
-    """What surrounds an animal, as ranges to draw a scene from; lengths in mm.
+    """Ranges of an animal's surroundings, from which a scene is drawn; lengths in mm.
 
     Attributes:
         camera_mm: lowest and highest camera above the floor.
         tilt_rad: largest tilt of a camera, rad.
         walls_mm: lowest and highest walls.
-        open_share: of the scenes that have no walls.
-        clutter: kinds of objects that stand around, see `objects.draw_thing`.
+        open_share: share of scenes without walls.
+        clutter: kinds of objects in the scene, see `objects.draw_thing`.
         scale: of corners, unevenness, distances and estimation errors, over those of a mouse's
             arena.
     """
@@ -204,7 +203,7 @@ ARENA = SceneSpec()
 
 @dataclass(frozen=True)
 class SimulatedScene:
-    """The still scene that a virtual camera looks at.
+    """The still scene of a virtual camera.
 
     Attributes:
         camera: the camera.
@@ -212,9 +211,9 @@ class SimulatedScene:
         kind: 'round' or 'box', the outline of the walls.
         centre: (2,) of the walls in the arena frame, mm.
         half: (2,) half extents of the walls (or their radius, twice), mm.
-        yaw: turn of the walls, rad.
+        yaw: rotation of the walls, rad.
         wall_mm: height of the walls, mm; 0 is an open table.
-        clutter: (n, 2) outline points of what stands around, mm, arena frame.
+        clutter: (n, 2) outline points of the clutter, mm, arena frame.
         still: (H, W) float32 mm, the ideal depth without the animal, 0 = nothing in range.
     """
 
@@ -238,13 +237,13 @@ class SimulatedScene:
         two pieces of clutter near the wall.
 
         Args:
-            rng: source of randomness.
-            camera: the camera that looks at it.
+            rng: random number generator.
+            camera: the camera.
             spine_mm: length of the animal, mm.
             setting: ranges to draw from.
 
         Returns:
-            The scene with its ideal depth picture.
+            The scene with its ideal depth image.
         """
         T = draw_views(rng, 1, setting)
         T_arena_camera = SE3(T.rotation[0], T.translation[0])
@@ -280,7 +279,7 @@ class SimulatedScene:
     def _furnished(
         self, rng: np.random.Generator, spine_mm: float, setting: SceneSpec
     ) -> SimulatedScene:
-        """The same with its still picture, and in a third one or two objects near the wall."""
+        """The scene with its depth image, and in a third of cases with one or two objects."""
         still = self._ideal_depth(rng, setting.scale)
         T_camera_arena = self.T_arena_camera.inverse()
         outline = []
@@ -307,13 +306,13 @@ class SimulatedScene:
 
     @staticmethod
     def _turned(xy: Array, yaw: float) -> Array:
-        """Points (..., 2) turned by yaw rad."""
+        """Points (..., 2) rotated by yaw rad."""
         c = np.cos(yaw)
         s = np.sin(yaw)
         return np.stack([c * xy[..., 0] - s * xy[..., 1], s * xy[..., 0] + c * xy[..., 1]], axis=-1)
 
     def wall_clearance(self, xy: Array) -> Array:
-        """Signed distance of points of the floor from the walls, mm; negative outside.
+        """Signed distance of floor points from the walls, mm; negative outside.
 
         Args:
             xy: (..., 2) points, mm, arena frame.
@@ -327,14 +326,14 @@ class SimulatedScene:
         return np.min(self.half - np.abs(local), axis=-1)
 
     def freedom(self, xy: Array, z: float = 0.0) -> float:
-        """Distance of one point from walls, clutter and the border of the picture, mm.
+        """Distance of one point from walls, clutter and the image border, mm.
 
         Args:
             xy: (2,) point, mm, arena frame.
             z: its height above the floor, mm.
 
         Returns:
-            The least of the three; the border's counts at the point's own depth. Negative outside.
+            The smallest of the three; the border's is at the point's own depth. Negative outside.
         """
         c = self.camera
         p = self.T_arena_camera.inverse() @ np.array([xy[0], xy[1], z])
@@ -348,8 +347,8 @@ class SimulatedScene:
     def _ideal_depth(self, rng: np.random.Generator, scale: float) -> NDArray[np.float32]:
         """Depth (H, W) mm along every ray: floor within the walls, walls up to their height.
 
-        Beyond an open table the floor goes on; beyond walls there is nothing, or in 40 % of the
-        scenes the untidy surroundings of the arena.
+        The floor continues beyond an open table; beyond walls there is nothing, or in 40 % of the
+        scenes the cluttered surroundings of the arena.
         """
         T = self.T_arena_camera
         camera = self.camera
@@ -361,7 +360,7 @@ class SimulatedScene:
         ground = floor[..., None] * d[..., :2]
         raised = _unevenness(rng, ground, scale)
         wall_clearance = self.wall_clearance(ground)
-        # multiple reflections fill the corner between floor and wall
+        # multi-path reflections fill the corner between floor and wall
         corner = rng.uniform(0.0, 12.0) * scale
         spread = rng.uniform(6.0, 25.0) * scale
         raised += corner * np.exp(-np.maximum(wall_clearance, 0.0) / spread) * (self.wall_mm > 0)
@@ -373,7 +372,7 @@ class SimulatedScene:
         beyond = ~inside & ~on_wall
         if self.wall_mm == 0.0:
             depth = np.where(beyond, floor - raised / fall, depth)
-        elif rng.random() < 0.4:  # the untidy room around the arena
+        elif rng.random() < 0.4:  # the cluttered room around the arena
             around = (
                 height + rng.uniform(0.0, 700.0) * scale - 60.0 * _unevenness(rng, ground, scale)
             )
@@ -381,9 +380,7 @@ class SimulatedScene:
         return np.where((depth > 100.0) & (depth < 4500.0), depth, 0.0).astype(np.float32)
 
     def _wall_distance(self, direction: Array) -> Array:
-        """Depth (H, W) mm at which rays from the camera leave the walls' outline; 0 when they never
-        do.
-        """
+        """Depth (H, W) mm at which rays leave the walls' outline; 0 if they never do."""
         start = self._turned(-self.centre, -self.yaw)
         d = self._turned(direction[..., :2], -self.yaw)
         if self.kind == ROUND:
@@ -403,15 +400,15 @@ class SimulatedScene:
     def places(
         self, rng: np.random.Generator, outline: Array, tops: Array, bottoms: Array | None = None
     ) -> Array:
-        """Shifts that bring each of n bodies to a random free position, whole and in the picture.
+        """Shifts that move each of n bodies to a random free position, completely inside the image.
 
-        Of 64 random positions the first free one is taken, else the one with the largest clearance.
+        Of 64 random positions the first free one is used, else the one with the largest clearance.
 
         Args:
-            rng: source of randomness.
-            outline: (n, K, 2) outermost points of the bodies seen from above, mm.
-            tops: (n,) how high the bodies reach, mm above the floor.
-            bottoms: (n,) how high they begin, mm; None on the floor.
+            rng: random number generator.
+            outline: (n, K, 2) outermost points of the bodies in top view, mm.
+            tops: (n,) highest points of the bodies, mm above the floor.
+            bottoms: (n,) lowest points, mm; None for the floor.
 
         Returns:
             (n, 2) shifts, mm.
@@ -438,7 +435,7 @@ class SimulatedScene:
                 - _CLUTTER_MM
             )
             wall_clearance = np.minimum(wall_clearance, gap)
-        # the first place with room enough, else the roomiest
+        # the first free position, else the one with the largest clearance
         chosen = np.where(
             (wall_clearance > 0).any(axis=1),
             np.argmax(wall_clearance > 0, axis=1),
@@ -448,17 +445,17 @@ class SimulatedScene:
 
 
 def draw_views(rng: np.random.Generator, m: int, setting: SceneSpec = ARENA) -> SE3:
-    """Poses of cameras that look down on a scene, tilted in any direction.
+    """Poses of downward-facing cameras, tilted in any direction.
 
     The tilt's direction is uniform and its angle such that the tilts are uniform over a disc.
 
     Args:
-        rng: source of randomness.
-        m: how many.
-        setting: its `camera_mm` and `tilt_rad` are drawn from.
+        rng: random number generator.
+        m: number of cameras.
+        setting: supplies the ranges `camera_mm` and `tilt_rad`.
 
     Returns:
-        (m) T_arena_camera; the arena frame's origin lies at the camera's foot, its x along the
+        (m) T_arena_camera; the arena frame's origin is at the camera's foot, its x along the
         camera's.
     """
     tilt = setting.tilt_rad * np.sqrt(rng.random(m))
@@ -474,7 +471,7 @@ def draw_views(rng: np.random.Generator, m: int, setting: SceneSpec = ARENA) -> 
 
 
 def floor_point(camera: Camera, T_arena_camera: SE3, uv: Array) -> Array:
-    """Points of the floor z = 0 that pixels look at.
+    """Points of the floor z = 0 at given pixels.
 
     Args:
         camera: the camera.
@@ -489,7 +486,7 @@ def floor_point(camera: Camera, T_arena_camera: SE3, uv: Array) -> Array:
 
 
 def outline_of(vertices: Array, n_directions: int = 24) -> Array:
-    """Outermost points of bodies seen from above, one in each of evenly spaced directions.
+    """Outermost points of bodies in top view, one in each of evenly spaced directions.
 
     Args:
         vertices: (n, V, 3) meshes, mm, arena frame.
@@ -504,9 +501,7 @@ def outline_of(vertices: Array, n_directions: int = 24) -> Array:
 
 
 def _unevenness(rng: np.random.Generator, ground: Array, scale: float) -> Array:
-    """Heights (H, W) mm of a floor that is not quite flat: a few long waves over points (H, W, 2)
-    mm.
-    """
+    """Heights (H, W) mm of an uneven floor: a few long waves over points (H, W, 2) mm."""
     waves = np.zeros(ground.shape[:-1])
     for _ in range(4):
         azimuth = rng.uniform(-np.pi, np.pi)

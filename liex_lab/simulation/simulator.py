@@ -1,10 +1,10 @@
-"""Synthetic data generators, one an animal: training patches, test splits, recordings with truth.
+"""Synthetic data generators, one per animal: training patches, test splits, recordings with truth.
 
-Each simulator renders a posed body mesh through a depth camera with a sensor noise model and hands
-out the exact pose beside every picture. Mouse and fish have pose and locomotion models of their own
-(`MouseSimulator`, `FishSimulator`), the hand one of its own scene (`HandSimulator`); an animal
-known only by its skeleton and surface is drawn within its joint limits (`GenericSimulator`).
-Everything is drawn from seeds, so that any part of a set can be made again, in any order.
+Each simulator renders a posed body mesh through a depth camera with a sensor noise model and
+returns the exact pose with every depth image. Mouse and fish have their own pose and locomotion
+models (`MouseSimulator`, `FishSimulator`), the hand its own scene (`HandSimulator`); any animal
+with a skeleton and a surface is drawn within its joint limits (`GenericSimulator`). Everything is
+drawn from seeds, so that any part of a set can be reproduced, in any order.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from liex_lab.simulation.training_patches import TrainingPatches
 class Simulator(Protocol):
     """Interface of an animal's source of synthetic training and test data.
 
-    Everything is drawn from seeds, in any order. `world_of` chooses the implementation.
+    Everything is drawn from seeds, in any order. `world_of` selects the implementation.
     """
 
     @property
@@ -40,17 +40,17 @@ class Simulator(Protocol):
 
     @property
     def protocol(self) -> str:
-        """One sentence on the test splits, to stand beside figures measured on them."""
+        """One sentence on the test splits, for reports of results."""
 
     @property
     def test_postures(self) -> str:
-        """One phrase on where the postures of the test splits come from; '' where seeds alone say
-        so.
+        """Source of the postures of the test splits, one phrase; '' if they follow from seeds
+        alone.
         """
 
     @property
     def sources(self) -> str:
-        """One phrase on what the training images were made from, for a model's card."""
+        """Source of the training images, one phrase, for a model's card."""
 
     def training_blocks(
         self,
@@ -69,19 +69,20 @@ class Simulator(Protocol):
         """Blocks of `BLOCK` training patches with truth; see `training_patches.training_blocks`.
 
         Args:
-            seed: of the whole set; a block depends on it and on its own number alone.
-            n_blocks: how many blocks to make.
+            seed: of the whole set; a block depends only on the seed and its number.
+            n_blocks: number of blocks.
             first: number of the first block.
             family: of body shapes, one of `body.shape.FAMILIES`.
             noise: multiplies the sensor's random errors and its rate of holes.
             erosion_px: pixels stripped off the animal's outline.
-            degraded_share: of the mini-sessions that get more noise, and half of them more erosion.
-            spine_mm: mean length of the animals, mm; None takes the skeleton's own.
+            degraded_share: share of mini-sessions with more noise; half of them also have more
+                erosion.
+            spine_mm: mean length of the animals, mm; None uses the skeleton's own.
             window_px: side of the patches, px.
-            parallel: render on all threads; the pictures are the same either way.
+            parallel: render on all threads; the images are the same either way.
 
         Returns:
-            An iterator of sets of patches, one a block.
+            An iterator of sets of patches, one per block.
         """
 
     def test_split(
@@ -92,17 +93,17 @@ class Simulator(Protocol):
         Args:
             name: of the split.
             spine_mm: length of every animal, mm; None draws it.
-            n_sessions: how many recordings to make, from the first on.
+            n_sessions: number of recordings, from the first on.
 
         Returns:
             One recording with truth per session, each with its own camera, surroundings and animal.
         """
 
     def motion(self, seed: int | list[int], n_frames: int, **settings: Any) -> TrueRecording:
-        """A continuous recording in which one animal moves.
+        """A continuous recording of one moving animal.
 
         Args:
-            seed: or seeds, that everything is drawn from.
+            seed: seed or seeds of all random numbers.
             n_frames: length of the recording.
             **settings: keyword arguments as in `locomotion.walking_session`.
 
@@ -113,7 +114,7 @@ class Simulator(Protocol):
 
 @dataclass(frozen=True)
 class BodySimulator:
-    """Simulator of an animal that a `Species` describes: where it lives, its body, its postures.
+    """Simulator of an animal that is described by a `Species`.
 
     Attributes:
         species: the animal's species.
@@ -130,7 +131,7 @@ class BodySimulator:
 
     @property
     def protocol(self) -> str:
-        """One sentence on the test splits, to stand beside figures measured on them."""
+        """One sentence on the test splits, for reports of results."""
         return (
             "each with its own camera, arena, animal; the background, the floor, the blob and the "
             "animal's size are found by the product, nothing is handed over. "
@@ -138,12 +139,12 @@ class BodySimulator:
 
     @property
     def test_postures(self) -> str:
-        """Postures follow from the seeds alone: ''."""
+        """'': postures follow from the seeds alone."""
         return ""
 
     @property
     def sources(self) -> str:
-        """One phrase on what the training images were made from."""
+        """Source of the training images, one phrase."""
         return "rendered from a seed; no recording of an animal was used"
 
     def training_blocks(
@@ -153,11 +154,11 @@ class BodySimulator:
 
         Args:
             seed: of the whole set.
-            n_blocks: how many blocks to make.
+            n_blocks: number of blocks.
             **settings: keyword arguments as in `training_patches.training_blocks`.
 
         Returns:
-            An iterator of sets of patches, one a block.
+            An iterator of sets of patches, one per block.
         """
         return training_patches.training_blocks(seed, n_blocks, self.species, **settings)
 
@@ -170,7 +171,7 @@ class BodySimulator:
             name: 'clean', 'hard', 'other-body', 'other-camera', or 'sealed', see
                 `recording.SEALED`.
             spine_mm: length of every animal, mm; None draws it.
-            n_sessions: how many recordings to make, from the first on.
+            n_sessions: number of recordings, from the first on.
 
         Returns:
             One recording of independent postures per session.
@@ -183,13 +184,13 @@ class BodySimulator:
 
 @dataclass(frozen=True)
 class MouseSimulator(BodySimulator):
-    """Simulator of a mouse in an arena, seen from above."""
+    """Simulator of a mouse in an arena, recorded from above."""
 
     def motion(self, seed: int | list[int], n_frames: int, **settings: Any) -> SyntheticSession:
         """A recording of a mouse that walks, turns, rears and curls up; see `walking_session`.
 
         Args:
-            seed: or seeds, that everything is drawn from.
+            seed: seed or seeds of all random numbers.
             n_frames: length of the recording, at 30 frames/s.
             **settings: further keyword arguments of `locomotion.walking_session`.
 
@@ -202,13 +203,13 @@ class MouseSimulator(BodySimulator):
 
 @dataclass(frozen=True)
 class FishSimulator(BodySimulator):
-    """Simulator of a zebrafish in a tank, seen from above."""
+    """Simulator of a zebrafish in a tank, recorded from above."""
 
     def motion(self, seed: int | list[int], n_frames: int, **settings: Any) -> SyntheticSession:
         """A recording of a fish that swims in bouts; see `swimming_session`.
 
         Args:
-            seed: or seeds, that everything is drawn from.
+            seed: seed or seeds of all random numbers.
             n_frames: length of the recording, at 50 frames/s.
             **settings: further keyword arguments of `locomotion.swimming_session`.
 
@@ -224,7 +225,7 @@ class GenericSimulator(BodySimulator):
     """Simulator of any animal on a floor, or above one."""
 
     def window_px(self, length_mm: float) -> int:
-        """Side of a square patch, px, that holds an animal of this mean length wherever it is.
+        """Side of a square patch, px, that contains an animal of this mean length at any position.
 
         Args:
             length_mm: mean length of the animals, mm.
@@ -236,10 +237,10 @@ class GenericSimulator(BodySimulator):
         return self.species.window_px(length_mm)
 
     def motion(self, seed: int | list[int], n_frames: int, **settings: Any) -> SyntheticSession:
-        """A recording of an animal that goes about and changes its posture; see `moving_session`.
+        """A recording of an animal that moves and changes its posture; see `moving_session`.
 
         Args:
-            seed: or seeds, that everything is drawn from.
+            seed: seed or seeds of all random numbers.
             n_frames: length of the recording.
             **settings: further keyword arguments of `generic.moving_session`.
 
@@ -251,14 +252,13 @@ class GenericSimulator(BodySimulator):
 
 
 def world_of(skeleton: Skeleton) -> Simulator:
-    """The simulator of an animal; the generic one where its name is not known here.
+    """The simulator of an animal; the generic one for other names than those below.
 
     Args:
-        skeleton: of the animal; the names 'mouse', 'fish' and 'hand' have simulators of their own.
+        skeleton: of the animal; the names 'mouse', 'fish' and 'hand' have their own simulators.
 
     Returns:
-        The simulator; that of the hand takes labelled test postures where `find_reference` finds
-        any.
+        The simulator; that of the hand uses labelled test postures if `find_reference` finds any.
     """
     if skeleton.name == "mouse":
         return MouseSimulator(MouseSpecies(skeleton))

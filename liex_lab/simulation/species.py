@@ -1,6 +1,6 @@
 """Interface between an animal and the renderer: sensors, surroundings, body shapes, pose prior.
 
-`Species` is what `training_patches`, `recording` and `locomotion` ask of an animal; `MouseSpecies`
+`Species` is the interface that `training_patches`, `recording` and `locomotion` use; `MouseSpecies`
 is the mouse, `fish.FishSpecies` the zebrafish, `generic.GenericSpecies` any animal with a skeleton.
 """
 
@@ -36,14 +36,14 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Sensor:
-    """A make of depth sensor: its camera and how it errs.
+    """A make of depth sensor: its camera and its noise.
 
     Attributes:
         name: of the make.
         camera: its camera.
         kind: number of its noise model, `PRIMESENSE_KIND`, `KINECT_V2_KIND` or `LIGHT_FIELD_KIND`.
         unit_mm: step of its depth, mm.
-        stride: its pictures are so large that only every so many-th pixel is read.
+        stride: only every `stride`-th pixel of its large depth images is read.
     """
 
     name: str
@@ -53,10 +53,10 @@ class Sensor:
     stride: int = 1
 
     def coarse(self, parameters: Array) -> Array:
-        """Parameters of this sensor's units for pictures of every `stride`-th pixel.
+        """Parameters of this sensor's units for images of every `stride`-th pixel.
 
         Args:
-            parameters: (n, N_PARAMETERS) of whole pictures.
+            parameters: (n, N_PARAMETERS) of full-resolution images.
 
         Returns:
             (n, N_PARAMETERS), the lengths in pixels divided by the stride.
@@ -66,9 +66,9 @@ class Sensor:
         return coarse
 
     def spread_mm(self, parameters: Array, distance_mm: Array) -> Array | float:
-        """Standard deviation of what units of a light-field camera read of one surface.
+        """Standard deviation of the readings of a surface by units of a light-field camera.
 
-        Of other sensors it is 0, for it is small beside everything that they are used for.
+        For other sensors it is 0, as it is negligible.
 
         Args:
             parameters: (n, N_PARAMETERS) of the units.
@@ -85,11 +85,11 @@ class Sensor:
     def draw(
         self, rng: np.random.Generator, n: int, fur: Array, noise: float = 1.0, erosion_px: int = 0
     ) -> Array:
-        """Parameters of n units of this sensor, each looking at one animal.
+        """Parameters of n units of this sensor, each recording one animal.
 
         Args:
-            rng: source of randomness.
-            n: how many units.
+            rng: random number generator.
+            n: number of units.
             fur: (n,) of the animals, from 0 (sleek) to 1 (long and soft).
             noise: multiplies random errors and the rate of holes.
             erosion_px: pixels stripped off the animal's outline.
@@ -123,7 +123,7 @@ class Sensor:
             p[:, k.EDGE_DROP] = rng.uniform(0.0, 0.15, n)
             p[:, k.GRID] = rng.uniform(2.5, 5.0, n)
             p[:, k.FLYING] = rng.uniform(0.2, 0.8, n)
-            # dark hair returns late: its depth is a little off as a whole
+            # dark hair has a small constant depth error
             p[:, k.BIAS] = np.where(dark, rng.uniform(-2.0, 4.0, n), rng.uniform(-0.5, 1.0, n))
         return p
 
@@ -139,11 +139,11 @@ def _draw_light_field(rng: np.random.Generator, p: Array) -> None:
     p[:, k.BACKGROUND] = 0.5
     p[:, k.BIAS] = 0.0
     p[:, k.OUTLIERS] = rng.uniform(2.3, 3.2, n)  # standard deviations of a field
-    # quantiles of a field: from a few per cent to a third of the smooth skin bears no texture, less
-    # of the rest
+    # quantiles of a field: from a few per cent to a third of smooth skin has no texture, less of
+    # the rest
     p[:, k.DARK] = rng.uniform(-2.6, -0.45, n)
     p[:, k.HOLES] = rng.uniform(-4.0, -1.2, n)
-    p[:, k.FLYING] = rng.random(n) < 0.5  # whether the maker's software fills what is unread
+    p[:, k.FLYING] = rng.random(n) < 0.5  # whether the maker's software fills unread pixels
 
 
 PRIMESENSE_SENSOR = Sensor("PrimeSense", PRIMESENSE, k.PRIMESENSE_KIND)
@@ -153,13 +153,13 @@ RAYTRIX_R5_SENSOR = Sensor("Raytrix R5", RAYTRIX_R5, k.LIGHT_FIELD_KIND, unit_mm
 SENSORS = (
     PRIMESENSE_SENSOR,
     KINECT_V2_SENSOR,
-)  # those that sessions and training windows are drawn from
+)  # makes used for sessions and training windows
 BY_NAME = {
     sensor.name.lower().replace(" ", "-"): sensor
     for sensor in (KINECT_V2_SENSOR, PRIMESENSE_SENSOR, PRIMESENSE_QVGA_SENSOR, RAYTRIX_R5_SENSOR)
 }
-# of each noise model, cameras whose focal length and resolution no training picture has: those are
-# within 3 % of the makes in `SENSORS`, of the Raytrix R5 above or of the NYU camera
+# for each noise model, cameras with a focal length and resolution that training does not use: those
+# in training are within 3 % of the makes in `SENSORS`, of the Raytrix R5 above or of the NYU camera
 _UNSEEN = {
     k.PRIMESENSE_KIND: (Sensor("RealSense D435", REALSENSE_D435, k.PRIMESENSE_KIND),),
     k.KINECT_V2_KIND: (Sensor("Azure Kinect", AZURE_KINECT, k.KINECT_V2_KIND),),
@@ -171,10 +171,10 @@ _UNSEEN = {
 
 
 def unseen(sensors: tuple[Sensor, ...]) -> tuple[Sensor, ...]:
-    """Sensors that err as the given ones do, with cameras that no model was trained on.
+    """Cameras that are not used in training, with the noise models of the given sensors.
 
     Args:
-        sensors: makes that training pictures are drawn from.
+        sensors: makes used for training images.
     """
     kinds = dict.fromkeys(sensor.kind for sensor in sensors)
     return tuple(sensor for kind in kinds for sensor in _UNSEEN[kind])
@@ -195,15 +195,15 @@ class Postures(NamedTuple):
 
 
 class Species(Protocol):
-    """An animal as the renderer knows it; all is drawn from the generator handed over.
+    """An animal as used by the renderer; everything is drawn from the given generator.
 
     Attributes:
         skeleton: of the animal.
-        sensors: makes of cameras that look at it.
+        sensors: makes of cameras.
         setting: ranges of its surroundings.
-        things: kinds of distractors beside it, see `objects.draw_thing`.
+        things: kinds of distractors, see `objects.draw_thing`.
         sizes: smallest and largest animal over the nominal size.
-        floats: it is somewhere above the floor, not on it.
+        floats: whether it is above the floor, not on it.
         frame_ns: between two frames of a recording, ns.
     """
 
@@ -232,9 +232,9 @@ class Species(Protocol):
         """Bodies of a family of shapes.
 
         Args:
-            rng: source of randomness.
+            rng: random number generator.
             family: one of `body.shape.FAMILIES`.
-            n: how many.
+            n: number of bodies.
 
         Returns:
             A batch of n bodies.
@@ -243,10 +243,10 @@ class Species(Protocol):
     def postures(
         self, rng: np.random.Generator, size: Array, shape: Body, camera_mm: Array
     ) -> Postures:
-        """A posture for each of n animals, anywhere on or above the floor.
+        """A posture for each of n animals, on or above the floor.
 
         Args:
-            rng: source of randomness.
+            rng: random number generator.
             size: (n,) of the animals over home size.
             shape: (n) their bodies.
             camera_mm: (n,) heights of the cameras above the floor, mm.
@@ -256,28 +256,28 @@ class Species(Protocol):
         """
 
     def bends(self, rng: np.random.Generator, n: int) -> Array | None:
-        """How tails lie, see `Surface.vertices`.
+        """Bends of tails, see `Surface.vertices`.
 
         Args:
-            rng: source of randomness.
-            n: how many.
+            rng: random number generator.
+            n: number of tails.
 
         Returns:
-            (n, TAIL_RINGS) rad, or None for an animal without a tail of its own.
+            (n, TAIL_RINGS) rad, or None for an animal without a separate tail.
         """
 
 
 @dataclass(frozen=True)
 class MouseSpecies:
-    """A mouse in an arena, before a PrimeSense or a Kinect v2.
+    """A mouse in an arena, recorded by a PrimeSense or a Kinect v2.
 
     Attributes:
-        skeleton: of the mouse, the preset's if not given.
-        sensors: makes of cameras that look at it.
+        skeleton: of the mouse; by default the preset's.
+        sensors: makes of cameras.
         setting: ranges of its surroundings.
-        things: kinds of distractors beside it.
+        things: kinds of distractors.
         sizes: smallest and largest mouse over the nominal size.
-        floats: False, for it stands on the floor.
+        floats: False, as it is on the floor.
         frame_ns: between two frames of a recording, ns.
     """
 
@@ -293,9 +293,9 @@ class MouseSpecies:
         """Mice of a family of shapes.
 
         Args:
-            rng: source of randomness.
+            rng: random number generator.
             family: one of `body.shape.FAMILIES`.
-            n: how many.
+            n: number of mice.
 
         Returns:
             A batch of n bodies.
@@ -305,13 +305,14 @@ class MouseSpecies:
     def postures(
         self, rng: np.random.Generator, size: Array, shape: Body, camera_mm: Array
     ) -> Postures:
-        """Mice that go about, curl up, rear, hunch and reach, by the shares of `pose_prior.SHARES`.
+        """Mice that walk, curl up, rear, hunch and reach, with the frequencies of
+        `pose_prior.SHARES`.
 
         Args:
-            rng: source of randomness.
+            rng: random number generator.
             size: (n,) of the mice over home size.
             shape: (n) their bodies.
-            camera_mm: (n,) not used, for mice stand on the floor.
+            camera_mm: (n,) not used, as mice are on the floor.
 
         Returns:
             The poses with girths and kinds, indices into `pose_prior.KINDS`.
@@ -322,13 +323,13 @@ class MouseSpecies:
         return Postures(pose, girth, kinds)
 
     def bends(self, rng: np.random.Generator, n: int) -> Array | None:
-        """How the tails lie.
+        """Bends of the tails.
 
         Args:
-            rng: source of randomness.
-            n: how many.
+            rng: random number generator.
+            n: number of tails.
 
         Returns:
-            (n, TAIL_RINGS) rad, the turn at each ring.
+            (n, TAIL_RINGS) rad, the bend at each ring.
         """
         return draw_tail_bends(rng, n)

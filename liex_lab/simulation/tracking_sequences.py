@@ -1,10 +1,9 @@
-"""Benchmark sequences for tracking: one animal that moves, clean or corrupted, with exact truth.
+"""Benchmark sequences for tracking: one moving animal, clean or corrupted, with exact truth.
 
-'easy' is what a sensor gives of an animal that moves; 'hard' has twice the noise, an eroded outline
-and the corruptions of `corruptions`. Their lengths, 511 and 300 frames, are those of the tracking
-sequences in the Lie-X paper. A script of events re-times one long recording (frames that are
-dropped or played faster), adds occluders and distractors to the scene and takes readings out of the
-pictures.
+'easy' has the normal noise of a sensor; 'hard' has twice the noise, an eroded outline and the
+corruptions of `corruptions`. Their lengths, 511 and 300 frames, are those of the tracking sequences
+in the Lie-X paper. A script of events re-times one long recording (dropped or accelerated frames),
+adds occluders and distractors to the scene and removes readings from the depth images.
 """
 
 from __future__ import annotations
@@ -34,11 +33,11 @@ class Sequence:
     """A fixed test sequence and its difficulty.
 
     Attributes:
-        n_frames: its length, that of the paper's.
-        seed: that it is drawn from.
+        n_frames: its length, as in the paper.
+        seed: its seed.
         noise: multiplies the sensor's random errors and its rate of holes.
-        erosion_px: stripped off the animal's outline, in px of the picture that is looked at.
-        corrupted: whether corruptions happen.
+        erosion_px: pixels stripped off the animal's outline, px of the subsampled depth image.
+        corrupted: whether there are corruptions.
     """
 
     n_frames: int
@@ -55,7 +54,7 @@ SEQUENCES = {
 
 
 class TestSequence(TrueRecording):
-    """A recording with its truth and the events that happen in it.
+    """A recording with its truth and events.
 
     Attributes:
         scene: the recording without the losses.
@@ -67,11 +66,11 @@ class TestSequence(TrueRecording):
     def __init__(
         self, scene: SyntheticSession | HandSession, events: list[Event], loss: Loss, name: str
     ) -> None:
-        """Apply losses to a recording whose truth is kept.
+        """Apply losses to a recording and keep its truth.
 
         Args:
             scene: the recording without the losses.
-            events: what happens in it, in order of start.
+            events: its events, in order of start.
             loss: readings that are lost in its frames.
             name: of the sequence.
         """
@@ -89,14 +88,14 @@ class TestSequence(TrueRecording):
         self._loss = loss
 
     def depths(self, start: int, stop: int) -> NDArray[np.float32]:
-        """Depth pictures of a range of frames, with the losses.
+        """Depth images of a range of frames, with the losses.
 
         Args:
             start: first frame.
             stop: one past the last frame.
 
         Returns:
-            (stop - start, H, W) float32 mm, 0 where unread.
+            (stop - start, H, W) float32 mm, 0 if unread.
         """
         depths = self.scene.depths(start, stop)
         camera = self.camera
@@ -130,21 +129,22 @@ def tracking_sequence(
     sensor: Sensor | None = None,
     spine_mm: float | None = None,
 ) -> TestSequence:
-    """The fixed sequence 'easy' or 'hard' of an animal; other seeds make others of its kind.
+    """The fixed sequence 'easy' or 'hard' of an animal; other seeds make similar ones.
 
-    hard: bursts of holes, frames dropped, a bar passing between camera and animal, a second object,
-    an animal that is lost in the floor or in glare, and stretches at two to three times the speed.
+    hard: bursts of holes, dropped frames, a bar passing between camera and animal, a second object,
+    an animal that is lost in the floor's noise or in glare, and stretches at two to three times the
+    speed.
 
     Args:
         world: the animal's simulator.
         name: 'easy' or 'hard', a key of `SEQUENCES`.
-        seed: another one makes a sequence to develop on; None is the fixed one.
+        seed: another seed makes a development sequence; None is the fixed one.
         n_frames: its length; None is the fixed one.
         sensor: the camera's make; None is the animal's first.
         spine_mm: length of the animal, mm; None draws it.
 
     Returns:
-        The sequence with its truth and its events, 'hidden' spans among them.
+        The sequence with its truth and its events, including 'hidden' spans.
 
     Raises:
         RecordingError: there is no such sequence, or none of this animal.
@@ -201,7 +201,7 @@ def _hands(
     events: list[Event],
     title: str,
 ) -> tuple[HandSession, list[Event]]:
-    """Some moments of a hand, with things before and beside it, and when it is hidden."""
+    """Some moments of a hand, with an occluder and a distractor, and its hidden spans."""
     assert isinstance(base, HandSession)
     contents = base.contents[rows]
     hidden = list[Event]()
@@ -234,7 +234,7 @@ def _animals(
     events: list[Event],
     title: str,
 ) -> tuple[SyntheticSession, list[Event]]:
-    """As `_hands` of an animal."""
+    """The same as `_hands`, for an animal."""
     assert isinstance(base, SyntheticSession)
     assert isinstance(world, BodySimulator)
     contents = _taken(base.contents, rows)
@@ -271,7 +271,7 @@ def _animals(
 
 
 def _taken(contents: FrameContents, rows: NDArray[np.int64]) -> FrameContents:
-    """Some moments of what moves, in another order of time."""
+    """Some moments of the moving contents, in a new order."""
     pose = Pose(
         SE3(contents.pose.root.rotation[rows], contents.pose.root.translation[rows]),
         contents.pose.angles[rows],
@@ -290,9 +290,7 @@ def _taken(contents: FrameContents, rows: NDArray[np.int64]) -> FrameContents:
 
 
 def _hidden(camera: Camera, body: Array, things: Array, events: list[Event]) -> list[Event]:
-    """The stretches in which the occluder hides the animal; meshes (n, V, 3) mm in the camera
-    frame.
-    """
+    """Spans in which the occluder hides the animal; meshes (n, V, 3) mm in the camera frame."""
     spans = [np.arange(event.start, event.stop) for event in events if event.kind == "occluder"]
     rows = np.concatenate(spans) if spans else np.zeros(0, np.int64)
     one = things.shape[1] // 2

@@ -3,11 +3,11 @@
 Domain randomisation: each image draws camera tilt and height, intrinsics, floor, walls,
 neighbouring objects, body shape, posture and sensor noise at random, and keeps the exact pose as
 its label. Images come in mini-sessions of `PER_SESSION` that share camera, floor, animal and
-sensor, as a recording's frames do. They are made in blocks; a block depends on the seed and its own
-number alone, so any part of a set can be made again, bit for bit.
+sensor, as the frames of a recording do. They are made in blocks; a block depends only on the seed
+and its number, so that any part of a set can be reproduced bit for bit.
 
 The floor is stored as inverse depth, 1 / z = a u + b v + c, which is linear in the pixel (u, v) for
-a plane in a pinhole picture.
+a plane in a pinhole image.
 """
 
 from __future__ import annotations
@@ -41,14 +41,14 @@ _WALL_SHARE = 0.35
 
 @dataclass(frozen=True)
 class TrainingPatches:
-    """Depth patches of S x S pixels around an animal, n of them, and the truth behind each.
+    """Depth patches of S x S pixels around an animal, n of them, with their truth.
 
     Attributes:
-        depth: (n, S, S) uint16, steps of `unit_mm`, 0 = unread: the picture.
-        background: (n, S, S) uint16, likewise: the still scene as a recording would have taught it.
-        origin: (n, 2) int32, the full picture's pixel (u, v) of patch pixel (0, 0).
-        intrinsics: (n, 4) fx, fy, cx, cy of the full picture, px.
-        floor: (n, 3) plane 1 / z = a u + b v + c in pixels of the full picture, as estimated.
+        depth: (n, S, S) uint16 depth image, steps of `unit_mm`, 0 = unread.
+        background: (n, S, S) uint16, likewise: the still scene as learned from a recording.
+        origin: (n, 2) int32, the full image's pixel (u, v) of patch pixel (0, 0).
+        intrinsics: (n, 4) fx, fy, cx, cy of the full image, px.
+        floor: (n, 3) plane 1 / z = a u + b v + c in pixels of the full image, as estimated.
         floor_true: (n, 3) the same plane, exact.
         T_arena_camera: (n) exact transform from the camera frame into the arena frame.
         root: (n) T_camera_root, the base joint in the camera frame.
@@ -60,9 +60,9 @@ class TrainingPatches:
         sensor: (n,) int64, index into the animal's sensors.
         kind: (n,) int64, index into its kinds of posture.
         unit_mm: step of the stored depths, mm.
-        spread_mm: (n,) standard deviation of the floor's readings, mm, where it matters; else 0.
-        own_bones: `joints_mm` are those of each body's own proportions, from which the skeleton's
-            differ.
+        spread_mm: (n,) standard deviation of the floor's readings, mm, or 0 if negligible.
+        own_bones: whether `joints_mm` are those of each body's own proportions, which differ from
+            the skeleton's.
     """
 
     depth: NDArray[np.uint16]
@@ -89,13 +89,10 @@ class TrainingPatches:
         return len(self.depth)
 
     def __getitem__(self, index: slice | NDArray[np.int64]) -> TrainingPatches:
-        """Some of the patches.
+        """A subset of the patches.
 
         Args:
             index: slice, mask or row numbers over the patches.
-
-        Returns:
-            The chosen patches with their truth.
         """
         picked: list[Any] = []
         for field in fields(self):
@@ -107,13 +104,10 @@ class TrainingPatches:
 
     @staticmethod
     def joined(parts: list[TrainingPatches]) -> TrainingPatches:
-        """The patches of several sets, one after the other.
+        """Concatenate several sets.
 
         Args:
-            parts: at least one set; `unit_mm` and `own_bones` are taken from the first.
-
-        Returns:
-            One set with all of them.
+            parts: at least one set; `unit_mm` and `own_bones` are those of the first.
         """
         columns: list[Any] = []
         for field in fields(TrainingPatches):
@@ -125,7 +119,7 @@ class TrainingPatches:
                         np.concatenate([v.translation for v in values]),
                     )
                 )
-            elif isinstance(values[0], float | bool):  # of all images alike
+            elif isinstance(values[0], float | bool):  # shared by all images
                 columns.append(values[0])
             else:
                 columns.append(np.concatenate(values))
@@ -161,20 +155,20 @@ def training_windows(
     parallel: bool = True,
     worn_share: float = 0.0,
 ) -> TrainingPatches:
-    """The first n training patches of a seed; those that `training_blocks` makes.
+    """The first n training patches of a seed, as made by `training_blocks`.
 
     Args:
         seed: of the whole set.
-        n: how many patches; whole blocks are rendered and the last one is cut.
-        species: the species; None a mouse.
+        n: number of patches; whole blocks are rendered and the last one is cut.
+        species: the species; None is a mouse.
         family: of body shapes, one of `body.shape.FAMILIES`.
         noise: multiplies the sensor's random errors and its rate of holes.
         erosion_px: pixels stripped off the animal's outline.
-        degraded_share: of the mini-sessions that get more noise, and half of them more erosion.
-        spine_mm: mean length of the animals, mm; None takes the skeleton's own.
+        degraded_share: share of mini-sessions with more noise; half of them also have more erosion.
+        spine_mm: mean length of the animals, mm; None uses the skeleton's own.
         window_px: side of the patches, px.
         parallel: render on all threads.
-        worn_share: of the mice that wear a head stage or a cable.
+        worn_share: share of mice with a head stage or a cable.
 
     Returns:
         n patches with their truth.
@@ -217,28 +211,28 @@ def training_blocks(
 ) -> Iterator[TrainingPatches]:
     """Blocks of `BLOCK` training patches from block `first` on.
 
-    They are the same bit for bit for a seed, whatever the threads.
+    They are bit-identical for a seed, for any number of threads.
 
     Args:
-        seed: of the whole set; a block depends on it and on its own number alone.
-        n_blocks: how many blocks to make.
-        species: the species; None a mouse.
+        seed: of the whole set; a block depends only on the seed and its number.
+        n_blocks: number of blocks.
+        species: the species; None is a mouse.
         first: number of the first block.
         family: of body shapes, one of `body.shape.FAMILIES`.
         noise: multiplies the sensor's random errors and its rate of holes, see `Sensor.draw`.
         erosion_px: pixels stripped off the animal's outline, see `Sensor.draw`.
-        degraded_share: of the mini-sessions that have 1 to 2.5 times the noise; half of those have
-            an outline eroded by one pixel more.
-        spine_mm: mean length of the animals, mm; None takes the skeleton's own.
-        window_px: side of the patches, px; it must hold the animal with a margin, and 144 does up
-            to mice of 70 mm.
+        degraded_share: share of mini-sessions with 1 to 2.5 times the noise; half of them have an
+            outline eroded by one more pixel.
+        spine_mm: mean length of the animals, mm; None uses the skeleton's own.
+        window_px: side of the patches, px; it must contain the animal with a margin: 144 is enough
+            for mice of up to 70 mm.
         parallel: render on all threads.
-        worn_share: of the mini-sessions whose mouse wears a head stage or a cable, see
-            `scenes.worn.draw_worn`; 0 makes the patches that there were before it could.
-        per_session: images of one animal before one camera, a divisor of `BLOCK`.
+        worn_share: share of mini-sessions whose mouse has a head stage or a cable, see
+            `scenes.meshes.draw_worn`; 0 does not change the other random numbers.
+        per_session: images of one animal with one camera, a divisor of `BLOCK`.
 
     Yields:
-        One set of `BLOCK` patches a block.
+        One set of `BLOCK` patches per block.
     """
     species = MouseSpecies() if species is None else species
     surface = Surface.of(species.skeleton)
@@ -263,16 +257,16 @@ def drawn_bodies(
     spine_mm: float | None = None,
     per_session: int = PER_SESSION,
 ) -> Body:
-    """The bodies of a block of `training_blocks`, a batch with one for each mini-session.
+    """The bodies of a block of `training_blocks`, a batch with one per mini-session.
 
     Args:
         seed: of the whole set.
         number: of the block.
         species: the species.
         family: of body shapes, one of `body.shape.FAMILIES`.
-        degraded_share: as the block was drawn with.
-        spine_mm: as the block was drawn with.
-        per_session: images of one animal before one camera.
+        degraded_share: as for the block.
+        spine_mm: as for the block.
+        per_session: images of one animal with one camera.
     """
     rng = np.random.default_rng([seed, number])
     looks = _draw_looks(rng, species, family, 1.0, 0, degraded_share, spine_mm, per_session)
@@ -289,9 +283,7 @@ def _draw_looks(
     spine_mm: float | None,
     per_session: int = PER_SESSION,
 ) -> _Views:
-    """Cameras, floors and animals of one block's mini-sessions, repeated for each of their
-    images.
-    """
+    """Cameras, floors and animals of one block's mini-sessions, repeated for their images."""
     m = BLOCK // per_session
     skeleton = species.skeleton
     sensor = np.arange(m) % len(species.sensors)
@@ -341,7 +333,7 @@ def _degrade(rng: np.random.Generator, parameters: Array, share: float) -> None:
 def inverse_depth_plane(
     T_arena_camera: SE3, intrinsics: Array, tilt_and_lift: Array | None = None
 ) -> Array:
-    """Inverse-depth coefficients of the floor, 1 / z = a u + b v + c, exact or wrongly estimated.
+    """Inverse-depth coefficients of the floor, 1 / z = a u + b v + c, exact or with errors.
 
     With n the floor's unit normal in the camera frame and d its distance, a = n_x / (fx d), b = n_y
     / (fy d) and c = n_z / d - a cx - b cy.
@@ -349,8 +341,8 @@ def inverse_depth_plane(
     Args:
         T_arena_camera: (n) exact poses of the cameras, the arena frame's origin at their feet.
         intrinsics: (n, 4) fx, fy, cx, cy, px.
-        tilt_and_lift: (n, 3) errors of a wrongly estimated floor: slopes along the arena's x and y,
-            rad, and how many mm farther below the camera it lies; None is the exact floor.
+        tilt_and_lift: (n, 3) errors of an estimated floor: slopes along the arena's x and y, rad,
+            and additional distance below the camera, mm; None is the exact floor.
 
     Returns:
         (n, 3) a, b, c in 1/mm per pixel and 1/mm.
@@ -375,7 +367,7 @@ def _with_worn(
     worn_faces: NDArray[np.int32],
     wears: NDArray[np.bool_],
 ) -> tuple[Array, NDArray[np.int32], NDArray[np.bool_]]:
-    """Neighbours and what is worn as one mesh (n, V, 3); each far behind the camera without it."""
+    """Neighbours and equipment as one mesh (n, V, 3); absent parts are far behind the camera."""
     away = np.array([0.0, 0.0, 1e7])
     both = [
         mesh + (~there)[:, None, None] * away for mesh, there in ((thing, has_thing), (worn, wears))
@@ -460,7 +452,7 @@ def _draw_block(
 
 
 def _place(rng: np.random.Generator, species: Species, pose: Pose, views: _Views) -> None:
-    """Move the poses over the floor so that each animal is somewhere in its picture, whole."""
+    """Translate the poses over the floor so that each animal is completely inside its image."""
     n = len(pose.scale)
     T = views.T_arena_camera
     skeleton = species.skeleton
@@ -483,7 +475,7 @@ def _place(rng: np.random.Generator, species: Species, pose: Pose, views: _Views
 def window_origin(
     trunk: Array, T_camera_arena: SE3, intrinsics: Array, window_px: int
 ) -> NDArray[np.int64]:
-    """First pixels of square patches that have the trunk's bounding box in their middle.
+    """First pixels of square patches centred on the trunk's bounding box.
 
     Args:
         trunk: (n, V, 3) vertices of the trunks, mm, arena frame.
@@ -492,7 +484,7 @@ def window_origin(
         window_px: side of the patches, px.
 
     Returns:
-        (n, 2) int64 pixel (u, v) of the full picture at patch pixel (0, 0); it may lie outside.
+        (n, 2) int64 pixel (u, v) of the full image at patch pixel (0, 0); may be outside the image.
     """
     p = (
         np.einsum("nij,nvj->nvi", T_camera_arena.rotation, trunk)
@@ -507,10 +499,9 @@ def window_origin(
 def _draw_neighbours(
     rng: np.random.Generator, trunk: Array, spine_mm: Array, scale: float, floats: bool
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """A block or ball (n, V, 3) beside each trunk, never touching it, and which images show theirs
-    (n,).
+    """A block or ball (n, V, 3) next to each trunk, without contact, and its presence (n,).
 
-    Beside an animal that floats it is anywhere between the floor and the animal's back.
+    Next to a floating animal it is anywhere between the floor and the animal's back.
     """
     n = len(trunk)
     radii = spine_mm[:, None] * rng.uniform(0.12, 0.5, (n, 3))
@@ -535,7 +526,7 @@ def _draw_neighbours(
 
 
 def _draw_walls(rng: np.random.Generator, trunk: Array, setting: SceneSpec) -> Array:
-    """A straight wall (n, WALL_COLUMNS) beyond some of the trunks, seen from the arena's inside."""
+    """A straight wall (n, WALL_COLUMNS) beyond some of the trunks, as viewed from inside."""
     n = len(trunk)
     scale = setting.scale
     middle = trunk[..., :2].mean(axis=1)

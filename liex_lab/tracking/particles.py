@@ -190,7 +190,7 @@ class ParticleFilter:
         ), float(found.chosen.error_mm[0])
 
     def _select(self) -> None:
-        """Selection: draw particles from the cumulative weights; all have equal weights afterwards."""
+        """Selection: draw particles from the cumulative weights; all then have equal weights."""
         assert self._particles is not None
         p = self._particles
         k = self._noise.n_particles

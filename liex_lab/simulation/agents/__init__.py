@@ -1,1 +1,1 @@
-"""Virtual animals that act: sequences of labelled behaviour, rendered frame by frame."""
+"""Virtual animals with labelled behaviour, rendered frame by frame."""

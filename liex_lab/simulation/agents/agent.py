@@ -1,10 +1,10 @@
-"""Behaviour simulator: labelled actions in a row, smoothed by a causal filter, kept in bounds.
+"""Behaviour simulator: a sequence of labelled actions, smoothed by a causal filter, within bounds.
 
-An action is a stretch of control channels on a clock of 5 ms: speed, turning, climbing, and what
-the species adds (bends, postures). A `BehaviourSequence` strings actions together, smooths them
-with a critically damped second-order low pass, two poles at exp(-dt / tau), as a body does,
-integrates heading and position, and rejects an action that would lead outside: it is drawn again.
-Animals differ in log-uniform traits (`Individual`).
+An action is a stretch of control channels on a clock of 5 ms: speed, turning, climbing, and those
+of the species (bends, postures). A `BehaviourSequence` concatenates actions, smooths them with a
+critically damped second-order low pass, two poles at exp(-dt / tau), as a body does, integrates
+heading and position, and redraws an action that would leave the bounds. Animals differ in
+log-uniform traits (`Individual`).
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ from liex_lab.simulation.training_patches import inverse_depth_plane, window_ori
 
 Array = NDArray[np.float64]
 
-STEP_S = 0.005  # of the clock on which an animal moves, whatever the camera's rate
+STEP_S = 0.005  # of the animal's clock, independent of the camera's rate
 UNLABELLED = ""
-# channels that every animal has: mm/s, rad/s, rad
+# channels of every animal: mm/s, rad/s, rad
 SPEED = 0
 TURN = 1
 CLIMB = 2
@@ -40,21 +40,21 @@ _TRAITS = {
     "tempo": 0.12,
     "bend": 0.12,
     "patience": 0.2,
-}  # spread of the logarithm at the range's end
+}  # spread of the logarithm at the end of the range
 
 
 @dataclass(frozen=True)
 class Individual:
-    """One animal's own way of moving.
+    """Traits of one animal's movement.
 
     Attributes:
         size: over home size.
         vigour: factor of speed.
         tempo: factor of rhythm.
         bend: factor of bending.
-        patience: factor of how long its actions last.
+        patience: factor of the duration of its actions.
         restless: from 0 to 1.
-        side: the side it prefers, from -1 (right) to 1 (left).
+        side: preferred side, from -1 (right) to 1 (left).
     """
 
     size: float
@@ -69,13 +69,12 @@ class Individual:
     def draw(
         rng: np.random.Generator, sizes: tuple[float, float], novel: bool = False
     ) -> Individual:
-        """An animal with traits exp(spread z), z uniform.
+        """Draw an animal with traits exp(spread z), z uniform.
 
         Args:
-            rng: source of randomness.
+            rng: random number generator.
             sizes: smallest and largest animal over home size.
-            novel: draws |z| from 0.7 to 1.5, at and beyond the ends of the range from 0 to 1 that
-                all others come from.
+            novel: draw |z| from 0.7 to 1.5, at and beyond the ends of the usual range from 0 to 1.
 
         Returns:
             The animal.
@@ -91,10 +90,7 @@ class Individual:
         return Individual(size=float(size), **factors, restless=float(restless), side=float(side))
 
     def turn_side(self, rng: np.random.Generator) -> float:
-        """A direction to turn in, left (1) or right (-1), by the side it prefers.
-
-        Args:
-            rng: source of randomness.
+        """Draw a turning direction, left (1) or right (-1), by the preferred side.
 
         Returns:
             1.0 or -1.0.
@@ -104,13 +100,13 @@ class Individual:
 
 @dataclass(frozen=True)
 class Motion:
-    """A behaviour sequence, step by step of the 5 ms clock.
+    """A behaviour sequence at the steps of the 5 ms clock.
 
     Attributes:
         channels: (m, C) speed mm/s, turning rad/s, climb rad, and the species' own.
         heading: (m,) rad.
-        position: (m, 3) of the body's middle, mm, arena frame.
-        word: (m,) name of the action, '' where it has none.
+        position: (m, 3) of the body's centre, mm, arena frame.
+        word: (m,) name of the action, '' if unnamed.
         act: (m,) int64, number of the action in the sequence.
     """
 
@@ -121,7 +117,7 @@ class Motion:
     act: NDArray[np.int64]
 
     def __getitem__(self, rows: NDArray[np.int64]) -> Motion:
-        """Some steps of it.
+        """A subset of steps.
 
         Args:
             rows: (n,) int64 numbers of steps.
@@ -138,7 +134,7 @@ class Motion:
         )
 
     def at(self, rate_hz: float) -> NDArray[np.int64]:
-        """The steps that a camera sees.
+        """Steps at which a camera takes frames.
 
         Args:
             rate_hz: of the camera, Hz.
@@ -150,10 +146,10 @@ class Motion:
 
 
 class BehaviourSequence:
-    """Actions, one after the other, with the state of the animal at the end of the last one.
+    """A sequence of actions, with the state of the animal at its end.
 
     Attributes:
-        position: (3,) of the body's middle, mm, arena frame.
+        position: (3,) of the body's centre, mm, arena frame.
         heading: rad.
         n_steps: steps of the clock so far.
     """
@@ -169,10 +165,10 @@ class BehaviourSequence:
         """Begin a sequence at rest.
 
         Args:
-            rest: (C,) channels of the animal at rest, the filter's first state.
+            rest: (C,) channels of the animal at rest, the filter's initial state.
             blend_s: time constant of each of the filter's two poles, s.
-            position: (3,) to begin at, mm.
-            heading: to begin with, rad.
+            position: (3,) initial position, mm.
+            heading: initial heading, rad.
             fits: whether an animal can be at positions (m, 3) mm with headings (m,) rad.
         """
         gain = 1.0 - np.exp(-STEP_S / blend_s)
@@ -189,15 +185,15 @@ class BehaviourSequence:
         self.n_steps = 0
 
     def play(self, word: str, draw: Callable[[], Array], tries: int = _TRIES) -> bool:
-        """Add an action, drawn again until it leads only to possible positions.
+        """Add an action, redrawn until it leads only to possible positions.
 
         Args:
             word: name of the action.
-            draw: makes its channels (m, C), anew on every call.
-            tries: how often to draw.
+            draw: draws its channels (m, C).
+            tries: number of draws.
 
         Returns:
-            False where none of the tries fits; the sequence is then as before.
+            False if no draw fits; the sequence is then unchanged.
         """
         for _ in range(tries):
             channels, state = lfilter(*self._taps, wanted := draw(), axis=0, zi=self._state)
@@ -219,19 +215,19 @@ class BehaviourSequence:
         return False
 
     def nudge(self, position: Array) -> None:
-        """Stop a cornered animal and put it a little inside.
+        """Stop a cornered animal and move it slightly inside.
 
         Args:
-            position: (3,) to go on from, mm.
+            position: (3,) position to resume from, mm.
         """
         self.position = np.array(position, float)
         self._state[:, SPEED] = 0.0
 
     def told(self) -> Motion:
-        """All of the sequence so far.
+        """The motion of the sequence so far.
 
-        A word begins when the body, which follows with a lag of 2 time constants of the filter,
-        begins to show its action.
+        A label begins when the action becomes visible in the body, which lags by 2 time constants
+        of the filter.
 
         Returns:
             The motion on the 5 ms clock.
@@ -260,12 +256,12 @@ def clock(seconds: float) -> Array:
 
 
 def bump(t: Array, length_s: float, peak: float = 0.5) -> Array:
-    """Raised cosine that rises from 0 to 1 at `peak` of the length and falls back; 0 outside.
+    """Raised cosine, from 0 to 1 at `peak` of the length and back; 0 outside.
 
     Args:
         t: (m,) s.
         length_s: of the bump, s.
-        peak: where it reaches 1, over the length.
+        peak: position of the maximum, over the length.
 
     Returns:
         (m,) from 0 to 1.
@@ -276,12 +272,12 @@ def bump(t: Array, length_s: float, peak: float = 0.5) -> Array:
 
 
 def slow_noise(rng: np.random.Generator, m: int, seconds: float, columns: int = 1) -> Array:
-    """Noise of about unit deviation that wanders over about so many seconds.
+    """Smooth noise of about unit standard deviation with the given correlation time.
 
-    Normal numbers (deviation 1.2) at knots, joined by raised cosines.
+    Normal numbers (standard deviation 1.2) at knots, joined by raised cosines.
 
     Args:
-        rng: source of randomness.
+        rng: random number generator.
         m: number of steps.
         seconds: between two knots, s.
         columns: number of independent channels.
@@ -297,7 +293,7 @@ def slow_noise(rng: np.random.Generator, m: int, seconds: float, columns: int = 
     return np.asarray(values[low] * (1.0 - share) + values[low + 1] * share)
 
 
-# Renders an acting animal before a virtual depth camera: the patch around it, frame by frame.
+# Rendering of an acting animal by a virtual depth camera: the patch around it, frame by frame.
 
 
 _BLOCK = 256  # frames rendered at a time
@@ -305,15 +301,15 @@ _BLOCK = 256  # frames rendered at a time
 
 @dataclass(frozen=True)
 class CameraPath:
-    """One camera over a scene, at rest.
+    """One fixed camera above a scene.
 
     Attributes:
-        intrinsics: (4,) fx, fy, cx, cy of the pictures that are read, px.
+        intrinsics: (4,) fx, fy, cx, cy of the rendered images, px.
         picture: (2,) their width and height, px.
         T_arena_camera: its pose.
         parameters: (N_PARAMETERS,) of the unit's sensor.
-        floor_error: (3,) how far off the floor is estimated to be: slopes along x and y, rad, and
-            mm farther below the camera.
+        floor_error: (3,) error of the estimated floor: slopes along x and y, rad, and mm farther
+            below the camera.
     """
 
     intrinsics: Array
@@ -331,18 +327,18 @@ class CameraPath:
         height_mm: float,
         stride: int,
     ) -> CameraPath:
-        """A camera of a make at a given height, of whose pixels every `stride`-th is read.
+        """Draw a camera of a make at a given height, with every `stride`-th pixel read.
 
-        Its picture is twice as wide and high as the sensor's, so that an animal has space for long
+        Its image is twice as wide and high as the sensor's, so that an animal has space for long
         stretches of action.
 
         Args:
-            rng: source of randomness.
-            species: the species; its scene's tilt and scale are drawn from.
+            rng: random number generator.
+            species: the species, which sets the scene's tilt and scale.
             sensor: the camera's make.
             fur: (1,) of the animal, from 0 to 1.
             height_mm: of the camera above the floor, mm.
-            stride: px of the sensor that one pixel stands for.
+            stride: sensor pixels per image pixel.
 
         Returns:
             The camera.
@@ -377,13 +373,13 @@ def render_agent(
     """Patches around an animal in given poses, 256 frames at a time.
 
     Args:
-        rng: source of randomness, for the noise and the tail.
+        rng: random number generator for the noise and the tail.
         species: the species.
-        camera: that looks at it.
-        shape: its body, a batch of which the first counts.
+        camera: the camera.
+        shape: its body, a batch of which the first is used.
         pose: (n) arena frame.
         girth: (n,) factor of all lengths across the body.
-        walls: (n, WALL_COLUMNS) the wall that each frame shows; None shows none.
+        walls: (n, WALL_COLUMNS) the wall in each frame; None for no walls.
         window_px: side of the patches, px.
 
     Yields:

@@ -1,9 +1,10 @@
-"""Kinematic definitions of nine zebrafish actions, and of what lies between, as control channels.
+"""Kinematic definitions of nine zebrafish actions and of unnamed movements, as control channels.
 
-Ranges follow the definitions of the literature where there are any (bends of scoots and turns,
-speeds, durations) and overlap as those do: strong routine turns are weak C-turns, J-turns bend no
-more than scoots do, only elsewhere. Bends are degrees a joint of 20 bones; speeds body lengths a
-second. `agents.agent` filters and strings them together, `fish_poses` bends the body by them.
+Ranges follow the definitions of the literature if there are any (bends of scoots and turns, speeds,
+durations) and overlap as those do: strong routine turns are weak C-turns, and J-turns bend no more
+than scoots, but in another part of the body. Bends are degrees per joint of 20 bones; speeds body
+lengths per second. `agents.agent` filters and concatenates the actions, `fish_poses` bends the
+body.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ ACTIONS = ("scoot", "j_turn", "c_turn", "r_turn", "surface", "dive", "zigzag", "
 _ROLL, _FRONT, _HIND, _WAVE, _BEAT = range(3, 8)
 _CHANNELS = 8
 _BLEND_S = 0.008
-# how often each follows in an uncut recording; what lies between has no name
+# relative frequencies in an uncut recording; other movements are unnamed
 _SHARES = {
     "scoot": 5.0,
     "j_turn": 2.5,
@@ -51,20 +52,20 @@ _SHARES = {
     "thrash": 1.4,
     "freeze": 1.4,
 }
-_NEAREST_MM = 185.0  # to the camera
-_VIEW = 0.32  # half the picture's side over the distance
-_BETWEEN = 0.75  # of the acts are followed by something without a name
+_NEAREST_MM = 185.0  # smallest distance to the camera
+_VIEW = 0.32  # half the image's side over the distance
+_BETWEEN = 0.75  # share of actions followed by an unnamed movement
 
 
 @dataclass(frozen=True)
 class FishActor:
-    """A fish that acts in the view of a camera.
+    """A fish that acts in view of a camera.
 
     Attributes:
         fish: its traits.
         length_mm: its length, mm.
-        water: its lowest and highest middle, mm above the floor.
-        camera_mm: height of the camera above the floor, mm; the fish stays in its view.
+        water: lowest and highest position of its centre, mm above the floor.
+        camera_mm: height of the camera above the floor, mm; the fish stays in view.
     """
 
     fish: Individual
@@ -73,14 +74,14 @@ class FishActor:
     camera_mm: float
 
     def fits(self, position: Array, heading: Array) -> bool:
-        """Whether all positions lie in the water and in view.
+        """Whether all positions are in the water and in view.
 
         Args:
-            position: (m, 3) of the body's middle, mm.
+            position: (m, 3) of the body's centre, mm.
             heading: (m,) rad, not used.
 
         Returns:
-            True where all m do.
+            True if all m are.
         """
         low, high = self.water
         seen = np.abs(position[:, :2]).max(axis=1) < self._half(position[:, 2])
@@ -91,11 +92,11 @@ class FishActor:
         return _VIEW * (self.camera_mm - z) - 0.6 * self.length_mm
 
     def begin(self, rng: np.random.Generator, word: str = UNLABELLED) -> BehaviourSequence:
-        """A sequence that begins somewhere in the middle, for a dive near the top.
+        """Begin a sequence at a random position near the centre, at a height that suits the action.
 
         Args:
-            rng: source of randomness.
-            word: of the action to come; 'surface' begins low, 'dive' high.
+            rng: random number generator.
+            word: the next action; 'surface' begins low, 'dive' high.
 
         Returns:
             The empty sequence.
@@ -111,11 +112,11 @@ class FishActor:
         )
 
     def cut(self, rng: np.random.Generator, word: str) -> Motion:
-        """One action with a quarter of a second of something unnamed before and after it.
+        """One action between two quarter-second unnamed movements.
 
         Args:
-            rng: source of randomness.
-            word: one of `ACTIONS`; it marks the steps of the action.
+            rng: random number generator.
+            word: one of `ACTIONS`; the label of its steps.
 
         Returns:
             The motion on the 5 ms clock.
@@ -132,11 +133,11 @@ class FishActor:
         raise AssertionError(f"no room for {word}")
 
     def uncut(self, rng: np.random.Generator, seconds: float) -> Motion:
-        """A recording: actions in random order, most of them with something unnamed between.
+        """A recording: actions in random order, most of them separated by unnamed movements.
 
         Args:
-            rng: source of randomness.
-            seconds: least length, s.
+            rng: random number generator.
+            seconds: minimum length, s.
 
         Returns:
             The motion on the 5 ms clock.
@@ -155,7 +156,7 @@ class FishActor:
         return sequence.told()
 
     def _go_home(self, rng: np.random.Generator, sequence: BehaviourSequence) -> None:
-        """An unnamed slow turn towards the middle, or, cornered, one on the spot."""
+        """An unnamed slow turn towards the centre, or, if cornered, a turn without translation."""
         x, y, z = sequence.position
         low, high = self.water
         away = (np.arctan2(-y, -x) - sequence.heading + np.pi) % (2 * np.pi) - np.pi
@@ -176,7 +177,7 @@ class FishActor:
             sequence.play(UNLABELLED, lambda: home(0.0))
 
     def _blank(self, rng: np.random.Generator, seconds: float) -> tuple[Array, Array]:
-        """The clock and the channels of a fish that does nothing but hold itself."""
+        """The clock and the channels of a resting fish."""
         t = clock(seconds)
         c = np.zeros((len(t), _CHANNELS))
         c[:, _ROLL] = np.radians(4.0) * slow_noise(rng, len(t), 1.5)[:, 0]
@@ -186,12 +187,12 @@ class FishActor:
         """Control channels of one action.
 
         Args:
-            rng: source of randomness.
+            rng: random number generator.
             word: one of `ACTIONS`.
 
         Returns:
             (m, 8): speed mm/s, turning rad/s, climb rad, roll rad, bend of the front and of the
-            hind half and amplitude of the wave in degrees a joint, beat Hz.
+            hind half and amplitude of the wave in degrees per joint, beat Hz.
         """
         table: dict[str, Callable[[np.random.Generator], Array]] = {
             "scoot": self._scoot,
@@ -209,7 +210,7 @@ class FishActor:
         return channels
 
     def _seconds(self, rng: np.random.Generator, shortest: float, longest: float) -> float:
-        """How long an act lasts: most are nearer to the shortest."""
+        """Draw the duration of an action; most are near the shortest."""
         return float(
             np.clip(
                 shortest + (longest - shortest) * rng.beta(1.3, 2.2) * self.fish.patience,
@@ -219,7 +220,7 @@ class FishActor:
         )
 
     def _swim(self, rng: np.random.Generator, t: Array, c: Array, pace: float) -> None:
-        """Waves down the body that fit a speed."""
+        """Set the body wave for a speed."""
         c[:, _WAVE] = self.fish.bend * rng.uniform(0.9, 2.1) * np.sqrt(max(pace, 0.05))
         c[:, _BEAT] = self.fish.tempo * (2.5 + 1.1 * pace) * rng.uniform(0.85, 1.2)
 
@@ -264,9 +265,7 @@ class FishActor:
         total_deg: float,
         lag_s: float,
     ) -> None:
-        """Bends that add up to total_deg from head to tail at the shape's peak; the tail
-        follows.
-        """
+        """Add bends that sum to total_deg from head to tail at the shape's peak; the tail lags."""
         hind = rng.uniform(0.52, 0.64)
         lag = max(1, round(lag_s / STEP_S))
         late = np.concatenate([np.zeros(lag), shape])[: len(shape)]
@@ -365,9 +364,7 @@ class FishActor:
         return c
 
     def _between(self, rng: np.random.Generator, seconds: float | None) -> Array:
-        """What has no name: gliding, hovering, slow turns and climbs below every threshold,
-        backing.
-        """
+        """Unnamed movements: gliding, hovering, weak turns and climbs, swimming backwards."""
         kind = rng.choice(5, p=[0.34, 0.28, 0.2, 0.1, 0.08])
         t, c = self._blank(
             rng,
@@ -422,10 +419,10 @@ def fish_poses(
     """Poses of a fish at some steps of its motion.
 
     Args:
-        rng: source of randomness, for small standing waves and the length of the travelling one.
+        rng: random number generator for small standing waves and the length of the travelling one.
         species: the species.
         motion: its motion.
-        rows: (n,) int64 steps of it.
+        rows: (n,) int64 steps of the motion.
         size: of the fish over home size.
 
     Returns:
@@ -456,13 +453,13 @@ def fish_poses(
 def depth_of_water(
     species: FishSpecies, shape: BodyShape, size: float, camera_mm: float
 ) -> tuple[float, float]:
-    """Lowest and highest middle of a fish, so that all of it stays in the water.
+    """Lowest and highest position of a fish's centre for which its body stays in the water.
 
     Args:
         species: the species.
         shape: its body.
         size: over home size.
-        camera_mm: height of the camera above the floor, mm; no part comes nearer than 185 mm to it.
+        camera_mm: height of the camera above the floor, mm; no part is nearer to it than 185 mm.
 
     Returns:
         Lowest and highest, mm above the floor.

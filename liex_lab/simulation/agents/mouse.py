@@ -1,9 +1,9 @@
-"""Kinematic definitions of twelve mouse actions, and of what lies between, as control channels.
+"""Kinematic definitions of twelve mouse actions and of unnamed movements, as control channels.
 
-Thresholds of speed, height and turning are Live Mouse Tracker's and the literature's; speeds are
-mm/s of a mouse of home size. A posture is one elevation for each of the four bones, a turn at each
-of the three inner joints, and how far the body is stretched. `agents.agent` filters and strings
-them together, `mouse_poses` stands them on the floor.
+Thresholds of speed, height and turning are those of Live Mouse Tracker and the literature; speeds
+are mm/s of a mouse of home size. A posture is one elevation for each of the four bones, a turn at
+each of the three inner joints, and the stretch of the body. `agents.agent` filters and concatenates
+the actions, `mouse_poses` places the postures on the floor.
 """
 
 from __future__ import annotations
@@ -70,9 +70,9 @@ _SHARES = {
     "dart": 2.5,
     "stretch_attend": 1.5,
 }
-_BETWEEN = 0.3  # of the acts are followed by something without a name
+_BETWEEN = 0.3  # share of actions followed by an unnamed movement
 _STRIDE_HZ_PER_SPINE = 1.6
-_WALL_MM = 50.0  # a nose nearer to a wall can lean on it
+_WALL_MM = 50.0  # nose-to-wall distance for a supported rear
 
 
 @dataclass(frozen=True)
@@ -83,7 +83,7 @@ class MouseActor:
         mouse: its traits.
         spine_mm: its length, mm.
         half: (2,) half sides x and y of the box, mm.
-        rest: (4,) elevations of its bones when it stands, rad.
+        rest: (4,) elevations of its bones when standing, rad.
     """
 
     mouse: Individual
@@ -98,7 +98,7 @@ class MouseActor:
         Args:
             mouse: its traits.
             skeleton: of the mouse, with four bones.
-            shape: its body, a batch of which the first counts.
+            shape: its body, a batch of which the first is used.
             half: (2,) half sides x and y of its box, mm.
 
         Returns:
@@ -112,14 +112,14 @@ class MouseActor:
         return MouseActor(mouse, mouse.size * skeleton.length, half, rest)
 
     def fits(self, position: Array, heading: Array) -> bool:
-        """Whether the body stays inside the box, nose and rump too.
+        """Whether the body, including nose and rump, stays inside the box.
 
         Args:
-            position: (m, 3) of the body's middle, mm.
+            position: (m, 3) of the body's centre, mm.
             heading: (m,) rad.
 
         Returns:
-            True where it does in all m steps.
+            True if it does in all m steps.
         """
         ahead = 0.55 * self.spine_mm * np.stack([np.cos(heading), np.sin(heading)], axis=1)
         middle = position[:, :2]
@@ -127,11 +127,11 @@ class MouseActor:
         return bool((reach < self.half).all())
 
     def uncut(self, rng: np.random.Generator, seconds: float) -> Motion:
-        """A recording: actions in random order, some of them with something unnamed between.
+        """A recording: actions in random order, some of them separated by unnamed movements.
 
         Args:
-            rng: source of randomness.
-            seconds: least length, s.
+            rng: random number generator.
+            seconds: minimum length, s.
 
         Returns:
             The motion on the 5 ms clock.
@@ -162,9 +162,7 @@ class MouseActor:
         return sequence.told()
 
     def _possible(self, sequence: BehaviourSequence, word: str) -> bool:
-        """Whether a rear here is of that kind: one on a wall has it before the nose, any other is
-        away from walls.
-        """
+        """Whether a rear is possible here: supported near a wall ahead, else away from walls."""
         if word == "rear_supported":
             return self._room(sequence) < _WALL_MM
         nose = sequence.position[:2] + 0.5 * self.spine_mm * np.array(
@@ -173,7 +171,7 @@ class MouseActor:
         return word != "rear_unsupported" or bool((self.half - np.abs(nose)).min() > 1.4 * _WALL_MM)
 
     def _room(self, sequence: BehaviourSequence) -> float:
-        """From the nose to the wall ahead, mm."""
+        """Distance from the nose to the wall ahead, mm."""
         way = np.array([np.cos(sequence.heading), np.sin(sequence.heading)])
         nose = sequence.position[:2] + 0.5 * self.spine_mm * way
         ahead = np.where(
@@ -198,7 +196,7 @@ class MouseActor:
             sequence.play("walk", partial(self._stride, rng, seconds, speed), 2)
 
     def _turn_home(self, rng: np.random.Generator, sequence: BehaviourSequence) -> None:
-        """Turn to the middle of the box, on the spot where there is no room."""
+        """Turn towards the centre of the box, in place if there is no room."""
         self._turn_by(
             rng,
             sequence,
@@ -221,7 +219,7 @@ class MouseActor:
         """Control channels of one action.
 
         Args:
-            rng: source of randomness.
+            rng: random number generator.
             word: one of `ACTIONS`.
 
         Returns:
@@ -266,7 +264,7 @@ class MouseActor:
     def _blank(
         self, rng: np.random.Generator, seconds: float, unrest: float = 1.0
     ) -> tuple[Array, Array]:
-        """The clock and the channels of a standing mouse, a little restless."""
+        """The clock and the channels of a standing, slightly restless mouse."""
         t = clock(seconds)
         c = np.zeros((len(t), _CHANNELS))
         c[:, _RISE] = self.rest + np.radians(rng.normal(0.0, 3.0, 4))
@@ -279,7 +277,7 @@ class MouseActor:
         return t, c
 
     def _gait(self, c: Array) -> None:
-        """The trunk sways with the stride."""
+        """Add the sway of the trunk with the stride."""
         spines = np.abs(c[:, SPEED]) / self.spine_mm
         phase = (
             2
@@ -304,7 +302,7 @@ class MouseActor:
     def _dart(self, rng: np.random.Generator) -> Array:
         t, c = self._blank(rng, 0.15 + self._seconds(rng, 0.4, 0.9), 0.5)
         peak = max(245.0, self.mouse.vigour * rng.uniform(260.0, 520.0)) * self.mouse.size
-        burst = t[-1] - 0.15  # it starts from a stand and stops again
+        burst = t[-1] - 0.15  # it starts and ends at rest
         c[:, SPEED] = peak * bump(t - 0.05, burst, rng.uniform(0.2, 0.35)) ** 0.7
         c[:, TURN] = np.radians(rng.normal(0.0, 25.0))
         c[:, _STRETCH] += 0.03
@@ -400,7 +398,7 @@ class MouseActor:
         return c
 
     def _between(self, rng: np.random.Generator) -> Array:
-        """What has no name: a nose half up, sitting hunched, backing, bending far to one side."""
+        """Unnamed movements: nose half up, sitting hunched, backing, bending far to one side."""
         kind = rng.choice(4, p=[0.25, 0.25, 0.25, 0.25])
         t, c = self._blank(rng, self._seconds(rng, 0.4, 1.6))
         shape = bump(t, t[-1])
@@ -433,12 +431,12 @@ def mouse_poses(
     """Poses of a mouse at some steps of its motion, and its girths.
 
     Args:
-        rng: source of randomness, for the gap under the trunk (up to 2 mm).
+        rng: random number generator for the gap under the trunk (up to 2 mm).
         species: the species.
         motion: its motion.
-        rows: (n,) int64 steps of it.
+        rows: (n,) int64 steps of the motion.
         size: of the mouse over home size.
-        shape: its body, a batch of which the first counts.
+        shape: its body, a batch of which the first is used.
 
     Returns:
         Poses (n) in the arena frame and girths (n,).
@@ -448,7 +446,7 @@ def mouse_poses(
     skeleton = species.skeleton
     turn = np.zeros((n, skeleton.n_joints))
     turn[:, 1:-1] = c[:, _BEND]
-    # a body that bends to one side heads between its ends
+    # a bent body's heading is between its ends
     posture = Posture(c[:, _RISE].copy(), turn, c[:, _ROLL].copy(), c[:, _STRETCH].copy())
     heading = motion.heading[rows] - 0.5 * c[:, _BEND].sum(axis=1)
     gap = np.full(n, rng.uniform(0.0, 2.0))

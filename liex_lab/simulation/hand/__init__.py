@@ -1,1 +1,1 @@
-"""The simulated hand: its pose prior, its gestures, the scene around it."""
+"""The simulated hand: its pose prior, its gestures, and its scene."""

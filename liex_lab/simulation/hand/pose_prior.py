@@ -2,9 +2,9 @@
 
 Each of eight kinds of posture has a mean, six principal axes and a residual deviation, as in
 mixtures of probabilistic PCA; each of eight orientations is a Gaussian in the tangent space of
-SO(3), R = R_k exp(delta). Training postures are also drawn between two of these, and freely within
-what a hand can do. `pose_prior.toml` beside this module holds the statistics and says where they
-come from; `distil` makes them, by k-means and a singular value decomposition.
+SO(3), R = R_k exp(delta). Training postures are also blends of two of these, and random postures
+within the joints' limits. `pose_prior.toml` next to this module contains the statistics and their
+sources; `distil` makes it, by k-means and a singular value decomposition.
 """
 
 from __future__ import annotations
@@ -30,15 +30,15 @@ STATISTICS = Path(__file__).with_name("pose_prior.toml")
 _N_POSTURES = 8
 _N_TURNS = 8
 _N_AXES = 6
-_FREE_SHARE = 0.45  # of the training postures are what a hand can do, not what was seen
-SEEN_SHARE = 1.0 - _FREE_SHARE  # come from the labelled points of NYU test frames
+_FREE_SHARE = 0.45  # share of random training postures, not based on observations
+SEEN_SHARE = 1.0 - _FREE_SHARE  # share based on the labelled points of NYU test frames
 _FAN_DEG = {
     "index": 10.0,
     "middle": 1.0,
     "ring": -8.0,
     "little": -19.0,
-}  # how fingers part when a hand is spread
-_BLEND_SHARE = 0.3  # of the seen ones lie between two
+}  # angles of the fingers of a spread hand
+_BLEND_SHARE = 0.3  # share of observed postures that are blends of two
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class HandPostures:
         share: (K,) weights.
         mean: (K, D) rad.
         axes: (K, A, D) principal deviations, one standard deviation long, rad.
-        rest: (K, D) standard deviation of what they leave, rad.
+        rest: (K, D) residual standard deviation, rad.
         turn_share: (M,) weights.
         turn: (M, 3, 3) T_view_palm, the view's z axis pointing at the viewer.
         turn_axes: (M, 3, 3) deviations from it, one standard deviation long, in the palm's frame,
@@ -67,7 +67,7 @@ class HandPostures:
     @staticmethod
     @cache
     def load() -> HandPostures:
-        """The statistics that come with the package, read once."""
+        """The bundled statistics, cached."""
         table = tomllib.loads(STATISTICS.read_text(encoding="utf-8"))
         postures = table["postures"]
         turns = table["turns"]
@@ -82,12 +82,12 @@ class HandPostures:
         )
 
     def draw_angles(self, rng: np.random.Generator, skeleton: Skeleton, n: int) -> Array:
-        """Postures as they were seen, within the joints' limits.
+        """Observed postures, within the joints' limits.
 
         Args:
-            rng: source of randomness.
+            rng: random number generator.
             skeleton: of the hand.
-            n: how many.
+            n: number of postures.
 
         Returns:
             (n, J, 3) rad.
@@ -98,11 +98,11 @@ class HandPostures:
         return _within_limits(skeleton, values)
 
     def draw_turns(self, rng: np.random.Generator, n: int) -> Array:
-        """Orientations of the palm towards the viewer, as they were seen.
+        """Observed orientations of the palm towards the viewer.
 
         Args:
-            rng: source of randomness.
-            n: how many.
+            rng: random number generator.
+            n: number of orientations.
 
         Returns:
             (n, 3, 3) T_view_palm.
@@ -114,12 +114,12 @@ class HandPostures:
 
 
 def draw_seen(rng: np.random.Generator, skeleton: Skeleton, n: int) -> tuple[Array, Array]:
-    """Hands as they were seen.
+    """Draw hands from the observed postures and orientations.
 
     Args:
-        rng: source of randomness.
+        rng: random number generator.
         skeleton: of the hand.
-        n: how many.
+        n: number of hands.
 
     Returns:
         Angles (n, J, 3) rad and T_view_palm (n, 3, 3).
@@ -129,15 +129,15 @@ def draw_seen(rng: np.random.Generator, skeleton: Skeleton, n: int) -> tuple[Arr
 
 
 def draw_wide(rng: np.random.Generator, skeleton: Skeleton, n: int) -> tuple[Array, Array]:
-    """Hands as they were seen, between two of these, or quite free.
+    """Draw hands from the observed postures, blends of two of them, or random postures.
 
-    Angles and orientations are each free in 45 % of the draws; of the others' angles 30 % lie
-    between two postures.
+    Angles and orientations are each random in 45 % of the draws; 30 % of the other postures are
+    blends of two observed ones.
 
     Args:
-        rng: source of randomness.
+        rng: random number generator.
         skeleton: of the hand.
-        n: how many.
+        n: number of hands.
 
     Returns:
         Angles (n, J, 3) rad and T_view_palm (n, 3, 3).
@@ -156,12 +156,12 @@ def draw_wide(rng: np.random.Generator, skeleton: Skeleton, n: int) -> tuple[Arr
 
 
 def free_angles(rng: np.random.Generator, skeleton: Skeleton, n: int) -> Array:
-    """Postures in which every finger is bent, stretched or in between on its own, or all alike.
+    """Random postures: every finger is bent independently, or all in the same way.
 
     Args:
-        rng: source of randomness.
+        rng: random number generator.
         skeleton: of the hand.
-        n: how many.
+        n: number of postures.
 
     Returns:
         (n, J, 3) rad, within the joints' limits.
@@ -171,7 +171,7 @@ def free_angles(rng: np.random.Generator, skeleton: Skeleton, n: int) -> Array:
     together = rng.random((n, 1))
     each = np.clip(rng.beta(0.5, 0.5, (n, 4)), 0.0, 1.0)
     bent = np.clip(np.where(alike, together, each) + rng.normal(0.0, 0.05, (n, 4)), 0.0, 1.0)
-    spread = rng.uniform(-0.6, 1.6, n)  # fingers closed up, or fanned out
+    spread = rng.uniform(-0.6, 1.6, n)  # fingers together or spread
     for f, (finger, fan) in enumerate(_FAN_DEG.items()):
         root, middle, end = (
             skeleton.names.index(f"{finger}_{part}") for part in ("root", "middle", "end")
@@ -199,14 +199,14 @@ def free_angles(rng: np.random.Generator, skeleton: Skeleton, n: int) -> Array:
 
 
 def free_turns(rng: np.random.Generator, n: int) -> Array:
-    """Orientations with palm or back towards the viewer, tilted any way, turned by any angle.
+    """Random orientations with the palm or the back towards the viewer, with tilt and spin.
 
-    The palm faces the viewer in 70 % of the draws; the tilt's standard deviation is 35 degrees an
+    The palm faces the viewer in 70 % of the draws; the tilt's standard deviation is 35 degrees per
     axis.
 
     Args:
-        rng: source of randomness.
-        n: how many.
+        rng: random number generator.
+        n: number of orientations.
 
     Returns:
         (n, 3, 3) T_view_palm.
@@ -215,8 +215,8 @@ def free_turns(rng: np.random.Generator, n: int) -> Array:
     spin[:, 2] = rng.uniform(-np.pi, np.pi, n)
     tilt = np.zeros((n, 3))
     tilt[:, :2] = np.radians(rng.normal(0.0, 35.0, (n, 2)))
-    # the palm's z axis leaves through the back of the hand: turned about its long axis it points
-    # away from the viewer
+    # the palm's z axis points out of the back of the hand: a rotation by pi about the long axis
+    # turns the palm towards the viewer
     over = np.zeros((n, 3))
     over[:, 0] = np.where(rng.random(n) < 0.7, np.pi, 0.0)
     return so3.exp(spin) @ so3.exp(tilt) @ so3.exp(over)
@@ -234,7 +234,7 @@ def _clipped(skeleton: Skeleton, angles: Array) -> Array:
 
 
 def _free(skeleton: Skeleton) -> NDArray[np.bool_]:
-    """(J, 3) the angles that a posture consists of."""
+    """(J, 3) mask of the free angles of a posture."""
     free = skeleton.axes.copy()
     free[0] = False
     return free
@@ -290,7 +290,7 @@ def _degrees(values: Array) -> list[float]:
     return np.degrees(values).round(1).tolist()
 
 
-# Where the labelled hands lie that test postures are fitted to.
+# Location of the labelled hands to which test postures are fitted.
 
 
 VARIABLE = "LIEX_NYU"
@@ -300,11 +300,11 @@ _REPOSITORY = Path(__file__).resolve().parents[3]
 
 
 def find_reference() -> Path | None:
-    """The folder of labelled hands: what `LIEX_NYU` names, else that beside the repository.
+    """Find the folder of labelled hands: `LIEX_NYU`, else the one next to the repository.
 
     Returns:
-        `LIEX_NYU`, or `../shared/data/hand_nyu` of the repository that this file is in; None where
-        the variable is not set and no labels lie there.
+        `LIEX_NYU`, or `../shared/data/hand_nyu` of the repository that contains this file; None if
+        the variable is not set and that folder has no labels.
 
     Raises:
         LiexError: `LIEX_NYU` names a folder without labels.
@@ -324,15 +324,15 @@ def find_reference() -> Path | None:
 # Trajectories of hand gestures: geodesics in SO(3), straight lines in angles, cosine timing.
 
 
-# at the fastest moment of a move: the palm's turning and the quickest finger joint's, rad/s, and
-# the palm's way, mm/s
+# peak speeds of a move: rotation of the palm and of the fastest finger joint, rad/s, and
+# translation of the palm, mm/s
 _TURN = (2.0, 6.0)
 _BEND = (5.0, 12.0)
 _GO = (200.0, 700.0)
 _SHORTEST_S = 0.25
 _REST_S = (0.0, 0.6)
-_WRIST_RAD = np.radians([0.0, 22.0, 12.0])  # how a wrist is bent
-# where gestures are made, beside the middle of them all
+_WRIST_RAD = np.radians([0.0, 22.0, 12.0])  # standard deviations of the wrist's rotation
+# positions of gestures relative to their common centre
 _NEARER = (0.93, 1.07)
 _ASIDE_MM = 15.0
 
@@ -344,7 +344,7 @@ class Gestures(NamedTuple):
         angles: (n, J, 3) joint angles, rad.
         turns: (n, 3, 3) T_view_palm.
         places: (n, 3) of the palm, mm, camera frame.
-        wrists: (n, 3) how the wrist is bent, rad.
+        wrists: (n, 3) wrist rotation, rad.
     """
 
     angles: Array
@@ -356,17 +356,17 @@ class Gestures(NamedTuple):
 def draw_gestures(
     rng: np.random.Generator, skeleton: Skeleton, n: int, step_s: float, middle: Array
 ) -> Gestures:
-    """Moments of somebody who goes through postures that were seen, about one point.
+    """A sequence of observed postures near one point, joined by smooth moves.
 
-    Each move lasts as long as its longest part, turning, bending or going, takes at a speed drawn
-    for it, but 0.25 s at least.
+    The duration of a move is that of its slowest part (rotation, bending or translation) at a
+    random speed, at least 0.25 s.
 
     Args:
-        rng: source of randomness.
+        rng: random number generator.
         skeleton: of the hand.
         n: number of moments.
         step_s: between two moments, s.
-        middle: (3,) point about which gestures are made, mm, camera frame.
+        middle: (3,) centre of the gestures, mm, camera frame.
 
     Returns:
         The hand at n moments.

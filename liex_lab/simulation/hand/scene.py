@@ -1,8 +1,8 @@
-"""Model of a scene with an outstretched hand: arm, body and wall behind it, objects beside it.
+"""Scene model of an outstretched hand: arm, body and wall behind it, objects next to it.
 
 Torso, head and objects are superellipsoids, arms are capsules, the wall is a plane 1 / z = a u + b
-v + c. Everything lives in the camera frame; a palm's orientation is drawn in the view along its
-line of sight, so that what a hand looks like does not depend on where in the picture it is.
+v + c. Everything is in the camera frame; a palm's orientation is drawn in the view along its line
+of sight, so that a hand's appearance does not depend on its position in the image.
 """
 
 from __future__ import annotations
@@ -29,16 +29,16 @@ Array = NDArray[np.float64]
 
 DISTANCE_MM = (400.0, 1200.0)
 ARM_FACES = joined_faces([(CAPSULE_RINGS, CAPSULE_SEGMENTS)] * N_ARM_CAPSULES)
-_N_BODY_PARTS = 3  # torso, head, and something else behind
+_N_BODY_PARTS = 3  # torso, head, and another object behind
 BODY_FACES = np.concatenate([PART_FACES + k * len(SPHERE) for k in range(_N_BODY_PARTS)]).astype(
     np.int32
 )
-_EDGE_MM = 110.0  # the palm stays this far inside the picture
+_EDGE_MM = 110.0  # minimum distance of the palm from the image border
 
 
 @dataclass(frozen=True)
 class HandFrameContents:
-    """Hands, n of them, and what is around each, in the camera frame.
+    """Hands, n of them, and their surroundings, in the camera frame.
 
     Attributes:
         pose: (n) of the hands.
@@ -46,9 +46,9 @@ class HandFrameContents:
         spine_mm: (n,) lengths of the hands, mm.
         hand: (n, V, 3) meshes of the hands, mm.
         arm: (n, A, 3) meshes of the arms, mm.
-        body: (n, B, 3) meshes of torso, head and something else, mm.
+        body: (n, B, 3) meshes of torso, head and another object, mm.
         thing: (n, W, 3) meshes of the distractors, mm.
-        shown: (n,) bool, which distractors are there.
+        shown: (n,) bool, whether the distractor is present.
         wall: (n, 4) planes behind everything and their unevenness, as in `_render_kernels.picture`.
         parameters: (n, N_PARAMETERS) of the sensors.
         seeds: (n,) uint64 of their noise.
@@ -69,13 +69,10 @@ class HandFrameContents:
     thing_faces: NDArray[np.int32] = field(default_factory=lambda: PART_FACES)
 
     def __getitem__(self, index: slice | NDArray[np.int64]) -> HandFrameContents:
-        """Some of the pictures.
+        """A subset of the images.
 
         Args:
             index: slice or row numbers.
-
-        Returns:
-            The chosen pictures' contents.
         """
         columns = [column.name for column in fields(self) if column.name != "thing_faces"]
         return replace(self, **{name: getattr(self, name)[index] for name in columns})
@@ -89,18 +86,18 @@ class HandFrameContents:
         shape: tuple[int, int],
         parallel: bool = True,
     ) -> NDArray[np.uint16]:
-        """What the cameras read.
+        """Render depth images.
 
         Args:
             faces: (F, 3) int32, triangles of the hands' meshes, see `hand_faces`.
             intrinsics: (n, 4) fx, fy, cx, cy, px.
-            size: (n, 2) int64 width and height of the whole pictures, px.
-            origin: (n, 2) int64 pixel (u, v) of the whole pictures to begin at.
-            shape: rows and columns of what is rendered.
+            size: (n, 2) int64 width and height of the whole images, px.
+            origin: (n, 2) int64 first pixel (u, v) of the rendered part of the whole images.
+            shape: rows and columns of the rendered part.
             parallel: render on all threads.
 
         Returns:
-            (n, *shape) uint16 mm, 0 where unread.
+            (n, *shape) uint16 mm, 0 if unread.
         """
         out = np.empty((len(self.seeds), *shape), np.uint16)
         with threads(parallel):
@@ -132,7 +129,7 @@ def hold_out(
     size: Array,
     p_camera: Array,
 ) -> Pose:
-    """Poses of hands held out at given points, oriented along the lines of sight.
+    """Poses of hands at given points, oriented relative to the lines of sight.
 
     Args:
         rng: not used.
@@ -152,13 +149,13 @@ def hold_out(
 def draw_places(
     rng: np.random.Generator, intrinsics: Array, picture: Array, low: Array, high: Array
 ) -> Array:
-    """Points between two depths that are well inside their pictures, uniform in the picture.
+    """Points between two depths and inside their images, uniform in the image.
 
     Args:
-        rng: source of randomness.
+        rng: random number generator.
         intrinsics: (n, 4) fx, fy, cx, cy, px.
-        picture: (n, 2) width and height, px.
-        low: (n,) least depths, mm.
+        picture: (n, 2) image width and height, px.
+        low: (n,) smallest depths, mm.
         high: (n,) largest depths, mm.
 
     Returns:
@@ -187,19 +184,19 @@ def assemble(
     """Hands with their arms, bodies, walls and distractors.
 
     Args:
-        rng: source of randomness.
+        rng: random number generator.
         skeleton: of the hand.
         pose: (n) camera frame.
         shape: (n) the people's hands.
         size: (n,) over home size.
         intrinsics: (n, 4) fx, fy, cx, cy, px.
         parameters: (n, N_PARAMETERS) of the sensors.
-        thing_share: of the pictures with a distractor beside the hand.
-        scenery: so many pictures in a row share body and wall.
-        wrists: (n, 3) how each wrist is bent, rad; None draws it for every picture.
+        thing_share: share of images with a distractor next to the hand.
+        scenery: number of consecutive images that share body and wall.
+        wrists: (n, 3) wrist rotations, rad; None draws one for every image.
 
     Returns:
-        What stands before the cameras in n pictures.
+        The contents of n images.
     """
     n = len(size)
     rotations, positions = shape.joints(skeleton, pose)
@@ -230,8 +227,8 @@ def assemble(
 def _bodies(joints: Array, elbow: Array, forward: Array, u: Array) -> tuple[Array, Array]:
     """Torso, head and one more object (n, V, 3) mm behind each hand, and the shoulders (n, 3) mm.
 
-    The arms lead to the shoulders. u (n, 3, 8) in [0, 1) says where and how large the three are,
-    and which are there. Without a torso the arm goes straight on and leaves the picture.
+    The arms lead to the shoulders. u (n, 3, 8) in [0, 1) sets position, size and presence of the
+    three. Without a torso the arm continues straight out of the image.
     """
     n = len(joints)
     behind = np.maximum(joints[:, :, 2].max(axis=1), elbow[:, 2])
@@ -266,9 +263,7 @@ def _bodies(joints: Array, elbow: Array, forward: Array, u: Array) -> tuple[Arra
 
 
 def _things(rng: np.random.Generator, hand: Array, share: float) -> tuple[Array, NDArray[np.bool_]]:
-    """A block or ball (n, V, 3) mm beside each hand, at about its depth, and which are
-    there (n,).
-    """
+    """A block or ball (n, V, 3) mm next to each hand at about its depth, and its presence (n,)."""
     n = len(hand)
     radii = rng.uniform(15.0, 60.0, (n, 3))
     direction = rng.uniform(-np.pi, np.pi, n)
@@ -278,7 +273,7 @@ def _things(rng: np.random.Generator, hand: Array, share: float) -> tuple[Array,
     clear = reach - np.sum(middle[:, :2] * toward, axis=1) + np.hypot(radii[:, 0], radii[:, 1])
     offset = (clear + rng.uniform(10.0, 80.0, n))[:, None] * toward
     depth = np.maximum(middle[:, 2] + rng.uniform(-30.0, 160.0, n), 300.0)
-    # farther away it must stand further aside to appear beside the hand and not behind it
+    # an object farther away needs a larger offset to appear next to the hand, not behind it
     centre = np.column_stack(
         [
             (middle[:, :2] + offset) * (np.maximum(depth, middle[:, 2]) / middle[:, 2])[:, None],
@@ -290,9 +285,7 @@ def _things(rng: np.random.Generator, hand: Array, share: float) -> tuple[Array,
 
 
 def _walls(rng: np.random.Generator, m: int, intrinsics: Array, hand: Array, body: Array) -> Array:
-    """A plane (m, 4) behind everything, seldom parallel to the picture, and in a fifth of the
-    scenes out of range.
-    """
+    """A randomly sloped plane (m, 4) behind everything; out of range in a fifth of the scenes."""
     farthest = max(float(hand[..., 2].max()), float(np.quantile(body[..., 2], 0.9)))
     distance = np.minimum(farthest, 2000.0) + rng.uniform(150.0, 1500.0, m)
     slope = rng.normal(0.0, 0.25, (m, 2))

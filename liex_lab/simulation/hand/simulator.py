@@ -1,9 +1,9 @@
-"""Simulator of the hand: training patches, test splits and gestures, rendered before an NYU camera.
+"""Simulator of the hand: training patches, test splits and gestures, rendered for an NYU camera.
 
-Hands are drawn from the statistics in `hand.pose_prior`, posed along the line of sight, set before
-an arm, a body and a wall, and passed through a structured-light noise model. Test postures come
-from another person's labelled frames of the NYU Hand Pose data set (Tompson et al. 2014) where that
-reference is at hand.
+Hands are drawn from the statistics in `hand.pose_prior`, posed relative to the line of sight,
+combined with an arm, a body and a wall, and passed through a structured-light noise model. Test
+postures come from another person's labelled frames of the NYU Hand Pose data set (Tompson et al.
+2014) if that reference is available.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ NYU_SENSOR = Sensor("NYU Kinect", LABEL_CAMERA, PRIMESENSE_KIND)
 FRAME_NS = 33_333_333
 N_SESSIONS = 40
 N_FRAMES = 50
-# name: (own seed, shape family, noise, eroded pixels, share of frames with another object beside
+# name: (own seed, shape family, noise, eroded pixels, share of frames with another object next to
 # the hand)
 SPLITS = {
     "clean": (81_001, "train", 1.0, 0, 0.0),
@@ -52,29 +52,28 @@ SPLITS = {
     "other-body": (84_001, "other", 1.0, 0, 0.0),
     OTHER_CAMERA: (85_001, "train", 1.0, 0, 0.0),
 }
-_SEALED_SEED = 980_413  # of the split that is measured once, see `recording.SEALED`
-# training pictures: (sensor, pixels of it that one pixel stands for, nearest and farthest hand,
-# share)
+_SEALED_SEED = 980_413  # of the held-out split, see `recording.SEALED`
+# training images: (sensor, sensor pixels per image pixel, nearest and farthest hand, share)
 _KINDS = (
     (NYU_SENSOR, 1, 620.0, 1200.0, 0.55),
     (NYU_SENSOR, 2, 400.0, 700.0, 0.20),
     (KINECT_V2_SENSOR, 1, 400.0, 1000.0, 0.25),
 )
 _THING_SHARE = 0.15
-_LEAST_PX = 320  # a side of the pictures that windows are cut from
+_LEAST_PX = 320  # smallest height of the images that windows are cut from
 _FLAT = np.array([0.0, 0.0, 1.0])
-_FLOOR_MM = 1300.0  # where the plane stands that is taken for the arena's floor
+_FLOOR_MM = 1300.0  # depth of the plane that replaces the arena's floor
 
 
 class HandSession(TrueRecording):
     """A virtual recording of one person's hand; the joints are the person's own.
 
-    There is no floor in it: a plane at right angles to the optical axis, 1300 mm away, stands for
-    one and defines the arena frame.
+    It has no floor: a plane perpendicular to the optical axis, at 1300 mm, replaces it and defines
+    the arena frame.
 
     Attributes:
         sensor: the camera's make.
-        contents: the hand and what is around it, n frames.
+        contents: the hand and its surroundings, n frames.
     """
 
     def __init__(
@@ -91,7 +90,7 @@ class HandSession(TrueRecording):
             name: of the recording.
             skeleton: of the hand.
             sensor: the camera's make.
-            contents: the hand and what is around it, n frames, camera frame.
+            contents: the hand and its surroundings, n frames, camera frame.
             times_ns: (n,) int64 time stamps, ns; None counts steps of `FRAME_NS`.
         """
         n = len(contents.seeds)
@@ -114,14 +113,14 @@ class HandSession(TrueRecording):
         return self.depths(index, index + 1)[0]
 
     def depths(self, start: int, stop: int) -> NDArray[np.float32]:
-        """Depth pictures of a range of frames, made on all threads.
+        """Depth images of a range of frames, rendered on all threads.
 
         Args:
             start: first frame.
             stop: one past the last frame.
 
         Returns:
-            (stop - start, H, W) float32 mm, 0 where unread.
+            (stop - start, H, W) float32 mm, 0 if unread.
         """
         c = self.camera
         part = self.contents[slice(start, stop)]
@@ -136,12 +135,12 @@ class HandSession(TrueRecording):
 
 @dataclass(frozen=True)
 class HandSimulator:
-    """Simulator of somebody's right hand before a depth camera.
+    """Simulator of a right hand in front of a depth camera.
 
     Attributes:
         skeleton: of the hand.
-        reference: folder with labelled hands from which the test postures come, the second
-            person's; None draws them from the statistics of the first.
+        reference: folder with labelled hands (the second person's) for the test postures; None
+            draws them from the statistics of the first person.
         splits: names of the test splits.
     """
 
@@ -151,7 +150,7 @@ class HandSimulator:
 
     @property
     def protocol(self) -> str:
-        """One sentence on the test splits, to stand beside figures measured on them."""
+        """One sentence on the test splits, for reports of results."""
         how = (
             "each of another person's right hand before an NYU camera; the hand and its size are "
             "found by the product, nothing is handed over; flips are told by the direction from "
@@ -166,12 +165,12 @@ class HandSimulator:
 
     @property
     def test_postures(self) -> str:
-        """One phrase on where the postures of the test splits come from."""
+        """Source of the postures of the test splits, one phrase."""
         return DRAWN if self.reference is None else FITTED
 
     @property
     def sources(self) -> str:
-        """One phrase on what the training images were made from."""
+        """Source of the training images, one phrase."""
         return (
             "rendered from a seed; postures partly drawn from statistics of labelled points of "
             f"the NYU Hand Pose test frames 1 to {N_FIRST_PERSON}; no picture of a hand was used"
@@ -196,19 +195,20 @@ class HandSimulator:
         The patches have no floor and no background: these are zero.
 
         Args:
-            seed: of the whole set; a block depends on it and on its own number alone.
-            n_blocks: how many blocks to make.
+            seed: of the whole set; a block depends only on the seed and its number.
+            n_blocks: number of blocks.
             first: number of the first block.
             family: of hand shapes.
             noise: multiplies the sensor's random errors and its rate of holes.
             erosion_px: pixels stripped off the hand's outline.
-            degraded_share: of the mini-sessions that get more noise, and half of them more erosion.
-            spine_mm: mean length of the hands, mm; None takes the skeleton's own.
+            degraded_share: share of mini-sessions with more noise; half of them also have more
+                erosion.
+            spine_mm: mean length of the hands, mm; None uses the skeleton's own.
             window_px: side of the patches, px.
             parallel: render on all threads.
 
         Yields:
-            One set of `BLOCK` patches a block.
+            One set of `BLOCK` patches per block.
         """
         for number in range(first, first + n_blocks):
             rng = np.random.default_rng([seed, number, 1])
@@ -271,7 +271,7 @@ class HandSimulator:
         )
         origin = np.clip(
             origin, 0, np.maximum(picture[each] - window_px, 0)
-        )  # an arm leaves a window as a picture
+        )  # an arm leaves a window as it leaves an image
         depth = contents.pictures(
             scene.hand_faces(skeleton),
             intrinsics[each],
@@ -309,7 +309,7 @@ class HandSimulator:
             name: 'clean', 'hard', 'other-body', 'other-camera', or 'sealed', see
                 `recording.SEALED`.
             spine_mm: length of every hand, mm; None draws it.
-            n_sessions: takes only the first so many.
+            n_sessions: number of recordings, from the first on.
 
         Returns:
             The recordings, recording k named after the split and k.
@@ -379,8 +379,9 @@ class HandSimulator:
         return HandSession(name, self.skeleton, sensor, contents)
 
     def _test_postures(self, rng: np.random.Generator, n: int) -> tuple[Array, Array]:
-        """Angles (n, J, 3) and T_view_palm (n, 3, 3) that no training picture was drawn after,
-        where there are any.
+        """Angles (n, J, 3) and T_view_palm (n, 3, 3), from the reference (not used in training).
+
+        Without a reference they are drawn from the training statistics.
         """
         if self.reference is None:
             return draw_seen(rng, self.skeleton, n)
@@ -390,10 +391,10 @@ class HandSimulator:
         return pose.angles, sight_rotations(pose.root.translation) @ pose.root.rotation
 
     def motion(self, seed: int | list[int], n_frames: int, **settings: Any) -> HandSession:
-        """A recording of a hand that goes from one gesture to the next.
+        """A recording of a hand that moves from one gesture to the next.
 
         Args:
-            seed: or seeds, that everything is drawn from.
+            seed: seed or seeds of all random numbers.
             n_frames: length of the recording.
             **settings: sensor, family, noise, erosion_px, thing_share, spine_mm and name, see
                 `gesture_session`.
@@ -417,17 +418,17 @@ def gesture_session(
     spine_mm: float | None = None,
     name: str = "gestures",
 ) -> HandSession:
-    """A recording of one person who goes from gesture to gesture at 30 frames/s, with pauses.
+    """A recording of one person who moves from gesture to gesture at 30 frames/s, with pauses.
 
     Args:
         skeleton: of the hand.
-        seed: or seeds, that everything is drawn from.
+        seed: seed or seeds of all random numbers.
         n_frames: length of the recording.
         sensor: the camera's make.
         family: of hand shapes.
         noise: multiplies the sensor's random errors and its rate of holes.
         erosion_px: pixels stripped off the hand's outline.
-        thing_share: of the frames with a distractor beside the hand.
+        thing_share: share of frames with a distractor next to the hand.
         spine_mm: length of the hand, mm; None draws it.
         name: of the recording.
 
@@ -463,16 +464,14 @@ def gesture_session(
 
 
 def _same(shape: HandShape, n: int) -> HandShape:
-    """One person's hand in n pictures."""
+    """One person's hand repeated for n images."""
     return shape[np.zeros(n, np.int64)]
 
 
 def _draw_cameras(
     rng: np.random.Generator, m: int, noise: float, erosion_px: int
 ) -> tuple[NDArray[np.int64], Array, NDArray[np.int64], Array]:
-    """Kind (m,), intrinsics (m, 4), picture size (m, 2) and sensor parameters (m, N_PARAMETERS) of
-    m cameras.
-    """
+    """Kind (m,), intrinsics (m, 4), image size (m, 2) and sensor parameters of m cameras."""
     kind = rng.choice(len(_KINDS), m, p=[k[4] for k in _KINDS])
     focal = rng.uniform(0.97, 1.03, (m, 1))
     axis = rng.normal(0.0, 4.0, (m, 2))

@@ -1,1 +1,1 @@
-"""Scenes that stand before a lab's depth camera, with exact truth: `catalogue` has them by name."""
+"""Scenes in front of a lab's depth camera, with exact truth; `catalogue` lists them by name."""

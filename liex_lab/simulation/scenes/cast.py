@@ -1,7 +1,7 @@
-"""The animals of a scene: one body each, where it goes, and when it is there.
+"""The animals of a scene: body, path and presence of each.
 
-Body, posture and path of an animal are drawn from the seed alone and not from the scene, so that
-the same animal does the same in every scene of a seed, as far as its place allows.
+Body, posture and path of an animal are drawn from the seed alone, not from the scene, so that the
+animal behaves the same in every scene of a seed, as far as the arena permits.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from liex_lab.simulation.species import MouseSpecies
 Array = NDArray[np.float64]
 
 PRESENCES = ("always", "asleep", "still", "late", "leaves", "never")
-AWAY = np.array([0.0, 0.0, 1e7])  # mm: behind any camera that looks down
+AWAY = np.array([0.0, 0.0, 1e7])  # mm: behind any downward-facing camera
 _RATE_HZ = 30.0
 _ADULTS_MM = (55.0, 75.0)
 _BREATHS_HZ = 2.5
@@ -30,13 +30,13 @@ _BREATH = 0.012  # of the girth
 _SLEEP = (0.12, 0.90)  # of the recording, at most
 _COMES = 2.0 / 3.0
 _GOES = 0.45
-_APART = 0.95  # of a spine, between the middles of two animals
+_APART = 0.95  # of a spine, between the centres of two animals
 _TRIES = 60
 _TURN_RAD_S = 5.0
 _PAUSE_S = 0.8
 _DOOR_MM = 25.0
 _ARRIVED_MM = 6.0
-_ERRAND = 1.8  # spines a second on the way to a door
+_ERRAND = 1.8  # spines per second on the way to a door
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class Animal:
         shape: its body, a batch of one.
         pose: (n) arena frame.
         girth: (n,) factor of all lengths across the body.
-        bends: (n, TAIL_RINGS) rad, how its tail lies.
+        bends: (n, TAIL_RINGS) bends of its tail, rad.
         present: (n,) bool, whether it is in the arena.
     """
 
@@ -77,12 +77,12 @@ class Animal:
             seed: of the recording.
             which: number of the animal.
             species: the mouse.
-            arena: where it goes.
+            arena: the arena.
             family: of body shapes, see `draw_shapes`.
             spine_mm: its length, mm; None draws it.
-            timing: which moment of its walk (n,) each frame shows, and whether it is there (n,).
-            script: what it does, see `locomotion.walk`.
-            path: where it goes, likewise.
+            timing: index of the moment of its walk in each frame (n,), and its presence (n,).
+            script: its activity, see `locomotion.walk`.
+            path: its path, likewise.
 
         Returns:
             The animal.
@@ -113,7 +113,7 @@ class Animal:
         )
 
     def lifted(self, height: Array) -> Animal:
-        """The same animal higher above the floor.
+        """The same animal, raised above the floor.
 
         Args:
             height: (n,) mm.
@@ -124,11 +124,7 @@ class Animal:
         )
 
     def middle(self, species: MouseSpecies) -> Array:
-        """The mean of its joints (n, 3), mm, arena frame.
-
-        Args:
-            species: the mouse.
-        """
+        """The mean of its joints (n, 3), mm, arena frame."""
         return np.asarray(self.pose.joints(species.skeleton).mean(axis=1))
 
     def vertices(self, surface: Surface, part: slice) -> Array:
@@ -136,10 +132,10 @@ class Animal:
 
         Args:
             surface: of its skeleton.
-            part: which frames.
+            part: the frames.
 
         Returns:
-            (k, V, 3) mm, arena frame; where it is not there, far behind the camera.
+            (k, V, 3) mm, arena frame; far behind the camera if absent.
         """
         mesh = surface.vertices(self.pose[part], self.shape[0], self.girth[part], self.bends[part])
         mesh[~self.present[part]] += AWAY
@@ -147,15 +143,15 @@ class Animal:
 
 
 def timing_of(presence: str, n_frames: int) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """When an animal is there and when it moves.
+    """Presence and timing of an animal.
 
     Args:
         presence: 'always'; 'asleep', motionless for 78 % of the recording; 'still', for all of it;
-            'late', from two thirds on; 'leaves', for 45 %; or 'never'.
+            'late', from two thirds on; 'leaves', for the first 45 %; or 'never'.
         n_frames: length of the recording.
 
     Returns:
-        Which moment of its walk each frame shows (n,), and whether it is there (n,).
+        Index of the moment of its walk in each frame (n,), and its presence (n,).
     """
     frame = np.arange(n_frames)
     there = np.ones(n_frames, np.bool_)
@@ -176,8 +172,8 @@ def calm_script(rng: np.random.Generator, n: int) -> tuple[NDArray[np.int64], Ar
     """A mouse that walks without rearing, with pauses.
 
     Args:
-        rng: source of randomness.
-        n: how many frames.
+        rng: random number generator.
+        n: number of frames.
 
     Returns:
         Kinds of posture (n,) and speeds (n,), spines/s, see `locomotion.walk_script`.
@@ -194,12 +190,12 @@ def calm_script(rng: np.random.Generator, n: int) -> tuple[NDArray[np.int64], Ar
 
 
 def visiting(door: Array, inside: Array, spans: tuple[tuple[float, float], ...]) -> Path:
-    """A path that wanders from before a house, and goes into it for some stretches.
+    """A path that starts in front of a house, and enters it at given times.
 
     Args:
-        door: (2,) before the house, mm, arena frame.
-        inside: (2,) in it.
-        spans: from when until when it wants to be inside, as shares of the recording.
+        door: (2,) in front of the house, mm, arena frame.
+        inside: (2,) inside it.
+        spans: start and end of the times inside, as shares of the recording.
 
     Returns:
         A path for `locomotion.walk`.
@@ -214,7 +210,7 @@ def visiting(door: Array, inside: Array, spans: tuple[tuple[float, float], ...])
         goals = [free_spot(rng, scene, 0.8 * spine_mm) for _ in range(40)]
         at = door + 0.6 * (door - inside)
         way = rng.uniform(-np.pi, np.pi)
-        passing = False  # through the door, one way or the other
+        passing = False  # inside, or on the way through the door
         for i in range(n):
             wants = any(low <= i / n < high for low, high in spans)
             at_door = bool(np.linalg.norm(at - door) < _DOOR_MM)
@@ -241,15 +237,15 @@ def visiting(door: Array, inside: Array, spans: tuple[tuple[float, float], ...])
 
 
 def free_spot(rng: np.random.Generator, scene: SimulatedScene, margin_mm: float) -> Array:
-    """A random place in an arena, away from walls and clutter.
+    """A random position in an arena, away from walls and clutter.
 
     Args:
-        rng: source of randomness.
+        rng: random number generator.
         scene: the arena.
-        margin_mm: from them, mm.
+        margin_mm: minimum distance from them, mm.
 
     Returns:
-        (2,) mm, arena frame; the roomiest of some tries.
+        (2,) mm, arena frame; of some random positions the first free one, else the best.
     """
     spots = scene.centre + rng.uniform(-1.0, 1.0, (_TRIES, 2)) * scene.half
     room = np.array([scene.freedom(spot) for spot in spots])
@@ -258,14 +254,14 @@ def free_spot(rng: np.random.Generator, scene: SimulatedScene, margin_mm: float)
 
 
 def keeping_apart(other: Array, spine_mm: float) -> Path:
-    """A path that does not cross another animal's.
+    """A path that avoids another animal's path.
 
     Args:
-        other: (n, 2) where the other is, mm, arena frame.
+        other: (n, 2) positions of the other, mm, arena frame.
         spine_mm: its length, mm.
 
     Returns:
-        A path for `locomotion.walk`: of some free paths the one that comes least near.
+        A path for `locomotion.walk`: the first of some free paths that stays clear, else the best.
     """
 
     def path(

@@ -1,4 +1,4 @@
-"""The scenes by name: mice after a recipe, a fish in a small tank, a hand, and one in a mirror."""
+"""The scenes by name: mice from a recipe, a fish in a small tank, a hand, and a mirrored hand."""
 
 from __future__ import annotations
 
@@ -32,24 +32,25 @@ from liex_lab.simulation.species import KINECT_V2_SENSOR, MouseSpecies, Sensor
 
 @dataclass(frozen=True)
 class SceneRecipe:
-    """What a scene of mice is made of.
+    """The recipe of a scene of mice.
 
     Attributes:
-        says: what stands before the camera, in words.
+        says: a description of the scene.
         camera_mm: height of the camera above the floor, mm.
         tilt_rad: of the camera, rad.
         kind: outline of the arena, 'box' or 'round'.
         half_mm: half the arena's sides, mm.
         wall_mm: height of its walls, mm.
-        n_arenas: arenas in the picture, 1, 2 or 4, each with an animal of its own.
+        n_arenas: arenas in the image, 1, 2 or 4, each with its own animal.
         around: 'bench', 'untidy' or 'table', see `places`.
         n_animals: in one arena.
         presence: of the animals, one of `cast.PRESENCES`.
         worn: '', 'head stage' or 'tether'.
-        fixture: '', 'house', 'object', which is put in, 'object out', which is taken out, or 'lid'.
+        fixture: '', 'house', 'object' (added during the recording), 'object out' (removed), or
+            'lid'.
         bedding: whether there is bedding on the floor.
-        glossy: whether the floor reflects, so that it is unread in places.
-        drift_mm: what the sensor's depth changes by while it warms up, mm.
+        glossy: whether the floor reflects and is partly unread.
+        drift_mm: drift of the sensor's depth while it warms up, mm.
     """
 
     says: str
@@ -157,27 +158,27 @@ def _recipes() -> dict[str, SceneRecipe]:
 RECIPES: Final[Mapping[str, SceneRecipe]] = MappingProxyType(_recipes())
 
 
-# How a recording of mice is made from a recipe and a seed.
+# Recordings of mice from a recipe and a seed.
 
 
 Array = NDArray[np.float64]
 
-_EPOCHS = 64  # most still pictures of one recording
+_EPOCHS = 64  # maximum number of still depth images per recording
 _EPOCH_FRAMES = 12
-_COMMUTATOR_MM = np.array([80.0, 110.0, 300.0])  # from the middle of the arena
-_HAND_FRAMES = 16  # that a hand takes to put something in
-_OBJECTS = {"object": 0.4, "object out": 0.6}  # when it is put in or taken out, of the recording
-_WARM_UP = 0.35  # of the recording, in which a sensor's drift falls by a factor e
+_COMMUTATOR_MM = np.array([80.0, 110.0, 300.0])  # from the centre of the arena
+_HAND_FRAMES = 16  # duration of a hand's visit
+_OBJECTS = {"object": 0.4, "object out": 0.6}  # time of the change, share of the recording
+_WARM_UP = 0.35  # time constant of a sensor's drift, share of the recording
 
 
 @dataclass(frozen=True)
 class Making:
-    """The making of one recording; every part has a stream of random numbers of its own.
+    """Builds one recording; every part has its own stream of random numbers.
 
     Attributes:
         name: of the scene.
-        recipe: what it is made of.
-        seed: that everything is drawn from.
+        recipe: the scene's recipe.
+        seed: seed of all random numbers.
         n_frames: length of the recording.
         sensor: the camera's make.
         family: of body shapes, see `body.shape.draw_shapes`.
@@ -234,7 +235,7 @@ class Making:
         return max(_EPOCH_FRAMES, -(-self.n_frames // _EPOCHS))
 
     def _arenas(self) -> list[SimulatedScene]:
-        """The arenas of the picture, around the point that the camera's axis meets."""
+        """The arenas in the image, around the point where the camera's axis meets the floor."""
         recipe = self.recipe
         rng = self._rng("camera")
         camera: Camera = self.sensor.camera
@@ -267,12 +268,12 @@ class Making:
         return made
 
     def _house(self, arena: SimulatedScene) -> tuple[Array, float]:
-        """Where a house stands, (2,) mm, and the way out of it, rad."""
+        """Position of a house, (2,) mm, and the direction of its exit, rad."""
         corner = turned((arena.half - [85.0, 75.0]) * [1.0, 1.0], arena.yaw)
         return arena.centre + corner, float(np.pi + arena.yaw)
 
     def _clutter(self, arena: SimulatedScene) -> Array:
-        """Outlines (n, 2) mm of what animals walk around."""
+        """Outlines (n, 2) mm of obstacles for animals."""
         if self.recipe.fixture in _OBJECTS:
             return np.asarray(self._object(arena).vertices[:, :2])
         place, yaw = self._house(arena)
@@ -290,7 +291,7 @@ class Making:
     def _cast(
         self, species: MouseSpecies, arenas: list[SimulatedScene]
     ) -> tuple[tuple[Animal, ...], list[Moving], list[Mesh]]:
-        """The animals, what moves with them, and what stands still because of them."""
+        """The animals, the objects that move with them, and the still objects they need."""
         recipe = self.recipe
         timing = timing_of(recipe.presence, self.n_frames)
         script = path = None
@@ -334,7 +335,7 @@ class Making:
         return tuple(animals), moving, still
 
     def _hand(self, spot: Array, change: int) -> Moving:
-        """A hand that comes down to a place, lets go of or takes something, and leaves."""
+        """A hand that moves down to a position, releases or takes something, and leaves."""
         mesh = draw_thing(self._rng("object"), "hand", 65.0)
         mesh[:, 2] -= mesh[:, 2].min()
         reach = _HAND_FRAMES // 2
@@ -351,7 +352,7 @@ class Making:
         animals: tuple[Animal, ...],
         parts: list[Mesh],
     ) -> list[Moving]:
-        """What the first animal wears."""
+        """Objects worn by the first animal."""
         if not self.recipe.worn:
             return []
         rng = self._rng("worn")
@@ -374,7 +375,7 @@ class Making:
         beddings: list[Bedding],
         parts: list[Mesh],
     ) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
-        """The still scene epoch by epoch (E, H, W) mm, and the epoch of every frame (n,)."""
+        """The still scene by epoch (E, H, W) mm, and the epoch of every frame (n,)."""
         recipe = self.recipe
         rng = self._rng("place")
         fixed = list(parts)
@@ -417,13 +418,13 @@ class Making:
 def _reflections(
     same: np.random.Generator, own: np.random.Generator, camera: Camera, shape: tuple[int, ...]
 ) -> NDArray[np.bool_]:
-    """Where a glossy floor is not read: about the camera's own reflection, and in patches.
+    """Unread parts of a glossy floor: around the camera's reflection, and in patches.
 
     Args:
-        same: gives all epochs the same patches.
-        own: gives each epoch borders of its own.
+        same: generator of patches that all epochs share.
+        own: generator of the individual borders of an epoch.
         camera: the camera.
-        shape: (H, W) of the picture.
+        shape: (H, W) of the image.
 
     Returns:
         (H, W) bool.
@@ -445,8 +446,8 @@ def _reflections(
     return np.asarray(strength + 0.12 * ragged > 0.0)
 
 
-SEALED_FROM: Final = 900_000_000  # seeds from here on are kept for the sealed split
-# name: (the plan of its animal, the scene beside which it stands, '' for none)
+SEALED_FROM: Final = 900_000_000  # seeds from here on are reserved for the sealed split
+# name: (the plan of its animal, the scene it is compared with, '' for none)
 SCENES: Final[Mapping[str, tuple[str, str]]] = MappingProxyType(
     dict.fromkeys(RECIPES, ("mouse", "plain"))
     | {"fish": ("fish", ""), "hand": ("hand", ""), "mirrored-hand": ("hand", "hand")}
@@ -466,11 +467,11 @@ def film(
 
     Args:
         name: of the scene, a key of `SCENES`.
-        seed: that everything is drawn from.
-        n_frames: its length, at 30 frames/s, of a fish at 50.
-        sensor: the camera's make, of scenes with mice.
-        family: of body shapes, see `body.shape.draw_shapes`; 'other' are builds that no model was
-            trained on.
+        seed: seed of all random numbers.
+        n_frames: its length, at 30 frames/s (fish: 50).
+        sensor: the camera's make, for scenes with mice.
+        family: of body shapes, see `body.shape.draw_shapes`; 'other' are builds not used in
+            training.
         spine_mm: length of the animals, mm; None draws it.
 
     Returns:

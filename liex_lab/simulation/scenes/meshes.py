@@ -1,8 +1,8 @@
-"""Triangle meshes that scenes are put together from: boxes, height fields, walls, cables.
+"""Triangle meshes as parts of scenes: boxes, height fields, walls, cables.
 
-A still scene is the nearest surface along every ray, so that its parts need not be closed: they are
-drawn one by one with a z-buffer (`render_still`). Lengths in mm, arena frame: z up from the floor
-on which the animal stands.
+A still scene is the nearest surface along every ray, so its parts need not be closed: they are
+rendered one by one with a z-buffer (`render_still`). Lengths in mm, arena frame: z up from the
+floor below the animal.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ _BOX_FACES = np.array(
 
 
 class Mesh(NamedTuple):
-    """Triangles of one thing, or of many things together.
+    """Triangles of one or more objects.
 
     Attributes:
         vertices: (V, 3) mm, arena frame.
@@ -48,10 +48,10 @@ class Mesh(NamedTuple):
 
 
 def joined(parts: Sequence[Mesh]) -> Mesh:
-    """Several meshes as one.
+    """Join several meshes.
 
     Args:
-        parts: the meshes; none make an empty mesh.
+        parts: the meshes; may be empty.
 
     Returns:
         One mesh with all their triangles.
@@ -67,7 +67,7 @@ def joined(parts: Sequence[Mesh]) -> Mesh:
 
 
 def turned(xy: Array, yaw: float) -> Array:
-    """Points turned about the vertical.
+    """Points rotated about the vertical.
 
     Args:
         xy: (..., 2) mm.
@@ -87,10 +87,7 @@ def box(centre: Sequence[float] | Array, half: Sequence[float] | Array, yaw: flo
     Args:
         centre: (3,) mm.
         half: (3,) half its sides, mm.
-        yaw: its turn about the vertical, rad.
-
-    Returns:
-        The mesh.
+        yaw: its rotation about the vertical, rad.
     """
     corners = _BOX_CORNERS * np.asarray(half, float)
     corners = np.concatenate([turned(corners[:, :2], yaw), corners[:, 2:]], axis=1)
@@ -106,7 +103,7 @@ def field(x: Array, y: Array, heights: Array) -> Mesh:
         heights: (m, n) mm.
 
     Returns:
-        The mesh, two triangles a cell.
+        The mesh, two triangles per cell.
     """
     m, n = heights.shape
     at_x, at_y = np.meshgrid(x, y)
@@ -125,7 +122,7 @@ def wall(outline: Array, low: float, high: float, thick: float, slope: float = 0
         low: height of its foot, mm.
         high: height of its rim, mm.
         thick: width of the rim, mm.
-        slope: how far the rim lies outside the foot, mm.
+        slope: horizontal distance of the rim outside the foot, mm.
 
     Returns:
         The mesh: inner face, rim and outer face.
@@ -155,14 +152,14 @@ def wall(outline: Array, low: float, high: float, thick: float, slope: float = 0
 
 
 def cables(curves: Array, radius: Array | float) -> tuple[Array, NDArray[np.int32]]:
-    """Tubes along curves, one a frame.
+    """Tubes along curves, one per frame.
 
     Args:
         curves: (n, R, 3) mm, their midlines.
         radius: mm, one or (n,).
 
     Returns:
-        Vertices (n, V, 3) mm and the faces (F, 3) int32 that they share.
+        Vertices (n, V, 3) mm and their shared faces (F, 3) int32.
     """
     n, rings, _ = curves.shape
     along = np.gradient(curves, axis=1)
@@ -179,15 +176,15 @@ def cables(curves: Array, radius: Array | float) -> tuple[Array, NDArray[np.int3
 
 
 def render_still(parts: Sequence[Mesh], camera: Camera, T_camera_arena: SE3) -> NDArray[np.float32]:
-    """Ideal depth of things that stand still.
+    """Ideal depth of still objects.
 
     Args:
-        parts: what stands there; each within view of the camera, not behind it.
+        parts: the objects; each within view of the camera, not behind it.
         camera: the ideal pinhole camera.
-        T_camera_arena: carries the arena frame into the camera's.
+        T_camera_arena: transform from the arena frame into the camera frame.
 
     Returns:
-        (H, W) float32 mm, 0 where there is nothing.
+        (H, W) float32 mm, 0 for nothing.
     """
     inverse = np.zeros((camera.height, camera.width))
     depth = np.empty((camera.height, camera.width), np.float32)
@@ -209,18 +206,18 @@ def render_still(parts: Sequence[Mesh], camera: Camera, T_camera_arena: SE3) -> 
     return depth
 
 
-# What animals wear: a head stage, and a cable from it to a commutator above the arena.
+# Equipment of animals: a head stage, and a cable from it to a commutator above the arena.
 
 
 HEAD_STAGE_MM = (10.0, 8.0, 12.0)
 PLUG_MM = (5.0, 5.0, 7.0)
-_NECK = -2  # joint: the head's bone begins there
+_NECK = -2  # first joint of the head's bone
 _AT_STATION = 0.83  # of the spine: behind the eyes
 _RINGS = 30
 
 
 def on_head(skeleton: Skeleton, pose: Pose, shape: BodyShape, girth: Array) -> SE3:
-    """Where something cemented to the skull stands.
+    """Pose of an object that is cemented to the skull.
 
     Args:
         skeleton: of the animal, a chain.
@@ -266,7 +263,7 @@ def tether(
     """A flexible cable from the head to a commutator.
 
     Args:
-        rng: source of randomness.
+        rng: random number generator.
         mount: (n) T_arena_mount.
         commutator: (3,) mm, arena frame.
         thick_mm: its diameter, mm.
@@ -291,7 +288,7 @@ def _hanging(mount: SE3, commutator: Array, length: Array, way: Array) -> Array:
     s = np.linspace(0.0, 1.0, _RINGS)[:, None]
     straight = start[:, None] + s * span[:, None]
     swing = (bow[:, None] * side)[:, None] * np.sin(np.pi * s)
-    # stiff where it leaves the plug: it goes up from the head before it bends over
+    # stiff at the plug: it rises from the head before it bends
     stiff = (25.0 * mount.rotation[..., 2])[:, None] * (s * np.exp(-((s / 0.12) ** 2)) / 0.06)
     return np.asarray(straight + swing + stiff)
 
@@ -305,22 +302,22 @@ def draw_worn(
     share: float,
     per_session: int,
 ) -> tuple[Array, NDArray[np.int32], NDArray[np.bool_]]:
-    """Head stages and cables of animals in independent postures, for training pictures.
+    """Head stages and cables of animals in independent postures, for training images.
 
-    Half of the animals that wear anything wear a head stage of 6 to 14 mm a side, the others a plug
-    and a cable of 2 to 5 mm to a commutator of their own.
+    Half of the animals with equipment have a head stage of 6 to 14 mm a side, the others a plug and
+    a cable of 2 to 5 mm to their own commutator.
 
     Args:
-        rng: source of randomness.
+        rng: random number generator.
         skeleton: of the animals, a chain.
         pose: (n) arena frame.
         shape: (n) their bodies.
         girth: (n,) factors of all lengths across the bodies.
-        share: of the animals that wear something.
-        per_session: consecutive postures that are of one animal.
+        share: share of animals with equipment.
+        per_session: consecutive postures of one animal.
 
     Returns:
-        Vertices (n, V, 3) mm, arena frame, faces (F, 3), and which postures wear them (n,).
+        Vertices (n, V, 3) mm, arena frame, faces (F, 3), and whether each posture has them (n,).
     """
     n = len(girth)
     each = np.arange(n) // per_session
@@ -348,13 +345,10 @@ def draw_worn(
 
 
 def holder(commutator: Array) -> list[Mesh]:
-    """The commutator and the arm that holds it over the arena.
+    """The commutator and the arm that supports it above the arena.
 
     Args:
         commutator: (3,) mm, arena frame.
-
-    Returns:
-        The meshes.
     """
     x, y, z = commutator
     return [

@@ -1,8 +1,8 @@
-"""Arenas and what is around them: walled floors, benches, tables, untidy rooms, cages, bedding.
+"""Arenas and their surroundings: walled floors, benches, tables, cluttered rooms, cages, bedding.
 
 A floor is a height field over a grid of 5 mm: a few long waves, the rounding exp(-distance /
-spread) that multiple reflections leave at the foot of walls, and bedding. Bedding is a sum of
-lumps at random places; where an animal walks it is pressed down and pushed aside, epoch by epoch
+spread) that multi-path reflections leave at the foot of walls, and bedding. Bedding is a sum of
+lumps at random positions; an animal's steps compress it and push it aside, epoch by epoch
 (`Bedding`).
 """
 
@@ -22,13 +22,13 @@ Array = NDArray[np.float64]
 
 _GRID_MM = 5.0
 _RIM_MM = 5.0
-_BASE_MM = 6.0  # between an arena's floor and what it stands on
-_FAR_MM = 2600.0  # half of a side of a room's floor
+_BASE_MM = 6.0  # between an arena's floor and the surface below
+_FAR_MM = 2600.0  # half the side of a room's floor
 _CELL_MM = 100.0
 _OUTLINE = 48  # corners of a round wall
 _LUMP_MM = 18.0
 _LUMP_SPACING_MM = 26.0
-_PRESSED = 0.55  # of bedding's height goes where an animal has walked for an epoch
+_PRESSED = 0.55  # share of the bedding's height that an animal compresses in an epoch
 
 
 def look_down(camera_mm: float, tilt_rad: float, toward_rad: float) -> SE3:
@@ -37,11 +37,10 @@ def look_down(camera_mm: float, tilt_rad: float, toward_rad: float) -> SE3:
     Args:
         camera_mm: its height, mm.
         tilt_rad: of its axis from the vertical, rad.
-        toward_rad: the direction of the picture that the tilt turns away from the floor, rad.
+        toward_rad: direction in the image that is tilted away from the floor, rad.
 
     Returns:
-        T_arena_camera; the arena frame's origin lies at the camera's foot, its x along the
-        camera's.
+        T_arena_camera; the arena frame's origin is at the camera's foot, its x along the camera's.
     """
     up = -np.array(
         [
@@ -65,16 +64,16 @@ def arena_at(
     clutter: Array,
     kind: str = BOX,
 ) -> SimulatedScene:
-    """An arena as the paths of animals know it, its still picture to be drawn.
+    """An arena for the paths of animals, without its depth image.
 
     Args:
         camera: the camera.
         T_arena_camera: its pose.
-        shift: of the arena's centre from where the camera's axis meets the floor, mm.
+        shift: of the arena's centre from the point where the camera's axis meets the floor, mm.
         half: half its sides, or its radius twice, mm.
-        yaw: its turn, rad.
+        yaw: its rotation, rad.
         wall_mm: height of the walls, mm.
-        clutter: (n, 2) points that animals keep away from, mm.
+        clutter: (n, 2) points that animals avoid, mm.
         kind: 'box' or 'round'.
 
     Returns:
@@ -96,14 +95,7 @@ def arena_at(
 
 
 def outline_of_walls(arena: SimulatedScene) -> Array:
-    """The foot of an arena's walls.
-
-    Args:
-        arena: the arena.
-
-    Returns:
-        (n, 2) corners, counter-clockwise, mm.
-    """
+    """The foot of an arena's walls: (n, 2) corners, counter-clockwise, mm."""
     if arena.kind == ROUND:
         phi = 2 * np.pi * np.arange(_OUTLINE) / _OUTLINE
         local = arena.half[0] * np.stack([np.cos(phi), np.sin(phi)], axis=-1)
@@ -121,7 +113,7 @@ class Ground:
         x: (n,) mm, from its centre, along its own axes.
         y: (m,) mm.
         heights: (m, n) mm, without bedding.
-        within: (m, n) bool, the nodes that the floor reaches to.
+        within: (m, n) bool, grid nodes that belong to the floor.
     """
 
     arena: SimulatedScene
@@ -132,15 +124,7 @@ class Ground:
 
     @staticmethod
     def draw(rng: np.random.Generator, arena: SimulatedScene) -> Ground:
-        """A floor with its own unevenness.
-
-        Args:
-            rng: source of randomness.
-            arena: the arena.
-
-        Returns:
-            The floor.
-        """
+        """Draw a floor with random unevenness."""
         x, y = (
             np.arange(-reach - 2 * _GRID_MM, reach + 2 * _GRID_MM + 0.1, _GRID_MM)
             for reach in arena.half
@@ -162,13 +146,10 @@ class Ground:
         return Ground(arena, x, y, heights, clearance > -1.5 * _GRID_MM)
 
     def mesh(self, bedding: Array | None = None) -> Mesh:
-        """The floor as a mesh.
+        """The floor as a mesh in the arena frame.
 
         Args:
-            bedding: (m, n) heights of what lies on it, mm; None for nothing.
-
-        Returns:
-            The mesh, arena frame.
+            bedding: (m, n) heights of bedding, mm; None for no bedding.
         """
         heights = self.heights if bedding is None else self.heights + bedding
         flat = field(self.x, self.y, heights)
@@ -190,12 +171,12 @@ class Ground:
 
 @dataclass(frozen=True)
 class Bedding:
-    """Bedding whose lumps change slowly, and where the animal walks.
+    """Bedding whose lumps change slowly, mostly along the animal's path.
 
     Attributes:
-        ground: the floor on which it lies.
-        heights: (E, m, n) float32 mm, epoch by epoch.
-        frames: how many frames an epoch lasts.
+        ground: the floor below it.
+        heights: (E, m, n) float32 mm, by epoch.
+        frames: frames per epoch.
     """
 
     ground: Ground
@@ -204,14 +185,13 @@ class Bedding:
 
     @staticmethod
     def draw(rng: np.random.Generator, ground: Ground, tracks: Array, frames: int) -> Bedding:
-        """Bedding that an animal walks through.
+        """Draw the bedding under a walking animal.
 
         Args:
-            rng: source of randomness.
+            rng: random number generator.
             ground: the floor.
-            tracks: (n, 2) where the animal is in each frame, mm, arena frame; NaN while it is not
-                there.
-            frames: how many frames an epoch lasts.
+            tracks: (n, 2) position of the animal in each frame, mm, arena frame; NaN if absent.
+            frames: frames per epoch.
 
         Returns:
             The bedding of all epochs.
@@ -226,7 +206,7 @@ class Bedding:
         at = ground.local(tracks)
         epochs = []
         for start in range(0, len(tracks), frames):
-            moved = rng.random(n_lumps) < 0.01  # some lumps roll over by themselves
+            moved = rng.random(n_lumps) < 0.01  # some lumps move spontaneously
             places[moved] += rng.normal(0.0, 6.0, (int(moved.sum()), 2))
             if moved.any():
                 here = 0.9 * here + 0.1 * _lumps(grid, places, tall, wide)
@@ -241,10 +221,10 @@ class Bedding:
         return Bedding(ground, np.stack(epochs), frames)
 
     def below(self, tracks: Array) -> Array:
-        """How high the bedding lies under an animal, smoothly in time.
+        """Height of the bedding under an animal, smooth in time.
 
         Args:
-            tracks: (n, 2) where the animal is in each frame, mm, arena frame.
+            tracks: (n, 2) position of the animal in each frame, mm, arena frame.
 
         Returns:
             (n,) mm.
@@ -261,7 +241,7 @@ class Bedding:
 
 
 def _lumps(grid: Array, places: Array, tall: Array, wide: Array) -> Array:
-    """Heights (m, n) mm of lumps: the tallest at every node, with a low rest between them."""
+    """Heights (m, n) mm of lumps: the tallest at every node, with a low layer between them."""
     height = np.full(grid.shape[:-1], 2.0)
     for place, top, width in zip(places, tall, wide, strict=True):
         gap2 = ((grid - place) ** 2).sum(axis=-1)
@@ -274,7 +254,7 @@ def walls_of(arena: SimulatedScene, slope: float = 0.0, rim_mm: float = _RIM_MM)
 
     Args:
         arena: the arena; a wall height of 0 has none.
-        slope: how far the rim lies outside the foot, mm.
+        slope: horizontal distance of the rim outside the foot, mm.
         rim_mm: width of the rim, mm.
 
     Returns:
@@ -286,30 +266,25 @@ def walls_of(arena: SimulatedScene, slope: float = 0.0, rim_mm: float = _RIM_MM)
 
 
 def bench(middle: Array) -> list[Mesh]:
-    """A bench or floor on which arenas stand, as far as the camera sees.
+    """A bench or floor below the arenas, as large as the camera's view.
 
     Args:
         middle: (2,) below the camera's axis, mm.
-
-    Returns:
-        Its mesh.
     """
     return [_level(middle, -_BASE_MM)]
 
 
 def _level(middle: Array, z: float) -> Mesh:
-    """A level surface as far as the camera sees; in cells, for what reaches behind it is not
-    drawn.
-    """
+    """A level surface as large as the camera's view, in cells: those behind it are skipped."""
     reach = np.arange(-_FAR_MM, _FAR_MM + 1.0, _CELL_MM)
     return field(middle[0] + reach, middle[1] + reach, np.full((len(reach), len(reach)), z))
 
 
 def table(rng: np.random.Generator, arena: SimulatedScene, drop_mm: float) -> list[Mesh]:
-    """A table or stool under an arena, and the room's floor below with a few things on it.
+    """A table or stool under an arena, and the room's floor below with a few objects on it.
 
     Args:
-        rng: source of randomness.
+        rng: random number generator.
         arena: the arena on the table.
         drop_mm: from the arena's floor to the room's, mm.
 
@@ -331,14 +306,14 @@ def table(rng: np.random.Generator, arena: SimulatedScene, drop_mm: float) -> li
 
 
 def untidy(rng: np.random.Generator, arena: SimulatedScene) -> list[Mesh]:
-    """An untidy bench around an arena: boxes, books and instruments of many heights.
+    """A cluttered bench around an arena: boxes, books and instruments of many heights.
 
     Args:
-        rng: source of randomness.
-        arena: the arena, which stands free.
+        rng: random number generator.
+        arena: the arena, which has free space around it.
 
     Returns:
-        The meshes; nothing large and level is among them.
+        The meshes, without large level surfaces.
     """
     things = []
     reach = float(np.hypot(*arena.half)) + 20.0
@@ -359,10 +334,10 @@ def lid_bars(arena: SimulatedScene, share: float = 0.35) -> list[Mesh]:
 
     Args:
         arena: the cage; its long side is its first.
-        share: of the cage's length that the bars cover.
+        share: share of the cage's length covered by bars.
 
     Returns:
-        The meshes: bars along the cage every 9 mm, and two that cross them.
+        The meshes: bars along the cage every 9 mm, and two across.
     """
     long, wide = arena.half
     z = arena.wall_mm + 2.0
@@ -381,9 +356,9 @@ def house(arena: SimulatedScene, place: Array, yaw: float) -> list[Mesh]:
     """A shelter of 120 x 96 x 66 mm, open at one end.
 
     Args:
-        arena: the arena in which it stands.
-        place: (2,) its middle, mm, arena frame.
-        yaw: the way out of it, rad.
+        arena: the arena.
+        place: (2,) its centre, mm, arena frame.
+        yaw: direction of its exit, rad.
 
     Returns:
         The meshes of its roof and three walls.

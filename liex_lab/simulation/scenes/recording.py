@@ -1,9 +1,9 @@
 """A rendered scene as a recording with the truth of every animal in it.
 
-Frames are made when they are asked for, in any order, from the seed: the still scene of the epoch,
-the animals, what is worn and what moves besides, the sensor's model, and then what the whole camera
-does (warming up, mirroring). `visible` counts, in the ideal picture, the share of each animal's
-pixels that nothing hides.
+Frames are rendered on demand, in any order, from the seed: the still scene of the epoch, the
+animals, their equipment and other moving objects, the sensor's model, and then effects of the whole
+camera (warming up, mirroring). `visible` is the share of each animal's pixels in the ideal depth
+image that are not occluded.
 """
 
 from __future__ import annotations
@@ -33,12 +33,12 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class TrueAnimal:
-    """What is known of one animal of a recording of n frames.
+    """The truth of one animal of a recording of n frames.
 
     Attributes:
         spine_mm: its length, mm.
-        joints_camera: (n, J, 3) mm, camera frame; NaN where it is not there.
-        visible: (n,) share of it that is seen, 0 where it is not there.
+        joints_camera: (n, J, 3) mm, camera frame; NaN if absent.
+        visible: (n,) visible share of it, 0 if absent.
     """
 
     spine_mm: float
@@ -48,12 +48,12 @@ class TrueAnimal:
 
 @dataclass(frozen=True)
 class Moving:
-    """Something other than an animal that moves: worn, put in, or held in a hand.
+    """A moving object other than an animal: worn, added, or held in a hand.
 
     Attributes:
         vertices: (m, V, 3) mm, arena frame, at m moments.
         faces: (F, 3) int32.
-        moment: (n,) int64, which of them each frame shows; -1 where it is not there.
+        moment: (n,) int64, index of the moment in each frame; -1 if absent.
     """
 
     vertices: Array
@@ -62,22 +62,22 @@ class Moving:
 
     @staticmethod
     def always(vertices: Array, faces: NDArray[np.int32], shown: NDArray[np.bool_]) -> Moving:
-        """Something with a moment of its own in every frame.
+        """An object with its own moment in every frame.
 
         Args:
             vertices: (n, V, 3) mm, arena frame.
             faces: (F, 3) int32.
-            shown: (n,) bool, when it is there.
+            shown: (n,) bool, its presence.
         """
         return Moving(vertices, faces, np.where(shown, np.arange(len(shown)), -1))
 
     @staticmethod
     def fixed(mesh: Mesh, shown: NDArray[np.bool_]) -> Moving:
-        """Something that comes or goes, but does not move.
+        """An object that appears or disappears, but does not move.
 
         Args:
-            mesh: it.
-            shown: (n,) bool, when it is there.
+            mesh: its mesh.
+            shown: (n,) bool, its presence.
         """
         return Moving(mesh.vertices[None], mesh.faces, np.where(shown, 0, -1))
 
@@ -85,10 +85,10 @@ class Moving:
         """Its vertices in some frames.
 
         Args:
-            part: which frames.
+            part: the frames.
 
         Returns:
-            (k, V, 3) mm, arena frame; where it is not there, far behind the camera.
+            (k, V, 3) mm, arena frame; far behind the camera if absent.
         """
         moment = self.moment[part]
         return self.vertices[moment] + (moment < 0)[:, None, None] * AWAY
@@ -96,19 +96,19 @@ class Moving:
 
 @dataclass(frozen=True)
 class Stage:
-    """All that a scene is made of, n frames.
+    """The contents of a scene, n frames.
 
     Attributes:
         camera: the camera.
         T_arena_camera: its pose.
         species: the animals'.
-        animals: those that are ever there, the first of which a single track should follow.
-        moving: what moves besides.
-        stills: (E, H, W) float32 mm, the still scene epoch by epoch, 0 = nothing.
-        epoch: (n,) int64, which of them a frame shows.
+        animals: all animals; a single track should follow the first.
+        moving: other moving objects.
+        stills: (E, H, W) float32 mm, the still scene by epoch, 0 = nothing.
+        epoch: (n,) int64, the epoch of each frame.
         parameters: (N_PARAMETERS,) of the sensor.
         seeds: (n,) uint64, of its noise.
-        offset_mm: (n,) what the sensor reads too much, mm.
+        offset_mm: (n,) error added to the sensor's depth, mm.
     """
 
     camera: Camera
@@ -134,23 +134,23 @@ class TrueScene(TrueRecording):
 
     @cached_property
     def animals(self) -> tuple[TrueAnimal, ...]:
-        """The truth, animal by animal; () where none is ever there."""
+        """The truth of each animal; () if there are none."""
         raise NotImplementedError
 
 
 class OneAnimal(TrueScene):
-    """A recording of one animal in full view as a scene, or what a mirror shows of it."""
+    """A recording of one fully visible animal as a scene, optionally mirrored."""
 
     def __init__(
         self, name: str, scene: str, filmed: TrueRecording, *, mirrored: bool = False
     ) -> None:
-        """Take a recording for a scene.
+        """Wrap a recording as a scene.
 
         Args:
             name: of the recording.
             scene: name of the scene.
             filmed: the recording of one animal.
-            mirrored: exchange left and right in every picture, and in the truth.
+            mirrored: exchange left and right in every depth image, and in the truth.
         """
         c = filmed.camera
         camera = replace(c, cx=c.width - 1.0 - c.cx) if mirrored else c
@@ -176,33 +176,33 @@ class OneAnimal(TrueScene):
         return (TrueAnimal(self.spine_mm, self.joints_camera, np.ones(len(self))),)
 
     def depths(self, start: int, stop: int) -> NDArray[np.float32]:
-        """Depth pictures of a range of frames, made on all threads.
+        """Depth images of a range of frames, rendered on all threads.
 
         Args:
             start: first frame.
             stop: one past the last frame.
 
         Returns:
-            (stop - start, H, W) float32 mm, 0 where unread.
+            (stop - start, H, W) float32 mm, 0 if unread.
         """
         depths = self._filmed.depths(start, stop)
         return np.ascontiguousarray(depths[..., ::-1]) if self._mirrored else depths
 
 
 class SceneRecording(TrueScene):
-    """A scene of mice after a recipe.
+    """A scene of mice from a recipe.
 
     Attributes:
-        stage: what it is made of.
+        stage: its contents.
     """
 
     def __init__(self, name: str, scene: str, stage: Stage) -> None:
-        """Film a stage.
+        """Record a stage.
 
         Args:
             name: of the recording.
             scene: name of the scene.
-            stage: what is filmed.
+            stage: its contents.
         """
         n = len(stage.seeds)
         times = np.arange(n, dtype=np.int64) * stage.species.frame_ns
@@ -231,7 +231,7 @@ class SceneRecording(TrueScene):
 
     @cached_property
     def animals(self) -> tuple[TrueAnimal, ...]:
-        """The truth, animal by animal, worked out when it is asked for; () where there is none."""
+        """The truth of each animal, computed on demand; () if there are none."""
         return tuple(self._truth(animal) for animal in self.stage.animals)
 
     def _truth(self, animal: Animal) -> TrueAnimal:
@@ -240,7 +240,7 @@ class SceneRecording(TrueScene):
         return TrueAnimal(animal.spine_mm, joints, self._visible(animal))
 
     def _visible(self, animal: Animal) -> Array:
-        """Share (n,) of an animal's pixels that nothing hides and that lie in the picture."""
+        """Share (n,) of an animal's pixels that are inside the image and not occluded."""
         stage = self.stage
         T_camera_arena = self.T_arena_camera.inverse()
         others = [other for other in stage.animals if other is not animal]
@@ -281,14 +281,14 @@ class SceneRecording(TrueScene):
         return self.depths(index, index + 1)[0]
 
     def depths(self, start: int, stop: int) -> NDArray[np.float32]:
-        """Depth pictures of a range of frames, made on all threads.
+        """Depth images of a range of frames, rendered on all threads.
 
         Args:
             start: first frame.
             stop: one past the last frame.
 
         Returns:
-            (stop - start, H, W) float32 mm, 0 where unread.
+            (stop - start, H, W) float32 mm, 0 if unread.
         """
         stage = self.stage
         out = np.empty((stop - start, stage.camera.height, stage.camera.width), np.float32)
@@ -299,7 +299,7 @@ class SceneRecording(TrueScene):
         return out
 
     def _render(self, part: slice, epoch: int) -> NDArray[np.float32]:
-        """Pictures of consecutive frames of one epoch."""
+        """Depth images of consecutive frames of one epoch."""
         stage = self.stage
         c = stage.camera
         n = part.stop - part.start
@@ -333,7 +333,7 @@ class SceneRecording(TrueScene):
 def _together(
     n: int, parts: Sequence[tuple[Array, NDArray[np.int32]]]
 ) -> tuple[Array, NDArray[np.int32]]:
-    """Several meshes of n frames as one."""
+    """Join several meshes of n frames."""
     if not parts:
         return np.zeros((n, 3, 3)), np.zeros((0, 3), np.int32)
     starts = np.cumsum([0, *(vertices.shape[1] for vertices, _ in parts)])
