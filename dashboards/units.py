@@ -30,8 +30,9 @@ def counted(n: int, one: str, more: str = "") -> str:
 
 
 def reading(value: Any, unit: str) -> str:
-    """A number as text: counts as integers, other numbers with the decimals of their unit, and with
-    more decimals if fewer than two digits would remain; NaN is a dash.
+    """A number as text, with the decimals of its unit; NaN is a dash.
+
+    Counts are integers. A number has more decimals if fewer than two digits would remain.
 
     Args:
         value: in the displayed unit.
@@ -50,8 +51,8 @@ def reading(value: Any, unit: str) -> str:
 
 
 def day(iso: str) -> str:
-    """An ISO date and time, such as 2026-08-21T10:00:00+02:00, in words; other text is returned as
-    is.
+    """An ISO date and time (2026-08-21T10:00:00+02:00) in words; other text is returned
+    unchanged.
     """
     try:
         when = datetime.fromisoformat(iso)
@@ -62,12 +63,11 @@ def day(iso: str) -> str:
     return f"{when.day} {when:%B %Y, %H:%M:%S}{told}"
 
 
-# HTML pages from jinja2 templates.
+# HTML pages from Jinja templates.
 
 
 def page(template: Path, **shown: Any) -> str:
-    """An HTML page from its Jinja template; values are escaped, and a missing value raises an
-    error.
+    """An HTML page from its Jinja template; values are escaped, a missing value is an error.
 
     Args:
         template: the file, HTML with Jinja's marks.

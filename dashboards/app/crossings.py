@@ -74,9 +74,7 @@ def crossings(session: Session, all_seen: Sequence[Seen]) -> list[dict[str, Any]
 
 
 def _exchanged_ends(seen: Seen) -> Iterator[Crossing]:
-    """Stretches with a certain or possible exchange of head and tail; near ones of a kind are
-    merged.
-    """
+    """Stretches with a certain or possible exchange of head and tail; close ones are merged."""
     table = seen.table("flips")
     rows = [] if table is None else records(table.sort_values("start_s"))
     for said in dict.fromkeys(_said_of(row) for row in rows):

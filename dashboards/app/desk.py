@@ -107,9 +107,7 @@ class Desk:
         len(self.session.frames)  # shown on the page
 
     def about(self) -> dict[str, Any]:
-        """Facts that the page needs once: size, animals, actions with their colours, and the
-        author.
-        """
+        """Facts that the page needs once: size, animals, coloured actions, and the author."""
         camera = self.session.camera
         animal = self.session.metadata["animal"]
         words = list(self.session.metadata.get("actions") or {})
@@ -293,8 +291,7 @@ class Desks:
             return known
 
     def open_ahead(self, key: str) -> None:
-        """Prepare a session's first image in a thread; at most one at a time, further calls do
-        nothing.
+        """Prepare a session's first image in a thread; does nothing if another is being prepared.
 
         An unknown `key` is ignored.
         """

@@ -100,9 +100,7 @@ class Clerk:
         return self._kept(key, self._saver.take_back(folder, number, author))
 
     def _redo(self, key: str, desk: Desk, author: str) -> dict[str, Any]:
-        """Repeat the correction that was last undone, once the queue is saved; returns its
-        number.
-        """
+        """Repeat the last undone correction, once the queue is saved; returns its number."""
         with self._lock:
             ours = [ticket for of, ticket in self._tickets.values() if of == key]
         if ours:
@@ -174,9 +172,7 @@ def add_routes(server: Flask, desks: Desks, clerk: Clerk | None) -> None:
 
     @server.get("/desk/<path:key>/times")
     def desk_times(key: str) -> Response:
-        """The times of all frames of the session `key`, s: little-endian float64; empty without
-        poses.
-        """
+        """The frame times of the session `key`, s: little-endian float64; empty without poses."""
         try:
             times = desks.of(key).time_s
         except LiexError:  # the page shows the reason
@@ -195,9 +191,7 @@ def add_routes(server: Flask, desks: Desks, clerk: Clerk | None) -> None:
 
     @server.get("/desk/<path:key>/doubts")
     def desk_doubts(key: str) -> Response:
-        """The doubtful stretches of the session `key`: of its poses, or with ?of=actions of its
-        actions.
-        """
+        """The doubtful stretches of the session `key`: of poses, or with ?of=actions of actions."""
         if request.args.get("of") == "actions":
             return told(lambda: desks.suggested(key))
         return told(lambda: desks.of(key).doubts())

@@ -69,7 +69,7 @@ def guard(server: Flask, token: str, *, alone: bool = True) -> None:
         if told and hmac.compare_digest(told.encode(), token.encode()):
             rest = {name: value for name, value in request.args.items() if name != "token"}
             answer = redirect(request.path + ("?" + urlencode(rest) if rest else ""))
-            # lax: the page that --open writes must send the cookie at once
+            # lax, so that the page written by --open sends the cookie at once
             answer.set_cookie(_cookie(), token, httponly=True, samesite="Lax")
             return answer
         if not hmac.compare_digest(request.cookies.get(_cookie(), "").encode(), token.encode()):
@@ -87,7 +87,7 @@ def guard(server: Flask, token: str, *, alone: bool = True) -> None:
 
 
 def _cookie() -> str:
-    """The cookie's name with the port: cookies belong to a host, and each dashboard has its own
+    """The cookie's name with the port: a host may have several dashboards, each with its own
     token.
     """
     _, _, port = request.host.rpartition(":")

@@ -47,7 +47,7 @@ class Regions(Protocol):
         corners: Sequence[Any] | None,
         was: Any,
     ) -> str:
-        """Save a region with `corners` (px) for the recording `key` in `place`, which contained
+        """Save a region of `corners` (px) for the recording `key` in `place`; it contained
         `was`.
         """
 

@@ -214,9 +214,7 @@ def add_pages(
 
     @app.get("/moment/<path:key>")
     def moment(key: str) -> Response:
-        """The curves around ?t= (s), the values of its frame, and the command that opens its
-        replay.
-        """
+        """The curves around ?t= (s), the values of its frame, and the command of its replay."""
         at_s = _moment()
         span = (at_s - _HALF_S, at_s + _HALF_S)
         with drawing():
@@ -341,7 +339,7 @@ def _shares(
     shares = {word: float(row.get(f"{word}_share", np.nan)) for word in words}
     parts: dict[str, float] = {}
     for word, share in shares.items():
-        if share > 0.0:  # NaN where it is not known
+        if share > 0.0:  # NaN if unknown
             name = word if word in coloured or word == "unlabelled" else OTHER
             parts[name] = parts.get(name, 0.0) + 100.0 * share
     ends = np.cumsum([0.0, *parts.values()])

@@ -175,8 +175,7 @@ def csv_address(name: str) -> str:
 
 
 def fill(table: Table, words: str = "", sorted_by: str = "", down: bool = False) -> dict[str, Any]:
-    """The variables of the template `table.html`: heads, rows (at most `MOST_ROWS`), and their
-    number.
+    """Variables of the template `table.html`: heads, rows (at most `MOST_ROWS`), and row count.
 
     Args:
         table: the table.
@@ -210,9 +209,7 @@ def fill(table: Table, words: str = "", sorted_by: str = "", down: bool = False)
 
 
 def as_csv(table: pd.DataFrame) -> Iterator[str]:
-    """Yield a table as CSV text, some thousand rows at a time, the header first; formulas are
-    escaped.
-    """
+    """Yield a table as CSV text in blocks of rows, the header first; formulas are escaped."""
     for start in range(0, max(len(table), 1), _BATCH):
         part = table.iloc[start : start + _BATCH]
         yield harmless_table(part).to_csv(index=False, header=start == 0, lineterminator="\n")

@@ -147,9 +147,7 @@ def occupancy_by_group(all_seen: Sequence[Seen]) -> Figure | None:
 
 
 def budgets_by_group(all_seen: Sequence[Seen]) -> Figure | None:
-    """Share of the time in each action: every subject and the groups' means; None without
-    actions.
-    """
+    """Share of the time in each action, by subject and as group means; None without actions."""
     groups = by_group(all_seen)
     words = list(dict.fromkeys(word for seen in all_seen for word in seen.words))
     shares = {

@@ -40,8 +40,9 @@ _ACROSS = 3  # panels per row
 
 
 def aligned(session: Session, xy_mm: Array) -> Array:
-    """Positions relative to the arena's centre and sides, so that arenas can be superimposed;
-    unchanged if the arena's shape is unknown.
+    """Positions relative to the arena's centre and sides, so that arenas can be superimposed.
+
+    They are unchanged if the arena's shape is unknown.
 
     Args:
         session: the opened session.
@@ -163,7 +164,7 @@ def occupancy_of(seen: Seen) -> Occupancy:
 
 
 def occupancy_map(seen: Seen) -> Figure | None:
-    """Heatmap of the time per area, with walls and zones; None without a position, and for a
+    """Heatmap of the time per area, with walls and zones; None without positions, and for a
     hand.
     """
     found = occupancy_of(seen)
@@ -183,9 +184,7 @@ def occupancy_map(seen: Seen) -> Figure | None:
 
 
 def _is_hand(seen: Seen) -> bool:
-    """Whether the animal is a hand before the camera, whose position on the floor has no
-    meaning.
-    """
+    """Whether the animal is a hand, whose position on the floor has no meaning."""
     return axis_of(seen.session.metadata["animal"]).kind == BRANCHES
 
 
@@ -267,8 +266,7 @@ def arena_heights(
 
 
 def arena_map(session: Session, depth: Sequence[NDArray[np.uint16]]) -> Figure | None:
-    """The arena's heights above the floor with fixtures, walls and zones; None without depth
-    images.
+    """The arena's heights above the floor with fixtures, walls and zones; None without depth.
 
     Args:
         session: the opened session.

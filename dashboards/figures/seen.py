@@ -125,9 +125,7 @@ class Seen:
         return hold_times(self.kinematics["time_s"].to_numpy(float))
 
     def column(self, name: str) -> Array:
-        """A column of `kinematics`, interrupted at gaps of the camera, so that no line crosses
-        them.
-        """
+        """A column of `kinematics`, interrupted at gaps of the camera; no line crosses them."""
         if self.kinematics is None or name not in self.kinematics:
             return np.full(len(self.frames), np.nan)
         return self.broken(self.kinematics[name])

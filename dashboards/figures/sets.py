@@ -231,8 +231,7 @@ def put_figure(folder: Path, name: str, content: bytes) -> Path:
 
 
 def read_comparison(folder: Path) -> tuple[pd.DataFrame, pd.DataFrame, list[Session]]:
-    """The output of `liex compare`: its table of sessions, its table `stats`, and the opened
-    sessions.
+    """The output of `liex compare`: table of sessions, table `stats`, and the opened sessions.
 
     A session that is missing from its path is left out. `attrs` of the sessions' table contains the
     sentence on included and excluded sessions.

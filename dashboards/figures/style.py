@@ -178,8 +178,8 @@ def floor_limits(axes: Axes, low_mm: Any, high_mm: Any) -> None:
 
 
 def time_unit(duration_s: float) -> tuple[str, float]:
-    """Unit of a time axis and its length in s: s, min beyond three minutes, h beyond three
-    hours.
+    """Unit of a time axis and its length, s: s, min (over three minutes) or h (over three
+    hours).
     """
     if duration_s > 3 * 3600:
         return "h", 3600.0
@@ -187,8 +187,8 @@ def time_unit(duration_s: float) -> tuple[str, float]:
 
 
 def halo(text: Any) -> None:
-    """Make a text readable on any background: a box of paper, because an outline makes shapes of
-    it.
+    """Put a box of paper behind a text to make it readable; an outline would turn it into
+    shapes.
     """
     behind = {"boxstyle": "round,pad=0.15", "facecolor": PAPER, "alpha": 0.75, "linewidth": 0.0}
     text.set_bbox(behind)

@@ -71,9 +71,7 @@ def _followed(body_m: float, skeleton: str) -> Any:
 
 
 def _zoomed(skeleton: str) -> Any:
-    """The cut-out around the animal with its skeleton's entity; its camera moves with the
-    animal.
-    """
+    """The cut-out around the animal with its skeleton's entity; its camera follows the animal."""
     import rerun.blueprint as rrb
 
     from liex_lab.sessions.rrd_depth import CUTOUTS

@@ -76,8 +76,9 @@ def spine_mm(session: Session) -> float:
 
 
 def optics(session: Session) -> str:
-    """The lens, water and mirror corrections between the real and the ideal camera, without a full
-    stop; empty if there are none.
+    """The corrected optical effects (lens, water, mirror) as text; empty if there are none.
+
+    It has no full stop.
     """
     found = session.metadata["camera"].get("optics", {})
     undone = []

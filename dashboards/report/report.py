@@ -169,7 +169,7 @@ def cards(session: Session) -> list[tuple[str, str, str]]:
 
 
 def summary_rows(session: Session, words: list[str]) -> list[tuple[str, str, str, str]]:
-    """The summary as (title, value, unit, meaning), without the columns of `words` (actions) and
+    """The summary as (title, value, unit, meaning), without columns of `words` (actions) or
     zones.
     """
     if not session.has("summary.csv"):
@@ -255,9 +255,7 @@ def zone_rows(session: Session) -> list[tuple[str, list[str]]]:
 
 
 def gap_rows(session: Session) -> list[tuple[str, str, str, str]]:
-    """The longest gaps, at most twelve, in order of time: (from, to, frames, reason); times in
-    s.
-    """
+    """The longest gaps, at most twelve, by time: (from, to, frames, reason); times in s."""
     shown = session.gaps.nlargest(12, "n_frames_missing").sort_values("start_s")
     return [
         (

@@ -320,8 +320,8 @@ class Film:
             write(picture, text, right - 4 - text_width(text, small), y, small)
 
     def _write_length(self, picture: NDArray[np.uint8], pixel_mm: float) -> None:
-        """Draw a scale bar of 1, 2 or 5 times a power of ten mm on the floor; `pixel_mm` is
-        mm/px.
+        """Draw a scale bar of 1, 2 or 5 times a power of ten mm; `pixel_mm` is mm/px on the
+        floor.
         """
         height, width = picture.shape[:2]
         size = max(height // 26, 9)

@@ -50,9 +50,7 @@ class Relief:
         self._outside = _beyond_walls(session, np.stack([*rays, np.ones_like(rays[0])], axis=-1))
 
     def heights(self, depth: NDArray[np.uint16]) -> NDArray[np.float32]:
-        """(H, W) heights above the floor, mm, of depth (H, W) uint16 mm; NaN where it is 0
-        (unread).
-        """
+        """(H, W) heights above the floor, mm, of depth (H, W) uint16 mm; NaN where unread (0)."""
         heights = depth.astype(np.float32) * self._per_mm + self._above_mm
         heights[depth == 0] = np.nan
         return heights
@@ -106,9 +104,7 @@ class Relief:
         return (_PLAIN * np.clip(light, 0.6, 1.4)).astype(np.uint8)
 
     def scale(self, height: int) -> NDArray[np.uint8]:
-        """The colours from 0 to `top_mm`, the highest on top: (height, 6, 3) uint8 RGB; height in
-        px.
-        """
+        """The colours from 0 to `top_mm`, the highest on top: (height, 6, 3) uint8 RGB."""
         at = np.linspace(255.0, 0.0, height).astype(np.uint8)
         return np.repeat(self._colours[at][:, None], 6, axis=1)
 

@@ -104,8 +104,8 @@ def segments_of(
         return []
     good = good[~_reversed(track, good, time_s)]
     length_mm = float(np.median(track.scale[good])) * track.skeleton.length
-    # errors are relative to the recording's median error, whose size depends on camera and
-    # animal, and on how errors are predicted, and is unrelated to actions
+    # errors are relative to the recording's median error, which depends on the camera, the
+    # animal and the prediction of errors but not on actions
     usual_mm = float(np.median(np.nan_to_num(track.predicted_error_mm[good], nan=0.0))) or 1.0
     wall = np.full(len(time_s), np.nan) if wall_mm is None else wall_mm
     cuts = np.flatnonzero(np.diff(time_s[good]) > max(LONGEST_GAP_S, 2.5 * _usual_step(time_s))) + 1
@@ -219,8 +219,8 @@ class _OnClock:
         )
 
     def _measured(self, first: int, stop: int) -> Array:
-        """Columns (k, 6 J + 2) of measurements first to stop, each of one frame or averaged over a
-        tick.
+        """Columns (k, 6 J + 2) of measurements first to stop: single frames or averages over
+        ticks.
         """
         starts = None if self._starts is None else self._starts[first : stop + 1]
         track = self._track
@@ -277,9 +277,7 @@ def _stretch(
 
 
 def _direction(skeleton: Skeleton, joints: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """Heading of the trunk of a body with these joints (m, J, 3), (m,) rad, and whether it is
-    upright.
-    """
+    """Heading (m,) rad of the trunk of a body with joints (m, J, 3), and whether it is upright."""
     rear, front = _forward(skeleton)
     axis = joints[:, front] - joints[:, rear]
     upright = np.hypot(axis[:, 0], axis[:, 1]) < 0.25 * np.linalg.norm(axis, axis=1)
@@ -296,8 +294,10 @@ def _channels(
     wall: Array,
     error: Array,
 ) -> Array:
-    """Channels (m, C) of headings (m,) rad, joints (m, J, 3) mm, angles (m, J, 3) rad, distances
-    (m,) mm and predicted errors (m,) mm on a clock whose ticks are `step` s apart.
+    """Channels (m, C) on a clock whose ticks are `step` s apart.
+
+    From headings (m,) rad, joints (m, J, 3) mm, angles (m, J, 3) rad, distances (m,) mm and
+    predicted errors (m,) mm.
     """
     (rear, front), (length_mm, usual_mm) = _forward(skeleton), units_mm
     axis = joints[:, front] - joints[:, rear]
@@ -400,7 +400,7 @@ def window_features(segment: Segment, names: Sequence[str]) -> NDArray[np.float3
 
 
 def _window_mean(total: Array, start_s: float, stop_s: float, step: float) -> Array:
-    """Means (m, C) over [t + start_s, t + stop_s] from running sums (m + 1, C), clipped to the
+    """Means (m, C) over [t + start_s, t + stop_s] from running sums (m + 1, C), clipped at the
     ends.
     """
     m = len(total) - 1

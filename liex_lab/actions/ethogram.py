@@ -16,7 +16,7 @@ from liex_lab.recordings.timestamps import frames_apart, median_step
 
 UNLABELLED = ""  # the word of a frame without an action
 LONGEST_GAP_S = 0.4  # that the recogniser bridges
-ACROSS_GAPS = (  # for every reader: in columns.json, the report and the methods
+ACROSS_GAPS = (  # printed in columns.json, the report and the methods
     f"The recogniser continues a bout across gaps of up to {LONGEST_GAP_S:g} s (2.5 frame "
     "intervals of a slower camera), a person's bout may span any gap, and a bout named by a rule "
     "ends at a gap. The duration of a bout runs by the clock, gaps included; the time and the "

@@ -88,9 +88,7 @@ def pyramid(rows: Array) -> Array:
 
 
 def _resampled(track: Track) -> tuple[SE3, Array]:
-    """Base T_arena_root (32) along geodesics and joint angles (32, J, 3) of the frames with a
-    pose.
-    """
+    """Base T_arena_root (32) along geodesics and joint angles (32, J, 3) of the observed frames."""
     observed = track.observed
     n = int(observed.sum())
     if n < 2:
@@ -150,8 +148,10 @@ class SequenceForest:
         return SequenceForest(descriptor, forest.fit(rows, list(words)))
 
     def name(self, rows: Array) -> list[str]:
-        """The words of n sequences with descriptors `rows` (n, D): the largest class of the
-        averaged leaves.
+        """The words of n sequences: the largest class of the averaged leaves.
+
+        Args:
+            rows: (n, D) descriptors.
         """
         return [str(word) for word in self.forest.predict(rows)]
 

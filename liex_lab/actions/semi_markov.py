@@ -42,8 +42,7 @@ class SemiMarkovModel:
 
     @staticmethod
     def learn(runs: Sequence[Sequence[tuple[int, float]]], n_words: int) -> SemiMarkovModel:
-        """The model of labelled bouts; words that never occur get default durations (0.1 s and 0.5
-        s).
+        """The model of labelled bouts; words without bouts get default durations (0.1 s and 0.5 s).
 
         Args:
             runs: for each recording, the bouts (word, length in s) in order.

@@ -191,7 +191,7 @@ def load_action_model(name: str | Path, folder: Path = MODELS) -> TimelineModel:
         return model
     except ModelError:
         raise
-    except Exception as error:  # a file that is not ours can fail anywhere in the reader
+    except Exception as error:  # a foreign file can fail anywhere in the reader
         raise ModelError(
             f"{path} should be an action model made by `liex train actions`, but: "
             f"{type(error).__name__}: {error}"

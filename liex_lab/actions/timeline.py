@@ -176,8 +176,7 @@ class TimelineModel:
     def scores(
         self, segment: Segment, names: Sequence[str], speed: Array, allocate: Allocator = np.empty
     ) -> Array:
-        """Log scores for the semi-Markov model: the evidence of a tick relative to each word's
-        prior.
+        """Log scores for the semi-Markov model: evidence of each tick relative to the prior.
 
         Args:
             segment: channels of an unbroken segment of m ticks.

@@ -62,8 +62,8 @@ class MouseRules:
     min_bout_s: float = 0.23
 
     def rear_mm(self, spine_mm: float) -> float:
-        """Least height of the nose above the tail's base in a rear, mm, for a spine of `spine_mm`
-        (mm).
+        """Least height of the nose above the tail's base in a rear, mm, for a spine of
+        `spine_mm`.
         """
         return min(self.rear_height_mm, self.rear_height_bl * spine_mm)
 

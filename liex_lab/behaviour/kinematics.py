@@ -81,17 +81,19 @@ class Spans:
         return Spans(self.before[rows], self.after[rows], self.span_s[rows], rows)
 
     def rate(self, values: Array) -> Array:
-        """(m,) or (m, k) change per second of the values (n,) or (n, k) of all frames; NaN for an
-        isolated frame.
+        """(m,) or (m, k) change per second; NaN for an isolated frame.
+
+        Args:
+            values: (n,) or (n, k), of all frames.
         """
         span = self.span_s if values.ndim == 1 else self.span_s[:, None]
         return np.asarray((values[self.after] - values[self.before]) / span)
 
     def turning(self, angle: Array) -> Array:
-        """(m,) rad/s, the smallest turns from `before` to the frame itself and on to `after`,
-        added.
+        """(m,) rad/s, the sum of the smallest turns from `before` to the frame and on to `after`.
 
-        `angle` (n,) rad is of all frames.
+        Args:
+            angle: (n,) rad, of all frames.
         """
         here = angle[self.rows]
         turn = smallest_turn(here - angle[self.before]) + smallest_turn(angle[self.after] - here)
@@ -172,9 +174,7 @@ def _put(
     n: int,
     allocate: Allocator,
 ) -> None:
-    """Write values (m, ...) of some rows into their columns (n, ...); missing columns are
-    allocated.
-    """
+    """Write values (m, ...) of some rows into their columns (n, ...), allocated on first use."""
     for name, some in values.items():
         if name not in columns:
             columns[name] = allocate((n, *some.shape[1:]), float)
@@ -189,9 +189,7 @@ def _moving(
     impossible_above_mm_s: float,
     allocate: Allocator,
 ) -> dict[str, Array]:
-    """Position, speed and turning of the whole body; hold_s (n,) is the duration of each frame,
-    s.
-    """
+    """Position, speed and turning of the whole body; hold_s (n,) is each frame's duration, s."""
     columns: dict[str, Array] = {}
     for rows in blocks(len(hold_s), _BLOCK):
         centre = shape["centre"][rows]

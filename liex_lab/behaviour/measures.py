@@ -199,9 +199,7 @@ class BoutReader:
         }
 
     def _wave(self, start: int, stop: int) -> float:
-        """Speed of the bend that travels from the middle third of the body to the rear one,
-        mm/s.
-        """
+        """Speed of the bend that travels from the middle third of the body to the rear, mm/s."""
         middle, rear = (self.column(f"bend_{part}_rad", start, stop) for part in ("middle", "rear"))
         if not (np.isfinite(middle).all() and np.isfinite(rear).all()) or stop - start < 8:
             return np.nan
@@ -296,8 +294,7 @@ class BoutCheck:
         self._limits = {word: limits_of(meaning) for word, meaning in meanings.items()}
 
     def broken(self, start: int, stop: int, word: str) -> str:
-        """The contradictions between a bout and its word's definition, in words; empty if there are
-        none.
+        """The contradictions between a bout and its word's definition, in words; empty if none.
 
         Args:
             start: first row of the bout in the table `kinematics`.

@@ -237,9 +237,7 @@ class Occupancy:
 
 
 def hold_times(time_s: ArrayLike) -> Array:
-    """(n,) the duration of each frame, s: until the next frame; before a gap or at the end, a
-    median step.
-    """
+    """(n,) duration of each frame, s: until the next; a median step before a gap or at the end."""
     time = np.asarray(time_s, float)
     return np.asarray(stop_times(time) - time)
 

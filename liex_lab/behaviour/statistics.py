@@ -34,9 +34,7 @@ Array = NDArray[np.float64]
 
 
 class NotComparable(Exception):
-    """Raised if the design does not allow a test; the message is one sentence for the table's
-    reader.
-    """
+    """Raised if the design does not allow a test; the message is one sentence for the reader."""
 
 
 @dataclass(frozen=True)

@@ -224,8 +224,9 @@ def _start(session: Session) -> datetime:
 
 
 def _subject(session: Session) -> Any:
-    """The animal. Its sex is one of NWB's letters, and its id has no slash, because DANDI makes a
-    path of it.
+    """The animal; its sex is one of NWB's letters.
+
+    Its id has no slash, because DANDI makes a path of it.
     """
     from pynwb.file import Subject
 

@@ -160,8 +160,7 @@ def all_columns() -> dict[str, Column]:
 
 
 def dictionary(*extra: Sequence[Column]) -> list[dict[str, Any]]:
-    """The content of columns.json: every column of `TABLES`, then those of other packages, as
-    dicts.
+    """The content of columns.json: the columns of `TABLES`, then those of other packages, as dicts.
 
     Args:
         *extra: columns of further tables.
