@@ -34,8 +34,8 @@ class Frames:
     def depth(self, key: str, session: Session, row: int) -> NDArray[np.uint16] | None:
         """(H, W) uint16 mm, 0 where unread; None if the session has no depth of this frame.
 
-        Outside the cut-outs that a session keeps, it is the still background. Without a readable
-        replay file, a thumbnail of the same frame is used.
+        Outside the stored cut-outs, it is the static background. Without a readable replay file, a
+        thumbnail of the same frame is used.
 
         Args:
             key: the session's name in the study.

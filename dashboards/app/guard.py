@@ -39,8 +39,8 @@ def guard(server: Flask, token: str, *, alone: bool = True) -> None:
     """Refuse unauthorised requests, and set the security headers of every response.
 
     A request without the token is refused, because other accounts of this machine can reach its
-    loopback address. With `alone`, a request to another host name is refused as well (DNS
-    rebinding). A request from another origin is a form of another site (CSRF).
+    loopback address. A request from another origin is refused, because it is a form of another site
+    (CSRF). With `alone`, a request to another host name is refused as well (DNS rebinding).
 
     Args:
         server: the Flask server of the dashboard.

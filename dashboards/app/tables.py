@@ -151,7 +151,7 @@ def arranged(table: Table, words: str, column: str, down: bool) -> pd.DataFrame:
         table: the table.
         words: separated by spaces; each must occur in a shown cell, ignoring case.
         column: the column to sort by, rows without a value last; an unknown column does not sort.
-        down: whether the largest comes first.
+        down: sort in descending order.
     """
     rows = table.rows
     wanted = words.lower().split()
@@ -181,7 +181,7 @@ def fill(table: Table, words: str = "", sorted_by: str = "", down: bool = False)
         table: the table.
         words: required in every shown row, see `arranged`.
         sorted_by: the column to sort by.
-        down: whether the largest comes first.
+        down: sort in descending order.
     """
     rows = arranged(table, words, sorted_by, down)
     sort = "descending" if down else "ascending"

@@ -187,9 +187,7 @@ def time_unit(duration_s: float) -> tuple[str, float]:
 
 
 def halo(text: Any) -> None:
-    """Put a box of paper behind a text to make it readable; an outline would turn it into
-    shapes.
-    """
+    """Put a box of paper behind a text, for legibility; an outline would turn it into shapes."""
     behind = {"boxstyle": "round,pad=0.15", "facecolor": PAPER, "alpha": 0.75, "linewidth": 0.0}
     text.set_bbox(behind)
 

@@ -40,7 +40,7 @@ def traces(session: Session) -> list[tuple[str, Array, Array, str]]:
 
 
 def pictures(session: Session) -> list[tuple[str, str, str, str]]:
-    """The contact sheet: the kept depth images with scene and skeleton, in order of time.
+    """The contact sheet: the session's thumbnails with scene and skeleton, in order of time.
 
     Returns:
         (SVG, time, the ethogram's action at that time or an empty text, its colour) of each.
@@ -76,7 +76,7 @@ def whole_picture(session: Session) -> tuple[str, str] | None:
     """The whole depth image with another animal in view that is not tracked.
 
     Returns:
-        SVG, and its time; None if the session kept none.
+        SVG, and its time; None if the session has none.
     """
     import cv2
 

@@ -57,8 +57,8 @@ class FrameCheck:
     """Checks bouts of ticks by their frames.
 
     Args:
-        broken: returns the contradictions of frames [start, stop) to a word's definition; None
-            skips the check.
+        broken: returns what contradicts a word's definition in frames [start, stop); None skips the
+            check.
         first: row of the first frame of the segment.
         tick: (r,) tick of each of its frames, ascending.
     """
@@ -69,7 +69,7 @@ class FrameCheck:
         self._tick = tick
 
     def broken(self, start: int, stop: int, word: str) -> tuple[slice, str]:
-        """The frames of a bout of ticks, and its contradictions to its word's definition.
+        """The frames of a bout of ticks, and what contradicts its word's definition in them.
 
         Args:
             start: first tick.

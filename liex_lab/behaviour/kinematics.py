@@ -41,7 +41,7 @@ STEEP_RAD = np.radians(75.0)  # beyond it the body's axis has no reliable direct
 
 @dataclass(frozen=True)
 class Spans:
-    """The two frames between which the derivative at each of m frames is taken.
+    """The two frames for the derivative at each of m frames.
 
     The derivative's input is always the values of all n frames.
 
