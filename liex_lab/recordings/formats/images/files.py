@@ -1,10 +1,11 @@
-"""Depth images, one to a file: PNG, PGM and PCLZF, and the interface of every stack of images.
+"""Depth images, one per file: PNG, PGM and PCLZF, and the interface of every stack of images.
 
-Files are probed (header, length) without decoding any; damaged ones keep their place and read as
-None. OpenCV decodes PNG after all CRCs agree, for it writes about damage into the terminal. PGM
-(Netpbm P5, 16 bits) has the high byte first, but some programs write the low byte first: the order
-in which neighbouring pixels are at least twice as alike decides, for depth is smooth and its low
-byte is not. PCLZF is PCL's format, packed with LZF, with intrinsics in an XML file beside it.
+Files are probed (header, length) without decoding; damaged ones keep their index and read as None.
+OpenCV decodes PNG only if all CRCs match, because it prints messages about damage to the terminal.
+PGM (Netpbm P5, 16 bits) has the high byte first, but some programs write the low byte first: the
+byte order in which neighbouring pixels are at least twice as similar is used, as depth is smooth
+and its low byte is not. PCLZF is PCL's format, packed with LZF, with intrinsics in a separate XML
+file.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ Size = tuple[int, int]  # width, height, pixels
 
 
 class Stack(ABC):
-    """Depth images of one size, in order, as the files hold them.
+    """Depth images of one size, in order, as stored in the files.
 
     Attributes:
         width: columns of an image, px.
@@ -48,15 +49,15 @@ class Stack(ABC):
 
     @abstractmethod
     def read(self, index: int) -> NDArray[Any] | None:
-        """Stored values (H, W), or (H, W, 3) of colour; None if the image is cut or damaged."""
+        """Stored values (H, W), or (H, W, 3) for colour; None if the image is cut or damaged."""
 
     @abstractmethod
     def label(self, index: int) -> str:
-        """Name of an image for a sentence: the file, and where in it."""
+        """Name of an image for a message: the file, and the position in it."""
 
     @property
     def whole(self) -> list[bool]:
-        """(n,) True for images that are not cut short, as far as shows without decoding them."""
+        """(n,) True for images that are not cut short, as far as known without decoding."""
         return [True] * len(self)
 
     @property
@@ -65,16 +66,16 @@ class Stack(ABC):
         return not all(self.whole)
 
     def close(self) -> None:  # noqa: B027 (most hold no file open)
-        """Close what is open."""
+        """Close open files."""
 
 
-# what a file states before its image is decoded: its size, the error that says what else it is, or
-# None if it is cut or damaged
+# result of probing a file: its size, the error for another type, or None if it is cut or
+# damaged
 Probe = Size | RecordingError | None
 
 
 class FileStack(Stack):
-    """A stack with one image to a file."""
+    """A stack with one image per file."""
 
     def __init__(
         self,
@@ -83,7 +84,7 @@ class FileStack(Stack):
         whole: list[bool],
         decode: Callable[[Path], NDArray[Any] | None],
     ) -> None:
-        """Take files whose images `decode` reads, None for a damaged one."""
+        """Keep the files, and `decode`, which reads an image or returns None for a damaged one."""
         self.files = files
         self.width, self.height = size
         self.problems = []
@@ -99,7 +100,7 @@ class FileStack(Stack):
         return self._whole
 
     def read(self, index: int) -> NDArray[Any] | None:
-        """Stored values (H, W), or (H, W, 3) of colour; None if the image is cut or damaged."""
+        """Stored values (H, W), or (H, W, 3) for colour; None if the image is cut or damaged."""
         stored = self.decode(self.files[index]) if self.whole[index] else None
         fits = stored is not None and stored.shape[:2] == (self.height, self.width)
         return stored if fits else None
@@ -116,14 +117,14 @@ def open_files(
     decode: Callable[[Path], NDArray[Any] | None],
     progress: Progress,
 ) -> FileStack:
-    """Open images, one to a file: every file is probed and none is decoded.
+    """Open images, one per file: every file is probed and none is decoded.
 
     Args:
         files: the images, in order.
-        kind: their kind, for sentences, such as "PNG".
+        kind: their kind, for messages, such as "PNG".
         probe: reads a file's header; raises for an image that is whole but not depth.
-        decode: gives the stored values of a file; None if it is damaged.
-        progress: counts the files that were probed.
+        decode: reads the stored values of a file; None if it is damaged.
+        progress: counts the probed files.
 
     Raises:
         RecordingError: none is whole, or their sizes differ.
@@ -147,15 +148,7 @@ def open_files(
 
 
 def none_whole_error(files: list[Path], kind: str) -> RecordingError:
-    """The error for images none of which can be read.
-
-    Args:
-        files: the images.
-        kind: their kind, such as "PNG".
-
-    Returns:
-        The error, to be raised.
-    """
+    """The error if none of the images, of a kind such as "PNG", can be read."""
     return RecordingError(
         f"none of the {len(files)} {kind} pictures in {files[0].parent} is whole; copy them again"
         if len(files) > 1
@@ -164,7 +157,7 @@ def none_whole_error(files: list[Path], kind: str) -> RecordingError:
 
 
 def something_else(path: Path, kind: str) -> RecordingError:
-    """The finding that a file's first bytes are not those of its kind, such as "PNG"."""
+    """The error for a file whose first bytes do not match its kind, such as "PNG"."""
     return RecordingError(
         f"{path} is named like a {kind} picture but holds something else; remove it or give it its "
         "name"
@@ -172,28 +165,18 @@ def something_else(path: Path, kind: str) -> RecordingError:
 
 
 def too_large(size: Size) -> bool:
-    """Whether a stated size is beyond any depth camera (2^24 px), and so no size.
-
-    Args:
-        size: (width, height), px.
-
-    Returns:
-        True if it is too large.
-    """
+    """Whether a size (width, height), px, is beyond any depth camera (2^24 px) and so invalid."""
     return size[0] * size[1] > MAX_PIXELS
 
 
 def not_depth_error(where: str, found: str, width: int, height: int) -> RecordingError:
-    """The error for an image that cannot hold depth.
+    """The error for an image that cannot contain depth.
 
     Args:
         where: the file.
-        found: what it holds, such as "8-bit grey".
+        found: its type, such as "8-bit grey".
         width: its columns, px.
         height: its rows, px.
-
-    Returns:
-        The error, to be raised.
     """
     article = "an" if found.startswith(("8", "11", "18")) else "a"
     return RecordingError(
@@ -209,9 +192,6 @@ def one_size_error(pictures: list[tuple[str, int, int]]) -> RecordingError:
 
     Args:
         pictures: (name, width, height) of one image of each size.
-
-    Returns:
-        The error, to be raised.
     """
     (one, w, h), (other, v, g) = pictures[:2]
     return RecordingError(
@@ -226,7 +206,7 @@ def one_size_error(pictures: list[tuple[str, int, int]]) -> RecordingError:
 _SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _END = struct.pack(">I", 0) + b"IEND\xaeB`\x82"  # the last chunk: no data, its name, its CRC
 _HEAD_BYTES = 33  # signature and the whole header chunk with its CRC
-_SIZE_BYTES = 26  # what of it says size and kind
+_SIZE_BYTES = 26  # part of it with size and kind
 _COLOURS = {
     0: "grey",
     2: "colour",
@@ -237,30 +217,30 @@ _COLOURS = {
 
 
 def decode_png(data: NDArray[np.uint8], colour: bool = False) -> NDArray[Any] | None:
-    """Pixels of a PNG.
+    """Decode a PNG.
 
     Args:
         data: (m,) uint8 bytes of the file.
         colour: 8-bit colour is expected instead of 16-bit grey.
 
     Returns:
-        (H, W) uint16, or with colour (H, W, 3) uint8 (blue, green, red); None if it does not
-        decode to that.
+        (H, W) uint16, or for colour (H, W, 3) uint8 (blue, green, red); None if it is damaged or of
+        another type.
     """
     import cv2
 
-    if not _sums_agree(data):  # the decoder would find it too, and write about it into the terminal
+    if not _sums_agree(data):  # the decoder would print a message to the terminal
         return None
     try:
         picture: NDArray[Any] | None = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
-    except cv2.error:  # of an empty buffer, and of sizes beyond OpenCV's own limits
+    except cv2.error:  # an empty buffer, or a size beyond OpenCV's limits
         return None
     kind = (3, np.dtype(np.uint8)) if colour else (2, np.dtype(np.uint16))
     return picture if picture is not None and (picture.ndim, picture.dtype) == kind else None
 
 
 def _sums_agree(data: NDArray[np.uint8]) -> bool:
-    """Whether every chunk up to the last agrees with its check sum."""
+    """Whether all chunks up to the last match their check sums."""
     view = data.data
     at = len(_SIGNATURE)
     while at + 12 <= len(view):
@@ -277,15 +257,12 @@ def _sums_agree(data: NDArray[np.uint8]) -> bool:
 
 
 def open_pngs(files: list[Path], progress: Progress, colour: bool = False) -> FileStack:
-    """Open PNG images: the head and the tail of every file are checked, and none is decoded.
+    """Open PNG images: head and tail of every file are checked, and none is decoded.
 
     Args:
         files: the images, in order.
-        progress: reports how many were looked at.
+        progress: counts the probed files.
         colour: 8-bit colour is expected instead of 16-bit grey.
-
-    Returns:
-        The images as a stack.
 
     Raises:
         RecordingError: none is whole, one is of another kind, or their sizes differ.
@@ -310,7 +287,7 @@ def _look(path: Path, colour: bool) -> Probe:
         head[29:33], "big"
     )
     if damaged or tail != _END:
-        # a header that is whole still says whether this was depth at all
+        # a whole header still shows whether this was depth at all
         if not damaged:
             png_size(head, str(path), colour)
         return None
@@ -318,18 +295,18 @@ def _look(path: Path, colour: bool) -> Probe:
 
 
 def png_size(head: bytes, where: str, colour: bool = False) -> tuple[int, int] | None:
-    """Width and height that a PNG states in its header.
+    """Width and height in the header of a PNG.
 
     Args:
         head: the first bytes of the file; 26 are needed.
-        where: the file, for the sentence.
+        where: the file, for the error message.
         colour: 8-bit colour is expected instead of 16-bit grey.
 
     Returns:
         (width, height), px; None if the header is cut off.
 
     Raises:
-        RecordingError: it is no PNG, its header makes no sense, or it is of another kind.
+        RecordingError: it is not a PNG, its header is invalid, or it is of another kind.
     """
     if not head.startswith(_SIGNATURE[: len(head)]):
         raise RecordingError(
@@ -361,7 +338,7 @@ _DTYPES = {"big": np.dtype(">u2"), "little": np.dtype("<u2")}
 _GAP = rb"(?:\s|#[^\n]*\n)+"
 _HEADER = re.compile(rb"P5" + _GAP + rb"(\d{1,9})" + _GAP + rb"(\d{1,9})" + _GAP + rb"(\d{1,5})\s")
 _PGM_HEAD_BYTES = 1024  # comments included
-_N_ASKED = 5  # images, spread over the recording, that tell the byte order
+_N_ASKED = 5  # images, spread over the recording, that determine the byte order
 
 
 class _Header(NamedTuple):
@@ -372,19 +349,16 @@ class _Header(NamedTuple):
 
 
 def open_pgms(files: list[Path], progress: Progress, byte_order: str | None = None) -> FileStack:
-    """Open PGM images: the header and the length of every file are checked, and none is decoded.
+    """Open PGM images: header and length of every file are checked, and none is decoded.
 
     Args:
         files: the images, in order.
-        progress: reports how many were looked at.
-        byte_order: "big", as the format's definition has it, or "little"; None for big, unless most
-            images are plainly the other way round, which `problems` then say.
-
-    Returns:
-        The images as a stack.
+        progress: counts the probed files.
+        byte_order: "big", as in the format's definition, or "little"; None for big, unless most
+            images are clearly little endian, which `problems` then report.
 
     Raises:
-        RecordingError: none is whole, one is no depth, or their sizes differ.
+        RecordingError: none is whole, one is not depth, or their sizes differ.
     """
     stack = open_files(
         files, "PGM", _pgm_look, partial(_pgm_decode, dtype=_DTYPES[byte_order or "big"]), progress
@@ -421,8 +395,8 @@ def _pgm_look(path: Path) -> Probe:
         raise not_depth_error(str(path), "8-bit grey", header.width, header.height)
     n_pixels = header.width * header.height
     spare = path.stat().st_size - header.n_bytes - 2 * n_pixels
-    # a line's end or a comment behind the pixels is no matter; more, or less, and the header does
-    # not say the truth
+    # a line break or a comment after the pixels is accepted; otherwise the header is
+    # wrong
     fits = n_pixels > 0 and not too_large(header[:2]) and 0 <= spare < 2 * header.width
     return header[:2] if fits else None
 
@@ -440,9 +414,7 @@ def _pgm_decode(path: Path, dtype: np.dtype[np.uint16]) -> NDArray[np.uint16] | 
 
 
 def _is_little(path: Path) -> bool:
-    """Whether neighbouring pixels are alike with the low byte first only: depth is smooth, and its
-    low byte is not.
-    """
+    """Whether neighbouring pixels are at least twice as similar with the low byte first."""
     rough = {}
     for name, dtype in _DTYPES.items():
         picture = _pgm_decode(path, dtype)
@@ -454,7 +426,7 @@ def _is_little(path: Path) -> bool:
     return 2.0 * rough["little"] < rough["big"]
 
 
-# PCL's `.pclzf` images: 16-bit depth packed with LZF, intrinsics in the XML beside each.
+# PCL's `.pclzf` images: 16-bit depth packed with LZF, intrinsics in one XML file per image.
 
 
 _MAGIC = b"PCLZF"
@@ -481,17 +453,14 @@ class _PclzfHeader(NamedTuple):
 
 
 def open_pclzfs(files: list[Path], progress: Progress) -> FileStack:
-    """Open PCLZF images: the header and the length of every file are checked, none is decoded.
+    """Open PCLZF images: header and length of every file are checked, and none is decoded.
 
     Args:
         files: the images, in order.
-        progress: reports how many were looked at.
-
-    Returns:
-        The images as a stack.
+        progress: counts the probed files.
 
     Raises:
-        RecordingError: none is whole, one holds colour, or their sizes differ.
+        RecordingError: none is whole, one is colour, or their sizes differ.
     """
     return open_files(files, "PCLZF", _pclzf_look, _pclzf_decode, progress)
 
@@ -526,17 +495,17 @@ def _pclzf_decode(path: Path) -> NDArray[np.uint16] | None:
 
 
 def read_pclzf_camera(picture: Path) -> dict[str, float] | None:
-    """Intrinsics and unit in the XML beside an image.
+    """Intrinsics and unit in the XML file of an image.
 
-    PCL writes `frame_T.xml` beside `frame_T_depth.pclzf`, with two elements at the top, <rgb> and
-    <depth>, which is why it is no XML until something stands around them.
+    PCL writes `frame_T.xml` next to `frame_T_depth.pclzf`, with two top-level elements, <rgb> and
+    <depth>, so it is only valid XML inside another element.
 
     Args:
         picture: the .pclzf file.
 
     Returns:
-        fx, fy, cx, cy (px) and unit_mm (mm per stored step) by name; None if there is no XML
-        that states them.
+        fx, fy, cx, cy (px) and unit_mm (mm per stored step) by name; None if there is no XML file
+        with all of them.
     """
     path = picture.with_name(
         picture.name.removesuffix(picture.suffix).removesuffix("_depth") + ".xml"

@@ -38,7 +38,7 @@ from liex_lab.recordings.timestamps import (
 )
 from liex_lab.runtime.progress import Progress, silent
 
-KINDS: dict[str, tuple[str, ...]] = {  # of images: how their files' names end
+KINDS: dict[str, tuple[str, ...]] = {  # suffixes of image files
     "PNG": (".png",),
     "TIFF": (".tif", ".tiff"),
     "PGM": (".pgm",),
@@ -46,21 +46,21 @@ KINDS: dict[str, tuple[str, ...]] = {  # of images: how their files' names end
 }
 SUFFIXES = tuple(suffix for kind in KINDS.values() for suffix in kind)
 _EIGHT_BIT = (".jpg", ".jpeg", ".bmp", ".gif", ".webp")
-_COLOUR_PCLZF = "_rgb.pclzf"  # PCL's grabber writes one beside every depth image
+_COLOUR_PCLZF = "_rgb.pclzf"  # PCL's grabber writes one per depth image
 
 
 class Pictures:
-    """Images as depth: a cut or damaged one is wholly unread, and `problems` says so once."""
+    """Images as depth: cut or damaged ones are all unread, and reported once in `problems`."""
 
     def __init__(
         self, stack: Stack, decode: Callable[[Stored], Depth], problems: list[str]
     ) -> None:
-        """Take a stack of images.
+        """Keep a stack of images.
 
         Args:
             stack: the stored images.
-            decode: stored values of one image to depth (H, W) float32 mm.
-            problems: the recording's sentences, appended to when a damaged image is met.
+            decode: converts stored values of one image to depth (H, W) float32 mm.
+            problems: the recording's sentences, appended to for damaged images.
         """
         self.stack = stack
         self.problems = problems
@@ -68,14 +68,7 @@ class Pictures:
         self._bad = {i for i, whole in enumerate(stack.whole) if not whole}
 
     def read(self, index: int) -> Depth:
-        """Depth of one image.
-
-        Args:
-            index: number of the image.
-
-        Returns:
-            (H, W) float32 mm, 0 where unread.
-        """
+        """Depth of one image, (H, W) float32 mm, 0 where unread."""
         stored = self.stack.read(index)
         if stored is not None:
             return self._decode(stored)
@@ -92,8 +85,8 @@ def list_pictures(folder: Path, pattern: str = "*") -> tuple[str, list[Path]]:
     """The depth images of a folder, in natural order: frame_2 before frame_10.
 
     Args:
-        folder: where they are.
-        pattern: which names to take, as in "*_depth.png".
+        folder: the folder.
+        pattern: which names to read, as in "*_depth.png".
 
     Returns:
         Their kind, a key of `KINDS`, and their paths.
@@ -136,14 +129,7 @@ def list_pictures(folder: Path, pattern: str = "*") -> tuple[str, list[Path]]:
 
 
 def natural_key(name: str) -> list[tuple[int, int, str]]:
-    """Key that sorts digits in a name by their value and the rest by its letters.
-
-    Args:
-        name: name of a file.
-
-    Returns:
-        The key, for `sorted`.
-    """
+    """Sort key that compares digits in a file name by value and the rest by letters."""
     return [
         (0, int(part), "") if part.isascii() and part.isdigit() else (1, 0, part)
         for part in re.findall(r"[0-9]+|[^0-9]+", name)
@@ -161,17 +147,13 @@ def open_images(
 
     Args:
         path: the folder or file.
-        camera: comes before a camera.toml.
-        fps: frame rate, Hz; used only where there are no time stamps, and before that of a
-            camera.toml.
-        progress: reports how many images were looked at.
-        pattern: which names of the folder to take; None takes those that camera.toml states.
-
-    Returns:
-        The recording.
+        camera: overrides a camera.toml.
+        fps: frame rate, Hz; used only if there are no time stamps; overrides a camera.toml.
+        progress: counts the probed images.
+        pattern: which names of the folder to read; None for the pattern in camera.toml.
 
     Raises:
-        RecordingError: there is no depth, or the camera or the times are not known.
+        RecordingError: there is no depth, or the camera or the times are unknown.
     """
     folder = path if path.is_dir() else path.parent
     camera_toml = CameraFile.read(folder / CAMERA_FILE)
@@ -191,15 +173,15 @@ def open_images(
 
 @dataclass(frozen=True)
 class Folder:
-    """Images and all that is needed to make a recording of them.
+    """Images with everything needed to make a recording of them.
 
     Attributes:
-        path: what was asked for, a folder or one file.
-        files: the files of the images.
-        camera_toml: what the folder's camera.toml says.
+        path: the requested folder or file.
+        files: the image files.
+        camera_toml: the folder's camera.toml.
         stack: the stored images.
-        decode: stored values to depth (H, W) float32 mm.
-        beside: further files that say how to read the images.
+        decode: converts stored values to depth (H, W) float32 mm.
+        beside: further files that describe the images.
     """
 
     path: Path
@@ -210,18 +192,15 @@ class Folder:
     beside: Sequence[Path] = ()
 
     def recording(self, format: str, camera: Lens | None, fps: float | None) -> Recording:
-        """The recording, with its camera and times; the stack is closed where that fails.
+        """The recording, with its camera and times; the stack is closed on an error.
 
         Args:
             format: name of the format, for `Recording.format`.
-            camera: comes before the camera.toml.
-            fps: frame rate, Hz; used only where there are no time stamps.
-
-        Returns:
-            The recording.
+            camera: overrides the camera.toml.
+            fps: frame rate, Hz; used only if there are no time stamps.
 
         Raises:
-            RecordingError: the camera or the times are not known, or all depths are negative.
+            RecordingError: the camera or the times are unknown, or all depths are negative.
         """
         try:
             return self._recording(format, camera, fps)
@@ -257,14 +236,13 @@ class Folder:
 
     @property
     def folder(self) -> Path:
-        """Where the images lie."""
+        """The folder of the images."""
         return self.path if self.path.is_dir() else self.path.parent
 
     def _times(
         self, fps: float | None, problems: list[str], doubts: list[str]
     ) -> tuple[NDArray[np.int64], MonotoneTimes, str | None]:
-        """The images that have a stamp, their stamps, and the moment of the first, ISO 8601, where
-        they state it.
+        """The images that have a stamp, their stamps, and the start time, ISO 8601, if stated.
 
         From the stamp file, or else from the names of the images, or else from a stated rate.
         """
@@ -318,7 +296,7 @@ def _kind(path: Path) -> str:
 
 
 def _with_xml(camera_file: CameraFile, picture: Path) -> CameraFile:
-    """The camera file completed by the intrinsics that PCL writes beside each image."""
+    """The camera file completed by the intrinsics in PCL's XML file of an image."""
     from liex_lab.recordings.formats.images.files import read_pclzf_camera
 
     found = read_pclzf_camera(picture)
@@ -334,16 +312,13 @@ def _with_xml(camera_file: CameraFile, picture: Path) -> CameraFile:
 
 
 def open_stack(kind: str, files: list[Path], camera_file: CameraFile, progress: Progress) -> Stack:
-    """The images of one kind.
+    """The images of one kind, as a stack.
 
     Args:
         kind: a key of `KINDS`.
         files: the images, in order.
-        camera_file: what the folder's camera.toml says, for encoding and byte_order.
-        progress: reports how many were looked at.
-
-    Returns:
-        The images as a stack.
+        camera_file: the folder's camera.toml, for encoding and byte_order.
+        progress: counts the probed images.
 
     Raises:
         RecordingError: they cannot be read, or the stated encoding does not fit their kind.
@@ -383,8 +358,8 @@ def _cut_problems(stack: Stack) -> list[str]:
 def _refuse_negative(
     stack: Stack, decode: Callable[[Stored], Depth], camera_file: CameraFile
 ) -> None:
-    """Floats and signed integers may count away from the camera with a minus sign; all of them
-    would be unread.
+    """Raise RecordingError if all depths are negative (floats or signed integers): all would be
+    unread.
     """
     stored = stack.read(stack.whole.index(True))
     if stored is None or stored.dtype.kind not in "fi" or decode(stored).any():

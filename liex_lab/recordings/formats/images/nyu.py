@@ -1,7 +1,7 @@
 """The NYU hand pose data set (Tompson et al. 2014): depth in colour PNGs, joints in joint_data.mat.
 
-Depth is 256 green + blue, mm. The set holds no times; its cameras ran at 30 frames/s. Labels are
-the usual 14 of its 36 joints.
+Depth is 256 green + blue, mm. The set has no times; its cameras ran at 30 frames/s. Labels are the
+usual 14 of its 36 joints.
 """
 
 from __future__ import annotations
@@ -30,12 +30,12 @@ from liex_lab.runtime.progress import Progress, silent
 
 NYU_CAMERA = Camera(588.036865, 587.075073, 320.0, 240.0, 640, 480, source="NYU hand pose data set")
 JOINT_FILE = "joint_data.mat"
-VIEW = 1  # of the three cameras, the one that everybody measures on
+VIEW = 1  # of the three cameras, the one used in evaluations
 N_JOINTS = 36
 
 _NAME = re.compile(r"(?:depth|synthdepth)_([123])_(\d{7})\.png")
 _N_ASKED = 8  # images: one may be damaged
-_NOMINAL_HZ = 30.0  # the data set holds no times; its cameras ran at this rate
+_NOMINAL_HZ = 30.0  # the data set has no times; its cameras ran at this rate
 
 
 @dataclass(frozen=True)
@@ -45,8 +45,8 @@ class NyuJoints:
     Attributes:
         names: (J,) names of the joints, as in the file.
         uvd: (N, J, 3) u, v px and depth mm.
-        xyz: (N, J, 3) mm, camera frame (x right, y down, z away), so its y is the file's with the
-            sign turned.
+        xyz: (N, J, 3) mm, camera frame (x right, y down, z away); the sign of y is opposite in the
+            file.
     """
 
     names: tuple[str, ...]
@@ -55,14 +55,12 @@ class NyuJoints:
 
 
 def looks_like_nyu(folder: Path, names: list[str]) -> bool:
-    """Whether files are those of the NYU data set: so named, and 8-bit colour PNG.
+    """Whether files are those of the NYU data set: names match, and one of the first eight is in
+    colour.
 
     Args:
-        folder: where they are.
+        folder: their folder.
         names: names of the files in it.
-
-    Returns:
-        True if one of the first eight so named is in colour.
     """
     for name in [name for name in names if _NAME.fullmatch(name)][:_N_ASKED]:
         with (folder / name).open("rb") as file:
@@ -82,13 +80,10 @@ def open_nyu(
 
     Args:
         path: the folder or image.
-        camera: comes before a camera.toml and the data set's own intrinsics.
-        fps: frame rate, Hz, where there is no stamp file; None for that of a camera.toml, or 30.
-        progress: reports how many images were looked at.
+        camera: overrides a camera.toml and the data set's own intrinsics.
+        fps: frame rate, Hz, without a stamp file; None for that of a camera.toml, or 30.
+        progress: counts the probed images.
         view: which of the three cameras, 1 to 3.
-
-    Returns:
-        The recording.
 
     Raises:
         RecordingError: there are no such images, or they are damaged.
@@ -112,11 +107,8 @@ def frame_numbers(folder: Path, view: int = VIEW) -> list[int]:
     """Numbers, from 1, of the images that `open_nyu` reads, in its order.
 
     Args:
-        folder: where they are.
+        folder: their folder.
         view: which of the three cameras, 1 to 3.
-
-    Returns:
-        (N,) numbers out of the names.
 
     Raises:
         RecordingError: there are no such images.
@@ -137,20 +129,17 @@ def _pictures(folder: Path, view: int) -> list[Path]:
 
 
 def read_nyu_joints(folder: Path, view: int = VIEW) -> NyuJoints:
-    """Joints of one view out of a joint_data.mat.
+    """Joints of one view from a joint_data.mat.
 
     Row i belongs to the image with number i + 1.
 
     Args:
-        folder: the folder that holds joint_data.mat, or the file itself.
+        folder: the folder of joint_data.mat, or the file itself.
         view: which of the three cameras, 1 to 3.
 
-    Returns:
-        The joints of all frames.
-
     Raises:
-        RecordingError: there is no such file or no such view, or the file does not hold 36 joints
-            to a frame.
+        RecordingError: there is no such file or no such view, or the file does not have 36 joints
+            per frame.
     """
     from scipy.io import loadmat
     from scipy.io.matlab import MatReadError
@@ -212,8 +201,8 @@ REFERENCE_FILE = "nyu_test_14joints.npz"
 N_FIRST_PERSON = 2440  # test frames before this one show the first person, the others the second
 PALM = 13  # row of the palm, where the root is
 
-# row by row: how a labelled point is made of the skeleton's joints. The thumb's second point lies
-# on its last bone.
+# weights of the skeleton's joints for each labelled point. The thumb's second point is on its
+# last bone.
 POINTS: dict[str, dict[str, float]] = {
     "pinky_tip": {"little_tip": 1.0},
     "pinky_mid": {"little_middle": 1.0},
@@ -248,11 +237,11 @@ NYU_IDS = (
 )  # of the data set's 36 points, from 0
 _LITTLE_WRIST = 11
 _THUMB_WRIST = 12
-_START_BEND = 0.3  # rad: a straight finger does not know which way to bend
+_START_BEND = 0.3  # rad: the bending direction of a straight finger is ambiguous
 
 
 def points_of_joints(skeleton: Skeleton) -> Array:
-    """Weights that make the fourteen labelled points of a hand's joints.
+    """Weights that combine a hand's joints into the fourteen labelled points.
 
     Args:
         skeleton: the hand's skeleton, J joints.
@@ -268,7 +257,8 @@ def points_of_joints(skeleton: Skeleton) -> Array:
 
 
 def uvd_to_mm(uvd: ArrayLike) -> Array:
-    """Points in the camera frame of pixels and depths, by the pinhole `NYU_CAMERA`.
+    """Convert pixels and depths to points in the camera frame, by the pinhole camera
+    `LABEL_CAMERA`.
 
     Args:
         uvd: (..., 3) u, v px and depth mm.
@@ -282,7 +272,7 @@ def uvd_to_mm(uvd: ArrayLike) -> Array:
 
 @dataclass(frozen=True)
 class NyuReference:
-    """True points of the NYU test frames, and what methods have answered.
+    """True points of the NYU test frames, and the results of published methods.
 
     Attributes:
         truth: (n, 14, 3) mm, camera frame.
@@ -297,10 +287,8 @@ class NyuReference:
         """Load the reference from its file, or else from the data set's own.
 
         Args:
-            folder: holds nyu_test_14joints.npz, or else joint_data.mat, which holds no answers.
-
-        Returns:
-            The reference.
+            folder: contains nyu_test_14joints.npz, or else joint_data.mat, which has no results of
+                methods.
 
         Raises:
             LiexError: the folder has neither file, or the file is damaged or labels other points.
@@ -339,15 +327,15 @@ class NyuReference:
 def fit_hands(skeleton: Skeleton, points: Array) -> Fit:
     """Fit hand poses to labelled points.
 
-    The search begins with the palm at its point, pointing away from the wrist, and with fingers
-    bent by 0.3 rad, for a straight finger does not know which way to bend.
+    The search starts with the palm at its point, pointing away from the wrist, and with fingers
+    bent by 0.3 rad, because the bending direction of a straight finger is ambiguous.
 
     Args:
         skeleton: the hand's skeleton.
         points: (n, 14, 3) labelled points, mm, in the order of `POINTS`.
 
     Returns:
-        n poses in the frame of the points, and how well they fit.
+        n poses in the frame of the points, and their residuals.
     """
     palm = points[:, PALM]
     wrists = points[:, [_LITTLE_WRIST, _THUMB_WRIST]]

@@ -1,6 +1,6 @@
 """Point clouds (XYZ text, PLY) as depth images: projection into a pinhole camera with a z-buffer.
 
-u = floor(fx x / z + cx + 1/2), v likewise; the nearest point of a pixel counts.
+u = floor(fx x / z + cx + 1/2), v likewise; the nearest point of a pixel is used.
 """
 
 from __future__ import annotations
@@ -57,14 +57,14 @@ def open_clouds(
     to_camera: Callable[[Points], Points],
     progress: Progress,
 ) -> FileStack:
-    """Open point clouds, one to a file, as images of a camera.
+    """Open point clouds, one per file, as images of a camera.
 
     Args:
         files: the clouds, in order.
-        camera: the camera that sees them.
+        camera: the camera of the images.
         columns: of x, y, z in a text file, from 0.
-        to_camera: a file's points (n, 3) in its own units to mm in the camera frame.
-        progress: reports how many were looked at.
+        to_camera: converts a file's points (n, 3) in its own units to mm in the camera frame.
+        progress: counts the probed files.
 
     Returns:
         Images (H, W) float64 mm, 0 = unread, as a stack.
@@ -75,14 +75,7 @@ def open_clouds(
     size = (camera.width, camera.height)
 
     def decode(path: Path) -> NDArray[Any] | None:
-        """Depth of one cloud.
-
-        Args:
-            path: its file.
-
-        Returns:
-            (H, W) mm; None if it is damaged.
-        """
+        """Depth (H, W) mm of a file; None if it is damaged."""
         points = read_points(path, columns)
         return None if points is None else render_points(to_camera(points), camera)
 
@@ -90,15 +83,15 @@ def open_clouds(
 
 
 def render_points(p_camera: Points, camera: Camera) -> NDArray[np.float64]:
-    """Depth that a camera sees of points: the nearest in every pixel.
+    """Render points as a depth image: the nearest point in every pixel.
 
     Args:
-        p_camera: (n, 3) mm, camera frame; points that are not finite or behind the lens are left
-            out.
+        p_camera: (n, 3) mm, camera frame; points that are not finite or behind the lens are
+            ignored.
         camera: the camera.
 
     Returns:
-        (H, W) float64 mm, 0 where there is none.
+        (H, W) float64 mm, 0 without a point.
     """
     with np.errstate(invalid="ignore", over="ignore"):
         p_camera = p_camera[np.isfinite(p_camera).all(axis=1) & (p_camera[:, 2] > 0)]
@@ -114,8 +107,8 @@ def read_points(path: Path, columns: tuple[int, int, int]) -> Points | None:
     """Points of a file, in its own units.
 
     Args:
-        path: a .ply file, or a text with one point to a line.
-        columns: of x, y, z in a text, from 0.
+        path: a .ply file, or a text file with one point per line.
+        columns: of x, y, z in a text file, from 0.
 
     Returns:
         (n, 3); None if the file is damaged.
@@ -140,7 +133,7 @@ def _look(path: Path, size: Size) -> Probe:
 
 
 def _numbers(line: str) -> list[str]:
-    """The cells of a line if at least three and all of them are numbers."""
+    """The cells of a line if there are at least three numbers and nothing else."""
     cells = line.replace(",", " ").replace(";", " ").split()
     try:
         return (
@@ -163,14 +156,14 @@ def _read_text(path: Path, columns: tuple[int, int, int]) -> Points:
 
 
 class _PlyHeader(NamedTuple):
-    """What the header of a PLY file says of its vertices.
+    """Layout of the vertices in a PLY file.
 
     Attributes:
         order: of bytes, "<" or ">"; empty for text.
-        n: how many vertices.
+        n: number of vertices.
         fields: (name, NumPy type) of each number of a vertex.
-        start: where they begin in the file, bytes.
-        row_bytes: size of one vertex, bytes; for text, the least that it can be.
+        start: their position in the file, bytes.
+        row_bytes: size of one vertex, bytes; for text, its least size.
     """
 
     order: str
@@ -181,9 +174,7 @@ class _PlyHeader(NamedTuple):
 
 
 def _ply_header(head: bytes) -> _PlyHeader | None:
-    """What the header says of the vertices; None if it is cut, or the vertices are not the first
-    element.
-    """
+    """Parse the header; None if it is cut, or the vertices are not the first element."""
     end = head.find(b"end_header")
     start = head.find(b"\n", end) + 1
     if end < 0 or not start:
@@ -203,7 +194,7 @@ def _ply_header(head: bytes) -> _PlyHeader | None:
             n = int(words[2]) if n < 0 else n
         elif words[:1] == ["property"] and element == "vertex":
             if len(words) != 3 or words[1] not in _TYPES or words[2] in dict(fields):
-                return None  # a list among the vertices has no fixed place
+                return None  # a list among the vertices has no fixed size
             fields.append((words[2], _TYPES[words[1]]))
     if order is None or n < 0 or not {"x", "y", "z"} <= set(dict(fields)):
         return None
@@ -231,5 +222,5 @@ def _read_ply(path: Path) -> Points | None:
     vertices = np.frombuffer(raw, row)
     with np.errstate(
         invalid="ignore"
-    ):  # damage may hold any bits, also those of a NaN that signals
+    ):  # damage may contain any bits, also those of a signalling NaN
         return np.stack([vertices[axis].astype(np.float64) for axis in "xyz"], axis=-1)

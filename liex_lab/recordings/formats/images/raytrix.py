@@ -1,12 +1,12 @@
 """Exports of Raytrix light-field (plenoptic) cameras: depth maps and point clouds.
 
-The vendor documents little of what the numbers mean, so a profile is named in raytrix.toml and
-checked against the first image (type, sign, working distance). Without a camera.toml,
+The vendor documents little about the numbers, so raytrix.toml names a profile, which is checked
+against the first image (type, sign, working distance). Without a camera.toml,
 
     f_px = focal_mm / (pitch_mm * resolution_divisor).
 
-depth_mm = sign * unit_mm * stored + offset_mm. Virtual depth v goes through the thin lens law
-first: the image lies b = lens_to_grid + v * grid_to_sensor behind the main lens, and the object
+depth_mm = sign * unit_mm * stored + offset_mm. Virtual depth v is converted by the thin lens law
+first: the image is b = lens_to_grid + v * grid_to_sensor behind the main lens, and the object
 a = b f / (b - f) in front of it. `raw` values are 1 - 1 / v.
 """
 
@@ -37,36 +37,35 @@ from liex_lab.runtime.text_files import read_toml
 
 PROFILE_FILE = "raytrix.toml"
 _SHIPPED = Path(__file__).with_name("raytrix_profiles.toml")
-_CONFIRMED = "confirmed"  # how evidence begins that needs no warning
+_CONFIRMED = "confirmed"  # start of evidence that needs no warning
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 
 
 class Profile(BaseModel):
-    """How the stored numbers of an export mean millimetres.
+    """Conversion of the stored numbers of an export to millimetres.
 
     The keys are explained in raytrix_profiles.toml.
 
     Attributes:
-        name: name of the profile, or of the file that states it.
-        pattern: which files of the folder.
+        name: name of the profile, or of its file.
+        pattern: which files of the folder to read.
         kind: metric (depth maps), virtual (relative depth) or points (point clouds).
         stored: type of the stored values, float32 or uint16.
         unit_mm: mm per stored step.
         offset_mm: added after scaling, mm.
-        sign: -1 where object space lies on the negative side of the file's z axis.
-        invalid: stored values that mean "no reading" (of points: z).
-        valid_mm: nearest and farthest depth after conversion, mm; what is outside is unread.
+        sign: -1 if object space is on the negative side of the file's z axis.
+        invalid: stored values that mean "no reading" (z of points).
+        valid_mm: nearest and farthest depth after conversion, mm; other depths are unread.
         resolution_divisor: the sensor's pixels per pixel of the exported image.
-        evidence: how it is known that the profile is right; begins with "confirmed" once measured.
+        evidence: source of the profile; begins with "confirmed" once measured.
         virtual: v for virtual depth itself, raw for 1 - 1 / v.
         up: True if y points up in the file.
         columns: of x, y, z in a text file, from 0.
-        focal_mm: focal length of the main lens, mm, from which the intrinsics follow where no
-            camera.toml states them.
+        focal_mm: focal length of the main lens, mm, for the intrinsics without a camera.toml.
         pitch_mm: pitch of the sensor's pixels, mm; also for the intrinsics.
-        lens_f_mm: focal length of the main lens, mm, to turn virtual depth into mm.
+        lens_f_mm: focal length of the main lens, mm, to convert virtual depth to mm.
         lens_to_grid_mm: distance from the main lens to the micro-lens grid, mm.
         grid_to_sensor_mm: distance from the grid to the sensor, mm.
     """
@@ -103,7 +102,7 @@ class Profile(BaseModel):
 
     @property
     def doubt(self) -> str | None:
-        """A sentence for as long as nobody has confirmed the profile; None after that."""
+        """A sentence for an unconfirmed profile; None if it is confirmed."""
         if self.evidence.lower().startswith(_CONFIRMED):
             return None
         return (
@@ -115,7 +114,7 @@ class Profile(BaseModel):
 
     @property
     def lens(self) -> tuple[float, float, float] | None:
-        """(f, lens to micro-lens grid, grid to sensor), mm, where all are stated; else None."""
+        """(f, lens to micro-lens grid, grid to sensor), mm; None unless all are stated."""
         numbers = (self.lens_f_mm, self.lens_to_grid_mm, self.grid_to_sensor_mm)
         return None if None in numbers else numbers  # type: ignore[return-value]
 
@@ -127,17 +126,17 @@ class Profile(BaseModel):
         }
 
     def read(self, stored: NDArray[Any]) -> NDArray[np.float64]:
-        """Signed distance of stored values, before `valid_mm` is looked at.
+        """Signed distance of stored values, before `valid_mm` is applied.
 
         Args:
-            stored: (H, W) float32 or uint16, as the file holds them.
+            stored: (H, W) float32 or uint16, as in the file.
 
         Returns:
-            (H, W) mm, NaN where they are invalid.
+            (H, W) mm, NaN for invalid values.
         """
         with np.errstate(
             invalid="ignore"
-        ):  # damage may hold any bits, also those of a NaN that signals
+        ):  # damage may contain any bits, also those of a signalling NaN
             values = stored.astype(np.float64)
         for value in self.invalid:
             values[stored == value] = np.nan
@@ -149,29 +148,22 @@ class Profile(BaseModel):
     def _from_virtual(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Distance a from the main lens, mm, by the thin lens law 1/f = 1/a + 1/b.
 
-        The image lies b = lens_to_grid + v * grid_to_sensor behind the lens, v micro-lens gaps
-        behind the grid. NaN where b <= f, for there is no real image then.
+        The image is b = lens_to_grid + v * grid_to_sensor behind the lens, v micro-lens gaps behind
+        the grid. NaN if b <= f, because there is no real image then.
         """
         assert self.lens is not None
         f, to_grid, gap = self.lens
         v = values if self.virtual == "v" else 1.0 / (1.0 - np.where(values < 1.0, values, np.nan))
         behind = to_grid + np.where(v > 0, v, np.nan) * gap
-        behind = np.where(behind > f, behind, np.nan)  # nearer than f there is no real image
+        behind = np.where(behind > f, behind, np.nan)  # no real image within f
         return behind * f / (behind - f)
 
     def decode(self, stored: NDArray[Any]) -> Depth:
-        """Depth of stored values.
-
-        Args:
-            stored: (H, W) float32 or uint16, as the file holds them.
-
-        Returns:
-            (H, W) float32 mm, 0 = unread.
-        """
+        """Convert stored values (H, W), float32 or uint16, to depth in float32 mm, 0 = unread."""
         return self.within(self.read(stored))
 
     def within(self, depth_mm: NDArray[Any]) -> Depth:
-        """Depth with what lies outside `valid_mm` taken as unread.
+        """Mark depths outside `valid_mm` as unread.
 
         Args:
             depth_mm: (H, W) mm, NaN or 0 where unread.
@@ -184,22 +176,20 @@ class Profile(BaseModel):
 
 
 def shipped_profiles() -> dict[str, dict[str, Any]]:
-    """The profiles that come with the package, by name."""
+    """The profiles included in the package, by name."""
     return read_toml(_SHIPPED)
 
 
 def read_profile(path: Path) -> Profile:
-    """The profile that a raytrix.toml names or states in full.
+    """The profile that a raytrix.toml names or defines.
+
+    Keys in the file override those of the named profile.
 
     Args:
         path: the raytrix.toml.
 
-    Returns:
-        The profile; keys stated in the file count before those of the named profile.
-
     Raises:
-        RecordingError: the file is no TOML, names no known profile, or the value of a key cannot
-            be.
+        RecordingError: the file is not TOML, names no known profile, or a value is invalid.
     """
     try:
         table = read_toml(path)
@@ -234,7 +224,7 @@ def read_profile(path: Path) -> Profile:
 
 
 _CALIBRATION_BYTES = 1 << 20
-_LOOKS_LIKE = ("*depthmap*.*", "*depth3d*.*", "*.xyz", "*.ply")  # as exports are named
+_LOOKS_LIKE = ("*depthmap*.*", "*depth3d*.*", "*.xyz", "*.ply")  # names of exports
 _CALIBRATION = "RayCalibData"
 
 
@@ -244,17 +234,17 @@ def open_raytrix(
     """Open a folder of exported depth maps or point clouds with its raytrix.toml as a recording.
 
     Args:
-        folder: where the exports are.
-        camera: comes before a camera.toml and the profile's lens.
-        fps: frame rate, Hz; used only where there are no time stamps.
-        progress: reports how many files were looked at.
+        folder: the folder of the exports.
+        camera: overrides a camera.toml and the profile's lens.
+        fps: frame rate, Hz; used only if there are no time stamps.
+        progress: counts the probed files.
 
     Returns:
         The recording, with the profile in its metadata.
 
     Raises:
-        RecordingError: the profile does not fit the exports, depth is virtual and no calibration is
-            stated, or the camera or the times are not known.
+        RecordingError: the profile does not fit the exports, depth is virtual without a
+            calibration, or the camera or the times are unknown.
     """
     path = folder / PROFILE_FILE
     profile = read_profile(path)
@@ -285,14 +275,12 @@ def open_raytrix(
 
 
 def looks_like_raytrix(folder: Path, names: list[str]) -> bool:
-    """Whether files are exports: so named, point clouds, or with the vendor's calibration.
+    """Whether a file's name is that of an export, or it is a point cloud or the vendor's
+    calibration.
 
     Args:
-        folder: where they are.
+        folder: their folder.
         names: names of the files in it.
-
-    Returns:
-        True if one of them is.
     """
     if any(fnmatch(name.lower(), pattern) for name in names for pattern in _LOOKS_LIKE):
         return True
@@ -305,14 +293,7 @@ def looks_like_raytrix(folder: Path, names: list[str]) -> bool:
 
 
 def no_profile_error(folder: Path) -> RecordingError:
-    """The error for a folder of exports without a raytrix.toml.
-
-    Args:
-        folder: the folder.
-
-    Returns:
-        The error, to be raised.
-    """
+    """The error for a folder of exports without a raytrix.toml."""
     listed = ", ".join(shipped_profiles())
     return RecordingError(
         f"{folder} holds exports of a Raytrix camera, whose numbers mean depth in several ways; "
@@ -323,7 +304,7 @@ def no_profile_error(folder: Path) -> RecordingError:
 
 
 def _with_lens(camera_toml: CameraFile, profile: Profile, stack: Stack, path: Path) -> CameraFile:
-    """Intrinsics from the lens and the sensor, where no camera.toml states measured ones."""
+    """Intrinsics from lens and sensor, unless a camera.toml states measured ones."""
     if camera_toml.intrinsics or profile.focal_mm is None or profile.pitch_mm is None:
         return camera_toml
     f_px = profile.focal_mm / (profile.pitch_mm * profile.resolution_divisor)
@@ -342,7 +323,7 @@ def _with_lens(camera_toml: CameraFile, profile: Profile, stack: Stack, path: Pa
 
 
 def _check(stack: Stack, profile: Profile, path: Path) -> None:
-    """The first image must be what the profile says: stored type, sign, working distance."""
+    """Check the first image against the profile: stored type, sign, working distance."""
     first = stack.whole.index(True)
     stored = stack.read(first)
     if stored is None:
@@ -402,25 +383,20 @@ def _open_clouds(
 
 
 def profile_points(profile: Profile) -> Callable[[point_clouds.Points], point_clouds.Points]:
-    """The function that carries a file's points into the camera frame.
+    """The function that converts a file's points to the camera frame.
 
     Args:
         profile: for units, signs, offset and invalid values.
 
     Returns:
-        A function from points (n, 3) in the file's units to (n, 3) mm, camera frame; NaN where z is
+        A function from points (n, 3) in the file's units to (n, 3) mm, camera frame; NaN if z is
         invalid.
     """
     scale = profile.unit_mm * np.array([1.0, -1.0 if profile.up else 1.0, float(profile.sign)])
 
     def to_camera(points: point_clouds.Points) -> point_clouds.Points:
-        """Points in the camera frame.
-
-        Args:
-            points: (n, 3) in the file's units.
-
-        Returns:
-            (n, 3) mm; all three NaN where z is invalid.
+        """Convert points (n, 3) in the file's units to mm, camera frame; all three NaN if z is
+        invalid.
         """
         p_camera = points * scale
         for value in profile.invalid:
@@ -434,7 +410,7 @@ def profile_points(profile: Profile) -> Callable[[point_clouds.Points], point_cl
 def read_ray_calibration(path: Path) -> float:
     """The total covering plane, in virtual depth, of a `RayCalibData` XML file.
 
-    The file has no focal length and no metric scale, so it does not turn virtual depth into mm.
+    The file has no focal length and no metric scale, so it cannot convert virtual depth to mm.
 
     Raises:
         RecordingError: it is not such a calibration.
@@ -454,9 +430,7 @@ def read_ray_calibration(path: Path) -> float:
 
 
 def _refuse_virtual(folder: Path, profile: Profile) -> None:
-    """Virtual depth is relative; without the distances inside the camera it never becomes
-    millimetres.
-    """
+    """Raise RecordingError for virtual (relative) depth without the distances inside the camera."""
     if profile.kind != "virtual" or profile.lens is not None:
         return
     held = ""

@@ -1,8 +1,8 @@
-"""TIFF images, 16-bit or float32 grey, one to a file or many, BigTIFF and ImageJ included.
+"""TIFF images, 16-bit or float32 grey, one or many per file, including BigTIFF and ImageJ.
 
-Uncompressed pixels in one piece are read straight from their offset; other pages go through
-tifffile, and codecs that it leaves to another package (LZW) through OpenCV. A stack ends at its
-first bad page, for what follows may be noise.
+Contiguous uncompressed pixels are read directly from their offset; other pages are decoded by
+tifffile, and codecs that need an optional package of tifffile (LZW) by OpenCV. A stack ends at its
+first bad page, because later ones may be noise.
 """
 
 from __future__ import annotations
@@ -31,15 +31,15 @@ from liex_lab.runtime.progress import Progress
 
 _SPARE = 1 << 20  # bytes
 _LZMA = (34925,)
-_LZMA_MEMORY = 1 << 28  # bytes; the largest of its usual levels takes 64 MB
+_LZMA_MEMORY = 1 << 28  # bytes; the largest of its usual levels needs 64 MB
 _UNPACKERS = (8, 32946, 50013, *_LZMA)  # codes of compression: DEFLATE, LZMA
 
-# tifffile reports damage twice, as an exception and in the log; the log would come out between our
-# sentences
+# tifffile reports damage twice, as an exception and in the log; hide the
+# log
 logging.getLogger("tifffile").addHandler(logging.NullHandler())
 
-_LEAST_DIRECTORY = 30  # bytes: one that describes an image has more
-_DEPTHS = ("u2", "i2", "f4")  # of pixels that hold depth
+_LEAST_DIRECTORY = 30  # bytes: the directory of an image has more
+_DEPTHS = ("u2", "i2", "f4")  # types of depth pixels
 _KINDS = {"u": "unsigned integer ", "i": "signed integer ", "f": "floating-point "}
 _SIGNATURES = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 
@@ -50,7 +50,7 @@ class _Page(NamedTuple):
     Attributes:
         path: its file.
         page: its page in the file.
-        offset: where its pixels lie when they are plain bytes in one piece, else -1.
+        offset: position of contiguous plain pixels, else -1.
         dtype: of the pixels, with byte order.
         whole: True if it is not cut short.
     """
@@ -95,13 +95,8 @@ class TiffStack(Stack):
         return bool(self.problems) or not all(self.whole)
 
     def read(self, index: int) -> NDArray[Any] | None:
-        """Stored values of one image.
-
-        Args:
-            index: number of the image.
-
-        Returns:
-            (H, W) uint16, int16 or float32; None if the image is cut or damaged.
+        """Stored values of one image, (H, W) uint16, int16 or float32; None if it is cut or
+        damaged.
         """
         page = self.pages[index]
         if not page.whole:
@@ -128,11 +123,11 @@ class TiffStack(Stack):
             return self._open.asarray(key=page.page)
         except _LargerThanStatedError:
             return None
-        except Exception:  # damage inside compressed data comes out as almost any exception
+        except Exception:  # damage in compressed data raises almost any exception
             return _decode_with_opencv(page)
 
     def _check_unpacked(self, tif: tifffile.TiffFile, number: int) -> None:
-        """Raises where a packed piece is larger than the image when it is unpacked.
+        """Raises an error if a packed piece is larger than the image after unpacking.
 
         tifffile unpacks whole pieces of DEFLATE and LZMA in memory, of any size.
         """
@@ -146,30 +141,23 @@ class TiffStack(Stack):
                 raise _LargerThanStatedError
 
     def label(self, index: int) -> str:
-        """Name of an image, for a sentence.
-
-        Args:
-            index: number of the image.
-
-        Returns:
-            Its page and file.
-        """
+        """Name of an image, for a message: its page and file."""
         page = self.pages[index]
         return f"page {page.page} of {page.path.name}"
 
     def close(self) -> None:
-        """Close the file that is open."""
+        """Close the open file."""
         if self._open is not None:
             self._open.close()
         self._open = self._open_path = None
 
 
 class _LargerThanStatedError(Exception):
-    """A packed piece of an image that holds more than the image."""
+    """A packed piece of an image contains more than the image."""
 
 
 def _fits(packed: bytes, compression: int, most: int) -> bool:
-    """Whether a packed piece has at most so many bytes when it is unpacked."""
+    """Whether a packed piece unpacks to at most `most` bytes."""
     unpacked = 0
     try:
         if compression in _LZMA:
@@ -187,14 +175,12 @@ def _fits(packed: bytes, compression: int, most: int) -> bool:
     except lzma.LZMAError:
         return False
     except zlib.error:
-        return True  # whoever unpacks it reports damage
+        return True  # the decoder reports damage
     return unpacked <= most
 
 
 def _decode_with_opencv(page: _Page) -> NDArray[Any] | None:
-    """LZW and other codecs that tifffile leaves to another package; None if OpenCV cannot
-    either.
-    """
+    """Decode LZW and other codecs that tifffile lacks; None if OpenCV fails as well."""
     import cv2
 
     try:
@@ -205,17 +191,14 @@ def _decode_with_opencv(page: _Page) -> NDArray[Any] | None:
 
 
 def open_tiffs(files: list[Path], progress: Progress) -> TiffStack:
-    """Open TIFF images: every page is listed and its bytes must be there; none is decoded.
+    """Open TIFF images: every page is listed and its bytes must exist; none is decoded.
 
     Args:
         files: the files, in order, of one page or many.
-        progress: reports how many files were looked at.
-
-    Returns:
-        The images as a stack.
+        progress: counts the probed files.
 
     Raises:
-        RecordingError: none is whole, one is no depth, or their sizes differ.
+        RecordingError: none is whole, one is not depth, or their sizes differ.
     """
     pages: list[_Page] = []
     problems: list[str] = []
@@ -224,7 +207,7 @@ def open_tiffs(files: list[Path], progress: Progress) -> TiffStack:
         found, size, ends = _list_pages(path)
         n_whole = next((i for i, page in enumerate(found) if not page.whole), len(found))
         if n_whole and (n_whole < len(found) or not ends):
-            # a stack ends at its first bad page: what follows may be noise
+            # a stack ends at its first bad page: later ones may be noise
             problems.append(
                 f"{path.name} is cut short: only its first {n_whole} pictures are whole"
             )
@@ -242,10 +225,10 @@ def open_tiffs(files: list[Path], progress: Progress) -> TiffStack:
 
 
 def _list_pages(path: Path) -> tuple[list[_Page], tuple[int, int] | None, bool]:
-    """The images of one file in order, their (width, height), and whether the list of pages comes
-    to its end.
+    """The images of one file in order, their (width, height), and whether the page list is
+    complete.
 
-    No images and no size where the directory is cut off.
+    No images and no size if the directory is cut off.
     """
     size_bytes = path.stat().st_size
     with path.open("rb") as file:
@@ -262,7 +245,7 @@ def _list_pages(path: Path) -> tuple[list[_Page], tuple[int, int] | None, bool]:
             seen: set[int] = set()
             for page in tif.pages:
                 if page.offset in seen or len(listed) * _LEAST_DIRECTORY > size_bytes:
-                    return listed, size, False  # the list of directories leads back to itself
+                    return listed, size, False  # the list of directories is circular
                 seen.add(page.offset)
                 listed.append(_describe(path, len(listed), page, size_bytes))
                 size = size or (int(page.imagewidth), int(page.imagelength))
@@ -275,18 +258,16 @@ def _list_pages(path: Path) -> tuple[list[_Page], tuple[int, int] | None, bool]:
     except RecordingError:
         if not any(page.whole for page in listed):
             raise
-        # damage inside a directory, or an image of another kind behind the depth: the stack ends
-        # before it
+        # a damaged directory, or an image of another kind after the depth: the stack ends before
+        # it
         return listed, size, False
-    except (
-        Exception
-    ):  # the directory of a cut file is garbage, and comes out as almost any exception
+    except Exception:  # the directory of a cut file is garbage and raises almost any exception
         return listed, size, False
 
 
 def _list_ends(tif: tifffile.TiffFile) -> bool:
-    """Whether the last page that was found says that it is the last: each page ends with the place
-    of the next.
+    """Whether the last page found is marked as the last: each page ends with the offset of the
+    next.
     """
     layout = tif.tiff
     last = tif.pages[len(tif.pages) - 1]
@@ -331,9 +312,7 @@ def _describe(path: Path, index: int, page: Any, size_bytes: int) -> _Page:
 
 
 def _imagej_stack(tif: tifffile.TiffFile, first: _Page, size_bytes: int) -> list[_Page]:
-    """ImageJ describes a stack of over 4 GB as one page; its other images follow the first
-    without a gap.
-    """
+    """The images of an ImageJ stack over 4 GB, described as one page and stored without gaps."""
     shape = tif.series[0].shape if tif.series else ()
     n_pictures = int(np.prod(shape[:-2])) if len(shape) > 2 else 1
     if n_pictures == 1 or first.offset < 0:
