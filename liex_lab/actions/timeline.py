@@ -1,12 +1,12 @@
 """Default recogniser of uncut recordings: MLP on window features, then hidden semi-Markov decoding.
 
 1. Channels on a fixed clock, in seconds and body lengths, from any frame rate between 15 and 120
-per second (`channels`).
+   per second (`channels`).
 2. Features over windows around each tick (`window_features`).
 3. An ensemble of small networks gives p(word | tick); scores = sharpness (log p - log prior), a
-scaled likelihood (hybrid of network and Markov model, Bourlard and Morgan 1994).
+   scaled likelihood (hybrid of network and Markov model, Bourlard and Morgan 1994).
 4. A semi-Markov model of durations and transitions is decoded by Viterbi, with posteriors by
-forward-backward (`semi_markov`).
+   forward-backward (`semi_markov`).
 
 This method is our own; the recogniser of Lie-X section 4.3 names cut-out sequences only
 (`recogniser`).

@@ -4,14 +4,14 @@ All of them use the units of a design (`Units`: cages, animals or an animal's ow
 sessions or bouts.
 
 - Permutation test (Fisher 1935, Pitman 1937): the groups are reassigned to the units as the design
-allows, p = share of the arrangements with |difference| >= the observed one; exact up to
-`MOST_EXACT` arrangements, beyond that Monte Carlo with p = (1 + b) / (1 + m) (Phipson and Smyth
-2010). For paired units the signs are flipped; blocks are permuted separately.
+  allows, p = share of the arrangements with |difference| >= the observed one; exact up to
+  `MOST_EXACT` arrangements, beyond that Monte Carlo with p = (1 + b) / (1 + m) (Phipson and Smyth
+  2010). For paired units the signs are flipped; blocks are permuted separately.
 - Linear mixed model (Laird and Ware 1982): value ~ group + (1 | cage) or (1 | animal), by
-restricted maximum likelihood (REML), t with units - 2 degrees of freedom.
+  restricted maximum likelihood (REML), t with units - 2 degrees of freedom.
 - Confidence interval: Welch's t with Welch and Satterthwaite's degrees of freedom, a paired t, or
-least squares with a mean per block. A bootstrap is not used, because its intervals are far too
-short for three to six units, which are common.
+  least squares with a mean per block. A bootstrap is not used, because its intervals are far too
+  short for three to six units, which are common.
 - Hedges' g (1981): J x difference / pooled sd, with J = 1 - 3 / (4 df - 1).
 
 `liex_lab.behaviour.cohort` calls all of them.
