@@ -27,7 +27,7 @@ from liex_lab.recordings.frame import Depth, depth_mm
 
 LARGEST_PICTURE = (
     1 << 24
-)  # pixels; no depth camera has as many, and a damaged size would ask for all the memory
+)  # pixels; more than any depth camera: a damaged size would need all the memory
 _LARGEST_CLOUD = 1 << 22  # points
 _METRE = 1000.0
 _ENCODINGS = {
@@ -37,7 +37,7 @@ _ENCODINGS = {
 }  # stored type, mm per step
 _CONFIG = struct.Struct(
     "<iff"
-)  # before a compressedDepth image: format, and a and b of quantised depth
+)  # precedes a compressedDepth image: format, and a and b of quantised depth
 _RVL_SIZE = struct.Struct("<II")
 _PNG_HEAD = 26
 
@@ -64,16 +64,12 @@ def picture_size(message: DepthMessage) -> tuple[int, int] | None:
     try:
         found = _packed_size(message)
     except (RecordingError, DamagedMessage, struct.error):
-        return None  # a colour PNG is an image for people
+        return None  # a colour PNG is not depth
     return found if found is not None and min(found) > 0 and _fits(found) else None
 
 
 def stated_kind(message: DepthMessage) -> str:
-    """What a message says that it holds, for a sentence.
-
-    Args:
-        message: an image or a point cloud.
-    """
+    """Stated type of a message's content, for error messages."""
     if isinstance(message, PointCloud):
         return f"points of {', '.join(message.columns) or 'nothing'}"
     if isinstance(message, RawPicture):
@@ -101,7 +97,7 @@ def _is_rvl(message: PackedPicture) -> bool:
 
 
 def _body(message: PackedPicture) -> memoryview:
-    """What follows the configuration that ROS's compressedDepth writes first."""
+    """The data after the configuration at the start of ROS's compressedDepth."""
     data = memoryview(message.data)
     return data[_CONFIG.size :] if "compressedDepth" in message.packing else data
 
@@ -117,14 +113,14 @@ def decode(
 
     Args:
         message: an image or a point cloud.
-        camera: the camera of the recording, whose size images must have; loose points are
+        camera: the camera of the recording, whose size images must have; unordered points are
             projected by it.
-        step_mm: mm in a step of 16-bit depth.
-        scale: what a camera.toml multiplies all depth by.
-        unread: what a camera.toml calls unread, as stored (for clouds: mm).
+        step_mm: mm per step of 16-bit depth.
+        scale: factor on all depth, from a camera.toml.
+        unread: stored values (for clouds: mm) that mean "no reading", from a camera.toml.
 
     Returns:
-        (H, W) float32 mm of the camera's size; None if the message holds no such image.
+        (H, W) float32 mm of the camera's size; None if the message has no such image.
     """
     if picture_size(message) not in ((camera.width, camera.height), (0, 0)):
         return None
@@ -150,7 +146,7 @@ def _raw_pixels(message: RawPicture) -> NDArray[Any] | None:
     height = message.height
     step = message.step or width * dtype.itemsize
     if step == width and len(message.data) == height * width * dtype.itemsize:
-        step = width * dtype.itemsize  # pixels of a row instead of its bytes, as some writers state
+        step = width * dtype.itemsize  # some writers state pixels per row instead of bytes
     # some writers leave out the padding of the last row
     if step < width * dtype.itemsize or step * (height - 1) + width * dtype.itemsize > len(
         message.data
@@ -175,7 +171,7 @@ def _packed_pixels(message: PackedPicture) -> NDArray[Any] | None:
         or not message.packing.startswith("32FC1")
     ):
         return pixels
-    # metres, quantised so that the steps grow with the distance as the sensor's own do
+    # metres, quantised with steps that grow with distance like the sensor's own
     _, a, b = _CONFIG.unpack_from(message.data)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         metres = np.float32(a) / (pixels.astype(np.float32) - np.float32(b))
@@ -184,9 +180,7 @@ def _packed_pixels(message: PackedPicture) -> NDArray[Any] | None:
 
 
 def _cloud_depth(cloud: PointCloud, camera: Camera) -> NDArray[np.float64] | None:
-    """Depth (H, W) mm: of points in rows their z, of others that of the nearest point that each
-    pixel sees.
-    """
+    """Depth (H, W) mm: z of points in rows, or the nearest point per pixel of others."""
     points = {name: _column(cloud, name) for name in ("x", "y", "z")}
     x = points["x"]
     y = points["y"]
@@ -197,7 +191,7 @@ def _cloud_depth(cloud: PointCloud, camera: Camera) -> NDArray[np.float64] | Non
         x, y, z = _moved(cloud.pose, x, y, z)
     if cloud.height > 1:
         return z * _METRE
-    if x.size == camera.width * camera.height:  # rows that were strung together
+    if x.size == camera.width * camera.height:  # concatenated rows
         return z.reshape(camera.height, camera.width) * _METRE
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         column = np.floor(camera.fx * x / z + camera.cx + 0.5)
@@ -213,9 +207,7 @@ def _cloud_depth(cloud: PointCloud, camera: Camera) -> NDArray[np.float64] | Non
 
 
 def _column(cloud: PointCloud, name: str) -> NDArray[np.float64] | None:
-    """One coordinate (height, width) of the points, m; None if the data are shorter than they
-    should be.
-    """
+    """One coordinate (height, width) of the points, m; None if the data are too short."""
     offset, kind = cloud.columns[name]
     dtype = np.dtype(kind)
     row_step = cloud.row_step if cloud.height > 1 else 0
@@ -235,7 +227,7 @@ def _column(cloud: PointCloud, name: str) -> NDArray[np.float64] | None:
 def _moved(
     pose: tuple[float, ...], x: NDArray[np.float64], y: NDArray[np.float64], z: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """The points in the camera's frame: p + q v q*, written out."""
+    """The points in the camera's frame: p + q v q*, expanded."""
     at = np.array(pose[:3])
     turn = np.array(pose[3:])
     norm = float(np.linalg.norm(turn))

@@ -1,10 +1,10 @@
 """Selection of the depth topic in an MCAP file or ROS bag, with its calibration and its clock.
 
-One walk over the file finds the topics whose first message is depth, the calibrations, and what a
-known program states besides (`realsense`). The calibration of the same frame_id is taken, nearest
+One walk over the file finds the topics whose first message is depth, the calibrations, and further
+statements of known programs (`statements`). The calibration with the same frame_id is used, nearest
 by topic name, and mapped onto the image by its binning and region of interest; a rectified topic
-takes P instead of K. Stamps are the sensor's, or the times of sending or logging where images
-have none.
+uses P instead of K. Stamps are the sensor's, or the times of sending or logging if images have
+none.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ from liex_lab.recordings.recording import Recording
 from liex_lab.recordings.timestamps import in_order_of_sensor, start_of_clock
 from liex_lab.runtime.progress import Progress
 
-# 16-bit images too, but of brightness: not chosen unless asked for
+# expected message types, for errors
 _EXPECTED = (
     "expected foxglove.RawImage or CompressedImage, or sensor_msgs Image or CompressedImage, with "
     "the encoding 16UC1, mono16 or 32FC1 or as 16-bit PNG, or a point cloud"
@@ -60,9 +60,9 @@ _EXPECTED = (
 _LIMIT_NS = 2**62  # the year 2116
 _DAMAGE = (ValueError, TypeError, KeyError, OverflowError, struct.error, DamagedChunk)
 _FACTS = ("subject_id", "session_start_time")
-# calibrations of a topic that are compared: of all that differ, and of those that an index lists
+# most calibrations compared per topic: different ones, and those listed by an index
 _N_COMPARED = 12
-_SAME_CAMERA = 0.005  # of the focal length or the image: what a driver's rounding changes
+_SAME_CAMERA = 0.005  # of the focal length or the image: a driver's rounding
 _STATE_IT = (
     "state the depth camera's numbers with --set camera.fx=... --set camera.fy=... --set "
     "camera.cx=... --set camera.cy=..."
@@ -73,17 +73,17 @@ _Numbers = tuple[float, float, float, float]
 
 @dataclass
 class _Topic:
-    """The depth messages of one topic, in file order, and what its first one says.
+    """The depth messages of one topic, in file order, and properties of the first one.
 
     Attributes:
         channel: topic, schema and encoding.
-        parse: turns the bytes of a message into depth.
+        parse: parser of a message's bytes.
         frame_id: name of the camera's frame.
-        size: width and height, px; (0, 0) for loose points.
-        metric: whether it holds metres by convention.
-        order: (m,) numbers of messages that a recording was given already, by row.
-        rows: (6 n,) of each message the times of logging and of sending (0 where it is not stated)
-            and the stamp of the sensor, ns; chunk, offset and length.
+        size: width and height, px; (0, 0) for unordered points.
+        metric: whether its values are metres by convention.
+        order: (m,) numbers of messages already passed to a recording, by row.
+        rows: (6 n,) for each message the times of logging and of sending (0 if absent) and the
+            sensor's stamp, ns; chunk, offset and length.
     """
 
     channel: Channel
@@ -100,10 +100,10 @@ class _Topic:
         return self.channel.topic
 
     def add(self, message: Envelope, stamp_ns: int) -> None:
-        """Note a message.
+        """Record a message.
 
         Args:
-            message: the message as it was met.
+            message: the message from the walk.
             stamp_ns: its stamp, ns.
 
         Raises:
@@ -115,13 +115,13 @@ class _Topic:
         self.rows.extend((message.log_time_ns, sent_ns, stamp_ns, *message.place))
 
     def add_all(self, listed: Listed) -> None:
-        """Note messages that an index lists.
+        """Record messages listed by an index.
 
         Args:
             listed: the messages.
 
         Raises:
-            DamagedMessage: a time is beyond the year 2116; the others are noted.
+            DamagedMessage: a time is beyond the year 2116; the other messages are recorded.
         """
         logged = listed.log_time_ns
         sent = logged if listed.publish_time_ns is None else listed.publish_time_ns
@@ -133,10 +133,10 @@ class _Topic:
             raise DamagedMessage("a message's time cannot be")
 
     def forget(self, chunk: int) -> None:
-        """Forget the messages of a chunk and of those after it, for they will be met again.
+        """Remove the messages of a chunk and of later ones, which the next walk will return again.
 
         Args:
-            chunk: number of the chunk; these messages are at the end.
+            chunk: number of the chunk; its messages are at the end.
         """
         while self.rows and self.rows[-3] >= chunk:
             del self.rows[-6:]
@@ -144,18 +144,18 @@ class _Topic:
 
 @dataclass
 class _Found:
-    """What a file holds, as far as it was walked.
+    """Contents of a file, as far as it was walked.
 
     Attributes:
-        parsers: by channel; None of channels that are of no use.
+        parsers: by channel; None for irrelevant channels.
         depths: the depth topics by channel.
-        calibrations: the different calibrations by topic, each with the time of logging, ns, of
-            the first message that has it.
-        listed: time of logging, ns, and place of calibrations that were not read yet, by channel.
-        stated: what a known program states about its recording.
-        read: the channels of which a message could be read.
-        failed: why a message of a channel could not be read.
-        kinds: what the images of a channel hold instead of depth.
+        calibrations: the different calibrations by topic, each with the time of logging, ns, of its
+            first message.
+        listed: time of logging, ns, and place of unread calibrations, by channel.
+        stated: statements of a known program about its recording.
+        read: the channels with a readable message.
+        failed: error of a channel's unreadable message.
+        kinds: type of the images of a channel without depth.
     """
 
     parsers: dict[Channel, Parser | None] = field(default_factory=dict)
@@ -168,25 +168,25 @@ class _Found:
     kinds: dict[Channel, str] = field(default_factory=dict)
 
     def unreadable(self) -> list[str]:
-        """Sentences about channels of which no message could be read."""
+        """Sentences about channels without any readable message."""
         whys = {c.topic: why for c, why in self.failed.items() if c not in self.read}
         return [f"{printable(topic)}: {printable(why, 200)}" for topic, why in whys.items()]
 
 
 @dataclass
 class _Frames:
-    """Images of one topic, fetched from the file one at a time.
+    """Images of one topic, read from the file one at a time.
 
     Attributes:
         file: the open file.
         topic: the topic.
         places: (n, 3) chunk, offset and length of each image's message.
         camera: the camera of the recording.
-        step_mm: mm in a step of 16-bit depth.
-        unread: what a camera.toml calls unread.
-        problems: sentences, appended to for frames that cannot be read.
-        scale: what all depth is multiplied by.
-        bad: frames that were reported.
+        step_mm: mm per step of 16-bit depth.
+        unread: values that mean "no reading", from a camera.toml.
+        problems: sentences, appended to for unreadable frames.
+        scale: factor on all depth.
+        bad: frames already reported.
         lock: held while the file is read.
     """
 
@@ -202,7 +202,7 @@ class _Frames:
     lock: Any = field(default_factory=Lock)
 
     def read(self, number: int) -> Depth:
-        """Depth of one image; one that is damaged or of another size is wholly unread.
+        """Depth of one image; all unread if it is damaged or of another size.
 
         Args:
             number: index of the image, in order of logging.
@@ -226,7 +226,7 @@ class _Frames:
         return np.zeros((camera.height, camera.width), np.float32)
 
     def _decode(self, data: memoryview) -> tuple[Depth | None, str]:
-        """Depth of a message, or why there is none."""
+        """Depth of a message, or None and the reason."""
         try:
             message = self.topic.parse(data)
         except _DAMAGE as error:
@@ -243,11 +243,12 @@ class _Frames:
         return None, stated_kind(message)
 
     def scale_by(self, factors: Sequence[float]) -> None:
-        """Multiply all depth by the first factor that gives depths of a camera above an animal.
+        """Multiply all depth by the first factor that gives plausible depths for a camera above an
+        animal.
 
         Args:
-            factors: in order; the last is taken where none gives such depths, and the first where
-                nothing tells.
+            factors: in order; the last one if none is plausible, and the first one if all are equal
+                or there are no readings.
         """
         seen = (self.read(n) for n in ((0, len(self.places) // 2) if len(set(factors)) > 1 else ()))
         median_mm = next((float(np.median(one[one > 0])) for one in seen if one.any()), 0.0)
@@ -260,20 +261,20 @@ def open_topic(
 ) -> Recording:
     """Open one depth topic of a file of messages as a recording.
 
-    The recording closes the file; it is closed, too, where opening fails.
+    The recording closes the file; it is also closed if opening fails.
 
     Args:
         file: the open MCAP file or ROS bag.
         kind: name of the format, for `Recording.format`.
-        camera: comes before whatever the files state.
+        camera: overrides the camera in the files.
         topic: name of the depth topic; None for the only one.
-        progress: reports how far the walk over the file is.
+        progress: reports the progress of the walk over the file.
 
     Returns:
-        The recording; it can be read on where the file grows (MCAP).
+        The recording; reading resumes if the file grows (MCAP).
 
     Raises:
-        RecordingError: there is no depth topic, several to choose from, or the camera is not known.
+        RecordingError: there is no depth topic, several to choose from, or the camera is unknown.
     """
     try:
         return _open(file, kind, camera, topic, progress, _Found())
@@ -290,7 +291,7 @@ def _open(
     progress: Progress,
     found: _Found,
 ) -> Recording:
-    """`open_topic` of a file in which this much was found before."""
+    """`open_topic` with the results of earlier walks."""
     path = file.path
     _walk(file, found, progress)
 
@@ -356,14 +357,16 @@ def _open(
 def _stamps(
     topic: str, rows: NDArray[np.int64], stated: Statements, problems: list[str]
 ) -> NDArray[np.int64]:
-    """The sensor's stamps; the times of sending or logging instead when images have none (zero),
-    for two clocks do not mix.
+    """The sensor's stamps; for all images the times of sending or logging if some have no stamp
+    (zero).
+
+    Two clocks are never mixed.
     """
     logged, sent, in_headers = rows[:, :3].T
     stamps = stated.sensor_times(topic, logged, in_headers, problems)
     unstamped = int(((stamps == 0) & (logged != 0)).sum())
     rises = len(stamps) > 1 and np.all(np.diff(stamps) > 0)
-    if not unstamped or (unstamped == 1 and rises):  # a clock that begins at zero is one
+    if not unstamped or (unstamped == 1 and rises):  # a clock may begin at zero
         return stamps
     steps, sent_steps = np.diff(logged), np.diff(sent)
     is_even = len(steps) > 1 and sent_steps.min() > 0 and 2.0 * sent_steps.std() < steps.std()
@@ -375,7 +378,7 @@ def _stamps(
 
 
 def _walk(file: MessageFile, found: _Found, progress: Progress) -> None:
-    """Find the depth topics, the calibrations, and what a known program states besides."""
+    """Find the depth topics, the calibrations, and further statements of known programs."""
     parsers = found.parsers
 
     def wanted(channel: Channel) -> bool:
@@ -388,25 +391,23 @@ def _walk(file: MessageFile, found: _Found, progress: Progress) -> None:
         assert parse is not None
         try:
             if not _note(found, message, parse):
-                parsers[message.channel] = None  # nothing more of it is wanted
+                parsers[message.channel] = None  # ignore its further messages
             found.read.add(message.channel)
         except _DAMAGE as error:
             found.failed.setdefault(message.channel, f"its messages cannot be read: {error}")
 
     for message in file.walk(wanted, progress):
         take(message)
-    for channel, listed in found.listed.items():  # some, spread over the recording up to the last
+    for channel, listed in found.listed.items():  # a sample up to the last one
         for k in np.linspace(0, len(listed) - 1, _N_COMPARED).astype(int).tolist():
             log_ns, place = listed[k]
-            with suppress(RecordingError):  # a damaged chunk is reported when a frame in it is read
+            with suppress(RecordingError):  # reported when a frame in it is read
                 take(Envelope(channel, log_ns, place, file.read(place)))
     file.whole = file.whole and not found.failed.keys() & found.read
 
 
 def _note(found: _Found, envelope: Envelope | Listed, parse: Parser) -> bool:
-    """Take note of a message; False if it is the first image of a topic and not depth, or
-    where others on its topic add nothing.
-    """
+    """Record a message; False if its channel is not depth, or if further messages add nothing."""
     channel = envelope.channel
     if isinstance(envelope, Listed):
         if channel in found.depths:
@@ -438,7 +439,7 @@ def _note(found: _Found, envelope: Envelope | Listed, parse: Parser) -> bool:
 
 
 def _choose(file: MessageFile, found: _Found, topic: str | None) -> _Topic:
-    """The topic asked for, or the only one. Images come before point clouds, which are made of
+    """The requested topic, or the only one. Images have priority over point clouds derived from
     them.
     """
     depths = list(found.depths.values())
@@ -491,7 +492,7 @@ def _camera(
     problems: list[str],
     doubts: list[str],
 ) -> Camera:
-    """Stated by the caller, or else calibrated in the file, or else in a camera.toml beside it."""
+    """The camera given by the caller, or else calibrated in the file, or else in a camera.toml."""
     chosen = _calibrations_of(topic, found.calibrations)
     if stated is None and chosen is not None:
         return _calibrated(topic, *chosen, notes, problems, doubts)
@@ -537,14 +538,12 @@ def _calibrated(
     problems: list[str],
     doubts: list[str],
 ) -> Camera:
-    """The camera of a topic's calibrations; without distortion where the image was straightened,
-    and for points.
-    """
+    """The camera of a topic's calibrations, without distortion for rectified images and points."""
     fits = [one for one in calibrations if _mapped(topic, one[1])[1] == topic.size]
     (first_ns, calibration), *others = fits or calibrations
     kind = "CameraInfo" if topic.channel.encoding in ("ros1", "cdr") else "CameraCalibration"
     here = f"the {kind} on {printable(where)}"
-    # a converted file keeps where the numbers came from
+    # a converted file states the original source
     source = notes.get("camera_source", f"{kind} on {where}")
     numbers, size = _mapped(topic, calibration)
     bent = None
@@ -579,7 +578,7 @@ def _calibrated(
 
 
 def _is_straight(topic: _Topic) -> bool:
-    """Whether images have no distortion any more: rectified ones, and points."""
+    """Whether the data have no distortion: rectified images, and points."""
     is_cloud = plain_schema(topic.channel) in CLOUD_SCHEMAS
     return "rect" in topic.name.rpartition("/")[2] or is_cloud
 
@@ -587,9 +586,10 @@ def _is_straight(topic: _Topic) -> bool:
 def _mapped(topic: _Topic, calibration: Calibration) -> tuple[_Numbers, tuple[int, int]]:
     """(fx, fy, cx, cy) and size, px, of the images on a topic, by binning and region of interest.
 
-    A calibration is of the full image, of which the topic may show a part or every second pixel.
-    Drivers also state these of intrinsics that are mapped already, or beside the size of the part:
-    then the principal point, which lies near the middle of most images, decides.
+    A calibration describes the full image, of which the topic may show a part or every second
+    pixel. Some drivers state binning or region with intrinsics that are mapped already, or with the
+    size of the
+    part: then the principal point, which is near the centre of most images, decides.
     """
     p = calibration.p
     straight = _is_straight(topic) and len(p) == 12 and p[0] > 0 and p[5] > 0
@@ -616,8 +616,8 @@ def _mapped(topic: _Topic, calibration: Calibration) -> tuple[_Numbers, tuple[in
 def _is_of_another_lens(topic: _Topic, where: str, calibration: Calibration) -> bool:
     """Whether a calibration belongs to another frame than the depth.
 
-    Where a frame has no name, the topics tell: /camera/color/camera_info is not of
-    /camera/depth/image, while /camera/camera_info may be.
+    If a frame has no name, the topics decide: /camera/color/camera_info does not belong to
+    /camera/depth/image, while /camera/camera_info may.
     """
     frames = {topic.frame_id.strip("/"), calibration.frame_id.strip("/")}
     branch = re.sub(r"(/info)?/[^/]*$", "", f"/{where.strip('/')}")
@@ -625,16 +625,14 @@ def _is_of_another_lens(topic: _Topic, where: str, calibration: Calibration) -> 
 
 
 def _size(topic: _Topic, of_camera: tuple[int, int]) -> tuple[int, int]:
-    """Of the images; loose points are seen in an image of the camera's size."""
+    """Size of the images; that of the camera for unordered points."""
     return topic.size if min(topic.size) else of_camera
 
 
 def _calibrations_of(
     topic: _Topic, calibrations: dict[str, list[tuple[int, Calibration]]]
 ) -> tuple[str, list[tuple[int, Calibration]]] | None:
-    """The calibrations of the same camera: of the same frame, and among those on the topic nearest
-    by its name.
-    """
+    """The calibrations of the same camera: of the same frame, or on the topic nearest by name."""
     usable = {
         name: good
         for name, many in calibrations.items()
@@ -656,13 +654,13 @@ def _calibrations_of(
 
 
 def _is_usable(calibration: Calibration) -> bool:
-    """K[0] = 0 means "not calibrated" in these messages."""
+    """Whether K is valid; K[0] = 0 means "not calibrated" in these messages."""
     k = calibration.k
     return len(k) == 9 and bool(np.isfinite(k).all()) and k[0] > 0 and k[4] > 0
 
 
 def _n_shared(one: str, other: str) -> int:
-    """How many words of two topics are the same from the beginning on."""
+    """Number of common leading words of two topics."""
     words = (topic.strip("/").split("/")[:-1] for topic in (one, other))
     pairs = list(zip(*words, strict=False))
     return next((n for n, (a, b) in enumerate(pairs) if a != b), len(pairs))

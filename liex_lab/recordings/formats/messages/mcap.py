@@ -1,8 +1,8 @@
 """MCAP recordings, whole, cut or still growing: depth in Foxglove's or ROS's messages.
 
-Records (opcode, u64 length, content) are walked in file order; messages lie in chunks (none, zstd,
-lz4), which threads unpack ahead where the summary at the file's end says where they are. Schemas
-and channels are learnt from the summary too, in case the first ones are damaged.
+Records (opcode, u64 length, content) are walked in file order; messages are in chunks (none, zstd,
+lz4), which threads unpack ahead if the summary at the file's end lists their positions. Schemas and
+channels are also read from the summary, in case the first ones are damaged.
 """
 
 from __future__ import annotations
@@ -40,22 +40,22 @@ from liex_lab.recordings.recording import Recording
 from liex_lab.runtime.progress import Progress, silent
 
 MAGIC = b"\x89MCAP0\r\n"
-NOTES = "liex_lab"  # the name of the metadata record in files of our own making
-RECORD = struct.Struct("<BQ")  # opcode, length of what follows
+NOTES = "liex_lab"  # name of the metadata record in files written by liex_lab
+RECORD = struct.Struct("<BQ")  # opcode, length of the content
 MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
 _FOOTER = struct.Struct(
     "<BQQQI"
-)  # its record: opcode, length, where the summary and its offsets begin, CRC
+)  # its record: opcode, length, positions of the summary and its offsets, CRC
 _START = struct.Struct("<16xQ")  # of a chunk, in its index
 _CHUNK = struct.Struct(
     "<QQQII"
 )  # first and last log time, unpacked size, its CRC, length of the packing's name
 _BLOCK = 1 << 20
-# chunks of so many bytes at most are unpacked before it is their turn
+# chunks of at most this size are unpacked ahead
 THREADS = 2
 _SMALL_CHUNK = 1 << 23
 FACTS = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA)
-LARGEST_FACT = 1 << 24  # bytes of one of them
+LARGEST_FACT = 1 << 24  # bytes of one such record
 DAMAGE = (
     McapError,
     KeyError,
@@ -81,28 +81,28 @@ def open_mcap(
 
     Args:
         path: the .mcap file.
-        camera: comes before whatever the files state.
-        fps: not needed, for every message has its time.
-        progress: reports how far the walk over the file is.
+        camera: overrides the camera in the files.
+        fps: unused, as every message has its time.
+        progress: reports the progress of the walk over the file.
         topic: name of the depth topic; None for the only one.
 
     Returns:
-        The recording, which reads on where the file grows (`Recording.grown`).
+        The recording; reading resumes if the file grows (`Recording.grown`).
 
     Raises:
-        RecordingError: the file is no MCAP file, or holds no depth that can be chosen.
+        RecordingError: the file is not MCAP, or has no depth topic to choose.
     """
     return open_topic(McapFile(path, open_file(path)), "mcap", camera, topic, progress)
 
 
 def open_file(path: Path) -> IO[bytes]:
-    """Open a file that begins as an MCAP file does.
+    """Open a file with the magic bytes of MCAP.
 
     Args:
         path: the file.
 
     Raises:
-        RecordingError: it begins otherwise.
+        RecordingError: the magic bytes are missing.
     """
     file = path.open("rb")
     if file.read(len(MAGIC)) != MAGIC:
@@ -117,30 +117,25 @@ class McapFile(MessageFile):
     """An open MCAP file."""
 
     def __init__(self, path: Path, file: IO[bytes]) -> None:
-        """Take an open file; nothing is read yet.
-
-        Args:
-            path: where the file is.
-            file: the open file.
-        """
+        """Keep an open file; nothing is read."""
         super().__init__(path, file)
         self._by_id: dict[int, Channel] = {}
         self._schemas: dict[int, str] = {0: "no schema"}
-        self.listed: list[bytes] = []  # the indexes of its chunks, as they are written
-        self.n_messages: int | None = None  # in all chunks, as the file's own statistics say
-        # chunks that are being unpacked, by where their content begins
+        self.listed: list[bytes] = []  # the raw indexes of its chunks
+        self.n_messages: int | None = None  # in all chunks, from the file's own statistics
+        # chunks being unpacked, by the position of their content
         self._coming: dict[int, Future[bytes]] = {}
         self._sure = (
             len(MAGIC),
             0,
             True,
-        )  # behind the last whole record: where, chunks until there, `whole`
+        )  # after the last whole record: position, number of chunks, `whole`
 
     def go_on(self) -> int | None:
-        """Make ready for a walk over what was written behind the last whole record since.
+        """Prepare a walk over what was written since, after the last whole record.
 
         Returns:
-            How many chunks the walks before are sure of; None if the file became shorter.
+            Number of valid chunks of earlier walks; None if the file became shorter.
         """
         size = self.path.stat().st_size
         if size < self.size:
@@ -153,10 +148,10 @@ class McapFile(MessageFile):
     def walk(self, wanted: Wanted, progress: Progress) -> Iterator[Envelope | Listed]:
         """Every whole message of the wanted channels, in file order.
 
-        A second walk begins where the first was sure.
+        A second walk begins after the last whole record of the first.
 
         Args:
-            wanted: says of a channel whether its messages are of use.
+            wanted: whether the messages of a channel are relevant.
             progress: reports how many MB were walked over.
 
         Yields:
@@ -179,9 +174,7 @@ class McapFile(MessageFile):
             opcode, start, end = self._record(at)
             whole = end <= self.size and opcode != 0
             if (end > self.size and (opcode != Opcode.CHUNK or self.starts)) or opcode == 0:
-                end = self.resume(
-                    at
-                )  # a size that cannot be; and no record has the opcode 0: these are zeros
+                end = self.resume(at)  # an invalid size, or zeros: no record has the opcode 0
             elif opcode == Opcode.CHUNK:
                 self._look_ahead(at, unpackers)
                 yield from self._walk_chunk(start, end - start, wanted)
@@ -200,9 +193,7 @@ class McapFile(MessageFile):
         self.whole = self.whole and footer and at + len(MAGIC) <= self.size
 
     def _look_ahead(self, at: int, unpackers: ThreadPoolExecutor) -> None:
-        """Have the chunks after the one at `at` unpacked meanwhile, where the file's index says
-        where they are.
-        """
+        """Unpack the next chunks after `at` in the background, if the file's index lists them."""
         n = bisect_right(self.starts, at)
         for later in self.starts[n : n + THREADS]:
             if later + RECORD.size + _CHUNK.size > self.size:
@@ -213,7 +204,7 @@ class McapFile(MessageFile):
             try:
                 chunk = self._chunk(start, end - start)
             except (DamagedChunk, struct.error, UnicodeDecodeError):
-                return  # the walk says so when it is there
+                return  # the walk reports it later
             if chunk.size <= _SMALL_CHUNK:
                 self.file.seek(chunk.offset)
                 self._coming[start] = unpackers.submit(
@@ -221,15 +212,15 @@ class McapFile(MessageFile):
                 )
 
     def _record(self, at: int) -> tuple[int, int, int]:
-        """What kind of record begins at `at`, and where its content begins and ends."""
+        """Opcode of the record at `at`, and start and end of its content."""
         self.file.seek(at)
         opcode, length = RECORD.unpack(self.file.read(RECORD.size))
         return opcode, at + RECORD.size, at + RECORD.size + length
 
     def _learn_ending(self) -> None:
-        """The schemas, channels and places of chunks that a finished file repeats: where the first
-        ones are damaged, they are all that tells what the messages are. A repetition that is
-        damaged itself teaches nothing.
+        """Read schemas, channels and positions of chunks from the summary of a finished file.
+
+        They replace damaged records at the beginning. A damaged summary is ignored.
         """
         self.starts = []
         self.listed = []
@@ -256,11 +247,11 @@ class McapFile(MessageFile):
                     self._learn(kind, ReadDataStream(BytesIO(self.file.read(end - start))))
                 at = end
         except DAMAGE:
-            pass  # the walk says what it finds
+            pass  # the walk reports damage
         self.starts.sort()
 
     def _crc(self, start: int, end: int) -> int:
-        """CRC-32 of the bytes between; a block at a time."""
+        """CRC-32 of the bytes from start to end, computed in blocks."""
         self.file.seek(start)
         crc = 0
         while start < end and (block := self.file.read(min(_BLOCK, end - start))):
@@ -289,7 +280,7 @@ class McapFile(MessageFile):
         self.whole = self.whole and at == len(data) and not self.chunks[number].cut
 
     def _chunk(self, start: int, length: int) -> Chunk:
-        """The chunk whose record begins at `start`, as far as the file goes."""
+        """The chunk whose record is at `start`, up to the end of the file."""
         cut = start + length > self.size
         end = min(start + length, self.size)
         self.file.seek(start)
@@ -320,7 +311,7 @@ class McapFile(MessageFile):
             self.whole = False
 
     def _learn(self, opcode: int, stream: ReadDataStream) -> None:
-        """What the file says about its messages."""
+        """Record a schema, channel or metadata record."""
         if opcode == Opcode.SCHEMA:
             schema = SchemaRecord.read(stream)
             self._schemas[schema.id] = schema.name

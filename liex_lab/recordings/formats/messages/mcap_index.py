@@ -1,13 +1,13 @@
 """MCAP files opened by their index, without unpacking their chunks.
 
-`open_indexed` compares the records of the file with its index first: it must list every chunk and
-every message. Of each depth message only the beginning is unpacked, where the sensor's stamp is,
-on several threads. Any other file is walked (`mcap`). A chunk is checked against its CRC-32 when a
-frame in it is read, and not before: that is for whoever refuses what is damaged
-(`open_recording(..., strict=True)`).
+`open_indexed` first compares the records of the file with its index, which must list every chunk
+and every message. Only the beginning of each depth message, with the sensor's stamp, is unpacked,
+on several threads. Any other file is walked (`mcap`). A chunk is checked against its CRC-32 only
+when a frame in it is read, so this is for callers that refuse damage (`open_recording(...,
+strict=True)`).
 
-`open_replay` opens session.mcap, which this program wrote under the times of its frames: its index
-is trusted and no stamp is read, for some frames out of an hour are needed at once.
+`open_replay` opens session.mcap, which liex_lab wrote with the times of its frames: its index is
+trusted and no stamp is read, because single frames of a long recording are needed quickly.
 """
 
 from __future__ import annotations
@@ -55,15 +55,15 @@ from liex_lab.recordings.formats.messages.parsers import plain_schema, stamp_rea
 from liex_lab.recordings.recording import Recording
 from liex_lab.runtime.progress import Progress, silent
 
-_UNKNOWN = -1  # the length of a message that only its chunk states
+_UNKNOWN = -1  # the length of a message is only stated in its chunk
 _LARGEST_INDEX = 1 << 26  # bytes of one
 _LARGEST_OFFSET = 1 << 40
 _INDEX = struct.Struct("<HI")  # of a message index: channel, bytes of its entries
 _ENTRY = np.dtype([("time_ns", "<u8"), ("offset", "<u8")])
-_HEAD = 512  # bytes of a message's record in which its stamp is
-# share of the packed bytes; if more must be unpacked for the stamps, all of them are
+_HEAD = 512  # first bytes of a message's record, with its stamp
+# share of the packed bytes; if stamps need more, everything is unpacked
 _WORTH_IT = 0.6
-_BATCH = 32  # chunks from which one task unpacks the beginnings of messages
+_BATCH = 32  # chunks per task of unpacking
 _NOT_READ = (*DAMAGE, DamagedChunk)
 
 _StampReader = Callable[[memoryview], int | None]
@@ -77,13 +77,13 @@ def open_indexed(
     progress: Progress = silent,
     topic: str | None = None,
 ) -> Recording:
-    """Open one depth topic of an MCAP file by its index, or as `open_mcap` does if it has none.
+    """Open one depth topic of an MCAP file by its index, or like `open_mcap` without an index.
 
-    `fps` is not used, for every message has its time. Reading a frame raises a `RecordingError` if
-    its chunk is damaged.
+    `fps` is unused, as every message has its time. Reading a frame raises a `RecordingError` if its
+    chunk is damaged.
 
     Raises:
-        RecordingError: the file is not MCAP, or holds no depth that can be chosen.
+        RecordingError: the file is not MCAP, or has no depth topic to choose.
     """
     return open_topic(_Indexed(path, open_file(path)), "mcap", camera, topic, progress)
 
@@ -92,7 +92,7 @@ def open_replay(path: Path, progress: Progress = silent) -> Recording:
     """Open the depth of a session's replay, session.mcap, as a recording.
 
     Raises:
-        RecordingError: it cannot be read, or holds no depth.
+        RecordingError: it cannot be read, or has no depth.
     """
     try:
         return open_topic(_Replay(path, open_file(path)), "mcap", None, None, progress)
@@ -103,7 +103,7 @@ def open_replay(path: Path, progress: Progress = silent) -> Recording:
 
 
 class _Indexed(McapFile):
-    """An MCAP file that is whole as its index says; any other is walked."""
+    """An MCAP file that is complete according to its index; any other is walked."""
 
     trusted = False
     advice = (
@@ -111,7 +111,7 @@ class _Indexed(McapFile):
     )
 
     def walk(self, wanted: Wanted, progress: Progress) -> Iterator[Envelope | Listed]:
-        """The messages of the wanted channels by channel: the first of each with its data."""
+        """The messages of the wanted channels, by channel: the first of each with its data."""
         self._learn_ending()
         indexes: list[ChunkIndex] = []
         usable = False
@@ -123,7 +123,7 @@ class _Indexed(McapFile):
             else:
                 usable = self._agrees(indexes, progress)
         except _NOT_READ:
-            pass  # the walk says what it finds
+            pass  # the walk reports damage
         tables: dict[int, list[_Table]] = {}
         for index in indexes if usable else []:
             try:
@@ -140,7 +140,7 @@ class _Indexed(McapFile):
             yield from self._messages(channel_id, those, wanted)
 
     def _tables(self, index: ChunkIndex, wanted: Wanted) -> list[tuple[int, _Table]]:
-        """By channel what the message indexes of one chunk list."""
+        """Contents of the message indexes of one chunk, by channel."""
         opcode, start, end = self._record(index.chunk_start_offset)
         if opcode != Opcode.CHUNK:
             raise DamagedChunk("there is no chunk where its index says")
@@ -166,7 +166,7 @@ class _Indexed(McapFile):
         return found
 
     def _is_worth_it(self, tables: dict[int, list[_Table]]) -> bool:
-        """Whether the stamps lie in so few bytes that the rest need not be unpacked."""
+        """Whether reading the stamps unpacks few enough bytes."""
         last = [0] * len(self.chunks)
         for number, entries in itertools.chain.from_iterable(tables.values()):
             offsets = np.frombuffer(entries, _ENTRY)["offset"]
@@ -182,7 +182,7 @@ class _Indexed(McapFile):
     def _messages(
         self, channel_id: int, tables: Sequence[_Table], wanted: Wanted
     ) -> Iterator[Envelope | Listed]:
-        """One channel's messages: the first with its data, and the rest listed if that can be."""
+        """One channel's messages: the first with its data, and the rest listed if possible."""
         channel = self._by_id[channel_id]
         listed = _listed(channel, tables)
         n_stated = sum(len(entries) for _, entries in tables) // _ENTRY.itemsize
@@ -211,7 +211,7 @@ class _Indexed(McapFile):
                 return
 
     def _stamped(self, channel_id: int, listed: Listed) -> Listed | None:
-        """Messages with the sensor's stamps; None if these cannot be read without the rest."""
+        """Messages with the sensor's stamps; None if reading these needs whole messages."""
         channel = listed.channel
         if self.trusted or plain_schema(channel) in CALIBRATION_SCHEMAS:
             return listed
@@ -241,11 +241,12 @@ class _Indexed(McapFile):
         places: NDArray[np.int64],
         logged_ns: NDArray[np.uint64],
     ) -> NDArray[np.int64] | None:
-        """(n, 3) whether each of some messages could be read, its stamp and its time of sending,
-        ns; None if the beginnings of messages do not hold their stamps.
+        """(n, 3) for each message whether it could be read, its stamp and its time of sending, ns.
+
+        None if the beginnings of messages do not contain their stamps.
         """
         table = np.zeros((len(places), 3), np.int64)
-        with self.path.open("rb") as file:  # threads share no position
+        with self.path.open("rb") as file:  # threads need separate file positions
             for rows in np.split(np.arange(len(places)), np.flatnonzero(np.diff(places[:, 0])) + 1):
                 if not len(rows):
                     continue
@@ -281,7 +282,7 @@ class _Indexed(McapFile):
         return heads
 
     def read(self, place: Place) -> memoryview:
-        """The data of one message; an unknown length is looked up in its chunk.
+        """The data of one message; an unknown length is read from its chunk.
 
         Raises:
             RecordingError: its chunk is damaged.
@@ -294,7 +295,7 @@ class _Indexed(McapFile):
             raise RecordingError(f"{self.path} is damaged ({error}); {self.advice}") from None
 
     def _message(self, place: Place) -> memoryview:
-        """The data of a message whose length only its chunk states."""
+        """The data of a message whose length is only stated in its chunk."""
         data = self.unpack(place.chunk)
         try:
             opcode, length = RECORD.unpack_from(data, place.offset)
@@ -306,12 +307,12 @@ class _Indexed(McapFile):
         return data[begin + MESSAGE.size : begin + length]
 
     def _agrees(self, indexes: Sequence[ChunkIndex], progress: Progress) -> bool:
-        """Whether the file's records are those that its index lists, from beginning to end."""
+        """Whether the file's records match its index, from beginning to end."""
         at, n_messages = len(MAGIC), 0
         unseen = {index.chunk_start_offset: index for index in indexes}
         if len(unseen) < len(indexes):
             return False
-        expected = set[int]()  # where the indexes of the messages in the last chunk are
+        expected = set[int]()  # positions of the message indexes of the last chunk
         while at + RECORD.size <= self.size:
             opcode, start, end = self._record(at)
             if opcode in (0, Opcode.MESSAGE) or end > self.size:
@@ -340,16 +341,16 @@ class _Indexed(McapFile):
 
 
 class _Replay(_Indexed):
-    """An MCAP file whose index is trusted; one without an index is walked."""
+    """An MCAP file with a trusted index; one without an index is walked."""
 
     trusted = True
     advice = "copy it again, or run `liex run` on its recording"
 
 
 def _listed(channel: Channel, tables: Sequence[_Table]) -> Listed:
-    """Messages of a channel in file order, without those whose offset cannot be.
+    """Messages of a channel in file order, without those with invalid offsets.
 
-    An hour has sixteen thousand chunks, so their tables are read as one.
+    An hour has sixteen thousand chunks, so their tables are parsed as one.
     """
     table = np.frombuffer(b"".join(entries for _, entries in tables), _ENTRY)
     counts = [len(entries) // _ENTRY.itemsize for _, entries in tables]

@@ -1,8 +1,8 @@
-"""Writer of depth as MCAP: zstd chunks, stamps in ns, the calibration beside the images.
+"""Writer of depth as MCAP: zstd chunks, stamps in ns, the calibration along with the images.
 
-Every image closes its chunk (128 KiB), so that one frame is unpacked to read one frame. Messages
-are Foxglove's in protobuf or ROS 2's in CDR, which is written by hand, little endian and aligned to
-the size of each number, because only three messages are needed.
+Every image closes its chunk (128 KiB), so that reading one frame unpacks one frame. Messages are
+Foxglove's in protobuf or ROS 2's in CDR, which is encoded here, little endian and aligned to the
+size of each number, because only three messages are needed.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _SECOND = 10**9
 
 
 class Schema(NamedTuple):
-    """Definition of a message, as an MCAP file holds it.
+    """Definition of a message in an MCAP file.
 
     Attributes:
         name: full name of the message's type.
@@ -48,7 +48,7 @@ def _matrices(camera: Camera) -> tuple[list[float], list[float], list[float]]:
 
 
 def _distortion(camera: Camera) -> tuple[str, list[float]]:
-    """ROS's name of the lens's model, and its coefficients; Foxglove takes the same."""
+    """ROS's name of the distortion model, and its coefficients; Foxglove uses the same."""
     bent = camera.distortion
     if bent is None:
         return "plumb_bob", [0.0] * 5
@@ -107,7 +107,7 @@ def _stamped(message: Any, time_ns: int) -> bytes:
 
 
 def _protobuf_schema(message: Any) -> Schema:
-    """The definition of a message with those that it is made of."""
+    """The definition of a message with its dependencies."""
     from google.protobuf.descriptor_pb2 import FileDescriptorSet
 
     files: dict[str, Any] = {}
@@ -211,7 +211,7 @@ class RosMessages:
 
 
 def _compressed_image(time_ns: int, how: str, packed: bytes) -> bytes:
-    """sensor_msgs/msg/CompressedImage of an image that is packed in some way."""
+    """sensor_msgs/msg/CompressedImage of a packed image."""
     out = _Cdr(time_ns)
     out.text(how)
     out.whole(len(packed))
@@ -221,7 +221,7 @@ def _compressed_image(time_ns: int, how: str, packed: bytes) -> bytes:
 class _Cdr:
     """CDR, ROS 2's layout: little endian, each number at a multiple of its size.
 
-    Positions count from behind the first four bytes. It begins with a std_msgs/Header.
+    Positions count from after the first four bytes. It begins with a std_msgs/Header.
     """
 
     def __init__(self, time_ns: int) -> None:
@@ -239,21 +239,21 @@ class _Cdr:
         self.content += bytes((4 - len(self.content)) % size)
 
     def whole(self, *numbers: int) -> None:
-        """Unsigned integers of 32 bits."""
+        """Append unsigned integers of 32 bits."""
         self._align(4)
         self.content += struct.pack(f"<{len(numbers)}I", *numbers)
 
     def small(self, number: int) -> None:
-        """One of 8 bits."""
+        """Append an unsigned integer of 8 bits."""
         self.content.append(number)
 
     def floats(self, numbers: Sequence[float]) -> None:
-        """Float64s."""
+        """Append float64s."""
         self._align(8)
         self.content += struct.pack(f"<{len(numbers)}d", *numbers)
 
     def text(self, text: str) -> None:
-        """A string, with its length before it and a zero behind it."""
+        """Append a string, preceded by its length and followed by a zero."""
         raw = text.encode() + b"\x00"
         self.whole(len(raw))
         self.content += raw
@@ -261,16 +261,14 @@ class _Cdr:
 
 DEPTH_TOPIC = "/camera/depth"
 CALIBRATION_TOPICS = {"foxglove": "/camera/calibration", "ros": "/camera/camera_info"}
-_CHUNK_BYTES = (
-    128 * 1024
-)  # an image closes its chunk, so that one frame is unpacked to read one frame
+_CHUNK_BYTES = 128 * 1024  # an image closes its chunk, so that reading one frame unpacks one frame
 
 
 class McapDepthWriter(RecordingWriter):
     """Writer of one depth topic and its calibration topic.
 
-    Whole millimetres are 16UC1; from the first frame on that is something else, depth is 32FC1 in
-    metres. It uses `mcap`'s own writer: Foxglove's goes on without a word when the disk is full.
+    Whole millimetres are 16UC1; from the first other frame on, depth is 32FC1 in metres. It uses
+    the `mcap` library's writer: Foxglove's does not report a full disk.
     """
 
     def __init__(
@@ -289,9 +287,9 @@ class McapDepthWriter(RecordingWriter):
             path: the .mcap file.
             camera: the camera of the frames.
             messages: "foxglove" for Foxglove's schemas in protobuf, "ros" for ROS 2's.
-            packing: "raw", "png", or of ROS's messages "rvl", of an image within its chunk.
-            step_mm: mm of a stored step, of "png" and "rvl".
-            metadata: facts of the recording, kept as text in a metadata record.
+            packing: "raw", "png" or (ROS only) "rvl", of an image within its chunk.
+            step_mm: mm of a stored step, for "png" and "rvl".
+            metadata: facts of the recording, stored as text in a metadata record.
         """
         super().__init__(path, camera)
         self._packing = packing
@@ -334,7 +332,7 @@ class McapDepthWriter(RecordingWriter):
         self._log(self._depth, self._picture(frame), time_ns)
 
     def _log(self, channel: int, message: bytes, time_ns: int) -> None:
-        logged_ns = max(0, time_ns)  # the time of logging has no sign; the stamp is what counts
+        logged_ns = max(0, time_ns)  # the time of logging is unsigned; the stamp is authoritative
         self._writer.add_message(channel, logged_ns, message, logged_ns)
 
     def _picture(self, frame: DepthFrame) -> bytes:
@@ -357,15 +355,11 @@ class McapDepthWriter(RecordingWriter):
         return self._messages.raw_picture(frame.time_ns, size, encoding, data)
 
     def note(self, facts: Mapping[str, str]) -> None:
-        """Write facts that are known only when all frames were added, as a metadata record.
-
-        Args:
-            facts: texts by name.
-        """
+        """Write facts (texts by name) known only after all frames, as a metadata record."""
         self._writer.add_metadata(NOTES, dict(facts))
 
     def finish(self) -> None:
-        """Write the index, and note in what unit depth was kept."""
+        """Write the index, and note the unit of the stored depth."""
         self._writer.finish()
         if self._float:
             self.notes.append("depth is not in whole millimetres and was written as 32-bit metres")

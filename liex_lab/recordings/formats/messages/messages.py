@@ -1,11 +1,11 @@
 """Files of messages on named topics, with packed chunks, and the messages in a common form.
 
-This is what MCAP files and ROS bags share. A file is walked once from beginning to end, which needs
-no index and so reads cut files, too; afterwards every message is read from its position.
+This is shared by MCAP files and ROS bags. A file is walked once from beginning to end, which needs
+no index and so also reads cut files; afterwards every message is read from its position.
 
 Schemas: foxglove.RawImage, CompressedImage, PointCloud and CameraCalibration; sensor_msgs/Image,
 CompressedImage, PointCloud2 and CameraInfo (`parsers`); std_msgs/String, std_msgs/Float32 and
-diagnostic_msgs/KeyValue for what the RealSense programs state (`statements`).
+diagnostic_msgs/KeyValue for statements of the RealSense programs (`statements`).
 """
 
 from __future__ import annotations
@@ -37,12 +37,12 @@ PICTURE_SCHEMAS = (
 CLOUD_SCHEMAS = ("foxglove.PointCloud", "sensor_msgs/PointCloud2")
 CALIBRATION_SCHEMAS = ("foxglove.CameraCalibration", "sensor_msgs/CameraInfo")
 STATEMENT_SCHEMAS = ("std_msgs/String", "std_msgs/Float32", "diagnostic_msgs/KeyValue")
-# topics of which the RealSense programs state facts
+# topics with facts from the RealSense programs
 STATES = re.compile(r"(/option/Depth[ _]Units/value|/image/metadata|/camera_info)$")
 
 
 class DamagedMessage(ValueError):
-    """A message is not what its schema says."""
+    """A message does not match its schema."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,7 +77,7 @@ class PackedPicture:
     Attributes:
         stamp_ns: stamp of the sensor, ns.
         frame_id: name of the camera's frame.
-        packing: png, or as ROS writes it, '16UC1; compressedDepth rvl'.
+        packing: png, or as written by ROS, '16UC1; compressedDepth rvl'.
         data: the packed bytes.
     """
 
@@ -89,19 +89,19 @@ class PackedPicture:
 
 @dataclass(frozen=True, slots=True)
 class PointCloud:
-    """Points in metres, in rows like an image or loose.
+    """Points in metres, in rows like an image or unordered.
 
     Attributes:
         stamp_ns: stamp of the sensor, ns.
         frame_id: name of the points' frame.
-        width: columns of the image that they lie in, row by row.
-        height: its rows; 1 for loose points.
+        width: columns of the image, row by row.
+        height: its rows; 1 for unordered points.
         columns: by name (x, y, z), the offset within a point, bytes, and NumPy's name of the type.
         point_step: bytes from one point to the next.
         row_step: bytes from one row to the next.
         data: the points.
-        pose: position (3) m and quaternion x, y, z, w of the cloud's own frame; None if the
-            points are in the camera frame.
+        pose: position (3) m and quaternion x, y, z, w of the cloud's own frame; None if the points
+            are in the camera frame.
     """
 
     stamp_ns: int
@@ -117,7 +117,7 @@ class PointCloud:
 
 @dataclass(frozen=True, slots=True)
 class Calibration:
-    """Intrinsics of a camera, as ROS and Foxglove state them.
+    """Intrinsics of a camera, as stated by ROS and Foxglove.
 
     Attributes:
         frame_id: name of the camera's frame.
@@ -127,9 +127,9 @@ class Calibration:
         d: distortion coefficients.
         k: (9,) camera matrix 3 x 3, row by row.
         p: (12,) projection matrix 3 x 4 of the rectified image, row by row; or empty.
-        binning: pixels of the full image, along columns and rows, that make one of these; 0 is 1.
+        binning: pixels of the full image per pixel, along columns and rows; 0 is 1.
         roi: column and row offset, width and height of the part of the full image, px; width or
-            height 0 for the whole.
+            height 0 for the whole image.
     """
 
     frame_id: str
@@ -159,19 +159,19 @@ Message = DepthMessage | Calibration | Statement
 Parser = Callable[[memoryview], Message]
 
 
-# A chunk is some megabytes. A damaged one may state any size, and a few bytes unpack to as many
-# zeros as one likes.
+# A chunk has some megabytes. A damaged one may state any size, and a few bytes can unpack to
+# any number of zeros.
 _LARGEST_CHUNK = 1 << 27
 _PACKINGS = {b"\x28\xb5\x2f\xfd": "zstd", b"\x04\x22\x4d\x18": "lz4"}  # by their first bytes
-_PIECE = 1 << 15  # bytes of a packed chunk that are read at once where its beginning is wanted
+_PIECE = 1 << 15  # bytes of a packed chunk read at once for its beginning
 
 
 class Place(NamedTuple):
-    """Where a message's data lies.
+    """Position of a message's data.
 
     Attributes:
-        chunk: number of the chunk in whose unpacked bytes it lies; -1 for the file itself.
-        offset: where it begins there, bytes.
+        chunk: number of the chunk; -1 for the file itself.
+        offset: position in the unpacked chunk or the file, bytes.
         length: its length, bytes.
     """
 
@@ -181,7 +181,7 @@ class Place(NamedTuple):
 
 
 class Channel(NamedTuple):
-    """What is on a topic.
+    """A topic and its message type.
 
     Attributes:
         topic: name of the topic.
@@ -195,14 +195,14 @@ class Channel(NamedTuple):
 
 
 class Envelope(NamedTuple):
-    """A message as it is met on the walk.
+    """A message from the walk.
 
     Attributes:
         channel: topic, schema and encoding.
         log_time_ns: time of logging, ns.
-        place: where its data lies, to fetch it again.
+        place: position of its data, to read it again.
         data: its bytes.
-        publish_time_ns: when it was sent, ns; 0 where the file does not state it.
+        publish_time_ns: time of sending, ns; 0 if absent.
     """
 
     channel: Channel
@@ -213,14 +213,14 @@ class Envelope(NamedTuple):
 
 
 class Listed(NamedTuple):
-    """Messages that an index lists: fetched when they are wanted.
+    """Messages listed by an index, and read on demand.
 
     Attributes:
         channel: topic, schema and encoding.
         log_time_ns: (n,) uint64 times of logging, ns.
         places: (n, 3) int64 chunk, offset and length of each, as a `Place`.
-        stamp_ns: (n,) int64 stamps of the sensor, ns; None takes the times of logging.
-        publish_time_ns: (n,) when each was sent, ns; None if that was not read.
+        stamp_ns: (n,) int64 stamps of the sensor, ns; None for the times of logging.
+        publish_time_ns: (n,) times of sending, ns; None if not read.
     """
 
     channel: Channel
@@ -234,8 +234,8 @@ class Chunk(NamedTuple):
     """Messages packed together.
 
     Attributes:
-        offset: where the packed bytes begin in the file.
-        length: how many packed bytes there are.
+        offset: position of the packed bytes in the file.
+        length: number of packed bytes.
         packing: their compression: none, zstd, lz4 or bz2.
         size: unpacked size, bytes.
         crc: CRC-32 of the unpacked bytes; 0 for none.
@@ -251,32 +251,27 @@ class Chunk(NamedTuple):
 
 
 class DamagedChunk(Exception):
-    """A chunk does not unpack to what was packed."""
+    """A chunk cannot be unpacked to its original bytes."""
 
 
 class MessageFile(ABC):
     """An open file of messages.
 
     Attributes:
-        path: where the file is.
+        path: path of the file.
         file: the open file.
         size: its size, bytes.
-        whole: True while it ends as it should and nothing in it was found damaged.
-        parsed: False if messages were listed by an index, and only some of them looked at.
-        channels: all channels that were met, each once, in order; as keys, for a file may name
-            thousands of them.
+        whole: True while it has its end record and no damage was found.
+        parsed: False if an index lists the messages, and only some of them were parsed.
+        channels: all channels found, each once, in order; as keys, because a file may have
+            thousands.
         notes: facts that the file states about itself.
-        chunks: all chunks that were met, in file order.
-        starts: where the records of chunks begin, as the file's own index says, in order.
+        chunks: all chunks found, in file order.
+        starts: positions of the chunks' records by the file's own index, in order.
     """
 
     def __init__(self, path: Path, file: IO[bytes]) -> None:
-        """Take an open file; nothing is read yet.
-
-        Args:
-            path: where the file is.
-            file: the open file.
-        """
+        """Keep an open file; nothing is read."""
         self.path = path
         self.file = file
         self.size = path.stat().st_size
@@ -295,29 +290,31 @@ class MessageFile(ABC):
         """Every whole message of the wanted channels, in file order.
 
         Args:
-            wanted: says of a channel whether its messages are of use.
-            progress: reports how far the walk is.
+            wanted: whether the messages of a channel are relevant.
+            progress: reports the progress of the walk.
 
         Yields:
             The messages.
         """
 
     def go_on(self) -> int | None:
-        """Make ready for a walk over what was written behind the last whole record since.
+        """Prepare a walk over what was written since, after the last whole record.
 
         Returns:
-            How many chunks the walks before are sure of; None if the file has to be opened again.
+            Number of valid chunks of earlier walks; None if the file has to be opened again.
         """
         return None
 
     def resume(self, at: int) -> int:
-        """Where to go on behind a damaged record: at the next chunk that is known, or the end.
+        """Position at which to resume after a damaged record: the next known chunk, or the end.
+
+        `whole` becomes False.
 
         Args:
             at: position of the record, bytes.
 
         Returns:
-            Position to read on from, bytes; `whole` is False afterwards.
+            Position at which to resume, bytes.
         """
         self.whole = False
         n = bisect_right(self.starts, at)
@@ -327,13 +324,10 @@ class MessageFile(ABC):
         """The data of one message.
 
         Args:
-            place: where it lies.
-
-        Returns:
-            Its bytes.
+            place: its position.
 
         Raises:
-            RecordingError: its chunk cannot be unpacked any more.
+            RecordingError: its chunk can no longer be unpacked.
         """
         if place.chunk >= 0:
             try:
@@ -346,16 +340,14 @@ class MessageFile(ABC):
         return memoryview(self.file.read(place.length))
 
     def unpack(self, number: int) -> memoryview:
-        """The unpacked bytes of a chunk; the last one is kept, for neighbouring frames share it.
+        """The unpacked bytes of a chunk; the last one is cached for neighbouring frames.
 
         Args:
             number: index into `chunks`.
 
-        Returns:
-            The bytes.
-
         Raises:
-            DamagedChunk: it states a size that cannot be, or does not unpack to what was packed.
+            DamagedChunk: its stated size is invalid, or it cannot be unpacked to its original
+                bytes.
         """
         if self._last_chunk[0] != number:
             chunk = self.believable(number)
@@ -365,13 +357,13 @@ class MessageFile(ABC):
         return self._last_chunk[1]
 
     def believable(self, number: int) -> Chunk:
-        """A chunk whose stated size is one that it may have.
+        """A chunk, checked for a plausible size.
 
         Args:
             number: index into `chunks`.
 
         Raises:
-            DamagedChunk: it states a size that cannot be.
+            DamagedChunk: its stated size is invalid.
         """
         chunk = self.chunks[number]
         if chunk.size > max(_LARGEST_CHUNK, 2 * self.size):
@@ -385,19 +377,16 @@ class MessageFile(ABC):
 
 
 def unpacked(packed: bytes, chunk: Chunk) -> bytes:
-    """The bytes of a chunk, checked against its size and CRC-32.
+    """Unpack a chunk, checked against its size and CRC-32.
 
-    Of one that is cut, as many as there are: what lies before the cut is as it was written.
+    For a cut chunk, the bytes before the cut.
 
     Args:
         packed: its packed bytes.
-        chunk: what the file says of it.
-
-    Returns:
-        The unpacked bytes.
+        chunk: its description in the file.
 
     Raises:
-        DamagedChunk: it does not unpack to what was packed, or its compression is not known.
+        DamagedChunk: it cannot be unpacked to its original bytes, or its compression is unknown.
     """
     with _codec_errors():
         data = _inflate(packed, chunk.packing, chunk.size)
@@ -411,34 +400,31 @@ def unpacked(packed: bytes, chunk: Chunk) -> bytes:
 
 
 def unpacked_message(data: memoryview) -> memoryview:
-    """The bytes of a message, unpacked where a recorder packs every message by itself.
+    """The bytes of a message, unpacked if a recorder packed every message separately.
 
     Args:
-        data: the message; it begins otherwise than a packed one does if it is not packed.
+        data: the message; packed ones are recognised by their first bytes.
 
     Raises:
-        DamagedChunk: it does not unpack.
+        DamagedChunk: it cannot be unpacked.
     """
     packing = _PACKINGS.get(bytes(data[:4]))
     if packing is None:
         return data
-    whole = Chunk(0, len(data), packing, _LARGEST_CHUNK, 0, cut=True)  # it does not state its size
+    whole = Chunk(0, len(data), packing, _LARGEST_CHUNK, 0, cut=True)  # its size is not stated
     return memoryview(unpacked(bytes(data), whole))
 
 
 def first_bytes(file: IO[bytes], chunk: Chunk, size: int) -> bytes:
-    """The first bytes of a packed chunk; no more of it is unpacked than that takes, nor checked.
+    """The first bytes of a packed chunk; the rest is neither unpacked nor checked.
 
     Args:
         file: the open file.
-        chunk: what the file says of the chunk, packed by zstd or lz4.
-        size: how many unpacked bytes are wanted.
-
-    Returns:
-        The bytes.
+        chunk: its description in the file, packed by zstd or lz4.
+        size: number of unpacked bytes.
 
     Raises:
-        DamagedChunk: there are fewer, or it does not unpack.
+        DamagedChunk: there are fewer, or it cannot be unpacked.
     """
     file.seek(chunk.offset)
     with _codec_errors():
@@ -457,28 +443,26 @@ def first_bytes(file: IO[bytes], chunk: Chunk, size: int) -> bytes:
 
 @contextmanager
 def _codec_errors() -> Iterator[None]:
-    """Turn the exceptions of the codecs, which are foreign, into ours."""
+    """Convert the exceptions of the codecs to ours."""
     try:
         yield
     except DamagedChunk:
         raise
     except Exception as error:
-        if why_short(error):  # which says nothing about the file
+        if why_short(error):  # not a fault of the file
             raise MemoryError(str(error)) from None
         raise DamagedChunk(str(error)) from None
 
 
 def _inflate(packed: bytes, packing: str, size: int) -> bytes:
-    """At most `size` bytes. Piece by piece, so that a chunk that is cut gives what it still
-    holds.
-    """
+    """At most `size` bytes, in pieces, so that a cut chunk yields its remaining bytes."""
     if packing in ("", "none"):
         return packed[:size]
     if packing == "zstd":
         import zstandard
 
         unpacker = zstandard.ZstdDecompressor()
-        if zstandard.frame_content_size(packed) == size:  # in one go, and no more than that
+        if zstandard.frame_content_size(packed) == size:  # in one step, and no more than that
             try:
                 return unpacker.decompress(packed)
             except zstandard.ZstdError:
@@ -496,14 +480,14 @@ def _inflate(packed: bytes, packing: str, size: int) -> bytes:
 
 
 def printable(text: str, length: int = 80) -> str:
-    """A name out of a file, fit for a sentence: a damaged one may hold anything.
+    """A name from a file, safe for a message: a damaged one may contain anything.
 
     Args:
         text: the name.
-        length: how many characters are kept.
+        length: number of characters to keep.
 
     Returns:
-        The name with ? for what cannot be printed, and ... where it was longer.
+        The name with ? for characters that are not printable, and ... if it was longer.
     """
     return "".join(c if c.isprintable() else "?" for c in text[:length]) + (
         "..." if len(text) > length else ""

@@ -1,9 +1,8 @@
-"""Parsers of messages that hold depth: Foxglove's schemas (protobuf, JSON) and ROS's `sensor_msgs`.
+"""Parsers of messages with depth: Foxglove's schemas (protobuf, JSON) and ROS's `sensor_msgs`.
 
-In JSON, bytes are base64. Of ROS's messages the pixels are not copied. The definitions have been
-the same for as long as there are recordings, so they are written down here; ROS 1 serialisation
-and ROS 2 CDR order the fields alike and differ in alignment, in the header and in the zero at a
-string's end.
+In JSON, bytes are base64. The pixels of ROS's messages are not copied. The definitions have never
+changed, so they are fixed here; ROS 1 serialisation and ROS 2 CDR have the same order of fields and
+differ in alignment, in the header and in the zero at a string's end.
 """
 
 from __future__ import annotations
@@ -43,25 +42,18 @@ from liex_lab.recordings.formats.messages.messages import (
 
 
 def plain_schema(channel: Channel) -> str:
-    """Name of a schema without the 'msg' that ROS 2 puts into it.
-
-    Args:
-        channel: topic, schema and encoding.
-
-    Returns:
-        The name, such as "sensor_msgs/Image".
-    """
+    """Name of a channel's schema without the 'msg' of ROS 2, such as "sensor_msgs/Image"."""
     return channel.schema.replace("/msg/", "/")
 
 
 def parser_of(channel: Channel) -> Parser | None:
-    """The function that turns a channel's messages into ours.
+    """The function that parses a channel's messages.
 
     Args:
         channel: topic, schema and encoding.
 
     Returns:
-        The parser; None for messages that say nothing about depth.
+        The parser; None for messages unrelated to depth.
     """
     schema = plain_schema(channel)
     if schema in STATEMENT_SCHEMAS and not STATES.search(channel.topic):
@@ -82,14 +74,13 @@ def parser_of(channel: Channel) -> Parser | None:
 def stamp_reader(channel: Channel) -> Callable[[memoryview], int | None] | None:
     """The function that reads the sensor's stamp, ns, from the first bytes of a channel's messages.
 
-    It says what the channel's parser does of the whole message, or None if these bytes do not
-    tell.
+    It returns the same stamp as the channel's parser, or None if these bytes do not contain it.
 
     Args:
         channel: topic, schema and encoding.
 
     Returns:
-        The function; None for messages that hold no depth, or whose beginning tells nothing.
+        The function; None for messages without depth, or if their beginning has no stamp.
     """
     schema = plain_schema(channel)
     if schema not in (*PICTURE_SCHEMAS, *CLOUD_SCHEMAS):
@@ -155,7 +146,7 @@ def _cloud(message: Any) -> PointCloud:
 
 def _stamp(message: Any) -> int:
     stamp = message.timestamp
-    if isinstance(stamp, str):  # RFC 3339, as protobuf's MessageToJson writes it
+    if isinstance(stamp, str):  # RFC 3339, as written by protobuf's MessageToJson
         stamp = Timestamp()
         stamp.FromJsonString(message.timestamp)
     return int(stamp.seconds) * _SECOND + int(stamp.nanos)
@@ -165,9 +156,9 @@ _JSON_NAMES = {"seconds": "sec", "nanos": "nsec"}  # protobuf's name: JSON's
 
 
 class _Json:
-    """A JSON object whose keys are attributes, as protobuf's messages have them.
+    """A JSON object with its keys as attributes, as in protobuf's messages.
 
-    What is missing is empty, or 0.
+    Missing values are empty, or 0.
     """
 
     _TEXTS = ("frame_id", "encoding", "format", "distortion_model", "name")
@@ -232,7 +223,7 @@ def stamp_in(head: memoryview) -> int | None:
         head: the message's first bytes.
 
     Returns:
-        The stamp; None if another field comes first, as in a message without a stamp.
+        The stamp; None if another field is first, as in a message without a stamp.
     """
     if len(head) < 2 or head[0] != _STAMP or head[1] > min(_ONE_BYTE, len(head) - 2):
         return None
@@ -254,7 +245,7 @@ _PLAIN_CDR = (b"\0\0", b"\0\1", b"\0\6", b"\0\7")  # big and little endian, vers
 
 
 class _Fields:
-    """Reads one field after the other: ROS 1, little endian, nothing aligned."""
+    """Reads consecutive fields: ROS 1, little endian, nothing aligned."""
 
     order = "<"
     origin = 0
@@ -274,7 +265,7 @@ class _Fields:
         return self.data[begin : self.at]
 
     def numbers(self, kind: str, n: int = 1) -> tuple[Any, ...]:
-        """`n` numbers of a type, as `struct` names it."""
+        """`n` numbers of a type, named as in `struct`."""
         size = struct.calcsize(f"<{kind}")
         self.at += (self.origin - self.at) % min(size, self.largest_step)
         return struct.unpack(f"{self.order}{n}{kind}", self._next(n * size))
@@ -284,14 +275,14 @@ class _Fields:
         return int(self.numbers(kind)[0])
 
     def floats(self) -> tuple[float, ...]:
-        """Float64s with their number before them."""
+        """Float64s, preceded by their number."""
         n = self.whole()
         if n > len(self.data) // 8:
             raise DamagedMessage("a message states more numbers than it has bytes")
         return self.numbers("d", n) if n else ()
 
     def blob(self) -> memoryview:
-        """Bytes with their number before them."""
+        """Bytes, preceded by their number."""
         return self._next(self.whole())
 
     def text(self) -> str:
@@ -308,8 +299,8 @@ class _Fields:
 class _CdrFields(_Fields):
     """The same in ROS 2 (CDR): byte order in the first four bytes, numbers aligned to their size.
 
-    Strings end in a zero, and headers have no counter. The second version (XCDR2) aligns to four
-    bytes at most.
+    Strings end in a zero, and headers have no counter. The second version (XCDR2) aligns to at most
+    four bytes.
     """
 
     origin = 4
@@ -368,7 +359,7 @@ def _point_cloud2(fields: _Fields) -> PointCloud:
     found = []
     for _ in range(n_fields):
         found.append((fields.text(), fields.whole(), fields.whole("B")))
-        fields.whole()  # how many numbers the field has: one
+        fields.whole()  # number of values per field: one
     order = ">" if fields.whole("B") else "<"
     columns = {
         name: (at, order + _POINT_TYPES[kind]) for name, at, kind in found if kind in _POINT_TYPES
@@ -379,7 +370,7 @@ def _point_cloud2(fields: _Fields) -> PointCloud:
 
 
 def _value(fields: _Fields) -> Statement:
-    return Statement({"value": f"{fields.numbers('f')[0]:.6g}"})  # 0.001 was meant, not its float32
+    return Statement({"value": f"{fields.numbers('f')[0]:.6g}"})  # 0.001 instead of its float32
 
 
 def _text(fields: _Fields) -> Statement:
@@ -406,14 +397,14 @@ _LAYOUTS: dict[str, type[_Fields]] = {"ros1": _Fields, "cdr": _CdrFields}
 
 
 def ros_parser(schema: str, encoding: str) -> Parser | None:
-    """The function that reads messages of a schema.
+    """The function that parses messages of a schema.
 
     Args:
         schema: its name without "msg", such as "sensor_msgs/Image".
         encoding: "ros1" or "cdr".
 
     Returns:
-        The parser, which raises `DamagedMessage`; None if absent.
+        The parser, which raises `DamagedMessage`; None if unsupported.
     """
     layout = _LAYOUTS.get(encoding)
     if layout is None or schema not in _PARSERS:
@@ -425,7 +416,7 @@ def ros_parser(schema: str, encoding: str) -> Parser | None:
 
 
 def _read_cdr(read: Callable[[_Fields], Message], data: memoryview) -> Message:
-    """A message in CDR; one that begins as of the second version may be laid out as the first."""
+    """A message in CDR; one marked as the second version may have the layout of the first."""
     fields = _CdrFields(data)
     message = read(fields)
     if fields.largest_step == _SECOND_VERSION <= len(data) - fields.at:
@@ -436,7 +427,7 @@ def _read_cdr(read: Callable[[_Fields], Message], data: memoryview) -> Message:
 
 
 def _header_stamp(layout: type[_Fields], head: memoryview) -> int | None:
-    """The stamp, ns, in the header that a message begins with; None if the header is longer."""
+    """The stamp, ns, in a message's header; None if the header is longer than `head`."""
     try:
         return layout(head).header()[0]
     except DamagedMessage:

@@ -1,8 +1,8 @@
 """ROS bags, whole or cut: ROS 1 `.bag` (format 2.0, also RealSense's) and ROS 2 `.db3` (SQLite).
 
-A `.bag` is walked from its beginning and needs no index, which is written last and so is missing
-exactly if a recording broke off; `rosbags`, the library that the tests compare with, refuses such
-files. A record is a header of named fields and data; a chunk packs records (none, bz2, lz4).
+A `.bag` is walked from its beginning and needs no index. The index is written last, so interrupted
+recordings lack it; `rosbags`, the reference library in the tests, refuses such files. A record is a
+header of named fields and data; a chunk packs records (none, bz2, lz4).
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ _HEADER = 3
 _CHUNK = 5
 _CHUNK_INFO = 6
 _CONNECTION = 7
-_LARGEST_HEADER = 1 << 24  # bytes; a connection's holds the definition of its messages
+_LARGEST_HEADER = 1 << 24  # bytes; a connection's contains its message definition
 _DAMAGE = (KeyError, ValueError, OverflowError, struct.error)
 
 
@@ -54,16 +54,13 @@ def open_bag(
 
     Args:
         path: the .bag or .db3 file.
-        camera: comes before whatever the files state.
-        fps: not needed, for every message has its time.
-        progress: reports how far the walk over the file is.
+        camera: overrides the camera in the files.
+        fps: unused, as every message has its time.
+        progress: reports the progress of the walk over the file.
         topic: name of the depth topic; None for the only one.
 
-    Returns:
-        The recording.
-
     Raises:
-        RecordingError: the file is no such bag, is encrypted, or holds no depth that can be chosen.
+        RecordingError: the file is not such a bag, is encrypted, or has no depth topic to choose.
     """
     file = path.open("rb")
     magic = file.read(len(_SQLITE))
@@ -86,12 +83,7 @@ class BagFile(MessageFile):
     """An open ROS 1 bag, version 2.0: records, each with a header of named fields and data."""
 
     def __init__(self, path: Path, file: IO[bytes]) -> None:
-        """Take an open file; nothing is read yet.
-
-        Args:
-            path: where the file is.
-            file: the open file.
-        """
+        """Keep an open file; nothing is read."""
         super().__init__(path, file)
         self._by_id: dict[int, Channel] = {}
 
@@ -99,7 +91,7 @@ class BagFile(MessageFile):
         """Every whole message of the wanted channels, in file order.
 
         Args:
-            wanted: says of a channel whether its messages are of use.
+            wanted: whether the messages of a channel are relevant.
             progress: reports how many MB were walked over.
 
         Yields:
@@ -137,11 +129,11 @@ class BagFile(MessageFile):
                 (self.size >> 20) + 1,
                 "looking through the recording (MB)",
             )
-        # A recording that broke off has no index yet, and every other one ends with it.
+        # Only an interrupted recording has no index at its end.
         self.whole = self.whole and at == self.size and indexed
 
     def _record(self, at: int) -> tuple[dict[str, bytes], int, int]:
-        """The header of the record that begins at `at`, and where its data begin and end."""
+        """The header of the record at `at`, and start and end of its data."""
         self.file.seek(at)
         (n_header,) = _U32.unpack(self.file.read(_U32.size))
         begin = at + 2 * _U32.size + n_header
@@ -152,9 +144,7 @@ class BagFile(MessageFile):
         return _fields(memoryview(block)[:n_header]), begin, begin + n_data
 
     def _learn_ending(self, header: dict[str, bytes]) -> bool:
-        """The connections and places of chunks that the index at the end repeats; False if there
-        is no index.
-        """
+        """Read connections and positions of chunks from the index at the end; False without one."""
         if header.get("encryptor"):
             raise RecordingError(
                 f"{self.path} is an encrypted bag, which cannot be read; give it without encryption"
@@ -168,14 +158,14 @@ class BagFile(MessageFile):
                     self.starts += struct.unpack("<Q", facts["chunk_pos"])
                 elif (
                     facts["op"][0] == _CONNECTION and end <= self.size
-                ):  # else it would be read into nothing
+                ):  # not past the end of the file
                     self.file.seek(begin)
                     self._connect(facts, memoryview(self.file.read(end - begin)))
                 else:
                     break
                 at = end
         except (*_DAMAGE, IndexError):
-            pass  # the walk says what it finds
+            pass  # the walk reports damage
         self.starts.sort()
         return indexed
 
@@ -207,7 +197,7 @@ class BagFile(MessageFile):
     def _take(
         self, opcode: int, header: dict[str, bytes], data: memoryview, place: Place, wanted: Wanted
     ) -> Iterator[Envelope]:
-        """A connection, which is noted, or a message, which is handed out."""
+        """Record a connection, or yield a message."""
         if opcode == _CONNECTION:
             self._connect(header, data)
         elif opcode == _MESSAGE:
@@ -218,7 +208,7 @@ class BagFile(MessageFile):
                 yield Envelope(channel, seconds * 10**9 + nanoseconds, place, data)
 
     def _connect(self, header: dict[str, bytes], data: memoryview) -> None:
-        """Note what is on a topic."""
+        """Record a connection: the topic and its message type."""
         (number,) = _U32.unpack(header["conn"])
         topic = "/" + "/".join(part for part in header["topic"].decode().split("/") if part)
         channel = Channel(topic, _fields(data)["type"].decode(), "ros1")
@@ -227,9 +217,7 @@ class BagFile(MessageFile):
 
 
 def _fields(header: memoryview) -> dict[str, bytes]:
-    """The named fields of a header: each with its length before it, and an = between name and
-    value.
-    """
+    """The named fields of a header: each is preceded by its length, with an = after the name."""
     fields: dict[str, bytes] = {}
     at = 0
     while at < len(header):
@@ -246,15 +234,10 @@ class Db3File(MessageFile):
     """An open ROS 2 bag in SQLite: a table of topics and a table of messages."""
 
     def __init__(self, path: Path, file: IO[bytes]) -> None:
-        """Open the data base, read-only.
-
-        Args:
-            path: where the file is.
-            file: the open file.
-        """
+        """Open the database, read-only."""
         super().__init__(path, file)
-        # opened by several threads, of which one reads at a time; immutable: no lock file is made
-        # beside it
+        # used by several threads, one at a time; immutable: no lock file is
+        # created
         uri = f"{path.resolve().as_uri()}?mode=ro&immutable=1"
         self._base = sqlite3.connect(uri, uri=True, check_same_thread=False)
 
@@ -262,14 +245,14 @@ class Db3File(MessageFile):
         """Every message of the wanted channels, in the order in which they were stored.
 
         Args:
-            wanted: says of a channel whether its messages are of use.
+            wanted: whether the messages of a channel are relevant.
             progress: reports how many messages were walked over.
 
         Yields:
-            The messages, up to the first that is damaged.
+            The messages, up to the first damaged one.
 
         Raises:
-            RecordingError: what stands for the tables is something else.
+            RecordingError: the tables are views, virtual or generated.
         """
         self._refuse_views()
         try:
@@ -292,14 +275,14 @@ class Db3File(MessageFile):
             self.whole = False
 
     def _refuse_views(self) -> None:
-        """Refuse tables that are made up when they are read: one that names itself never ends."""
+        """Refuse tables that are computed on reading: a recursive one never ends."""
         try:
             stored = self._base.execute(
                 "SELECT lower(name), type, lower(sql) FROM sqlite_master "
                 "WHERE lower(name) IN ('topics', 'messages')"
             ).fetchall()
         except (sqlite3.Error, ValueError, OverflowError):
-            return  # the walk says what it finds
+            return  # the walk reports damage
         for name, kind, made in stored:
             if kind != "table" or "virtual" in str(made) or "generated" in str(made):
                 raise RecordingError(
@@ -312,20 +295,17 @@ class Db3File(MessageFile):
         return memoryview(row[0])
 
     def read(self, place: Place) -> memoryview:
-        """The data of one message.
+        """The data of one message; empty if it is damaged.
 
         Args:
             place: its `offset` is the message's id in the table.
-
-        Returns:
-            The bytes; none where it is damaged, for no message is empty.
         """
         try:
             return self._fetch(place.offset)
         except (sqlite3.Error, TypeError):
-            return memoryview(b"")  # no message is empty: a damaged one
+            return memoryview(b"")  # damaged: messages are never empty
 
     def close(self) -> None:
-        """Close the data base and the file."""
+        """Close the database and the file."""
         self._base.close()
         super().close()

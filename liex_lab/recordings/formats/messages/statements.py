@@ -1,10 +1,10 @@
-"""What known programs state about their recordings: RealSense's, and `liex pack`.
+"""Statements of known programs about their recordings: RealSense's, and `liex pack`.
 
-A RealSense `.bag` (until 2025) holds depth unit, camera and sensor times in numbers, KeyValues and
-a CameraInfo; a `.db3` (since 2026) holds all of them in strings such as "fx=287.9;ppx=159.5". Both
-use the same topics, of a sensor or of one of its streams, and converters keep these. In a `.db3` a
+A RealSense `.bag` (until 2025) has depth unit, camera and sensor times in numbers, KeyValues and a
+CameraInfo; a `.db3` (since 2026) has all of them in strings such as "fx=287.9;ppx=159.5". Both use
+the same topics, of a sensor or of one of its streams, and converters keep these. In a `.db3` a
 depth image's header has the time of arrival, counted from the beginning of the recording; the
-sensor's is in the metadata of its frame.
+sensor's time is in the metadata of its frame.
 """
 
 from __future__ import annotations
@@ -36,13 +36,13 @@ _LENS = ("width", "height", "fx", "ppx", "fy", "ppy")
 
 
 def calibration_in(statement: Statement) -> Calibration | None:
-    """The intrinsics of a stream that are stated as text; None if it states something else.
+    """The intrinsics of a stream in a statement; None if it states something else.
 
     Args:
-        statement: what the program states.
+        statement: the statement.
 
     Raises:
-        ValueError: one of them is no number.
+        ValueError: one of them is not a number.
     """
     if not set(_LENS) <= set(statement.facts):
         return None
@@ -54,11 +54,12 @@ def calibration_in(statement: Statement) -> Calibration | None:
 
 @dataclass
 class Statements:
-    """What a file states about its sensors and streams, each named by the beginning of its topics.
+    """Statements of a file about its sensors and streams, each named by the beginning of its
+    topics.
 
     Attributes:
-        units_mm: mm of a stored step, as a sensor's option or in the metadata of a stream's frames:
-            how often each was stated.
+        units_mm: mm of a stored step, as a sensor's option or in the metadata of a stream's frames,
+            with the number of times each was stated.
         times_ns: by message of a stream: time of logging and time of the sensor, ns.
         began_ns: the computer's clock at the first frame of a stream, ns.
     """
@@ -70,17 +71,17 @@ class Statements:
     began_ns: dict[str, int] = field(default_factory=dict)
 
     def add(self, message: Envelope, statement: Statement) -> bool:
-        """Take note of a statement.
+        """Record a statement.
 
         Args:
-            message: the message that it came in.
-            statement: what it states.
+            message: its message.
+            statement: the statement.
 
         Returns:
             False if further messages of the channel add nothing.
 
         Raises:
-            ValueError: a number in it is none.
+            ValueError: a value is not a number.
         """
         topic, facts = message.channel.topic, statement.facts
         of = STATES.sub("/", topic)
@@ -94,7 +95,7 @@ class Statements:
         if "timestamp" in facts:
             sensor_ns = _ms_as_ns(facts["timestamp"])
             self.times_ns[of][message.place] = (message.log_time_ns, sensor_ns)
-        # a .bag has one message for every fact of every frame, and its headers have the times
+        # a .bag has one message per fact and frame, and the times are in its headers
         return message.channel.schema.endswith("String") or of not in self.began_ns
 
     def step_mm(
@@ -102,16 +103,17 @@ class Statements:
     ) -> float | None:
         """Millimetres of a stored step on a topic.
 
-        What the frames themselves state comes before the sensor's option.
+        The unit in the frames' metadata (the longest matching topic prefix) overrides the
+        sensor's option.
 
         Args:
             topic: name of the depth topic.
             settled: whether a camera.toml states the unit.
-            problems: appended to where a recording of the programs states none.
-            doubts: appended to where it states several.
+            problems: appended to if a recording of these programs states none.
+            doubts: appended to if it states several.
 
         Returns:
-            mm; None if the file does not state it, or states several and it is settled.
+            mm; None if the file does not state it, or states several and a camera.toml decides.
         """
         stated = {of: units for of, units in self.units_mm.items() if topic.startswith(of)}
         if not stated and _OF_PROGRAM.search(topic) and not settled:
@@ -134,13 +136,10 @@ class Statements:
         return step_mm
 
     def start(self, topic: str) -> str | None:
-        """The moment of the first frame of a topic, ISO 8601, by the computer's clock.
+        """Start time of a topic, ISO 8601, by the computer's clock; None if absent.
 
         Args:
             topic: name of the depth topic.
-
-        Returns:
-            The moment; None if it is not stated.
         """
         began = [start_of_clock(ns) for of, ns in self.began_ns.items() if topic.startswith(of)]
         return began[0] if began else None
@@ -160,10 +159,10 @@ class Statements:
             topic: name of the depth topic.
             logged_ns: (n,) times of logging, ns, in order.
             arrived_ns: (n,) stamps in their headers, ns.
-            problems: appended to where images have no metadata.
+            problems: appended to if images have no metadata.
 
         Returns:
-            (n,) ns; the stamps of the headers where the file has no metadata.
+            (n,) ns; the stamps of the headers if the file has no metadata.
         """
         times = next((t for of, t in self.times_ns.items() if topic.startswith(of)), {})
         if not times:
@@ -184,33 +183,33 @@ class Statements:
 
 
 def _ms_as_ns(text: str) -> int:
-    """Milliseconds as they are written, in ns; a float64 of them would be good to 200 ns only."""
+    """Milliseconds as decimal text, in ns; a float64 would only be precise to 200 ns."""
     if not abs(float(text)) * 1e6 < LIMIT_NS:
         raise ValueError(f"a time in the metadata is {text}")
     return int((Decimal(text.strip()) * 1_000_000).to_integral_value())
 
 
-# What an archive made by `liex pack` says of the recording that it was made of.
+# Facts in an archive of `liex pack` about its source recording.
 
 
-SUFFIX = ".pack"  # of the name before .mcap; it is no part of the recording's name
+SUFFIX = ".pack"  # before .mcap; not part of the recording's name
 _FACTS = "packed"
 _HASH = "depth_sha256"
 
 
 @dataclass(frozen=True)
 class PackFacts:
-    """The facts; all at their defaults for a file that is no archive.
+    """Facts about the source of an archive; defaults for a file that is not an archive.
 
     Attributes:
         step_mm: mm of a stored step.
         problems: sentences about the recording.
-        doubts: reasons not to rely on its times.
+        doubts: reasons why its times are unreliable.
         moved: frames whose stamps were moved, and why: index into `FAULTS` by row.
         source: name, format and SHA-256 of the recording.
-        region_px: (u, v) corners of the polygon that the pixels kept lie in; empty for the whole
-            image, or where it was found and is no polygon.
-        n_px: pixels of an image that are kept; 0 where all are.
+        region_px: (u, v) corners of the polygon of kept pixels; empty for the whole image, or for a
+            region that is not a polygon.
+        n_px: number of kept pixels per image; 0 for all.
         depth_sha256: SHA-256 of times (int64 ns) and images (uint16 steps), little endian, in
             order; empty if unknown.
         packed: whether the file is an archive.
@@ -234,7 +233,7 @@ class PackFacts:
             notes: texts by name.
 
         Raises:
-            RecordingError: they are not what `liex pack` writes.
+            RecordingError: they were not written by `liex pack`, or are damaged.
         """
         if _FACTS not in notes:
             return PackFacts()
@@ -265,7 +264,7 @@ class PackFacts:
         return facts
 
     def to_notes(self) -> dict[str, str]:
-        """The facts as texts for the file's notes, but for the hash, see `hash_note`."""
+        """The facts as texts for the file's notes, except for the hash, see `hash_note`."""
         table = {
             "step_mm": self.step_mm,
             "problems": self.problems,
@@ -287,7 +286,7 @@ class PackFacts:
 
     @property
     def metadata(self) -> dict[str, Any]:
-        """What the open recording says of being an archive; nothing of another file."""
+        """Metadata of the recording about its archive; empty for other files."""
         if not self.packed:
             return {}
         table = {"source": self.source, "step_mm": self.step_mm, "depth_sha256": self.depth_sha256}
@@ -297,7 +296,7 @@ class PackFacts:
         """Why the stamps of the recording's frames were moved.
 
         Args:
-            found: (n,) what the archive's own stamps say.
+            found: (n,) faults of the archive's own stamps.
 
         Returns:
             (n,) index into `FAULTS`.
@@ -310,7 +309,7 @@ class PackFacts:
 
 
 def hash_note(depth_sha256: str) -> dict[str, str]:
-    """The text that closes an archive.
+    """The note at the end of an archive.
 
     Args:
         depth_sha256: see `PackFacts`.
