@@ -159,12 +159,7 @@ def measure_arenas(
 
 
 def arena_settings(arena: SeveralArenas, name: str) -> tuple[str, ...]:
-    """The settings that turn a plan of several arenas into the plan of one session.
-
-    Args:
-        arena: the arena.
-        name: of its session.
-    """
+    """The settings that turn a plan of several arenas into that of one arena's session, `name`."""
     told = ["arenas=", f"arena.region={toml_value(arena.region)}", f"session.name={_text(name)}"]
     for fact in _FACTS:
         if (value := getattr(arena, fact)) is not None:

@@ -108,9 +108,7 @@ def build_water(plan: Plan) -> Water | None:
 
 
 def _stated_lens(plan: Plan) -> Lens | None:
-    """The plan's camera if all of it is stated, or a placeholder that its preset replaces; else
-    None.
-    """
+    """The plan's camera if fully stated, a placeholder for its preset, or None."""
     from liex_lab.optics.camera import Lens
 
     stated = {name: getattr(plan.camera, name) for name in ("fx", "fy", "cx", "cy")}
@@ -140,12 +138,9 @@ def _overruled(camera: Camera, plan: Plan) -> Camera:
 
 
 def plan_of(animal: str) -> Plan:
-    """The bundled plan of an animal, or a plan for the animal of a skeleton's TOML.
+    """The plan of an animal: a bundled plan's name, or the path of a skeleton's TOML.
 
     The latter expects a model `NAME.npz` with the name of the skeleton's file.
-
-    Args:
-        animal: name of a bundled plan, or path of a skeleton's TOML.
     """
     from liex_lab.body.skeleton import Skeleton
 
@@ -165,9 +160,6 @@ def build_estimator(plan: Plan) -> PoseEstimator:
     """The pose estimator of the plan's model and animal.
 
     The last one stays in memory, since the next session of a study usually needs the same one.
-
-    Args:
-        plan: its sections `estimation` and `animal`.
 
     Raises:
         ModelError: there is no such model, or its file is damaged.
@@ -246,11 +238,7 @@ def build_tracker(
 
 
 def build_stated_shape(plan: Plan, skeleton: Skeleton) -> StatedShape | None:
-    """The shape that the plan states for its animal; None if it states none.
-
-    Args:
-        plan: its setting `animal.shared`.
-        skeleton: the animal's skeleton.
+    """The shape that the plan states for its animal (`animal.shared`); None if it states none.
 
     Raises:
         PlanError: the shape is of another skeleton.
@@ -361,13 +349,9 @@ def build_recogniser(plan: Plan, skeleton: Skeleton) -> TimelineModel | None:
 
 
 def why_nameless(plan: Plan, skeleton: Skeleton) -> str:
-    """Why no actions are named if there is no recogniser; '' if rules name them.
+    """Why no actions are named if there is no recogniser; '' if rules name them (`actions.model`).
 
     The rules are a mouse's: a hand does not rear, and a snake does not run.
-
-    Args:
-        plan: its setting `actions.model`; 'rules' applies the rules to any animal.
-        skeleton: the animal's skeleton.
     """
     if plan.actions.model is not None or skeleton.name == _RULED:
         return ""

@@ -88,11 +88,8 @@ class Proposal:
 
 
 def propose_plan(recording: Recording, plan: Plan | None = None) -> Proposal:
-    """Find the plan that a recording fits, from a few frames.
-
-    Args:
-        recording: an open recording.
-        plan: the given plan, tried first; None tries the usual one.
+    """Find the plan that a recording fits, from a few frames; tries `plan`, or the usual one,
+    first.
     """
     first = try_plan(recording, plan or USUAL)
     looks = [first]
@@ -211,12 +208,7 @@ def _shows_an_animal(tracker: FrameTracker) -> bool:
 
 
 def try_plan(recording: Recording, plan: Plan | str) -> PlanFit:
-    """Fit a plan to a few frames.
-
-    Args:
-        recording: an open recording.
-        plan: the plan, or the name of a bundled one.
-    """
+    """Fit a plan, or the bundled plan of that name, to a few frames."""
     name = plan if isinstance(plan, str) else animal_of(plan).name
     chosen = Plan.load(plan) if isinstance(plan, str) else plan
     plan = chosen.with_settings([_HANDFUL])
@@ -228,20 +220,13 @@ def try_plan(recording: Recording, plan: Plan | str) -> PlanFit:
 
 
 def best(looks: Sequence[PlanFit]) -> PlanFit | None:
-    """The plan that fits; of several, the one with the least error relative to its animal's
-    length.
-    """
+    """The plan that fits; of several, the one with the least error over its animal's length."""
     fitting = [one for one in looks if one.fit is not None and not one.misfits]
     return min(fitting, key=_error_share, default=None)
 
 
 def misfits_of(fit: SampleFit | None, plan: Plan) -> tuple[str, ...]:
-    """Evidence that a recording does not show the plan's animal.
-
-    Args:
-        fit: statistics of the sampled frames; None if unknown.
-        plan: its section `animal`.
-    """
+    """Evidence that a recording does not show the plan's animal; () if `fit` is None."""
     if fit is None:
         return ()
     animal = animal_of(plan)

@@ -1,5 +1,4 @@
-"""Group comparison of a cohort, `liex compare`: reads sessions, writes tests between groups as
-tables.
+"""Group comparison of a cohort, `liex compare`: tests between groups of sessions, as tables.
 
 A permutation test or a mixed model tests each measure and pair of groups over the units that were
 assigned to a group, with false discovery rates over the whole table (see `behaviour.cohort`). Every
@@ -151,9 +150,7 @@ def compare_sessions(
 
 
 def _counted_otherwise(sessions: Mapping[str, Session]) -> list[str]:
-    """A sentence on sessions of an earlier schema that compute shares differently; [] if none or
-    all do.
-    """
+    """A sentence on sessions of an earlier schema, with other shares; [] if none or all are."""
     old = [k for k, one in sessions.items() if one.metadata["schema_version"] < _OBSERVED_SHARES]
     if len(old) in (0, len(sessions)):
         return []
@@ -222,9 +219,7 @@ def _state_of(folder: Path, key: str, exclude: str = "") -> Entry:
 
 
 def _study_of(place: Path) -> Study | None:
-    """The study of a file, or the one whose results are in or around a folder; None if there is
-    none.
-    """
+    """The study of a file, or of results in or around a folder; None if there is none."""
     if place.is_file():
         return Study.load(place)
     here = place.resolve()
@@ -239,9 +234,6 @@ def _study_of(place: Path) -> Study | None:
 
 def find_copies(sessions: Mapping[str, Session]) -> dict[str, str]:
     """Sessions that duplicate another one, by input or by all measures, with the name of the other.
-
-    Args:
-        sessions: opened sessions by name.
 
     Raises:
         SessionError: two sessions of one recording are of two animals.
@@ -268,12 +260,9 @@ def find_copies(sessions: Mapping[str, Session]) -> dict[str, str]:
 
 
 def find_sessions(places: Sequence[str | Path]) -> list[Path]:
-    """Every session in the folders, each once, in order of their paths.
+    """Every session in session folders, or in folders at any depth, once and in order of path.
 
     Folders inside a session, such as its backups, are not sessions.
-
-    Args:
-        places: session folders, or folders with sessions at any depth.
 
     Raises:
         SessionError: a path is not a folder, or contains no session.

@@ -35,10 +35,6 @@ _DIGITS = 16
 def compile_ahead(animal: str, progress: Progress = silent) -> bool:
     """Compile the kernels that a run on an animal calls, unless this machine has done so before.
 
-    Args:
-        animal: name of the skeleton; nothing is compiled for one that is not listed.
-        progress: called with the number of compiled kernels.
-
     Returns:
         Whether all were compiled now; False if that is done already, on a single core, or if
         numba's compilation is off.
@@ -95,10 +91,8 @@ class _Compilers:
         self._running: list[subprocess.Popen[str]] = []
 
     def run(self, tell: Callable[[], None]) -> bool:
-        """Wait until all are done; returns whether all succeeded.
-
-        Args:
-            tell: called after each kernel.
+        """Wait until all are done; calls `tell` after each kernel and returns whether all
+        succeeded.
         """
         try:
             for command in self._commands:
@@ -137,9 +131,6 @@ def _listen(process: subprocess.Popen[str], tell: Callable[[], None]) -> bool:
 def listed_kernels(animal: str) -> Sequence[Mapping[str, Any]]:
     """The kernels that a run on an animal calls from Python.
 
-    Args:
-        animal: name of the skeleton.
-
     Returns:
         For each `kernel` ("module:name"), `args` (types, see `type_of`) and `cpu_s`, its compile
         time when the list was made; () for an animal that is not listed.
@@ -150,7 +141,7 @@ def listed_kernels(animal: str) -> Sequence[Mapping[str, Any]]:
 
 
 def compile_kernel(row: Mapping[str, Any]) -> None:
-    """Compile one kernel of `listed_kernels` into numba's cache, unless it is cached or has
+    """Compile a kernel of `listed_kernels` into numba's cache, unless it is cached or has
     changed.
     """
     from numba.core.errors import NumbaError
@@ -189,10 +180,7 @@ def _numba_types() -> Any:
 
 
 def spelling(kind: Any) -> Any:
-    """How `kernels.json` spells an argument's type.
-
-    Args:
-        kind: numba's type of a number, an array, a tuple, a NamedTuple, None or a default.
+    """How `kernels.json` spells the numba type of an argument.
 
     Raises:
         TypeError: it is another kind, such as a function.

@@ -160,9 +160,7 @@ def _is_mcap(target: Path) -> bool:
 
 
 def largest_step(recording: Recording) -> float | None:
-    """The largest step, mm, of which the depths of a few frames are multiples; None if there is
-    none.
-    """
+    """The largest step, mm, that divides all depths of a few frames; None if there is none."""
     rows = np.unique(np.linspace(0, len(recording) - 1, _N_PROBED).round().astype(int))
     depths = [recording.frame(int(row)).depth for row in rows]
     for step in _STEPS_MM:
@@ -185,8 +183,8 @@ def _step(recording: Recording, target: Path) -> float:
 
 
 def _check_target(target: Path, overwrite: bool) -> None:
-    """Refuse targets of another kind, existing ones unless `overwrite`, and folders with other
-    files.
+    """Refuse other kinds of targets, folders with other files, and existing ones unless
+    `overwrite`.
     """
     if _OTHER_KINDS.search(target.name):
         raise RecordingError(
@@ -227,11 +225,7 @@ def _written_here(path: Path) -> bool:
 
 @contextmanager
 def in_place(target: Path) -> Iterator[Path]:
-    """Yield a temporary name next to `target`; rename it to `target` on success, remove it on
-    failure.
-
-    Args:
-        target: the file or folder to write.
+    """Yield a temporary path; rename it to `target` on success, remove it on failure.
 
     Raises:
         RecordingError: it cannot be written.
@@ -453,9 +447,7 @@ def _region(
 
 
 def _stated(opened: Recording, plan: Plan) -> Corners:
-    """The corners (u, v) px of the plan's region in the recording's images; () if it states
-    none.
-    """
+    """The corners (u, v) px of the plan's region in the recording's images; () if not stated."""
     from .regions import stated_corners
 
     return () if plan.arena.region is None else stated_corners(opened, plan, plan.arena.region)

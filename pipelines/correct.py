@@ -1,5 +1,4 @@
-"""Manual corrections of a session, `liex correct`: kept in a log, from which every table is
-derived.
+"""Manual corrections of a session, `liex correct`: a log, and the tables derived from it.
 
 The original measurements are never overwritten. The folder `corrected` contains an append-only log
 of flips, moved joints and edited bouts, and the tables derived from the active ones; a rename
@@ -171,9 +170,7 @@ def _apply(raw: Session, log: Log, folder: Path, blueprint: BlueprintMaker | Non
 
 
 def _describe(raw: Session, log: Log, folder: Path) -> Log:
-    """Write the table `sessions` with the animal's corrected description; returns the log with
-    it.
-    """
+    """Write the table `sessions` with the corrected description; returns the log with this file."""
     path = folder / "sessions.parquet"
     table = pd.read_parquet(path) if path.is_file() else raw.table("sessions")
     said = {key: value for key, value in log.described.items() if key in table}
@@ -281,9 +278,7 @@ def corrected_track(session: Session, log: Log, skeleton: Skeleton) -> Corrected
 
 
 def _moves_of(log: Log, skeleton: Skeleton) -> list[JointMove]:
-    """The active moves; a later exchange of its frame turns a move into one of the mirrored
-    joint.
-    """
+    """The active moves; a later exchange of head and tail in their frame mirrors the joint."""
     names = list(skeleton.names)
     moves: list[JointMove] = []
     for one in (entry.what for entry in log.standing):

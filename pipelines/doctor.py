@@ -437,11 +437,9 @@ _FIRST = ("frames", "rate", "gaps", "intrinsics from", "floor", "arena", "animal
 
 
 def print_report(findings: dict[str, Any], verbose: bool = True) -> None:
-    """Print the findings on one screen, and the problems below.
+    """Print the findings of `examine` on one screen, and the problems below.
 
-    Args:
-        findings: from `examine`.
-        verbose: print every line, not only those that determine whether a run makes sense.
+    If not `verbose`, only lines that determine whether a run makes sense.
     """
     from rich.console import Console
     from rich.table import Table

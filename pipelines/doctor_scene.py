@@ -1,5 +1,4 @@
-"""Scene checks of `liex doctor` in the depth images: floor plane, noise, arena, water, and the
-animal.
+"""Scene checks of `liex doctor`: floor plane, noise, arena, water, and the animal.
 
 The floor is a plane fitted to the learned background; noise is the 68.3 % quantile of differences
 between frames over sqrt(2), which moving objects hardly affect. The animal is found by background
@@ -177,9 +176,7 @@ class SceneLook:
             )
 
     def _at_animal(self, background: NDArray[np.float32]) -> None:
-        """Find the animal as a run would; if there is none of the plan's size, search other
-        sizes.
-        """
+        """Find the animal as a run would, or else an object of another size."""
         from liex_lab.scene.background import sampled
         from liex_lab.scene.background_segmenter import BackgroundSubtraction
 

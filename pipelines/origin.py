@@ -28,13 +28,9 @@ _SPANS = (0.6, 1.8)
 
 
 def animal_of(plan: Plan) -> Animal:
-    """The plan's animal; for a user's own skeleton, with the skeleton's values where the plan has
-    none.
+    """The plan's animal, completed from the skeleton if that is the user's own.
 
     Its name is then the skeleton's, and its spine 0.6 to 1.8 times the skeleton's length.
-
-    Args:
-        plan: its section `animal`.
 
     Raises:
         LiexError: the skeleton's file cannot be read.
@@ -120,12 +116,7 @@ def build_background(
 
 
 def build_described_scene(segmenter: Segmenter, arena: Arena) -> Scene | None:
-    """The still scene for session.json; None for a hand, which has no floor.
-
-    Args:
-        segmenter: the learned segmentation.
-        arena: the outline of its floor.
-    """
+    """The still scene for session.json; None for a hand, which has no floor."""
     from liex_lab.scene.background_segmenter import BackgroundSubtraction
 
     if not isinstance(segmenter, BackgroundSubtraction):
@@ -153,9 +144,6 @@ def build_arena(scene: Segmenter, plan: Plan) -> tuple[Arena, tuple[Zone, ...]]:
 
 def build_zones(plan: Plan) -> tuple[DrawnZone, ...]:
     """The zones of the plan as drawn; () if it names none.
-
-    Args:
-        plan: its setting `arena.zones`.
 
     Raises:
         PlanError: the file of zones cannot be used.

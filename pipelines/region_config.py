@@ -250,9 +250,6 @@ class StatedRegions:
     def picture(self, key: str) -> tuple[NDArray[np.uint16], Camera]:
         """The usual depth of every pixel of a study's recording, in the whole image.
 
-        Args:
-            key: the recording's name in the study.
-
         Returns:
             (H, W) uint16 mm, 0 where unread, and the camera.
 

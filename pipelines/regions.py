@@ -34,11 +34,7 @@ _N_SAMPLED = 96
 
 
 def cut_out(recording: Recording, plan: Plan) -> Recording:
-    """The recording with all but the plan's region unread; unchanged if the plan states none.
-
-    Args:
-        recording: an ideal pinhole's recording.
-        plan: its setting `arena.region`.
+    """The recording with all but `arena.region` unread; unchanged if the plan states none.
 
     Raises:
         PlanError: the region lies outside the image.
@@ -70,11 +66,7 @@ def pinned(plan: Plan, recording: Recording) -> Plan:
 
 
 def stated_floor(camera: Camera, plan: Plan) -> Floor | None:
-    """The floor that the plan states; None if it is to be found.
-
-    Args:
-        camera: the ideal pinhole camera of the recording.
-        plan: its setting `arena.floor`.
+    """The floor that the plan states (`arena.floor`); None if it is to be found.
 
     Raises:
         PlanError: the floor does not face the camera.
@@ -84,11 +76,7 @@ def stated_floor(camera: Camera, plan: Plan) -> Floor | None:
 
 
 def region_of(recording: Recording, plan: Plan) -> NDArray[np.bool_] | None:
-    """The pixels (H, W) bool of the plan's region; None for all.
-
-    Args:
-        recording: an ideal pinhole's recording, cut out or not.
-        plan: its setting `arena.region`.
+    """The pixels (H, W) bool of the plan's `arena.region`; None for all.
 
     Raises:
         PlanError: the region lies outside the image.
@@ -129,11 +117,7 @@ def _sampled(recording: Recording, plan: Plan) -> tuple[SampledScene, int]:
 
 
 def arenas_of(recording: Recording, plan: Plan) -> list[SeveralArenas]:
-    """The arenas of a recording, as listed in the plan or as proposed.
-
-    Args:
-        recording: an ideal pinhole's recording, of the whole image.
-        plan: its setting `arenas`.
+    """The arenas of a recording of the whole image, as listed in the plan or as proposed.
 
     Raises:
         PlanError: the setting is 'auto', and fewer than two are found.
@@ -151,11 +135,7 @@ def arenas_of(recording: Recording, plan: Plan) -> list[SeveralArenas]:
 
 
 def propose_arenas(recording: Recording, plan: Plan) -> list[SeveralArenas]:
-    """The arenas in which animals move, from left to right and top to bottom.
-
-    Args:
-        recording: an ideal pinhole's recording, of the whole image.
-        plan: the animals' sizes and the foreground's thresholds.
+    """The arenas in which animals move, from left to right and top to bottom of the whole image.
 
     Returns:
         Two to eight of them, with disjoint polygons; [] if only one is found.

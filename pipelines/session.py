@@ -231,11 +231,7 @@ def _check_subject(opened: Recording, path: Path, plan: Plan) -> list[str]:
 
 
 def check_unused(folder: Path, overwrite: bool) -> None:
-    """Refuse a session folder that exists already, or that another process writes.
-
-    Args:
-        folder: the planned session folder.
-        overwrite: replace an existing session.
+    """Refuse to write a session that exists (unless `overwrite`) or that another process writes.
 
     Raises:
         SessionError: the session cannot be written there.
@@ -280,13 +276,7 @@ class Prepared:
     def measure_all(
         self, stretches: Iterable[list[DepthFrame]], writer: SessionWriter, progress: Progress
     ) -> None:
-        """Measure consecutive stretches of frames, some concurrently, and pass them to the writer.
-
-        Args:
-            stretches: of this recording.
-            writer: of the session.
-            progress: called frame by frame.
-        """
+        """Measure consecutive stretches of frames, some concurrently, and write them."""
         with closing(observed(self.fitted.tracker, stretches)) as coming:
             began = time.perf_counter()
             for frames, seen in coming:
@@ -372,10 +362,6 @@ def read_ahead(opened: Recording, first: int) -> Generator[list[DepthFrame], Non
     """Chunks of frames from `first` on, the next read while one is measured.
 
     Rendered recordings are not read ahead, as rendering takes all cores.
-
-    Args:
-        opened: an open recording.
-        first: row of the first frame.
     """
     if opened.format == "synthetic":
         yield from opened.chunks(CHUNK, first)
@@ -387,10 +373,6 @@ def read_ahead(opened: Recording, first: int) -> Generator[list[DepthFrame], Non
 
 def make_track(writer: SessionWriter, fitted: Fitted) -> Verdict:
     """Make the track of a session whose frames have all been measured, and pass it to the writer.
-
-    Args:
-        writer: has the observations, and allocates the track's arrays.
-        fitted: the plan and its tracker that measured the frames.
 
     Returns:
         The verdict on the session.
@@ -443,13 +425,7 @@ def make_track(writer: SessionWriter, fitted: Fitted) -> Verdict:
 
 
 def conclude(writer: SessionWriter, plan: Plan, timings: dict[str, float]) -> Session:
-    """Measure the behaviour and move the session to its folder; returns the finished session.
-
-    Args:
-        writer: has the track as rows.
-        plan: rules and action model.
-        timings: seconds of `prepare` and `track`, for session.json.
-    """
+    """Measure the behaviour and move the session to its folder; returns the finished session."""
     behaviour, notes = measure_behaviour(writer.rows, plan, writer.origin, writer.allocate)
     writer.note(**notes, problems=_told_refused(notes))
     rest()

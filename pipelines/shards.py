@@ -67,9 +67,6 @@ class Shard:
 def measure_shard(shard: Shard) -> Shard:
     """Measure a shard and write it: the task of a worker. It may safely run twice.
 
-    Args:
-        shard: the span of frames.
-
     Returns:
         The same shard, once its folder is complete.
     """
@@ -134,9 +131,7 @@ def measure_shards(pool: WorkerPool, whole: Shard, path: Path, progress: Progres
 
 
 def _cuts(first: int, stop: int) -> Iterator[tuple[int, int]]:
-    """Frames first to stop cut at multiples of `LENGTH`, so that every run makes the same
-    shards.
-    """
+    """Frames first to stop cut at multiples of `LENGTH`, the same shards in every run."""
     while first < stop:
         last = min(stop, (first // LENGTH + 1) * LENGTH)
         yield first, last

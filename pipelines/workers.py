@@ -40,12 +40,7 @@ class WorkerPool(Protocol):
         """Whether its workers can read this machine's temporary files."""
 
     def each(self, do: Callable[[Work], Done], works: Sequence[Work]) -> Iterator[Done]:
-        """Results of `do` for each task, as they arrive, in any order.
-
-        Args:
-            do: the task; it and its argument can be pickled.
-            works: the arguments, one per task.
-        """
+        """Results of `do` for each task, as they arrive, in any order; tasks can be pickled."""
 
 
 @dataclass(frozen=True)
@@ -65,11 +60,7 @@ class Processes:
     here: bool = True
 
     def each(self, do: Callable[[Work], Done], works: Sequence[Work]) -> Iterator[Done]:
-        """Results of `do` for each task, as they arrive, in any order.
-
-        Args:
-            do: the task; it and its argument can be pickled.
-            works: the arguments, one per task; without any, no process is started.
+        """Results of `do` for each task, as they arrive, in any order; tasks can be pickled.
 
         Raises:
             SessionError: a process died, perhaps from lack of memory.
@@ -119,11 +110,7 @@ def n_cores() -> int:
 
 
 def worker_environment(n_threads: int) -> dict[str, str]:
-    """Environment variables that make workers share the cores instead of each using all of them.
-
-    Args:
-        n_threads: threads of numba, OpenMP and OpenBLAS in each worker.
-    """
+    """Environment variables that limit a worker to so many threads (numba, OpenMP, OpenBLAS)."""
     return {
         name: str(n_threads)
         for name in ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS")

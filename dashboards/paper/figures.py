@@ -71,11 +71,6 @@ _APART = 12  # least distance between two of them, frames
 def draw_paper(results: Results, further: Mapping[str, Any], folder: Path) -> list[Path]:
     """Write every figure for which there are results.
 
-    Args:
-        results: evaluation results by animal.
-        further: results of other verbs.
-        folder: where the PNG files are written.
-
     Returns:
         Paths of the figures.
     """
@@ -182,9 +177,7 @@ def draw_sensitivity(results: Results, path: Path) -> Path:
 
 
 def draw_cumulative(results: Results, path: Path) -> Path:
-    """Fig. 8: share of frames whose mean joint error is at most so many mm; lost frames never
-    count.
-    """
+    """Fig. 8: share of frames with at most so many mm mean joint error; lost frames never count."""
     figure, grid = _sheet(len(results), max(len(one["splits"]) for one in results), 4.2, 3.2)
     for line, one in zip(grid, results, strict=True):
         for panel, split in zip(line, one["splits"], strict=False):
@@ -326,9 +319,7 @@ def draw_candidates(shown: Mapping[str, Any], path: Path) -> Path:
 
 
 def draw_convergence(shown: Mapping[str, Any], path: Path) -> Path:
-    """Fig. 16: one candidate from start to end, and the errors of all after every joint and
-    round.
-    """
+    """Fig. 16: one candidate from start to end, and all errors after every joint and round."""
     steps = shown["steps"]
     n = len(steps["names"])
     stages = np.unique(np.linspace(0, n - 1, min(_MOST_STAGES, n)).round().astype(int))
@@ -462,8 +453,7 @@ def draw_key_frames(acts: Sequence[Mapping[str, Any]], path: Path) -> Path:
 
 
 def draw_confusions(result: Mapping[str, Any], path: Path) -> Path:
-    """Fig. 20: confusion matrices of cut-out actions; rows are the true actions, shares in per
-    cent.
+    """Fig. 20: confusion matrices of cut-out actions, in per cent; rows are the true actions.
 
     Args:
         result: from `evaluate_actions`: confusion, accuracies and their 95 % intervals.

@@ -172,9 +172,7 @@ def _number(value: float | None, digits: int = 2) -> str:
 
 
 def error_table(results: Results) -> Table:
-    """One animal's medians: a row per method, and one for the wrong objects that all methods
-    share.
-    """
+    """One animal's medians: a row per method, and one for wrong objects, common to all methods."""
     published = PUBLISHED_MM.get(results["animal"], {})
     splits = results["splits"]
     rows = []
@@ -272,8 +270,7 @@ def origin_table(results: Sequence[Results]) -> Table:
 
 
 def notes_of(results: Results, quick: bool) -> list[str]:
-    """Notes on rows that are missing, from another version or other postures, or ranked
-    differently.
+    """Notes on missing rows, other versions, other test postures, and different rankings.
 
     A quick run makes no claim about the order of the methods.
     """
@@ -338,8 +335,8 @@ def _turned_pairs(results: Results) -> Iterator[str]:
 def exhibits(
     results: Sequence[Results], further: Mapping[str, Any], figures: Sequence[Path], quick: bool
 ) -> dict[str, dict[str, Any]]:
-    """The page's content for each label of the paper: tables, notes, figures, or why there are
-    none.
+    """The page's content for each label of the paper: tables, notes and figures, or why it is
+    empty.
     """
     tables: dict[str, list[tuple[str, Table]]] = {label: [] for label in _LABELS}
     notes: dict[str, list[str]] = {label: [] for label in _LABELS}

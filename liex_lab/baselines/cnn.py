@@ -298,12 +298,7 @@ class Cnn(Sizeless):
 
     @staticmethod
     def load(path: Path, skeleton: Skeleton, plan: CnnPlan) -> Cnn:
-        """Read the weights of a trained network.
-
-        Args:
-            path: file with the bytes of `to_bytes`.
-            skeleton: the animal's skeleton.
-            plan: the plan that the network was built with.
+        """Read the weights of a trained network from a file with the bytes of `to_bytes`.
 
         Raises:
             ModelError: the file is damaged, or its weights do not fit the plan.
@@ -325,7 +320,7 @@ class Cnn(Sizeless):
 
 
 def _channels(patches: NDArray[np.float32]) -> torch.Tensor:
-    """Patches (n, 224, 224) of 0-255 as the network's input: three equal channels of about -1
+    """Patches (n, 224, 224) of 0-255 as the network's input, three equal channels of about -1
     to 1.
     """
     import torch

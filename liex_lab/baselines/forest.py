@@ -138,12 +138,7 @@ class RegressionForest(Sizeless):
 
     @staticmethod
     def load(path: Path, skeleton: Skeleton, plan: ForestPlan) -> RegressionForest:
-        """Read a trained pair of forests.
-
-        Args:
-            path: file with the bytes of `to_bytes`.
-            skeleton: the animal's skeleton.
-            plan: the plan that the forests were trained with.
+        """Read a trained pair of forests from a file with the bytes of `to_bytes`.
 
         Raises:
             ModelError: the file does not contain two complete forests.
@@ -183,8 +178,7 @@ def as_seen(skeleton: Skeleton, home_turn: tuple[float, ...]) -> Skeleton:
 
 
 def levers(skeleton: Skeleton) -> Array:
-    """Lever arm of each coordinate of F2, (D,) mm: how far a unit of it moves the home pose's
-    joints.
+    """Lever arms (D,) mm of F2's coordinates: how far a unit moves the home pose's joints.
 
     It is the root mean square over all joints, and at least 5 % of the animal's length for
     rotations. Coordinates are the base's rotation about x, y, z (rad), its translation (mm, lever

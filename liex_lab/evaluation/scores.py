@@ -252,7 +252,7 @@ class Followed:
 
     @property
     def covered(self) -> Mask:
-        """(m,) bool, `inside` of the joint coordinates that have a pose and a standard
+        """(m,) bool, `inside` of the joint coordinates with both a pose and a standard
         deviation.
         """
         return self.inside[np.isfinite(self.joints) & np.isfinite(self.sd_mm)]
@@ -422,9 +422,7 @@ class Tally:
         self.flipped.append(is_flipped(one.joints_camera[rows], truth.joints_camera[rows], tip))
 
     def figures(self) -> dict[str, Any]:
-        """Results of the scene, see `SCENES_PROTOCOL`; None if there are no frames to compute one
-        from.
-        """
+        """Results of the scene, see `SCENES_PROTOCOL`; None for those without frames."""
         errors = np.concatenate(self.errors_mm)
         some = len(errors) > 0
         return {
@@ -440,8 +438,7 @@ class Tally:
 
 
 def matched(truths: Sequence[TrueAnimal], individuals: Sequence[Individual]) -> dict[int, int]:
-    """Assign individuals of a session to true animals by the least sum of errors (Hungarian
-    method).
+    """Assign individuals to true animals by the least sum of errors (Hungarian method).
 
     An error is capped at a spine's length, which is also the error of a missing pose.
 

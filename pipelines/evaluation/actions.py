@@ -231,10 +231,6 @@ def paper_names(
 ) -> dict[str, list[list[str]]]:
     """The actions that the paper's forests assign to test sequences, by descriptor and seed.
 
-    Args:
-        train: cut-out sequences for training.
-        test: cut-out sequences to recognise.
-
     Returns:
         For each descriptor (`tangent`, `joints`) and seed, one action per test sequence.
     """
@@ -287,10 +283,6 @@ def contradictions(
     recogniser: TimelineModel, tracks: Sequence[LabelledTrack]
 ) -> dict[str, dict[str, Any]]:
     """Number of bouts that contradict their printed definition, as in the table `bouts`.
-
-    Args:
-        recogniser: names the tracks.
-        tracks: of uncut recordings.
 
     Returns:
         `unchecked` and `checked` (as in `liex run`), each with the numbers of `bouts`, of
@@ -379,11 +371,6 @@ def speed_only(
 
     It shows that the task is not solved by speed alone. The tree has depth 8 and at least 50
     samples per leaf, and classes are balanced.
-
-    Args:
-        train: labelled tracks for training.
-        test: labelled tracks to recognise.
-        recogniser: its clock, Hz, and its actions.
     """
     (x, y), (asked, true) = (_speeds(some, recogniser.clock_hz) for some in (train, test))
     tree = DecisionTreeClassifier(

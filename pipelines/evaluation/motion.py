@@ -97,9 +97,7 @@ class Motion:
         }
 
     def change(self) -> dict[str, Array]:
-        """Rates of change (m,) of position, direction and angles by name; {} without a frame
-        rate.
-        """
+        """Rates of change (m,) of position, direction and angles; {} without a frame rate."""
         if self.rate_hz is None or self.clips is None:
             return {}
         lag = max(1, round(self.rate_hz * _STEP_S))
@@ -131,10 +129,6 @@ def _elevation(direction: Array) -> Array:
 
 def motion_figures(real: Motion, virtual: dict[str, Motion]) -> dict[str, Any]:
     """Quantiles of postures and rates of change of a real animal and of virtual ones.
-
-    Args:
-        real: the real animal.
-        virtual: virtual ones by name.
 
     Returns:
         `quantiles`: by measure, then by animal, the values at `QUANTILES`; `outside`: by virtual
@@ -175,9 +169,7 @@ def motion_figures(real: Motion, virtual: dict[str, Motion]) -> dict[str, Any]:
 
 
 def _shown(motion: Motion) -> dict[str, Array]:
-    """Postures, angles on the floor without their sign and about their median, and rates of
-    change.
-    """
+    """Postures, angles on the floor also unsigned and about their median, and rates of change."""
     shown: dict[str, Array] = {}
     for name, values in motion.posture().items():
         shown[name] = np.abs(values) if name in _UNSIGNED else values
@@ -187,12 +179,7 @@ def _shown(motion: Motion) -> dict[str, Array]:
 
 
 def nearest(real: Motion, virtual: Motion) -> Array:
-    """Difference (n,) degrees of each real posture to the most similar virtual one.
-
-    Args:
-        real: n frames.
-        virtual: m postures, compared with their mirror images as well.
-    """
+    """Difference (n,) degrees of each real posture to the most similar virtual or mirrored one."""
     own, drawn = (_angles(one) for one in (real, virtual))
     mirrored = drawn * np.array([-1.0 if name in _UNSIGNED else 1.0 for name in POSTURE[:-1]])
     drawn = np.concatenate([drawn, mirrored])

@@ -174,11 +174,7 @@ def shown_hands(
 
 
 def labels_used(numbers: Numbers) -> str:
-    """A sentence on the use of test frames' labels in our hand model.
-
-    Args:
-        numbers: (n,) numbers of the frames that are measured, from 1 on.
-    """
+    """A sentence on test labels in our hand model, for frame numbers (n,) from 1 on."""
     n = int((numbers <= N_FIRST_PERSON).sum())
     return _LABELS.format(share=100 * SEEN_SHARE, last=N_FIRST_PERSON, n=n, of=len(numbers))
 

@@ -384,10 +384,6 @@ def track(estimator: PoseEstimator, recording: TrueRecording, plan: Plan) -> Bui
 def build_figures(rows: Sequence[Built], joints: Sequence[str]) -> dict[str, Any]:
     """Results over some recordings, see `BUILDS_PROTOCOL`.
 
-    Args:
-        rows: the recordings, at least one.
-        joints: names of the joints.
-
     Returns:
         By name; without a pose, only those that need none.
     """
@@ -434,9 +430,7 @@ def build_figures(rows: Sequence[Built], joints: Sequence[str]) -> dict[str, Any
 
 
 def _reliability(told: Array, flipped: NDArray[np.bool_]) -> list[dict[str, Any]]:
-    """By classes of the predicted flip probability (m,), the number of poses and the flipped
-    share.
-    """
+    """Number of poses and share of flipped ones by classes of the predicted probability (m,)."""
     rows = []
     for low, high in pairwise(_FLIP_CLASSES):
         some = (told >= low) & ((told < high) | (high == _FLIP_CLASSES[-1]))

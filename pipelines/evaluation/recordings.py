@@ -212,9 +212,7 @@ def read_all(path: str, n_repeats: int) -> dict[str, float]:
 def evaluate_kinds(n_frames: int, folder: Path) -> dict[str, Any]:
     """The cost of a whole run of each kind of recording, after a first run has compiled everything.
 
-    Args:
-        n_frames: length of each recording.
-        folder: an empty folder to write into.
+    The recordings are written into an empty folder.
 
     Returns:
         By kind, the numbers defined in `DEFINITIONS`.
@@ -274,9 +272,7 @@ def as_mcap(recording: Recording, place: Path) -> Path:
 
 
 def as_moseq(recording: Recording, place: Path) -> Path:
-    """Write a recording like a session packed by MoSeq's extract: its folder's files in a
-    .tar.gz.
-    """
+    """Write a recording like a session packed by MoSeq's extract, as a .tar.gz."""
     folder = place / "session_walk"
     frames: Iterable[DepthFrame] = recording
     with MoseqWriter(folder, recording.camera) as writer:

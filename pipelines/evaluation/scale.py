@@ -279,9 +279,7 @@ def _side_by_side(recording: Path, folder: Path) -> dict[str, Any]:
 
 @contextmanager
 def _on_cores(n: int) -> Iterator[None]:
-    """Restrict processes that are started in the block to so many cores, if the system supports
-    it.
-    """
+    """Restrict processes that are started in the block to `n` cores, if the system supports it."""
     before = os.sched_getaffinity(0) if hasattr(os, "sched_setaffinity") else set()
     if before:
         os.sched_setaffinity(0, sorted(before)[:n])

@@ -169,10 +169,6 @@ def _measure_row(
 def run_product(recording: TrueRecording, plan: Plan) -> Outcome:
     """Measure a recording as a user does, and read the tables back.
 
-    Args:
-        recording: the recording.
-        plan: the plan.
-
     Returns:
         The tables' joints in the camera frame, the run's messages, and its exit code.
     """

@@ -398,9 +398,7 @@ def _film(
 def looped(
     short: Recording, n_frames: int, name: str = "long", step_ns: int = STEP_NS
 ) -> Recording:
-    """A recording of any length that repeats a short one's frames, in memory, forwards and
-    backwards.
-    """
+    """A recording of any length: a short one's frames, in memory, forwards and backwards."""
     depth = [short.frame(row).depth for row in range(len(short))]
     rows = to_and_fro(len(depth), n_frames)
     long = Recording(

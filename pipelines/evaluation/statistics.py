@@ -51,12 +51,7 @@ class StudyPlan:
     effect: float = 0.0
 
     def draw(self, rng: np.random.Generator, n_studies: int) -> pd.DataFrame:
-        """Independent studies of the design: a row per session, a column study_k per study.
-
-        Args:
-            rng: random number generator for all three levels.
-            n_studies: number of columns.
-        """
+        """Independent studies of the design: a row per session, a column study_k per study."""
         n_cages = self.n_cages if self.within else 2 * self.n_cages
         n_animals = n_cages * self.n_animals
         cage = np.repeat(np.arange(n_cages), self.n_animals)
@@ -123,14 +118,7 @@ def evaluate_statistics(
 
 
 def error_rates(plan: StudyPlan, n_studies: int, rng: np.random.Generator) -> dict[str, float]:
-    """Shares of studies without an effect: p <= 5 %, interval contains 0, tested by the mixed
-    model.
-
-    Args:
-        plan: the design.
-        n_studies: number of studies.
-        rng: random number generator for the studies and the permutations' seeds.
-    """
+    """Shares of studies without an effect: p <= 5 %, interval contains 0, mixed model used."""
     from scipy.stats import ttest_ind
 
     tests = []
@@ -151,13 +139,9 @@ def error_rates(plan: StudyPlan, n_studies: int, rng: np.random.Generator) -> di
 
 
 def power(plan: StudyPlan, effect: float, n_studies: int, rng: np.random.Generator) -> float:
-    """Share of studies with an effect in which the test detects it, p <= 5 %.
+    """Share of studies in which the test detects an effect, p <= 5 %.
 
-    Args:
-        plan: the design.
-        effect: in standard deviations between animals.
-        n_studies: number of studies.
-        rng: random number generator for the studies and the permutations' seeds.
+    The effect is in standard deviations between animals.
     """
     real = replace(plan, effect=effect)
     return _share(

@@ -47,11 +47,8 @@ class Watch(ABC):
     """
 
     def __init__(self, client: Client, every_s: float) -> None:
-        """Prepare the thread.
-
-        Args:
-            client: of the cluster; its pending futures are the remaining sessions.
-            every_s: interval between two checks, s.
+        """Prepare to check every `every_s` s; pending futures of the client are remaining
+        sessions.
         """
         self.gave_up = ""
         self._client, self._every_s = client, every_s
@@ -100,13 +97,7 @@ class KeptWorkers(Watch):
     """
 
     def __init__(self, client: Client, cluster: Any, every_s: float = 5.0) -> None:
-        """Watch the workers of a cluster.
-
-        Args:
-            client: of the cluster.
-            cluster: a `distributed.LocalCluster`.
-            every_s: interval between two checks, s.
-        """
+        """Watch the workers of a `distributed.LocalCluster` every `every_s` seconds."""
         super().__init__(client, every_s)
         self._cluster = cluster
         self._gone_since: dict[Any, float] = {}  # by nanny
@@ -185,10 +176,7 @@ class SlurmTable(BaseModel):
 
     @staticmethod
     def load(path: str | Path) -> SlurmTable:
-        """Read the settings from a TOML file.
-
-        Args:
-            path: the file; `slurm` is the bundled one.
+        """Read the settings from a TOML file; `slurm` is the bundled one.
 
         Raises:
             StudyError: there is no such file, or a setting is not valid.
@@ -355,10 +343,7 @@ def crew_of(
 
 
 def is_encrypted(scheduler: str) -> bool:
-    """Whether traffic to a scheduler is encrypted.
-
-    Args:
-        scheduler: its address, as in tcp://10.0.0.1:8786.
+    """Whether traffic to a scheduler's address, as in tcp://10.0.0.1:8786, is encrypted.
 
     Raises:
         StudyError: it is not the address of a scheduler.
@@ -503,12 +488,7 @@ def slurm_cluster(table: SlurmTable, scratch: str) -> Any:
 
 
 def slurm_options(table: SlurmTable, scratch: str) -> dict[str, Any]:
-    """The options of one job: a worker that measures a session at a time on all its cores.
-
-    Args:
-        table: how to request jobs.
-        scratch: folder for temporary files if the table names none.
-    """
+    """The options of one job: a worker that measures a session at a time on all its cores."""
     exports = [
         f"export {name}={value}" for name, value in worker_environment(table.cores_per_job).items()
     ]

@@ -111,11 +111,9 @@ def _ended(session: PlannedSession, run_id: str) -> dict[str, Any] | None:
 
 
 def quarantine(session: PlannedSession, failure: dict[str, Any]) -> None:
-    """Write failed.json into the session's folder, with plan and input to detect changes.
+    """Write failed.json into the session's folder, and set older results aside.
 
-    Args:
-        session: the session that failed; its older results are set aside.
-        failure: from `describe_failure`.
+    The file contains plan and input, to detect changes.
     """
     known = {
         "session_id": session.id,
@@ -265,9 +263,7 @@ def _why_died(error: BaseException, stage: str) -> dict[str, Any]:
 def _on_worker(
     run: RunSession, session: PlannedSession, run_id: str, shared: bool
 ) -> dict[str, Any]:
-    """The task: measure one session, its shards by all workers if `shared`; reports to the
-    client.
-    """
+    """The task: measure one session and report to the client; `shared` uses all workers."""
     return measure_one(session, run, _teller(session), run_id, Workers() if shared else None)
 
 
@@ -312,10 +308,6 @@ class Workers:
         """Results of a task per shard, as they arrive; see `workers.WorkerPool`.
 
         The calling task yields its worker meanwhile, which measures shards like the others.
-
-        Args:
-            do: the task.
-            works: its arguments, one per task.
         """
         from distributed import as_completed, worker_client
 

@@ -131,9 +131,6 @@ def find_twins(recordings: Sequence[Path]) -> dict[Path, Path]:
     Two recordings are duplicates if they are in one folder and their names differ only by the
     suffix, like an archive and its unpacked folder, or if their largest files have the same size,
     beginning and end.
-
-    Args:
-        recordings: paths of recordings.
     """
     kept: dict[object, Path] = {}
     twins: dict[Path, Path] = {}
@@ -163,8 +160,7 @@ def _content(path: Path) -> tuple[object, ...]:
 def find_recordings(folder: Path) -> list[Path]:
     """Every recording below a folder, in order of name, without results and hidden files.
 
-    Args:
-        folder: searched recursively, except inside folders that are recordings.
+    Folders that are recordings are not searched.
     """
     found = []
     for inside, folders, names in os.walk(folder):
@@ -229,9 +225,7 @@ def name_sessions(stated: Mapping[Path, str], raw: Path) -> tuple[list[Named], l
 
 
 def _pairs(text: str) -> str:
-    """A session's name: unchanged if it consists of key-value pairs, otherwise its letters and
-    digits.
-    """
+    """A session's name: unchanged if made of key-value pairs, otherwise its letters and digits."""
     kept = re.fullmatch(r"[A-Za-z0-9]{1,32}(?:_[A-Za-z0-9]{1,32}-[A-Za-z0-9]{1,64}){0,5}", text)
     return text if kept else letters(text)[:32]
 

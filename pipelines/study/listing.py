@@ -24,8 +24,7 @@ from .status import SessionStatus, standings, to_look_at
 def list_sessions(place: str | Path) -> tuple[str, Callable[[], Sequence[Entry]]]:
     """The name of a study, and a function that lists its sessions from disk at each call.
 
-    Args:
-        place: a study's .toml file, a folder with a study.toml, or a folder with sessions in it.
+    `place` is a study's .toml file, a folder with a study.toml, or a folder with sessions in it.
 
     Raises:
         StudyError: there is no such file or folder.
@@ -101,9 +100,7 @@ STUDY_SESSIONS = table_columns(TABLE)
 
 
 def write_study_table(study: Study, standings: Sequence[SessionStatus]) -> Path:
-    """Write study.parquet, study.csv and study_columns.json of a study; returns the path of the
-    CSV.
-    """
+    """Write study.parquet, study.csv and study_columns.json; returns the path of the CSV."""
     import csv
     import io
 
@@ -127,12 +124,7 @@ def write_study_table(study: Study, standings: Sequence[SessionStatus]) -> Path:
 
 
 def study_rows(study: Study, standings: Sequence[SessionStatus]) -> list[dict[str, Any]]:
-    """One row per session, with the columns of `STUDY_SESSIONS` as keys.
-
-    Args:
-        study: the study; paths are relative to its folder.
-        standings: the status of its sessions.
-    """
+    """One row per session with the columns of `STUDY_SESSIONS`; paths are relative to the study."""
     return [_row(study, one) for one in standings]
 
 

@@ -52,11 +52,7 @@ _SAYS = {".toml", ".txt", ".csv", ".json", ".yaml", ".yml"}
 
 
 def what_changed(session: PlannedSession, document: dict[str, Any]) -> str:
-    """Why a stored session differs from the planned one; '' if it does not.
-
-    Args:
-        session: the planned session.
-        document: the stored session.json, failed.json or look.json.
+    """Why a stored session.json, failed.json or look.json differs from the plan; '' if it does not.
 
     Raises:
         PlanError: the stored plan is not valid.
@@ -79,12 +75,7 @@ def _version_changed(document: dict[str, Any]) -> str:
 
 
 def plan_changed(plan: Plan, stored: dict[str, Any]) -> str:
-    """How a plan differs from the one that a session was measured with; '' if it does not.
-
-    Args:
-        plan: the current plan.
-        stored: the plan in session.json.
-    """
+    """How a plan differs from the stored one of a session.json; '' if it does not."""
     then = Plan.from_table(stored).model_dump()
     now = plan.model_dump()
     if plan.recording.mirrored is None:  # then it is estimated, and the result is stored
@@ -127,10 +118,9 @@ def _input_changed(session: PlannedSession, stored: dict[str, Any]) -> str:
 
 
 def input_stamp(recording: str) -> str:
-    """A short hash of names, sizes and times of a recording's files and of the metadata next to
-    them.
+    """A short hash of names, sizes and times of a recording's files and metadata files.
 
-    It is cheap, as no content is read. Metadata are files such as .toml, .csv and .json.
+    It is cheap, as no content is read. Metadata are files next to it such as .toml, .csv and .json.
 
     Args:
         recording: a path, or the address of a virtual recording, which is returned unchanged.
@@ -207,9 +197,7 @@ class Shared:
 
 
 def shared_sessions(study: Study) -> list[Shared]:
-    """The sessions of a study, in order, with size and shape shared according to the stored
-    findings.
-    """
+    """The sessions of a study, in order, with size and shape shared by the stored findings."""
     known = {session.id: Shared(session) for session in study.sessions}
     for group in _groups(study):
         looks: dict[str, Any] = {session.id: read_look(session) for session in group}
@@ -257,12 +245,7 @@ def _groups(study: Study) -> list[list[PlannedSession]]:
 def together(
     group: Sequence[PlannedSession], looks: Mapping[str, dict[str, Any]]
 ) -> list[PlannedSession]:
-    """The sessions of one animal with the shared values in their plans, or why they do not share.
-
-    Args:
-        group: sessions of one animal.
-        looks: findings on each of them, by id, from `look_at`.
-    """
+    """The sessions of one animal with the shared values in their plans, or why there are none."""
     subject = group[0].animal.id
     taking_part = {s.id: found_in(looks[s.id]) for s in group if not _why_not(looks[s.id])}
     alone = f"The sessions of {subject} do not share size and shape"
@@ -314,10 +297,7 @@ def _left_out(session: PlannedSession, look: Mapping[str, Any]) -> str:
 
 
 def found_in(look: Mapping[str, Any]) -> Found:
-    """The findings on an animal, from a look.
-
-    Args:
-        look: from `look_at`, of a session that shows the animal.
+    """The findings on an animal, from `look_at` of a session that shows it.
 
     Raises:
         ValueError: it is damaged.
@@ -369,10 +349,6 @@ class Stage:
 
 def look_at(session: PlannedSession, progress: Progress = silent) -> dict[str, Any]:
     """Estimate the animal's size and shape from a session's sampled frames, without writing files.
-
-    Args:
-        session: the planned session.
-        progress: called with the current step.
 
     Returns:
         The content of look.json: plan, model and input, and `animal`, `log_sd`, `n_frames`,

@@ -164,8 +164,7 @@ def to_check(found: Sequence[SessionStatus]) -> list[str]:
 def misnamed(sessions: Sequence[PlannedSession]) -> list[str]:
     """Sentences on sessions whose recordings are named after another animal of the study.
 
-    Args:
-        sessions: those of the study; sessions with a region, as one of several arenas, are skipped.
+    Sessions with a region, as one of several arenas, are skipped.
     """
     known = {same(one.animal.id): one.animal.id for one in sessions}
     notes = []
@@ -183,9 +182,6 @@ def misnamed(sessions: Sequence[PlannedSession]) -> list[str]:
 def to_look_at(verdict: Mapping[str, Any]) -> str:
     """Why a session that is done needs review, and cautions about it.
 
-    Args:
-        verdict: from `sessions.verdict.read_verdict`.
-
     Returns:
         The session's own wording; '' if there is nothing to report.
     """
@@ -199,9 +195,7 @@ def to_look_at(verdict: Mapping[str, Any]) -> str:
 
 
 def _described_anew(session: PlannedSession, document: dict[str, Any]) -> dict[str, str]:
-    """Descriptions of animal and session in the plan that differ from the results; '' removes
-    one.
-    """
+    """Descriptions in the plan that differ from those of the results; '' removes one."""
     stated = session.plan.session.model_dump()
     then = Plan.from_table(document.get("plan", {})).session.model_dump()
     described = read_log(session.folder).described

@@ -279,9 +279,7 @@ _FAST_SHARE = 1.0 / 6.0  # share of every test recording that is also filmed by 
 def cut_sequences(animal: str, test: bool) -> list[Scenario]:
     """Cut-out sequences of single actions, the actions in turn: the paper's experiment.
 
-    Args:
-        animal: `fish` or `mouse`, a key of `WORDS`.
-        test: the 173 test sequences of two individuals, else the 426 training sequences of five.
+    426 training sequences of five individuals, or 173 test sequences of two.
     """
     individuals, n = (_TEST_FISH, N_TEST) if test else (_TRAIN_FISH, N_TRAIN)
     words = WORDS[animal]
@@ -298,9 +296,7 @@ def cut_sequences(animal: str, test: bool) -> list[Scenario]:
 
 
 def training_recordings(animal: str) -> list[Scenario]:
-    """Uncut training recordings of a `fish` or `mouse`, 40 s each; also 8 of fish at 100 Hz, 20 s
-    each.
-    """
+    """Uncut training recordings, 24 of 40 s each; for fish also 8 of 20 s each at 100 Hz."""
     usual = [Scenario(animal, one, 1, RATE_HZ[animal], _SECONDS) for one in _TRAIN_SET]
     return usual + [
         Scenario(animal, one, 2, FAST_HZ, _FAST_SECONDS) for one in _FAST_SET.get(animal, ())

@@ -119,12 +119,7 @@ class AgentTrack:
 
 
 def thinned(times_ns: NDArray[np.int64], rate_hz: float) -> NDArray[np.int64]:
-    """Unique rows (m,) of the frames nearest to those of a camera with another rate.
-
-    Args:
-        times_ns: (n,) int64 times of the frames, ns.
-        rate_hz: frames per second of the other camera.
-    """
+    """Unique rows (m,) of the frames at times (n,), ns, nearest to those of another frame rate."""
     times = (times_ns - times_ns[:1]) * 1e-9
     wanted = np.arange(0.0, times[-1] + 1e-9, 1.0 / rate_hz)
     after = np.clip(np.searchsorted(times, wanted), 1, len(times) - 1)

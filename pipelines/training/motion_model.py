@@ -395,10 +395,6 @@ def calibrate_joints(measured: Sequence[Seen], tuning: TrackingParameters) -> Tr
     Over a grid of both stretch coefficients (`_PER_BLUR` x `_PER_SPREAD`) the factors are fitted to
     all sequences together; the chosen pair minimises, over the sequences, the mean squared
     logarithm of the factor that each would still need.
-
-    Args:
-        measured: the sequences.
-        tuning: what is changed: `calibration`, `stretch` and `usual_stretch` of its motion.
     """
     plain = with_motion(
         tuning,
@@ -446,15 +442,10 @@ def _claim(each: Seen, plain: TrackingParameters) -> _Claim:
 
 
 def calibrate_builds(builds: Sequence[Seen], tuning: TrackingParameters) -> TrackingParameters:
-    """The tuning with the unobservable part of a build: height of its joints, and position along
-    it.
+    """The tuning with the unobservable part of a build, `unseen_height` and `unseen_shift`.
 
     A joint whose error e, upwards or along the body, is more than 1.645 sd needs an additional
     spread of sqrt((e / 1.645)^2 - sd^2); the animal's spread is the 90 % quantile over all joints.
-
-    Args:
-        builds: recordings of builds that no forest was trained on; without any, the spread is 0.
-        tuning: what is changed: `unseen_height` and `unseen_shift` of its motion.
     """
     plain = with_motion(tuning, unseen_height=0.0, unseen_shift=0.0)
     upwards = [np.zeros(1)]
@@ -482,17 +473,13 @@ def calibrate_builds(builds: Sequence[Seen], tuning: TrackingParameters) -> Trac
 def calibrate_each_joint(
     measured: Sequence[Seen], tuning: TrackingParameters
 ) -> TrackingParameters:
-    """The tuning with factors that correct joints whose 90 % intervals cover far more or far less.
+    """The tuning with a factor (`joint_calibration`) for joints whose 90 % intervals are far off.
 
     The factors of `calibrate_joints` are common to all joints, so some intervals are too wide and
     others too narrow. A joint's own factor is as close to 1 as possible while its intervals cover
     85 to 96 % of the coordinates in each kind of sequences; if no factor does, it is the geometric
     mean of the bounds. If the unobservable part of a build dominates an animal's intervals
     (`unseen_height`, `unseen_shift`), they stay as they are.
-
-    Args:
-        measured: the sequences, and recordings of other builds.
-        tuning: what is changed: `joint_calibration` of its motion.
     """
     plain = with_motion(tuning, joint_calibration=())
     if tuning.motion.unseen_height or tuning.motion.unseen_shift:
@@ -514,8 +501,7 @@ def calibrate_each_joint(
 
 
 def calibration_knots(claims: Sequence[_Claim], stretch: tuple[float, float]) -> Knots:
-    """Calibration factors at three levels of the stated error, by bisection; see
-    `Motion.calibration`.
+    """`Motion.calibration`: factors at three levels of the stated error, by bisection.
 
     The frames are split into `_BINS` groups of equal size by their stated error. For each, f is the
     factor at which nine errors in ten lie within 1.645 sqrt((f sd)^2 + stretch^2).
@@ -552,12 +538,8 @@ def calibration_knots(claims: Sequence[_Claim], stretch: tuple[float, float]) ->
 def calibrate_roots(measured: Sequence[Seen], tuning: TrackingParameters) -> TrackingParameters:
     """The tuning with factors for which the 90 % intervals of root and bends cover 90 %.
 
-    The root's error is the twist log(g_est^-1 g_true), rotation and then translation in its own
-    frame.
-
-    Args:
-        measured: the sequences.
-        tuning: what is changed: `root_calibration` (6,) and `bend_calibration` (3,) of its motion.
+    These are `root_calibration` (6,) and `bend_calibration` (3,). The root's error is the twist
+    log(g_est^-1 g_true), rotation and then translation in its own frame.
     """
     plain = with_motion(
         tuning,

@@ -106,10 +106,6 @@ def train_shape(
 def left_over(prior: ShapePrior, others: Sequence[MiniSession]) -> tuple[float, float]:
     """Residuals of a prior on other builds: the joints' height and position along the body.
 
-    Args:
-        prior: fitted to other families.
-        others: mini-sessions of builds that it was not fitted to, at least one.
-
     Returns:
         Standard deviations over the length, of all joints together.
     """

@@ -224,10 +224,6 @@ def measured_rows(
 def numbers_of(runs: Sequence[PoseErrors], views: Sequence[CommonView]) -> dict[str, Any]:
     """The results of a row on one split.
 
-    Args:
-        runs: errors of the n frames of each run.
-        views: the row's input in each recording.
-
     Returns:
         `median_mm`, `mean_mm`, `interval95` (of the median) and `mean_interval95` by bootstrap over
         recordings, `run_median_mm`, `wrong_object`, `wrong_object_alone`, `n_frames`,
