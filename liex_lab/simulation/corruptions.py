@@ -200,7 +200,7 @@ def beside_animal(
         scene: the scene with its walls.
         joints: (n, J, 3) of the animal during the event, mm, arena frame.
         length_mm: of the animal, mm.
-        kinds: kinds of objects to choose from, see `objects.draw_thing`.
+        kinds: kinds of objects to choose from, see `scene.draw_thing`.
 
     Returns:
         (n, V, 3) mm, arena frame, the same in every frame.

@@ -185,7 +185,7 @@ class SceneSpec:
         tilt_rad: largest tilt of a camera, rad.
         walls_mm: lowest and highest walls.
         open_share: share of scenes without walls.
-        clutter: kinds of objects in the scene, see `objects.draw_thing`.
+        clutter: kinds of objects in the scene, see `draw_thing`.
         scale: of corners, unevenness, distances and estimation errors, over those of a mouse's
             arena.
     """

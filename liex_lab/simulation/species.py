@@ -201,7 +201,7 @@ class Species(Protocol):
         skeleton: of the animal.
         sensors: makes of cameras.
         setting: ranges of its surroundings.
-        things: kinds of distractors, see `objects.draw_thing`.
+        things: kinds of distractors, see `scene.draw_thing`.
         sizes: smallest and largest animal over the nominal size.
         floats: whether it is above the floor, not on it.
         frame_ns: between two frames of a recording, ns.

@@ -25,31 +25,31 @@ from liex_lab.tracking.trust import together, told_ends, usual_pixels
 
 Array = NDArray[np.float64]
 
-_BEAM = 24  # chains under way
-_JOINTS = 8  # so many say how far an animal has moved
-_BLOCK = 16_384  # frames that are in memory at a time
-_BESIDE = 256  # and beside them, for velocities
-# how badly the metric takes an animal's build is asked of some frames, of those in which the body
-# covers the outline, hardly lies beside it, and is near to the readings (of the length)
+_BEAM = 24  # chains kept in the beam
+_JOINTS = 8  # joints used to measure an animal's displacement
+_BLOCK = 16_384  # frames in memory at once
+_BESIDE = 256  # and context frames, for velocities
+# the effect of an animal's build on the metric is estimated from sampled frames in which the body
+# covers the outline, is hardly outside it, and is near the readings (over the length)
 _SAMPLE = 2048
 _FEWEST = 12
 _AGREES_COVERED = 0.5
 _AGREES_BESIDE = 0.3
 _AGREES_RESIDUAL = 0.06
-# nats that the best pose of a known build scores at most, in the median of a recording
+# largest median score of the best pose of a known build in a recording, nats
 _ORDINARY = 2.5
-# an animal backs up at so many lengths a second at most; going tail first at twice that costs so
-# many nats a second; what moves faster is another thing that was taken for it
+# largest speed of backward motion, body lengths/s; cost of twice that speed, nats/s; larger speeds
+# are jumps to another object
 _AROUND_S = 0.2
 _BACKS_UP = 0.6
 _BACKWARD = 60.0
 _JUMPS = 25.0
-# what the metric says of head against tail is as good as new after so long
+# correlation time of the metric's evidence on head and tail, s
 _ALIKE_S = 0.1
-# of several animals one is told from another by nothing but its place: to be elsewhere costs up to
-# so many times a transition's ceiling
+# several animals differ only in position: a jump costs up to this multiple of a transition's
+# ceiling
 _OTHER = 20.0
-# and of frames in which they touch, to pass one by costs this share of what it does else
+# share of the missed-detection cost in frames in which they touch
 _TOGETHER = 0.1
 NONE = kernels.NONE
 
@@ -340,7 +340,7 @@ def backward_cost(seen: Observations, ahead: NDArray[np.float32], length_mm: flo
         backward = -(velocity * ahead).sum(axis=-1) / np.linalg.norm(ahead, axis=-1)
         share = np.clip((backward - _BACKS_UP) / _BACKS_UP, 0.0, 1.0)
         share[~(np.linalg.norm(velocity, axis=-1) < _JUMPS)] = 0.0
-    # only which way round is in question, not whether it is the animal
+    # only the heading is in question, not the identity
     other = np.arange(share.shape[1]) ^ 1
     share = np.where(seen.known & seen.known[:, other], np.nan_to_num(share), 0.0)
     share -= np.minimum(share, share[:, other])
@@ -348,14 +348,14 @@ def backward_cost(seen: Observations, ahead: NDArray[np.float32], length_mm: flo
     return np.asarray(_BACKWARD * step[:, None] * share)
 
 
-# Which of two animals in view is followed, told by their sizes where these differ.
+# Selection of one of two animals in view by size, if their sizes differ.
 
 
-_LEAST = 0.08  # of the logarithm of the larger one's pixels over the smaller one's
-_NOISE = 0.08  # standard deviation of it, at least
-_IN_ORDER = 0.9  # of the frames, while both are apart: the larger one is the larger one throughout
-_MOST = 2.0  # nats that a frame says
-_CLEARLY = 1.5  # times the residual of one animal is that of another body
+_LEAST = 0.08  # smallest logarithm of the ratio of their pixels
+_NOISE = 0.08  # smallest standard deviation of it
+_IN_ORDER = 0.9  # share of the frames with both apart in which the same one is larger
+_MOST = 2.0  # largest evidence of a frame, nats
+_CLEARLY = 1.5  # ratio of residuals that indicates another body
 
 
 def cost_of_the_other(seen: Observations, path: NDArray[np.int64]) -> Array | None:
@@ -374,7 +374,7 @@ def cost_of_the_other(seen: Observations, path: NDArray[np.int64]) -> Array | No
     """
     first, second = seen.n_px[:, 0], seen.n_px[:, 2]
     apart = seen.known[:, 0] & seen.known[:, 2] & (first != second)
-    apart &= np.minimum(first, second) > 0  # of a session that does not know, none is told
+    apart &= np.minimum(first, second) > 0  # sessions without pixel counts have none
     ratio = np.zeros(len(seen))
     ratio[apart] = np.log(first[apart] / second[apart])
     if apart.sum() < _FEWEST:

@@ -25,8 +25,8 @@ from liex_lab.tracking.observations import joints_of
 
 Array = NDArray[np.float64]
 
-_NEARER_MM = 25.0  # what is nearer than the animal's edge by so much stands before it
-_REACH_PX = 3  # picture pixels beside the edge, which a sensor often cannot read
+_NEARER_MM = 25.0  # an object nearer than the animal's edge by this much is in front of it
+_REACH_PX = 3  # pixels next to the edge, often unread by a sensor
 
 
 def behind_something(crops: HeightMaps, depths: NDArray[np.float32]) -> Array:
@@ -98,11 +98,11 @@ def is_behind(depth, v, u, dv, du, nearer, reach_px):
     return False
 
 
-_BEFORE = 2.0  # roots of the animal's area: what is so much nearer lies before it
-_WHOLE = 0.95  # of the animal's usual area: it is all there
-# of half of what is seen: where nothing lies so far to one end, no one knows which end is hidden
+_BEFORE = 2.0  # square roots of the animal's area: an object nearer by this much is in front of it
+_WHOLE = 0.95  # of the animal's usual area: it is completely visible
+# of half the visible part: without an obstruction this far to one end, the hidden end is unknown
 _ASIDE = 0.25
-_SLIDE = 0.45  # of the share that is hidden: a chain that was fitted to the rest slides no farther
+_SLIDE = 0.45  # of the hidden share: largest shift of a chain fitted to the visible rest
 
 
 @dataclass(frozen=True)
@@ -225,7 +225,7 @@ def _look(heights, origin, step, distance, depths, ends, before, out):
                     continue
                 z = distance[i] - heights[i, r, c] / 16.0
                 if depth[v, u] > 0 and abs(depth[v, u] - z) > 0.5 * before:
-                    continue  # a hole in the height map, filled from beside it
+                    continue  # a hole in the height map, filled from its neighbours
                 at = ((u - ends[i, 0, 0]) * line[0] + (v - ends[i, 0, 1]) * line[1]) / squared
                 n = n + 1
                 middle = middle + at

@@ -60,9 +60,9 @@ from liex_lab.tracking.trust import (
 
 Mask = NDArray[np.bool_]
 
-_MUCH = 0.1  # of the frames; a stream that froze for longer is one to look at
+_MUCH = 0.1  # share of frames; a longer freeze needs review
 _FEW = 5  # frames that may repeat in a recording without noise
-_SOON = 0.9  # of a step: sooner than the camera could have made another image
+_SOON = 0.9  # of a step: too short for a new image
 
 
 def asked_too_often(times_ns: NDArray[np.int64], copies: Mask, known: Mask) -> Mask:
@@ -128,20 +128,19 @@ def copies_told(
 
 Array = NDArray[np.float64]
 
-# frames smoothed at a time, and how many beside them have a say
+# frames smoothed at once, and context frames on either side
 _BLOCK = 4096
 MARGIN = 160
-# nearer to the curve than so many predicted errors, its own and the curve's, a hypothesis that was
-# passed by is a measurement after all, unless it shows less than this share of what the animal
-# usually shows, or more than that many times as much; of half an animal beside a bar the pose errs
-# by this share of the length that is not seen. Each time that some are taken, the curve comes
-# nearer to others.
+# a skipped hypothesis within this many predicted errors (its own and the curve's) of the curve is
+# accepted after all, unless its area is below this share or above this multiple of the animal's
+# usual area; the pose of a partly hidden animal errs by this share of the hidden length. Repeated,
+# as each pass moves the curve nearer to others.
 _ADMIT = 1.0
 _LEAST = 0.5
 _MOST = 1.5
 _UNSEEN = 0.4
 _TIMES = 2
-_TOLD = 0.05  # a lesser doubt about head and tail is not worth a row
+_TOLD = 0.05  # a smaller doubt about head and tail is not reported
 
 
 def track_whole(
@@ -214,7 +213,7 @@ def track_whole(
 
     usual_px = usual_pixels(seen, path)
     in_view = share_in_view(seen, path, usual_px)
-    # fitted to what is seen, a pose is off by about what is hidden
+    # a pose fitted to the visible part is off by about the hidden length
     error = np.hypot(error, (1.0 - in_view) * subject.length_mm)
     unknown = lies_unknown(in_view, doubt)
     path[unknown] = NONE
@@ -243,8 +242,8 @@ def track_whole(
             usual_px,
         )
     hidden = gone_behind(seen, measured, usual_px)
-    bridged &= ~strayed & ~hidden  # what is in view is measured, or it has no pose
-    # nobody knows what an animal does that stays half hidden for long
+    bridged &= ~strayed & ~hidden  # visible animals are measured, or have no pose
+    # the behaviour of an animal that stays half hidden is unknown
     bridged &= ~unknown | whole_gaps(seconds, measured, subject.bridge_s)
     hidden |= unknown & ~bridged
     strayed |= doubted(subject, seen, path, in_view, usual_px)

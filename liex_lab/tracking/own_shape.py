@@ -30,7 +30,7 @@ from liex_lab.tracking.residual import BodyResidual
 Array = NDArray[np.float64]
 
 FEWEST_FRAMES = 50
-_HELD_OUT = 3  # every so many-th frame is not fitted to
+_HELD_OUT = 3  # every third frame is held out from the fit
 
 
 @dataclass(frozen=True)
@@ -232,11 +232,11 @@ def _median(residual: Array) -> float:
     return float(np.median(known)) if len(known) else float("nan")
 
 
-# One body for the sessions of one animal: a random-effects mean of what each found by itself.
+# One body for the sessions of one animal: a random-effects mean of the individual estimates.
 
 
-MOST_APART = 0.08  # of the median length: beyond it the animal has grown, or is another
-_LEAST_SD = 0.001  # of the length: no session tells it better
+MOST_APART = 0.08  # of the median length: a larger difference means growth, or another animal
+_LEAST_SD = 0.001  # of the length: smallest standard deviation of a session's estimate
 
 
 @dataclass(frozen=True)

@@ -32,8 +32,8 @@ Array = NDArray[np.float64]
 
 _GIRTHS = np.linspace(0.75, 1.35, 13)  # of the default body at the animal's size
 _MIN_OVERLAP_PX = 20
-# a part of fewer pixels, or of a lesser share of all that both cover, says nothing: a finger that
-# lies wrong is no wrong hand
+# a part with fewer pixels, or a smaller share of all that both cover, is ignored: one wrong finger
+# does not make the hand wrong
 _MIN_PART_PX = 8
 _MIN_PART = 0.05
 
@@ -180,7 +180,7 @@ def render_crops(
     camera = scene.camera
     n = len(pose_arena.scale)
     vertices = surface.vertices(pose_arena, girth=across)
-    # a crop of every second pixel is the picture of a camera of half the resolution
+    # a crop of every second pixel is the image of a camera of half the resolution
     step = crops.step.astype(float)
     scaled = np.stack(
         [camera.fx / step, camera.fy / step, camera.cx / step, camera.cy / step], axis=1
@@ -295,16 +295,16 @@ def median_of(values):
     return (below + values[half]) / 2.0
 
 
-# How well a plan's animal explains a recording: absolute evidence from the frames it learned from.
+# Fit of a plan's animal to a recording: absolute evidence from the sampled frames.
 
 
-# of the plan's own lengths: sizes are measured to a few per cent, and plans state round numbers
+# of the plan's lengths: sizes are measured to a few per cent, and plans contain round numbers
 _SIZE_MARGIN = 0.15
 _LEAST_COVERED = 0.4
 _MOST_BESIDE = 0.5
 _LEAST_FOUND = 0.05
-# a second thing is an animal, too, where its body fits as well as the first's usually does
-_TWIN_SHARE = 0.2  # of the frames: it is no passing hand
+# a second object is also an animal if its body fits as well as the first's usually does
+_TWIN_SHARE = 0.2  # of the frames: excludes a passing hand
 
 
 @dataclass(frozen=True)

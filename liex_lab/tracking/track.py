@@ -23,8 +23,8 @@ from liex_lab.runtime.memory import Allocator, blocks
 
 Array = NDArray[np.float64]
 
-_BLOCK = 16_384  # frames that are in memory at a time
-CORRECTED = "corrected"  # the flag of a pose of which a person placed joints
+_BLOCK = 16_384  # frames in memory at once
+CORRECTED = "corrected"  # flag of a pose with manually placed joints
 FLAGS = {
     "": "a pose was measured and is trusted",
     "doubtful": (
@@ -293,7 +293,7 @@ class Tracked:
     cuts: tuple[int, ...] = ()
 
 
-# Whom a track is of.
+# The subject of a track.
 
 
 @dataclass(frozen=True)

@@ -31,8 +31,8 @@ from liex_lab.tracking.trust import (
 Array = NDArray[np.float64]
 
 MEAN_PER_SD = 0.8  # the mean of |x| over the standard deviation of a Gaussian x, sqrt(2 / pi)
-# a mean distance in space over the standard deviation along one axis: 1.6 of a Gaussian, but tails
-# are heavier
+# mean 3D distance over the standard deviation along one axis: 1.6 for a Gaussian, but tails are
+# heavier
 ERROR_PER_SD = 1.4
 
 
@@ -139,13 +139,13 @@ def write_curve(subject: Subject, track: Track, curve: Curve, tuning: TrackingPa
     track.scale[:] = pose.scale
     stretch = motion.usual_stretch if subject.stretch_sd is None else subject.stretch_sd
     away = stretch_of(stretch, curve.joints)
-    # two of three axes: up, and along the body, whose direction on the floor is any
+    # two of three axes: up, and along the body, at any heading
     unseen = subject.unseen or (motion.unseen_height, motion.unseen_shift)
     height, shift = (share * subject.length_mm for share in unseen)
     track.sd_mm[:] = np.hypot(
         (curve.error_mm / ERROR_PER_SD)[:, None] * np.array(subject.joint_share), away
     ) * (motion.joint_calibration or 1.0)
-    # sd_mm is what speeds and headings are made of; what is off throughout changes none
+    # sd_mm applies to speeds and headings, which constant errors do not change
     track.sd_xy_mm[:] = np.hypot(track.sd_mm, np.sqrt(0.5) * shift)
     track.sd_z_mm[:] = np.hypot(track.sd_mm, height)
     constant = np.hypot(ERROR_PER_SD * away.mean(axis=1), MEAN_PER_SD * np.hypot(height, shift))
@@ -219,7 +219,7 @@ def covariance_of_root(curve: Curve) -> Array:
     root = curve.pose.root
     out = np.zeros((len(curve.joints), 6, 6))
     lever = np.einsum("nij,ni->nj", root.rotation, curve.joints[:, 0] - curve.joints.mean(axis=1))
-    moved = -so3.hat(lever)  # of a small turn: the shift is its cross product with the lever
+    moved = -so3.hat(lever)  # for a small turn: the shift is its cross product with the lever
     turn = curve.sd_turn[:, :, None] ** 2 * np.eye(3)
     out[:, :3, :3] = turn
     out[:, 3:, :3] = moved @ turn

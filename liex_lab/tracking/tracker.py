@@ -39,7 +39,7 @@ from liex_lab.tracking.trust import WHOLE, in_view, median_of_whole
 
 BRIDGE_S = 0.5
 _MOST_COUNTED = 24  # frames in which animals are counted
-_FEWEST_WHOLE = 20  # frames that show all of an animal tell its size by themselves
+_FEWEST_WHOLE = 20  # this many frames of a fully visible animal are enough to estimate its size
 
 
 @dataclass(frozen=True)
@@ -113,7 +113,7 @@ class FrameTracker:
         estimates = estimator.estimate(sample, scene, size)
         whole = _whole(scene, sample, estimates)
         if whole.sum() < len(whole) and (whole & estimates.found).sum() >= _FEWEST_WHOLE:
-            # of half an animal nobody knows how long it is
+            # the length of a partly hidden animal is unknown
             sample = sample[whole]
             size = size if spine_mm else estimator.find_size(sample, scene)
             estimates = estimator.estimate(sample, scene, size)
@@ -124,7 +124,7 @@ class FrameTracker:
         pose = estimates.chosen.pose.moved(scene.floor.T_arena_camera)
         crops = estimates.crops
         used = estimates.found
-        shown = sample if used.all() else sample[used]  # a copy of a hundred pictures
+        shown = sample if used.all() else sample[used]  # copies about a hundred depth images
         camera_view = estimator.model.method.camera_view
         average = Surface.of(estimator.skeleton)
         body = (
@@ -148,7 +148,7 @@ class FrameTracker:
         ends = None
         if (
             camera_view and estimator.skeleton.is_chain
-        ):  # one that stands on the floor is seen from above: it may rear
+        ):  # animals on the floor are recorded from above and may rear
             ends = OcclusionCorrection.fit(
                 estimator.skeleton, scene, estimates.chosen.pose[used], crops[used], shown
             )
@@ -223,7 +223,7 @@ class FrameTracker:
         seen.repeats[:] = [frame.repeats for frame in frames]
         with threads(
             len(frames) > 1
-        ):  # kernels share frames out: of one, the other cores would only wait
+        ):  # kernels distribute frames over cores: with one frame the others would idle
             hypotheses = self.estimator.hypotheses(depths, self.scene, self.size)
             cleared = self.scene.cleared(depths)
             poses = [
@@ -328,10 +328,10 @@ class FrameTracker:
             ):
                 column[frame, hypothesis] = values
         for h in best:
-            # of all frames, as those without it are thrown away for less than pictures are copied
+            # for all frames: discarding unused values is cheaper than copying depth images
             behind = behind_something(hypotheses[h].crops, cleared)
             seen.behind[rows[h], h] = behind[rows[h]]
-            # the body turned round covers the same pixels, nearly
+            # the reversed body covers nearly the same pixels
             for column in (*columns, seen.behind):
                 column[rows[h + 1], h + 1] = column[rows[h + 1], h]
 
@@ -345,7 +345,7 @@ def _whole(
     if not isinstance(scene, BackgroundSubtraction):
         return np.ones(len(sample), np.bool_)
     crops = estimates.crops
-    if scene.stride > 1:  # told in pixels of the picture, of which a sample holds some
+    if scene.stride > 1:  # from pixels of the full image to those of the subsampled image
         crops = replace(crops, origin=crops.origin // scene.stride, step=crops.step // scene.stride)
     behind = behind_something(crops, scene.cleared(sample))
     shown = np.where(estimates.found, crops.n_px, np.nan)
@@ -376,14 +376,14 @@ def _count(
     there = other.found
     pose = other.chosen.pose.moved(scene.floor.T_arena_camera)[there]
     own = body
-    if there.any():  # girth and size of the first say nothing of another's
+    if there.any():  # another animal has its own girth and size
         own = BodyResidual.fit(
             Surface.of(estimator.skeleton), pose, other.crops[there], scene, body.camera_view
         )
     second = own.agreement(pose, other.crops[there], scene)
     n = (
         len(n_candidates) * len(rows) // len(unsure)
-    )  # as many of all frames as were looked at of these
+    )  # scaled from the inspected frames to all frames
     return count_animals(first, second, rows[there], n)
 
 
@@ -393,7 +393,7 @@ def _count(
 Array = NDArray[np.float64]
 
 _SIZE_PASSES = 4
-_SURE = 0.5  # of the frames measure the size: those of which the model is surest
+_SURE = 0.5  # share of frames that determine the size: those with the highest confidence
 
 
 @dataclass(frozen=True)
@@ -453,7 +453,7 @@ class PatchObserver:
         for windows in parts:
             place = windows.floor(0).T_arena_camera
             rows = slice(start, start + len(windows.depth))
-            # a view: what is put there is put in all of it
+            # a view: writes change the whole
             start = rows.stop
             some = seen[rows]
             for h, estimates in enumerate(

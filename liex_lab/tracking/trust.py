@@ -27,31 +27,31 @@ Array = NDArray[np.float64]
 # of the animal's length
 MOST_ERROR = 0.25
 MOST_RESIDUAL = 0.12
-_ALWAYS_RESIDUAL = 0.04  # below this a residual contradicts nothing, however quiet the session is
+_ALWAYS_RESIDUAL = 0.04  # a smaller residual is never a contradiction, even in a low-noise session
 _TIMES_RESIDUAL = 4.0  # of the session's own usual residual
 _LEAST_COVERED = 0.35
 _MOST_BESIDE = 0.6
-# an animal is in full view where it shows this share of the usual pixels, at least and at most
+# smallest and largest share of the usual pixels of a fully visible animal
 _LEAST_SHOWN = 0.6
 _MOST_SHOWN = 1.6
-# one thing is two animals where it shows so much of the other's pixels beside the usual ones, and
-# no less than so many times these: where both touch, a part of each is behind the other
+# one object is two animals if it has the usual pixels plus this share of the other's, and at least
+# this multiple of the usual ones: where both touch, each hides a part of the other
 _OF_OTHER = 0.4
 _LEAST_TOGETHER = 1.25
-# an animal is partly behind something where so much of its outline ends there, and it shows less
-# than this share of its usual pixels; what lies before it is there for some frames at least
+# an animal is partly hidden if this share of its outline ends at an obstruction and it has less
+# than this share of its usual pixels; an obstruction lasts for some frames
 _BEHIND = 0.03
-_FEWEST_WHOLE = 12  # frames without anything before it that tell what an animal usually shows
+_FEWEST_WHOLE = 12  # unobstructed frames needed to estimate an animal's usual pixels
 WHOLE = 0.95
 _FRAMES = 2  # before and after
-MOSTLY = 0.7  # of it must be in view to tell how it lies
-_UNSURE = 0.25  # and all of it where head and tail are exchanged as probably as that
-# it has gone behind something where it showed less than this share shortly before it was gone
+MOSTLY = 0.7  # share that must be visible to determine its posture
+_UNSURE = 0.25  # flip probability above which all of it must be visible
+# it disappeared behind something if less than this share was visible shortly before
 _GOING = 0.8
 _SHORTLY_S = 0.5
-_REMEMBERED = 900  # measured frames that say, while the recording goes on, what it usually shows
-# a pose lies elsewhere if its joints are so far from every pose that the frame itself allows: so
-# many predicted errors, and this share of the length
+_REMEMBERED = 900  # measured frames that determine its usual pixels online
+# a pose has strayed if its joints are this far from every hypothesis of its frame, in predicted
+# errors and over the length
 _TIMES_ERROR = 4.0
 _ELSEWHERE = 0.25
 
@@ -252,7 +252,7 @@ class Watch:
     def __init__(self) -> None:
         # of measured frames: pixels, share of the outline behind something
         self._shown: deque[tuple[float, float]] = deque(maxlen=_REMEMBERED)
-        # of the frames shortly before this one in which something was in view: s, px, share behind
+        # preceding frames with something in view: s, px, share behind
         self._near: deque[tuple[float, int, float]] = deque()
         self._lost = False
         self._gone = False
@@ -336,11 +336,11 @@ def elsewhere(
     return np.asarray(np.isfinite(nearest) & (nearest > allowed))
 
 
-# Whether an animal goes as fast as animals do, by the clock of its recording.
+# Plausibility of an animal's speed, given the clock of its recording.
 
 
-_OVER_S = 0.1  # noise of single frames is small beside what is gone in so long
-_MOST_S = 0.2  # frames may be missing, but not so many
+_OVER_S = 0.1  # interval over which the displacement exceeds single-frame noise
+_MOST_S = 0.2  # longest gap of missing frames
 _N_LOOKED_AT = 20_000  # frames, spread over the recording
 _FEWEST = 30
 _MOST_LENGTHS_S = 10.0  # for a quarter of the time; 1 to 4 are usual, in short bursts 30
