@@ -138,7 +138,7 @@ def _overruled(camera: Camera, plan: Plan) -> Camera:
 
 
 def plan_of(animal: str) -> Plan:
-    """The plan of an animal: a bundled plan's name, or the path of a skeleton's TOML.
+    """The bundled plan of that name, or a plan for the animal of a skeleton's TOML.
 
     The latter expects a model `NAME.npz` with the name of the skeleton's file.
     """
@@ -321,7 +321,7 @@ def build_rules(plan: Plan) -> MouseRules:
 
 
 def build_recogniser(plan: Plan, skeleton: Skeleton) -> TimelineModel | None:
-    """The plan's action recogniser, named or bundled; None if there is none.
+    """The plan's action recogniser, named or bundled; None if absent.
 
     Without a recogniser rules name the actions, or nothing does, see `why_nameless`.
 

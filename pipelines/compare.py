@@ -219,7 +219,7 @@ def _state_of(folder: Path, key: str, exclude: str = "") -> Entry:
 
 
 def _study_of(place: Path) -> Study | None:
-    """The study of a file, or of results in or around a folder; None if there is none."""
+    """The study of a file, or of results in or around a folder; None if absent."""
     if place.is_file():
         return Study.load(place)
     here = place.resolve()

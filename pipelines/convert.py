@@ -160,7 +160,7 @@ def _is_mcap(target: Path) -> bool:
 
 
 def largest_step(recording: Recording) -> float | None:
-    """The largest step, mm, that divides all depths of a few frames; None if there is none."""
+    """The largest step, mm, that divides all depths of a few frames; None if absent."""
     rows = np.unique(np.linspace(0, len(recording) - 1, _N_PROBED).round().astype(int))
     depths = [recording.frame(int(row)).depth for row in rows]
     for step in _STEPS_MM:

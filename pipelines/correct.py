@@ -98,8 +98,8 @@ def correct_session(
         The session folder.
 
     Raises:
-        SessionError: a correction cannot be applied, there is none, those of the log were made on
-            another measurement, or another program corrects the session.
+        SessionError: a correction cannot be applied, no correction exists, those of the log were
+            made on another measurement, or another program corrects the session.
     """
     raw = Session.open(session, raw=True)
     with locked(raw.path / _BUSY, f"{raw.path} is being corrected by another program"):

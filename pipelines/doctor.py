@@ -197,7 +197,7 @@ def examine(
         propose: check which bundled plan fits, which needs their models: the given or the usual one
             first, others only if it does not fit.
         named: whether the user named the plan; if so, the report states when it does not fit.
-        typed: the plan as typed, None if there is none, and further options for the run.
+        typed: the plan as typed, None if absent, and further options for the run.
         progress: called while an archive is unpacked or an index made.
 
     Raises:

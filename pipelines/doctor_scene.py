@@ -58,7 +58,7 @@ class SceneLook:
     Attributes:
         seen: the recording, rectified.
         plan: expected sizes, thresholds, zones.
-        water: the water surface; None if there is none.
+        water: the water surface; None if absent.
         sample: (n, H, W) float32 depth, mm, of every `stride`-th pixel.
         stride: image pixels per sample pixel, along an axis.
         facts: numbers by the names of `KEYS`; None if unknown.

@@ -143,7 +143,7 @@ class Place:
         title: the recordings that the region applies to.
         file: the file; it may not exist yet.
         path: of the value in the file, see `with_value`.
-        stated: the current value; None if there is none.
+        stated: the current value; None if absent.
     """
 
     name: str
@@ -291,7 +291,7 @@ class StatedRegions:
         return [Place("beside", "this recording, in a plan beside it", file, _REGION, stated)]
 
     def _shown(self, place: Place, session: Session | None) -> list[list[float]] | None:
-        """The corners of the stated region, px; None if there is none."""
+        """The corners of the stated region, px; None if absent."""
         if place.stated is None:
             return None
         region = _region(place.stated)

@@ -97,7 +97,7 @@ def evaluate_actions(
 
     Args:
         animal: `fish` or `mouse`.
-        model: an action model; None uses the bundled one or, if there is none, trains one.
+        model: an action model; None uses the bundled one or, if absent, trains one.
         pose_model: another model than the animal's own for measuring the frames.
         minutes: total length of the uncut test recordings.
         draw: called with the result, to draw a figure.
