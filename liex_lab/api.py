@@ -811,7 +811,7 @@ def run_tables(
         fresh: ignore stored rows; every variant is trained again, which takes long.
         rows: rows to train and measure again, or `fig7`, the curves of Fig. 7; the others are
             stored ones. () measures none.
-        sealed: measure the held-out split, which is evaluated once per issue.
+        sealed: measure the held-out split, which is evaluated once per release.
         without: `tracking` or `actions`, parts of the page to skip.
         nyu: folder of the NYU hand data, counted for Table 2; None leaves it out.
         progress: receives progress reports.

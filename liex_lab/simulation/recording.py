@@ -42,7 +42,7 @@ SPLITS = {
     "other-body": (74_001, "other", 1.0, 0, 0.0),
     OTHER_CAMERA: (75_001, "train", 1.0, 0, 0.0),
 }
-# held-out recordings, not used in tests, training or development: evaluated once per issue. They
+# held-out recordings, not used in tests, training or development: evaluated once per release. They
 # are like the splits above in turn, each with its own seed
 SEALED = "sealed"
 _SEALED_SEED = 970_413

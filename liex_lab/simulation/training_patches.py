@@ -228,7 +228,7 @@ def training_blocks(
             for mice of up to 70 mm.
         parallel: render on all threads.
         worn_share: share of mini-sessions whose mouse has a head stage or a cable, see
-            `scenes.meshes.draw_worn`; 0 does not change the other random numbers.
+            `scenes.meshes.draw_worn`; 0 gives the same patches as without this option.
         per_session: images of one animal with one camera, a divisor of `BLOCK`.
 
     Yields:

@@ -2,13 +2,14 @@
 
 1. Select: draw K particles from the cumulative weights.
 2. Propagate: the base joint by a left-invariant Brownian step, g exp(sqrt(δ) ξ) with ξ ~ N(0, C)
-(Eq. 6 and 7); every other joint by the cascade's regressors from its parent (Eq. 10). Regressors
-and metric are used as in Algorithm 1, see `Cascade.predict`. The paper does not state whether the
-base's own regressors run after its step; `base_rounds` of `ParticleFilter` selects this.
+   (Eq. 6 and 7); every other joint by the cascade's regressors from its parent (Eq. 10).
+   Regressors and metric are used as in Algorithm 1, see `Cascade.predict`. The paper does not state
+   whether the base's own regressors run after its step; `base_rounds` of `ParticleFilter` selects
+   this.
 3. Measure: m is the learned metric's score; w = exp(-m^2 / 2 σ^2) (Eq. 12), normalised to sum 1
-(Eq. 13).
+   (Eq. 13).
 4. Estimate: the weighted average of tangent vectors (Eq. 14), taken at the average itself: the
-intrinsic mean on the group.
+   intrinsic mean on the group.
 
 Choices that the paper leaves open are stated in `ProcessNoise` and in `ParticleFilter`. The filter
 is kept for the evaluation tables; the default tracker is `curve` (`offline`).

@@ -191,7 +191,7 @@ class Track:
         self.joints_mm[rows] = pose.joints(self.skeleton)
 
     def __getitem__(self, rows: slice) -> Track:
-        """Some consecutive frames; what is written into them is written into the whole."""
+        """Some consecutive frames, as views."""
         return Track(self.skeleton, *(getattr(self, name)[rows] for name in COLUMNS))
 
     @property
@@ -201,7 +201,7 @@ class Track:
 
     @property
     def posed(self) -> NDArray[np.bool_]:
-        """(n,) True where there is a pose, measured or bridged."""
+        """(n,) True if there is a pose, measured or bridged."""
         there = np.empty(self.n_frames, np.bool_)
         for rows in blocks(self.n_frames, _BLOCK):
             there[rows] = np.isfinite(self.joints_mm[rows, 0, 0])
@@ -209,7 +209,7 @@ class Track:
 
     @property
     def observed(self) -> NDArray[np.bool_]:
-        """(n,) True where a pose was measured."""
+        """(n,) True if a pose was measured."""
         return self.posed & ~self.bridged
 
     @property

@@ -274,8 +274,9 @@ class FrameTracker:
     def _put(
         self, seen: Observations, h: int, estimates: Estimates, depths: NDArray[np.float32]
     ) -> Pose:
-        """Put estimates in as hypothesis h, with their component's pixels and centroid; their poses
-        (n) in the arena frame.
+        """Set estimates as hypothesis h, with their component's pixels and centroid.
+
+        Returns their poses (n), arena frame.
         """
         found = np.flatnonzero(estimates.found)
         chosen = estimates.chosen
