@@ -2,8 +2,8 @@
 
 The whole pipeline on one page: recording -> foreground -> candidate poses of single frames -> track
 (association, smoothing) -> actions -> behaviour tables. Single frames are measured in chunks and
-written at once, so an interrupted run resumes where it stopped; the track and all later stages use
-all frames at once.
+written immediately, so an interrupted run resumes where it stopped; the track and all later stages
+use all frames at once.
 """
 
 from __future__ import annotations

@@ -37,7 +37,7 @@ Array = NDArray[np.float64]
 
 # alternately another build and one of those that models were trained on
 SEEDS: Final = tuple(range(1001, 1013))
-# not 931_507_211 to 213: development after 25 November 2026 used their results
+# not 931_507_211 to 213, whose results have influenced development
 SEALED_SEEDS: Final = (958_204_331, 958_204_332, 958_204_333)
 N_FRAMES: Final = 300
 
