@@ -216,7 +216,7 @@ def pack_rvl(depth: NDArray[np.uint16]) -> NDArray[np.uint32]:
         (m,) uint32 words.
     """
     pixels = np.ascontiguousarray(depth, np.uint16).ravel()
-    # a pixel costs at most 6 nibbles, and every second pixel may add two counts of one nibble each
+    # a pixel needs at most 6 nibbles, and every second pixel may add two counts of one nibble each
     words = np.empty(pixels.size + 8, np.uint32)
     return words[: _pack(pixels, words)]
 
@@ -330,7 +330,7 @@ def to_millimetres(depth: NDArray[np.float32]) -> NDArray[np.uint16]:
 # The 16z depth codec of PrimeSense recordings: delta and run-length coding in half bytes (numba).
 
 
-WORST_BYTES_A_PIXEL = 3  # a wide step for every pixel: its mark, and two bytes
+WORST_BYTES_A_PIXEL = 3  # a wide step for every pixel: its marker and two bytes
 _RUN = 0xE0
 _WIDE = 0xFF
 

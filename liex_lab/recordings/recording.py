@@ -77,7 +77,7 @@ class SourceFiles:
         return self._digest is not None
 
     def digest(self, progress: Progress = silent) -> str:
-        """SHA-256 of the files, see `file_digest`; computed once and kept.
+        """SHA-256 of the files, see `file_digest`; computed once and cached.
 
         Args:
             progress: reports how many MB were read.
@@ -115,7 +115,7 @@ class SourceFiles:
         )
 
     def _beside(self) -> list[tuple[tuple[str, int, int], tuple[str, int, int]]]:
-        """Each file's stamp now and at opening."""
+        """Pairs of each file's stamp now and at opening."""
         return [
             ((str(a[0]), int(a[1]), int(a[2])), (str(b[0]), int(b[1]), int(b[2])))
             for a, b in zip(self.stamp, self.stamp_at_opening, strict=True)
@@ -139,7 +139,7 @@ def file_digest(files: Iterable[Path], progress: Progress = silent) -> str:
     sizes = [path.stat().st_size for path in ordered]
     whole = hashlib.sha256()
     done = 0
-    room = memoryview(bytearray(_BLOCK))  # new memory for each block takes as long as reading it
+    room = memoryview(bytearray(_BLOCK))  # allocating memory per block takes as long as reading it
     total = (sum(sizes) >> 20) + 1
     for path, size in zip(ordered, sizes, strict=True):
         if len(ordered) > 1:

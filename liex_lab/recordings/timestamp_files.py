@@ -235,7 +235,7 @@ class Stamps:
             tries = [(_places([_stem(name) for name in names], [_stem(c) for c in cells]), n // 2)]
             counts = name_numbers(cells)
             if counts is not None and frame_counts(counts) is not None:
-                moved = numbers - numbers[0] + counts[0]  # one of the two may begin at 1
+                moved = numbers - numbers[0] + counts[0]  # one of them may begin at 1
                 tries.append((_places(numbers, counts), n - 1 if in_order else 0))
                 tries.append((_places(moved, counts), min(n, len(self)) - 1))
             for rows, least in tries:

@@ -21,13 +21,13 @@ from numpy.typing import NDArray
 Times = NDArray[np.int64]
 
 GAP_FACTOR = 1.5  # a step longer than this many median steps means that frames are missing
-# stamps count as rounded to a unit above this share of the usual step, or where this share of the
-# steps is off a multiple of it by this much
+# stamps are rounded if their unit exceeds this share of the usual step, or if this share of the
+# steps differs from a multiple of it by this much
 _COARSE = 1e-3
 _OFTEN = 0.05
 _OFF = 0.1
 _LEAST = 0.8  # least share of the mean step for a real clock; less comes from stamps without one
-_TICKS_NS = (1_000_000, 15_625_000)  # of clocks that may be as coarse as a camera's step
+_TICKS_NS = (1_000_000, 15_625_000)  # of coarse clocks, near a camera's step
 _RARELY = 2.25  # times the median: longest step across one missing frame
 _LONGER = (3, 16, 64, 256)  # frames missing in gaps, short ones first, as they define the step
 _FAR = 3  # steps; the clock's phase may change across more of them
@@ -81,8 +81,8 @@ class Gap:
 
 
 PLAUSIBLE_HZ = (0.5, 2000.0)  # of a depth camera that watches an animal
-_MOST_MOVED = 0.25  # of the stamps may be repeated or out of order, as of a busy computer
-FAULTS = ("", "stamp_repeated", "stamp_out_of_order", JUMPED)  # what `MonotoneTimes.faults` counts
+_MOST_MOVED = 0.25  # most stamps repeated or out of order, as on a busy computer
+FAULTS = ("", "stamp_repeated", "stamp_out_of_order", JUMPED)  # indexed by `MonotoneTimes.faults`
 # their indices
 _REPEATED, _OUT_OF_ORDER, _JUMPED = range(1, len(FAULTS))
 
@@ -136,7 +136,7 @@ def rounded_step(times_ns: Times) -> int:
         return 0
     unit = int(np.gcd.reduce(dt))
     if unit > _COARSE * usual:
-        # frames lost by a camera of exact stamps make multiples of its step, too
+        # lost frames with exact stamps also give multiples of the step
         rounded = unit <= usual / 2 or unit in _TICKS_NS
     else:
         off = np.abs(dt / usual - np.rint(dt / usual)) > _OFF
@@ -202,7 +202,7 @@ def frames_apart(times_ns: Times, step_ns: int) -> Times:
     dt = np.diff(times_ns)
     if rounded_step(times_ns):
         return _in_phase(times_ns, step_ns, 16)
-    # the median of jittering steps is off by a hundredth, which longer and longer gaps show
+    # the median of jittering steps is off by 1 %, which is refined with longer and longer gaps
     period = float(step_ns)
     for longest in (1, *_LONGER):
         missing = np.maximum(2, np.rint(dt / period))
@@ -456,7 +456,7 @@ def _fewest_moved(times_ns: Times) -> Times:
 
     The moved stamps are spread evenly between the others.
     """
-    # Integers that must increase by at least 1 are integers minus their rank that must not
+    # Integers increase strictly if and only if integers minus their rank do not
     # decrease.
     slack = times_ns - np.arange(len(times_ns), dtype=np.int64)
     keep = _first_of_equal(times_ns, slack, _longest_nondecreasing(slack.tolist()))
@@ -561,7 +561,7 @@ def read_moment(text: str) -> tuple[datetime, int]:
     if len(text.strip()) <= len("2024-10-27"):
         raise ValueError(f"{text!r} has no time of day")
     moment = datetime.fromisoformat(re.sub(" (?=[z+-])", "", text.strip(), flags=re.I).upper())
-    fraction = re.search(r"[.,](\d+)", text)  # of which datetime keeps six digits
+    fraction = re.search(r"[.,](\d+)", text)  # datetime keeps six digits
     ns = int(fraction[1][:9].ljust(9, "0")) if fraction else 0
     since_1970 = moment.replace(tzinfo=moment.tzinfo or UTC) - datetime(1970, 1, 1, tzinfo=UTC)
     return moment, since_1970 // timedelta(seconds=1) * 10**9 + ns

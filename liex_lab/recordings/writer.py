@@ -138,7 +138,7 @@ class PictureFolderWriter(RecordingWriter):
 
 
 def steps_of(frame: DepthFrame, step_mm: float, exact: bool) -> NDArray[np.uint16]:
-    """Depth of a frame as 16-bit steps.
+    """Convert depth of a frame to 16-bit steps.
 
     Args:
         frame: the frame, depth (H, W) float32 mm.
@@ -149,7 +149,7 @@ def steps_of(frame: DepthFrame, step_mm: float, exact: bool) -> NDArray[np.uint1
         (H, W) uint16 steps, 0 where unread.
 
     Raises:
-        RecordingError: a depth is beyond 65535 steps, or (exact) lies between two of them.
+        RecordingError: a depth is beyond 65535 steps, or (exact) between two of them.
     """
     depth: Depth = frame.depth
     steps = whole_steps(depth, step_mm) if exact else nearest_steps(depth, step_mm)

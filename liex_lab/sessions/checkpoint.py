@@ -108,7 +108,7 @@ class Checkpoint:
             ) from None
         check_free(folder)
         held = take_lock(folder / _LOCK)
-        if held is None:  # taken in between
+        if held is None:  # locked in the meantime
             raise SessionError(
                 f"another process has just begun to write {folder}; wait until it is done"
             )
@@ -221,7 +221,7 @@ class Checkpoint:
 
     def _cut(self, state: State) -> bool:
         """Truncate everything to the checkpoint; False if a file is shorter than recorded."""
-        for path in self.folder.iterdir():  # half-written tables, and logs without a checkpoint
+        for path in self.folder.iterdir():  # incomplete tables, and logs without a checkpoint
             own = path.name in OWN and path.name != _RESUMED
             if not own and path.name not in state.logs:
                 _remove(path)

@@ -152,7 +152,7 @@ def disagreements(session: Session) -> list[str]:
     index, time_s = (session.frames[name].to_numpy() for name in ("frame_index", "time_s"))
     ahead = _ahead(session)
     rows = np.flatnonzero(np.isfinite(ahead).all(axis=1))
-    cosine = np.zeros(len(index))  # of the turn from the frame with a pose before each
+    cosine = np.zeros(len(index))  # of the turn from the previous frame with a pose
     cosine[rows[1:]] = (ahead[rows[1:]] * ahead[rows[:-1]]).sum(axis=1)
     apart = set(rows[1:][np.diff(time_s[rows]) > _APART_S].tolist())
     half_turns = set(np.flatnonzero(cosine < 0.0).tolist()) - apart
@@ -160,7 +160,7 @@ def disagreements(session: Session) -> list[str]:
     path = shlex.quote(str(session.path))
     found = []
     for number, one in exchanges:
-        # the first row with a pose from each end on
+        # the first row with a pose from each end
         ends = np.searchsorted(rows, np.searchsorted(index, (one.start_frame, one.stop_frame)))
         ends = np.append(rows, len(index))[ends]
         at = [row for row in ends.tolist() if row in half_turns]

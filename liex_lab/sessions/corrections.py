@@ -79,7 +79,7 @@ class JointMove:
     x_mm: float
     y_mm: float
     z_mm: float
-    note: str = ""  # logs of earlier versions lack it
+    note: str = ""  # absent in logs of earlier versions
     kind: Literal["joint"] = "joint"
 
     def __str__(self) -> str:
@@ -302,7 +302,7 @@ class Log:
         undos = {entry.number for entry in self.entries if entry.what is None}
         redone = any(entry.undoes in undos for entry in self.entries)
         document = {
-            "schema_version": SCHEMA_VERSION if redone else 2,  # which earlier versions read
+            "schema_version": SCHEMA_VERSION if redone else 2,  # readable by earlier versions
             "made_of": self.made_of,
             "entries": [entry.to_dict() for entry in self.entries],
             "files": self.files,

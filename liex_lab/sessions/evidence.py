@@ -298,7 +298,7 @@ def link_to(recording: str | Path, folder: Path) -> dict[str, Any]:
     whole = Path(recording).resolve()
     try:
         return {"path": Path(os.path.relpath(whole, folder.resolve())).as_posix()}
-    except ValueError:  # on another drive of Windows
+    except ValueError:  # on another Windows drive
         return {"path": whole.as_posix()}
 
 

@@ -266,6 +266,3 @@ def versions() -> dict[str, str]:
 
 def _hash(value: Any) -> str:
     return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()[:16]
-
-
-# Link from a session to the recording that it was measured from: a path, and the hash it had.

@@ -178,7 +178,7 @@ class ReplayWriter:
             rows: the track in the form of the tables.
             kinematics: the table `kinematics`.
             bouts: the table `bouts`.
-            words: the ethogram's vocabulary, coloured by `actions.colours`.
+            words: the ethogram's vocabulary, coloured by `vocabulary.action_colours`.
             problems: sentences about the recording, logged as warnings.
             candidates: the pose hypotheses of single frames, to be shown as well; None if absent.
 

@@ -225,12 +225,11 @@ def log_body(stream: Any, skeleton: Skeleton, animal: Mapping[str, Any]) -> list
 
 
 def body_columns(track: Track, carriers: list[int]) -> Iterator[tuple[str, Any]]:
-    """Entity and columns of each part of the body in some frames; it shrinks to nothing without a
-    pose.
+    """Entity and columns of each part of the body in some frames; its scale is 0 without a pose.
 
     Args:
         track: the frames.
-        carriers: the joints that carry a part, as `log_body` returned them.
+        carriers: the joints that carry a part, from `log_body`.
     """
     posed = track.posed
     frames = Pose(track.root, track.angles_rad, track.scale)[posed].frames(track.skeleton)

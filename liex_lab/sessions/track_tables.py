@@ -289,6 +289,3 @@ def _actions(poses: Poses, bouts: pd.DataFrame) -> np.ndarray[Any, Any]:
     for start, stop, action in zip(starts, stops, bouts["action"], strict=True):
         out[start:stop] = action
     return out.astype(str)
-
-
-# Track of a session, read back from its Parquet tables.

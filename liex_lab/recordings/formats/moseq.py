@@ -286,8 +286,8 @@ def open_moseq(
             name = folder.resolve().name if depth.name in DEPTHS else depth.stem
             session = _Session(path, depth, found, camera, fps, progress)
             return session.open(name, list(files.values()), opened)
-        # gzip has no random access, so the session is streamed once into a folder that lives as
-        # long as the recording
+        # gzip has no random access, so the session is unpacked once into a temporary
+        # folder
         scratch = Scratch()
         opened.callback(scratch.close)
         found = unpack(path, (*DEPTHS, *names), scratch.folder, progress)

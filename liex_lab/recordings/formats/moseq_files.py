@@ -37,7 +37,7 @@ _PIECE = 256  # packed bytes tried at once near damage
 _ENOUGH_ZEROS = 1 << 22  # far more than the end of any tar; a longer walk skips missing data
 _ALWAYS = 1 << 29  # bytes unpacked at any compression ratio
 _MOST_TIMES = 200  # compression ratio beyond that: true images have noise
-_MOST_HEADER = 1 << 20  # bytes of a member's name and notes
+_MOST_HEADER = 1 << 20  # bytes of a member's name or notes
 _MOST_NOTES = 1 << 28  # bytes of any file but the images: stamps of days
 _GZIP_MAGIC = b"\x1f\x8b"
 Pieces = Generator[bytes | memoryview, None, None]
@@ -108,7 +108,7 @@ class _Patient:
         self._progress = progress
         self.zipped = file.read(2) == _GZIP_MAGIC
         file.seek(0)
-        self.whole = not self.zipped or fast  # it ended where it should
+        self.whole = not self.zipped or fast  # complete
         self._coming = (
             _read(file) if not self.zipped else _by_isal(file) if fast else self._by_zlib()
         )

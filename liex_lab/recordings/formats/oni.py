@@ -111,7 +111,7 @@ class OniFile:
         Raises:
             RecordingError: it is not an .oni file, or its version cannot be read.
         """
-        # without a buffer: every read is a seek, and a buffer would fetch 8 kB for each 40 bytes
+        # unbuffered: every read follows a seek, and a buffer would read 8 kB for each 40 bytes
         self._file: IO[bytes] = path.open("rb", buffering=0)
         self.size = path.stat().st_size
         self.whole = True
@@ -329,7 +329,7 @@ def index_file(file: OniFile, progress: Progress) -> tuple[list[DepthNode], set[
 
 
 def _text(fields: bytes) -> tuple[str, bytes]:
-    """A string at the beginning of some fields, with its length before it, and what follows it."""
+    """A string at the beginning of some fields, preceded by its length, and the rest."""
     (size,) = struct.unpack_from("<I", fields)
     return fields[4 : 4 + size].split(b"\0")[0].decode("latin-1"), fields[4 + size :]
 
@@ -340,7 +340,7 @@ WITHOUT_TABLE = b"16zP"
 _CODECS = (RAW, WITH_TABLE, WITHOUT_TABLE)
 _UNIT_MM = {100: 1.0, 101: 0.1}  # OpenNI's pixel formats of depth
 _SHIFTS = (102, 103)
-_MOST_PIXELS = 1 << 24  # a frame of a damaged header may not ask for all the memory there is
+_MOST_PIXELS = 1 << 24  # limits the memory for a frame with a damaged header
 _LATEST_US = 2**62 // 1000
 _NOMINAL_HZ = 30.0
 _N_PROBED = 5
@@ -348,7 +348,7 @@ _N_PROBED = 5
 # of PrimeSense's reference design: 120 mm / (2 x 0.1052 mm)
 _VGA_FOCAL = 570.342
 _VGA_WIDTH = 640
-_SENSOR_WIDTH = 1280  # pixels that the plane's pixel size (ZPPS) is stated for
+_SENSOR_WIDTH = 1280  # columns of the sensor for which ZPPS states the pixel size
 _USUAL_SIZES = ((160, 120), (320, 240), (640, 480), (1280, 960), (1280, 1024))
 _FIELDS_OF_VIEW = (math.radians(5.0), math.radians(170.0))
 
@@ -426,7 +426,7 @@ class OniFrames:
         if (width, height) != (form.width, form.height):
             depth = np.zeros((form.height, form.width), np.float32)
             depth[y : y + height, x : x + width] = part.reshape(height, width)
-        # a mirror image has the animal's left and right exchanged
+        # undo the exchange of left and right
         return np.ascontiguousarray(depth[:, ::-1]) if form.mirrored else depth
 
     def _payload(self, number: int, n_pixels: int) -> bytes:
@@ -639,8 +639,8 @@ def _camera(
     """The camera given by the caller, or else in a camera.toml next to the file, or else in the
     file.
     """
-    # a camera.toml comes first here: what is in the file is the design of the make and no
-    # calibration of this camera
+    # a camera.toml has priority: the file has the design values of the model, not a
+    # calibration
     if stated is not None or camera_file.intrinsics:
         return camera_file.camera(form.width, form.height, stated)
     ours = node.numbers(INTRINSICS, "<dddd")
@@ -665,7 +665,7 @@ def _camera(
             "camera.toml beside it with [camera], fx = ..., fy = ..., cx = ... and cy = ... in "
             "pixels"
         )
-    # OpenNI places the optical axis at half the size, counted as we count pixels
+    # OpenNI's optical axis is at half the size, in our pixel coordinates
     cx = form.width / 2 if not form.mirrored else form.width - 1 - form.width / 2
     return Camera(*focal, cx, form.height / 2, form.width, form.height, source=source)
 

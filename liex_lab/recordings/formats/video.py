@@ -153,7 +153,7 @@ class _Walk:
             self.file.seek(at)
             name, length = _CHUNK.unpack(self.file.read(_CHUNK.size))
             start = at + _CHUNK.size
-            if not all(32 <= byte < 127 for byte in name):  # what follows may be noise
+            if not all(32 <= byte < 127 for byte in name):  # later data may be noise
                 self.whole = False
                 return
             if name in (b"RIFF", b"LIST") and self.file.read(4) in _LISTS:
@@ -172,7 +172,7 @@ class _Walk:
         while at < self.size:
             self.file.seek(at)
             head = self.file.read(12)
-            # the first bit that is set gives the length of an id, which keeps it
+            # the first set bit determines the length of an id and is part of it
             n = 9 - head[0].bit_length()
             id = int.from_bytes(head[:n], "big")
             length, start = _vint(head, n)
@@ -207,7 +207,7 @@ def _index(path: Path, progress: Progress) -> DepthTrack:
     """The depth track of a file and its frames.
 
     It is the stream titled or tagged DEPTH, else the first of 16-bit grey frames that is not titled
-    as infrared, else the first of them or the first video.
+    as infrared, else the first grey one, else the first video.
     """
     is_mkv = path.suffix.lower() == ".mkv"
     try:

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from liex_lab.errors import RecordingError
 from liex_lab.runtime.progress import Progress
 
-MAX_PIXELS = 1 << 24  # well above any depth camera; a header that states more is damaged
+MAX_PIXELS = 1 << 24  # well above any depth camera; a larger stated size is damage
 
 Size = tuple[int, int]  # width, height, pixels
 
@@ -515,7 +515,7 @@ def read_pclzf_camera(picture: Path) -> dict[str, float] | None:
     with path.open("rb") as file:
         text = file.read(_XML_BYTES)
     try:
-        # bandit B314: expat reads no external entities and bounds the others; tests hold it to that
+        # bandit B314: expat reads no external entities and limits the others, which tests check
         root = ET.fromstring(  # nosec B314
             b"<both>" + re.sub(rb"<\?xml[^>]*\?>", b"", text) + b"</both>"
         )

@@ -418,7 +418,7 @@ def read_ray_calibration(path: Path) -> float:
     with path.open("rb") as file:
         text = file.read(_CALIBRATION_BYTES)
     try:
-        # bandit B314: expat reads no external entities and bounds the others; tests hold it to that
+        # bandit B314: expat reads no external entities and limits the others, which tests check
         root = ET.fromstring(text)  # nosec B314
         if root.tag != _CALIBRATION:
             raise ValueError(f"its root is <{root.tag}>")

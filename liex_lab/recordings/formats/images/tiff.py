@@ -299,7 +299,7 @@ def _describe(path: Path, index: int, page: Any, size_bytes: int) -> _Page:
     plain = (
         page.is_contiguous and page.compression == 1 and page.fillorder == 1 and page.predictor == 1
     )
-    # without compression the size follows from the bytes; a directory that contradicts itself is
+    # without compression the size determines the bytes; an inconsistent directory is
     # damaged
     agrees = page.compression != 1 or sum(page.databytecounts) == width * height * dtype.itemsize
     return _Page(

@@ -313,7 +313,7 @@ def _open(
             "read from it"
         )
     the_camera = _camera(path, chosen, found, camera_file, camera, file.notes, problems, doubts)
-    # A writer may flush its topics out of turn; the order of logging is the file's own order.
+    # A writer may flush its topics out of order; the times of logging define the order.
     rows = np.array(chosen.rows, np.int64).reshape(-1, 6)
     rows = rows[np.argsort(rows[:, 0], kind="stable")]
     stamps = _stamps(chosen.name, rows, found.stated, problems)

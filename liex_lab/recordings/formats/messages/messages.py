@@ -145,7 +145,7 @@ class Calibration:
 
 @dataclass(frozen=True, slots=True)
 class Statement:
-    """Facts that a program states as text.
+    """Facts stated as text by the recording program.
 
     Attributes:
         facts: text by name; a bare value has the name "value".
@@ -466,7 +466,7 @@ def _inflate(packed: bytes, packing: str, size: int) -> bytes:
             try:
                 return unpacker.decompress(packed)
             except zstandard.ZstdError:
-                pass  # it is cut
+                pass  # a cut chunk
         with unpacker.stream_reader(packed) as reader:
             return reader.read(size)
     if packing == "lz4":

@@ -97,7 +97,7 @@ def stamp_reader(channel: Channel) -> Callable[[memoryview], int | None] | None:
 # foxglove.PackedElementField's NumericType: NumPy's name of it
 _FIELD_TYPES = {1: "<u1", 2: "<i1", 3: "<u2", 4: "<i2", 5: "<u4", 6: "<i4", 7: "<f4", 8: "<f8"}
 _SECOND = 10**9
-_STAMP = 1 << 3 | 2  # protobuf's key of field 1, the stamp, which has a length
+_STAMP = 1 << 3 | 2  # protobuf's key of field 1, the stamp, length-delimited
 _ONE_BYTE = 127  # the largest length in one byte
 
 
@@ -240,7 +240,7 @@ def stamp_in(head: memoryview) -> int | None:
 # sensor_msgs/PointField: number of a type, and NumPy's name of it without the byte order
 _POINT_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 _MOST_FIELDS = 256
-_SECOND_VERSION = 4  # bytes to which its numbers are aligned at most
+_SECOND_VERSION = 4  # largest alignment of its numbers, bytes
 _PLAIN_CDR = (b"\0\0", b"\0\1", b"\0\6", b"\0\7")  # big and little endian, version 1 and 2
 
 
@@ -249,7 +249,7 @@ class _Fields:
 
     order = "<"
     origin = 0
-    largest_step = 1  # bytes to which numbers are aligned at most
+    largest_step = 1  # largest alignment of numbers, bytes
     end_of_text = 0
 
     def __init__(self, data: memoryview) -> None:
@@ -292,7 +292,7 @@ class _Fields:
 
     def header(self) -> tuple[int, str]:
         """The stamp, ns, and the frame's name of a std_msgs/Header."""
-        self.whole()  # a number that counts up
+        self.whole()  # a sequence number
         return self.whole() * 10**9 + self.whole(), self.text()
 
 
@@ -319,7 +319,7 @@ class _CdrFields(_Fields):
 
     def header(self) -> tuple[int, str]:
         """The stamp, ns, and the frame's name of a std_msgs/Header without the counter."""
-        return self.whole("i") * 10**9 + self.whole(), self.text()  # seconds have a sign here
+        return self.whole("i") * 10**9 + self.whole(), self.text()  # signed seconds
 
 
 def _image(fields: _Fields) -> RawPicture:
@@ -374,7 +374,7 @@ def _value(fields: _Fields) -> Statement:
 
 
 def _text(fields: _Fields) -> Statement:
-    """Facts as in "fx=287.9;fy=287.9", or one bare value."""
+    """Facts such as "fx=287.9;fy=287.9", or one bare value."""
     text = fields.text()
     pairs = dict(part.split("=", 1) for part in text.split(";") if "=" in part)
     return Statement(pairs or {"value": text})
