@@ -178,11 +178,6 @@ def draw_angles(rng: np.random.Generator, skeleton: Skeleton, n: int) -> Array:
     its home pose, so that some are nearly straight. An axis whose range is wider than 200 degrees
     counts as unlimited and turns by up to 45 degrees either way.
 
-    Args:
-        rng: random number generator.
-        skeleton: of the animal.
-        n: number of postures.
-
     Returns:
         (n, J, 3) rad, 0 at the base joint.
     """

@@ -173,10 +173,6 @@ def walk(
 def walk_script(rng: np.random.Generator, n: int) -> tuple[NDArray[np.int64], Array]:
     """Activity and speed of a mouse in each frame: stretches of all kinds of posture.
 
-    Args:
-        rng: random number generator.
-        n: number of frames.
-
     Returns:
         Kinds of posture (n,), indices into `pose_prior.KINDS`, and speeds (n,), spines/s.
     """

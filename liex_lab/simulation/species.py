@@ -258,10 +258,6 @@ class Species(Protocol):
     def bends(self, rng: np.random.Generator, n: int) -> Array | None:
         """Bends of tails, see `Surface.vertices`.
 
-        Args:
-            rng: random number generator.
-            n: number of tails.
-
         Returns:
             (n, TAIL_RINGS) rad, or None for an animal without a separate tail.
         """
@@ -324,10 +320,6 @@ class MouseSpecies:
 
     def bends(self, rng: np.random.Generator, n: int) -> Array | None:
         """Bends of the tails.
-
-        Args:
-            rng: random number generator.
-            n: number of tails.
 
         Returns:
             (n, TAIL_RINGS) rad, the bend at each ring.

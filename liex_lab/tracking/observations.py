@@ -241,10 +241,6 @@ class Observations:
 def joints_of(skeleton: Skeleton, pose: Pose) -> Array:
     """Joint positions of poses by forward kinematics; as `Pose.joints`, but faster.
 
-    Args:
-        skeleton: kinematic tree of the animal.
-        pose: (n) poses.
-
     Returns:
         (n, J, 3) mm in the poses' frame.
     """

@@ -84,11 +84,6 @@ class HandPostures:
     def draw_angles(self, rng: np.random.Generator, skeleton: Skeleton, n: int) -> Array:
         """Observed postures, within the joints' limits.
 
-        Args:
-            rng: random number generator.
-            skeleton: of the hand.
-            n: number of postures.
-
         Returns:
             (n, J, 3) rad.
         """
@@ -99,10 +94,6 @@ class HandPostures:
 
     def draw_turns(self, rng: np.random.Generator, n: int) -> Array:
         """Observed orientations of the palm towards the viewer.
-
-        Args:
-            rng: random number generator.
-            n: number of orientations.
 
         Returns:
             (n, 3, 3) T_view_palm.
@@ -116,11 +107,6 @@ class HandPostures:
 def draw_seen(rng: np.random.Generator, skeleton: Skeleton, n: int) -> tuple[Array, Array]:
     """Draw hands from the observed postures and orientations.
 
-    Args:
-        rng: random number generator.
-        skeleton: of the hand.
-        n: number of hands.
-
     Returns:
         Angles (n, J, 3) rad and T_view_palm (n, 3, 3).
     """
@@ -133,11 +119,6 @@ def draw_wide(rng: np.random.Generator, skeleton: Skeleton, n: int) -> tuple[Arr
 
     Angles and orientations are each random in 45 % of the draws; 30 % of the other postures are
     blends of two observed ones.
-
-    Args:
-        rng: random number generator.
-        skeleton: of the hand.
-        n: number of hands.
 
     Returns:
         Angles (n, J, 3) rad and T_view_palm (n, 3, 3).
@@ -157,11 +138,6 @@ def draw_wide(rng: np.random.Generator, skeleton: Skeleton, n: int) -> tuple[Arr
 
 def free_angles(rng: np.random.Generator, skeleton: Skeleton, n: int) -> Array:
     """Random postures: every finger is bent independently, or all in the same way.
-
-    Args:
-        rng: random number generator.
-        skeleton: of the hand.
-        n: number of postures.
 
     Returns:
         (n, J, 3) rad, within the joints' limits.
@@ -203,10 +179,6 @@ def free_turns(rng: np.random.Generator, n: int) -> Array:
 
     The palm faces the viewer in 70 % of the draws; the tilt's standard deviation is 35 degrees per
     axis.
-
-    Args:
-        rng: random number generator.
-        n: number of orientations.
 
     Returns:
         (n, 3, 3) T_view_palm.

@@ -300,9 +300,6 @@ def _walls(rng: np.random.Generator, m: int, intrinsics: Array, hand: Array, bod
 def hand_faces(skeleton: Skeleton) -> NDArray[np.int32]:
     """Triangles of the hands' meshes.
 
-    Args:
-        skeleton: of the hand.
-
     Returns:
         (F, 3) int32.
     """

@@ -171,10 +171,6 @@ def timing_of(presence: str, n_frames: int) -> tuple[NDArray[np.int64], NDArray[
 def calm_script(rng: np.random.Generator, n: int) -> tuple[NDArray[np.int64], Array]:
     """A mouse that walks without rearing, with pauses.
 
-    Args:
-        rng: random number generator.
-        n: number of frames.
-
     Returns:
         Kinds of posture (n,) and speeds (n,), spines/s, see `locomotion.walk_script`.
     """
