@@ -50,7 +50,7 @@ class Observations:
         covered: (n, H) share of the silhouette that is covered by the rendered body.
         beside: (n, H) share of the rendered body that is outside the silhouette.
         behind: (n, H) share of the component's outline that borders on something nearer.
-        part_mm: (n, H) that distance in the part of the body where it is largest, mm.
+        part_mm: (n, H) largest residual of a part of the body, mm.
         repeats: (n,) True if the depth image is bit-identical to the previous one.
     """
 

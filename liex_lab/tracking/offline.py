@@ -314,7 +314,7 @@ def _half_turns(
 
 
 def _reverse(skeleton: Skeleton, pose: Pose, turned: NDArray[np.int64]) -> None:
-    """Turn poses (n) round so many times (n,) each, in place."""
+    """Reverse poses (n) a given number of times (n,) each, in place."""
     for t in np.repeat(np.arange(len(turned)), turned):
         other = reversed_pose(skeleton, pose[t : t + 1])
         pose.root.rotation[t] = other.root.rotation[0]

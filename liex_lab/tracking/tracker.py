@@ -206,7 +206,7 @@ class FrameTracker:
         return motion.stretch_sd(self.blur, self.size_spread)
 
     def observe(self, frames: Sequence[DepthFrame]) -> Observations:
-        """The pose hypotheses of consecutive frames, each by itself.
+        """The pose hypotheses of consecutive frames, one frame at a time.
 
         A depth image that a noisy sensor repeats bit for bit is a copy and is ignored.
 
@@ -235,7 +235,7 @@ class FrameTracker:
         return seen
 
     def follow(self, frames: Sequence[DepthFrame]) -> Track:
-        """The track of consecutive frames, each by itself, without smoothing.
+        """The track of consecutive frames, one frame at a time, without smoothing.
 
         Args:
             frames: at least one.
@@ -439,7 +439,7 @@ class PatchObserver:
     def observe(
         self, parts: Iterable[Patches], times_ns: NDArray[np.int64], size: float
     ) -> Observations:
-        """The pose hypotheses of frames, each by itself, in the arena frame.
+        """The pose hypotheses of single frames, in the arena frame.
 
         Args:
             parts: patches of consecutive frames, batch by batch; each batch on one floor.
