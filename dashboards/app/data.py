@@ -275,17 +275,25 @@ class StudyData:
         known = self._kept.get((what, entry.key))
         if known is not None and known[0] == stamp:
             return known[1]
-        try:
-            value = read(Session.open(entry.folder))
-        except LiexError as error:
-            value = {"damage": str(error)}
-        except Exception as error:  # one bad session must not break the study's pages
-            value = {
-                "damage": f"{entry.folder} cannot be shown ({type(error).__name__}: "
-                f"{one_line(error)}); look at it with `liex verify`"
-            }
-        self._kept[what, entry.key] = (stamp, value)
-        return value
+        session: list[Session] = []
+
+        def value_of(read: Callable[[Session], Any]) -> Any:
+            try:
+                if not session:
+                    session.append(Session.open(entry.folder))
+                return read(session[0])
+            except LiexError as error:
+                return {"damage": str(error)}
+            except Exception as error:  # one bad session must not break the study's pages
+                return {
+                    "damage": f"{entry.folder} cannot be shown ({type(error).__name__}: "
+                    f"{one_line(error)}); look at it with `liex verify`"
+                }
+
+        # opening checks the whole session, so read at once what the study's pages will need
+        for name, other in {**_OF_STUDY, what: read}.items():
+            self._kept[name, entry.key] = (stamp, value_of(other))
+        return self._kept[what, entry.key][1]
 
 
 QUALITY = (
@@ -420,3 +428,10 @@ def _summary(session: Session) -> pd.DataFrame | None:
     if not session.has("summary.csv"):
         return None
     return cohort.collect([session])
+
+
+_OF_STUDY: dict[str, Callable[[Session], Any]] = {
+    "quality": _quality,
+    "ethogram": _ethogram,
+    "summary": _summary,
+}

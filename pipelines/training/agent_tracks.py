@@ -42,7 +42,7 @@ from .pose_model import cache_folder
 
 Array = NDArray[np.float64]
 
-_SOURCES = ("agent.py", "render.py")  # and the animal's own agent
+_SOURCES = ("agent.py",)  # and the animal's own agent
 _WALL_ERROR_MM = 4.0  # error of the estimated arena
 _FISH_STRIDE = 4
 _FISH_WINDOW = 128

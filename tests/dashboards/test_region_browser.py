@@ -170,5 +170,5 @@ def test_the_doctor_takes_what_the_page_says(served: Served, watched: Watched) -
     ran = subprocess.run(
         [*command, "--region", corners], cwd=REPOSITORY, capture_output=True, text=True
     )
-    assert "only a region is looked at" in ran.stdout, ran.stdout + ran.stderr
+    assert "only a region is inspected" in ran.stdout, ran.stdout + ran.stderr
     watched.nothing_went_wrong()

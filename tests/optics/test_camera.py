@@ -129,7 +129,7 @@ def test_where_a_model_folds_back_nothing_is_seen() -> None:
 @pytest.mark.parametrize(
     ("model", "k", "says"),
     [
-        ("mei", [0.1], "'mei' is not known"),
+        ("mei", [0.1], "'mei' is not supported"),
         ("plumb_bob", [0.1] * 12, "has up to 8 coefficients here, got 12"),
         ("equidistant", [0.1] * 5, "has up to 4"),
         ("plumb_bob", [math.nan], "finite"),

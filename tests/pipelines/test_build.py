@@ -121,7 +121,7 @@ def test_what_a_file_says_of_its_lens_is_undone_and_the_plan_overrules_it(tmp_pa
         path, plan(*LENS)
     ) as recording:  # a camera that is stated as a whole is the whole camera
         assert recording.optics == {}
-    with pytest.raises(LiexError, match="'mei' is not known"):
+    with pytest.raises(LiexError, match="'mei' is not supported"):
         build_recording(path, plan("camera.distortion=[0.1]", "camera.distortion_model=mei"))
 
 

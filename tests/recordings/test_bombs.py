@@ -282,7 +282,7 @@ def test_a_model_that_claims_more_numbers_than_it_has_is_refused(tmp_path: Path)
     deep = np.frombuffer(b"[" * 200_000, np.uint8)
     bounded(
         lambda: Model.load(npz(tmp_path / "d.npz", {"head": array(deep)})),
-        "whole model",
+        "complete model",
         ModelError,
     )
     with pytest.raises(ValueError, match="no archive"):

@@ -11,6 +11,7 @@ import pytest
 
 from liex_lab.runtime import kernel_cache
 from liex_lab.runtime.kernel_cache import VARIABLE, keep_kernels
+from tests.conftest import REPOSITORY
 
 
 @pytest.fixture
@@ -72,3 +73,31 @@ def test_liex_starts_where_a_stated_place_cannot_be_written() -> None:
     )
     assert ran.returncode == 0, ran.stderr
     assert "liex-kernels-" in ran.stdout
+
+
+def test_kernels_of_an_earlier_version_are_compiled_again(tmp_path: Path) -> None:
+    """Their index names a record type that has another name now."""
+    source = """
+import liex_lab
+from typing import NamedTuple
+from numba import njit
+
+class {name}(NamedTuple):
+    value: float
+
+@njit(cache=True)
+def doubled(record):
+    return 2.0 * record.value
+
+print(doubled({name}(21.0)))
+"""
+    for name in ("Earlier", "Present"):
+        script = tmp_path / "kernels.py"
+        script.write_text(source.format(name=name), encoding="utf-8")
+        ran = subprocess.run(
+            [sys.executable, script],
+            env=os.environ | {VARIABLE: str(tmp_path / "cache"), "PYTHONPATH": str(REPOSITORY)},
+            capture_output=True,
+            text=True,
+        )
+        assert ran.stdout.strip() == "42.0", ran.stderr
