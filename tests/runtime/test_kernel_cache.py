@@ -78,7 +78,6 @@ def test_liex_starts_where_a_stated_place_cannot_be_written() -> None:
 def test_kernels_of_an_earlier_version_are_compiled_again(tmp_path: Path) -> None:
     """Their index names a record type that has another name now."""
     source = """
-import liex_lab
 from typing import NamedTuple
 from numba import njit
 
@@ -92,10 +91,10 @@ def doubled(record):
 print(doubled({name}(21.0)))
 """
     for name in ("Earlier", "Present"):
-        script = tmp_path / "kernels.py"
-        script.write_text(source.format(name=name), encoding="utf-8")
+        (tmp_path / "kernels.py").write_text(source.format(name=name), encoding="utf-8")
         ran = subprocess.run(
-            [sys.executable, script],
+            [sys.executable, "-c", "import liex_lab, kernels"],
+            cwd=tmp_path,
             env=os.environ | {VARIABLE: str(tmp_path / "cache"), "PYTHONPATH": str(REPOSITORY)},
             capture_output=True,
             text=True,
