@@ -270,8 +270,9 @@ class StudyData:
             return list(pool.map(lambda entry: self._of_one(what, read, entry), chosen))
 
     def _of_one(self, what: str, read: Callable[[Session], Any], entry: Entry) -> Any:
-        assert entry.folder is not None
-        stamp = _stamp(entry.folder)
+        folder = entry.folder
+        assert folder is not None
+        stamp = _stamp(folder)
         known = self._kept.get((what, entry.key))
         if known is not None and known[0] == stamp:
             return known[1]
@@ -280,13 +281,13 @@ class StudyData:
         def value_of(read: Callable[[Session], Any]) -> Any:
             try:
                 if not session:
-                    session.append(Session.open(entry.folder))
+                    session.append(Session.open(folder))
                 return read(session[0])
             except LiexError as error:
                 return {"damage": str(error)}
             except Exception as error:  # one bad session must not break the study's pages
                 return {
-                    "damage": f"{entry.folder} cannot be shown ({type(error).__name__}: "
+                    "damage": f"{folder} cannot be shown ({type(error).__name__}: "
                     f"{one_line(error)}); look at it with `liex verify`"
                 }
 

@@ -11,14 +11,13 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from flask import Flask, Response, jsonify, request
-from liex_lab.dashboards.report.contact_sheet import Mark, scene_marks, svg_marks
 from numpy.typing import NDArray
 
 from liex_lab.errors import LiexError, PlanError, SessionError
 from liex_lab.scene.background import usual_depth
 from liex_lab.sessions import Session
 
-from ..report.contact_sheet import png_uri, shade
+from ..report.contact_sheet import Mark, png_uri, scene_marks, shade, svg_marks
 from .data import StudyData
 from .frames import Frames
 

@@ -15,7 +15,6 @@ from urllib.parse import quote, unquote
 
 import numpy as np
 from flask import Flask, Response, jsonify, redirect, render_template, request
-from liex_lab.dashboards.report.contact_sheet import WORDS, scene_marks
 from markupsafe import Markup
 from werkzeug.exceptions import NotFound
 
@@ -38,6 +37,7 @@ from ..figures.style import (
     on_page,
     time_unit,
 )
+from ..report.contact_sheet import WORDS, scene_marks
 from ..report.quality import warnings
 from ..units import shown, titled
 from . import tables

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from liex_lab.dashboards.units import page
 
 from liex_lab.actions.ethogram import ACROSS_GAPS
 from liex_lab.actions.vocabulary import NO_POSE, UNLABELLED, action_colours
@@ -21,7 +20,7 @@ from liex_lab.sessions.verdict import verdict_in
 
 from ..figures.seen import FRAMES, KINEMATICS
 from ..figures.sets import FOLDER, for_the_page
-from ..units import counted, day, reading, shown, titled
+from ..units import counted, day, page, reading, shown, titled
 from ..video.relief import scale_mm
 from .charts import pictures, whole_picture
 from .facts import facts, methods

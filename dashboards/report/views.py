@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from liex_lab.dashboards.replay.layouts import write_blueprint, write_layout
-
 from liex_lab.sessions import Session
 
+from ..replay.layouts import write_blueprint, write_layout
 from .report import write_report
 
 

@@ -7,7 +7,6 @@ from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
-from liex_lab.dashboards.figures.seen import DepthReader
 from numpy.typing import NDArray
 
 from liex_lab.actions.vocabulary import action_colours
@@ -15,7 +14,7 @@ from liex_lab.errors import SessionError
 from liex_lab.optics.camera import Camera
 from liex_lab.sessions import Session
 
-from ..figures.seen import Array, Seen, animals, joints_in_picture
+from ..figures.seen import Array, DepthReader, Seen, animals, joints_in_picture
 from .relief import Relief
 
 

@@ -14,8 +14,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from liex_lab.pipelines.training.action_model import cut_sequences
-from liex_lab.pipelines.training.agent_tracks import filmed_at
 from numpy.typing import NDArray
 
 from liex_lab.body.skeleton import Skeleton
@@ -37,7 +35,8 @@ from liex_lab.runtime.progress import Progress, silent
 from liex_lab.scene._height_map_kernels import CropCamera
 from liex_lab.scene.height_maps import in_camera_frame
 
-from ...training.agent_tracks import Scenario
+from ...training.action_model import cut_sequences
+from ...training.agent_tracks import Scenario, filmed_at
 from ...training.pose_model import recipe_of, rendered_set
 
 Array = NDArray[np.float64]

@@ -22,7 +22,6 @@ from pathlib import Path
 from typing import Any, cast
 
 import numba
-from liex_lab.pipelines.training.action_model import cut_sequences
 
 from liex_lab.actions.storage import load_action_model
 from liex_lab.baselines.cnn import CnnPlan, require_torch
@@ -37,6 +36,7 @@ from liex_lab.sessions.provenance import package_version
 from liex_lab.simulation.recording import SEALED
 from liex_lab.simulation.simulator import world_of
 
+from ...training.action_model import cut_sequences
 from ...training.agent_tracks import acted_tracks
 from ...training.baselines import BASELINES, fit, training_of
 from ...training.pose_model import (
