@@ -55,7 +55,7 @@ def test_going_through_rows_in_blocks_holds_no_more_than_a_block_of_what_lies_on
 
 @pytest.mark.skipif(sys.platform != "linux", reason="only there the system tells and takes back")
 def test_a_track_on_disk_takes_no_memory_when_it_rests(tmp_path):
-    mouse, n = Skeleton.load("mouse"), 100_000
+    mouse, n = Skeleton.load("mouse"), 400_000  # many times what else comes and goes meanwhile
     before = resident_mb()
     track = Track.empty(mouse, np.arange(n, dtype=np.int64), allocate=on_disk(tmp_path))
     track.joints_mm[:] = 1.0
