@@ -49,7 +49,7 @@ LIMITS = {
 
 
 def count_words() -> dict[str, int]:
-    """How often each word stands in the product and its manual."""
+    """Occurrences of each word in the product and its manual."""
     listed = subprocess.run(
         ["git", "ls-files", "--", *COUNTED],
         cwd=REPOSITORY,
@@ -65,7 +65,7 @@ def count_words() -> dict[str, int]:
 @pytest.mark.checks
 def test_words_of_our_own_only_become_fewer() -> None:
     more = {word: n for word, n in count_words().items() if n > LIMITS[word]}
-    assert not more, f"use the field's word (CONTRIBUTING.md); these became more: {more}"
+    assert not more, f"use the field's terms (CONTRIBUTING.md); used more often than before: {more}"
 
 
 if __name__ == "__main__":

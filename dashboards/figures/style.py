@@ -32,8 +32,6 @@ LINE = "#d9dbd7"
 SOFT = "#f2f2ee"
 PAPER = "#fdfdfb"
 BLUE = "#4477aa"
-GREEN = "#228833"
-PURPLE = "#aa3377"
 # Okabe and Ito's colour-blind safe colours; every group also has its own mark
 # the first group is the reference, in grey
 GROUP_COLOURS = ("#7f7f7f", "#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")

@@ -1,4 +1,4 @@
-"""The report's figures from a session's tables: the dashboard's curves, and the contact sheet."""
+"""The report's contact sheet, and the whole depth image of a session with its scene."""
 
 from __future__ import annotations
 
@@ -7,12 +7,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from liex_lab.actions.vocabulary import PREDICTED_ERROR, action_colours
+from liex_lab.actions.vocabulary import action_colours
 from liex_lab.sessions import Session
 
-from ..figures.seen import animals
-from ..figures.times import drawn_curves
-from ..units import shown
 from ..video.relief import Relief, put_back, scale_mm
 from . import contact_sheet
 from .contact_sheet import BESIDE, Mark, scene_marks
@@ -21,22 +18,6 @@ if TYPE_CHECKING:
     import pandas as pd
 
 Array = NDArray[np.float64]
-
-
-def traces(session: Session) -> list[tuple[str, Array, Array, str]]:
-    """Curves over time, interrupted at gaps of the camera; the last one is the predicted error.
-
-    Returns:
-        (name with its unit, time s (n,), values (n,), colour) of each.
-    """
-    seen = animals(session)[0]
-    time_s = seen.frames["time_s"].to_numpy(float)
-    made: list[tuple[str, Array, Array, str]] = []
-    for one in drawn_curves(seen):
-        values, unit = shown(seen.column(one.column), one.unit)
-        made.append((f"{one.title}{f', {unit}' if unit else ''}", time_s, values, one.colour))
-    error = seen.broken(seen.frames["predicted_error_mm"])
-    return [*made, ("Predicted error, mm", time_s, error, PREDICTED_ERROR)]
 
 
 def pictures(session: Session) -> list[tuple[str, str, str, str]]:

@@ -49,7 +49,7 @@ def keep_kernels() -> str:
 
 
 def ignore_outdated_kernels() -> None:
-    """Let numba survive kernels that were compiled by an earlier version, here or once loaded."""
+    """Make numba recompile kernels whose cache an earlier version wrote."""
     if caching := sys.modules.get("numba.core.caching"):
         _ignore_outdated(caching)
     else:
@@ -79,7 +79,7 @@ class _CachingFinder:
 
 
 def _ignore_outdated(caching: Any) -> None:
-    """Let numba take an index that names record types of an earlier version for an empty one.
+    """Make numba treat an index that names record types of an earlier version as empty.
 
     numba resolves all names in an index before it compares the index's age with the source, so a
     renamed or moved record type would end every run until the cache is deleted by hand.
