@@ -25,10 +25,10 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, NonNegativeInt
 
 from liex_lab.errors import SessionError
+from liex_lab.recordings.formats.messages.mcap import MAGIC, RECORD
 from liex_lab.runtime.durable import sync_file, sync_tree, take_lock, write_whole
 from liex_lab.runtime.memory import mapped
 from liex_lab.runtime.places import unlinked, unlinked_tree
-from liex_lab.sessions.mcap_log import append_chunks
 
 # between two checkpoints: the most work that can be lost, besides startup
 EVERY_S = 3.0
@@ -371,6 +371,16 @@ def append_rrd(source: Path, target: Path) -> None:
         file.seek(RRD_HEAD if whole.tell() else 0)
         while block := file.read(min(_BLOCK, end - file.tell())):
             whole.write(block)
+
+
+def append_chunks(source: Path, log: Path) -> None:
+    """Append the chunks of an MCAP file without an end to another one of the same topics."""
+    with source.open("rb") as file, log.open("ab") as whole:
+        if whole.tell():  # magic bytes and header exist already
+            file.seek(len(MAGIC))
+            _, length = RECORD.unpack(file.read(RECORD.size))
+            file.seek(length, os.SEEK_CUR)
+        shutil.copyfileobj(file, whole)
 
 
 def _size(path: Path) -> int:

@@ -23,8 +23,8 @@ from liex_lab.plan.sections import Factor
 from liex_lab.scene.outline import Arena
 from liex_lab.scene.zones import Zone
 from liex_lab.sessions.provenance import SCHEMA_VERSION
-from liex_lab.sessions.thumbnails import FOLDER
 
+THUMBNAILS = "thumbnails"  # folder of a session
 _MOST_BYTES = 1 << 28
 _MOST_FRAMES = 1 << 31
 _MOST_JOINTS = 1000
@@ -134,7 +134,7 @@ class _Thumbnail(_Section):
 
     @model_validator(mode="after")
     def _stay(self) -> _Thumbnail:
-        if PurePosixPath(self.file).parts[:-1] != (FOLDER,):
+        if PurePosixPath(self.file).parts[:-1] != (THUMBNAILS,):
             raise ValueError("is a picture outside of the session")
         return self
 

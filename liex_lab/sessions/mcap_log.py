@@ -10,7 +10,6 @@ of data, summary with offsets, footer.
 from __future__ import annotations
 
 import os
-import shutil
 import struct
 from collections import Counter
 from collections.abc import Sequence
@@ -268,16 +267,6 @@ class McapLog:
     def _write(self, data: bytes) -> None:
         self._sink.write(data)
         self._at += len(data)
-
-
-def append_chunks(source: Path, log: Path) -> None:
-    """Append the chunks of an MCAP file without an end to another one of the same topics."""
-    with source.open("rb") as file, log.open("ab") as whole:
-        if whole.tell():  # magic bytes and header exist already
-            file.seek(len(MAGIC))
-            _, length = RECORD.unpack(file.read(RECORD.size))
-            file.seek(length, os.SEEK_CUR)
-        shutil.copyfileobj(file, whole)
 
 
 def _bytes_of(record: McapRecord) -> bytes:

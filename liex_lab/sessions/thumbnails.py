@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 
 from liex_lab.optics.camera import Camera
 from liex_lab.recordings.depth_kernels import to_millimetres
+from liex_lab.sessions.document import THUMBNAILS
 from liex_lab.tables.rows import Rows
 from liex_lab.tracking.observations import Observations
 
-FOLDER = "thumbnails"
 _KEPT = 32  # most whole frames kept of a recording of unknown length
 _SHOWN = 16
 _HALF_SPINES = 1.15  # half the side of a thumbnail, in spine lengths
@@ -67,7 +67,7 @@ class Thumbnails:
         usable = self._usable(rows)
         if not usable:
             return []
-        (folder / FOLDER).mkdir()
+        (folder / THUMBNAILS).mkdir()
         chosen = {usable[k] for k in np.linspace(0, len(usable) - 1, _SHOWN).round().astype(int)}
         return [
             _written(folder, "frame", rows, row, *self._cut(row, rows, camera))
@@ -139,7 +139,7 @@ def _written(
     import cv2
 
     index = int(rows.frame_index[row])
-    name = f"{FOLDER}/{kind}_{index:07d}.png"
+    name = f"{THUMBNAILS}/{kind}_{index:07d}.png"
     cv2.imwrite(str(folder / name), depth)
     height, width = depth.shape
     return {
