@@ -44,6 +44,7 @@ from liex_lab.sessions.corrections import (
     read_log,
 )
 from liex_lab.sessions.evidence import (
+    Results,
     provenance_of,
     read_evidence,
     read_flips,
@@ -52,7 +53,6 @@ from liex_lab.sessions.evidence import (
 )
 from liex_lab.sessions.folder import file_facts
 from liex_lab.sessions.rrd import ReplayWriter
-from liex_lab.sessions.track_tables import Results
 from liex_lab.sessions.writer import BlueprintMaker, ReportMaker
 from liex_lab.tables import schema
 from liex_lab.tables.rows import Rows, frame_count

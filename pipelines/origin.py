@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
     from liex_lab.behaviour.places import Surroundings
     from liex_lab.plan import Plan
-    from liex_lab.plan.sections import Animal
+    from liex_lab.plan.sections import AnimalSettings
     from liex_lab.recordings.recording import Recording
     from liex_lab.scene.height_maps import Segmenter
     from liex_lab.scene.outline import Arena
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 _SPANS = (0.6, 1.8)
 
 
-def animal_of(plan: Plan) -> Animal:
+def animal_of(plan: Plan) -> AnimalSettings:
     """The plan's animal, completed from the skeleton if that is the user's own.
 
     Its name is then the skeleton's, and its spine 0.6 to 1.8 times the skeleton's length.

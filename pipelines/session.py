@@ -236,9 +236,8 @@ def check_unused(folder: Path, overwrite: bool) -> None:
     Raises:
         SessionError: the session cannot be written there.
     """
-    from liex_lab.sessions.backups import put_back_session
     from liex_lab.sessions.checkpoint import check_free
-    from liex_lab.sessions.folder import check_writable, part_folder
+    from liex_lab.sessions.folder import check_writable, part_folder, put_back_session
 
     put_back_session(folder)
     check_writable(folder, overwrite)

@@ -70,15 +70,15 @@ def measure_shard(shard: Shard) -> Shard:
     Returns:
         The same shard, once its folder is complete.
     """
-    from liex_lab.sessions.shards import ShardWriter
+    from liex_lab.sessions.writer import shard_writer
 
     opened = _opened(shard.recording, shard.plan.to_toml(), shard.origin.input_sha256)
     first_ns = int(opened.times_ns[0]) if shard.start else None
     rooms = FrameRooms()
     coming = opened.frames(shard.start, shard.stop)
-    with ShardWriter(shard.folder, shard.origin, first_ns) as writer:
+    with shard_writer(shard.folder, shard.origin, first_ns) as add:
         while frames := rooms.filled(coming, CHUNK):
-            writer.add(frames, shard.tracker.observe(frames))
+            add(frames, shard.tracker.observe(frames))
     return shard
 
 
@@ -103,8 +103,7 @@ def measure_shards(pool: WorkerPool, whole: Shard, path: Path, progress: Progres
     Raises:
         SessionError: a worker died, or another process writes the session.
     """
-    from liex_lab.sessions.shards import append_shard, is_whole, shard_folder
-    from liex_lab.sessions.writer import open_unfinished
+    from liex_lab.sessions.writer import append_shard, is_whole, open_unfinished, shard_folder
 
     held = open_unfinished(path, whole.origin)
     try:

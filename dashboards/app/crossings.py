@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from liex_lab.behaviour.kinematics import IMPOSSIBLE_MM_S
 from liex_lab.sessions import Session
-from liex_lab.sessions.evidence import read_things
+from liex_lab.sessions.evidence import read_centres
 
 from ..figures.seen import Seen
 from .tables import records
@@ -113,7 +113,7 @@ def _jumps(session: Session, seen: Seen) -> Iterator[Crossing]:
 
 def _near_others(session: Session, seen: Seen) -> Iterator[Crossing]:
     """Where another animal comes within a body's length of the tracked one."""
-    things = read_things(session)
+    things = read_centres(session)
     if things is None:
         return
     away_mm = np.linalg.norm(things[:, 1] - things[:, 0], axis=1)

@@ -74,7 +74,7 @@ def _zoomed(skeleton: str) -> Any:
     """The cut-out around the animal with its skeleton's entity; its camera follows the animal."""
     import rerun.blueprint as rrb
 
-    from liex_lab.sessions.rrd_depth import CUTOUTS
+    from liex_lab.sessions.rrd_scene import CUTOUTS
 
     return rrb.Spatial2DView(
         origin=f"{CUTOUTS}/1",
@@ -88,7 +88,7 @@ def _in_picture() -> Any:
     import rerun as rr
 
     from liex_lab.sessions.cutouts import N_BOXES, N_WINDOWS
-    from liex_lab.sessions.rrd_depth import cutout_entity, cutout_frame
+    from liex_lab.sessions.rrd_scene import cutout_entity, cutout_frame
 
     return {
         cutout_entity(k, which): rr.CoordinateFrame(cutout_frame(k))
@@ -148,7 +148,7 @@ def replay_blueprint(session: dict[str, Any]) -> Any:
 
     from liex_lab.sessions.cutouts import ALL, ANIMAL, NONE
     from liex_lab.sessions.rrd import OVERLAY, SKELETON, corrected_entity
-    from liex_lab.sessions.rrd_depth import CUTOUTS
+    from liex_lab.sessions.rrd_scene import CUTOUTS
 
     # with corrections, the original entities are hidden in the views but remain in the
     # replay

@@ -420,8 +420,7 @@ def _tell_session(session: Path, further: str = "") -> None:
 
 def _told_session(session: Path, further: str = "") -> int:
     """Print the session's path and result; returns the exit code."""
-    from liex_lab.sessions.backups import taken_from
-    from liex_lab.sessions.folder import folder_bytes, megabytes
+    from liex_lab.sessions.folder import folder_bytes, megabytes, taken_from
     from liex_lab.sessions.verdict import read_verdict
 
     say(f"session: {session}")

@@ -20,9 +20,9 @@ from pydantic import Field, ValidationError, model_validator
 from liex_lab.errors import PlanError
 from liex_lab.plan.sections import (
     Actions,
-    Animal,
+    AnimalSettings,
     ArenaFacts,
-    Behaviour,
+    BehaviourThresholds,
     CameraOverride,
     Estimation,
     Foreground,
@@ -30,8 +30,8 @@ from liex_lab.plan.sections import (
     Replay,
     Report,
     SessionFacts,
+    SettingsTable,
     SeveralArenas,
-    Table,
     Tracking,
     WaterSurface,
     first_twice,
@@ -42,15 +42,15 @@ _HERE = Path(__file__).resolve().parents[1]
 _MOST_ARENAS = 8  # in one image
 _NOT_PLANS = {"slurm"}  # configures where sessions are measured, not how
 _HEADER = """\
-# A plan of liex_lab: everything a run depends on. Copy this file, change the copy, and name it:
+# A plan of liex_lab: all settings of a run. Copy this file, edit the copy, and use it with:
 #     liex run RECORDING --plan my-plan.toml
 # or change one value for one run:  --set animal.spine_mm=65
-# A line that is left out has its default value; a line in the form '# name =' is not set.
+# A missing line has its default value; a line such as '# name =' is not set.
 # Lengths are millimetres, times seconds, angles radians.
 """
 
 
-class Plan(Table):
+class Plan(SettingsTable):
     """All settings of a run.
 
     Units are part of the names of the settings; None means not set. Plans are immutable.
@@ -73,16 +73,16 @@ class Plan(Table):
         report: files written with the report.
     """
 
-    seed: int = Field(0, ge=0, description="all randomness of a run comes from this number")
+    seed: int = Field(0, ge=0, description="seed of all random numbers of a run")
     arenas: list[SeveralArenas] | Literal["auto"] | None = Field(
         None,
         description=(
-            "several arenas in one picture, each a session of its own: a table [[arenas]] with "
-            "name and region for each, and subject_id, group, ... of its animal; 'auto' proposes "
-            "them, as liex doctor prints them; not set: one arena"
+            "several arenas in one image, each a session of its own: a table [[arenas]] with name "
+            "and region for each, and subject_id, group, ... of its animal; 'auto' proposes them, "
+            "as liex doctor prints them; not set: one arena"
         ),
     )
-    animal: Animal = Animal()
+    animal: AnimalSettings = AnimalSettings()
     camera: CameraOverride = CameraOverride()
     recording: RecordingOptions = RecordingOptions()
     water: WaterSurface = WaterSurface()
@@ -92,7 +92,7 @@ class Plan(Table):
     tracking: Tracking = Tracking()
     session: SessionFacts = SessionFacts()
     actions: Actions = Actions()
-    behaviour: Behaviour = Behaviour()
+    behaviour: BehaviourThresholds = BehaviourThresholds()
     replay: Replay = Replay()
     report: Report = Report()
 
@@ -113,20 +113,16 @@ class Plan(Table):
         return self
 
     def __repr__(self) -> str:
-        usual = Plan()
-        said: list[str] = []
-        for name in type(self).model_fields:
-            mine, other = getattr(self, name), getattr(usual, name)
-            if isinstance(mine, Table):
-                said += [
-                    f"{name}.{key}={value!r}"
-                    for key, value in mine
-                    if value != getattr(other, key) and (name, key) != ("animal", "name")
-                ]
-            elif mine != other:
-                said.append(f"{name}={mine if isinstance(mine, int | str) else len(mine)}")
-        unlike = f"; unlike the defaults: {', '.join(said)}" if said else ", all else by default"
-        return f"<Plan for the {self.animal.name}{unlike}>"
+        parts: list[str] = []
+        for name, changed in self.model_dump(exclude_defaults=True).items():
+            value = getattr(self, name)
+            if isinstance(value, SettingsTable):
+                keys = [key for key in changed if (name, key) != ("animal", "name")]
+                parts += [f"{name}.{key}={getattr(value, key)!r}" for key in keys]
+            else:
+                parts.append(f"{name}={value if isinstance(value, int | str) else len(value)}")
+        others = f"; changed settings: {', '.join(parts)}" if parts else ", default settings"
+        return f"<Plan for the {self.animal.name}{others}>"
 
     @staticmethod
     def load(plan: str | Path) -> Plan:
@@ -149,7 +145,11 @@ class Plan(Table):
                 f"there is no plan '{plan}': {hint}bundled are: {', '.join(known) or 'none'}, or "
                 "give the path of a .toml file"
             )
-        return Plan.from_toml(_read(path), origin=str(path))
+        try:
+            text = read_text(path)
+        except ValueError as error:
+            raise PlanError(f"the plan {path} should be a TOML file, but: {error}") from None
+        return Plan.from_toml(text, origin=str(path))
 
     @staticmethod
     def from_toml(text: str, origin: str = "the plan") -> Plan:
@@ -212,20 +212,17 @@ class Plan(Table):
             inner.pop(key, None)
             if text or dotted not in _settings():
                 inner[key] = _value(dotted, text)
-        return (
-            Plan.from_table(table, " ".join(f"--set {setting}" for setting in chosen))
-            if chosen
-            else self
-        )
+        given = " ".join(f"--set {setting}" for setting in chosen)
+        return Plan.from_table(table, given) if chosen else self
 
     def to_toml(self) -> str:
         """The plan as TOML with a comment for every setting; loading it gives an equal plan."""
         lines = [_HEADER]
         for name, field in Plan.model_fields.items():
             value = getattr(self, name)
-            if not isinstance(value, Table):
-                told = None if isinstance(value, list) else value  # [[tables]] come last
-                lines += [*_entry(name, told, field.description), ""]
+            if not isinstance(value, SettingsTable):
+                single = None if isinstance(value, list) else value  # [[tables]] come last
+                lines += [*_entry(name, single, field.description), ""]
                 continue
             lines += [*_comment(" ".join((type(value).__doc__ or "").split())), f"[{name}]"]
             for key, inner in type(value).model_fields.items():
@@ -255,18 +252,11 @@ def known_plans() -> list[str]:
     )
 
 
-def _read(path: Path) -> str:
-    try:
-        return read_text(path)
-    except ValueError as error:
-        raise PlanError(f"the plan {path} should be a TOML file, but: {error}") from None
-
-
 def _settings() -> dict[str, Any]:
     """Type of every setting, by dotted name."""
     found: dict[str, Any] = {}
     for name, field in Plan.model_fields.items():
-        if isinstance(field.annotation, type) and issubclass(field.annotation, Table):
+        if isinstance(field.annotation, type) and issubclass(field.annotation, SettingsTable):
             inner = field.annotation.model_fields
             found |= {f"{name}.{key}": inner[key].annotation for key in inner}
         else:
@@ -282,9 +272,8 @@ def _value(dotted: str, text: str) -> Any:
         return text
     annotation = _settings().get(dotted)
     takes_text = str in (get_args(annotation) or (annotation,))
-    return (
-        text if takes_text and not isinstance(value, str) else value
-    )  # subject_id=0123 is a name, not a number
+    # subject_id=0123 is a name, not a number
+    return text if takes_text and not isinstance(value, str) else value
 
 
 def _unknown(dotted: str) -> str:
@@ -319,9 +308,8 @@ def _sentence(error: ValidationError) -> str:
         where = f"[{dotted}]: " if dotted else ""
         return f"{where}{first['msg'].removeprefix('Value error, ')}{more}"
     expected = first["msg"].removeprefix("Value error, ").replace("Input should", "should")
-    got = (
-        first["input"].isoformat() if isinstance(first["input"], datetime) else repr(first["input"])
-    )
+    value = first["input"]
+    got = value.isoformat() if isinstance(value, datetime) else repr(value)
     return (
         f"{dotted} {expected}, got {got}; correct it in the plan or with --set {dotted}=...{more}"
     )
@@ -342,7 +330,7 @@ def toml_value(value: Any) -> str:
     Args:
         value: a setting's table, list, text, number or bool.
     """
-    if isinstance(value, Table):
+    if isinstance(value, SettingsTable):
         return toml_value(value.model_dump(exclude_none=True))
     if isinstance(value, dict):
         return f"{{{', '.join(f'{key} = {toml_value(item)}' for key, item in value.items())}}}"

@@ -7,7 +7,7 @@ recordings, plans and results are inside the folder of the file.
 from __future__ import annotations
 
 import difflib
-import json
+import re
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,11 +16,11 @@ from pathlib import Path, PurePosixPath
 from typing import Annotated, Any, Literal
 from urllib.parse import parse_qsl
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import Field, ValidationError, model_validator
 
 from liex_lab.errors import PlanError, StudyError
 from liex_lab.plan import Plan, known_plans
-from liex_lab.plan.sections import ArenaName, Region, first_twice
+from liex_lab.plan.sections import ArenaPlace, SettingsTable, first_twice
 from liex_lab.runtime.places import named_beside
 from liex_lab.runtime.text_files import read_toml
 
@@ -39,12 +39,9 @@ DERIVED = "derivatives/liex-lab"
 # NeuroBlueprint's name of the folder of behavioural data
 RESULTS = "behav"
 VIRTUAL = "synthetic:"
-_PATHS = (
-    ("arena", "zones"),
-    ("estimation", "model"),
-    ("animal", "skeleton"),
-)  # settings that may name a file
-_SAY = {
+# settings that may name a file
+_PATHS = (("arena", "zones"), ("estimation", "model"), ("animal", "skeleton"))
+_PATTERNS = {
     "id": "should be letters and digits only, as in m01",
     "animal": "should be the id of an animal: letters and digits only, as in m01",
     "session": (
@@ -54,11 +51,7 @@ _SAY = {
 }
 
 
-class _Table(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
-
-
-class StudyAnimal(_Table):
+class StudyAnimal(SettingsTable):
     """One animal of the study, a table [[animals]].
 
     Attributes:
@@ -75,10 +68,10 @@ class StudyAnimal(_Table):
     cage: Text = ""
     sex: Text = ""
     batch: Text = ""
-    set: Settings = {}
+    set: Settings = Field(default_factory=dict)
 
 
-class StudyArena(_Table):
+class StudyArena(ArenaPlace):
     """One of several arenas in the images of the study's rig, a table [[arenas]].
 
     Attributes:
@@ -87,12 +80,10 @@ class StudyArena(_Table):
         set: settings of the plan for this arena, nested, such as its zones.
     """
 
-    name: ArenaName
-    region: Region
-    set: Settings = {}
+    set: Settings = Field(default_factory=dict)
 
 
-class StudySession(_Table):
+class StudySession(SettingsTable):
     """One recording of one animal, a table [[sessions]].
 
     Attributes:
@@ -113,10 +104,10 @@ class StudySession(_Table):
     arena: Text = ""
     start_time: str | None = None
     exclude: Text = ""
-    set: Settings = {}
+    set: Settings = Field(default_factory=dict)
 
 
-class StudyTable(_Table):
+class StudyTable(SettingsTable):
     """The content of a study file.
 
     Attributes:
@@ -134,10 +125,10 @@ class StudyTable(_Table):
     plan: PathText = "mouse"
     results: PathText = DERIVED
     shared: Literal["off", "subject"] = "off"
-    set: Settings = {}
-    animals: list[StudyAnimal] = []
-    arenas: list[StudyArena] = []
-    sessions: list[StudySession] = []
+    set: Settings = Field(default_factory=dict)
+    animals: list[StudyAnimal] = Field(default_factory=list)
+    arenas: list[StudyArena] = Field(default_factory=list)
+    sessions: list[StudySession] = Field(default_factory=list)
 
     @model_validator(mode="after")
     def _agree(self) -> StudyTable:
@@ -158,8 +149,8 @@ class StudyTable(_Table):
                     f"the session {one.session} of {one.animal} is in the arena {one.arena}, which "
                     "is not in [[arenas]]"
                 )
-        filmed = Counter((one.arena, one.recording) for one in self.sessions if one.arena)
-        for (arena, recording), n in filmed.items():
+        recorded = Counter((one.arena, one.recording) for one in self.sessions if one.arena)
+        for (arena, recording), n in recorded.items():
             if n > 1:
                 raise ValueError(
                     f"two sessions are of the arena {arena} in {recording}; an arena holds one "
@@ -305,7 +296,17 @@ class Study:
             PlanError: a named plan is invalid.
         """
         animals = {animal.id: animal for animal in self.table.animals}
-        return tuple(self._planned(animals[one.animal], one) for one in self.table.sessions)
+        planned = []
+        for one in self.table.sessions:
+            animal = animals[one.animal]
+            id = f"sub-{animal.id}_ses-{one.session}"
+            recording = one.recording
+            if not recording.startswith(VIRTUAL):
+                recording = str(self.inside(recording, f"the recording of {id}"))
+            folder = self.results / f"sub-{animal.id}" / f"ses-{one.session}" / RESULTS
+            plan = self._plan(animal, one, id)
+            planned.append(PlannedSession(id, animal, recording, folder, plan, one.exclude))
+        return tuple(planned)
 
     def inside(self, text: str, what: str) -> Path:
         """Full path of a path in the study file, which must stay in the study's folder.
@@ -325,27 +326,14 @@ class Study:
             )
         return self.folder.joinpath(*PurePosixPath(text.replace("\\", "/")).parts)
 
-    def _planned(self, animal: StudyAnimal, one: StudySession) -> PlannedSession:
-        id = f"sub-{animal.id}_ses-{one.session}"
-        recording = one.recording
-        if not recording.startswith(VIRTUAL):
-            recording = str(self.inside(recording, f"the recording of {animal.id} {one.session}"))
-        folder = self.results / f"sub-{animal.id}" / f"ses-{one.session}" / RESULTS
-        return PlannedSession(
-            id, animal, recording, folder, self._plan(animal, one, id), one.exclude
-        )
-
     def _plan(self, animal: StudyAnimal, one: StudySession, id: str) -> Plan:
         """The plan with the settings of study, arena, animal and session applied, in this order."""
         named = one.plan or self.table.plan
         plan = Plan.load(named if named in known_plans() else self.inside(named, "plan"))
         facts: Settings = {"name": id, "individual": animal.id, "subject_id": animal.id}
-        facts |= {
-            key: value
-            for key in ("group", "cage", "sex", "batch")
-            if (value := getattr(animal, key))
-        }
-        facts |= {"session_start_time": one.start_time} if one.start_time else {}
+        stated = {key: getattr(animal, key) for key in ("group", "cage", "sex", "batch")}
+        stated["session_start_time"] = one.start_time
+        facts |= {key: value for key, value in stated.items() if value}
         table = plan.model_dump(exclude_none=True)
         arena = next((each for each in self.table.arenas if each.name == one.arena), None)
         where: Settings = {}
@@ -355,11 +343,11 @@ class Study:
         for settings in (self.table.set, where, animal.set, {"session": facts}, one.set):
             table = merged(table, settings)
         for section, key in _PATHS:
-            text = table.get(section, {}).get(key) if isinstance(table.get(section), dict) else None
+            settings = table.get(section)
+            text = settings.get(key) if isinstance(settings, dict) else None
             if isinstance(text, str) and (self.folder / text).is_file():
-                table[section][key] = str(
-                    self.inside(text, f"{section}.{key}")
-                )  # workers run in other folders
+                # workers run in other folders
+                table[section][key] = str(self.inside(text, f"{section}.{key}"))
         if table.get("arenas") is not None:
             raise StudyError(
                 f"{self.path}, session {id}: a session of a study is of one animal in one arena; "
@@ -382,9 +370,8 @@ def merged(table: Settings, settings: Settings) -> Settings:
     out = dict(table)
     for key, value in settings.items():
         below = out.get(key)
-        out[key] = (
-            merged(below, value) if isinstance(below, dict) and isinstance(value, dict) else value
-        )
+        both = isinstance(below, dict) and isinstance(value, dict)
+        out[key] = merged(below, value) if both else value
     return out
 
 
@@ -400,15 +387,15 @@ def _sentence(error: ValidationError) -> str:
         return f"{where} is not known here{_nearest(key, first['loc'])}; correct or remove it{more}"
     if first["type"] == "value_error":
         return first["msg"].removeprefix("Value error, ") + more
-    said = _SAY.get(key) if first["type"] == "string_pattern_mismatch" else None
-    expected = said or first["msg"].replace("Input should", "should").replace(
-        "String should", "should"
-    )
-    return f"{where} {expected}, got {_short(first['input'])}; correct it{more}"
+    pattern = _PATTERNS.get(key) if first["type"] == "string_pattern_mismatch" else None
+    expected = re.sub("(Input|String) should", "should", first["msg"])
+    got = ascii(first["input"])
+    got = got if len(got) <= 80 else got[:77] + "..."
+    return f"{where} {pattern or expected}, got {got}; correct it{more}"
 
 
 def _nearest(key: str, where: Sequence[Any]) -> str:
-    models: dict[str, type[BaseModel]] = {
+    models: dict[str, type[SettingsTable]] = {
         "animals": StudyAnimal,
         "arenas": StudyArena,
         "sessions": StudySession,
@@ -416,11 +403,3 @@ def _nearest(key: str, where: Sequence[Any]) -> str:
     model = models.get(str(where[0]), StudyTable) if len(where) > 1 else StudyTable
     near = difflib.get_close_matches(key, model.model_fields, 1)
     return f", did you mean {near[0]}" if near else ""
-
-
-def _short(value: Any) -> str:
-    try:
-        text = json.dumps(value, ensure_ascii=True, default=str)
-    except (ValueError, RecursionError):
-        text = type(value).__name__
-    return text if len(text) <= 80 else text[:77] + "..."

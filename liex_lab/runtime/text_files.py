@@ -7,6 +7,7 @@ separate cells by semicolons or tabs in locales with a decimal comma.
 from __future__ import annotations
 
 import csv
+import json
 import re
 import tomllib
 from collections.abc import Sequence
@@ -89,6 +90,15 @@ def read_toml(path: Path) -> dict[str, Any]:
         ValueError: it is not valid text or TOML.
     """
     return parse_toml(read_text(path))
+
+
+def loose_json(path: Path) -> dict[str, Any]:
+    """The object in a JSON file; empty if the file is absent, damaged or not an object."""
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError):
+        return {}
+    return found if isinstance(found, dict) else {}
 
 
 def split_lines(text: str) -> tuple[str, list[str]]:

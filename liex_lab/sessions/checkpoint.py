@@ -29,6 +29,7 @@ from liex_lab.recordings.formats.messages.mcap import MAGIC, RECORD
 from liex_lab.runtime.durable import sync_file, sync_tree, take_lock, write_whole
 from liex_lab.runtime.memory import mapped
 from liex_lab.runtime.places import unlinked, unlinked_tree
+from liex_lab.runtime.text_files import loose_json
 
 # between two checkpoints: the most work that can be lost, besides startup
 EVERY_S = 3.0
@@ -106,18 +107,14 @@ class Checkpoint:
             raise SessionError(
                 f"no folder can be made at {error.filename} ({error.strerror}); name another place"
             ) from None
-        check_free(folder)
-        held = take_lock(folder / _LOCK)
-        if held is None:  # locked in the meantime
-            raise SessionError(
-                f"another process has just begun to write {folder}; wait until it is done"
-            )
+        self._held = _locked(folder)
         self.folder = folder
-        self._held = held
         self._clock = clock
         text = json.dumps(facts, sort_keys=True, default=str)
         key = hashlib.sha256(text.encode()).hexdigest()
-        state = _read_state(folder / _STATE)
+        state = None
+        with suppress(OSError, ValueError):  # nothing to resume from
+            state = State.model_validate_json((folder / _STATE).read_bytes())
         if state is None or state.key != key or not self._cut(state):
             self._empty()
             state = State(key=key)
@@ -138,11 +135,6 @@ class Checkpoint:
     def is_saved(self) -> bool:
         """Whether there is a checkpoint to resume from."""
         return (self.folder / _STATE).is_file()
-
-    @property
-    def kept_frames(self) -> int:
-        """Frames that need not be measured again, however the work ends."""
-        return self.state.n_frames if self.is_saved else 0
 
     @property
     def due(self) -> bool:
@@ -248,7 +240,7 @@ class Columns:
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
-        self._kinds = _read_kinds(folder) or {}
+        self._kinds = _read_kinds(folder)
         self._files: dict[str, IO[bytes]] = {}
 
     def append(self, columns: Mapping[str, NDArray[Any]]) -> None:
@@ -319,7 +311,7 @@ class Columns:
             n: rows to keep.
         """
         kinds = _read_kinds(folder)
-        if kinds is None:
+        if not kinds:
             return n == 0
         for name, (kind, shape) in kinds.items():
             path = folder / f"{name}.bin"
@@ -407,12 +399,9 @@ def hash_once(recording: Recording, folder: Path, progress: Progress) -> None:
         progress: reports how many MB were read.
     """
     stamp = recording.files.stamp
-    try:
-        found = json.loads((folder / _INPUT).read_text(encoding="utf-8"))
-        if stamp and found["stamp"] == stamp:
-            recording.files.take_digest(str(found["sha256"]))
-    except (OSError, ValueError, KeyError, TypeError):
-        pass
+    known = loose_json(folder / _INPUT)
+    if stamp and known.get("stamp") == stamp and isinstance(known.get("sha256"), str):
+        recording.files.take_digest(known["sha256"])
     began = time.monotonic()
     digest = recording.digest(progress)
     if stamp and time.monotonic() - began > EVERY_S:
@@ -427,13 +416,18 @@ def check_free(folder: Path) -> None:
         folder: the folder NAME.part.
     """
     if (folder / _LOCK).is_file():
-        held = take_lock(folder / _LOCK)
-        if held is None:
-            raise SessionError(
-                f"another process is writing the session {folder.with_suffix('').name} into "
-                f"{folder.parent}; wait until it is done, or choose another place with --out"
-            )
-        held.close()
+        _locked(folder).close()
+
+
+def _locked(folder: Path) -> IO[bytes]:
+    """The lock of an unfinished session; raises SessionError if another process is writing it."""
+    held = take_lock(folder / _LOCK)
+    if held is None:
+        raise SessionError(
+            f"another process is writing the session {folder.with_suffix('').name} into "
+            f"{folder.parent}; wait until it is done, or choose another place with --out"
+        )
+    return held
 
 
 def hold(folder: Path) -> IO[bytes] | None:
@@ -452,24 +446,17 @@ def hold(folder: Path) -> IO[bytes] | None:
         return None
 
 
-def _read_state(path: Path) -> State | None:
-    """The state in a file; None if it cannot be resumed."""
+def _read_kinds(folder: Path) -> dict[str, tuple[str, list[int]]]:
+    """Dtype and row shape of the columns by name, from columns.json; empty if it is invalid."""
     try:
-        return State.model_validate_json(path.read_bytes())
-    except (OSError, ValueError):
-        return None
-
-
-def _read_kinds(folder: Path) -> dict[str, tuple[str, list[int]]] | None:
-    """Dtype and row shape of the columns by name, from columns.json; None if it is invalid."""
-    try:
-        found: dict[str, Any] = json.loads((folder / "columns.json").read_text(encoding="utf-8"))
         kinds = {
             name: (np.dtype(str(kind)), [int(n) for n in shape])
-            for name, (kind, shape) in found.items()
+            for name, (kind, shape) in loose_json(folder / "columns.json").items()
         }
-    except (OSError, ValueError, AttributeError, TypeError, RecursionError, OverflowError):
-        return None
-    sound = all(name.isidentifier() and dtype.kind in "biufU" for name, (dtype, _) in kinds.items())
-    sound = sound and all(0 <= n < _MOST for _, shape in kinds.values() for n in shape)
-    return {name: (dtype.str, shape) for name, (dtype, shape) in kinds.items()} if sound else None
+    except (ValueError, TypeError, OverflowError):
+        return {}
+    sound = all(
+        name.isidentifier() and dtype.kind in "biufU" and all(0 <= n < _MOST for n in shape)
+        for name, (dtype, shape) in kinds.items()
+    )
+    return {name: (dtype.str, shape) for name, (dtype, shape) in kinds.items()} if sound else {}

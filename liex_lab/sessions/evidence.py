@@ -1,17 +1,19 @@
-"""Intermediate results of a session, read back: observations, skeleton, track, provenance,
-recording.
+"""Results of a session as tables, and its intermediate results read back for corrections.
 
-The file observations.npz contains the pose hypotheses of every frame, before association and
-smoothing, and their animal and camera. After a correction, the track is recomputed from them.
+`Results` writes the tables of a track. The file observations.npz contains the pose hypotheses of
+every frame, before association and smoothing, with their animal and camera; after a correction, the
+track is recomputed from them.
 """
 
 from __future__ import annotations
 
 import json
 import os
-import zipfile
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,38 +22,130 @@ from liex_lab.body.skeleton import Skeleton
 from liex_lab.errors import SessionError
 from liex_lab.geometry import so3
 from liex_lab.recordings.timestamps import Gap
-from liex_lab.runtime.memory import blocks, check_npz
-from liex_lab.sessions.document import reading_from
-from liex_lab.sessions.provenance import Provenance
-from liex_lab.sessions.track_tables import spreads
-from liex_lab.tables.rows import LOST
-from liex_lab.tables.schema import ROOT_COVARIANCES
+from liex_lab.runtime.memory import check_npz
+from liex_lab.runtime.text_files import write_csv
+from liex_lab.sessions.provenance import Provenance, package_version, reading_from
+from liex_lab.sessions.session import Session, spreads
+from liex_lab.sessions.verdict import WHO
+from liex_lab.tables import schema as tables
+from liex_lab.tables.rows import LOST, Rows, median_step, stop_times
 from liex_lab.tracking.observations import COLUMNS, Observations
 from liex_lab.tracking.track import Flip, Subject, Track
 
 if TYPE_CHECKING:
     import pandas as pd
 
-    from liex_lab.sessions.session import Session
-
-_SCALARS = ("scale", "predicted_error_mm", "residual_mm", "n_foreground_px", "p_flip", "bridged")
-
-_ADDRESS = "synthetic:"
-
 Array = NDArray[np.float64]
 
 FILE = "observations.npz"
+_SCALARS = ("scale", "predicted_error_mm", "residual_mm", "n_foreground_px", "p_flip", "bridged")
+_ADDRESS = "synthetic:"
 # columns that sessions of earlier versions lack
 _LATER = ("covered", "beside", "behind", "part_mm", "repeats")
 _BYTES_PER_JOINT = 1 << 10  # upper limit per frame, several times the true size
 _SPARE_BYTES = 1 << 26  # for the skeleton and its mesh
-_BLOCK = 16_384  # frames in memory at a time
+
+
+@dataclass(frozen=True)
+class Results:
+    """A track as rows, with its provenance.
+
+    Attributes:
+        origin: provenance of the recording.
+        rows: the track in the form of the tables.
+        flips: intervals in which head and tail may be exchanged.
+    """
+
+    origin: Provenance
+    rows: Rows
+    flips: Sequence[Flip] = ()
+
+    def write_track(self, folder: Path) -> None:
+        """Write the tables of the track itself: frames, poses, rotations, gaps, flips, sessions.
+
+        Args:
+            folder: the folder of the Parquet files.
+        """
+        rows = self.rows
+        described = self.origin.table_metadata()
+        own: dict[str, Any] = {
+            "frames": rows.frames(),
+            "poses": rows.poses(),
+            "rotations": rows.rotations(),
+            "gaps": [rows.gaps()],
+            "flips": [rows.flips(self.flips)],
+            "sessions": [self.session_row()],
+        }
+        for name, blocks in own.items():
+            tables.write_table(folder / f"{name}.parquet", tables.TABLES[name], blocks, described)
+
+    def write_measured(
+        self, folder: Path, results: Mapping[str, pd.DataFrame], columns: Sequence[tables.Column]
+    ) -> None:
+        """Write the tables of behaviour, summary.csv, and columns.json, which describes all tables.
+
+        Args:
+            folder: the folder of the files.
+            results: tables by name; a table without any described column is left out.
+            columns: descriptions of columns beyond those of `tables.TABLES`.
+
+        Raises:
+            SessionError: a table has a column that is not described.
+        """
+        described = self.origin.table_metadata()
+        for name, result in results.items():
+            schema = [*tables.TABLES.get(name, ()), *(c for c in columns if c.table == name)]
+            if not schema:  # kinematics without any measure
+                continue
+            if name == "summary":
+                tables.check_described(result.columns, schema, name)
+                write_csv(result, folder / "summary.csv")
+            else:
+                tables.write_table(
+                    folder / f"{name}.parquet", schema, tables.from_pandas(result), described
+                )
+        text = json.dumps(tables.dictionary(columns), indent=1, ensure_ascii=False)
+        (folder / "columns.json").write_text(text + "\n", encoding="utf-8")
+
+    def session_row(self) -> dict[str, Any]:
+        """The row of the table `sessions`."""
+        rows = self.rows
+        origin = self.origin
+        observed = rows.track.observed
+        step = median_step(rows.time_s)
+        subject = {name: origin.subject.get(name, "") for name in WHO}
+        return {
+            "session_id": rows.session_id,
+            "individual": rows.individual,
+            **subject,
+            "session_start_time": origin.session_start_time,
+            "n_frames": rows.track.n_frames,
+            "n_frames_observed": int(observed.sum()),
+            "observed_s": float((stop_times(rows.time_s) - rows.time_s)[observed].sum()),
+            "fps_median": 1.0 / step if step else float("nan"),
+            "calibration_hash": origin.calibration_hash,
+            "software_version": package_version("liex_lab"),
+        }
+
+    def counts(self) -> dict[str, Any]:
+        """Counts of frames and of their flags: section `frames` of session.json."""
+        flags, counts = np.unique(self.rows.track.flag, return_counts=True)
+        missing = self.rows.missing_before()
+        row = self.session_row()
+        return {
+            "n_frames": row["n_frames"],
+            "n_observed": row["n_frames_observed"],
+            "flags": {flag or "good": n for flag, n in zip(flags, counts.tolist(), strict=True)},
+            "n_missing": int(missing.sum()),
+            "n_gaps": int((missing > 0).sum()),
+            "duration_s": float(stop_times(self.rows.time_s)[-1]),
+            "observed_s": row["observed_s"],
+            "fps_median": None if np.isnan(row["fps_median"]) else row["fps_median"],
+        }
 
 
 def write_evidence(folder: Path, seen: Observations, subject: Subject) -> None:
     """Write observations.npz, a compressed NumPy archive without pickle.
-
-    Frames are written in blocks, so that long recordings need little memory.
 
     Args:
         folder: the folder of the file.
@@ -68,38 +162,26 @@ def write_evidence(folder: Path, seen: Observations, subject: Subject) -> None:
         "unseen": None if subject.unseen is None else list(subject.unseen),
         "n_animals": subject.n_animals,
     }
-    told = np.frombuffer(json.dumps(facts).encode(), np.uint8)
-    columns = {"subject": told, **{name: getattr(seen, name) for name in COLUMNS}}
-    with zipfile.ZipFile(
-        folder / FILE, "w", zipfile.ZIP_DEFLATED
-    ) as kept:  # as np.savez_compressed, in parts
-        for name, values in columns.items():
-            with kept.open(f"{name}.npy", "w", force_zip64=True) as file:
-                kind = np.lib.format.dtype_to_descr(values.dtype)
-                head = {"descr": kind, "fortran_order": False, "shape": values.shape}
-                np.lib.format.write_array_header_1_0(file, head)
-                for rows in blocks(len(values), _BLOCK):
-                    file.write(np.ascontiguousarray(values[rows]).tobytes())
+    columns = {name: getattr(seen, name) for name in COLUMNS}
+    text = np.frombuffer(json.dumps(facts).encode(), np.uint8)
+    np.savez_compressed(folder / FILE, subject=text, **columns)
 
 
-def read_skeleton(session: Session) -> Skeleton | None:
-    """The skeleton of a session's observations; None for a session without observations.
+@contextmanager
+def _opened(session: Session) -> Iterator[tuple[Any, dict[str, Any]]]:
+    """The arrays of observations.npz by name, and the facts on their animal.
 
-    Args:
-        session: the session.
+    The file's size is checked against the numbers of frames and joints.
 
     Raises:
         SessionError: the file is damaged.
     """
-    path = session.path / FILE
-    if not path.is_file():
-        return None
-    with (
-        reading_from(path),
-        _opened(path, session) as file,
-        np.load(file, allow_pickle=False) as kept,
-    ):
-        return Skeleton.from_table(json.loads(kept["subject"].tobytes())["skeleton"], str(path))
+    n_joints = len(session.metadata["animal"]["joints"])
+    n_frames = session.metadata["frames"]["n_frames"]
+    with reading_from(session.path / FILE) as path:
+        check_npz(path, _SPARE_BYTES + n_frames * (n_joints + 1) * _BYTES_PER_JOINT)
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
+            yield arrays, json.loads(arrays["subject"].tobytes())
 
 
 def read_evidence(session: Session) -> tuple[Observations, Subject]:
@@ -115,29 +197,24 @@ def read_evidence(session: Session) -> tuple[Observations, Subject]:
         SessionError: the session has no observations, as in earlier versions, or the file is
             damaged.
     """
-    path = session.path / FILE
-    if not path.is_file():
+    if not session.has(FILE):
         raise SessionError(
-            f"{session.path} does not hold what its single frames said ({FILE}), as sessions of "
-            "earlier versions; run `liex run` on the recording again"
+            f"{session.path} lacks the observations of single frames ({FILE}), as sessions of "
+            "earlier versions do; run `liex run` on the recording again"
         )
-    with (
-        reading_from(path),
-        _opened(path, session) as file,
-        np.load(file, allow_pickle=False) as kept,
-    ):
-        facts = json.loads(kept["subject"].tobytes())
-        skeleton = Skeleton.from_table(facts["skeleton"], str(path))
-        none = Observations.empty(skeleton, np.zeros(len(session.frames), np.int64))
-        seen = Observations(
-            skeleton,
-            *(
-                getattr(none, name) if name in _LATER and name not in kept else kept[name]
-                for name in COLUMNS
-            ),
-        )
-        _check_shapes(seen, len(session.frames))
-        # missing in sessions of earlier versions
+    with _opened(session) as (arrays, facts):
+        skeleton = Skeleton.from_table(facts["skeleton"], str(session.path / FILE))
+        empty = Observations.empty(skeleton, np.zeros(len(session.frames), np.int64))
+        columns = []
+        for name in COLUMNS:
+            expected = getattr(empty, name)
+            found = expected if name in _LATER and name not in arrays else arrays[name]
+            if (found.shape, found.dtype) != (expected.shape, expected.dtype):
+                raise ValueError(
+                    f"{name} is {found.dtype} {found.shape}, not {expected.dtype} {expected.shape}"
+                )
+            columns.append(found)
+        # the last three are missing in sessions of earlier versions
         stretch = facts.get("stretch_sd")
         unseen = facts.get("unseen")
         subject = Subject(
@@ -152,10 +229,10 @@ def read_evidence(session: Session) -> tuple[Observations, Subject]:
             None if unseen is None else (float(unseen[0]), float(unseen[1])),
             int(facts.get("n_animals", 1)),
         )
-    return seen, subject
+    return Observations(skeleton, *columns), subject
 
 
-def read_things(session: Session) -> NDArray[np.float64] | None:
+def read_centres(session: Session) -> NDArray[np.float64] | None:
     """Positions of the two likeliest objects of every frame, without the rest of the observations.
 
     Args:
@@ -168,39 +245,15 @@ def read_things(session: Session) -> NDArray[np.float64] | None:
     Raises:
         SessionError: the file is damaged.
     """
-    path = session.path / FILE
-    if not path.is_file():
+    if not session.has(FILE):
         return None
-    with (
-        reading_from(path),
-        _opened(path, session) as file,
-        np.load(file, allow_pickle=False) as kept,
-    ):
-        centre = kept["centroid_mm"][:, ::2].astype(np.float64)  # h ^ 1 is the same object
-        centre[~np.isfinite(kept["score"]).reshape(len(centre), -1, 2).any(axis=2)] = np.nan
+    with _opened(session) as (arrays, _):
+        centre = arrays["centroid_mm"][:, ::2].astype(np.float64)  # h ^ 1 is the same object
+        found = np.isfinite(arrays["score"]).reshape(len(centre), -1, 2).any(axis=2)
+        centre[~found] = np.nan
         if centre.shape != (session.metadata["frames"]["n_frames"], 2, 3):
-            raise ValueError(f"centres of things are {centre.shape}, not those of every frame")
+            raise ValueError(f"centres of objects are {centre.shape}, not those of every frame")
     return centre
-
-
-def _opened(path: Path, session: Session) -> IO[bytes]:
-    """Open the file after checking its size against the numbers of frames and joints."""
-    n_joints = len(session.metadata["animal"]["joints"])
-    n_frames = session.metadata["frames"]["n_frames"]
-    check_npz(path, _SPARE_BYTES + n_frames * (n_joints + 1) * _BYTES_PER_JOINT)
-    return path.open("rb")
-
-
-def _check_shapes(seen: Observations, n_frames: int) -> None:
-    """Raises ValueError if the arrays do not match the number of frames."""
-    wanted = Observations.empty(seen.skeleton, np.zeros(n_frames, np.int64))
-    for name in COLUMNS:
-        found = getattr(seen, name)
-        expected = getattr(wanted, name)
-        if (found.shape, found.dtype) != (expected.shape, expected.dtype):
-            raise ValueError(
-                f"{name} is {found.dtype} {found.shape}, not {expected.dtype} {expected.shape}"
-            )
 
 
 def read_flips(session: Session) -> list[Flip]:
@@ -220,7 +273,7 @@ def read_flips(session: Session) -> list[Flip]:
                 str(row["source"]),
                 str(row.get("undone_at", "")),
             )
-            for row in _rows_of(session.flips)
+            for row in session.flips.to_dict("records")
         ]
 
 
@@ -263,8 +316,9 @@ def provenance_of(session: Session, skeleton: Skeleton) -> Provenance:
 def _camera_gaps(session: Session) -> list[Gap]:
     """Frames that the camera did not deliver and moved timestamps, from the table `gaps`."""
     times, index = (session.frames[name].to_numpy() for name in ("time_ns", "frame_index"))
+    lost_by_camera = session.gaps[~session.gaps["reason"].isin(LOST)]
     found = []
-    for row in _rows_of(session.gaps[~session.gaps["reason"].isin(LOST)]):
+    for row in lost_by_camera.to_dict("records"):
         at = int(times[np.searchsorted(index, row["start_frame"])])
         missing = int(row["n_frames_missing"])
         first = at - round(1e9 * (row["stop_s"] - row["start_s"])) if missing else at
@@ -279,11 +333,6 @@ def _camera_gaps(session: Session) -> list[Gap]:
             )
         )
     return found
-
-
-def _rows_of(table: pd.DataFrame) -> list[dict[str, Any]]:
-    """Rows of a short table as dicts."""
-    return [{str(name): value for name, value in row.items()} for row in table.to_dict("records")]
 
 
 def link_to(recording: str | Path, folder: Path) -> dict[str, Any]:
@@ -321,9 +370,9 @@ def skeleton_of(session: Session) -> Skeleton:
     Args:
         session: the session.
     """
-    kept = read_skeleton(session)
-    if kept is not None:
-        return kept
+    if session.has(FILE):
+        with _opened(session) as (_, facts):
+            return Skeleton.from_table(facts["skeleton"], str(session.path / FILE))
     planned = session.metadata["plan"].get("animal")
     return Skeleton.load(
         planned["skeleton"] if isinstance(planned, dict) else session.metadata["animal"]["name"]
@@ -342,31 +391,37 @@ def track_of(session: Session, skeleton: Skeleton | None = None) -> Track:
     """
     skeleton = skeleton or skeleton_of(session)
     frames = session.frames
-    n = len(session.frames)
-    j = skeleton.n_joints
     poses = session.poses
     rotations = session.rotations
+    n = len(frames)
+    j = skeleton.n_joints
     if len(poses) != n * j or len(rotations) != n * (j + 1):
         raise SessionError(
             f"{session.path} holds {len(poses)} rows of poses for {n} frames, {j} joints; run it "
             "again"
         )
+
+    def turned(name: str) -> Array:
+        return _columns(rotations, [name.format(a) for a in "xyz"]).reshape(n, j + 1, 3)
+
     track = Track.empty(skeleton, frames["time_ns"].to_numpy(np.int64))
     track.joints_mm[:] = _columns(poses, [f"{a}_mm" for a in "xyz"]).reshape(n, j, 3)
     track.uv_px[:] = _columns(poses, ["u_px", "v_px"]).reshape(n, j, 2)
     track.sd_mm[:] = poses["sd_mm"].to_numpy(float).reshape(n, j)
     track.sd_xy_mm[:], _, track.sd_z_mm[:] = np.moveaxis(spreads(poses).reshape(n, j, 3), -1, 0)
-    turns = _columns(rotations, [f"w{a}_rad" for a in "xyz"]).reshape(n, j + 1, 3)
-    spread = _columns(rotations, [f"sd_w{a}_rad" for a in "xyz"]).reshape(n, j + 1, 3)
+    turns = turned("w{}_rad")
+    spread = turned("sd_w{}_rad")
     track.angles_rad[:] = turns[:, 1:]
     track.sd_angles_rad[:] = spread[:, 1:]
-    seen = np.isfinite(turns[:, 0]).all(axis=1)
-    track.root_rotation[seen] = so3.exp(turns[seen, 0])
-    track.root_mm[:] = _columns(rotations, [f"t{a}_mm" for a in "xyz"]).reshape(n, j + 1, 3)[:, 0]
-    shift = _columns(rotations, [f"sd_t{a}_mm" for a in "xyz"]).reshape(n, j + 1, 3)[:, 0]
-    track.cov_root[:] = _covariance(
-        rotations.iloc[:: j + 1], np.concatenate([spread[:, 0], shift], axis=1)
-    )
+    posed = np.isfinite(turns[:, 0]).all(axis=1)
+    track.root_rotation[posed] = so3.exp(turns[posed, 0])
+    track.root_mm[:] = turned("t{}_mm")[:, 0]
+    sd = np.concatenate([spread[:, 0], turned("sd_t{}_mm")[:, 0]], axis=1)
+    covariance = track.cov_root  # NaN beside the diagonal for an older session
+    covariance[:, range(6), range(6)] = sd**2
+    above, below = np.triu_indices(6, 1)
+    pairs = _columns(rotations.iloc[:: j + 1], list(tables.ROOT_COVARIANCES))
+    covariance[:, above, below] = covariance[:, below, above] = pairs
     for name in _SCALARS:
         if name in frames:
             getattr(track, name)[:] = frames[name].to_numpy()
@@ -376,30 +431,9 @@ def track_of(session: Session, skeleton: Skeleton | None = None) -> Track:
     return track
 
 
-def _covariance(roots: pd.DataFrame, sd: Array) -> Array:
-    """Covariances (n, 6, 6) of the root from its rows and its standard deviations (n, 6).
-
-    An older session only has the standard deviations; the rest is NaN.
-    """
-    out = np.zeros((len(sd), 6, 6))
-    out[:, range(6), range(6)] = sd**2
-    rows, columns = np.triu_indices(6, 1)
-    out[:, rows, columns] = out[:, columns, rows] = _columns(roots, list(ROOT_COVARIANCES))
-    return out
-
-
 def wall_of(session: Session) -> Array:
-    """(n,) distance of the animal from the nearest wall, mm; NaN if unknown.
-
-    Args:
-        session: the session.
-    """
-    frames = session.frames
-    return (
-        frames["wall_distance_mm"].to_numpy(float)
-        if "wall_distance_mm" in frames
-        else np.full(len(frames), np.nan)
-    )
+    """(n,) distance of the animal from the nearest wall, mm; NaN if unknown."""
+    return _columns(session.frames, ["wall_distance_mm"])[:, 0]
 
 
 def _columns(table: pd.DataFrame, names: list[str]) -> Array:

@@ -1,4 +1,10 @@
-"""Folder of a session: its name, write checks, failed.json, and free disk space."""
+"""Folder of a session: its name, write checks, failed.json, free disk space, and older copies.
+
+NAME.part is an unfinished session. NAME.old is the session being replaced by a new one; it exists
+only for a moment, but remains if the writer is killed in that moment. NAME.outdated is the session
+from before a study's run of it failed. A copy with corrections that no later session contains is
+never removed, but numbered: NAME.outdated-2, NAME.outdated-3 and so on.
+"""
 
 from __future__ import annotations
 
@@ -7,22 +13,25 @@ import platform
 import shutil
 import traceback
 from datetime import UTC, datetime
+from itertools import count
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from liex_lab.catalog import sha256
 from liex_lab.errors import LiexError, SessionError
-from liex_lab.runtime.durable import write_whole
+from liex_lab.runtime import durable
 from liex_lab.runtime.memory import why_short
 from liex_lab.runtime.places import is_full, storable_document, unlinked, why_full
-from liex_lab.sessions.checkpoint import OWN
+from liex_lab.runtime.text_files import loose_json
+from liex_lab.sessions.checkpoint import OWN, hold
+from liex_lab.sessions.corrections import FOLDER, LOG, corrected_folder, read_log
 from liex_lab.sessions.provenance import versions
 
-if TYPE_CHECKING:
-    pass
-
 FAILED_FILE = "failed.json"
-_REPORT = "report it to the makers of liex_lab with the lines under traceback"
+_TAKEN = "corrected.taken"  # in an outdated copy: corrections inherited by a later session
+_LOGS = {".rrd", ".mcap"}
+_HASHED = {".parquet", ".csv", ".json", ".toml"}
+_SURE = 0.5  # of the estimated size: least free space to begin with
 
 
 def describe_failure(error: BaseException, stage: str, frame: int | None) -> dict[str, Any]:
@@ -55,8 +64,8 @@ def describe_failure(error: BaseException, stage: str, frame: int | None) -> dic
         remedy = "make room, correct the permissions or mend the drive, and try again"
     else:
         reason = f"{type(error).__name__}: {error}"
-        remedy = _REPORT
-    told: dict[str, Any] = {
+        remedy = "report it to the makers of liex_lab with the lines under traceback"
+    failure: dict[str, Any] = {
         "stage": stage,
         "frame": frame,
         "reason": reason,
@@ -66,7 +75,7 @@ def describe_failure(error: BaseException, stage: str, frame: int | None) -> dic
         "machine": platform.node(),
         "versions": versions(),
     }
-    return {**told, "traceback": traceback.format_exception(error)} if ours else told
+    return {**failure, "traceback": traceback.format_exception(error)} if ours else failure
 
 
 def write_failure(folder: Path, failure: dict[str, Any]) -> None:
@@ -77,8 +86,8 @@ def write_failure(folder: Path, failure: dict[str, Any]) -> None:
         failure: the result of `describe_failure`.
     """
     unlinked(folder).mkdir(parents=True, exist_ok=True)
-    told = storable_document(failure)
-    write_whole(folder / FAILED_FILE, json.dumps(told, indent=2, default=str) + "\n")
+    text = json.dumps(storable_document(failure), indent=2, default=str)
+    durable.write_whole(folder / FAILED_FILE, text + "\n")
 
 
 def read_failure(folder: Path) -> dict[str, Any] | None:
@@ -95,22 +104,10 @@ def read_failure(folder: Path) -> dict[str, Any] | None:
     path = folder / FAILED_FILE
     if not path.is_file():
         return None
-    try:
-        found = json.loads(path.read_text(encoding="utf-8"))
-        if isinstance(found, dict) and isinstance(found.get("reason"), str):
-            return found
-    except (ValueError, OSError, RecursionError):
-        pass
-    return {
-        "reason": f"{path} cannot be read",
-        "stage": "",
-        "frame": None,
-        "remedy": "try the session again",
-    }
-
-
-_LOGS = {".rrd", ".mcap"}
-_HASHED = {".parquet", ".csv", ".json", ".toml"}
+    found = loose_json(path)
+    damaged = {"reason": f"{path} cannot be read", "remedy": "try the session again"}
+    known = isinstance(found.get("reason"), str)
+    return found if known else {**damaged, "stage": "", "frame": None}
 
 
 def part_folder(path: Path) -> Path:
@@ -187,12 +184,6 @@ def file_facts(folder: Path) -> dict[str, Any]:
     return found
 
 
-# Disk space of a session, estimated before its first frame.
-
-
-_SURE = 0.5  # of the estimate: least free space to begin with
-
-
 def check_room(folder: Path, needed: int) -> None:
     """Refuse to begin a session for which the disk does not have enough space.
 
@@ -207,8 +198,7 @@ def check_room(folder: Path, needed: int) -> None:
         SessionError: the disk has less than half of that.
     """
     nearest = next(place for place in folder.absolute().parents if place.is_dir())
-    begun = part_folder(folder)
-    written = folder_bytes(begun)
+    written = folder_bytes(part_folder(folder))
     free = shutil.disk_usage(nearest).free
     if free < _SURE * (needed - written):
         raise SessionError(
@@ -226,3 +216,158 @@ def folder_bytes(folder: Path) -> int:
 def megabytes(size: float) -> str:
     """A size in bytes as text, in MB or GB."""
     return f"{size / 1e9:.1f} GB" if size >= 1e9 else f"{size / 1e6:.1f} MB"
+
+
+# Older copies of a session next to it, and the corrections in them.
+
+
+def put_back_session(path: Path) -> bool:
+    """Restore a session that a killed writer had moved aside, unless a writer is active.
+
+    Args:
+        path: the session folder.
+
+    Returns:
+        Whether it was restored.
+
+    Raises:
+        OSError: it cannot be renamed.
+    """
+    if not _waits(path):
+        return False
+    part = part_folder(path)
+    if not part.is_dir():
+        return put_back_held(path)
+    held = hold(part)
+    if held is None:
+        return False
+    with held:
+        return put_back_held(path)
+
+
+def put_back_held(path: Path) -> bool:
+    """Restore a session that was moved aside; the caller holds the lock of NAME.part.
+
+    If a failure was recorded in its folder since, it becomes an outdated copy.
+
+    Args:
+        path: the session folder.
+
+    Returns:
+        Whether it was restored.
+
+    Raises:
+        OSError: it cannot be renamed.
+    """
+    if not _waits(path):
+        return False
+    if (path / FAILED_FILE).is_file():
+        aside_folder(path).rename(_free(path))
+        durable.sync_folder(path.parent)
+        return False
+    return durable.put_back(path, aside_folder(path))
+
+
+def set_outdated(path: Path) -> None:
+    """Clear the folder of a session that failed: an existing session becomes NAME.outdated.
+
+    The previous outdated copy is removed, unless it has corrections that this one lacks.
+
+    Args:
+        path: the session folder, with a session or a failed.json in it, or absent.
+
+    Raises:
+        OSError: it cannot be renamed.
+    """
+    put_back_session(path)
+    if not (path / "session.json").is_file():
+        (path / FAILED_FILE).unlink(missing_ok=True)
+        return
+    older = path.with_name(f"{path.name}.outdated")
+    if older.is_dir():
+        try:
+            has_more = not set(read_log(older).entries) <= set(read_log(path).entries)
+        except SessionError:  # it may have more
+            has_more = True
+        if has_more:
+            older.rename(_free(path))
+        else:
+            durable.discard(older)
+    path.rename(older)
+    durable.sync_folder(path.parent)
+
+
+def corrections_for(path: Path) -> Path | None:
+    """Folder of the corrections that a new session inherits; None if absent.
+
+    They are those of the existing session; without any, those of its newest outdated copy with
+    readable corrections that were not inherited before.
+
+    Args:
+        path: the session folder.
+    """
+    own = corrected_folder(path)
+    if (own / LOG).is_file():
+        return own
+    for copy in _outdated(path):
+        try:
+            if read_log(copy).entries:
+                return corrected_folder(copy)
+        except SessionError:  # damaged: left unchanged
+            continue
+    return None
+
+
+def note_taken(made: Path, path: Path) -> None:
+    """Mark the corrections of an outdated copy as inherited by the session.
+
+    Args:
+        made: the folder that `corrections_for` returned.
+        path: the session folder, complete with these corrections.
+
+    Raises:
+        OSError: it cannot be renamed.
+    """
+    if made.parent == path:
+        return
+    if made.name == FOLDER:
+        durable.discard(made.with_name(f"{FOLDER}.old"))
+    names = (made.with_name(_TAKEN if k == 1 else f"{_TAKEN}-{k}") for k in count(1))
+    made.rename(next(name for name in names if not name.exists()))
+
+
+def taken_from(path: Path) -> str:
+    """Name of the outdated copy from which a session inherited its corrections; "" if absent.
+
+    Args:
+        path: the session folder.
+    """
+    return str(loose_json(path / "session.json").get("corrections_taken_from", ""))
+
+
+def _waits(path: Path) -> bool:
+    """Whether a session was moved aside and not replaced."""
+    there = (path / "session.json").is_file()
+    return not there and (aside_folder(path) / "session.json").is_file()
+
+
+def _free(path: Path) -> Path:
+    """The next unused name NAME.outdated-2, NAME.outdated-3 ..."""
+    taken = [_number(path, copy) for copy in _outdated(path)]
+    return path.with_name(f"{path.name}.outdated-{max([1, *taken]) + 1}")
+
+
+def _outdated(path: Path) -> list[Path]:
+    """The outdated copies of a session, newest first."""
+    last = path.with_name(f"{path.name}.outdated")
+    beside = [*path.parent.iterdir()] if path.parent.is_dir() else []
+    numbered = [copy for copy in beside if _number(path, copy) and copy.is_dir()]
+    numbered.sort(key=lambda copy: _number(path, copy), reverse=True)
+    return [last, *numbered] if last.is_dir() else numbered
+
+
+def _number(path: Path, copy: Path) -> int:
+    """The number of an outdated copy; 0 if it has none."""
+    begin = f"{path.name}.outdated-"
+    number = copy.name.removeprefix(begin) if copy.name.startswith(begin) else ""
+    return int(number) if number.isascii() and number.isdigit() else 0

@@ -9,22 +9,28 @@ from __future__ import annotations
 import hashlib
 import json
 import platform
+import re
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
-from typing import TYPE_CHECKING, Any
+from pathlib import Path, PurePosixPath
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from liex_lab.body.skeleton import Skeleton
-from liex_lab.errors import SessionError
+from liex_lab.errors import LiexError, SessionError, one_line
 from liex_lab.geometry import SE3
 from liex_lab.optics.camera import Camera
+from liex_lab.plan.sections import Factor
 from liex_lab.runtime.places import storable
 from liex_lab.scene.outline import UNKNOWN, Arena
+from liex_lab.scene.zones import Zone
 
 if TYPE_CHECKING:
     from liex_lab.plan import Plan
@@ -32,7 +38,6 @@ if TYPE_CHECKING:
     from liex_lab.recordings.timestamps import Gap
     from liex_lab.scene.floor import Floor
     from liex_lab.scene.scene import Scene
-    from liex_lab.scene.zones import Zone
 
 
 SCHEMA_VERSION = 8
@@ -266,3 +271,323 @@ def versions() -> dict[str, str]:
 
 def _hash(value: Any) -> str:
     return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()[:16]
+
+
+# Schema of session.json: guarantees for every part of the program once a session is open.
+
+
+THUMBNAILS = "thumbnails"  # folder of a session
+_MOST_BYTES = 1 << 28
+_MOST_FRAMES = 1 << 31
+_MOST_JOINTS = 1000
+_MOST_PX = 1 << 15
+_ESCAPED = re.compile(r"\\u(0000|[dD][89a-fA-F])")
+
+
+def _said(text: str) -> str:
+    """Check that files can store a text: Unicode without NUL or surrogates."""
+    if "\0" in text:
+        raise ValueError("holds a NUL character")
+    try:
+        text.encode()
+    except UnicodeEncodeError:
+        raise ValueError("holds half of a Unicode character") from None
+    return text
+
+
+Text = Annotated[str, AfterValidator(_said)]
+Name = Annotated[Text, Field(max_length=4096)]
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+Count = Annotated[int, Field(ge=0, le=_MOST_FRAMES)]
+Focal = Annotated[float, Field(gt=1e-3, lt=1e7)]
+Size = Annotated[int, Field(gt=0, le=_MOST_PX)]
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(extra="ignore", strict=True)
+
+
+class _Input(_Section):
+    name: Name
+    format: Text
+    sha256: Text
+    truncated: bool
+    profile: dict[Text, Any] = {}
+
+
+class _Camera(_Section):
+    fx: Focal
+    fy: Focal
+    cx: Finite
+    cy: Finite
+    width: Size
+    height: Size
+    source: Text
+    T_arena_camera: list[list[Finite]]
+    floor_distance_mm: Finite
+    optics: dict[Text, Any] | None = None
+
+
+class _Shape(_Section):
+    kept: bool
+    n_frames: Count
+    average_residual_mm: Finite | None = None
+    residual_mm: Finite | None = None
+    why: Text = ""
+    shared_by: Text = ""
+    places: list[Finite] = []
+    width: list[Factor] = []
+    width_sd: list[Finite] = []
+    height: list[Factor] = []
+    height_sd: list[Finite] = []
+    joints_moved: list[Annotated[list[Finite], Field(min_length=3, max_length=3)]] = []
+
+    @model_validator(mode="after")
+    def _fit(self) -> _Shape:
+        columns = (self.width, self.width_sd, self.height, self.height_sd)
+        if any(len(column) != len(self.places) for column in columns):
+            raise ValueError(f"has not as many widths and heights as its {len(self.places)} places")
+        known = self.residual_mm is not None and self.average_residual_mm is not None
+        if self.kept and not ((known or self.shared_by) and self.places and self.joints_moved):
+            raise ValueError("is kept, but does not say what speaks for it")
+        return self
+
+
+class _Animal(_Section):
+    name: Name
+    joints: Annotated[list[Name], Field(min_length=1, max_length=_MOST_JOINTS)]
+    bones: list[Annotated[list[int], Field(min_length=2, max_length=2)]]
+    home_length_mm: Finite
+    spine_mm: Finite | None = None
+    origin: Text | None = None
+    shape: _Shape | None = None
+
+    @model_validator(mode="after")
+    def _fit(self) -> _Animal:
+        if len(set(self.joints)) != len(self.joints):
+            raise ValueError("names a joint twice")
+        if any(not 0 <= joint < len(self.joints) for bone in self.bones for joint in bone):
+            raise ValueError(f"has a bone between joints that are none of its {len(self.joints)}")
+        return self
+
+
+class _Model(_Section):
+    name: Text = ""
+    sha256: Text = ""
+
+
+class _Thumbnail(_Section):
+    file: Text
+    frame_index: int
+    left_px: int
+    top_px: int
+    width_px: Size
+    height_px: Size
+
+    @model_validator(mode="after")
+    def _stay(self) -> _Thumbnail:
+        if PurePosixPath(self.file).parts[:-1] != (THUMBNAILS,):
+            raise ValueError("is a picture outside of the session")
+        return self
+
+
+class _WholePicture(_Thumbnail):
+    beside_px: Annotated[list[Finite], Field(min_length=2, max_length=2)]
+
+
+class _Frames(_Section):
+    n_frames: Count
+    n_observed: Count
+    flags: dict[Text, Count]
+    n_missing: Annotated[int, Field(ge=0)]
+    n_gaps: Count
+    duration_s: Finite
+    observed_s: Finite
+    fps_median: Finite | None
+
+
+class _Refusal(_Section):
+    action: Text
+    start_s: Finite
+    stop_s: Finite
+    named: Text | None
+    why: Text
+
+
+class _Refusals(_Section):
+    bouts: list[_Refusal] = []
+
+
+class _Recogniser(_Section):
+    sha256: Text = ""
+    labels: Text = ""
+    n_recordings: Count = 0
+    clock_hz: Finite | None = None
+
+
+class _HandMade(_Section):
+    n: Count = 0
+    authors: list[Text] = []
+
+
+class _Verdict(_Section):
+    look_at_it: bool = False
+    accepted: bool = False
+    reasons: list[Text] = []
+    cautions: list[Text] = []
+    sentence: Text = ""
+
+
+class _Facts(_Section):
+    bytes: Annotated[int, Field(ge=0)]
+    sha256: Text = ""
+
+
+class Document(_Section):
+    """The sections of session.json that are read, with their types."""
+
+    schema_version: Annotated[int, Field(ge=1)]
+    session_id: Name
+    individual: Name
+    subject: dict[Text, Text]
+    session_start_time: Text | None
+    versions: dict[Text, Text | None]
+    input: _Input
+    plan: dict[Text, Any]
+    camera: _Camera
+    arena: dict[Text, Any] | None = None
+    zones: list[dict[Text, Any]] = []
+    animal: _Animal
+    model: _Model
+    problems: list[Text]
+    actions: dict[Text, Text] = {}
+    rules: dict[Text, Finite] | None = None
+    no_actions: Text = ""
+    thumbnails: list[_Thumbnail] = []
+    whole_picture: _WholePicture | None = None
+    files: dict[Text, _Facts] = {}
+    frames: _Frames
+    depth_unit_mm: Finite = 1.0
+    timings_s: dict[Text, Finite]
+    frames_per_s: Finite
+    peak_memory_mb: Finite | None = None
+    interruptions: Count = 0
+    action_model: _Recogniser | None = None
+    unresolved_actions: dict[Text, Text] | None = None
+    refused_bouts: _Refusals | None = None
+    corrections: _HandMade | None = None
+    verdict: _Verdict | None = None
+
+
+def read_document(path: Path) -> dict[str, Any]:
+    """Read and validate a session.json.
+
+    Args:
+        path: the file.
+
+    Returns:
+        Its content, unchanged, if it satisfies `Document`.
+
+    Raises:
+        SessionError: it is damaged, or was written by a newer version.
+    """
+    try:
+        if path.stat().st_size > _MOST_BYTES:
+            raise ValueError(f"it is larger than {_MOST_BYTES >> 20} MB")
+        text = path.read_text(encoding="utf-8")
+        found = json.loads(text, parse_constant=_no_number)
+        if not isinstance(found, dict):
+            raise TypeError("a JSON object is expected")
+        version = found.get("schema_version")
+    except (OSError, ValueError, TypeError, RecursionError) as error:
+        raise _damaged(path, str(error) or type(error).__name__) from None
+    if isinstance(version, int) and version > SCHEMA_VERSION:
+        raise SessionError(
+            f"{path.parent} was written by a newer liex_lab (session schema {version}, this one "
+            f"reads up to {SCHEMA_VERSION}); upgrade with `pip install -U liex_lab`"
+        )
+    try:
+        check_document(found)
+        if _ESCAPED.search(text):
+            _walk(found)
+    except ValidationError as error:
+        raise _damaged(path, _first(error)) from None
+    except (ValueError, TypeError, KeyError, IndexError, OverflowError, RecursionError) as error:
+        raise _damaged(path, str(error) or type(error).__name__) from None
+    return found
+
+
+def check_document(found: dict[str, Any]) -> None:
+    """Validate the content of a session.json.
+
+    Args:
+        found: its content.
+
+    Raises:
+        ValueError: it does not satisfy `Document`; pydantic's error is one.
+        TypeError: a value in camera, arena or zones has the wrong type.
+        KeyError: a key in them is missing.
+    """
+    Document.model_validate(found)
+    Camera.from_dict(found["camera"])
+    SE3.from_matrix(found["camera"]["T_arena_camera"])
+    Arena.from_dict(found.get("arena") or {"kind": "open"})
+    for zone in found.get("zones", []):
+        Zone.from_dict(zone)
+
+
+def _walk(value: Any) -> None:
+    """Raises ValueError if any nested text contains what files cannot store."""
+    if isinstance(value, str):
+        _said(value)
+    elif isinstance(value, dict):
+        for key, inner in value.items():
+            _said(key)
+            _walk(inner)
+    elif isinstance(value, list):
+        for inner in value:
+            _walk(inner)
+
+
+def _no_number(text: str) -> NoReturn:
+    raise ValueError(f"it holds {text} for a number")
+
+
+def _first(error: ValidationError) -> str:
+    """The first validation error: where, and what was expected."""
+    first = error.errors(include_url=False, include_input=False)[0]
+    where = ".".join(str(part) for part in first["loc"])
+    said = first["msg"].removeprefix("Value error, ").replace("Input should", "should")
+    return ascii(f"{where} {said}".strip())[1:-1]
+
+
+def _damaged(path: Path, why: str) -> SessionError:
+    return SessionError(
+        f"{path} is damaged and cannot be read ({why[:200]}); run `liex run` on the recording again"
+    )
+
+
+# Error translation for reading files of a session: every error becomes one sentence.
+
+
+@contextmanager
+def reading_from(path: Path) -> Iterator[Path]:
+    """Within the block, convert any error to a SessionError that names the file as damaged.
+
+    A LiexError is passed on unchanged.
+
+    Args:
+        path: the file that is read in the block, and the value of the `with` statement.
+
+    Raises:
+        SessionError: any error in the block.
+    """
+    try:
+        yield path
+    except LiexError:
+        raise
+    except Exception as error:
+        raise SessionError(
+            f"{path} is damaged and cannot be read ({type(error).__name__}: {one_line(error)}); "
+            "run `liex run` on the recording again"
+        ) from None

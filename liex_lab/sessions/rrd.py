@@ -27,10 +27,12 @@ from liex_lab.runtime.memory import blocks
 from liex_lab.runtime.places import probe_full
 from liex_lab.sessions.checkpoint import RRD_HEAD, rrd_messages
 from liex_lab.sessions.provenance import Provenance
-from liex_lab.sessions.rrd_depth import IMAGE, MM_PER_UNIT, DepthColumns, timeline
 from liex_lab.sessions.rrd_scene import (
+    IMAGE,
+    MM_PER_UNIT,
     OVERLAY,
     PALETTE,
+    DepthColumns,
     body_columns,
     dot_mm,
     dot_pt,
@@ -40,6 +42,7 @@ from liex_lab.sessions.rrd_scene import (
     log_outlines,
     log_surroundings,
     rgba,
+    timeline,
 )
 from liex_lab.tables.rows import Rows, constant_runs, frame_count, stop_times
 from liex_lab.tables.schema import shown

@@ -9,14 +9,15 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from liex_lab.errors import SessionError
+from liex_lab.errors import MissingPackageError, SessionError, how_to_install
 from liex_lab.geometry import SE3
 from liex_lab.optics.camera import Camera
 from liex_lab.runtime.memory import rest
@@ -24,7 +25,6 @@ from liex_lab.runtime.places import safe_name
 from liex_lab.runtime.text_files import read_harmless
 from liex_lab.scene.outline import Arena
 from liex_lab.scene.zones import Zone
-from liex_lab.sessions.backups import put_back_session
 from liex_lab.sessions.corrections import (
     Log,
     applies,
@@ -32,9 +32,10 @@ from liex_lab.sessions.corrections import (
     read_log,
     with_description,
 )
-from liex_lab.sessions.document import read_document, reading_from
-from liex_lab.sessions.track_tables import Poses, dataset_of
+from liex_lab.sessions.folder import put_back_session
+from liex_lab.sessions.provenance import read_document, reading_from
 from liex_lab.tables.schema import FRAMES, check_footer, check_rows
+from liex_lab.tracking.track import CORRECTED
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -140,16 +141,11 @@ class Session:
         fitting = log if applies(log, folder, metadata) else None
         # absolute, so that tables are found after the process changes its folder
         session = Session(folder.absolute(), metadata, fitting, log.described)
-        session._check_tables()
+        counts = metadata["frames"]["n_frames"], len(metadata["animal"]["joints"])
+        for path in sorted(session.path.glob("*.parquet")):
+            with reading_from(session.file(path.name)) as own:
+                check_footer(own, path.stem, *counts)
         return session
-
-    def _check_tables(self) -> None:
-        """Raises SessionError if a table's file does not match the session's frames and joints."""
-        n_frames = self.metadata["frames"]["n_frames"]
-        n_joints = len(self.metadata["animal"]["joints"])
-        for path in sorted(self.path.glob("*.parquet")):
-            with reading_from(self.file(path.name)) as own:
-                check_footer(own, path.stem, n_frames, n_joints)
 
     def __repr__(self) -> str:
         frames = self.metadata.get("frames", {}).get("n_frames", "unknown")
@@ -311,12 +307,17 @@ class Session:
         other = Session(self.path, self.metadata, self.log, self.described)
         for name, columns in wanted.items():
             path = self.file(f"{name}.parquet")
-            if path.is_file():
-                with reading_from(path):
-                    known = pq.read_schema(path).names
-                    found = _narrow(path, [column for column in columns if column in known])
-                    check_rows(name, found, self.metadata["animal"]["joints"])
-                    other.__dict__[name] = found
+            if not path.is_file():
+                continue
+            # with little else of a long table in memory
+            with reading_from(path), pq.ParquetFile(path, pre_buffer=False) as file:
+                known = [column for column in columns if column in file.schema_arrow.names]
+                read = file.read(known, use_threads=False)
+                table = read.to_pandas(split_blocks=True, self_destruct=True, use_threads=False)
+                del read
+                rest()
+                check_rows(name, table, self.metadata["animal"]["joints"])
+                other.__dict__[name] = table
         return other
 
     def table(
@@ -348,11 +349,10 @@ class Session:
             if name == "frames" and columns is None and PULSE.name not in found:  # before schema 8
                 before = pd.read_parquet(path, columns=["frame_index", "gap_before"])
                 pulse = np.arange(len(before)) + before["gap_before"].cumsum()
-                found[PULSE.name] = pulse[
-                    before["frame_index"].isin(found["frame_index"])
-                ].to_numpy()
-            said = self.described if name == "sessions" else {}
-            return found.assign(**{key: said[key] for key in said if key in found})
+                chosen = before["frame_index"].isin(found["frame_index"])
+                found[PULSE.name] = pulse[chosen].to_numpy()
+            facts = self.described if name == "sessions" else {}
+            return found.assign(**{key: facts[key] for key in facts if key in found})
 
     def to_xarray(self) -> xarray.Dataset:
         """The poses as a labelled data set, in the format of the Python package movement.
@@ -364,7 +364,50 @@ class Session:
         Raises:
             MissingPackageError: xarray is not installed.
         """
-        return dataset_of(self.pose_arrays(), self.bouts, self.metadata, self.path.name)
+        try:
+            import xarray
+        except ModuleNotFoundError:
+            raise MissingPackageError(
+                f"a labelled data set needs xarray; {how_to_install('exchange')}"
+            ) from None
+
+        poses = self.pose_arrays()
+        bouts = self.bouts
+        actions = np.full(len(poses.frame_index), "", dtype=object)
+        starts, stops = (
+            np.searchsorted(poses.frame_index, bouts[name].to_numpy())
+            for name in ("start_frame", "stop_frame")
+        )
+        for start, stop, action in zip(starts, stops, bouts["action"], strict=True):
+            actions[start:stop] = action
+        rate = self.metadata["frames"]["fps_median"]
+        in_space = ("time", "space", "keypoints", "individuals")
+        of_joints = ("time", "keypoints", "individuals")
+        return xarray.Dataset(
+            data_vars={
+                "position": (in_space, np.moveaxis(poses.xyz_mm, 1, 2)[..., None]),
+                "confidence": (of_joints, poses.likelihood[..., None]),
+                "score": (of_joints, poses.score[..., None]),
+                "sd_mm": (in_space, np.moveaxis(poses.sd_mm, 1, 2)[..., None]),
+                "action": (("time", "individuals"), actions.astype(str)[:, None]),
+            },
+            coords={
+                "time": poses.time_s,
+                "space": ["x", "y", "z"],
+                "keypoints": list(poses.joints),
+                "individuals": [poses.individual],
+                "pulse_index": ("time", poses.pulse_index),
+            },
+            attrs={
+                "source_software": "liex_lab",
+                "ds_type": "poses",
+                "time_unit": "seconds",
+                "source_file": self.path.name,
+                "space_unit": "mm",
+                "axes": "arena: z up from the floor",
+                **({"fps": float(rate)} if rate else {}),
+            },
+        )
 
     def pose_arrays(self) -> Poses:
         """The poses as arrays by frame and joint, NaN where there is no pose.
@@ -372,18 +415,6 @@ class Session:
         `session.pose_arrays().xyz_mm[10]` are the joints (J, 3) of row 10 of the recording, mm.
         """
         return Poses.of(self.metadata, self.table("poses"), self.table("frames"))
-
-
-def _narrow(path: Path, columns: list[str]) -> pd.DataFrame:
-    """Some columns of a long table, with little else of it in memory."""
-    import pyarrow.parquet as pq
-
-    with pq.ParquetFile(path, pre_buffer=False) as file:
-        read = file.read(columns, use_threads=False)
-    table: pd.DataFrame = read.to_pandas(split_blocks=True, self_destruct=True, use_threads=False)
-    del read
-    rest()
-    return table
 
 
 def _rows_of(path: Path, columns: list[str] | None, frame_index: list[int]) -> pd.DataFrame:
@@ -435,3 +466,102 @@ def found_video(session: Session, what: str = "") -> Path | None:
     """
     path = video_path(session.path, session.name, what)
     return path if path.is_file() else None
+
+
+# A session's poses as plain arrays.
+
+
+Array = NDArray[np.float64]
+_KEPT = 0.6  # the usual threshold of likelihoods: least value in trusted frames
+_UNSURE = 0.5  # the highest likelihood in other frames
+
+
+@dataclass(frozen=True, repr=False)
+class Poses:
+    """Poses of one animal, one row for every recorded frame; NaN where there is no pose.
+
+    Attributes:
+        individual: the animal's name.
+        joints: names of the J joints.
+        bones: pairs of joint indices, parent and child.
+        frame_index: (n,) int64, number of the frame in the recording.
+        pulse_index: (n,) int64, number of the camera's pulse, see the column of `frames`.
+        time_s: (n,) s since the first frame.
+        xyz_mm: (n, J, 3) mm, arena frame.
+        uv_px: (n, J, 2) px of the depth image; (0, 0) is the centre of the top-left pixel.
+        score: (n, J) probability that the joint is within 10 % of the spine's length of the truth.
+        trusted: (n,) bool, whether the pose was measured and nothing contradicts it, or a person
+            corrected it.
+        sd_mm: (n, J, 3) standard deviation of x, y and z, mm; see the columns sd_xy_mm and sd_z_mm.
+    """
+
+    individual: str
+    joints: tuple[str, ...]
+    bones: tuple[tuple[int, int], ...]
+    frame_index: NDArray[np.int64]
+    pulse_index: NDArray[np.int64]
+    time_s: Array
+    xyz_mm: Array
+    uv_px: Array
+    score: Array
+    trusted: NDArray[np.bool_]
+    sd_mm: Array
+
+    def __repr__(self) -> str:
+        n, posed = len(self.time_s), int(np.isfinite(self.xyz_mm).all(axis=(1, 2)).sum())
+        return (
+            f"<Poses {self.individual}: {n} frames, {posed} with a pose; {', '.join(self.joints)}>"
+        )
+
+    @property
+    def likelihood(self) -> Array:
+        """(n, J) likelihood or confidence for exports; NaN where there is no pose.
+
+        It is 0.6 + 0.4 x score in a trusted frame and 0.5 x score in any other, so that the field's
+        usual threshold of 0.6 keeps trusted frames.
+        """
+        sure = self.trusted[:, None]
+        return np.where(sure, _KEPT + (1.0 - _KEPT) * self.score, _UNSURE * self.score)
+
+    @staticmethod
+    def of(about: Mapping[str, Any], table: pd.DataFrame, frames: pd.DataFrame) -> Poses:
+        """The poses of a session, see `Session.pose_arrays`.
+
+        Args:
+            about: content of session.json.
+            table: table `poses`.
+            frames: table `frames`.
+        """
+        joints = tuple(about["animal"]["joints"])
+        n = len(joints)
+        shape = (-1, n)
+        measured = ~frames["bridged"].to_numpy(bool) if "bridged" in frames else True
+
+        def array(*names: str) -> Array:
+            columns = [table[name].to_numpy(float).reshape(shape) for name in names]
+            return np.stack(columns, axis=-1) if len(names) > 1 else columns[0]
+
+        return Poses(
+            about["individual"],
+            joints,
+            tuple((int(a), int(b)) for a, b in about["animal"]["bones"]),
+            table["frame_index"].to_numpy()[::n],
+            frames["pulse_index"].to_numpy(),
+            table["time_s"].to_numpy(float)[::n],
+            array("x_mm", "y_mm", "z_mm"),
+            array("u_px", "v_px"),
+            array("score"),
+            np.asarray(frames["flag"].isin(["", CORRECTED]) & measured, np.bool_),
+            spreads(table).reshape(*shape, 3),
+        )
+
+
+def spreads(poses: pd.DataFrame) -> Array:
+    """Standard deviations (m, 3) of x, y and z, mm; `sd_mm` for each in older tables.
+
+    Args:
+        poses: all columns of the table `poses`, m rows.
+    """
+    names = [f"sd_{axes}_mm" for axes in ("xy", "xy", "z")]
+    columns = [poses[name if name in poses else "sd_mm"].to_numpy(float) for name in names]
+    return np.stack(columns, axis=-1)

@@ -25,8 +25,7 @@ from liex_lab.optics.camera import Camera
 from liex_lab.recordings.frame import DepthFrame
 from liex_lab.runtime.processes import own_python
 from liex_lab.sessions.rrd import BONE_COLOUR, JOINT_COLOUR, SKELETON
-from liex_lab.sessions.rrd_depth import DEPTH, MM_PER_UNIT, colour_range
-from liex_lab.sessions.rrd_scene import dot_mm, log_camera
+from liex_lab.sessions.rrd_scene import DEPTH, MM_PER_UNIT, colour_range, dot_mm, log_camera
 from liex_lab.tracking.track import Track
 
 _PATIENCE_S = 30.0  # for a viewer to start

@@ -3,6 +3,10 @@
 The session is written to the folder NAME.part next to its final path. Depth is streamed directly
 into the Rerun replay and the MCAP file; tables are written at the end. Every few seconds a
 checkpoint is saved, from which an interrupted run resumes (see `liex_lab.sessions.checkpoint`).
+
+Several processes may measure shards of one recording in parallel, each in a folder inside the
+unfinished session, which appends them in order. If a worker dies, another one may write its shard a
+second time: a shard is published by an atomic rename, and both versions are equal.
 """
 
 from __future__ import annotations
@@ -14,9 +18,9 @@ import shutil
 import time
 from array import array
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import fields
 from pathlib import Path
 from types import TracebackType
@@ -26,30 +30,36 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.errors import LiexError, SessionError
-from liex_lab.runtime.durable import put_in_place, sync_tree
+from liex_lab.runtime.durable import put_in_place, sync_folder, sync_tree, write_whole
 from liex_lab.runtime.memory import Allocator, on_disk, peak_memory_mb, rest
 from liex_lab.runtime.places import is_full, probe_full, storable_document, unlinked_tree, why_full
-from liex_lab.sessions.backups import corrections_for, note_taken, put_back_held, put_back_session
-from liex_lab.sessions.checkpoint import LOGS, Checkpoint
+from liex_lab.runtime.text_files import loose_json
+from liex_lab.sessions.checkpoint import LOGS, STRETCHES, Checkpoint, Columns
 from liex_lab.sessions.corrections import FOLDER
-from liex_lab.sessions.cutouts import Boxes, DepthKeeper, write_boxes
-from liex_lab.sessions.evidence import write_evidence
-from liex_lab.sessions.folder import aside_folder, check_writable, file_facts, part_folder
+from liex_lab.sessions.cutouts import Boxes, DepthKeeper, Thumbnails, write_boxes
+from liex_lab.sessions.evidence import Results, write_evidence
+from liex_lab.sessions.folder import (
+    aside_folder,
+    check_writable,
+    corrections_for,
+    file_facts,
+    note_taken,
+    part_folder,
+    put_back_held,
+    put_back_session,
+)
 from liex_lab.sessions.provenance import Provenance
-from liex_lab.sessions.thumbnails import Thumbnails
-from liex_lab.sessions.track_tables import Results
 from liex_lab.tables import schema
 from liex_lab.tables.rows import Rows, rows_only
-from liex_lab.tables.schema import Column
 from liex_lab.tracking.observations import Observations
-from liex_lab.tracking.track import Flip, Track, Tracked
+from liex_lab.tracking.track import Flip, Subject, Track, Tracked
 
 if TYPE_CHECKING:
     import pandas as pd
 
     from liex_lab.recordings.frame import DepthFrame
     from liex_lab.sessions.session import Session
-    from liex_lab.tracking.track import Subject
+
 
 INDEX = "frame_index"
 TIMES = "frame_time_ns"
@@ -95,10 +105,12 @@ class SessionWriter:
         blueprint: BlueprintMaker | None = None,
         report: ReportMaker | None = None,
     ) -> None:
-        path = Path(path)
-        put_back_session(path)
-        check_writable(path, overwrite)
-        self.path = path
+        from liex_lab.sessions.mcap import McapWriter
+        from liex_lab.sessions.rrd import ReplayWriter
+
+        self.path = Path(path)
+        put_back_session(self.path)
+        check_writable(self.path, overwrite)
         self.origin = origin
         self._overwrite = overwrite
         self._report = report
@@ -113,8 +125,8 @@ class SessionWriter:
         self._thumbnails = Thumbnails()
         self._keeper = DepthKeeper(origin)
         self._done = False
-        self._folder = part_folder(path)
-        self._checkpoint = open_unfinished(path, origin)
+        self._folder = part_folder(self.path)
+        self._checkpoint = open_unfinished(self.path, origin)
         before = self._checkpoint.seen.read()
         self._index, self._times_ns = (
             array("q", before.get(name, np.zeros(0, np.int64)).tobytes()) for name in (INDEX, TIMES)
@@ -124,22 +136,16 @@ class SessionWriter:
             log: ThreadPoolExecutor(1) for log in LOGS
         }  # each writes in order, parallel to the other
         try:
-            self._open_logs(blueprint)
+            layout = blueprint(self._document) if blueprint else None
+            messages = self._folder / LOGS[1]
+            self._replay = ReplayWriter(self._checkpoint.replay, origin, layout)
+            self._mcap = McapWriter(messages, origin, resume=messages.is_file())
+            if self._times_ns:
+                self._replay.resume(self._times_ns[0])
         except BaseException:
             self._stop_logging()
             self._checkpoint.leave(keep=True)
             raise
-
-    def _open_logs(self, blueprint: BlueprintMaker | None) -> None:
-        from liex_lab.sessions.mcap import McapWriter
-        from liex_lab.sessions.rrd import ReplayWriter
-
-        made = blueprint(self._document) if blueprint else None
-        messages = self._folder / LOGS[1]
-        self._replay = ReplayWriter(self._checkpoint.replay, self.origin, made)
-        self._mcap = McapWriter(messages, self.origin, resume=messages.is_file())
-        if self._times_ns:
-            self._replay.resume(self._times_ns[0])
 
     def __enter__(self) -> SessionWriter:
         return self
@@ -153,12 +159,18 @@ class SessionWriter:
         if self._done:
             return
         full = full_disk(self._folder, error)
-        self._abandon(keep=error is not None)
+        self._stop_logging()
+        for log in (self._replay, self._mcap):
+            with suppress(Exception):  # the error being handled is the one to report
+                log.abandon()
+        self._checkpoint.leave(keep=error is not None)
         if full is not None:
-            kept = self._checkpoint.kept_frames
+            kept = self._checkpoint.state.n_frames if self._checkpoint.is_saved else 0
+            begins = (
+                f"resumes after the {kept} frames in {self._folder}" if kept else "starts again"
+            )
             raise SessionError(
-                f"{full}; make room there and run the same command again, which "
-                + (f"goes on after the {kept} frames in {self._folder}" if kept else "begins anew")
+                f"{full}; make room there and run the same command again, which {begins}"
             ) from error
         if error is None:
             raise SessionError(
@@ -294,15 +306,9 @@ class SessionWriter:
         """The track in the form of the tables; cached until frames or a track are added."""
         if self._rows is None:
             origin = self.origin
-            self._rows = Rows(
-                self.track,
-                np.array(self._index, np.int64),
-                origin.name,
-                origin.individual,
-                origin.gaps,
-                origin.arena,
-                origin.zones,
-            )
+            frames = np.array(self._index, np.int64)
+            about = origin.name, origin.individual, origin.gaps, origin.arena, origin.zones
+            self._rows = Rows(self.track, frames, *about)
         return self._rows
 
     def note(self, **sections: Any) -> None:
@@ -315,21 +321,16 @@ class SessionWriter:
         for name, value in sections.items():
             known = self._document.get(name)
             if isinstance(known, dict) and isinstance(value, Mapping):
-                self._document[name] = {**known, **value}
-            elif (
-                isinstance(known, list)
-                and isinstance(value, Sequence)
-                and not isinstance(value, str)
-            ):
-                self._document[name] = known + [item for item in value if item not in known]
-            else:
-                self._document[name] = value
+                value = {**known, **value}
+            elif isinstance(known, list) and isinstance(value, list | tuple):
+                value = known + [item for item in value if item not in known]
+            self._document[name] = value
 
     def close(
         self,
         *,
         results: Mapping[str, pd.DataFrame] | None = None,
-        columns: Sequence[Column] = (),
+        columns: Sequence[schema.Column] = (),
         actions: Mapping[str, str] | None = None,
         record: Mapping[str, Any] | None = None,
         timings_s: Mapping[str, float] | None = None,
@@ -337,7 +338,7 @@ class SessionWriter:
         """Write everything else and publish the session; returns it opened.
 
         Corrections of the replaced session are copied; without one, those of an outdated copy (see
-        `liex_lab.sessions.backups`), which session.json then names under `corrections_taken_from`.
+        `liex_lab.sessions.folder`), which session.json then names under `corrections_taken_from`.
 
         The report is written last; if it fails, the session is kept all the same.
 
@@ -371,8 +372,8 @@ class SessionWriter:
         of_track.write_track(self._folder)
         of_track.write_measured(self._folder, results, columns)
         rest()
-        actions = dict(actions or {})
-        actions |= dict.fromkeys(sorted({str(word) for word in bouts["action"]} - set(actions)), "")
+        named = sorted({str(word) for word in bouts["action"]}.difference(actions or {}))
+        actions = {**(actions or {}), **dict.fromkeys(named, "")}
         words = [*actions]
         problems = self._document["problems"]
         self._replay.finish(rows, results["kinematics"], bouts, words, problems, self._candidates)
@@ -385,7 +386,8 @@ class SessionWriter:
         self._document["thumbnails"] = self._thumbnails.save(self._folder, rows, self.origin.camera)
         if self._together is not None:
             whole = self._thumbnails.save_whole(self._folder, rows, self._together)
-            self._document |= {} if whole is None else {"whole_picture": whole}
+            if whole is not None:
+                self._document["whole_picture"] = whole
         (self._folder / "plan.toml").write_text(self.origin.plan_toml, encoding="utf-8")
         self._seconds += time.perf_counter() - began
         self._document["files"] = file_facts(self._folder)
@@ -470,14 +472,6 @@ class SessionWriter:
             with suppress(OSError):  # they are then recognised as the same
                 note_taken(made, self.path)
 
-    def _abandon(self, keep: bool) -> None:
-        """Close open files; keep: leave the folder if it has a checkpoint."""
-        self._stop_logging()
-        for log in (self._replay, self._mcap):
-            with suppress(Exception):  # the error being handled is the one to report
-                log.abandon()
-        self._checkpoint.leave(keep)
-
 
 def full_disk(folder: Path, error: BaseException | None) -> str | None:
     """The message about a full disk, naming it, if it caused an error; else None.
@@ -537,3 +531,103 @@ def _check_times(times_ns: NDArray[np.int64], track: Track) -> None:
             f"a track has one row for every frame written, got {track.n_frames} rows for "
             f"{len(times_ns)} frames or other time stamps; pass the track of exactly these frames"
         )
+
+
+# Shards of a recording, measured by several processes in parallel, each in its own folder.
+
+
+_SIZES = "stretch.json"
+_SEEN = "seen"
+
+
+def shard_folder(unfinished: Path, start: int, stop: int) -> Path:
+    """Path of a complete shard of an unfinished session.
+
+    Args:
+        unfinished: the folder of the unfinished session.
+        start: first row of the shard.
+        stop: the first row after it.
+    """
+    return unfinished / STRETCHES / f"{start:09d}-{stop:09d}"
+
+
+def is_whole(folder: Path) -> bool:
+    """Whether a shard exists with files of the recorded sizes.
+
+    Args:
+        folder: the shard's folder.
+    """
+    sizes = loose_json(folder / _SIZES)
+    try:
+        return all((folder / log).stat().st_size == sizes[log] for log in LOGS)
+    except (OSError, KeyError):
+        return False
+
+
+def append_shard(held: Checkpoint, folder: Path, n_frames: int, seconds: float) -> None:
+    """Append a complete shard to an unfinished session, and remove its folder.
+
+    Args:
+        held: the unfinished session, locked by this process.
+        folder: the shard's folder.
+        n_frames: frames of the session including the shard.
+        seconds: time spent on them, s.
+    """
+    held.seen.append(Columns(folder / _SEEN).read())
+    held.append(folder, n_frames, seconds)
+    shutil.rmtree(folder, ignore_errors=True)
+
+
+@contextmanager
+def shard_writer(
+    folder: Path, origin: Provenance, first_ns: int | None
+) -> Iterator[Callable[[Sequence[DepthFrame], Observations], None]]:
+    """Write a shard in a temporary folder next to its own; after an error it is absent.
+
+    Args:
+        folder: the shard's folder.
+        origin: provenance of the recording.
+        first_ns: time of the recording's first frame, ns; None if it is in this shard.
+
+    Yields:
+        A function that writes the next frames and their observations, one row per frame.
+    """
+    from liex_lab.sessions.mcap import McapWriter
+    from liex_lab.sessions.rrd import ReplayWriter
+
+    part = folder.with_name(f".{folder.name}.{os.getpid()}")
+    shutil.rmtree(part, ignore_errors=True)
+    (part / _SEEN).mkdir(parents=True)
+    columns = Columns(part / _SEEN)
+    replay = ReplayWriter(part / LOGS[0], origin)
+    messages = McapWriter(part / LOGS[1], origin)
+    keeper = DepthKeeper(origin)
+    if first_ns is not None:
+        replay.resume(first_ns)
+
+    def add(frames: Sequence[DepthFrame], seen: Observations) -> None:
+        boxes = keeper.boxes(seen)
+        depth = keeper.keep([frame.depth for frame in frames], boxes)
+        times = [int(frame.time_ns) for frame in frames]
+        replay.add([int(frame.index) for frame in frames], times, depth, boxes)
+        messages.add(times, depth)
+        columns.append(seen_rows(frames, seen, boxes))
+
+    try:
+        try:
+            yield add
+            sizes = dict(zip(LOGS, (replay.flushed(), messages.flushed()), strict=True))
+        finally:
+            columns.close()
+            replay.abandon()
+            messages.abandon()
+        for log, size in sizes.items():  # drop what closing added
+            os.truncate(part / log, size)
+        write_whole(part / _SIZES, json.dumps(sizes))
+        if not is_whole(folder):  # else another worker was faster
+            shutil.rmtree(folder, ignore_errors=True)
+            sync_tree(part)
+            part.rename(folder)
+            sync_folder(folder.parent)
+    finally:
+        shutil.rmtree(part, ignore_errors=True)

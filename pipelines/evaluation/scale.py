@@ -36,10 +36,9 @@ from liex_lab.runtime.memory import peak_memory_mb, rest
 from liex_lab.runtime.progress import Progress, silent
 from liex_lab.sessions import Provenance, Session, SessionWriter
 from liex_lab.sessions.cutouts import Kept, composed, still_scene
-from liex_lab.sessions.evidence import provenance_of, track_of
+from liex_lab.sessions.evidence import Results, provenance_of, track_of
 from liex_lab.sessions.mcap import McapWriter
 from liex_lab.sessions.rrd import ReplayWriter
-from liex_lab.sessions.track_tables import Results
 from liex_lab.sessions.writer import ReportMaker
 from liex_lab.tables.rows import Rows, stop_times
 from liex_lab.tracking.observations import COLUMNS, Observations

@@ -19,8 +19,13 @@ from typing import TYPE_CHECKING, Any
 from liex_lab.errors import RecordingError, StudyError
 from liex_lab.plan.study import PlannedSession
 from liex_lab.runtime.progress import Progress, silent
-from liex_lab.sessions.backups import set_outdated, taken_from
-from liex_lab.sessions.folder import describe_failure, read_failure, write_failure
+from liex_lab.sessions.folder import (
+    describe_failure,
+    read_failure,
+    set_outdated,
+    taken_from,
+    write_failure,
+)
 from liex_lab.sessions.verdict import read_verdict
 
 from ..workers import Done, Work, WorkerPool

@@ -26,15 +26,8 @@ from liex_lab.sessions import Session
 from liex_lab.sessions.correcting import joint_move
 from liex_lab.sessions.cutouts import Kept
 from liex_lab.sessions.rrd import ReplayWriter
-from liex_lab.sessions.rrd_depth import BACKGROUND as BACKGROUND_ENTITY
-from liex_lab.sessions.rrd_depth import (
-    CUTOUTS,
-    IMAGE,
-    PLACES,
-    colour_range,
-    cutout_frame,
-    packed,
-)
+from liex_lab.sessions.rrd_scene import BACKGROUND as BACKGROUND_ENTITY
+from liex_lab.sessions.rrd_scene import CUTOUTS, IMAGE, PLACES, colour_range, cutout_frame, packed
 from tests.sessions.test_cutouts import BACKGROUND, written
 from tests.sessions.test_cutouts import MOUSE as KEPT_MOUSE
 from tests.sessions.walking_mouse import WalkingMouse, steady, write

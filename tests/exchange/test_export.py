@@ -23,7 +23,7 @@ from liex_lab import cli
 from liex_lab.errors import MissingPackageError, SessionError
 from liex_lab.exchange import TARGETS, export
 from liex_lab.sessions import Session
-from liex_lab.sessions.track_tables import Poses
+from liex_lab.sessions.session import Poses
 from liex_lab.tables.rows import Rows
 from liex_lab.tables.schema import POSES, to_pandas
 from tests.sessions.walking_mouse import WalkingMouse, steady, write
@@ -75,7 +75,7 @@ def test_every_table_is_a_sheet_of_the_workbook_and_texts_are_no_formulas(sessio
 
 
 def test_a_table_longer_than_a_sheet_is_refused_in_a_sentence(session, tmp_path, monkeypatch):
-    monkeypatch.setattr("liex_lab.exchange.tables.MAX_ROWS", 100)
+    monkeypatch.setattr("liex_lab.exchange.export.MAX_ROWS", 100)
     with pytest.raises(SessionError, match=r"at most 100 rows .* export it as csv"):
         export(session, "xlsx", tmp_path)
     assert not list(tmp_path.iterdir())
@@ -85,7 +85,7 @@ def test_a_workbook_whose_sheets_have_no_room_is_refused_in_a_sentence(
     session, tmp_path, monkeypatch
 ):
     room = shutil.disk_usage(tmp_path)._replace(free=100_000)
-    monkeypatch.setattr("liex_lab.exchange.tables.shutil.disk_usage", lambda _: room)
+    monkeypatch.setattr("liex_lab.exchange.export.shutil.disk_usage", lambda _: room)
     with pytest.raises(SessionError, match=r"need \d MB in .*, which has 0 MB left; .*TMPDIR"):
         export(session, "xlsx", tmp_path)
     assert not list(tmp_path.iterdir())
@@ -245,7 +245,7 @@ def test_missing_packages_are_named(session, tmp_path, monkeypatch):
     def missing(*_):
         raise ModuleNotFoundError("No module named 'pynwb'", name="pynwb")
 
-    monkeypatch.setattr(import_module("liex_lab.exchange.nwb"), "write_nwb", missing)
+    monkeypatch.setattr(import_module("liex_lab.exchange.pose_files"), "write_nwb", missing)
     with pytest.raises(SessionError, match="pynwb is missing") as told:
         export(session, "nwb", tmp_path)
     assert "pip install '.[exchange]'" in str(told.value)

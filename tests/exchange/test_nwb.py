@@ -18,7 +18,7 @@ from pynwb import NWBHDF5IO, validate
 
 from liex_lab.errors import SessionError
 from liex_lab.exchange import export
-from liex_lab.exchange.nwb import observed_spans
+from liex_lab.exchange.pose_files import observed_spans
 from liex_lab.sessions import Session
 from liex_lab.sessions.corrections import BoutEdit, Entry, Log
 from tests.sessions.walking_mouse import WalkingMouse, steady, write

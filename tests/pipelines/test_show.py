@@ -20,7 +20,7 @@ from liex_lab.recordings import open_recording
 from liex_lab.recordings.formats.messages.mcap_writer import McapDepthWriter
 from liex_lab.sessions import Session
 from liex_lab.sessions.evidence import link_to
-from liex_lab.sessions.rrd_depth import DEPTH
+from liex_lab.sessions.rrd_scene import DEPTH
 from tests.sessions.walking_mouse import WalkingMouse, steady, write
 
 MOUSE = WalkingMouse(steady(1.0))

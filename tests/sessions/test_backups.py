@@ -17,9 +17,8 @@ from liex_lab import behaviour
 from liex_lab.plan import Plan
 from liex_lab.sessions import Session, SessionWriter
 from liex_lab.sessions import correcting as ask
-from liex_lab.sessions.backups import put_back_session, set_outdated, taken_from
 from liex_lab.sessions.corrections import read_log
-from liex_lab.sessions.folder import write_failure
+from liex_lab.sessions.folder import put_back_session, set_outdated, taken_from, write_failure
 from tests.sessions.kills import check_order, killed_at, recorded
 from tests.sessions.walking_mouse import WalkingMouse, write
 

@@ -15,7 +15,7 @@ import pytest
 from mcap.reader import make_reader
 
 from liex_lab.errors import SessionError
-from liex_lab.sessions import Session, SessionWriter, checkpoint, rrd, rrd_depth
+from liex_lab.sessions import Session, SessionWriter, checkpoint, rrd, rrd_scene
 from liex_lab.sessions.checkpoint import Checkpoint, Columns, rrd_messages
 from tests.sessions.interrupted import CHUNK, MOUSE, start, write_session
 from tests.sessions.test_rrd import columns_of
@@ -118,7 +118,7 @@ def test_its_logs_are_whole_and_hold_every_frame_once(
 def test_its_replay_holds_the_rows_of_an_undisturbed_one(
     disturbed: tuple[Path, list[int]], undisturbed: Path
 ) -> None:
-    for entity in (rrd_depth.DEPTH, f"{rrd.SKELETON}/joints", rrd.ACTIONS):
+    for entity in (rrd_scene.DEPTH, f"{rrd.SKELETON}/joints", rrd.ACTIONS):
         rows = [columns_of(Session.open(place), entity) for place in (disturbed[0], undisturbed)]
         assert rows[0]["frame"] == rows[1]["frame"], entity
         for name in rows[1]:

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
-import liex_lab.sessions.rrd_depth as depth_of
+import liex_lab.sessions.rrd_scene as depth_of
 from liex_lab.body.pose import Pose
 from liex_lab.errors import RecordingError, SessionError
 from liex_lab.geometry import SE3

@@ -14,7 +14,7 @@ from liex_lab.errors import LiexError
 from liex_lab.plan import Plan
 from liex_lab.sessions import viewer
 from liex_lab.sessions.rrd import SKELETON
-from liex_lab.sessions.rrd_depth import DEPTH, IMAGE
+from liex_lab.sessions.rrd_scene import DEPTH, IMAGE
 from liex_lab.sessions.viewer import ERROR
 
 SOURCE = "synthetic:walk?seed=3&frames=30&sensor=primesense-qvga&spine_mm=70"

@@ -15,7 +15,8 @@ from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader
 
 from liex_lab.errors import SessionError
-from liex_lab.sessions.mcap_log import McapLog, MessageType, append_chunks
+from liex_lab.sessions.checkpoint import append_chunks
+from liex_lab.sessions.mcap import McapLog, MessageType
 
 ONE = MessageType("one", "jsonschema", b"{}", "json")
 OTHER = MessageType("other", "jsonschema", b'{"type": "object"}', "json")

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import liex_lab.sessions.rrd as replay
-import liex_lab.sessions.rrd_depth as depth_of
+import liex_lab.sessions.rrd_scene as depth_of
 import liex_lab.sessions.rrd_scene as scene_of
 from liex_lab.body.pose import Pose
 from liex_lab.body.surface import Surface
