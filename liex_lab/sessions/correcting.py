@@ -159,9 +159,9 @@ def disagreements(session: Session) -> list[str]:
     ends_s = np.append(time_s, stop_times(time_s)[-1:])
     path = shlex.quote(str(session.path))
     found = []
-    for number, one in exchanges:
+    for number, flip in exchanges:
         # the first row with a pose from each end
-        ends = np.searchsorted(rows, np.searchsorted(index, (one.start_frame, one.stop_frame)))
+        ends = np.searchsorted(rows, np.searchsorted(index, (flip.start_frame, flip.stop_frame)))
         ends = np.append(rows, len(index))[ends]
         at = [row for row in ends.tolist() if row in half_turns]
         if not at:
@@ -174,7 +174,7 @@ def disagreements(session: Session) -> list[str]:
             f"{np.degrees(np.arccos(cosine[row])):.0f} degrees at frame {index[row]}" for row in at
         )
         found.append(
-            f"{one}: this disagrees with the frames around it (a turn of "
+            f"{flip}: this disagrees with the frames around it (a turn of "
             f"{' and '.join(turns)}). Take it back with `liex correct undo {path} {number}`; "
             "the nearest span that agrees is then exchanged by `liex correct flip "
             f"{path} --from {ends_s[start]:.3f} --to {ends_s[stop]:.3f}`"

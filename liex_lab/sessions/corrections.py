@@ -41,6 +41,7 @@ FACTS = {
 START = "session_start_time"
 DESCRIBED = (*WHO, *ALSO, START)
 _UNDO = "undo"
+UNREADABLE = (OSError, ValueError, KeyError, TypeError, AttributeError)  # errors of damaged JSON
 
 
 @dataclass(frozen=True)
@@ -164,7 +165,7 @@ _CORRECTION: TypeAdapter[Correction] = TypeAdapter(
 
 
 @dataclass(frozen=True)
-class Entry:
+class LogEntry:
     """One entry of the log: a correction, the undo of one, or the undo of an undo, which is a redo.
 
     Attributes:
@@ -189,7 +190,7 @@ class Entry:
         return {**about, "kind": self.what.kind, **asdict(self.what)}
 
     @staticmethod
-    def from_dict(entry: Mapping[str, Any]) -> Entry:
+    def from_dict(entry: Mapping[str, Any]) -> LogEntry:
         """Inverse of `to_dict`.
 
         Raises:
@@ -199,8 +200,8 @@ class Entry:
         """
         about = (int(entry["number"]), str(entry["author"]), str(entry["made_at"]))
         if entry["kind"] == _UNDO:
-            return Entry(*about, None, int(entry["undoes"]))
-        return Entry(*about, _CORRECTION.validate_python(entry))
+            return LogEntry(*about, None, int(entry["undoes"]))
+        return LogEntry(*about, _CORRECTION.validate_python(entry))
 
 
 @dataclass(frozen=True)
@@ -218,7 +219,7 @@ class Log:
     """
 
     made_of: str
-    entries: tuple[Entry, ...] = ()
+    entries: tuple[LogEntry, ...] = ()
     files: dict[str, dict[str, Any]] = field(default_factory=dict)
     facts: dict[str, dict[str, Any]] = field(default_factory=dict)
 
@@ -229,7 +230,7 @@ class Log:
             raise ValueError(f"facts of {', '.join(sorted(set(self.facts) - FACTS))}")
 
     @property
-    def standing(self) -> tuple[Entry, ...]:
+    def standing(self) -> tuple[LogEntry, ...]:
         """The active corrections, not undone, in the order in which they were made."""
         gone = set(self.undos.values())
         return tuple(
@@ -267,7 +268,7 @@ class Log:
         return {one.key: one.value for one in self.corrections(Description)}
 
     @property
-    def touched(self) -> tuple[Entry, ...]:
+    def touched(self) -> tuple[LogEntry, ...]:
         """The active corrections of measurements: all except descriptions."""
         return tuple(one for one in self.standing if not isinstance(one.what, Description))
 
@@ -286,15 +287,15 @@ class Log:
         redoable = self.redoable
         for number in undo:
             if number not in known and (redoable is None or number != redoable[0]):
-                told = ", ".join(str(n) for n in sorted(known)) or "none"
+                active = ", ".join(str(n) for n in sorted(known)) or "none"
                 raise SessionError(
-                    f"there is no correction {number} to take back; those that stand are {told}"
+                    f"there is no correction {number} to take back; those that stand are {active}"
                 )
         author = author or author_name()
         now = datetime.now(UTC).isoformat(timespec="seconds")
         first = 1 + max((entry.number for entry in self.entries), default=0)
         wanted = [*((None, number) for number in dict.fromkeys(undo)), *((one, 0) for one in what)]
-        new = [Entry(number, author, now, *one) for number, one in enumerate(wanted, first)]
+        new = [LogEntry(number, author, now, *one) for number, one in enumerate(wanted, first)]
         return Log(self.made_of, (*self.entries, *new), self.files, self.facts)
 
     def to_json(self) -> str:
@@ -348,15 +349,11 @@ def basis(session: Path, metadata: Mapping[str, Any]) -> str:
         The first 16 hexadecimal digits of each table's SHA-256, joined by '-'.
     """
     stated = metadata.get("files") or {}
-    found = []
-    for name in ("poses.parquet", "bouts.parquet", "flips.parquet"):
-        facts = stated.get(name) if isinstance(stated, dict) else None
-        found.append(
-            str(facts["sha256"])
-            if isinstance(facts, dict) and "sha256" in facts
-            else sha256(session / name)
-        )
-    return "-".join(one[:16] for one in found)
+    hashes = [
+        stated.get(name, {}).get("sha256") or sha256(session / name)
+        for name in ("poses.parquet", "bouts.parquet", "flips.parquet")
+    ]
+    return "-".join(one[:16] for one in hashes)
 
 
 def read_log(session: Path) -> Log:
@@ -378,18 +375,10 @@ def read_log(session: Path) -> Log:
             )
         if document["sum"] != _sum(document):
             raise ValueError("its sum does not fit, so it was changed")
-        entries = tuple(Entry.from_dict(entry) for entry in document["entries"])
+        entries = tuple(LogEntry.from_dict(entry) for entry in document["entries"])
         made_of = str(document["made_of"])
         return Log(made_of, entries, document.get("files", {}), document.get("facts", {}))
-    except (
-        OSError,
-        ValueError,
-        KeyError,
-        TypeError,
-        AttributeError,
-        OverflowError,
-        RecursionError,
-    ) as error:
+    except (*UNREADABLE, OverflowError, RecursionError) as error:
         raise SessionError(
             f"{path} is damaged ({type(error).__name__}: {one_line(error)}); restore a copy of it, "
             f"or remove the folder {FOLDER} to continue with what was measured"
@@ -411,8 +400,8 @@ def with_description(metadata: Mapping[str, Any], described: Mapping[str, str]) 
     found = dict(metadata)
     subject = {name: value for name, value in described.items() if name != START}
     if subject:
-        subject = {**metadata.get("subject", {}), **subject}
-        found["subject"] = {name: value for name, value in subject.items() if value}
+        known = {**metadata.get("subject", {}), **subject}
+        found["subject"] = {name: value for name, value in known.items() if value}
     if START in described:
         found[START] = described[START] or None
     return found

@@ -13,12 +13,12 @@ import json
 import os
 import struct
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from itertools import zip_longest
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
 import zstandard
@@ -44,7 +44,7 @@ from mcap.stream_reader import StreamReader
 from numpy.typing import NDArray
 
 from liex_lab.errors import SessionError
-from liex_lab.geometry import SE3, so3
+from liex_lab.geometry import so3
 from liex_lab.recordings.formats.messages.mcap import MAGIC, MESSAGE, RECORD
 from liex_lab.runtime.memory import blocks
 from liex_lab.sessions.provenance import Provenance, package_version
@@ -56,7 +56,6 @@ if TYPE_CHECKING:
     import pandas as pd
 
 
-_WINDOW = 1 << 23
 _LEAST, _MOST = 10, 27  # log2 of the windows that every Zstandard reader accepts
 
 
@@ -87,10 +86,6 @@ class _Chunk:
         self._checksum = isal_zlib.crc32(data, self._checksum)
         self.size += len(data)
 
-    def begin_message(self, channel: int, time_ns: int) -> None:
-        index = self.indexes.setdefault(channel, MessageIndex(channel, []))
-        index.records.append((time_ns, self.size))
-
     def record(self) -> Chunk:
         """The whole chunk; nothing may be appended afterwards."""
         self._packed.append(self._packing.flush())
@@ -106,34 +101,34 @@ class _Chunk:
 
 
 class McapLog:
-    """Writer of one MCAP file with an index; call `log`, `flush` at will, and `close` once."""
+    """Writer of one MCAP file with an index; call `log`, `flush` at will, and `close` once.
+
+    Args:
+        sink: binary stream for appending; it stays open.
+        topics: the type of each topic's messages. Channels are numbered in this order; to resume a
+            file, give the same topics in the same order.
+        library: name and version of the writing program.
+        level: Zstandard level, 1 to 22.
+        chunk_size: bytes of messages that are compressed together.
+        repetition: shortest distant repetition to find, bytes; 0 for Zstandard's 64.
+        window: bytes searched for repetitions, rounded up to a power of two, 1 kB to 128 MB; a
+            window larger than the processor's cache is slow.
+        resume: whether `sink` is a file of the same topics that ends after a flush; it is read
+            once.
+    """
 
     def __init__(
         self,
         sink: BinaryIO,
+        topics: Mapping[str, MessageType],
         *,
-        profile: str,
         library: str,
         level: int,
         chunk_size: int,
         repetition: int = 0,
-        window: int = _WINDOW,
-        written: BinaryIO | None = None,
+        window: int = 1 << 23,
+        resume: bool = False,
     ) -> None:
-        """Write the beginning of the file, unless it is resumed.
-
-        Args:
-            sink: binary stream for appending; it stays open.
-            profile: purpose of the messages.
-            library: name and version of the writing program.
-            level: Zstandard level, 1 to 22.
-            chunk_size: bytes of messages that are compressed together.
-            repetition: shortest distant repetition to find, bytes; 0 for Zstandard's 64.
-            window: bytes searched for repetitions, rounded up to a power of two, 1 kB to 128 MB; a
-                window larger than the processor's cache is slow.
-            written: the present content of `sink`, a file of the same topics that ends after a
-                flush; it is read once.
-        """
         self._sink = sink
         self._at = 0
         self._chunk_size = chunk_size
@@ -144,17 +139,30 @@ class McapLog:
             ldm_min_match=repetition,
         )
         self._packer = zstandard.ZstdCompressor(compression_params=packing)
-        self._schemas: dict[str, Schema] = {}
-        self._channels: dict[str, Channel] = {}
-        self._introduced: set[int] = set()
+        kinds = {kind.name: kind for kind in topics.values()}
+        self._schemas = {
+            kind.name: Schema(id=k, data=kind.data, encoding=kind.encoding, name=kind.name)
+            for k, kind in enumerate(kinds.values(), 1)
+        }
+        self._channels = {
+            topic: Channel(
+                id=k,
+                topic=topic,
+                message_encoding=kind.messages,
+                schema_id=self._schemas[kind.name].id,
+                metadata={},
+            )
+            for k, (topic, kind) in enumerate(topics.items(), 1)
+        }
+        self._topics = topics
+        self._introduced: set[str] = set()
         self._counts: Counter[int] = Counter()
         self._chunks: list[ChunkIndex] = []
         self._open = _Chunk(self._packer)
-        if written is None:
-            self._write(MAGIC)
-            self._write(_bytes_of(Header(profile, library)))
+        if resume:
+            self._resume(sink)
         else:
-            self._resume(written)
+            self._write(MAGIC + _bytes_of(Header("liex_lab", library)))
 
     def _resume(self, written: BinaryIO) -> None:
         """Rebuild counts and chunk indexes from the records of a file without an end."""
@@ -171,34 +179,17 @@ class McapLog:
                 "the MCAP file was not written whole; make room on the disk and run it again"
             )
 
-    def declare(self, topic: str, kind: MessageType) -> Channel:
-        """The channel of a topic. Channels are numbered in the order of their declaration; to
-        resume a file, declare the same ones in the same order.
-        """
-        if topic not in self._channels:
-            new = Schema(
-                id=len(self._schemas) + 1, data=kind.data, encoding=kind.encoding, name=kind.name
-            )
-            self._channels[topic] = Channel(
-                id=len(self._channels) + 1,
-                topic=topic,
-                message_encoding=kind.messages,
-                schema_id=self._schemas.setdefault(kind.name, new).id,
-                metadata={},
-            )
-        return self._channels[topic]
-
-    def log(
-        self, topic: str, kind: MessageType, data: Sequence[bytes | memoryview], time_ns: int
-    ) -> None:
+    def log(self, topic: str, data: Sequence[bytes | memoryview], time_ns: int) -> None:
         """Add an encoded message, in one or more parts, logged and published at a time."""
-        channel = self.declare(topic, kind)
+        channel = self._channels[topic]
         chunk = self._open
-        if channel.id not in self._introduced:  # in the chunk of its first message
-            self._introduced.add(channel.id)
-            chunk.put(_bytes_of(self._schemas[kind.name]) + _bytes_of(channel))
-        chunk.begin_message(channel.id, time_ns)
-        number = self._counts[channel.id] + len(chunk.indexes[channel.id].records)
+        if topic not in self._introduced:  # in the chunk of its first message
+            self._introduced.add(topic)
+            schema = self._schemas[self._topics[topic].name]
+            chunk.put(_bytes_of(schema) + _bytes_of(channel))
+        index = chunk.indexes.setdefault(channel.id, MessageIndex(channel.id, []))
+        index.records.append((time_ns, chunk.size))
+        number = self._counts[channel.id] + len(index.records)
         head = RECORD.pack(Opcode.MESSAGE, MESSAGE.size + sum(map(len, data)))
         chunk.put(head + MESSAGE.pack(channel.id, number, time_ns, time_ns))
         for part in data:
@@ -248,10 +239,21 @@ class McapLog:
         start = self._at
         channels = [channel for channel in self._channels.values() if self._counts[channel.id]]
         used = {channel.schema_id for channel in channels}
+        statistics = Statistics(
+            attachment_count=0,
+            channel_count=len(channels),
+            channel_message_counts=dict(self._counts),
+            chunk_count=len(self._chunks),
+            message_count=self._counts.total(),
+            metadata_count=0,
+            message_start_time=min((one.message_start_time for one in self._chunks), default=0),
+            message_end_time=max((one.message_end_time for one in self._chunks), default=0),
+            schema_count=len(used),
+        )
         groups: dict[int, Sequence[McapRecord]] = {
             Opcode.SCHEMA: [schema for schema in self._schemas.values() if schema.id in used],
             Opcode.CHANNEL: channels,
-            Opcode.STATISTICS: [self._statistics(len(used), len(channels))],
+            Opcode.STATISTICS: [statistics],
             Opcode.CHUNK_INDEX: self._chunks,
         }
         summary, offsets = RecordBuilder(), RecordBuilder()
@@ -265,19 +267,6 @@ class McapLog:
         head = _bytes_of(Footer(start, offsets_at, 0))[:-4]
         checksum = isal_zlib.crc32(head, isal_zlib.crc32(content))
         self._write(content + head + checksum.to_bytes(4, "little") + MAGIC)
-
-    def _statistics(self, n_schemas: int, n_channels: int) -> Statistics:
-        return Statistics(
-            attachment_count=0,
-            channel_count=n_channels,
-            channel_message_counts=dict(self._counts),
-            chunk_count=len(self._chunks),
-            message_count=self._counts.total(),
-            metadata_count=0,
-            message_start_time=min((one.message_start_time for one in self._chunks), default=0),
-            message_end_time=max((one.message_end_time for one in self._chunks), default=0),
-            schema_count=n_schemas,
-        )
 
     def _write(self, data: bytes) -> None:
         self._sink.write(data)
@@ -343,33 +332,16 @@ _BONE = messages.Color(r=1.0, g=1.0, b=1.0, a=1.0)
 _JOINT = messages.Color(r=1.0, g=0.31, b=0.24, a=1.0)
 
 
-class _Packing(NamedTuple):
-    """Compression of images.
-
-    Attributes:
-        level: of Zstandard.
-        chunk_size: bytes packed together.
-        repetition: least length of a distant repetition, bytes, see `McapLog`.
-        window: bytes searched for repetitions.
-    """
-
-    level: int
-    chunk_size: int
-    repetition: int
-    window: int
-
-
-def _packing_of(origin: Provenance) -> _Packing:
-    """Whole images one per chunk, or many images that only differ in a cut-out.
+def _packing_of(origin: Provenance) -> dict[str, int]:
+    """Settings of `McapLog` for whole images, one per chunk, or for images with cut-outs.
 
     The latter repeat the still scene of the previous image; short repetitions would split it.
     """
     if origin.background is None:
-        return _Packing(level=3, chunk_size=128 * 1024, repetition=0, window=1 << 23)
-    picture = 2 * origin.camera.width * origin.camera.height
-    return _Packing(
-        level=1, chunk_size=32 * 1024 * 1024, repetition=256, window=2 * picture + picture // 2
-    )
+        return {"level": 3, "chunk_size": 128 * 1024}
+    size = 2 * origin.camera.width * origin.camera.height
+    window = 2 * size + size // 2
+    return {"level": 1, "chunk_size": 32 * 1024 * 1024, "repetition": 256, "window": window}
 
 
 class McapWriter:
@@ -397,32 +369,28 @@ class McapWriter:
             chunk_size: bytes packed at once; None as for level.
             resume: append to a file that ends after `flushed`.
         """
-        usual = _packing_of(origin)
+        given = {"level": level, "chunk_size": chunk_size}
+        chosen = {name: value for name, value in given.items() if value is not None}
         self._path = path
         self._origin = origin
         self._dot_m = dot_mm(origin.skeleton) / 1000.0
         self._file = path.open("a+b" if resume else "wb")
         self._log = McapLog(
             self._file,
-            profile="liex_lab",
+            _TYPES,
             library=f"liex_lab {package_version('liex_lab')}",
-            level=usual.level if level is None else level,
-            chunk_size=usual.chunk_size if chunk_size is None else chunk_size,
-            repetition=usual.repetition,
-            window=usual.window,
-            written=self._file if resume else None,
+            resume=resume,
+            **{**_packing_of(origin), **chosen},
         )
-        for topic, kind in _TYPES.items():
-            self._log.declare(topic, kind)
         self._calibrated_ns: int | None = None
 
     def _log_message(self, topic: str, time_ns: int, message: Any) -> None:
-        self._log.log(topic, _TYPES[topic], [message.encode()], time_ns)
+        self._log.log(topic, [message.encode()], time_ns)
 
     def _log_json(self, topic: str, time_ns: int, content: dict[str, Any]) -> None:
         sec, nsec = divmod(time_ns, _SECOND)
         stamped = {"timestamp": {"sec": sec, "nsec": nsec}, **content}
-        self._log.log(topic, _TYPES[topic], [json.dumps(stamped).encode()], time_ns)
+        self._log.log(topic, [json.dumps(stamped).encode()], time_ns)
 
     def add(self, times_ns: Sequence[int], depth: Sequence[NDArray[np.uint16]]) -> None:
         """Write the depth of consecutive frames, and the calibration about once a second.
@@ -439,7 +407,7 @@ class McapWriter:
                 if self._calibrated_ns is None or time_ns - self._calibrated_ns >= _SECOND:
                     self._log_camera(time_ns)
                 if image is not None:
-                    self._log.log(_DEPTH, _TYPES[_DEPTH], _picture(time_ns, image), time_ns)
+                    self._log.log(_DEPTH, _raw_image(time_ns, image), time_ns)
 
     def finish(
         self, rows: Rows, bouts: pd.DataFrame, words: Sequence[str], problems: Sequence[str]
@@ -461,26 +429,37 @@ class McapWriter:
                 self._log_track(track[part])
             self._log_actions(rows, bouts, words)
             for problem in problems if len(track.times_ns) else ():
-                self._log_note(int(track.times_ns[0]), problem)
+                first_ns = int(track.times_ns[0])
+                note = messages.Log(
+                    timestamp=_stamp(first_ns),
+                    level=messages.LogLevel.Warning,
+                    message=problem,
+                    name="liex_lab",
+                )
+                self._log_message("/log", first_ns, note)
         self.abandon()
 
     def _log_track(self, track: Track) -> None:
         """Skeleton and transforms of some frames."""
         posed = track.posed
-        quaternions = so3.quaternion(np.where(posed[:, None, None], track.root_rotation, np.eye(3)))
-        for i, (time_ns, seen) in enumerate(
-            zip(track.times_ns.tolist(), posed.tolist(), strict=True)
-        ):
+        rotations = np.where(posed[:, None, None], track.root_rotation, np.eye(3))
+        quaternions = so3.quaternion(rotations)
+        for i, time_ns in enumerate(track.times_ns.tolist()):
             joints_m = track.joints_mm[i] / 1000.0
-            self._log_message(
-                "/skeleton/scene", time_ns, self._scene_update(time_ns, joints_m, seen)
+            found = bool(posed[i])
+            scene = self._scene_update(time_ns, joints_m, found)
+            self._log_message("/skeleton/scene", time_ns, scene)
+            joints = messages.PosesInFrame(
+                timestamp=_stamp(time_ns),
+                frame_id="arena",
+                poses=[_place(*xyz) for xyz in joints_m.tolist()] if found else [],
             )
-            self._log_message("/skeleton/joints", time_ns, _joint_poses(time_ns, joints_m, seen))
-            overlay = self._annotations(time_ns, track.uv_px[i], seen)
+            self._log_message("/skeleton/joints", time_ns, joints)
+            overlay = self._annotations(time_ns, track.uv_px[i], found)
             self._log_message("/camera/skeleton", time_ns, overlay)
-            if seen:
-                root = _transform(time_ns, "arena", "root", track.root_mm[i], quaternions[i])
-                self._log_message("/tf", time_ns, messages.FrameTransforms(transforms=[root]))
+            if found:
+                root = _transform(time_ns, "root", track.root_mm[i], quaternions[i])
+                self._log_message("/tf", time_ns, root)
             error_mm = float(track.predicted_error_mm[i])
             if np.isfinite(error_mm):
                 self._log_json("/predicted_error", time_ns, {"predicted_error_mm": error_mm})
@@ -521,15 +500,15 @@ class McapWriter:
             P=np.hstack([k, np.zeros((3, 1))]).ravel().tolist(),
         )
         self._log_message("/camera/calibration", time_ns, calibration)
-        transform = _transform(time_ns, "arena", "camera", place.translation, _quaternion(place))
-        self._log_message("/tf", time_ns, messages.FrameTransforms(transforms=[transform]))
+        turn = so3.quaternion(place.rotation)
+        self._log_message("/tf", time_ns, _transform(time_ns, "camera", place.translation, turn))
 
-    def _scene_update(self, time_ns: int, joints_m: Array, seen: bool) -> messages.SceneUpdate:
+    def _scene_update(self, time_ns: int, joints_m: Array, found: bool) -> messages.SceneUpdate:
         """Bones as lines and joints as spheres under one entity id, which is deleted without a
         pose.
         """
         stamp = _stamp(time_ns)
-        if not seen:
+        if not found:
             gone = messages.SceneEntityDeletion(
                 timestamp=stamp, type=messages.SceneEntityDeletionType.MatchingId, id="skeleton"
             )
@@ -559,9 +538,9 @@ class McapWriter:
         )
         return messages.SceneUpdate(entities=[entity])
 
-    def _annotations(self, time_ns: int, uv: Array, seen: bool) -> messages.ImageAnnotations:
+    def _annotations(self, time_ns: int, uv: Array, found: bool) -> messages.ImageAnnotations:
         """The skeleton over the depth image."""
-        if not seen:
+        if not found:
             return messages.ImageAnnotations(points=[])
         at = [messages.Point2(x=u, y=v) for u, v in uv.tolist()]
         ends = [at[end] for edge in self._origin.skeleton.edges for end in edge]
@@ -593,13 +572,6 @@ class McapWriter:
             }
             self._log_json("/actions", first + at, state)
 
-    def _log_note(self, time_ns: int, problem: str) -> None:
-        level = messages.LogLevel.Warning
-        note = messages.Log(
-            timestamp=_stamp(time_ns), level=level, message=problem, name="liex_lab"
-        )
-        self._log_message("/log", time_ns, note)
-
 
 @contextmanager
 def _naming(path: Path) -> Iterator[None]:
@@ -611,11 +583,6 @@ def _naming(path: Path) -> Iterator[None]:
         raise
 
 
-def _joint_poses(time_ns: int, joints_m: Array, seen: bool) -> messages.PosesInFrame:
-    poses = [_place(*xyz) for xyz in joints_m.tolist()] if seen else []
-    return messages.PosesInFrame(timestamp=_stamp(time_ns), frame_id="arena", poses=poses)
-
-
 def _place(x: float, y: float, z: float) -> messages.Pose:
     return messages.Pose(
         position=messages.Vector3(x=x, y=y, z=z),
@@ -624,48 +591,43 @@ def _place(x: float, y: float, z: float) -> messages.Pose:
 
 
 def _transform(
-    time_ns: int, parent: str, child: str, translation_mm: Array, wxyz: Array
-) -> messages.FrameTransform:
+    time_ns: int, child: str, translation_mm: Array, wxyz: Array
+) -> messages.FrameTransforms:
+    """The transform from a frame to the arena frame."""
     x, y, z = (translation_mm / 1000.0).tolist()
     qw, qx, qy, qz = wxyz.tolist()
-    return messages.FrameTransform(
+    transform = messages.FrameTransform(
         timestamp=_stamp(time_ns),
-        parent_frame_id=parent,
+        parent_frame_id="arena",
         child_frame_id=child,
         translation=messages.Vector3(x=x, y=y, z=z),
         rotation=messages.Quaternion(x=qx, y=qy, z=qz, w=qw),
     )
+    return messages.FrameTransforms(transforms=[transform])
 
 
-def _quaternion(transform: SE3) -> Array:
-    return so3.quaternion(transform.rotation)
-
-
-def _picture(time_ns: int | np.int64, image: NDArray[np.uint16]) -> list[bytes | memoryview]:
+def _raw_image(time_ns: int | np.int64, image: NDArray[np.uint16]) -> list[bytes | memoryview]:
     """A depth image as a `RawImage`, in parts, without a copy of the pixels.
 
     Protobuf's fields are in order of their numbers, and only the frame id follows the pixels.
     """
     height, width = image.shape
     pixels = np.ascontiguousarray(image, "<u2")
+    varint = bytearray()  # the number of bytes, seven bits per byte, lowest first
+    left = pixels.nbytes
+    while left > 127:
+        varint.append(left & 127 | 128)
+        left >>= 7
+    varint.append(left)
     before = messages.RawImage(
         timestamp=_stamp(time_ns), encoding="16UC1", width=width, height=height, step=2 * width
     )
     after = messages.RawImage(frame_id="camera")
     return [
-        before.encode() + _DATA + _varint(pixels.nbytes),
+        before.encode() + _DATA + bytes(varint),
         pixels.reshape(-1).view(np.uint8).data,
         after.encode(),
     ]
-
-
-def _varint(number: int) -> bytes:
-    """A number in Protobuf's varint encoding: seven bits per byte, lowest first."""
-    out = bytearray()
-    while number > 127:
-        out.append(number & 127 | 128)
-        number >>= 7
-    return bytes([*out, number])
 
 
 def _stamp(time_ns: int | np.int64) -> Any:

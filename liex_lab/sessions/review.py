@@ -12,18 +12,22 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from contextlib import suppress
+from dataclasses import field, replace
 from datetime import UTC, datetime
 from itertools import combinations
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
+from pydantic import TypeAdapter
+from pydantic.dataclasses import dataclass
 
 from liex_lab.actions.scores import Agreement, cohens_kappa
-from liex_lab.errors import SessionError
+from liex_lab.errors import SessionError, one_line
 from liex_lab.runtime.durable import write_whole
 from liex_lab.runtime.places import inside
+from liex_lab.sessions.corrections import UNREADABLE
 
 if TYPE_CHECKING:
     from liex_lab.sessions.session import Session
@@ -114,28 +118,17 @@ class Review:
         """Agreement of every two raters who are done, and of each with the program."""
         program = {k: clip.program for k, clip in enumerate(self.clips)}
         raters = [name for name in self.answers if self.done_by(name)]
-        said = {**{name: self.answers[name] for name in raters}, PROGRAM: program}
+        labels = {**{name: self.answers[name] for name in raters}, PROGRAM: program}
         found = []
-        for a, b in combinations(said, 2):
-            both = sorted(set(said[a]) & set(said[b]))
-            words = ([said[one][k] for k in both] for one in (a, b))
+        for a, b in combinations(labels, 2):
+            both = sorted(set(labels[a]) & set(labels[b]))
+            words = ([labels[one][k] for k in both] for one in (a, b))
             found.append((a, b, cohens_kappa(*words)))
         return found
 
     def to_json(self) -> str:
         """The content of the review's file."""
-        document = {
-            "schema_version": SCHEMA_VERSION,
-            "name": self.name,
-            "seed": self.seed,
-            "made_at": self.made_at,
-            "words": list(self.words),
-            "clips": [vars(clip) for clip in self.clips],
-            "answers": {
-                rater: {str(k): word for k, word in own.items()}
-                for rater, own in self.answers.items()
-            },
-        }
+        document = {"schema_version": SCHEMA_VERSION, **_REVIEW.dump_python(self, mode="json")}
         return json.dumps(document, indent=1, ensure_ascii=False) + "\n"
 
     @staticmethod
@@ -146,30 +139,17 @@ class Review:
             text: the content of a review's file.
 
         Raises:
-            ValueError: a value is invalid.
-            KeyError: a key is missing.
-            TypeError: a value is of another type.
+            ValueError: a value is missing, invalid or of another type.
+            KeyError: the version is missing.
+            TypeError: the content is not an object.
         """
-        told = json.loads(text)
-        if int(told["schema_version"]) > SCHEMA_VERSION:
+        found = json.loads(text)
+        if int(found["schema_version"]) > SCHEMA_VERSION:
             raise ValueError("it was written by a newer liex_lab")
-        clips = tuple(
-            Clip(
-                str(one["session"]),
-                float(one["at_s"]),
-                float(one["start_s"]),
-                float(one["stop_s"]),
-                str(one["program"]),
-            )
-            for one in told["clips"]
-        )
-        answers = {
-            str(rater): {int(k): str(word) for k, word in own.items()}
-            for rater, own in told["answers"].items()
-        }
-        words = tuple(str(word) for word in told["words"])
-        made_at = str(told["made_at"])
-        return Review(str(told["name"]), int(told["seed"]), words, clips, answers, made_at)
+        return _REVIEW.validate_python(found)
+
+
+_REVIEW = TypeAdapter(Review)
 
 
 def drawn_review(
@@ -227,15 +207,15 @@ def _bouts_of(session: Session) -> list[tuple[str, float, float, float]]:
     last_s = float(session.frames["time_s"].iloc[-1])
     found = []
     at_s = 0.0
-    for word, start, stop in zip(
-        table["action"].astype(str), table["start_s"], table["stop_s"], strict=True
-    ):
-        if start - at_s > _LEAST_S:
-            found.append((NO_NAME, at_s, float(start), last_s))
-        found.append((word, float(start), float(stop), last_s))
-        at_s = max(at_s, float(stop))
-    if last_s - at_s > _LEAST_S:
-        found.append((NO_NAME, at_s, last_s, last_s))
+    for word, start_s, stop_s in [
+        *table[["action", "start_s", "stop_s"]].itertuples(index=False, name=None),
+        ("", last_s, last_s),
+    ]:
+        if start_s - at_s > _LEAST_S:
+            found.append((NO_NAME, at_s, float(start_s), last_s))
+        if word:
+            found.append((str(word), float(start_s), float(stop_s), last_s))
+        at_s = max(at_s, float(stop_s))
     return found
 
 
@@ -283,9 +263,9 @@ def read_review(folder: Path, name: str) -> Review:
         return Review.from_json(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise SessionError(f"there is no review '{name}' in {folder}") from None
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+    except UNREADABLE as error:
         raise SessionError(
-            f"{path} is damaged ({type(error).__name__}: {error}); put back a copy of it"
+            f"{path} is damaged ({type(error).__name__}: {one_line(error)}); put back a copy of it"
         ) from None
 
 
@@ -295,10 +275,8 @@ def review_names(folder: Path) -> Sequence[str]:
     Args:
         folder: the study's folder of reviews; it may not exist.
     """
-    found: list[Any] = []
+    found = []
     for path in sorted(folder.glob(f"*{ENDING}")):
-        try:
+        with suppress(*UNREADABLE):
             found.append(Review.from_json(path.read_text(encoding="utf-8")).name)
-        except (OSError, ValueError, KeyError, TypeError, AttributeError):
-            continue
     return found

@@ -8,7 +8,6 @@ session list of a study.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -16,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from liex_lab.runtime.memory import blocks
+from liex_lab.runtime.text_files import loose_json
 
 if TYPE_CHECKING:
     from liex_lab.tracking.observations import Observations
@@ -29,7 +28,6 @@ OTHER_ANIMAL = "the recording names another animal"  # start of that caution
 _MEASURED_SHARE = 0.5  # of the frames with an object of the animal's size in view
 _LEAST_SHARE = 0.2  # of all frames with depth
 _DOUBTFUL_SHARE = 0.05
-_BLOCK = 16_384
 
 
 @dataclass(frozen=True)
@@ -84,35 +82,28 @@ class Verdict:
             cautions: further doubts.
             accepted: whether the plan accepts misfits.
         """
-        n_in_view = 0
-        n_depth = 0
-        n_trusted = 0
-        for rows in blocks(track.n_frames, _BLOCK):
-            part = seen[rows]
-            n_in_view += int(part.known.any(axis=1).sum())
-            n_depth += int(part.has_depth.sum())
-            n_trusted += int((track[rows].observed & (track.flag[rows] == "")).sum())
-        n_posed = int(track.observed.sum())
-        errors = track.predicted_error_mm[track.observed]
-        doubtful = int((track.flag == "doubtful").sum())
         n_hidden = int((track.flag == "hidden").sum())
-        n_depth -= n_hidden  # there is a reason for the missing pose
-        n_in_view = min(n_in_view, n_depth)
+        n_depth = int(seen.has_depth.sum()) - n_hidden  # there is a reason for the missing pose
+        n_in_view = min(int(seen.known.any(axis=1).sum()), n_depth)
+        n_posed = int(track.observed.sum())
+        n_trusted = int((track.observed & (track.flag == "")).sum())
+        n_doubtful = int((track.flag == "doubtful").sum())
+        errors = track.predicted_error_mm[track.observed]
         reasons = [*misfits, *doubts]
         if n_trusted < _LEAST_SHARE * n_depth:
             reasons.append(f"an animal is measured in {n_trusted} of {n_depth} frames only")
         elif n_trusted < _MEASURED_SHARE * n_in_view:
             reasons.append(
-                f"only {n_trusted} of the {n_in_view} frames with something of its size in view "
+                f"only {n_trusted} of the {n_in_view} frames with an object of its size in view "
                 "are measured and trusted"
             )
-        said = list(cautions)
+        notes = list(cautions)
         if n_animals > 1:
-            said.append(f"{n_animals} animals are in view and one of them is followed")
+            notes.append(f"{n_animals} animals are in view and one of them is followed")
         if n_hidden:
-            said.append(f"the animal is hidden in {n_hidden:,} frames")
-        if doubtful > _DOUBTFUL_SHARE * track.n_frames:
-            said.append(f"{doubtful} poses are doubtful")
+            notes.append(f"the animal is hidden in {n_hidden:,} frames")
+        if n_doubtful > _DOUBTFUL_SHARE * track.n_frames:
+            notes.append(f"{n_doubtful} poses are doubtful")
         return Verdict(
             track.n_frames,
             n_in_view,
@@ -121,7 +112,7 @@ class Verdict:
             float(np.median(errors)) if len(errors) else None,
             n_animals if n_posed else 0,
             tuple(reasons),
-            tuple(said),
+            tuple(notes),
             accepted,
             n_hidden,
         )
@@ -168,24 +159,22 @@ def read_verdict(folder: Path) -> Mapping[str, Any]:
     Returns:
         At least `look_at_it`, `accepted`, `reasons`, `cautions` and `sentence` ("" if absent).
     """
-    try:
-        document = json.loads((folder / "session.json").read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError):
-        document = {}
-    return verdict_in(document if isinstance(document, dict) else {})
+    return verdict_in(loose_json(folder / "session.json"))
 
 
 def verdict_in(document: Mapping[str, Any]) -> Mapping[str, Any]:
     """The verdict in the content of a session.json, as in `read_verdict`."""
-    unsaid = {"look_at_it": False, "accepted": False, "reasons": [], "cautions": [], "sentence": ""}
+    default = {
+        "look_at_it": False,
+        "accepted": False,
+        "reasons": [],
+        "cautions": [],
+        "sentence": "",
+    }
     found = document.get("verdict")
-    if not isinstance(found, Mapping):
-        return unsaid
-    return {
-        **unsaid,
-        **{
-            name: one for name, one in found.items() if isinstance(one, type(unsaid.get(name, one)))
-        },
+    stated = found.items() if isinstance(found, Mapping) else ()
+    return default | {
+        name: value for name, value in stated if isinstance(value, type(default.get(name, value)))
     }
 
 

@@ -20,7 +20,7 @@ from liex_lab.errors import SessionError
 from liex_lab.exchange import export
 from liex_lab.exchange.pose_files import observed_spans
 from liex_lab.sessions import Session
-from liex_lab.sessions.corrections import BoutEdit, Entry, Log
+from liex_lab.sessions.corrections import BoutEdit, Log, LogEntry
 from tests.sessions.walking_mouse import WalkingMouse, steady, write
 
 BEGINNING = "2026-08-21T10:00:00+02:00"
@@ -119,7 +119,7 @@ def test_a_recording_without_gaps_was_observed_throughout(tmp_path):
 
 def test_an_ethogram_that_people_corrected_says_so(session, tmp_path):
     edit = BoutEdit("rename", "run", 1, 2)
-    log = Log("", (Entry(1, "ada", BEGINNING, edit), Entry(2, "bob", BEGINNING, edit)))
+    log = Log("", (LogEntry(1, "ada", BEGINNING, edit), LogEntry(2, "bob", BEGINNING, edit)))
     looked_at = Session(session.path, session.metadata, log)
     with NWBHDF5IO(export(looked_at, "nwb", tmp_path), "r") as file:
         actions = file.read().intervals["actions"]

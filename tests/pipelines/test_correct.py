@@ -25,7 +25,7 @@ from liex_lab.errors import LiexError, SessionError
 from liex_lab.exchange import export
 from liex_lab.plan import Plan
 from liex_lab.sessions import Session, correcting
-from liex_lab.sessions.corrections import Correction, Entry, Log, read_log
+from liex_lab.sessions.corrections import Correction, Log, LogEntry, read_log
 from liex_lab.sessions.evidence import track_of
 from tests.golden.test_golden import golden  # noqa: F401
 from tests.sessions.walking_mouse import FLOOR_MM, WalkingMouse, write
@@ -220,7 +220,7 @@ def test_redo_makes_again_what_was_taken_back_until_something_new_is_done(steps:
                 done.append(undone.pop())
         assert [entry.what for entry in log.standing] == done
     stated = json.loads(log.to_json())
-    assert [Entry.from_dict(entry) for entry in stated["entries"]] == list(log.entries)
+    assert [LogEntry.from_dict(entry) for entry in stated["entries"]] == list(log.entries)
     redone = "redo" in steps and len(log.undos) < sum(e.what is None for e in log.entries)
     assert stated["schema_version"] == (3 if redone else 2)
 
@@ -230,7 +230,7 @@ def test_logs_of_earlier_versions_are_read(session: Session) -> None:
     corrected(session, correcting.joint_move(session, 0, "nose", place + 2.0))
     entry = read_log(session.path).entries[0].to_dict()
     del entry["note"]
-    assert Entry.from_dict(entry) == read_log(session.path).entries[0]
+    assert LogEntry.from_dict(entry) == read_log(session.path).entries[0]
 
 
 def test_taken_back_everything_reads_as_measured_and_the_log_says_who_and_when(

@@ -22,7 +22,7 @@ from liex_lab.errors import SessionError
 from liex_lab.plan import Plan
 from liex_lab.sessions import Session, correcting
 from liex_lab.sessions.correcting import disagreements, flip_span
-from liex_lab.sessions.corrections import Entry, FlipSpan, JointMove, Log
+from liex_lab.sessions.corrections import FlipSpan, JointMove, Log, LogEntry
 from liex_lab.sessions.evidence import skeleton_of, track_of
 
 ADDRESS = "synthetic:walk?seed=3&frames=30&sensor=primesense-qvga&spine_mm=70"
@@ -113,7 +113,7 @@ def test_a_joint_placed_before_its_frame_was_exchanged_is_of_the_other_end(track
     nose = track_of(tracked, skeleton).joints_mm[row, -1] + np.array([2.0, -2.0, 1.0])
     move = JointMove(row, "nose", *nose.tolist())
     flip = FlipSpan(SPAN.start, SPAN.stop)
-    entries = [Entry(1, "", "", move), Entry(2, "", "", flip)]
+    entries = [LogEntry(1, "", "", move), LogEntry(2, "", "", flip)]
     found = corrected_track(tracked, Log("", tuple(entries)), skeleton).track
     assert np.linalg.norm(found.joints_mm[row, 0] - nose) < 1.5, "its rump is there now"
     later = corrected_track(tracked, Log("", tuple(entries[::-1])), skeleton)

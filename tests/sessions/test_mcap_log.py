@@ -6,7 +6,7 @@ import io
 from collections import Counter
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 import pytest
@@ -20,170 +20,138 @@ from liex_lab.sessions.mcap import McapLog, MessageType
 
 ONE = MessageType("one", "jsonschema", b"{}", "json")
 OTHER = MessageType("other", "jsonschema", b'{"type": "object"}', "json")
-Said = list[tuple[str, int, bytes]]
+TOPICS = {"/a": ONE, "/b": OTHER}
+Messages = list[tuple[str, int, bytes]]
 
 
-def said(n: int = 60) -> Said:
+def messages(n: int = 60) -> Messages:
     """Messages of two topics, out of turn, of 0 to 3,000 bytes that compress and that do not."""
     rng = np.random.default_rng(5)
-    told = []
+    made = []
     for k in range(n):
         data = rng.bytes(k * 50) if k % 3 else bytes(k * 50)
-        told.append((f"/{'ab'[k % 2]}", int(rng.integers(1, 10**12)), data))
-    return told
+        made.append((f"/{'ab'[k % 2]}", int(rng.integers(1, 10**12)), data))
+    return made
 
 
-def parts(data: bytes) -> list[bytes | memoryview]:
-    """A message in two parts, either of which may be empty."""
-    return [data[:70], memoryview(data)[70:]]
+def new_log(sink: Any, chunk_size: int = 4_000, **settings: Any) -> McapLog:
+    return McapLog(sink, TOPICS, library="l", chunk_size=chunk_size, **{"level": 1, **settings})
 
 
-def written(told: Said, chunk_size: int = 4_000, level: int = 1, flush_at: int = -1) -> io.BytesIO:
+def log_all(file: McapLog, made: Messages) -> None:
+    for topic, time_ns, data in made:  # in two parts, either of which may be empty
+        file.log(topic, [data[:70], memoryview(data)[70:]], time_ns)
+
+
+def written(made: Messages, flush_at: int = 0, **settings: Any) -> io.BytesIO:
     sink = io.BytesIO()
-    file = McapLog(sink, profile="p", library="l", level=level, chunk_size=chunk_size)
-    for k, (topic, time_ns, data) in enumerate(told):
-        if k == flush_at:
-            file.flush()
-            file.flush()  # what does not wait is not written
-        file.log(topic, ONE if topic == "/a" else OTHER, parts(data), time_ns)
+    file = new_log(sink, **settings)
+    log_all(file, made[:flush_at])
+    for _ in range(2 if flush_at else 0):  # what does not wait is not written
+        file.flush()
+    log_all(file, made[flush_at:])
     file.close()
     sink.seek(0)
     return sink
 
 
-@pytest.mark.parametrize("chunk_size", [1, 4_000, 10**9])
-@pytest.mark.parametrize("level", [1, 3, 19])
-def test_every_message_comes_back_by_the_index_in_the_order_of_time(
-    chunk_size: int, level: int
-) -> None:
-    told = said()
-    reader = make_reader(written(told, chunk_size, level), validate_crcs=True)
-    found = [
-        (channel.topic, message.log_time, message.data)
-        for _, channel, message in reader.iter_messages()
-    ]
-    assert found == sorted(told, key=lambda one: one[1])
-    summary = reader.get_summary()
+def in_order_of_time(file: BinaryIO) -> Messages:
+    reader = make_reader(file, validate_crcs=True)
+    return [(channel.topic, one.log_time, one.data) for _, channel, one in reader.iter_messages()]
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        *({"chunk_size": size, "level": level} for size in (1, 4_000, 10**9) for level in (1, 19)),
+        *({"window": window} for window in (1, 40, 1 << 20, 1 << 33)),
+    ],
+    ids=str,
+)
+def test_every_message_is_found_by_the_index_in_the_order_of_time(settings: dict[str, int]) -> None:
+    made = messages()
+    file = written(made, **settings)
+    assert in_order_of_time(file) == sorted(made, key=lambda one: one[1])
+    summary = make_reader(file).get_summary()
     assert summary is not None
     assert summary.statistics is not None
-    assert summary.statistics.message_count == len(told)
-    assert summary.statistics.message_start_time == min(one[1] for one in told)
-    assert summary.statistics.message_end_time == max(one[1] for one in told)
+    assert summary.statistics.message_count == len(made)
+    assert summary.statistics.message_start_time == min(one[1] for one in made)
+    assert summary.statistics.message_end_time == max(one[1] for one in made)
     assert len(summary.chunk_indexes) == summary.statistics.chunk_count
     assert {s.name: s.data for s in summary.schemas.values()} == {
         one.name: one.data for one in (ONE, OTHER)
     }
+    file.seek(0)
+    names = [type(one).__name__ for one in StreamReader(file, validate_crcs=True).records]
+    assert (names[0], names[-1], names.count("Message")) == ("Header", "Footer", 60)
+    assert "Message" not in names[names.index("DataEnd") :]
 
 
-@pytest.mark.parametrize("window", [1, 40, 1 << 20, 1 << 33])
-def test_pictures_of_any_size_have_a_window_that_readers_take(window: int) -> None:
-    sink = io.BytesIO()
-    file = McapLog(sink, profile="p", library="l", level=1, chunk_size=4_000, window=window)
-    for _, time_ns, data in said():
-        file.log("/a", ONE, parts(data), time_ns)
-    file.close()
-    sink.seek(0)
-    found = [message.data for _, _, message in make_reader(sink).iter_messages()]
-    assert sorted(found) == sorted(data for _, _, data in said())
-
-
-def test_records_follow_each_other_as_the_format_says_and_checksums_hold() -> None:
-    sink = written(said())
-    names = [type(one).__name__ for one in StreamReader(sink, validate_crcs=True).records]
-    assert names[0] == "Header"
-    assert names[-1] == "Footer"
-    assert names.count("Message") == 60
-    assert names.index("DataEnd") > max(k for k, name in enumerate(names) if name == "Message")
-
-
-def test_a_file_that_ends_after_a_flush_holds_what_was_written_before() -> None:
-    told = said()
+def test_a_file_that_ends_after_a_flush_contains_the_messages_before_it() -> None:
+    made = messages()
     whole = io.BytesIO()
-    file = McapLog(whole, profile="p", library="l", level=1, chunk_size=10**9)
-    for topic, time_ns, data in told[:25]:
-        file.log(topic, ONE if topic == "/a" else OTHER, parts(data), time_ns)
+    file = new_log(whole, 10**9)
+    log_all(file, made[:25])
     file.flush()
-    for topic, time_ns, data in told[25:]:
-        file.log(topic, ONE if topic == "/a" else OTHER, parts(data), time_ns)
-    cut = io.BytesIO(whole.getvalue())
+    log_all(file, made[25:])
     found = []
     with suppress(McapError, EOFError):  # it has no end
-        for record in StreamReader(cut, validate_crcs=True).records:
+        for record in StreamReader(io.BytesIO(whole.getvalue()), validate_crcs=True).records:
             if type(record).__name__ == "Message":
                 found.append(record.data)  # type: ignore[attr-defined]
-    assert found == [data for _, _, data in told[:25]]
+    assert found == [data for _, _, data in made[:25]]
 
 
 def test_the_same_messages_and_flushes_are_the_same_bytes() -> None:
-    told = said()
-    assert written(told, flush_at=7).getvalue() == written(told, flush_at=7).getvalue()
+    made = messages()
+    assert written(made, flush_at=7).getvalue() == written(made, flush_at=7).getvalue()
+    assert in_order_of_time(written([])) == []
 
 
-def test_a_file_without_a_message_is_whole(tmp_path: Path) -> None:
-    place = tmp_path / "empty.mcap"
-    place.write_bytes(written([]).getvalue())
-    with place.open("rb") as file:
-        reader = make_reader(file, validate_crcs=True)
-        assert list(reader.iter_messages()) == []
-
-
-def test_pictures_that_are_alike_are_stored_once() -> None:
+def test_similar_images_are_stored_once() -> None:
     rng = np.random.default_rng(6)
     still = rng.integers(0, 2**16, (240, 320)).astype("<u2")
-    pictures = []
+    images = []
     for k in range(10):
-        picture = still.copy()
-        picture[20 + k : 40 + k, 30:60] = k
-        pictures.append(picture.tobytes())
-    size = len(written([("/a", k, data) for k, data in enumerate(pictures)], 10**9).getvalue())
-    assert size < 1.2 * len(pictures[0])
-
-
-def log_all(file: McapLog, told: Said) -> None:
-    for topic in ("/a", "/b"):
-        file.declare(topic, ONE if topic == "/a" else OTHER)
-    for topic, time_ns, data in told:
-        file.log(topic, ONE if topic == "/a" else OTHER, parts(data), time_ns)
+        image = still.copy()
+        image[20 + k : 40 + k, 30:60] = k
+        images.append(image.tobytes())
+    file = written([("/a", k, data) for k, data in enumerate(images)], chunk_size=10**9)
+    assert len(file.getvalue()) < 1.2 * len(images[0])
 
 
 @pytest.mark.parametrize("first_topics", ["/a", "/b", "/a/b"])
 def test_a_file_that_was_cut_after_a_flush_is_resumed_and_shards_are_appended(
     tmp_path: Path, first_topics: str
 ) -> None:
-    told = [one for one in said(20) if one[0] in first_topics]
-    pieces, place = [told, said(30)[20:], said(50)[30:]], tmp_path / "log.mcap"
-    settings: dict[str, Any] = {"profile": "p", "library": "l", "level": 1, "chunk_size": 4_000}
+    first = [one for one in messages(20) if one[0] in first_topics]
+    pieces, place = [first, messages(30)[20:], messages(50)[30:]], tmp_path / "log.mcap"
     for k, piece in enumerate(pieces[:2]):  # a first run that was killed, and a shard
         with (tmp_path / f"{k}.mcap").open("wb") as sink:
-            file = McapLog(sink, **settings)
+            file = new_log(sink)
             log_all(file, piece)
             file.flush()
         append_chunks(tmp_path / f"{k}.mcap", place)
     with place.open("a+b") as sink:
-        file = McapLog(sink, **settings, written=sink)
+        file = new_log(sink, resume=True)
         log_all(file, pieces[2])
         file.close()
     with place.open("rb") as whole:
-        reader = make_reader(whole, validate_crcs=True)
-        found = [
-            (channel.topic, message.log_time, message.data)
-            for _, channel, message in reader.iter_messages()
-        ]
-        summary = reader.get_summary()
-    assert found == sorted([one for piece in pieces for one in piece], key=lambda one: one[1])
-    assert summary is not None
-    assert summary.statistics is not None
-    counts = {
-        c.topic: summary.statistics.channel_message_counts[i] for i, c in summary.channels.items()
-    }
-    assert counts == Counter(topic for topic, _, _ in found)
-    with place.open("rb") as whole:
+        found = in_order_of_time(whole)
+        assert found == sorted([one for part in pieces for one in part], key=lambda one: one[1])
+        summary = make_reader(whole).get_summary()
+        assert summary is not None
+        assert summary.statistics is not None
+        counts = summary.statistics.channel_message_counts
+        of_topics = {channel.topic: counts[i] for i, channel in summary.channels.items()}
+        assert of_topics == Counter(topic for topic, _, _ in found)
+        whole.seek(0)
         walked = StreamReader(whole, validate_crcs=True).records
         assert sum(type(record).__name__ == "Message" for record in walked) == len(found)
 
 
-def test_a_log_that_is_cut_within_a_record_is_not_resumed(tmp_path: Path) -> None:
-    place = tmp_path / "log.mcap"
-    place.write_bytes(written(said()).getvalue()[:-500])
-    with place.open("a+b") as sink, pytest.raises(SessionError, match="not written whole"):
-        McapLog(sink, profile="p", library="l", level=1, chunk_size=1, written=sink)
+def test_a_log_that_is_cut_within_a_record_is_not_resumed() -> None:
+    cut = io.BytesIO(written(messages()).getvalue()[:-500])
+    with pytest.raises(SessionError, match="not written whole"):
+        new_log(cut, resume=True)
