@@ -302,11 +302,6 @@ def composed(depth: NDArray[np.float32], boxes: Boxes, background: Depth) -> Dep
     return picture
 
 
-def write_boxes(folder: Path, boxes: Boxes) -> None:
-    """Write the boxes (n, K, 4) of every frame to cutouts.npz in the session's folder."""
-    np.savez_compressed(folder / FILE, boxes=boxes)
-
-
 def meant_to_keep_depth(session: Session) -> bool:
     """Whether a session's plan keeps depth in its replay.
 

@@ -27,7 +27,7 @@ from liex_lab.body.skeleton import Skeleton
 from liex_lab.errors import LiexError, SessionError, one_line
 from liex_lab.geometry import SE3
 from liex_lab.optics.camera import Camera
-from liex_lab.plan.sections import Factor
+from liex_lab.plan.sections import Factor, SubjectFacts
 from liex_lab.runtime.places import storable
 from liex_lab.scene.outline import UNKNOWN, Arena
 from liex_lab.scene.zones import Zone
@@ -130,15 +130,8 @@ class Provenance:
         """
         entries = recording.metadata
         stated = plan.session
-        subject = {
-            "subject_id": stated.subject_id or entries.get("subject_id"),
-            "group": stated.group,
-            "cage": stated.cage,
-            "sex": stated.sex,
-            "batch": stated.batch,
-            "species": stated.species,
-            "age": stated.age,
-        }
+        subject = stated.model_dump(include=set(SubjectFacts.model_fields))
+        subject["subject_id"] = stated.subject_id or entries.get("subject_id")
         known: dict[str, Any] = {
             "name": storable(stated.name or recording.name),
             "skeleton": skeleton,
@@ -208,7 +201,7 @@ class Provenance:
                 "truncated": self.truncated,
                 **({"profile": self.profile} if self.profile else {}),
             },
-            "plan": plan_table(self.plan_toml),
+            "plan": tomllib.loads(self.plan_toml),
             "camera": {
                 **self.camera.to_dict(),
                 "T_arena_camera": self.T_arena_camera.matrix.tolist(),
@@ -229,23 +222,6 @@ class Provenance:
             "model": dict(self.model),
             "problems": list(self.problems),
         }
-
-
-def plan_table(plan_toml: str) -> dict[str, Any]:
-    """The plan as a nested table for session.json.
-
-    Args:
-        plan_toml: the plan as TOML text.
-
-    Raises:
-        SessionError: the text is not TOML.
-    """
-    try:
-        return tomllib.loads(plan_toml)
-    except tomllib.TOMLDecodeError as error:
-        raise SessionError(
-            f"the plan to be stored is not TOML ({error}); pass the plan's own TOML text"
-        ) from None
 
 
 @cache
@@ -281,10 +257,11 @@ _MOST_BYTES = 1 << 28
 _MOST_FRAMES = 1 << 31
 _MOST_JOINTS = 1000
 _MOST_PX = 1 << 15
+_DAMAGED = (OSError, ValueError, TypeError, KeyError, IndexError, OverflowError, RecursionError)
 _ESCAPED = re.compile(r"\\u(0000|[dD][89a-fA-F])")
 
 
-def _said(text: str) -> str:
+def _storable(text: str) -> str:
     """Check that files can store a text: Unicode without NUL or surrogates."""
     if "\0" in text:
         raise ValueError("holds a NUL character")
@@ -295,7 +272,7 @@ def _said(text: str) -> str:
     return text
 
 
-Text = Annotated[str, AfterValidator(_said)]
+Text = Annotated[str, AfterValidator(_storable)]
 Name = Annotated[Text, Field(max_length=4096)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Count = Annotated[int, Field(ge=0, le=_MOST_FRAMES)]
@@ -349,7 +326,7 @@ class _Shape(_Section):
             raise ValueError(f"has not as many widths and heights as its {len(self.places)} places")
         known = self.residual_mm is not None and self.average_residual_mm is not None
         if self.kept and not ((known or self.shared_by) and self.places and self.joints_moved):
-            raise ValueError("is kept, but does not say what speaks for it")
+            raise ValueError("is kept, but its residuals or its places are missing")
         return self
 
 
@@ -367,7 +344,9 @@ class _Animal(_Section):
         if len(set(self.joints)) != len(self.joints):
             raise ValueError("names a joint twice")
         if any(not 0 <= joint < len(self.joints) for bone in self.bones for joint in bone):
-            raise ValueError(f"has a bone between joints that are none of its {len(self.joints)}")
+            raise ValueError(
+                f"has a bone between joints that do not exist, it has {len(self.joints)}"
+            )
         return self
 
 
@@ -387,15 +366,15 @@ class _Thumbnail(_Section):
     @model_validator(mode="after")
     def _stay(self) -> _Thumbnail:
         if PurePosixPath(self.file).parts[:-1] != (THUMBNAILS,):
-            raise ValueError("is a picture outside of the session")
+            raise ValueError("is an image outside of the session")
         return self
 
 
-class _WholePicture(_Thumbnail):
+class _WholeImage(_Thumbnail):
     beside_px: Annotated[list[Finite], Field(min_length=2, max_length=2)]
 
 
-class _Frames(_Section):
+class _FrameCounts(_Section):
     n_frames: Count
     n_observed: Count
     flags: dict[Text, Count]
@@ -464,9 +443,9 @@ class Document(_Section):
     rules: dict[Text, Finite] | None = None
     no_actions: Text = ""
     thumbnails: list[_Thumbnail] = []
-    whole_picture: _WholePicture | None = None
+    whole_picture: _WholeImage | None = None
     files: dict[Text, _Facts] = {}
-    frames: _Frames
+    frames: _FrameCounts
     depth_unit_mm: Finite = 1.0
     timings_s: dict[Text, Finite]
     frames_per_s: Finite
@@ -499,50 +478,35 @@ def read_document(path: Path) -> dict[str, Any]:
         if not isinstance(found, dict):
             raise TypeError("a JSON object is expected")
         version = found.get("schema_version")
-    except (OSError, ValueError, TypeError, RecursionError) as error:
-        raise _damaged(path, str(error) or type(error).__name__) from None
-    if isinstance(version, int) and version > SCHEMA_VERSION:
-        raise SessionError(
-            f"{path.parent} was written by a newer liex_lab (session schema {version}, this one "
-            f"reads up to {SCHEMA_VERSION}); upgrade with `pip install -U liex_lab`"
-        )
-    try:
-        check_document(found)
+        if isinstance(version, int) and version > SCHEMA_VERSION:
+            raise SessionError(
+                f"{path.parent} was written by a newer liex_lab (session schema {version}, this "
+                f"one reads up to {SCHEMA_VERSION}); upgrade with `pip install -U liex_lab`"
+            )
+        Document.model_validate(found)
+        Camera.from_dict(found["camera"])
+        SE3.from_matrix(found["camera"]["T_arena_camera"])
+        Arena.from_dict(found.get("arena") or {"kind": "open"})
+        for zone in found.get("zones", []):
+            Zone.from_dict(zone)
         if _ESCAPED.search(text):
             _walk(found)
-    except ValidationError as error:
-        raise _damaged(path, _first(error)) from None
-    except (ValueError, TypeError, KeyError, IndexError, OverflowError, RecursionError) as error:
-        raise _damaged(path, str(error) or type(error).__name__) from None
+    except _DAMAGED as error:
+        why = _first(error) if isinstance(error, ValidationError) else str(error)
+        raise SessionError(
+            f"{path} is damaged and cannot be read ({(why or type(error).__name__)[:200]}); run "
+            "`liex run` on the recording again"
+        ) from None
     return found
-
-
-def check_document(found: dict[str, Any]) -> None:
-    """Validate the content of a session.json.
-
-    Args:
-        found: its content.
-
-    Raises:
-        ValueError: it does not satisfy `Document`; pydantic's error is one.
-        TypeError: a value in camera, arena or zones has the wrong type.
-        KeyError: a key in them is missing.
-    """
-    Document.model_validate(found)
-    Camera.from_dict(found["camera"])
-    SE3.from_matrix(found["camera"]["T_arena_camera"])
-    Arena.from_dict(found.get("arena") or {"kind": "open"})
-    for zone in found.get("zones", []):
-        Zone.from_dict(zone)
 
 
 def _walk(value: Any) -> None:
     """Raises ValueError if any nested text contains what files cannot store."""
     if isinstance(value, str):
-        _said(value)
+        _storable(value)
     elif isinstance(value, dict):
         for key, inner in value.items():
-            _said(key)
+            _storable(key)
             _walk(inner)
     elif isinstance(value, list):
         for inner in value:
@@ -557,14 +521,8 @@ def _first(error: ValidationError) -> str:
     """The first validation error: where, and what was expected."""
     first = error.errors(include_url=False, include_input=False)[0]
     where = ".".join(str(part) for part in first["loc"])
-    said = first["msg"].removeprefix("Value error, ").replace("Input should", "should")
-    return ascii(f"{where} {said}".strip())[1:-1]
-
-
-def _damaged(path: Path, why: str) -> SessionError:
-    return SessionError(
-        f"{path} is damaged and cannot be read ({why[:200]}); run `liex run` on the recording again"
-    )
+    what = first["msg"].removeprefix("Value error, ").replace("Input should", "should")
+    return ascii(f"{where} {what}".strip())[1:-1]
 
 
 # Error translation for reading files of a session: every error becomes one sentence.

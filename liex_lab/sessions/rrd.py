@@ -161,8 +161,7 @@ class ReplayWriter:
 
     def _send_depth(self) -> None:
         """Write the waiting depth."""
-        n_messages = self._depth.send(self._stream)
-        if n_messages:
+        if n_messages := self._depth.send(self._stream):
             self._flush()
             self._n_sent += n_messages
 
@@ -211,17 +210,19 @@ class ReplayWriter:
             log_hidden_places(self._stream, rows)
         for problem in problems:
             self._stream.log("log", rr.TextLog(problem, level=rr.TextLogLevel.WARN), static=True)
-        self._stream.send_property(
-            "session",
-            rr.AnyValues(
-                session_id=self._origin.name,
-                animal=self._origin.skeleton.name,
-                input_sha256=self._origin.input_sha256,
-            ),
-        )
+        facts = {
+            "session_id": self._origin.name,
+            "animal": self._origin.skeleton.name,
+            "input_sha256": self._origin.input_sha256,
+        }
+        self._stream.send_property("session", rr.AnyValues(**facts))
         self.flushed()
         self.abandon()
-        if not self._ended():
+        try:
+            self._count()
+        except SessionError:
+            raise self._why_unwritten() from None
+        if self._path.stat().st_size <= self._checked:  # without the index that Rerun writes last
             raise self._why_unwritten()
 
     def flushed(self) -> int:
@@ -288,7 +289,10 @@ class ReplayWriter:
         """The error to raise if Rerun has not written everything; it writes nothing from now on."""
         if not self._broken:
             self._broken = True
-            _let_go(self._stream)
+            # closing a stream whose thread has died would block forever, so neither garbage
+            # collection nor the end of the process closes it; the process's end closes its file
+            atexit.unregister(rr.rerun_shutdown)
+            ctypes.pythonapi.Py_IncRef(ctypes.py_object(self._stream))
         return self._why_unwritten()
 
     def _why_unwritten(self) -> Exception:
@@ -296,14 +300,6 @@ class ReplayWriter:
             f"the replay {self._path} was not written whole; make room on the disk or mend it, and "
             "run the same command again"
         )
-
-    def _ended(self) -> bool:
-        """Whether the closed file is complete, with the index that Rerun writes last."""
-        try:
-            self._count()
-        except SessionError:
-            return False
-        return self._path.stat().st_size > self._checked
 
     def abandon(self) -> None:
         """Close the file, whole or not.
@@ -391,13 +387,9 @@ class ReplayWriter:
         worst = np.sort(np.argsort(-error, kind="stable")[:_WORST])
         worst = worst[error[worst] > 0]
         if len(worst):
-            notes = [
-                f"frame {self._index[k]}: joint error to be expected {error[k]:.1f} mm"
-                for k in worst
-            ]
-            self._send(
-                "log/worst", worst, rr.TextLog.columns(text=notes, level=["INFO"] * len(notes))
-            )
+            notes = [f"frame {self._index[k]}: predicted error {error[k]:.1f} mm" for k in worst]
+            columns = rr.TextLog.columns(text=notes, level=["INFO"] * len(notes))
+            self._send("log/worst", worst, columns)
 
     def _log_lanes(self, rows: Rows, bouts: pd.DataFrame, words: Sequence[str]) -> None:
         """Log the lane of the actions, and the lane of flagged frames."""
@@ -436,11 +428,8 @@ class ReplayWriter:
             changes = [(0, 0.0, ""), (*end, "")]
         frames, times, words = zip(*changes, strict=True)
         elapsed = np.rint(np.array(times) * 1e9).astype(np.int64)
-        self._stream.send_columns(
-            entity,
-            timeline(np.array(frames), elapsed),
-            [*rr.StateChange.columns(state=list(words))],
-        )
+        states = rr.StateChange.columns(state=list(words))
+        self._stream.send_columns(entity, timeline(np.array(frames), elapsed), [*states])
 
 
 def corrected_entity(entity: str) -> str:
@@ -455,19 +444,6 @@ def corrected_entity(entity: str) -> str:
         if entity.startswith(above):
             return f"{above}corrected/{entity.removeprefix(above)}"
     return f"corrected/{entity}"
-
-
-def _let_go(stream: Any) -> None:
-    """Never close a stream whose thread has died, because closing would block forever.
-
-    Neither garbage collection nor the end of the process closes it; the process's end closes its
-    file.
-
-    Args:
-        stream: a Rerun stream.
-    """
-    atexit.unregister(rr.rerun_shutdown)
-    ctypes.pythonapi.Py_IncRef(ctypes.py_object(stream))
 
 
 class _Renamed:

@@ -1,4 +1,18 @@
-"""Scene and animal body in a Rerun replay: camera, arena, zones, region, fixtures, skinned surface.
+"""Entities of a Rerun replay: depth images, camera, arena, zones, fixtures, and the animal's body.
+
+Depth is stored without loss: RVL (Wilson 2017, run-length and variable-length coding), or PNG if
+sensor noise makes that smaller. A cut-out belongs to its own pinhole camera, whose principal point
+is that of the camera minus the corner (left, top) of its window (see `cutouts.windows`):
+
+    K' = K - [[0, 0, left], [0, 0, top], [0, 0, 0]].
+
+The still scene is stored once. The entities below `PLACES` position every cut-out in the image, see
+`cutout_frame`.
+
+Rerun 0.41 treats the images of an entity over time as a video (rerun-io/rerun#12801). It reports no
+problem if all images of an entity have one size and one encoding, and the encoding is logged once
+for all times. So every window size and every encoding has its own entity, and only one of each
+group shows an image at a time. Without a time only PNG is accepted.
 
 The scene is static. Every triangle of the body follows one joint, so a frame costs a few rigid
 transforms instead of a mesh: the trunk at home pose is cut at its joints, and each vertex belongs
@@ -9,7 +23,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from itertools import cycle
 from typing import TYPE_CHECKING, Any, Final
 
@@ -35,7 +48,6 @@ if TYPE_CHECKING:
 
 
 Array = NDArray[np.float64]
-Packed = tuple[NDArray[np.uint8], str]  # bytes and media type
 
 IMAGE = "arena/camera/image"
 DEPTH = f"{IMAGE}/depth"
@@ -53,12 +65,8 @@ _RVL = "application/rvl"
 _PNG = "image/png"
 _LARGE = 0.54  # bytes per pixel: 166 kB for 640 x 480
 _PACKED_FURTHER = 0.93  # by Rerun's own compression: RVL by this factor, PNG not at all
-_NOISY_PNG = (
-    16,
-    1,
-    17,
-    2,
-)  # OpenCV's IMWRITE_PNG_COMPRESSION 1 and IMWRITE_PNG_STRATEGY 2, HUFFMAN_ONLY
+# OpenCV's IMWRITE_PNG_COMPRESSION 1 and IMWRITE_PNG_STRATEGY 2, HUFFMAN_ONLY
+_NOISY_PNG = (16, 1, 17, 2)
 # images, and their bytes, per message: the index at the file's end needs some 5 kB of memory
 # per message
 _TOGETHER = 128
@@ -74,15 +82,11 @@ class DepthColumns:
 
     def __init__(self, origin: Provenance) -> None:
         self._origin = origin
-        self._waiting: list[_Picture] = []
+        self._windows = windows(origin)
+        self._waiting: list[_KeptImage] = []
         self._n_bytes = 0
-        self._n_messages = 0
         self._introduced: set[str] = set()
         self._shown: set[str] = set()  # entities that show an image of earlier frames
-
-    @cached_property
-    def _windows(self) -> list[tuple[int, int]]:
-        return windows(self._origin)
 
     def resume(self) -> None:
         """Continue another file, whose last visible entities are unknown."""
@@ -108,34 +112,21 @@ class DepthColumns:
         Returns:
             Whether to `send` the waiting images.
         """
+        parts: dict[str, NDArray[np.uint8]] = {}
+        places: list[tuple[int, int, int, int]] = []
         if boxes is None:
             blob, media_type = packed(depth)
-            parts = {DEPTH if media_type == _RVL else NOISY: blob}
-            cuts: list[tuple[int, int, int, int]] = []
-        else:
-            parts, cuts = self._cut_out(depth, boxes.tolist())
-        self._waiting.append(_Picture(int(frame_index), elapsed_ns, parts, cuts))
+            parts[DEPTH if media_type == _RVL else NOISY] = blob
+        for k, box in enumerate(() if boxes is None else boxes.tolist()):
+            places.append((0, 0, 0, 0))
+            if box[2] > box[0]:
+                # always RVL: it is several times as fast as PNG, and not larger
+                which, places[k] = window_around(box, self._windows)
+                left, top, right, bottom = places[k]
+                parts[cutout_entity(k, which)] = rvl_message(depth[top:bottom, left:right])
+        self._waiting.append(_KeptImage(int(frame_index), elapsed_ns, parts, places))
         self._n_bytes += sum(len(blob) for blob in parts.values())
         return len(self._waiting) == _TOGETHER or self._n_bytes > _TOGETHER_BYTES
-
-    def _cut_out(
-        self, depth: NDArray[np.uint16], boxes: Sequence[Sequence[int]]
-    ) -> tuple[dict[str, NDArray[np.uint8]], list[tuple[int, int, int, int]]]:
-        """Packed windows around boxes by their entities, and their bounds; all 0 for no box.
-
-        Always RVL: it is several times as fast as PNG, and not larger.
-        """
-        parts = {}
-        places = []
-        for k, box in enumerate(boxes):
-            if box[2] <= box[0]:
-                places.append((0, 0, 0, 0))
-                continue
-            which, place = window_around(box, self._windows)
-            left, top, right, bottom = place
-            parts[cutout_entity(k, which)] = rvl_message(depth[top:bottom, left:right])
-            places.append(place)
-        return parts, places
 
     def send(self, stream: Any) -> int:
         """Write the waiting images.
@@ -149,40 +140,33 @@ class DepthColumns:
         waiting = self._waiting
         self._waiting = []
         self._n_bytes = 0
-        self._n_messages = 0
         if not waiting:
             return 0
         for k in range(len(waiting[0].windows)):
             self._send_lens(stream, k, waiting)
-        for entity in sorted(self._shown.union(*(picture.parts for picture in waiting))):
-            self._send_pictures(stream, entity, waiting)
+        entities = sorted(self._shown.union(*(image.parts for image in waiting)))
+        for entity in entities:
+            # its images, and the frame from which it shows none
+            blobs = [image.parts.get(entity) for image in waiting]
+            shows = np.array([blob is not None for blob in blobs])
+            rows = np.flatnonzero(shows | np.append(entity in self._shown, shows[:-1]))
+            if shows.any() and entity.startswith(CUTOUTS) and entity not in self._introduced:
+                assert self._origin.background is not None
+                look = self._look(self._origin.background)
+                kind = rr.EncodedDepthImage.from_fields(**look, media_type=_RVL, draw_order=_BEHIND)
+                stream.log(entity, kind, static=True)
+                self._introduced.add(entity)
+            columns = rr.EncodedDepthImage.columns(
+                blob=[blob for blob in blobs if blob is not None]
+            )
+            partition = columns.partition(shows[rows].astype(int))
+            stream.send_columns(entity, _when([waiting[row] for row in rows]), [*partition])
         self._shown = set(waiting[-1].parts)
-        return self._n_messages
+        return len(entities)
 
-    def _send_pictures(self, stream: Any, entity: str, waiting: Sequence[_Picture]) -> None:
-        """Send the images of an entity, and the frame from which it shows none."""
-        blobs = []
-        rows = []
-        counts = []
-        shown = entity in self._shown
-        for row, picture in enumerate(waiting):
-            blob = picture.parts.get(entity)
-            if blob is not None:
-                blobs.append(blob)
-            if blob is not None or shown:
-                rows.append(row)
-                counts.append(int(blob is not None))
-            shown = blob is not None
-        if blobs and entity.startswith(CUTOUTS) and entity not in self._introduced:
-            self._introduce(stream, entity)
-        columns = rr.EncodedDepthImage.columns(blob=blobs)
-        when = _when([waiting[row] for row in rows])
-        stream.send_columns(entity, when, [*columns.partition(counts)])
-        self._n_messages += 1
-
-    def _send_lens(self, stream: Any, k: int, waiting: Sequence[_Picture]) -> None:
+    def _send_lens(self, stream: Any, k: int, waiting: Sequence[_KeptImage]) -> None:
         """Send the intrinsics of the k-th cut-out of frames, and its position in the image."""
-        boxes = np.array([picture.windows[k] for picture in waiting], np.float64)
+        boxes = np.array([image.windows[k] for image in waiting], np.float64)
         there = boxes[:, 2] > boxes[:, 0]
         if not there.any() and k:
             return
@@ -202,14 +186,6 @@ class DepthColumns:
         when = _when(waiting)
         stream.send_columns(f"{CUTOUTS}/{k + 1}", when, [*lenses])
         stream.send_columns(f"{PLACES}/{k + 1}", when, [*places])
-
-    def _introduce(self, stream: Any, entity: str) -> None:
-        """Log the static properties of a cut-out entity, equal in every part of a replay."""
-        assert self._origin.background is not None
-        look = self._look(self._origin.background)
-        kind = rr.EncodedDepthImage.from_fields(**look, media_type=_RVL, draw_order=_BEHIND)
-        stream.log(entity, kind, static=True)
-        self._introduced.add(entity)
 
     def log_kind(self, stream: Any, first: NDArray[np.uint16], *, whole: bool) -> None:
         """Log the static properties of whole images (encoding, unit, colours, layout), or the still
@@ -250,7 +226,7 @@ class DepthColumns:
 
 
 @dataclass(frozen=True)
-class _Picture:
+class _KeptImage:
     """Kept depth of a frame: its packed parts by entity, and the windows of its cut-outs
     (left, top, right, bottom, px; all 0 if absent), empty for a whole image.
     """
@@ -261,11 +237,11 @@ class _Picture:
     windows: Sequence[tuple[int, int, int, int]]
 
 
-def _when(pictures: Sequence[_Picture]) -> list[rr.TimeColumn]:
+def _when(images: Sequence[_KeptImage]) -> list[rr.TimeColumn]:
     """The timelines of images."""
     return timeline(
-        np.array([picture.index for picture in pictures], np.int64),
-        np.array([picture.elapsed_ns for picture in pictures], np.int64),
+        np.array([image.index for image in images], np.int64),
+        np.array([image.elapsed_ns for image in images], np.int64),
     )
 
 
@@ -299,7 +275,7 @@ def cutout_frame(k: int) -> str:
     return f"cutout {k + 1} in the picture"
 
 
-def packed(depth: NDArray[np.uint16]) -> Packed:
+def packed(depth: NDArray[np.uint16]) -> tuple[NDArray[np.uint8], str]:
     """Encode a depth image without loss.
 
     RVL is fast and halves the size of raw images. If noise makes it large, beyond 0.54 bytes per
@@ -337,9 +313,8 @@ def colour_range(depth: NDArray[np.uint16], floor_distance_mm: float) -> tuple[f
     near, far = (
         np.percentile(read, [2.0, 98.0]) if len(read) else (floor_distance_mm, floor_distance_mm)
     )
-    near = (
-        max(float(near), floor_distance_mm - 60.0) - 80.0
-    )  # a floor tilted by 10 degrees, but not the walls
+    # a floor tilted by 10 degrees, but not the walls
+    near = max(float(near), floor_distance_mm - 60.0) - 80.0
     return max(near, 1.0), max(float(far), near + 10.0) + 10.0
 
 
@@ -506,14 +481,12 @@ def body_parts(surface: Surface, girth: float = 1.0) -> list[BodyPart]:
 def _carriers(skeleton: Skeleton, vertices: Array) -> NDArray[np.int64]:
     """(V,) for each vertex the parent joint of the nearest bone at home pose."""
     home = Pose.home(skeleton).joints(skeleton)
-    off = []
-    for parent, child in skeleton.edges:
-        along = home[child] - home[parent]
-        share = np.clip(
-            (vertices - home[parent]) @ along / max(float(along @ along), 1e-12), 0.0, 1.0
-        )
-        off.append(np.linalg.norm(vertices - home[parent] - share[:, None] * along, axis=1))
-    return np.array([parent for parent, _ in skeleton.edges], np.int64)[np.argmin(off, axis=0)]
+    parents, children = np.array(skeleton.edges, np.int64).T
+    along = home[children] - home[parents]
+    out = vertices[:, None] - home[parents]
+    share = (out * along).sum(axis=-1) / np.maximum((along**2).sum(axis=-1), 1e-12)
+    off = np.linalg.norm(out - np.clip(share, 0.0, 1.0)[..., None] * along, axis=-1)
+    return np.asarray(parents[off.argmin(axis=1)])
 
 
 def _normals(vertices: Array, faces: NDArray[np.int64]) -> Array:
@@ -521,8 +494,7 @@ def _normals(vertices: Array, faces: NDArray[np.int64]) -> Array:
     corners = vertices[faces]
     of_faces = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     out = np.zeros(vertices.shape)
-    for k in range(3):
-        np.add.at(out, faces[:, k], of_faces)
+    np.add.at(out, faces.ravel(), np.repeat(of_faces, 3, axis=0))
     return out / np.maximum(np.linalg.norm(out, axis=1, keepdims=True), 1e-12)
 
 

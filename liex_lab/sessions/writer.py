@@ -36,7 +36,8 @@ from liex_lab.runtime.places import is_full, probe_full, storable_document, unli
 from liex_lab.runtime.text_files import loose_json
 from liex_lab.sessions.checkpoint import LOGS, STRETCHES, Checkpoint, Columns
 from liex_lab.sessions.corrections import FOLDER
-from liex_lab.sessions.cutouts import Boxes, DepthKeeper, Thumbnails, write_boxes
+from liex_lab.sessions.cutouts import FILE as CUTOUTS_FILE
+from liex_lab.sessions.cutouts import Boxes, DepthKeeper, Thumbnails
 from liex_lab.sessions.evidence import Results, write_evidence
 from liex_lab.sessions.folder import (
     aside_folder,
@@ -50,7 +51,7 @@ from liex_lab.sessions.folder import (
 )
 from liex_lab.sessions.provenance import Provenance
 from liex_lab.tables import schema
-from liex_lab.tables.rows import Rows, rows_only
+from liex_lab.tables.rows import Rows
 from liex_lab.tracking.observations import Observations
 from liex_lab.tracking.track import Flip, Subject, Track, Tracked
 
@@ -366,7 +367,10 @@ class SessionWriter:
         rows = self.rows
         _check_times(np.array(self._times_ns, np.int64), rows.track)
         if results is None:
-            results = {"bouts": schema.empty_table(schema.BOUTS), "kinematics": rows_only(rows)}
+            results = {
+                "bouts": schema.empty_table(schema.BOUTS),
+                "kinematics": rows.frames_table.iloc[:, :5],
+            }
         bouts = results["bouts"]
         of_track = Results(self.origin, rows, self._flips)
         of_track.write_track(self._folder)
@@ -381,7 +385,7 @@ class SessionWriter:
         self._checkpoint.join_replay()
         kept = self._checkpoint.seen.read()
         if BOXES in kept:
-            write_boxes(self._folder, kept[BOXES])
+            np.savez_compressed(self._folder / CUTOUTS_FILE, boxes=kept[BOXES])
         self.note(actions=actions, **dict(record or {}))
         self._document["thumbnails"] = self._thumbnails.save(self._folder, rows, self.origin.camera)
         if self._together is not None:

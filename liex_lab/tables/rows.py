@@ -41,9 +41,8 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-_Found = tuple[
-    float, float, int, int, int, str, float, float
-]  # start_s, stop_s, start_frame, stop_frame, frames missing, reason, x mm, y mm
+# start_s, stop_s, start_frame, stop_frame, frames missing, reason, x mm, y mm
+_Found = tuple[float, float, int, int, int, str, float, float]
 _SPAN_NAMES = ("start_s", "stop_s", "start_frame", "stop_frame")
 _NOWHERE = (float("nan"), float("nan"))
 HIDDEN = "hidden"
@@ -80,7 +79,11 @@ class Rows:
 
     def frames(self) -> Iterator[Block]:
         """The table `frames`, in blocks of 100 000 rows."""
-        return (_some_rows(self._frame_columns, part) for part in self._parts(1))
+        for part in self._parts(1):
+            yield {
+                name: column if isinstance(column, str) else column[part]
+                for name, column in self._frame_columns.items()
+            }
 
     @property
     def wall_distance_mm(self) -> Array:
@@ -291,14 +294,6 @@ class Rows:
         return blocks(max(self.track.n_frames, 1), max(1, ROWS_PER_GROUP // rows_per_frame))
 
 
-def _some_rows(columns: Block, part: slice) -> Block:
-    """Some rows of a block; values for all rows are unchanged."""
-    return {
-        name: column if isinstance(column, str) else column[part]
-        for name, column in columns.items()
-    }
-
-
 def _xyz(name: str, values: Array) -> dict[str, Array]:
     return {name.format(axis): values[:, :, k].ravel() for k, axis in enumerate("xyz")}
 
@@ -397,11 +392,6 @@ def constant_runs(labels: NDArray[Any]) -> list[tuple[int, int, Any]]:
     if len(labels) == 0:
         return []
     return [(int(a), int(b), label) for a, b, label in zip(*runs_of(labels), strict=True)]
-
-
-def rows_only(rows: Rows) -> pd.DataFrame:
-    """A kinematics table without measures: the first five columns of the table `frames`."""
-    return rows.frames_table.iloc[:, :5]
 
 
 def bout_rows(ethogram: Ethogram, frames: pd.DataFrame, model_hash: str) -> pd.DataFrame:

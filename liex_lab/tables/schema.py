@@ -13,7 +13,7 @@ import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import cache
-from itertools import groupby
+from itertools import chain, groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -155,8 +155,8 @@ def all_columns() -> dict[str, Column]:
         Vocabulary(tuple(WORDS.get(animal, ())), (), kind).columns
         for animal, kind in (("mouse", "stands"), ("fish", "swims"), ("hand", "branches"))
     )
-    stored = [column for rows in TABLES.values() for column in rows]
-    return {f"{c.table}.{c.name}": c for c in (*stored, *branching, *swimming, *walking)}
+    every = chain(*TABLES.values(), branching, swimming, walking)
+    return {f"{c.table}.{c.name}": c for c in every}
 
 
 def dictionary(*extra: Sequence[Column]) -> list[dict[str, Any]]:
@@ -168,11 +168,8 @@ def dictionary(*extra: Sequence[Column]) -> list[dict[str, Any]]:
     Raises:
         SessionError: two different descriptions of one column.
     """
-    entries = [column for rows in TABLES.values() for column in rows] + [
-        column for rows in extra for column in rows
-    ]
     listed: dict[tuple[str, str], Column] = {}
-    for column in entries:
+    for column in chain(*TABLES.values(), *extra):
         if listed.setdefault((column.table, column.name), column) != column:
             raise SessionError(
                 f"column {column.table}.{column.name} is described twice and differently; keep one"
@@ -220,6 +217,7 @@ def write_table(
     Raises:
         SessionError: a block's columns differ from those of the schema.
     """
+    import pyarrow as pa
     import pyarrow.parquet as pq
 
     arrow = arrow_schema(schema, metadata)
@@ -229,22 +227,14 @@ def write_table(
         path, arrow, compression="zstd", use_dictionary=texts, write_statistics=True
     ) as writer:
         for block in blocks:
-            batch = _arrow_block(block, schema, arrow)
+            check_described(block, schema)
+            n = max((len(v) for v in block.values() if _is_array(v)), default=1)
+            columns = [_arrow_column(block[one.name], one.type, n) for one in arrow]
+            batch = pa.Table.from_arrays(columns, schema=arrow)
             n_rows += batch.num_rows
             writer.write_table(batch, row_group_size=ROWS_PER_GROUP)
-            del block, batch  # to free memory for the next block
+            del block, columns, batch  # to free memory for the next block
     return n_rows
-
-
-def _arrow_block(block: Block, schema: Sequence[Column], arrow: pa.Schema) -> pa.Table:
-    """One block as Arrow columns in the schema's order."""
-    import pyarrow as pa
-
-    check_described(block, schema)
-    n = max((len(v) for v in block.values() if _is_array(v)), default=1)
-    return pa.Table.from_arrays(
-        [_arrow_column(block[f.name], f.type, n) for f in arrow], schema=arrow
-    )
 
 
 def check_described(names: Iterable[str], schema: Sequence[Column], table: str = "") -> None:
@@ -278,9 +268,8 @@ def _arrow_column(value: Any, kind: pa.DataType, n: int) -> pa.Array:
     import pyarrow as pa
 
     if isinstance(value, Words):
-        return pa.DictionaryArray.from_arrays(value.codes.astype(np.int32), list(value.words)).cast(
-            kind
-        )
+        codes = value.codes.astype(np.int32)
+        return pa.DictionaryArray.from_arrays(codes, list(value.words)).cast(kind)
     if not _is_array(value):
         return pa.repeat(pa.scalar(value, kind), n)
     if kind == pa.string():
@@ -330,7 +319,8 @@ def to_pandas(schema: Sequence[Column], block: Block, copy: bool = True) -> pd.D
             value = np.array(value.words, dtype=object)[value.codes]
         elif not _is_array(value):
             value = [value] * n
-        data[column.name] = pd.Series(value, dtype=_pandas_dtype(column), copy=copy)
+        dtype = "str" if column.dtype == "string" else column.dtype
+        data[column.name] = pd.Series(value, dtype=dtype, copy=copy)
     return pd.DataFrame(data, copy=False)
 
 
@@ -347,10 +337,6 @@ def from_pandas(table: pd.DataFrame) -> Iterator[Block]:
     """
     for part in blocks(max(len(table), 1), ROWS_PER_GROUP):
         yield {str(name): table[name].iloc[part].to_numpy() for name in table.columns}
-
-
-def _pandas_dtype(column: Column) -> str:
-    return "str" if column.dtype == "string" else column.dtype
 
 
 # Displayed units: cm/s and degrees on pages and in replays; tables use mm/s and rad.
