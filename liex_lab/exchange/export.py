@@ -40,22 +40,22 @@ TARGETS: dict[str, tuple[str, str, str]] = {
     "movement": (
         "pose_files.write_movement",
         ".nc",
-        "netCDF as movement keeps poses, true times",
+        "netCDF in movement's format of poses, with true times",
     ),
     "sleap": (
         "pose_files.write_sleap",
         ".analysis.h5",
-        "SLEAP's analysis file, in pixels of the depth picture",
+        "SLEAP's analysis file, in pixels of the depth image",
     ),
     "csv": (
-        "tables.write_csv_folder",
+        "export.write_csv_folder",
         "_csv",
         "a folder with every table as CSV, and columns.json",
     ),
     "xlsx": (
-        "tables.write_xlsx",
+        "export.write_xlsx",
         ".xlsx",
-        "an Excel workbook with every table as a sheet, and what every column means",
+        "an Excel workbook with every table as a sheet, and the description of every column",
     ),
 }
 ALIASES = {"deeplabcut": "dlc"}
@@ -119,15 +119,17 @@ def export(
 # Every table of a session as CSV, for programs that do not read Parquet.
 
 
+def _tables_of(session: Session) -> list[str]:
+    """Names of the Parquet tables of a session, corrected ones included."""
+    files = {file.name for file in session.path.glob("*.parquet")} | set(session.log.files)
+    return sorted(name.removesuffix(".parquet") for name in files if name.endswith(".parquet"))
+
+
 def write_csv_folder(session: Session, path: Path) -> None:
     """Write a new folder with one file per table, numbers in full precision, and columns.json."""
     path.mkdir()
-    for name in sorted(
-        {file.name for file in session.path.glob("*.parquet")} | set(session.log.files)
-    ):
-        if name.endswith(".parquet"):
-            table = name.removesuffix(".parquet")
-            write_csv(session.table(table), inside(path, table, ".csv"))
+    for table in _tables_of(session):
+        write_csv(session.table(table), inside(path, table, ".csv"))
     if session.has("summary.csv"):
         with reading_from(session.file("summary.csv")) as summary:
             copy_harmless(summary, path / "summary.csv")
@@ -159,8 +161,7 @@ def write_xlsx(session: Session, path: Path) -> None:
     import pyarrow.parquet as pq
     from openpyxl import Workbook
 
-    stored = {file.name for file in session.path.glob("*.parquet")} | set(session.log.files)
-    names = sorted(name.removesuffix(".parquet") for name in stored if name.endswith(".parquet"))
+    names = _tables_of(session)
     footers = [pq.read_metadata(session.file(f"{name}.parquet")) for name in names]
     for name, one in zip(names, footers, strict=True):  # before anything is written
         if one.num_rows >= MAX_ROWS:
@@ -168,7 +169,17 @@ def write_xlsx(session: Session, path: Path) -> None:
                 f"a sheet of Excel has at most {MAX_ROWS:,} rows and the table {name} has "
                 f"{one.num_rows + 1:,} with its headings; export it as csv"
             )
-    _check_room(sum(one.num_rows * one.num_columns for one in footers))
+    # openpyxl writes uncompressed sheets into the folder for temporary files, and crashes if it
+    # becomes full
+    folder = Path(tempfile.gettempdir())
+    needed = sum(one.num_rows * one.num_columns for one in footers) * _CELL_BYTES + _OTHER_BYTES
+    free = shutil.disk_usage(folder).free
+    if free < needed:
+        raise SessionError(
+            f"the workbook's sheets need {needed / 1e6:,.0f} MB in {folder} while they are "
+            f"written, which has {free / 1e6:,.0f} MB left; make room there, name another "
+            "folder in the variable TMPDIR, or export as csv"
+        )
     book = Workbook(write_only=True)
     if session.has("summary.csv"):
         _add(book, "summary", session.summary)
@@ -179,21 +190,6 @@ def write_xlsx(session: Session, path: Path) -> None:
     packed = io.BytesIO()
     book.save(packed)
     path.write_bytes(packed.getbuffer())
-
-
-def _check_room(n_cells: int) -> None:
-    """Refuse if the folder for temporary files has not enough space for the uncompressed sheets.
-
-    openpyxl writes them there, and crashes if it becomes full.
-    """
-    folder = Path(tempfile.gettempdir())
-    needed, free = n_cells * _CELL_BYTES + _OTHER_BYTES, shutil.disk_usage(folder).free
-    if free < needed:
-        raise SessionError(
-            f"the workbook's sheets need {needed / 1e6:,.0f} MB in {folder} while they are "
-            f"written, which has {free / 1e6:,.0f} MB left; make room there, name another "
-            "folder in the variable TMPDIR, or export as csv"
-        )
 
 
 def _add(book: Workbook, name: str, table: pd.DataFrame) -> None:

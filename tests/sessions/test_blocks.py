@@ -10,13 +10,9 @@ import pytest
 
 from liex_lab.scene.outline import Arena
 from liex_lab.scene.zones import Zone
-from liex_lab.sessions import evidence
-from liex_lab.sessions.evidence import FILE, write_evidence
 from liex_lab.tables import rows as rows_module
 from liex_lab.tables import schema
 from liex_lab.tables.rows import Rows, seconds
-from liex_lab.tracking.observations import COLUMNS, Observations
-from liex_lab.tracking.track import Subject
 from tests.sessions.walking_mouse import WalkingMouse, steady, write
 
 MOUSE = WalkingMouse(np.delete(steady(3.0), slice(30, 36)), lost=(40, 41, 70))
@@ -75,25 +71,3 @@ def test_some_columns_or_rows_of_a_table_are_those_of_the_whole(tmp_path: Path) 
     pd.testing.assert_frame_equal(
         session.table("poses", ["joint", "x_mm"], [3, 80]), wanted[["joint", "x_mm"]]
     )
-
-
-def test_evidence_is_written_in_blocks_as_numpy_writes_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    seen = Observations.empty(MOUSE.skeleton, MOUSE.times_ns)
-    rng = np.random.default_rng(3)
-    seen.place[:], seen.n_px[:] = (
-        rng.normal(size=seen.place.shape),
-        rng.integers(0, 99, seen.n_px.shape),
-    )
-    subject = Subject(
-        MOUSE.skeleton, MOUSE.camera, MOUSE.T_arena_camera, 90.0, 5.0, 0.5, (1.0,) * 5
-    )
-    monkeypatch.setattr(evidence, "_BLOCK", 16)
-    write_evidence(tmp_path, seen, subject)
-    with np.load(tmp_path / FILE) as kept:
-        told = kept["subject"]
-    np.savez_compressed(
-        tmp_path / "by_numpy.npz", subject=told, **{name: getattr(seen, name) for name in COLUMNS}
-    )
-    assert (tmp_path / FILE).read_bytes() == (tmp_path / "by_numpy.npz").read_bytes()

@@ -12,14 +12,14 @@ from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
 from liex_lab.geometry import so3
-from liex_lab.sessions.mcap import _picture
+from liex_lab.sessions.mcap import _raw_image
 from tests.sessions.walking_mouse import WalkingMouse, steady, write
 
 MOUSE = WalkingMouse(steady(2.5), rear_s=(1.0, 2.0), lost=(20,))
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (7, 9), (8, 8), (90, 91), (424, 512)])
-def test_a_picture_in_parts_is_the_message_that_foxglove_encodes(shape: tuple[int, int]) -> None:
+def test_a_raw_image_in_parts_is_the_message_that_foxglove_encodes(shape: tuple[int, int]) -> None:
     image = np.random.default_rng(8).integers(0, 5000, shape).astype(np.uint16)
     height, width = shape
     whole = foxglove.RawImage(
@@ -32,7 +32,7 @@ def test_a_picture_in_parts_is_the_message_that_foxglove_encodes(shape: tuple[in
         data=image.astype("<u2").tobytes(),
     )
     for told in (image, np.asfortranarray(image), np.repeat(image, 2, axis=1)[:, ::2]):
-        assert b"".join(_picture(12_000_000_345, told)) == whole.encode()
+        assert b"".join(_raw_image(12_000_000_345, told)) == whole.encode()
 
 
 @pytest.fixture(scope="module")
