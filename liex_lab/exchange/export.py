@@ -10,19 +10,15 @@ import shutil
 import tempfile
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+import pandas as pd
+import pyarrow.parquet as pq
 
 from liex_lab.errors import SessionError, how_to_install
-from liex_lab.runtime.durable import replacing
-from liex_lab.runtime.places import inside
-from liex_lab.runtime.text_files import copy_harmless, write_csv
+from liex_lab.runtime import durable, places, text_files
 from liex_lab.sessions import Session
 from liex_lab.sessions.provenance import reading_from
-
-if TYPE_CHECKING:
-    import pandas as pd
-    from openpyxl import Workbook
-
 
 # format -> (module and function of its writer, suffix of the name, description)
 TARGETS: dict[str, tuple[str, str, str]] = {
@@ -99,7 +95,7 @@ def export(
             "Python out=)"
         )
     folder.mkdir(parents=True, exist_ok=True)
-    path = inside(folder, session.name, ending)
+    path = places.inside(folder, session.name, ending)
     if path.exists() and not overwrite:
         raise SessionError(
             f"{path} exists already; name another place (--out, in Python out=), or say "
@@ -107,7 +103,7 @@ def export(
         )
     try:
         write = getattr(import_module(f"liex_lab.exchange.{home}"), function)
-        with replacing(path, replace_folder=True) as part:
+        with durable.replacing(path, replace_folder=True) as part:
             write(session, part)
     except ImportError as error:
         raise SessionError(
@@ -129,10 +125,10 @@ def write_csv_folder(session: Session, path: Path) -> None:
     """Write a new folder with one file per table, numbers in full precision, and columns.json."""
     path.mkdir()
     for table in _tables_of(session):
-        write_csv(session.table(table), inside(path, table, ".csv"))
+        text_files.write_csv(session.table(table), places.inside(path, table, ".csv"))
     if session.has("summary.csv"):
         with reading_from(session.file("summary.csv")) as summary:
-            copy_harmless(summary, path / "summary.csv")
+            text_files.copy_harmless(summary, path / "summary.csv")
     shutil.copyfile(session.file("columns.json"), path / "columns.json")
 
 
@@ -158,7 +154,6 @@ def write_xlsx(session: Session, path: Path) -> None:
         SessionError: a table is longer than a sheet can be, or there is not enough space for
             temporary files.
     """
-    import pyarrow.parquet as pq
     from openpyxl import Workbook
 
     names = _tables_of(session)
@@ -192,7 +187,7 @@ def write_xlsx(session: Session, path: Path) -> None:
     path.write_bytes(packed.getbuffer())
 
 
-def _add(book: Workbook, name: str, table: pd.DataFrame) -> None:
+def _add(book: Any, name: str, table: pd.DataFrame) -> None:
     sheet = book.create_sheet(name)
     sheet.freeze_panes = "A2"
     sheet.append([_cell(sheet, str(column)) for column in table.columns])

@@ -21,8 +21,7 @@ from pydantic import Field, ValidationError, model_validator
 from liex_lab.errors import PlanError, StudyError
 from liex_lab.plan import Plan, known_plans
 from liex_lab.plan.sections import ArenaPlace, SettingsTable, first_twice
-from liex_lab.runtime.places import named_beside
-from liex_lab.runtime.text_files import read_toml
+from liex_lab.runtime import places, text_files
 
 # as in NeuroBlueprint: only letters and digits, so that no name is a path, a formula or markup
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9]{1,64}$")]
@@ -227,7 +226,7 @@ class Study:
         if not file.is_file():
             raise StudyError(f"there is no study file {file}; `liex cohort init FOLDER` begins one")
         try:
-            table = read_toml(file)
+            table = text_files.read_toml(file)
         except ValueError as error:
             raise StudyError(f"{file} should be a TOML file, but: {error}; correct it") from None
         return Study.from_table(table, file)
@@ -318,7 +317,7 @@ class Study:
         Raises:
             StudyError: the path is absolute, begins with ~ or a drive, or has a part '..'.
         """
-        if not named_beside(text):
+        if not places.named_beside(text):
             raise StudyError(
                 f"{self.path}: {what} is '{text}', and a study names only what is in its own "
                 f"folder {self.folder}; move or link it there and write the path from there, "

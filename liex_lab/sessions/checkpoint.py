@@ -18,7 +18,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, suppress
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Annotated, Any
+from typing import IO, Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,10 +26,9 @@ from pydantic import BaseModel, ConfigDict, Field, NonNegativeInt
 
 from liex_lab.errors import SessionError
 from liex_lab.recordings.formats.messages.mcap import MAGIC, RECORD
-from liex_lab.runtime.durable import sync_file, sync_tree, take_lock, write_whole
-from liex_lab.runtime.memory import mapped
-from liex_lab.runtime.places import unlinked, unlinked_tree
-from liex_lab.runtime.text_files import loose_json
+from liex_lab.recordings.recording import Recording
+from liex_lab.runtime import durable, memory, places, text_files
+from liex_lab.runtime.progress import Progress
 
 # between two checkpoints: the most work that can be lost, besides startup
 EVERY_S = 3.0
@@ -43,9 +42,6 @@ _MOST_S = 1e10
 _MOST = 1 << 20  # values per frame in one column
 OWN = (_STATE, _LOCK, _SEEN, _INPUT, STRETCHES, "resumed.rrd")  # not in the finished session
 
-if TYPE_CHECKING:
-    from liex_lab.recordings.recording import Recording
-    from liex_lab.runtime.progress import Progress
 
 LOGS = ("session.rrd", "session.mcap")
 # an .rrd file: a header, then messages that begin with kind and length, 8 bytes each
@@ -102,7 +98,7 @@ class Checkpoint:
             SessionError: another process is writing the session.
         """
         try:
-            unlinked_tree(folder).mkdir(parents=True, exist_ok=True)
+            places.unlinked_tree(folder).mkdir(parents=True, exist_ok=True)
         except FileNotFoundError as error:  # a virtual parent folder, such as /proc
             raise SessionError(
                 f"no folder can be made at {error.filename} ({error.strerror}); name another place"
@@ -176,10 +172,10 @@ class Checkpoint:
         """Save a state once its files are on disk, so that it survives a power cut."""
         self.seen.flush()
         state = self.state.model_copy(update=changes)
-        sync_tree(self.folder / _SEEN)
+        durable.sync_tree(self.folder / _SEEN)
         for log in state.logs:
-            sync_file(self.folder / log)
-        write_whole(self.folder / _STATE, state.model_dump_json())
+            durable.sync_file(self.folder / log)
+        durable.write_whole(self.folder / _STATE, state.model_dump_json())
         self.state, self._last = state, self._clock()
 
     def join_replay(self) -> None:
@@ -257,7 +253,7 @@ class Columns:
             name: (values.dtype.str, list(values.shape[1:])) for name, values in columns.items()
         }
         if not self._kinds:
-            write_whole(self._folder / "columns.json", json.dumps(kinds))
+            durable.write_whole(self._folder / "columns.json", json.dumps(kinds))
             self._kinds = kinds
         if kinds != self._kinds:
             raise ValueError(f"columns {kinds} were to be appended to {self._kinds}")
@@ -297,7 +293,7 @@ class Columns:
         """
         self.flush()
         return {
-            name: mapped(self._folder / f"{name}.bin", np.dtype(kind)).reshape(-1, *shape)
+            name: memory.mapped(self._folder / f"{name}.bin", np.dtype(kind)).reshape(-1, *shape)
             for name, (kind, shape) in self._kinds.items()
             if (self._folder / f"{name}.bin").stat().st_size
         }
@@ -399,14 +395,14 @@ def hash_once(recording: Recording, folder: Path, progress: Progress) -> None:
         progress: reports how many MB were read.
     """
     stamp = recording.files.stamp
-    known = loose_json(folder / _INPUT)
+    known = text_files.loose_json(folder / _INPUT)
     if stamp and known.get("stamp") == stamp and isinstance(known.get("sha256"), str):
         recording.files.take_digest(known["sha256"])
     began = time.monotonic()
     digest = recording.digest(progress)
     if stamp and time.monotonic() - began > EVERY_S:
-        unlinked(folder).mkdir(parents=True, exist_ok=True)
-        write_whole(folder / _INPUT, json.dumps({"stamp": stamp, "sha256": digest}))
+        places.unlinked(folder).mkdir(parents=True, exist_ok=True)
+        durable.write_whole(folder / _INPUT, json.dumps({"stamp": stamp, "sha256": digest}))
 
 
 def check_free(folder: Path) -> None:
@@ -421,7 +417,7 @@ def check_free(folder: Path) -> None:
 
 def _locked(folder: Path) -> IO[bytes]:
     """The lock of an unfinished session; raises SessionError if another process is writing it."""
-    held = take_lock(folder / _LOCK)
+    held = durable.take_lock(folder / _LOCK)
     if held is None:
         raise SessionError(
             f"another process is writing the session {folder.with_suffix('').name} into "
@@ -441,7 +437,7 @@ def hold(folder: Path) -> IO[bytes] | None:
         finished in the meantime.
     """
     try:
-        return take_lock(folder / _LOCK)
+        return durable.take_lock(folder / _LOCK)
     except FileNotFoundError:
         return None
 
@@ -451,7 +447,7 @@ def _read_kinds(folder: Path) -> dict[str, tuple[str, list[int]]]:
     try:
         kinds = {
             name: (np.dtype(str(kind)), [int(n) for n in shape])
-            for name, (kind, shape) in loose_json(folder / "columns.json").items()
+            for name, (kind, shape) in text_files.loose_json(folder / "columns.json").items()
         }
     except (ValueError, TypeError, OverflowError):
         return {}

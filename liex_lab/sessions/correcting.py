@@ -11,13 +11,16 @@ import difflib
 import math
 import shlex
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from liex_lab.actions.ethogram import Ethogram
+from liex_lab.actions.labels import sessions_named, words_of
 from liex_lab.errors import LiexError, SessionError
 from liex_lab.plan import Plan
+from liex_lab.recordings.recording import Recording
 from liex_lab.sessions.corrections import (
     DESCRIBED,
     BoutEdit,
@@ -26,12 +29,9 @@ from liex_lab.sessions.corrections import (
     FlipSpan,
     JointMove,
 )
+from liex_lab.sessions.cutouts import Kept, open_pictures
+from liex_lab.sessions.session import Session
 from liex_lab.tables.rows import frame_count, stop_times
-
-if TYPE_CHECKING:
-    from liex_lab.recordings.recording import Recording
-    from liex_lab.sessions.cutouts import Kept
-    from liex_lab.sessions.session import Session
 
 Array = NDArray[np.float64]
 
@@ -255,8 +255,6 @@ def joint_move_at_pixel(
         SessionError: the pixel is outside the image, the session has no depth, the pixel's ray does
             not reach the joint's height, or see `joint_move`.
     """
-    from liex_lab.sessions.cutouts import Kept, open_pictures
-
     row, was = _joint_row(session, frame, joint)
     camera = session.camera
     if not (
@@ -464,9 +462,6 @@ def labelled_bouts(session: Session, labels: Any) -> list[BoutEdit]:
         SessionError: the labels are of several recordings without this one, or none of them is
             within the session.
     """
-    from liex_lab.actions.ethogram import Ethogram
-    from liex_lab.actions.labels import sessions_named, words_of
-
     time_ns, time_s = (session.frames[name].to_numpy() for name in ("time_ns", "time_s"))
     of = sessions_named(labels)
     named = session.name if session.name in of else ""

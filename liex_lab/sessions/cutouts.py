@@ -26,24 +26,25 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import cv2
 import numpy as np
+import zstandard
 from numpy.typing import NDArray
 
 from liex_lab.errors import RecordingError, SessionError
 from liex_lab.optics.camera import Camera
 from liex_lab.recordings.depth_kernels import to_millimetres
-from liex_lab.sessions.provenance import THUMBNAILS, reading_from
+from liex_lab.recordings.formats.messages.mcap_index import open_replay
+from liex_lab.recordings.frame import region_mask
+from liex_lab.recordings.recording import Recording
+from liex_lab.scene.background import learn_background, sample_frames
+from liex_lab.scene.still_scene import StillScene, at_every_pixel
+from liex_lab.sessions.provenance import THUMBNAILS, Provenance, reading_from
+from liex_lab.sessions.session import Session
 from liex_lab.tables.rows import Rows
 from liex_lab.tracking.observations import Observations
-
-if TYPE_CHECKING:
-    from liex_lab.recordings.recording import Recording
-    from liex_lab.scene.still_scene import StillScene
-    from liex_lab.sessions.provenance import Provenance
-    from liex_lab.sessions.session import Session
-
 
 _ONCE = 1_200_000
 _A_FRAME = 1_000
@@ -85,10 +86,6 @@ def still_scene(recording: Recording, known: StillScene | None = None) -> Depth:
     Returns:
         (H, W) uint16 mm, smoothed by a median of 3 x 3 pixels, 0 where no depth recurs.
     """
-    import cv2
-
-    from liex_lab.scene.background import learn_background, sample_frames
-
     learned = to_millimetres(learn_background(sample_frames(recording, _FRAMES))[0])
     # remove specks of the small sample
     smooth: Depth = np.asarray(cv2.medianBlur(learned, 3), np.uint16)
@@ -105,10 +102,6 @@ def _without_animals(image: Depth, known: StillScene) -> Depth:
         image: (H, W) uint16 mm.
         known: the segmentation's scene, on a subsampled pixel grid.
     """
-    import cv2
-
-    from liex_lab.scene.still_scene import at_every_pixel
-
     step = known.stride
     limit, background = (
         at_every_pixel(values, step, image.shape) for values in (known.limit, known.background)
@@ -182,8 +175,6 @@ class DepthKeeper:
 
 def _region(origin: Provenance) -> NDArray[np.bool_] | None:
     """(H, W) mask of the arena's region; None for the whole image."""
-    from liex_lab.recordings.frame import region_mask
-
     if origin.scene is None or not origin.scene.region_px:
         return None
     return region_mask(origin.scene.region_px, origin.camera.width, origin.camera.height)
@@ -327,8 +318,6 @@ def open_pictures(session: Session) -> Recording:
         SessionError: the session keeps no depth.
         RecordingError: session.mcap cannot be read.
     """
-    from liex_lab.recordings.formats.messages.mcap_index import open_replay
-
     try:
         return open_replay(session.path / "session.mcap")
     except RecordingError:
@@ -404,8 +393,6 @@ def needed_bytes(
         length_px: length of the animal in the image.
         kept: extent of the kept depth, as in `[replay] depth`.
     """
-    import zstandard
-
     packer = zstandard.ZstdCompressor(level=_LEVEL)
     packed = sum(len(packer.compress(np.ascontiguousarray(image).tobytes())) for image in images)
     whole = sum(image.size for image in images)
@@ -540,8 +527,6 @@ def _written(
     folder: Path, kind: str, rows: Rows, row: int, left: int, top: int, depth: NDArray[np.uint16]
 ) -> dict[str, Any]:
     """Write a PNG of a frame; returns its entry."""
-    import cv2
-
     index = int(rows.frame_index[row])
     name = f"{THUMBNAILS}/{kind}_{index:07d}.png"
     cv2.imwrite(str(folder / name), depth)

@@ -13,17 +13,17 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.errors import SessionError
 from liex_lab.geometry import so3
 from liex_lab.recordings.timestamps import Gap
-from liex_lab.runtime.memory import check_npz
-from liex_lab.runtime.text_files import write_csv
+from liex_lab.runtime import memory, text_files
 from liex_lab.sessions.provenance import Provenance, package_version, reading_from
 from liex_lab.sessions.session import Session, spreads
 from liex_lab.sessions.verdict import WHO
@@ -31,9 +31,6 @@ from liex_lab.tables import schema as tables
 from liex_lab.tables.rows import LOST, Rows, median_step, stop_times
 from liex_lab.tracking.observations import COLUMNS, Observations
 from liex_lab.tracking.track import Flip, Subject, Track
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 Array = NDArray[np.float64]
 
@@ -99,7 +96,7 @@ class Results:
                 continue
             if name == "summary":
                 tables.check_described(result.columns, schema, name)
-                write_csv(result, folder / "summary.csv")
+                text_files.write_csv(result, folder / "summary.csv")
             else:
                 tables.write_table(
                     folder / f"{name}.parquet", schema, tables.from_pandas(result), described
@@ -179,7 +176,7 @@ def _opened(session: Session) -> Iterator[tuple[Any, dict[str, Any]]]:
     n_joints = len(session.metadata["animal"]["joints"])
     n_frames = session.metadata["frames"]["n_frames"]
     with reading_from(session.path / FILE) as path:
-        check_npz(path, _SPARE_BYTES + n_frames * (n_joints + 1) * _BYTES_PER_JOINT)
+        memory.check_npz(path, _SPARE_BYTES + n_frames * (n_joints + 1) * _BYTES_PER_JOINT)
         with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
             yield arrays, json.loads(arrays["subject"].tobytes())
 

@@ -19,10 +19,7 @@ from typing import Any
 
 from liex_lab.catalog import sha256
 from liex_lab.errors import LiexError, SessionError
-from liex_lab.runtime import durable
-from liex_lab.runtime.memory import why_short
-from liex_lab.runtime.places import is_full, storable_document, unlinked, why_full
-from liex_lab.runtime.text_files import loose_json
+from liex_lab.runtime import durable, memory, places, text_files
 from liex_lab.sessions.checkpoint import OWN, hold
 from liex_lab.sessions.corrections import FOLDER, LOG, corrected_folder, read_log
 from liex_lab.sessions.provenance import versions
@@ -48,13 +45,13 @@ def describe_failure(error: BaseException, stage: str, frame: int | None) -> dic
         stage, frame, reason, remedy, kind, at (ISO 8601, UTC), machine, versions, and perhaps
         traceback.
     """
-    short = "" if isinstance(error, LiexError) else why_short(error)
+    short = "" if isinstance(error, LiexError) else memory.why_short(error)
     ours = not short and not isinstance(error, LiexError | OSError)
     if isinstance(error, LiexError):
         reason, _, remedy = str(error).rpartition("; ")
         reason, remedy = (reason, remedy) if reason else (remedy, "see `liex doctor`")
-    elif isinstance(error, OSError) and is_full(error):
-        reason = why_full(error)
+    elif isinstance(error, OSError) and places.is_full(error):
+        reason = places.why_full(error)
         remedy = "make room there and run it again"
     elif short:
         reason, _, remedy = short.partition("; ")
@@ -85,8 +82,8 @@ def write_failure(folder: Path, failure: dict[str, Any]) -> None:
         folder: the session folder; created if needed.
         failure: the result of `describe_failure`.
     """
-    unlinked(folder).mkdir(parents=True, exist_ok=True)
-    text = json.dumps(storable_document(failure), indent=2, default=str)
+    places.unlinked(folder).mkdir(parents=True, exist_ok=True)
+    text = json.dumps(places.storable_document(failure), indent=2, default=str)
     durable.write_whole(folder / FAILED_FILE, text + "\n")
 
 
@@ -104,7 +101,7 @@ def read_failure(folder: Path) -> dict[str, Any] | None:
     path = folder / FAILED_FILE
     if not path.is_file():
         return None
-    found = loose_json(path)
+    found = text_files.loose_json(path)
     damaged = {"reason": f"{path} cannot be read", "remedy": "try the session again"}
     known = isinstance(found.get("reason"), str)
     return found if known else {**damaged, "stage": "", "frame": None}
@@ -147,7 +144,7 @@ def check_writable(path: Path, overwrite: bool) -> None:
         PlaceError: the session's path, or NAME.part or NAME.old, is a symbolic link.
     """
     for place in (path, part_folder(path), aside_folder(path)):
-        unlinked(place)
+        places.unlinked(place)
     nearest = next((folder for folder in path.parents if folder.exists()), None)
     if nearest is not None and not nearest.is_dir():
         raise SessionError(
@@ -342,7 +339,7 @@ def taken_from(path: Path) -> str:
     Args:
         path: the session folder.
     """
-    return str(loose_json(path / "session.json").get("corrections_taken_from", ""))
+    return str(text_files.loose_json(path / "session.json").get("corrections_taken_from", ""))
 
 
 def _waits(path: Path) -> bool:

@@ -18,9 +18,10 @@ from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from itertools import zip_longest
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
+import pandas as pd
 import zstandard
 from foxglove import messages
 from isal import isal_zlib
@@ -51,10 +52,6 @@ from liex_lab.sessions.provenance import Provenance, package_version
 from liex_lab.sessions.rrd_scene import dot_mm
 from liex_lab.tables.rows import Rows
 from liex_lab.tracking.track import Track
-
-if TYPE_CHECKING:
-    import pandas as pd
-
 
 _LEAST, _MOST = 10, 27  # log2 of the windows that every Zstandard reader accepts
 

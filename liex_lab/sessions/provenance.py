@@ -17,7 +17,7 @@ from dataclasses import dataclass, field
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path, PurePosixPath
-from typing import TYPE_CHECKING, Annotated, Any, NoReturn
+from typing import Annotated, Any, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,18 +27,15 @@ from liex_lab.body.skeleton import Skeleton
 from liex_lab.errors import LiexError, SessionError, one_line
 from liex_lab.geometry import SE3
 from liex_lab.optics.camera import Camera
+from liex_lab.plan import Plan
 from liex_lab.plan.sections import Factor, SubjectFacts
+from liex_lab.recordings.recording import Recording
+from liex_lab.recordings.timestamps import Gap
 from liex_lab.runtime.places import storable
+from liex_lab.scene.floor import Floor
 from liex_lab.scene.outline import UNKNOWN, Arena
+from liex_lab.scene.scene import Scene
 from liex_lab.scene.zones import Zone
-
-if TYPE_CHECKING:
-    from liex_lab.plan import Plan
-    from liex_lab.recordings.recording import Recording
-    from liex_lab.recordings.timestamps import Gap
-    from liex_lab.scene.floor import Floor
-    from liex_lab.scene.scene import Scene
-
 
 SCHEMA_VERSION = 8
 _PACKAGES = (

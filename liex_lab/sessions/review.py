@@ -17,7 +17,6 @@ from dataclasses import field, replace
 from datetime import UTC, datetime
 from itertools import combinations
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from pydantic import TypeAdapter
@@ -25,12 +24,9 @@ from pydantic.dataclasses import dataclass
 
 from liex_lab.actions.scores import Agreement, cohens_kappa
 from liex_lab.errors import SessionError, one_line
-from liex_lab.runtime.durable import write_whole
-from liex_lab.runtime.places import inside
+from liex_lab.runtime import durable, places
 from liex_lab.sessions.corrections import UNREADABLE
-
-if TYPE_CHECKING:
-    from liex_lab.sessions.session import Session
+from liex_lab.sessions.session import Session
 
 FOLDER = "reviews"
 ENDING = ".review.json"
@@ -243,8 +239,8 @@ def write_review(folder: Path, review: Review) -> Path:
         review: the review.
     """
     folder.mkdir(exist_ok=True)
-    path = inside(folder, review.name, ENDING)
-    write_whole(path, review.to_json())
+    path = places.inside(folder, review.name, ENDING)
+    durable.write_whole(path, review.to_json())
     return path
 
 
@@ -258,7 +254,7 @@ def read_review(folder: Path, name: str) -> Review:
     Raises:
         SessionError: it does not exist, or is damaged.
     """
-    path = inside(folder, name, ENDING)
+    path = places.inside(folder, name, ENDING)
     try:
         return Review.from_json(path.read_text(encoding="utf-8"))
     except FileNotFoundError:

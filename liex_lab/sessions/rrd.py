@@ -13,9 +13,10 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from itertools import chain, cycle
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import pandas as pd
 import rerun as rr
 from numpy.typing import NDArray
 
@@ -23,9 +24,9 @@ from liex_lab.actions import vocabulary
 from liex_lab.behaviour.body import logged_of
 from liex_lab.errors import SessionError
 from liex_lab.geometry import so3
-from liex_lab.runtime.memory import blocks
-from liex_lab.runtime.places import probe_full
+from liex_lab.runtime import memory, places
 from liex_lab.sessions.checkpoint import RRD_HEAD, rrd_messages
+from liex_lab.sessions.cutouts import Boxes
 from liex_lab.sessions.provenance import Provenance
 from liex_lab.sessions.rrd_scene import (
     IMAGE,
@@ -46,13 +47,8 @@ from liex_lab.sessions.rrd_scene import (
 )
 from liex_lab.tables.rows import Rows, constant_runs, frame_count, stop_times
 from liex_lab.tables.schema import shown
+from liex_lab.tracking.observations import Observations
 from liex_lab.tracking.track import Track
-
-if TYPE_CHECKING:
-    import pandas as pd
-
-    from liex_lab.sessions.cutouts import Boxes
-    from liex_lab.tracking.observations import Observations
 
 Array = NDArray[np.float64]
 DepthBatch = Sequence[NDArray[np.uint16]]
@@ -194,7 +190,7 @@ class ReplayWriter:
         self._elapsed = track.times_ns - track.times_ns[:1]
         curves = self._log_curves(rows, kinematics)
         carriers = self._log_looks(track, 0 if candidates is None else candidates.known.shape[1])
-        for part in blocks(track.n_frames, _BLOCK):
+        for part in memory.blocks(track.n_frames, _BLOCK):
             self._send_root(track, part)
             for entity, columns in chain(
                 _skeleton_columns(track[part]),
@@ -282,7 +278,7 @@ class ReplayWriter:
             size = self._path.stat().st_size if self._path.is_file() else 0
             waited = waited + _TURN_S if size == before else 0.0
             before = size
-            if waited > _PATIENCE_S or probe_full(self._path.parent):
+            if waited > _PATIENCE_S or places.probe_full(self._path.parent):
                 raise self._unwritten()
 
     def _unwritten(self) -> Exception:
@@ -296,7 +292,7 @@ class ReplayWriter:
         return self._why_unwritten()
 
     def _why_unwritten(self) -> Exception:
-        return probe_full(self._path.parent) or SessionError(
+        return places.probe_full(self._path.parent) or SessionError(
             f"the replay {self._path} was not written whole; make room on the disk or mend it, and "
             "run the same command again"
         )

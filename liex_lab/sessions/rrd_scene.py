@@ -24,8 +24,9 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import cycle
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
+import cv2
 import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
@@ -38,14 +39,11 @@ from liex_lab.estimation.session_shape import built
 from liex_lab.geometry import SE3, so3
 from liex_lab.optics.camera import Camera
 from liex_lab.recordings.depth_kernels import rvl_message
+from liex_lab.scene.scene import Scene
 from liex_lab.sessions.cutouts import N_BOXES, N_WINDOWS, Boxes, window_around, windows
 from liex_lab.sessions.provenance import Provenance
+from liex_lab.tables.rows import Rows
 from liex_lab.tracking.track import Track
-
-if TYPE_CHECKING:
-    from liex_lab.scene.scene import Scene
-    from liex_lab.tables.rows import Rows
-
 
 Array = NDArray[np.float64]
 
@@ -203,7 +201,6 @@ class DepthColumns:
                 )
                 stream.log(entity, kind, static=True)
             return
-        import cv2
 
         assert self._origin.background is not None
         blob = cv2.imencode(".png", self._origin.background)[1].ravel()
@@ -287,8 +284,6 @@ def packed(depth: NDArray[np.uint16]) -> tuple[NDArray[np.uint8], str]:
     Returns:
         The bytes, and their media type: 'application/rvl' or 'image/png'.
     """
-    import cv2
-
     rvl = rvl_message(depth)
     if len(rvl) > _LARGE * depth.size:
         png = cv2.imencode(".png", depth, _NOISY_PNG)[1].ravel()

@@ -15,14 +15,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import pandas as pd
+import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from liex_lab.errors import MissingPackageError, SessionError, how_to_install
 from liex_lab.geometry import SE3
 from liex_lab.optics.camera import Camera
-from liex_lab.runtime.memory import rest
-from liex_lab.runtime.places import safe_name
-from liex_lab.runtime.text_files import read_harmless
+from liex_lab.runtime import memory, places, text_files
 from liex_lab.scene.outline import Arena
 from liex_lab.scene.zones import Zone
 from liex_lab.sessions.corrections import (
@@ -38,7 +38,6 @@ from liex_lab.tables.schema import FRAMES, check_footer, check_rows
 from liex_lab.tracking.track import CORRECTED
 
 if TYPE_CHECKING:
-    import pandas as pd
     import xarray
 
 FILES = (
@@ -249,13 +248,11 @@ class Session:
                 "measures"
             )
         with reading_from(path):
-            return read_harmless(path, ("session_id", "individual"))
+            return text_files.read_harmless(path, ("session_id", "individual"))
 
     @cached_property
     def columns(self) -> pd.DataFrame:
         """The column dictionary: one row per column of every table."""
-        import pandas as pd
-
         with reading_from(self.file("columns.json")) as path:
             found = pd.DataFrame(json.loads(path.read_text(encoding="utf-8")))
             if not {"table", "name", "unit", "meaning"} <= set(found.columns):
@@ -302,8 +299,6 @@ class Session:
         Args:
             **wanted: table name to column names, as in `frames=["time_s", "flag"]`.
         """
-        import pyarrow.parquet as pq
-
         other = Session(self.path, self.metadata, self.log, self.described)
         for name, columns in wanted.items():
             path = self.file(f"{name}.parquet")
@@ -315,7 +310,7 @@ class Session:
                 read = file.read(known, use_threads=False)
                 table = read.to_pandas(split_blocks=True, self_destruct=True, use_threads=False)
                 del read
-                rest()
+                memory.rest()
                 check_rows(name, table, self.metadata["animal"]["joints"])
                 other.__dict__[name] = table
         return other
@@ -334,8 +329,6 @@ class Session:
         Raises:
             SessionError: there is no such table, or it is damaged.
         """
-        import pandas as pd
-
         path = self.file(f"{name}.parquet")
         if not path.is_file():
             known = ", ".join(sorted(p.stem for p in self.path.glob("*.parquet")))
@@ -419,9 +412,6 @@ class Session:
 
 def _rows_of(path: Path, columns: list[str] | None, frame_index: list[int]) -> pd.DataFrame:
     """The rows of some frames of a long table, with at most one row group in memory."""
-    import pandas as pd
-    import pyarrow.parquet as pq
-
     with pq.ParquetFile(path, pre_buffer=False) as file:
         wanted = None if columns is None else [*dict.fromkeys([*columns, "frame_index"])]
         groups = (
@@ -429,7 +419,7 @@ def _rows_of(path: Path, columns: list[str] | None, frame_index: list[int]) -> p
             for k in range(file.num_row_groups)
         )
         found = [group[group["frame_index"].isin(frame_index)] for group in groups]
-    rest()
+    memory.rest()
     rows = pd.concat(found, ignore_index=True)
     return rows if columns is None else rows[columns]
 
@@ -443,7 +433,7 @@ def video_path(folder: Path, name: str, what: str = "") -> Path:
         what: its subject, such as an action; "" for the whole session.
     """
     tail = "".join(c if c.isalnum() or c in "-_.+" else "_" for c in what)
-    return folder / safe_name(f"{name}_{tail}" if tail else name, ".mp4")
+    return folder / places.safe_name(f"{name}_{tail}" if tail else name, ".mp4")
 
 
 def stretch(start_s: float | None, stop_s: float | None) -> str:

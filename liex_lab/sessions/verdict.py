@@ -11,16 +11,13 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from liex_lab.runtime.text_files import loose_json
-
-if TYPE_CHECKING:
-    from liex_lab.tracking.observations import Observations
-    from liex_lab.tracking.track import Track
-
+from liex_lab.tracking.observations import Observations
+from liex_lab.tracking.track import Track
 
 LOOK_AT_IT = "look at it"
 CAUTION = "note"

@@ -17,6 +17,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 import rerun as rr
+from rerun.experimental import ViewerClient
 
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.errors import LiexError
@@ -24,8 +25,10 @@ from liex_lab.geometry import SE3
 from liex_lab.optics.camera import Camera
 from liex_lab.recordings.frame import DepthFrame
 from liex_lab.runtime.processes import own_python
+from liex_lab.sessions.corrections import REPLAY
 from liex_lab.sessions.rrd import BONE_COLOUR, JOINT_COLOUR, SKELETON
 from liex_lab.sessions.rrd_scene import DEPTH, MM_PER_UNIT, colour_range, dot_mm, log_camera
+from liex_lab.sessions.session import Session
 from liex_lab.tracking.track import Track
 
 _PATIENCE_S = 30.0  # for a viewer to start
@@ -82,9 +85,6 @@ def replays_with(replay: Path, more: Sequence[Path] = ()) -> list[Path]:
         replay: the session's own .rrd, or a separate one.
         more: further files of the same replay.
     """
-    from liex_lab.sessions.corrections import REPLAY
-    from liex_lab.sessions.session import Session
-
     try:
         corrected = Session.open(replay.parent).file(REPLAY)
     except LiexError:  # a separate replay
@@ -112,7 +112,6 @@ def show_replay(
         raise LiexError(f"there is no replay {replay}; run `liex run` on the recording again")
     if not headless:
         need_screen(f"open {replay} on a computer with a screen")
-    from rerun.experimental import ViewerClient
 
     port, process = _begin(*(["--headless"] if headless else []))
 

@@ -24,16 +24,15 @@ from contextlib import contextmanager, suppress
 from dataclasses import fields
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 
 from liex_lab.errors import LiexError, SessionError
-from liex_lab.runtime.durable import put_in_place, sync_folder, sync_tree, write_whole
-from liex_lab.runtime.memory import Allocator, on_disk, peak_memory_mb, rest
-from liex_lab.runtime.places import is_full, probe_full, storable_document, unlinked_tree, why_full
-from liex_lab.runtime.text_files import loose_json
+from liex_lab.recordings.frame import DepthFrame
+from liex_lab.runtime import durable, memory, places, text_files
 from liex_lab.sessions.checkpoint import LOGS, STRETCHES, Checkpoint, Columns
 from liex_lab.sessions.corrections import FOLDER
 from liex_lab.sessions.cutouts import FILE as CUTOUTS_FILE
@@ -50,17 +49,11 @@ from liex_lab.sessions.folder import (
     put_back_session,
 )
 from liex_lab.sessions.provenance import Provenance
+from liex_lab.sessions.session import Session
 from liex_lab.tables import schema
 from liex_lab.tables.rows import Rows
 from liex_lab.tracking.observations import Observations
 from liex_lab.tracking.track import Flip, Subject, Track, Tracked
-
-if TYPE_CHECKING:
-    import pandas as pd
-
-    from liex_lab.recordings.frame import DepthFrame
-    from liex_lab.sessions.session import Session
-
 
 INDEX = "frame_index"
 TIMES = "frame_time_ns"
@@ -106,8 +99,7 @@ class SessionWriter:
         blueprint: BlueprintMaker | None = None,
         report: ReportMaker | None = None,
     ) -> None:
-        from liex_lab.sessions.mcap import McapWriter
-        from liex_lab.sessions.rrd import ReplayWriter
+        from liex_lab.sessions import mcap, rrd
 
         self.path = Path(path)
         put_back_session(self.path)
@@ -139,8 +131,8 @@ class SessionWriter:
         try:
             layout = blueprint(self._document) if blueprint else None
             messages = self._folder / LOGS[1]
-            self._replay = ReplayWriter(self._checkpoint.replay, origin, layout)
-            self._mcap = McapWriter(messages, origin, resume=messages.is_file())
+            self._replay = rrd.ReplayWriter(self._checkpoint.replay, origin, layout)
+            self._mcap = mcap.McapWriter(messages, origin, resume=messages.is_file())
             if self._times_ns:
                 self._replay.resume(self._times_ns[0])
         except BaseException:
@@ -264,9 +256,9 @@ class SessionWriter:
             self._checkpoint.save(len(self._index), seconds, *sizes)
 
     @property
-    def allocate(self) -> Allocator:
+    def allocate(self) -> memory.Allocator:
         """Allocator of arrays on the session's disk, for the track of a long recording."""
-        return on_disk(self._folder)
+        return memory.on_disk(self._folder)
 
     @property
     def track(self) -> Track:
@@ -297,7 +289,7 @@ class SessionWriter:
         """
         self.track = tracked.track
         self._flips = tracked.flips
-        rest()  # much memory after a long recording
+        memory.rest()  # much memory after a long recording
         self._candidates = seen if self.origin.replay_candidates else None
         self._together = seen if subject.n_animals > 1 else None
         write_evidence(self._folder, seen, subject)
@@ -354,8 +346,6 @@ class SessionWriter:
             SessionError: the recording has no frame, the track is of other frames, a column is not
                 described, a log could not be written, or the disk had no room for the report.
         """
-        from liex_lab.sessions.session import Session
-
         if not self._index:
             raise SessionError(
                 "the recording holds no frame, so there is no session to write; see `liex doctor`"
@@ -375,7 +365,7 @@ class SessionWriter:
         of_track = Results(self.origin, rows, self._flips)
         of_track.write_track(self._folder)
         of_track.write_measured(self._folder, results, columns)
-        rest()
+        memory.rest()
         named = sorted({str(word) for word in bouts["action"]}.difference(actions or {}))
         actions = {**(actions or {}), **dict.fromkeys(named, "")}
         words = [*actions]
@@ -399,12 +389,12 @@ class SessionWriter:
         made = corrections_for(self.path)
         if made is not None and made.parent != self.path:
             self.note(corrections_taken_from=made.parent.name)
-        document = storable_document(self._document)
+        document = places.storable_document(self._document)
         text = json.dumps(document, indent=2, default=str, allow_nan=False)
         (self._folder / "session.json").write_text(text + "\n", encoding="utf-8")
         del rows, of_track
         self._rows = None  # the report reads the folder
-        rest()
+        memory.rest()
         self._publish_with_report()
         return Session.open(self.path)
 
@@ -446,7 +436,7 @@ class SessionWriter:
                 "total": round(elapsed, 4),
             },
             "frames_per_s": round(self.n_frames / elapsed, 2),
-            "peak_memory_mb": peak_memory_mb(),
+            "peak_memory_mb": memory.peak_memory_mb(),
             "machine": {
                 "name": platform.node(),
                 "system": platform.platform(),
@@ -461,14 +451,14 @@ class SessionWriter:
         """
         put_back_held(self.path)
         check_writable(self.path, self._overwrite)
-        sync_tree(self._folder)  # can take long; until it is done the work can resume
+        durable.sync_tree(self._folder)  # can take long; until it is done the work can resume
         made = corrections_for(self.path)
         copy = self._folder / FOLDER
         shutil.rmtree(copy, ignore_errors=True)
         if made is not None:  # they apply again if the poses are the same
-            shutil.copytree(unlinked_tree(made), copy)
-            sync_tree(copy)
-        put_in_place(self._folder, self.path, aside_folder(self.path))
+            shutil.copytree(places.unlinked_tree(made), copy)
+            durable.sync_tree(copy)
+        durable.put_in_place(self._folder, self.path, aside_folder(self.path))
         self._done = True
         self._stop_logging()
         self._checkpoint.tidy(self.path)
@@ -489,10 +479,10 @@ def full_disk(folder: Path, error: BaseException | None) -> str | None:
     if error is None or isinstance(error, LiexError) or not isinstance(error, Exception):
         return None
     if isinstance(error, OSError) and error.errno is not None:
-        found = error if is_full(error) else None
+        found = error if places.is_full(error) else None
     else:
-        found = probe_full(folder)
-    return None if found is None else why_full(found, folder.parent)
+        found = places.probe_full(folder)
+    return None if found is None else places.why_full(found, folder.parent)
 
 
 def seen_rows(
@@ -561,7 +551,7 @@ def is_whole(folder: Path) -> bool:
     Args:
         folder: the shard's folder.
     """
-    sizes = loose_json(folder / _SIZES)
+    sizes = text_files.loose_json(folder / _SIZES)
     try:
         return all((folder / log).stat().st_size == sizes[log] for log in LOGS)
     except (OSError, KeyError):
@@ -596,15 +586,14 @@ def shard_writer(
     Yields:
         A function that writes the next frames and their observations, one row per frame.
     """
-    from liex_lab.sessions.mcap import McapWriter
-    from liex_lab.sessions.rrd import ReplayWriter
+    from liex_lab.sessions import mcap, rrd
 
     part = folder.with_name(f".{folder.name}.{os.getpid()}")
     shutil.rmtree(part, ignore_errors=True)
     (part / _SEEN).mkdir(parents=True)
     columns = Columns(part / _SEEN)
-    replay = ReplayWriter(part / LOGS[0], origin)
-    messages = McapWriter(part / LOGS[1], origin)
+    replay = rrd.ReplayWriter(part / LOGS[0], origin)
+    messages = mcap.McapWriter(part / LOGS[1], origin)
     keeper = DepthKeeper(origin)
     if first_ns is not None:
         replay.resume(first_ns)
@@ -627,11 +616,11 @@ def shard_writer(
             messages.abandon()
         for log, size in sizes.items():  # drop what closing added
             os.truncate(part / log, size)
-        write_whole(part / _SIZES, json.dumps(sizes))
+        durable.write_whole(part / _SIZES, json.dumps(sizes))
         if not is_whole(folder):  # else another worker was faster
             shutil.rmtree(folder, ignore_errors=True)
-            sync_tree(part)
+            durable.sync_tree(part)
             part.rename(folder)
-            sync_folder(folder.parent)
+            durable.sync_folder(folder.parent)
     finally:
         shutil.rmtree(part, ignore_errors=True)

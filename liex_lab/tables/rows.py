@@ -11,14 +11,16 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
+from scipy.special import erf
 
 from liex_lab.actions.ethogram import Ethogram, runs_of
 from liex_lab.geometry import so3
-from liex_lab.recordings.timestamps import frames_apart, rounded_step
+from liex_lab.recordings.timestamps import Gap, frames_apart, rounded_step
 from liex_lab.recordings.timestamps import median_step as recorded_step
 from liex_lab.runtime.memory import blocks
 from liex_lab.scene.outline import UNKNOWN, Arena
@@ -33,11 +35,6 @@ from liex_lab.tables.schema import (
     to_pandas,
 )
 from liex_lab.tracking.track import Flip, Track
-
-if TYPE_CHECKING:
-    import pandas as pd
-
-    from liex_lab.recordings.timestamps import Gap
 
 Array = NDArray[np.float64]
 
@@ -318,8 +315,6 @@ def nearness(sd: Array, radius: Array) -> Array:
     Returns:
         Probabilities; NaN where `sd` or `radius` is NaN.
     """
-    from scipy.special import erf
-
     r = radius / np.maximum(sd, 1e-9)
     return np.asarray(erf(r / np.sqrt(2.0)) - np.sqrt(2.0 / np.pi) * r * np.exp(-0.5 * r * r))
 

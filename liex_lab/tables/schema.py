@@ -15,23 +15,20 @@ from dataclasses import asdict, dataclass
 from functools import cache
 from itertools import chain, groupby
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
 import numpy as np
+import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from liex_lab.actions.ethogram import ACROSS_GAPS
 from liex_lab.actions.vocabulary import WORDS
 from liex_lab.errors import SessionError
 from liex_lab.runtime.memory import blocks
-
-if TYPE_CHECKING:
-    import pandas as pd
-    import pyarrow as pa
-
-    from liex_lab.scene.outline import Arena
-    from liex_lab.scene.zones import Zone
-
+from liex_lab.scene.outline import Arena
+from liex_lab.scene.zones import Zone
 
 ROWS_PER_GROUP = 100_000  # about 20 MB per block of the widest table
 _TEXTS = ("name", "dtype", "unit", "meaning", "formula", "source")
@@ -187,8 +184,6 @@ def arrow_schema(schema: Sequence[Column], metadata: Mapping[str, Any]) -> pa.Sc
     Returns:
         The schema, fields in the order of the columns.
     """
-    import pyarrow as pa
-
     kinds = {
         "string": pa.string(),
         "float64": pa.float64(),
@@ -217,9 +212,6 @@ def write_table(
     Raises:
         SessionError: a block's columns differ from those of the schema.
     """
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
     arrow = arrow_schema(schema, metadata)
     texts = [column.name for column in schema if column.dtype == "string"]
     n_rows = 0
@@ -265,8 +257,6 @@ def _is_array(value: Any) -> bool:
 
 def _arrow_column(value: Any, kind: pa.DataType, n: int) -> pa.Array:
     """One column: a scalar is repeated for all rows, `Words` are a dictionary encoding."""
-    import pyarrow as pa
-
     if isinstance(value, Words):
         codes = value.codes.astype(np.int32)
         return pa.DictionaryArray.from_arrays(codes, list(value.words)).cast(kind)
@@ -307,8 +297,6 @@ def to_pandas(schema: Sequence[Column], block: Block, copy: bool = True) -> pd.D
         block: column -> one value for all rows, an array, or `Words`.
         copy: False if the table may share the block's arrays.
     """
-    import pandas as pd
-
     n = max((len(v) for v in block.values() if _is_array(v)), default=1)
     data: dict[str, Any] = {}
     for column in schema:
@@ -445,8 +433,6 @@ def check_footer(path: Path, name: str, n_frames: int, n_joints: int) -> None:
     Raises:
         ValueError: they do not match a session with these numbers of frames and joints.
     """
-    import pyarrow.parquet as pq
-
     footer = pq.read_metadata(path)
     n_rows = footer.num_rows
     found = {
