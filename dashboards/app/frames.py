@@ -52,7 +52,7 @@ class Frames:
                     if known is not None:
                         known[1].close()
                     stack = ExitStack()
-                    known = (stamp, stack, stack.enter_context(cutouts.open_pictures(session)))
+                    known = (stamp, stack, stack.enter_context(cutouts.open_depth(session)))
                 self._open[key] = known
                 while len(self._open) > _HELD:
                     self._open.pop(next(iter(self._open)))[1].close()

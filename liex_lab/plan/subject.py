@@ -85,7 +85,7 @@ _REFERENCE = re.compile(
 
 
 @dataclass(frozen=True)
-class Subject:
+class SubjectName:
     """The animal of a recording.
 
     Attributes:
@@ -99,7 +99,7 @@ class Subject:
     session: str
 
 
-def find_subject(path: Path, stated: str = "", root: Path | None = None) -> Subject:
+def find_subject(path: Path, stated: str = "", root: Path | None = None) -> SubjectName:
     """Find the animal by metadata, a folder sub-NAME, another folder, or the recording's name.
 
     Args:
@@ -122,12 +122,12 @@ def find_subject(path: Path, stated: str = "", root: Path | None = None) -> Subj
     if chosen == len(above) and animal and cage not in animal:
         animal = f"{cage} {animal}"
     by_metadata = strength(stated) > 0
-    told = animal_part(stated) if by_metadata else animal
-    if not told:
-        return Subject(letters(re.sub(r"\W|_", "", "".join(names))), "", "")
+    name = animal_part(stated) if by_metadata else animal
+    if not name:
+        return SubjectName(letters(re.sub(r"\W|_", "", "".join(names))), "", "")
     origin = "file name" if chosen == len(above) else "folder"
-    session = _session(names, f"{same(told)} {same(letters(animal))}")
-    return Subject(letters(told), "metadata" if by_metadata else origin, session)
+    session = _session(names, f"{same(name)} {same(letters(animal))}")
+    return SubjectName(letters(name), "metadata" if by_metadata else origin, session)
 
 
 def _session(names: Sequence[str], animal: str) -> str:

@@ -29,7 +29,7 @@ from liex_lab.sessions.corrections import (
     FlipSpan,
     JointMove,
 )
-from liex_lab.sessions.cutouts import Kept, open_pictures
+from liex_lab.sessions.cutouts import Kept, open_depth
 from liex_lab.sessions.session import Session
 from liex_lab.tables.rows import frame_count, stop_times
 
@@ -268,7 +268,7 @@ def joint_move_at_pixel(
             f"{camera.height}, the top-left one (0, 0); got ({u_px:g}, {v_px:g})"
         )
     kept = Kept(session)
-    with open_pictures(session) as recording:
+    with open_depth(session) as recording:
         skin_mm = _skin_under(session, recording, kept, row, u_px, v_px)
         inset_mm = 0.0 if math.isnan(skin_mm) else _inset_mm(session, recording, kept, joint)
     eye = session.T_arena_camera.translation
@@ -332,18 +332,13 @@ def _inset_mm(session: Session, recording: Recording, kept: Kept, joint: str) ->
     usable = np.flatnonzero(
         (frames["flag"].to_numpy() == "") & np.isfinite(poses["u_px"].to_numpy(float))
     )
-    chosen = (
-        usable[np.unique(np.linspace(0, len(usable) - 1, _INSET_FRAMES).astype(int))]
-        if len(usable)
-        else usable
-    )
-    uv, places = (
-        poses[names].to_numpy(float) for names in (["u_px", "v_px"], ["x_mm", "y_mm", "z_mm"])
-    )
+    sample = np.linspace(0, len(usable) - 1, _INSET_FRAMES if len(usable) else 0).astype(int)
+    uv = poses[["u_px", "v_px"]].to_numpy(float)
+    places = poses[["x_mm", "y_mm", "z_mm"]].to_numpy(float)
     into = session.T_arena_camera.inverse()
     found = [
         (into @ places[row])[2] - depth_under(recording.frame(row).depth, *uv[row])
-        for row in chosen.tolist()
+        for row in np.unique(usable[sample]).tolist()
         if kept.holds(row, *uv[row])  # else it shows the still scene
     ]
     known = np.array(found)[np.isfinite(found)]
@@ -365,13 +360,12 @@ def bout_at(session: Session, at_s: float) -> dict[str, Any]:
     if len(inside) == 0:
         starts, stops = (bouts[name].to_numpy(float) for name in ("start_s", "stop_s"))
         distance = np.maximum(starts - at_s, at_s - stops)
-        near = bouts.iloc[np.sort(np.argsort(distance)[:2])]
-        told = " and ".join(
-            f"{b.action} from {b.start_s:.3f} to {b.stop_s:.3f} s" for b in near.itertuples()
+        near = " and ".join(
+            f"{b.action} from {b.start_s:.3f} to {b.stop_s:.3f} s"
+            for b in bouts.iloc[np.sort(np.argsort(distance)[:2])].itertuples()
         )
-        raise SessionError(
-            f"no bout holds {at_s:g} s; {f'the nearest are {told}' if told else 'there are none'}"
-        )
+        others = f"the nearest are {near}" if near else "there are none"
+        raise SessionError(f"no bout holds {at_s:g} s; {others}")
     return {str(k): v for k, v in inside.iloc[0].items()}
 
 
@@ -597,8 +591,8 @@ def descriptions(facts: Mapping[str, str]) -> list[Correction]:
                 f"a session is not described by {key!r}"
                 + (f"; did you mean {near[0]}?" if near else f"; say {', '.join(DESCRIBED)}")
             )
-    said = {key: value for key, value in facts.items() if value}
-    checked = Plan.from_table({"session": said}).session.model_dump()
+    stated = {key: value for key, value in facts.items() if value}
+    checked = Plan.from_table({"session": stated}).session.model_dump()
     return [
         Description(key, str(checked[key] or "") if value else "") for key, value in facts.items()
     ]

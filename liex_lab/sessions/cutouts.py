@@ -287,10 +287,10 @@ def composed(depth: NDArray[np.float32], boxes: Boxes, background: Depth) -> Dep
     Returns:
         (H, W) uint16 mm, a new array.
     """
-    picture = background.copy()
+    image = background.copy()
     for left, top, right, bottom in boxes.tolist():
-        picture[top:bottom, left:right] = to_millimetres(depth[top:bottom, left:right])
-    return picture
+        image[top:bottom, left:right] = to_millimetres(depth[top:bottom, left:right])
+    return image
 
 
 def meant_to_keep_depth(session: Session) -> bool:
@@ -303,7 +303,7 @@ def meant_to_keep_depth(session: Session) -> bool:
     return plan.get("replay", {}).get("depth", ALL) not in (NONE, False)
 
 
-def open_pictures(session: Session) -> Recording:
+def open_depth(session: Session) -> Recording:
     """The depth images that a session keeps, as a recording.
 
     Outside of its boxes an image shows the still scene, see `Kept`.
@@ -324,7 +324,7 @@ def open_pictures(session: Session) -> Recording:
         if meant_to_keep_depth(session):
             raise
     raise SessionError(
-        f'{session.path} keeps no depth pictures, for its plan says replay.depth = "none"; run '
+        f'{session.path} keeps no depth images, for its plan states replay.depth = "none"; run '
         "`liex run` on the recording again with --set replay.depth=animal (in Python "
         "plan.with_settings(['replay.depth=animal']))"
     )
@@ -399,9 +399,9 @@ def needed_bytes(
     a_pixel = packed / max(whole, 1)
     a_frame = _A_FRAME + _A_JOINT * n_joints
     if kept != NONE:
-        a_picture = whole / max(len(images), 1)
-        around = min((_CUTOUT_SIDE * length_px + _CUTOUT_PX) ** 2, a_picture)
-        kept_px = around if kept == ANIMAL else a_picture
+        an_image = whole / max(len(images), 1)
+        around = min((_CUTOUT_SIDE * length_px + _CUTOUT_PX) ** 2, an_image)
+        kept_px = around if kept == ANIMAL else an_image
         a_frame += int(_COPIES * (a_pixel * kept_px + (0 if kept == ALL else _A_CUTOUT)))
     thumbnails = _THUMBNAILS * (_THUMBNAIL_SIDE * length_px) ** 2 * a_pixel
     return _ONCE + int(thumbnails) + n_frames * a_frame

@@ -189,7 +189,7 @@ class ReplayWriter:
         self._index = rows.frame_index
         self._elapsed = track.times_ns - track.times_ns[:1]
         curves = self._log_curves(rows, kinematics)
-        carriers = self._log_looks(track, 0 if candidates is None else candidates.known.shape[1])
+        carriers = self._log_styles(track, 0 if candidates is None else candidates.known.shape[1])
         for part in memory.blocks(track.n_frames, _BLOCK):
             self._send_root(track, part)
             for entity, columns in chain(
@@ -338,7 +338,7 @@ class ReplayWriter:
             self._stream.log(entity, look, static=True)
         return {entity: values for entity, _, _, values in drawn}
 
-    def _log_looks(self, track: Track, n_candidates: int) -> list[int]:
+    def _log_styles(self, track: Track, n_candidates: int) -> list[int]:
         """Log the style of all moving entities; returns the joints that carry part of the body."""
         skeleton = track.skeleton
         names = [rr.AnnotationInfo(id=j, label=name) for j, name in enumerate(skeleton.names)]
@@ -348,7 +348,7 @@ class ReplayWriter:
         pt = dot_pt(skeleton)
         dot: dict[str, Any] = {"colors": JOINT_COLOUR, "show_labels": False}
         thick, thin = rr.Radius.ui_points(pt), rr.Radius.ui_points(pt / 3.0)
-        looks: dict[str, rr.AsComponents] = {
+        styles: dict[str, rr.AsComponents] = {
             SKELETON: rr.AnnotationContext([kind]),
             f"{SKELETON}/joints": rr.Points3D.from_fields(radii=dot_m, **dot),
             f"{SKELETON}/bones": rr.LineStrips3D.from_fields(radii=dot_m / 2.0, colors=BONE_COLOUR),
@@ -360,11 +360,11 @@ class ReplayWriter:
             ),
         }
         if track.posed.any():
-            looks[ROOT] = rr.TransformAxes3D(0.02)
+            styles[ROOT] = rr.TransformAxes3D(0.02)
         for h, colour in zip(range(n_candidates), cycle(PALETTE), strict=False):
             look = rr.LineStrips3D.from_fields(radii=0.0008, colors=rgba([colour]))
-            looks[f"{CANDIDATES}/{h + 1}"] = look
-        for entity, archetype in looks.items():
+            styles[f"{CANDIDATES}/{h + 1}"] = look
+        for entity, archetype in styles.items():
             self._stream.log(entity, archetype, static=True)
         animal = self._origin.animal_size
         return log_body(self._stream, skeleton, animal) if skeleton.surface else []

@@ -386,8 +386,8 @@ def log_surroundings(stream: Any, scene: Scene) -> None:
     if scene.fixtures:
         tops = np.array([[*one.centre_mm, one.height_mm] for one in scene.fixtures])
         labels = [f"fixture, {one}" for one in scene.fixtures]
-        things = rr.Points3D(tops / MM_PER_UNIT, radii=0.003, colors=[_GREY], labels=labels)
-        stream.log(f"{FLOOR}/fixtures", things, static=True)
+        points = rr.Points3D(tops / MM_PER_UNIT, radii=0.003, colors=[_GREY], labels=labels)
+        stream.log(f"{FLOOR}/fixtures", points, static=True)
 
 
 def log_hidden_places(stream: Any, rows: Rows) -> None:

@@ -16,6 +16,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
+import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
@@ -323,8 +325,7 @@ class Session:
         Args:
             name: the table's name, such as 'poses'.
             columns: only these columns; None for all.
-            frame_index: only the rows of these frames, by number, with at most one row group of the
-                file in memory at a time. None for all rows.
+            frame_index: only the rows of these frames, by number; None for all rows.
 
         Raises:
             SessionError: there is no such table, or it is damaged.
@@ -334,10 +335,10 @@ class Session:
             known = ", ".join(sorted(p.stem for p in self.path.glob("*.parquet")))
             raise SessionError(f"the session {self.path} has no table '{name}'; it holds {known}")
         with reading_from(path):
-            if frame_index is None:
-                found = pd.read_parquet(path, columns=columns)
-            else:
-                found = _rows_of(path, columns, frame_index)
+            chosen = None
+            if frame_index is not None:
+                chosen = pc.field("frame_index").isin(pa.array(frame_index, pa.int64()))
+            found = pd.read_parquet(path, columns=columns, filters=chosen)
             check_rows(name, found, self.metadata["animal"]["joints"])
             if name == "frames" and columns is None and PULSE.name not in found:  # before schema 8
                 before = pd.read_parquet(path, columns=["frame_index", "gap_before"])
@@ -408,20 +409,6 @@ class Session:
         `session.pose_arrays().xyz_mm[10]` are the joints (J, 3) of row 10 of the recording, mm.
         """
         return Poses.of(self.metadata, self.table("poses"), self.table("frames"))
-
-
-def _rows_of(path: Path, columns: list[str] | None, frame_index: list[int]) -> pd.DataFrame:
-    """The rows of some frames of a long table, with at most one row group in memory."""
-    with pq.ParquetFile(path, pre_buffer=False) as file:
-        wanted = None if columns is None else [*dict.fromkeys([*columns, "frame_index"])]
-        groups = (
-            file.read_row_group(k, wanted, use_threads=False).to_pandas()
-            for k in range(file.num_row_groups)
-        )
-        found = [group[group["frame_index"].isin(frame_index)] for group in groups]
-    memory.rest()
-    rows = pd.concat(found, ignore_index=True)
-    return rows if columns is None else rows[columns]
 
 
 def video_path(folder: Path, name: str, what: str = "") -> Path:

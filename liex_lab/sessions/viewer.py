@@ -268,8 +268,8 @@ class LiveView:
             if not self._range:
                 self._range = colour_range(depth, self._floor_mm)
             look: dict[str, Any] = {"colormap": "viridis", "point_fill_ratio": 0.25}
-            picture = rr.DepthImage(depth, meter=MM_PER_UNIT, depth_range=self._range, **look)
-            self._stream.log(DEPTH, picture)
+            image = rr.DepthImage(depth, meter=MM_PER_UNIT, depth_range=self._range, **look)
+            self._stream.log(DEPTH, image)
 
     def close(self) -> None:
         """Send buffered data, and end the stream."""

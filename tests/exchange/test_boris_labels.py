@@ -49,29 +49,20 @@ def test_the_time_offset_of_an_observation_is_taken_off(tmp_path: Path) -> None:
     assert (row.action, row.start_s, row.stop_s) == ("dig", 1.0, 2.5)
 
 
-@pytest.mark.parametrize(
-    ("events", "complaint"),
-    [
+def test_damaged_projects_are_refused_in_a_sentence(tmp_path: Path) -> None:
+    path = tmp_path / "a.boris"
+    for events, complaint in (
         ([[1.0, "m", "dig", "", ""]], "starts at 1 s and never stops"),
         ([["x", "m", "dig", "", ""]], "cannot be read"),
         ([[1.0, "m"]], "cannot be read"),
-    ],
-)
-def test_events_that_make_no_bouts_are_one_sentence(
-    events: list, complaint: str, tmp_path: Path
-) -> None:
-    path = tmp_path / "a.boris"
-    path.write_text(json.dumps({"observations": {"o": {"events": events}}}))
-    with pytest.raises(LiexError, match=complaint):
-        boris_labels(path)
-
-
-@pytest.mark.parametrize("content", [b"", b"[]", b"{}", b"\x1f\x8bnot gzip", b"\xff\xfe"])
-def test_what_is_no_project_is_one_sentence(content: bytes, tmp_path: Path) -> None:
-    path = tmp_path / "a.boris"
-    path.write_bytes(content)
-    with pytest.raises(LiexError, match="should be a BORIS project"):
-        boris_labels(path)
+    ):
+        path.write_text(json.dumps({"observations": {"o": {"events": events}}}))
+        with pytest.raises(LiexError, match=complaint):
+            boris_labels(path)
+    for content in (b"", b"[]", b"{}", b"\x1f\x8bnot gzip", b"\xff\xfe"):
+        path.write_bytes(content)
+        with pytest.raises(LiexError, match="should be a BORIS project"):
+            boris_labels(path)
 
 
 def test_an_export_of_aggregated_events_gives_its_states(tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ import shutil
 import subprocess
 import sys
 from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
 
 import h5py
@@ -77,10 +78,10 @@ def test_every_table_is_a_sheet_of_the_workbook_and_texts_are_no_formulas(sessio
 def test_a_table_that_does_not_fit_into_a_workbook_is_refused(session, tmp_path, monkeypatch):
     room = shutil.disk_usage(tmp_path)._replace(free=100_000)
     with monkeypatch.context() as patch:
-        patch.setattr("liex_lab.exchange.export.shutil.disk_usage", lambda _: room)
+        patch.setattr(shutil, "disk_usage", lambda _: room)
         with pytest.raises(SessionError, match=r"need \d MB in .*, which has 0 MB left; .*TMPDIR"):
             export(session, "xlsx", tmp_path)
-    monkeypatch.setattr("liex_lab.exchange.export.MAX_ROWS", 100)
+    monkeypatch.setattr(import_module("liex_lab.exchange.export"), "MAX_ROWS", 100)
     with pytest.raises(SessionError, match=r"at most 100 rows .* export it as csv"):
         export(session, "xlsx", tmp_path)
     assert not list(tmp_path.iterdir())

@@ -115,7 +115,7 @@ def test_random_files_come_out_with_one_value_changed() -> None:
         "true",
     ]
     done = 0
-    for _ in range(400):
+    for _ in range(120):
         lines = [f"k{k} = {rng.choice(values)}  # {k}" for k in range(rng.randrange(3))]
         for k in range(rng.randrange(4)):
             lines += [rng.choice([f"[t{k}]", "[[many]]", f"[a.'b c'.t{k}]", f"[set.u{k}]"])]
@@ -137,7 +137,7 @@ def test_random_files_come_out_with_one_value_changed() -> None:
         inner.pop(path[-1])
         for name in {*before, *after} - {path[0]}:
             assert before[name] == after[name]
-    assert done > 200
+    assert done > 60
 
 
 def test_what_cannot_be_changed_is_a_sentence() -> None:

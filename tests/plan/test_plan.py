@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from liex_lab.errors import PlanError
@@ -37,6 +37,7 @@ def plans(draw: st.DrawFn) -> Plan:
     return Plan.from_table(table)
 
 
+@settings(max_examples=20)
 @given(plan=plans())
 def test_a_plan_survives_its_own_file(plan: Plan) -> None:
     text = plan.to_toml()
@@ -63,9 +64,9 @@ def test_every_setting_says_what_it_means() -> None:
 
 
 def test_settings_are_put_in_as_their_own_type() -> None:
-    settings = ["animal.spine_mm=65", "recording.accept_truncated=true", "session.subject_id=0123"]
-    settings += ["session.group = control A", "recording.topic=/depth", "seed=7"]
-    plan = Plan.load("mouse").with_settings(settings)
+    chosen = ["animal.spine_mm=65", "recording.accept_truncated=true", "session.subject_id=0123"]
+    chosen += ["session.group = control A", "recording.topic=/depth", "seed=7"]
+    plan = Plan.load("mouse").with_settings(chosen)
     assert plan.animal.spine_mm == 65.0
     assert plan.recording.accept_truncated is True
     assert plan.session.subject_id == "0123"
@@ -73,12 +74,9 @@ def test_settings_are_put_in_as_their_own_type() -> None:
     assert plan.recording.topic == "/depth"
     assert plan.seed == 7
     assert plan.with_settings(["animal.spine_mm="]).animal.spine_mm is None
+    both = ["animal.spine_min_mm=200", "animal.spine_max_mm=300"]
+    assert plan.with_settings(both).animal.spine_min_mm == 200.0, "checked together"
     assert Plan.load("mouse").animal.spine_mm is None, "a plan never changes"
-
-
-def test_settings_that_belong_together_are_checked_together() -> None:
-    plan = Plan().with_settings(["animal.spine_min_mm=200", "animal.spine_max_mm=300"])
-    assert (plan.animal.spine_min_mm, plan.animal.spine_max_mm) == (200.0, 300.0)
 
 
 @pytest.mark.parametrize(
@@ -109,20 +107,18 @@ def test_a_wrong_setting_is_told_in_one_sentence(setting: str, says: str) -> Non
     assert "\n" not in str(caught.value)
 
 
-def test_a_wrong_key_in_a_file_names_the_file(tmp_path: Path) -> None:
+def test_a_mistake_in_a_file_names_the_file_and_a_wrong_name_the_known_plans(
+    tmp_path: Path,
+) -> None:
     path = tmp_path / "my.toml"
     path.write_text("[estimation]\nmodle = 'mouse'\n")
-    with pytest.raises(
-        PlanError, match=r"my\.toml: estimation\.modle is not .* nearest one is estimation\.model"
+    for plan, says in (
+        (path, r"my\.toml: estimation\.modle is not .* nearest one is estimation\.model"),
+        ("moose", "did you mean 'mouse'"),
+        (tmp_path / "nothing.toml", r"bundled are: .*mouse"),
     ):
-        Plan.load(path)
-
-
-def test_a_wrong_name_lists_the_known_plans(tmp_path: Path) -> None:
-    with pytest.raises(PlanError, match="did you mean 'mouse'"):
-        Plan.load("moose")
-    with pytest.raises(PlanError, match=r"bundled are: .*mouse"):
-        Plan.load(tmp_path / "nothing.toml")
+        with pytest.raises(PlanError, match=says):
+            Plan.load(plan)
 
 
 @pytest.mark.parametrize("content", [b"[animal\n", b"\xff\xfe\x00", b"\x89PNG\r\n"])
@@ -135,12 +131,7 @@ def test_a_file_that_is_no_toml_is_told_in_a_sentence(tmp_path: Path, content: b
 
 def test_a_missing_line_has_its_default() -> None:
     assert Plan.from_toml("[animal]\nspine_mm = 65") == Plan().with_settings(["animal.spine_mm=65"])
-
-
-def test_the_file_is_plain_toml() -> None:
-    table = tomllib.loads(Plan().to_toml())
-    assert table["foreground"]["min_height_mm"] == 7.0
-    assert "spine_mm" not in table["animal"]
+    assert "spine_mm" not in tomllib.loads(Plan().to_toml())["animal"]
 
 
 def test_the_behaviour_section_holds_the_rules_of_the_mouse() -> None:

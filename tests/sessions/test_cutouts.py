@@ -30,7 +30,7 @@ from liex_lab.sessions.cutouts import (
     Kept,
     boxes_around,
     composed,
-    open_pictures,
+    open_depth,
     window_around,
     windows,
 )
@@ -116,7 +116,7 @@ def test_a_kept_picture_is_as_read_in_its_box_and_the_still_scene_elsewhere(
     kept = Kept(session)
     assert kept.boxes is not None
     n_unread = 0
-    with open_pictures(session) as pictures:
+    with open_depth(session) as pictures:
         assert pictures.times_ns.tolist() == MOUSE.times_ns.tolist()
         for row in range(len(MOUSE.times_s)):
             read = to_millimetres(MOUSE.frame(row).depth)
@@ -142,7 +142,7 @@ def test_pictures_are_opened_by_the_index_and_unpacked_when_they_are_wanted(
         return unpack(file, number)
 
     monkeypatch.setattr(McapFile, "unpack", counting)
-    with open_pictures(session) as pictures:
+    with open_depth(session) as pictures:
         assert set(unpacked) <= {0}, "what the first messages say lies in the first chunk"
         assert len(pictures) == len(MOUSE.times_s)
     with open_recording(session.path / "session.mcap") as walked:
@@ -153,7 +153,7 @@ def test_pictures_are_opened_by_the_index_and_unpacked_when_they_are_wanted(
 def test_of_a_damaged_replay_no_picture_is_taken_for_another_one(tmp_path: Path) -> None:
     whole = written(tmp_path / "whole.liex", "all")
     path = whole.path / "session.mcap"
-    with open_pictures(whole) as pictures:
+    with open_depth(whole) as pictures:
         before = [pictures.frame(row).depth for row in range(len(pictures))]
     with path.open("rb") as file:
         summary = make_reader(file).get_summary()
@@ -164,7 +164,7 @@ def test_of_a_damaged_replay_no_picture_is_taken_for_another_one(tmp_path: Path)
         content[at] ^= 0xFF
     path.write_bytes(content)
     n_refused = 0
-    with open_pictures(Session.open(whole.path)) as pictures:
+    with open_depth(Session.open(whole.path)) as pictures:
         assert len(pictures) == len(before)
         for row, depth in enumerate(before):
             if bad.message_start_time <= pictures.times_ns[row] <= bad.message_end_time:
@@ -302,9 +302,9 @@ def test_the_region_of_an_arena_is_kept_in_every_frame(tmp_path: Path) -> None:
 
 def test_without_depth_neither_replay_holds_any_and_it_is_said_why(tmp_path: Path) -> None:
     session = written(tmp_path / "none.liex", "none")
-    with pytest.raises(SessionError, match="keeps no depth pictures, for its plan says replay"):
-        open_pictures(session)
-    with pytest.raises(SessionError, match="keeps no depth pictures"):
+    with pytest.raises(SessionError, match="keeps no depth images, for its plan states replay"):
+        open_depth(session)
+    with pytest.raises(SessionError, match="keeps no depth images"):
         correcting.joint_move_at_pixel(session, 3, "neck", 40.0, 30.0)
 
 

@@ -249,12 +249,12 @@ def test_tables_of_other_widths_kinds_and_rows_are_refused(foreign: Path) -> Non
 
 
 def test_a_table_that_claims_more_rows_than_its_file_can_hold_is_not_read(foreign: Path) -> None:
-    n = 50_000_000
+    n = 1_000_000
     path = foreign / "gaps.parquet"
     schema = pq.read_schema(path)
     columns = [pa.nulls(n, field.type) for field in schema]
     pq.write_table(pa.Table.from_arrays(columns, schema=schema.remove_metadata()), path)
-    assert path.stat().st_size < 1_000_000
+    assert path.stat().st_size < 100_000
     refused(foreign, "gaps.parquet")
 
 

@@ -70,23 +70,16 @@ def test_depth_comes_back_exactly_at_the_recording_s_times(messages):
         np.testing.assert_array_equal(pixels, MOUSE.frame(row).depth)
 
 
-def test_the_calibration_is_repeated_about_once_a_second(messages):
-    calibrations = messages["/camera/calibration"]
-    assert len(calibrations) == 3
-    assert list(calibrations[0][1].K) == MOUSE.camera.matrix.ravel().tolist()
-    assert (calibrations[0][1].width, calibrations[0][1].height) == (
-        MOUSE.camera.width,
-        MOUSE.camera.height,
-    )
-
-
 def test_transforms_place_the_camera_and_the_animal_in_the_arena_in_metres(messages):
     placed = defaultdict(list)
     for _, message in messages["/tf"]:
         for transform in message.transforms:
             assert transform.parent_frame_id == "arena"
             placed[transform.child_frame_id].append(transform)
-    assert len(placed["camera"]) == 3
+    calibrations = messages["/camera/calibration"]
+    assert len(placed["camera"]) == len(calibrations) == 3, "about once a second"
+    assert list(calibrations[0][1].K) == MOUSE.camera.matrix.ravel().tolist()
+    assert calibrations[0][1].width == MOUSE.camera.width
     assert len(placed["root"]) == 74
     assert placed["camera"][0].translation.z == pytest.approx(0.7)
     track, q = MOUSE.track(), placed["root"][10].rotation
@@ -132,11 +125,8 @@ def test_the_predicted_error_is_that_of_the_table(messages, session):
     assert errors == frames["predicted_error_mm"].tolist()
 
 
-def test_what_is_odd_about_the_recording_is_in_the_log(messages):
+def test_the_file_is_whole_and_its_chunks_are_small(session, messages):
     assert [note.message for _, note in messages["/log"]] == ["It was dark."]
-
-
-def test_the_file_is_whole_and_its_chunks_are_small(session):
     data = (session.path / "session.mcap").read_bytes()
     assert data.endswith(b"\x89MCAP0\r\n")
     with (session.path / "session.mcap").open("rb") as file:

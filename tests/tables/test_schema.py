@@ -67,12 +67,6 @@ def test_a_unit_in_a_name_is_the_unit_of_the_entry():
                 break
 
 
-def test_the_dictionary_says_that_joints_lie_on_the_mid_axis(session):
-    meanings = session.columns.set_index(["table", "name"])["meaning"]
-    assert "mid-axis" in meanings["poses", "x_mm"]
-    assert "mid-axis" in meanings["poses", "z_mm"]
-
-
 def test_a_column_without_an_entry_is_refused(tmp_path):
     schema = [Column("notes", "text", "string", "", "what was noted")]
     with pytest.raises(SessionError, match=r"without a description \['extra'\]"):
@@ -124,18 +118,6 @@ def test_parquet_files_are_zstd_and_describe_themselves(session):
         assert set(about["columns"]) == set(file.schema_arrow.names)
         if file.metadata.num_row_groups:
             assert file.metadata.row_group(0).column(0).compression == "ZSTD"
-
-
-def test_a_long_table_is_written_in_several_row_groups(tmp_path, monkeypatch):
-    from liex_lab.tables import rows
-    from liex_lab.tables import schema as tables
-
-    monkeypatch.setattr(tables, "ROWS_PER_GROUP", 100)
-    monkeypatch.setattr(rows, "ROWS_PER_GROUP", 100)
-    session = write(tmp_path / "long.liex", WalkingMouse(steady(2.0)))
-    assert pq.ParquetFile(session.path / "poses.parquet").num_row_groups == 3
-    assert len(session.poses) == 300
-    assert session.poses["frame_index"].is_monotonic_increasing
 
 
 def test_tables_without_rows_keep_their_columns(session):
