@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import struct
 from dataclasses import replace
 from pathlib import Path
@@ -84,6 +85,11 @@ def written(folder: Path, depth: str, **own: Any) -> Session:
 
 
 @pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Session:
+    return written(tmp_path_factory.mktemp("whole") / "whole.liex", "all")
+
+
+@pytest.fixture(scope="module")
 def session(tmp_path_factory: pytest.TempPathFactory) -> Session:
     return written(tmp_path_factory.mktemp("cut") / "circle.liex", "animal")
 
@@ -102,12 +108,8 @@ def test_a_box_holds_the_joints_and_the_animals_pixels_and_lies_in_the_picture()
         assert right > uv[row, :, 0].max() + 4 or right == MOUSE.camera.width
         assert not boxes[row, 1].any(), "there is one thing only"
     assert (boxes[:, 0, 2] - boxes[:, 0, 0]).max() < MOUSE.camera.width / 2
-
-
-def test_boxes_do_not_depend_on_how_frames_come_together() -> None:
-    whole = boxes_around(SEEN, MOUSE.provenance())
     parts = [boxes_around(SEEN[k : k + 7], MOUSE.provenance()) for k in range(0, len(SEEN), 7)]
-    np.testing.assert_array_equal(np.concatenate(parts), whole)
+    np.testing.assert_array_equal(np.concatenate(parts), boxes)
 
 
 def test_a_kept_picture_is_as_read_in_its_box_and_the_still_scene_elsewhere(
@@ -150,11 +152,13 @@ def test_pictures_are_opened_by_the_index_and_unpacked_when_they_are_wanted(
         assert pictures.camera == walked.camera
 
 
-def test_of_a_damaged_replay_no_picture_is_taken_for_another_one(tmp_path: Path) -> None:
-    whole = written(tmp_path / "whole.liex", "all")
-    path = whole.path / "session.mcap"
-    with open_depth(whole) as pictures:
-        before = [pictures.frame(row).depth for row in range(len(pictures))]
+def test_of_a_damaged_replay_no_image_is_taken_for_another_one(
+    whole: Session, tmp_path: Path
+) -> None:
+    damaged = Session.open(shutil.copytree(whole.path, tmp_path / "damaged.liex"))
+    path = damaged.path / "session.mcap"
+    with open_depth(whole) as images:
+        before = [images.frame(row).depth for row in range(len(images))]
     with path.open("rb") as file:
         summary = make_reader(file).get_summary()
     assert summary is not None
@@ -164,7 +168,7 @@ def test_of_a_damaged_replay_no_picture_is_taken_for_another_one(tmp_path: Path)
         content[at] ^= 0xFF
     path.write_bytes(content)
     n_refused = 0
-    with open_depth(Session.open(whole.path)) as pictures:
+    with open_depth(damaged) as pictures:
         assert len(pictures) == len(before)
         for row, depth in enumerate(before):
             if bad.message_start_time <= pictures.times_ns[row] <= bad.message_end_time:
@@ -283,19 +287,14 @@ def test_of_every_cut_out_one_window_is_shown_at_a_time_also_where_a_run_went_on
         }
 
 
-def test_a_session_with_cut_outs_is_a_fraction_of_one_with_whole_pictures(
-    session: Session, tmp_path: Path
+def test_a_session_with_cut_outs_is_a_fraction_of_one_with_whole_images(
+    session: Session, whole: Session, tmp_path: Path
 ) -> None:
-    whole = written(tmp_path / "whole.liex", "all")
     assert Kept(whole).boxes is None
     assert not (whole.path / FILE).exists()
     for name in ("session.mcap", "session.rrd"):
         assert (session.path / name).stat().st_size < 0.75 * (whole.path / name).stat().st_size
-
-
-def test_the_region_of_an_arena_is_kept_in_every_frame(tmp_path: Path) -> None:
-    session = written(tmp_path / "arena.liex", "arena")
-    boxes = Kept(session).boxes
+    boxes = Kept(written(tmp_path / "arena.liex", "arena")).boxes
     assert boxes is not None
     assert (boxes[:, 0] == [0, 0, MOUSE.camera.width, MOUSE.camera.height]).all()
 
@@ -321,10 +320,7 @@ def test_a_joint_cannot_be_put_where_the_still_scene_is_shown(session: Session) 
 
 
 def test_damaged_boxes_are_told_in_a_sentence(session: Session, tmp_path: Path) -> None:
-    import shutil
-
-    copy = tmp_path / "copy.liex"
-    shutil.copytree(session.path, copy)
+    copy = Path(shutil.copytree(session.path, tmp_path / "copy.liex"))
     for content in (b"nothing", b""):
         (copy / FILE).write_bytes(content)
         with pytest.raises(SessionError, match=r"cutouts\.npz is damaged and cannot be read"):
@@ -334,13 +330,12 @@ def test_damaged_boxes_are_told_in_a_sentence(session: Session, tmp_path: Path) 
         Kept(Session.open(copy))
 
 
-def test_nobody_looked_so_everything_is_kept() -> None:
+def test_without_observations_whole_images_are_kept() -> None:
     keeper = DepthKeeper(MOUSE.provenance(replay_depth="animal", background=BACKGROUND))
     depth = MOUSE.frame(0).depth
-    boxes = keeper.boxes(None)
-    assert boxes is None
-    kept = keeper.keep([depth], boxes)
-    np.testing.assert_array_equal(kept[0], to_millimetres(depth))
+    np.testing.assert_array_equal(
+        keeper.keep([depth], keeper.boxes(None))[0], to_millimetres(depth)
+    )
 
 
 def test_a_session_says_where_its_recording_is_also_when_both_were_moved(

@@ -79,6 +79,20 @@ def test_the_expected_entities_are_there_on_both_timelines(session):
         assert columns.get("frame"), entity
         assert len(columns["frame"]) == len(columns["time"]), entity
     assert columns_of(session, "log")["TextLog:text"] == [["It was dark."]]
+    worst = columns_of(session, "log/worst")["frame"]
+    error = session.frames.set_index("frame_index")["predicted_error_mm"]
+    assert len(worst) == 12
+    assert error.loc[worst].min() >= error.drop(worst).max()
+
+
+def test_joints_are_metres_and_pixels_from_the_corner_and_vanish_with_the_animal(session):
+    columns = columns_of(session, f"{replay.SKELETON}/joints")
+    positions = [row for row in columns["Points3D:positions"] if row is not None]
+    track = MOUSE.track()
+    np.testing.assert_allclose(positions[0], track.joints_mm[0] / 1000.0, atol=1e-6)
+    assert [len(row) for row in positions] == [5 if found else 0 for found in track.observed]
+    pixels = columns_of(session, f"{replay.OVERLAY}/joints")["Points2D:positions"]
+    np.testing.assert_allclose(pixels[0], track.uv_px[0] + 0.5, atol=1e-4)
 
 
 def test_ellipsoids_hold_the_joints_with_95_per_cent(session):
@@ -112,13 +126,6 @@ def test_walls_and_zones_are_drawn_on_the_floor_and_in_the_picture(tmp_path, str
     np.testing.assert_allclose(
         seen[0], [camera.cx + 0.5, camera.cy + 0.5], atol=1e-3
     )  # the foot of the camera
-
-
-def test_the_worst_frames_can_be_jumped_to(session):
-    columns = columns_of(session, "log/worst")
-    error = session.frames.set_index("frame_index")["predicted_error_mm"]
-    assert len(columns["frame"]) == 12
-    assert error.loc[columns["frame"]].min() >= error.drop(columns["frame"]).max()
 
 
 def unpacked(blob, kind):
@@ -276,19 +283,6 @@ def test_every_candidate_is_there_when_it_is_asked_for(tmp_path, strict):
         assert [len(row) for row in strips[:2]] == [4 * shown] * 2
     first = columns_of(session, f"{replay.CANDIDATES}/3")["LineStrips3D:strips"][0][0][0]
     np.testing.assert_allclose(first, (track.joints_mm[0, 0] + 20.0) / 1000.0, atol=1e-5)
-
-
-def test_joints_are_metres_in_the_arena_and_vanish_with_the_animal(session):
-    columns = columns_of(session, f"{replay.SKELETON}/joints")
-    positions = [row for row in columns["Points3D:positions"] if row is not None]
-    track = MOUSE.track()
-    np.testing.assert_allclose(positions[0], track.joints_mm[0] / 1000.0, atol=1e-6)
-    assert [len(row) for row in positions] == [5 if seen else 0 for seen in track.observed]
-
-
-def test_the_overlay_counts_from_the_corner_of_the_picture(session):
-    positions = columns_of(session, f"{replay.OVERLAY}/joints")["Points2D:positions"]
-    np.testing.assert_allclose(positions[0], MOUSE.track().uv_px[0] + 0.5, atol=1e-4)
 
 
 def test_the_action_lane_changes_where_the_bouts_do_and_ends_empty(session):
