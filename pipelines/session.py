@@ -270,7 +270,7 @@ class Prepared:
         began = time.perf_counter()
         seen = self.fitted.tracker.observe(frames)
         self.timings["track"] += time.perf_counter() - began
-        writer.add(frames, seen=seen)
+        writer.add(frames, observations=seen)
 
     def measure_all(
         self, stretches: Iterable[list[DepthFrame]], writer: SessionWriter, progress: Progress
@@ -280,7 +280,7 @@ class Prepared:
             began = time.perf_counter()
             for frames, seen in coming:
                 self.timings["track"] += time.perf_counter() - began
-                writer.add(frames, seen=seen)
+                writer.add(frames, observations=seen)
                 progress(frames[-1].index + 1, len(self.recording), MEASURING)
                 began = time.perf_counter()
 
@@ -383,7 +383,7 @@ def make_track(writer: SessionWriter, fitted: Fitted) -> Verdict:
     from liex_lab.tracking.trust import why_too_fast
 
     tracker = fitted.tracker
-    whole = writer.seen(Observations)
+    whole = writer.observations(Observations)
     tracked = tracker.track(whole, allocate=writer.allocate)
     subject = tracker.subject
     recording = fitted.recording

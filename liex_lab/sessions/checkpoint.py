@@ -81,7 +81,7 @@ class Checkpoint:
         seconds_before: time spent in earlier runs, s.
         n_interruptions: number of earlier interruptions.
         replay: file of Rerun's messages in this run.
-        seen: the observations on disk.
+        columns: the observations on disk.
     """
 
     def __init__(
@@ -118,7 +118,7 @@ class Checkpoint:
         self.seconds_before = state.seconds
         self.n_interruptions = state.interruptions
         (folder / _SEEN).mkdir(exist_ok=True)
-        self.seen = Columns(folder / _SEEN)
+        self.columns = Columns(folder / _SEEN)
         self._last = clock()
         replay, resumed = folder / LOGS[0], folder / _RESUMED
         if resumed.is_file():
@@ -151,7 +151,7 @@ class Checkpoint:
         self._keep(n_frames=n_frames, seconds=seconds, logs=logs, interruptions=interruptions)
 
     def append(self, shard: Path, n_frames: int, seconds: float) -> None:
-        """Append the logs of a shard, whose observations are in `seen` already.
+        """Append the logs of a shard, whose observations are in `columns` already.
 
         Args:
             shard: its folder.
@@ -170,7 +170,7 @@ class Checkpoint:
 
     def _keep(self, **changes: Any) -> None:
         """Save a state once its files are on disk, so that it survives a power cut."""
-        self.seen.flush()
+        self.columns.flush()
         state = self.state.model_copy(update=changes)
         durable.sync_tree(self.folder / _SEEN)
         for log in state.logs:
@@ -189,7 +189,7 @@ class Checkpoint:
         Args:
             folder: the current folder of the session.
         """
-        self.seen.close()
+        self.columns.close()
         for name in OWN:
             _remove(folder / name)
         self._held.close()
@@ -202,7 +202,7 @@ class Checkpoint:
                 otherwise remove it.
         """
         with suppress(OSError):  # unwritten bytes are after the checkpoint
-            self.seen.close()
+            self.columns.close()
         if not (keep and self.is_saved):
             shutil.rmtree(self.folder, ignore_errors=True)
         self._held.close()

@@ -131,23 +131,23 @@ class DepthKeeper:
         self._region = _region(origin) if self._kept == ARENA else None
         self._arena = _arena(origin) if self._kept == ARENA else (0, 0, 0, 0)
 
-    def boxes(self, seen: Observations | None) -> Boxes | None:
+    def boxes(self, observations: Observations | None) -> Boxes | None:
         """Boxes in which images are kept as read; the background replaces the rest.
 
         Args:
-            seen: the hypotheses of these n frames; None without a search for an animal.
+            observations: the hypotheses of these n frames; None without a search for an animal.
 
         Returns:
             (n, K, 4) int16 of left, top, right and bottom (px, the latter two exclusive, all 0 for
             no box); None if whole images are kept, or none.
         """
-        if self._kept in (NONE, ALL) or self._origin.background is None or seen is None:
+        if self._kept in (NONE, ALL) or self._origin.background is None or observations is None:
             return None
         if self._kept == ARENA:
-            boxes = np.zeros((len(seen), N_BOXES, 4), np.int16)
+            boxes = np.zeros((len(observations), N_BOXES, 4), np.int16)
             boxes[:, 0] = self._arena
             return boxes
-        boxes = boxes_around(seen, self._origin)
+        boxes = boxes_around(observations, self._origin)
         camera = self._origin.camera
         nothing = ~boxes.any(axis=(1, 2))
         boxes[nothing, 0] = (0, 0, camera.width, camera.height)  # for people to find out why
@@ -238,11 +238,11 @@ def _spine_mm(origin: Provenance) -> float:
     return float(origin.animal_size.get("spine_mm") or origin.skeleton.length)
 
 
-def boxes_around(seen: Observations, origin: Provenance) -> Boxes:
+def boxes_around(observations: Observations, origin: Provenance) -> Boxes:
     """The boxes around the likely animals of single frames.
 
     Args:
-        seen: the hypotheses of n frames.
+        observations: the hypotheses of n frames.
         origin: camera, its pose, and the animal's length.
 
     Returns:
@@ -251,16 +251,18 @@ def boxes_around(seen: Observations, origin: Provenance) -> Boxes:
     camera = origin.camera
     into = origin.T_arena_camera.inverse()
     spine_mm = _spine_mm(origin)
-    found = np.zeros((len(seen), N_BOXES, 4), np.int16)
+    found = np.zeros((len(observations), N_BOXES, 4), np.int16)
     for k in range(N_BOXES):
         h = 2 * k  # the other hypothesis of each object is the same one reversed
-        rows = np.flatnonzero(seen.known[:, h] & (seen.n_px[:, h] > 0))
+        rows = np.flatnonzero(observations.known[:, h] & (observations.n_px[:, h] > 0))
         if not len(rows):
             continue
-        joints = seen.joints_as(h, range(seen.skeleton.n_joints))[rows].astype(np.float64)
-        centre = seen.centroid_px[rows, h].astype(np.float64)
-        reach = _REACH * np.sqrt(seen.n_px[rows, h].astype(np.float64))[:, None]
-        far = (into @ seen.centroid_mm[rows, h].astype(np.float64))[:, 2:]
+        joints = observations.joints_as(h, range(observations.skeleton.n_joints))[rows].astype(
+            np.float64
+        )
+        centre = observations.centroid_px[rows, h].astype(np.float64)
+        reach = _REACH * np.sqrt(observations.n_px[rows, h].astype(np.float64))[:, None]
+        far = (into @ observations.centroid_mm[rows, h].astype(np.float64))[:, 2:]
         margin = _MARGIN * spine_mm * camera.fx / np.maximum(far, 1.0) + _MARGIN_PX
         with np.errstate(invalid="ignore"):
             uv = camera.project(into @ joints.reshape(-1, 3)).reshape(len(rows), -1, 2)
@@ -465,7 +467,9 @@ class Thumbnails:
             for row in sorted(chosen)
         ]
 
-    def save_whole(self, folder: Path, rows: Rows, seen: Observations) -> dict[str, Any] | None:
+    def save_whole(
+        self, folder: Path, rows: Rows, observations: Observations
+    ) -> dict[str, Any] | None:
         """Write the whole depth image that best shows another object of the animal's size.
 
         Call it after `save`.
@@ -473,7 +477,7 @@ class Thumbnails:
         Args:
             folder: the session folder.
             rows: the track in the form of the tables.
-            seen: the observations: the animal is one of their two components.
+            observations: the observations: the animal is one of their two components.
 
         Returns:
             Its entry as in `save`, and `beside_px`, [u, v] of the centre of the other object; None
@@ -483,10 +487,10 @@ class Thumbnails:
         for row in self._usable(rows):
             uv = rows.track.uv_px[row]
             centre = np.nanmean(uv, axis=0)
-            found = np.asarray(seen.centroid_px[row, ::2], float)  # of both components
+            found = np.asarray(observations.centroid_px[row, ::2], float)  # of both components
             away = np.linalg.norm(found - centre, axis=1)
             reach = np.nanmax(np.linalg.norm(uv - centre, axis=1))
-            n_px = seen.n_px[row, ::2]
+            n_px = observations.n_px[row, ::2]
             size = int(n_px.min())  # both components should be whole
             both = (np.isfinite(away) & (n_px > 0)).all() and away.max() >= reach
             if both and (best is None or size > best[1]):

@@ -141,12 +141,12 @@ class Results:
         }
 
 
-def write_evidence(folder: Path, seen: Observations, subject: Subject) -> None:
+def write_evidence(folder: Path, observations: Observations, subject: Subject) -> None:
     """Write observations.npz, a compressed NumPy archive without pickle.
 
     Args:
         folder: the folder of the file.
-        seen: the hypotheses of every frame.
+        observations: the hypotheses of every frame.
         subject: their animal and camera.
     """
     facts = {
@@ -159,7 +159,7 @@ def write_evidence(folder: Path, seen: Observations, subject: Subject) -> None:
         "unseen": None if subject.unseen is None else list(subject.unseen),
         "n_animals": subject.n_animals,
     }
-    columns = {name: getattr(seen, name) for name in COLUMNS}
+    columns = {name: getattr(observations, name) for name in COLUMNS}
     text = np.frombuffer(json.dumps(facts).encode(), np.uint8)
     np.savez_compressed(folder / FILE, subject=text, **columns)
 

@@ -488,11 +488,13 @@ def _skeleton_columns(track: Track) -> Iterator[tuple[str, Any]]:
     yield UNCERTAINTY, spheres.partition(np.where(posed, n_joints, 0))
 
 
-def _candidate_columns(seen: Observations) -> Iterator[tuple[str, Any]]:
+def _candidate_columns(observations: Observations) -> Iterator[tuple[str, Any]]:
     """The bones of every pose hypothesis, ranked."""
-    edges = np.array(seen.skeleton.edges, np.int64).reshape(-1, 2)
-    for h in range(seen.known.shape[1]):
-        known = seen.known[:, h]
-        joints = seen.joints_as(h, range(seen.skeleton.n_joints))[known] / MM_PER_UNIT
+    edges = np.array(observations.skeleton.edges, np.int64).reshape(-1, 2)
+    for h in range(observations.known.shape[1]):
+        known = observations.known[:, h]
+        joints = (
+            observations.joints_as(h, range(observations.skeleton.n_joints))[known] / MM_PER_UNIT
+        )
         strips = rr.LineStrips3D.columns(strips=joints[:, edges].reshape(-1, 2, 3))
         yield f"{CANDIDATES}/{h + 1}", strips.partition(np.where(known, len(edges), 0))

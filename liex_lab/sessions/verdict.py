@@ -60,7 +60,7 @@ class Verdict:
     @staticmethod
     def of(
         track: Track,
-        seen: Observations,
+        observations: Observations,
         *,
         misfits: Sequence[str] = (),
         doubts: Sequence[str] = (),
@@ -72,7 +72,7 @@ class Verdict:
 
         Args:
             track: one row for every frame.
-            seen: the observations.
+            observations: the observations.
             misfits: how the scene does not fit the plan.
             doubts: why its scene or its clock is unreliable.
             n_animals: number of animals in the frames used for learning the scene.
@@ -80,8 +80,10 @@ class Verdict:
             accepted: whether the plan accepts misfits.
         """
         n_hidden = int((track.flag == "hidden").sum())
-        n_depth = int(seen.has_depth.sum()) - n_hidden  # there is a reason for the missing pose
-        n_in_view = min(int(seen.known.any(axis=1).sum()), n_depth)
+        n_depth = (
+            int(observations.has_depth.sum()) - n_hidden
+        )  # there is a reason for the missing pose
+        n_in_view = min(int(observations.known.any(axis=1).sum()), n_depth)
         n_posed = int(track.observed.sum())
         n_trusted = int((track.observed & (track.flag == "")).sum())
         n_doubtful = int((track.flag == "doubtful").sum())

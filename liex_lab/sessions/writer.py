@@ -120,7 +120,7 @@ class SessionWriter:
         self._done = False
         self._folder = part_folder(self.path)
         self._checkpoint = open_unfinished(self.path, origin)
-        before = self._checkpoint.seen.read()
+        before = self._checkpoint.columns.read()
         self._index, self._times_ns = (
             array("q", before.get(name, np.zeros(0, np.int64)).tobytes()) for name in (INDEX, TIMES)
         )
@@ -186,14 +186,14 @@ class SessionWriter:
     def add(
         self,
         frames: Sequence[DepthFrame],
-        seen: Observations | Track | None = None,
+        observations: Observations | Track | None = None,
     ) -> None:
         """Write consecutive frames.
 
         Args:
             frames: the next frames.
-            seen: their observations, one row per frame, kept on disk until the session is complete
-                so that an interrupted run can resume. The depth around the animal in them is kept.
+            observations: one row per frame, kept on disk until the session is complete so that an
+                interrupted run can resume. The depth around the animal in them is kept.
 
         Raises:
             SessionError: a log could not be written.
@@ -204,7 +204,7 @@ class SessionWriter:
         times = [int(frame.time_ns) for frame in frames]
         index = [int(frame.index) for frame in frames]
         # of all frames at once: a call costs as much as a frame
-        boxes = self._keeper.boxes(seen if isinstance(seen, Observations) else None)
+        boxes = self._keeper.boxes(observations if isinstance(observations, Observations) else None)
         for start in range(0, len(frames), 16):  # limits the number of copies
             part = slice(start, start + 16)
             depth = [frame.depth for frame in frames[part]]
@@ -220,19 +220,19 @@ class SessionWriter:
                 self._thumbnails.add(image)
         self._index.extend(index)
         self._times_ns.extend(times)
-        if seen is not None:
-            self._checkpoint.seen.append(seen_rows(frames, seen, boxes))
+        if observations is not None:
+            self._checkpoint.columns.append(observation_rows(frames, observations, boxes))
         if self._checkpoint.due:
             self._save_checkpoint()
         self._seconds += time.perf_counter() - began
 
-    def seen(self, kind: Callable[..., Kept]) -> Kept:
+    def observations(self, kind: Callable[..., Kept]) -> Kept:
         """The observations of all frames so far, as passed to `add`, from disk.
 
         Args:
             kind: called with the skeleton and the columns in order, such as `Observations`.
         """
-        kept = self._checkpoint.seen.read()
+        kept = self._checkpoint.columns.read()
         return kind(
             self.origin.skeleton,
             *(values for name, values in kept.items() if name not in (INDEX, TIMES, BOXES)),
@@ -251,7 +251,7 @@ class SessionWriter:
         """Save a checkpoint of everything so far. Only frames with observations can resume."""
         self._drain()
         sizes = self._replay.flushed(), self._mcap.flushed()
-        if len(self._checkpoint.seen) == len(self._index):
+        if len(self._checkpoint.columns) == len(self._index):
             seconds = round(self._checkpoint.seconds_before + self._elapsed, 3)
             self._checkpoint.save(len(self._index), seconds, *sizes)
 
@@ -279,20 +279,20 @@ class SessionWriter:
         self._track = track
         self._rows = None
 
-    def take(self, tracked: Tracked, seen: Observations, subject: Subject) -> None:
+    def take(self, tracked: Tracked, observations: Observations, subject: Subject) -> None:
         """Accept the track of all frames so far, and write its observations to observations.npz.
 
         Args:
             tracked: the track, and possible exchanges of head and tail.
-            seen: the observations of all frames.
+            observations: the observations of all frames.
             subject: animal and camera of the track.
         """
         self.track = tracked.track
         self._flips = tracked.flips
         memory.rest()  # much memory after a long recording
-        self._candidates = seen if self.origin.replay_candidates else None
-        self._together = seen if subject.n_animals > 1 else None
-        write_evidence(self._folder, seen, subject)
+        self._candidates = observations if self.origin.replay_candidates else None
+        self._together = observations if subject.n_animals > 1 else None
+        write_evidence(self._folder, observations, subject)
 
     @property
     def rows(self) -> Rows:
@@ -373,7 +373,7 @@ class SessionWriter:
         self._replay.finish(rows, results["kinematics"], bouts, words, problems, self._candidates)
         self._mcap.finish(rows, bouts, words, problems)
         self._checkpoint.join_replay()
-        kept = self._checkpoint.seen.read()
+        kept = self._checkpoint.columns.read()
         if BOXES in kept:
             np.savez_compressed(self._folder / CUTOUTS_FILE, boxes=kept[BOXES])
         self.note(actions=actions, **dict(record or {}))
@@ -485,20 +485,22 @@ def full_disk(folder: Path, error: BaseException | None) -> str | None:
     return None if found is None else places.why_full(found, folder.parent)
 
 
-def seen_rows(
-    frames: Sequence[DepthFrame], seen: Observations | Track, boxes: Boxes | None = None
+def observation_rows(
+    frames: Sequence[DepthFrame], observations: Observations | Track, boxes: Boxes | None = None
 ) -> dict[str, NDArray[Any]]:
     """Columns of consecutive frames to keep on disk: observations, camera's frame count, time (ns).
 
     Args:
         frames: n consecutive frames.
-        seen: their observations, n rows.
+        observations: their observations, n rows.
         boxes: (n, K, 4) boxes of the kept depth around the animal; None if whole images are kept.
 
     Returns:
         Arrays (n, ...) by name.
     """
-    columns: dict[str, Any] = {one.name: getattr(seen, one.name) for one in fields(seen)}
+    columns: dict[str, Any] = {
+        one.name: getattr(observations, one.name) for one in fields(observations)
+    }
     columns = {name: kept for name, kept in columns.items() if isinstance(kept, np.ndarray)}
     columns[INDEX] = np.array([frame.index for frame in frames], np.int64)
     columns[TIMES] = np.array([frame.time_ns for frame in frames], np.int64)
@@ -567,7 +569,7 @@ def append_shard(held: Checkpoint, folder: Path, n_frames: int, seconds: float) 
         n_frames: frames of the session including the shard.
         seconds: time spent on them, s.
     """
-    held.seen.append(Columns(folder / _SEEN).read())
+    held.columns.append(Columns(folder / _SEEN).read())
     held.append(folder, n_frames, seconds)
     shutil.rmtree(folder, ignore_errors=True)
 
@@ -598,13 +600,13 @@ def shard_writer(
     if first_ns is not None:
         replay.resume(first_ns)
 
-    def add(frames: Sequence[DepthFrame], seen: Observations) -> None:
-        boxes = keeper.boxes(seen)
+    def add(frames: Sequence[DepthFrame], observations: Observations) -> None:
+        boxes = keeper.boxes(observations)
         depth = keeper.keep([frame.depth for frame in frames], boxes)
         times = [int(frame.time_ns) for frame in frames]
         replay.add([int(frame.index) for frame in frames], times, depth, boxes)
         messages.add(times, depth)
-        columns.append(seen_rows(frames, seen, boxes))
+        columns.append(observation_rows(frames, observations, boxes))
 
     try:
         try:

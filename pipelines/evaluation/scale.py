@@ -388,9 +388,9 @@ def write_long(
     began = time.perf_counter()
     with SessionWriter(Path(out) / "long.liex", origin, report=report) as writer:
         for frames, part in _parts(short, n):
-            writer.add(frames, seen=part)
+            writer.add(frames, observations=part)
         told("written")
-        whole = writer.seen(Observations)
+        whole = writer.observations(Observations)
         track = track_whole(short.subject, whole, allocate=writer.allocate)
         writer.take(track, whole, short.subject)
         del whole, track

@@ -49,9 +49,9 @@ def _write(place: str, pause_s: float) -> None:
         writer.resume(lambda row: MOUSE.frame(row).depth)
         for frames, track in MOUSE.chunks(CHUNK):
             if frames[0].index >= writer.n_frames:
-                writer.add(frames, seen=track)
+                writer.add(frames, observations=track)
                 time.sleep(pause_s)
-        writer.track = writer.seen(Track)
+        writer.track = writer.observations(Track)
         writer.close(**behaviour.measure_rows(writer.rows).for_session())
 
 

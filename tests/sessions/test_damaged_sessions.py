@@ -79,7 +79,7 @@ def begun(folder: Path) -> Path:
     held = Checkpoint(folder / "x.part", FACTS)
     for log in LOGS:
         (held.folder / log).write_bytes(b"0123456789")
-    held.seen.append({"a": np.arange(6.0).reshape(3, 2), "b": np.arange(3)})
+    held.columns.append({"a": np.arange(6.0).reshape(3, 2), "b": np.arange(3)})
     held.save(3, 1.0, 8, 8)
     held.leave(keep=True)
     return folder / "x.part"
@@ -156,7 +156,7 @@ def test_any_value_anywhere_in_an_unfinished_session(
         held = Checkpoint(copy, FACTS)  # it goes on, or begins anew
         n = held.state.n_frames
         assert n in (0, 3) or name == "checkpoint.json"
-        assert all(len(values) >= n for values in held.seen.read().values())
+        assert all(len(values) >= n for values in held.columns.read().values())
         for log in (held.replay, held.folder / "session.mcap"):
             log.touch()
         held.save(n + 1, held.seconds_before + 1.0, 0, 0)

@@ -100,7 +100,7 @@ def test_a_replay_whose_thread_is_dead_is_abandoned_within_seconds(
     def write() -> None:
         with writer:
             frames, track = next(iter(MOUSE.chunks(16)))
-            writer.add(frames, seen=track)
+            writer.add(frames, observations=track)
             writer._save_checkpoint()
 
     said = r"is full \(No space left on device\)" if full else r"session\.rrd was not written whole"
