@@ -201,7 +201,7 @@ def boris_labels(path: str | Path) -> pd.DataFrame:
         name = " ".join(str(name).split())
         if not isinstance(observation, dict):
             raise LiexError(
-                f"{path}: the observation {name} is none; save the project from BORIS again"
+                f"{path}: the observation {name} is not an object; save it from BORIS again"
             )
         rows += _pairs(
             observation.get("events", []), points, name, _offset(observation, name, path), path

@@ -342,8 +342,8 @@ class Study:
         for settings in (self.table.set, where, animal.set, {"session": facts}, one.set):
             table = merged(table, settings)
         for section, key in _PATHS:
-            settings = table.get(section)
-            text = settings.get(key) if isinstance(settings, dict) else None
+            inner: Any = table.get(section)
+            text = inner.get(key) if isinstance(inner, dict) else None
             if isinstance(text, str) and (self.folder / text).is_file():
                 # workers run in other folders
                 table[section][key] = str(self.inside(text, f"{section}.{key}"))
@@ -369,8 +369,8 @@ def merged(table: Settings, settings: Settings) -> Settings:
     out = dict(table)
     for key, value in settings.items():
         below = out.get(key)
-        both = isinstance(below, dict) and isinstance(value, dict)
-        out[key] = merged(below, value) if both else value
+        nested = isinstance(below, dict) and isinstance(value, dict)
+        out[key] = merged(below or {}, value) if nested else value
     return out
 
 

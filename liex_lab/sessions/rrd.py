@@ -334,8 +334,8 @@ class ReplayWriter:
                 label = f"{one.title.lower()}{f' ({unit})' if unit else ''}"
                 drawn.append((one.entity, label, one.colour, values))
         for entity, label, colour, _ in drawn:
-            look = rr.SeriesLines(names=label, colors=rgba([int(colour[1:], 16)]), widths=1.5)
-            self._stream.log(entity, look, static=True)
+            style = rr.SeriesLines(names=label, colors=rgba([int(colour[1:], 16)]), widths=1.5)
+            self._stream.log(entity, style, static=True)
         return {entity: values for entity, _, _, values in drawn}
 
     def _log_styles(self, track: Track, n_candidates: int) -> list[int]:
@@ -362,8 +362,8 @@ class ReplayWriter:
         if track.posed.any():
             styles[ROOT] = rr.TransformAxes3D(0.02)
         for h, colour in zip(range(n_candidates), cycle(PALETTE), strict=False):
-            look = rr.LineStrips3D.from_fields(radii=0.0008, colors=rgba([colour]))
-            styles[f"{CANDIDATES}/{h + 1}"] = look
+            style = rr.LineStrips3D.from_fields(radii=0.0008, colors=rgba([colour]))
+            styles[f"{CANDIDATES}/{h + 1}"] = style
         for entity, archetype in styles.items():
             self._stream.log(entity, archetype, static=True)
         animal = self._origin.animal_size

@@ -150,8 +150,10 @@ class DepthColumns:
             rows = np.flatnonzero(shows | np.append(entity in self._shown, shows[:-1]))
             if shows.any() and entity.startswith(CUTOUTS) and entity not in self._introduced:
                 assert self._origin.background is not None
-                look = self._look(self._origin.background)
-                kind = rr.EncodedDepthImage.from_fields(**look, media_type=_RVL, draw_order=_BEHIND)
+                style = self._style(self._origin.background)
+                kind = rr.EncodedDepthImage.from_fields(
+                    **style, media_type=_RVL, draw_order=_BEHIND
+                )
                 stream.log(entity, kind, static=True)
                 self._introduced.add(entity)
             columns = rr.EncodedDepthImage.columns(
@@ -197,7 +199,7 @@ class DepthColumns:
         if whole:
             for entity, media_type in ((DEPTH, _RVL), (NOISY, _PNG)):
                 kind = rr.EncodedDepthImage.from_fields(
-                    **self._look(first), media_type=media_type, draw_order=_WHOLE
+                    **self._style(first), media_type=media_type, draw_order=_WHOLE
                 )
                 stream.log(entity, kind, static=True)
             return
@@ -207,12 +209,12 @@ class DepthColumns:
         scene = rr.EncodedDepthImage(
             blob=blob,
             media_type=_PNG,
-            **self._look(self._origin.background),
+            **self._style(self._origin.background),
             draw_order=_BACKMOST,
         )
         stream.log(BACKGROUND, scene, static=True)
 
-    def _look(self, depth: NDArray[np.uint16]) -> dict[str, Any]:
+    def _style(self, depth: NDArray[np.uint16]) -> dict[str, Any]:
         """Unit and colours of images similar to this one."""
         return {
             "meter": MM_PER_UNIT,
@@ -366,12 +368,12 @@ def log_outlines(stream: Any, origin: Provenance) -> None:
         drawn.append((part, zone.name, zone.outline_mm(), colour))
     for part, name, outline, colour in drawn:
         ring = np.column_stack([outline, np.zeros(len(outline))])[[*range(len(outline)), 0]]
-        look: dict[str, Any] = {"colors": rgba([colour]), "labels": [name] if name else None}
-        on_floor = rr.LineStrips3D([ring / MM_PER_UNIT], radii=0.001, **look)
+        style: dict[str, Any] = {"colors": rgba([colour]), "labels": [name] if name else None}
+        on_floor = rr.LineStrips3D([ring / MM_PER_UNIT], radii=0.001, **style)
         stream.log(f"{FLOOR}/{part}", on_floor, static=True)
         uv_px = origin.camera.project(origin.T_arena_camera.inverse() @ ring) + 0.5
         if np.isfinite(uv_px).all():
-            in_image = rr.LineStrips2D([uv_px], radii=rr.Radius.ui_points(1.0), **look)
+            in_image = rr.LineStrips2D([uv_px], radii=rr.Radius.ui_points(1.0), **style)
             stream.log(f"{OVERLAY}/{part}", in_image, static=True)
 
 

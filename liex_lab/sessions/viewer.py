@@ -267,8 +267,8 @@ class LiveView:
             depth = np.clip(np.rint(frame.depth), 0, 65535).astype(np.uint16)
             if not self._range:
                 self._range = colour_range(depth, self._floor_mm)
-            look: dict[str, Any] = {"colormap": "viridis", "point_fill_ratio": 0.25}
-            image = rr.DepthImage(depth, meter=MM_PER_UNIT, depth_range=self._range, **look)
+            style: dict[str, Any] = {"colormap": "viridis", "point_fill_ratio": 0.25}
+            image = rr.DepthImage(depth, meter=MM_PER_UNIT, depth_range=self._range, **style)
             self._stream.log(DEPTH, image)
 
     def close(self) -> None:
