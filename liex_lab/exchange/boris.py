@@ -28,32 +28,34 @@ _KEYS = "abcdefghijklmnopqrstuvwxyz0123456789"
 
 
 def write_boris(session: Session, path: Path) -> None:
-    """Write the project as a .boris file."""
-    path.write_text(
-        # escapes, because BORIS uses the machine's own encoding, which on Windows is not UTF-8
-        json.dumps(project(session, path.parent), indent=1) + "\n",
-        encoding="ascii",
-    )
+    """Write the project as a .boris file.
 
-
-def project(session: Session, folder: Path | None = None) -> dict[str, Any]:
-    """The project as a dict for JSON.
-
-    It names the session's video if one was made (`liex export --to video`).
-
-    Args:
-        session: the session.
-        folder: the folder of the project, in which BORIS searches for the video first; None names
-            the video by its absolute path.
+    It names the session's video if one was made (`liex export --to video`), which BORIS searches in
+    the project's folder first.
     """
+    # escapes, because BORIS uses the machine's own encoding, which on Windows is not UTF-8
+    text = json.dumps(project(session, path.parent), indent=1)
+    path.write_text(text + "\n", encoding="ascii")
+
+
+def project(session: Session, folder: Path) -> dict[str, Any]:
+    """The project as a dict for JSON."""
     about = session.metadata
     subject = about["individual"]
-    bouts = session.bouts
-    words = list(
-        dict.fromkeys([*about.get("actions", {}), *(str(word) for word in bouts["action"])])
-    )
+    meanings = about.get("actions", {})
+    words = dict.fromkeys([*meanings, *(str(word) for word in session.bouts["action"])])
     behaviours = {
-        str(k): _behaviour(word, about.get("actions", {}).get(word, ""), k)
+        str(k): {
+            "type": "State event",
+            "key": _KEYS[k] if k < len(_KEYS) else "",
+            "code": word,
+            "description": meanings.get(word, ""),
+            "color": "",
+            "category": "",
+            "modifiers": {},
+            "excluded": "",
+            "coding map": "",
+        }
         for k, word in enumerate(words)
     }
     return {
@@ -78,46 +80,22 @@ def project(session: Session, folder: Path | None = None) -> dict[str, Any]:
     }
 
 
-def _behaviour(word: str, meaning: str, index: int) -> dict[str, Any]:
-    key = _KEYS[index] if index < len(_KEYS) else ""
-    return {
-        "type": "State event",
-        "key": key,
-        "code": word,
-        "description": meaning,
-        "color": "",
-        "category": "",
-        "modifiers": {},
-        "excluded": "",
-        "coding map": "",
-    }
+def _observation(session: Session, subject: str, folder: Path) -> dict[str, Any]:
+    """The video as the media file, and two rows per bout.
 
-
-def _media(session: Session, folder: Path | None) -> str:
-    """The video's path: relative if it is in the project's folder.
-
-    Without a video the recording's name, which BORIS need not find.
+    Without a video the media file is the recording's name, which BORIS need not find.
     """
-    beside = None if folder is None else video_path(folder, session.name)
-    if beside is not None and beside.is_file():
-        return beside.name
+    beside = video_path(folder, session.name)
     made = found_video(session)
-    return str(session.metadata["input"]["name"]) if made is None else str(made.resolve())
-
-
-def _observation(session: Session, subject: str, folder: Path | None) -> dict[str, Any]:
-    """The video as the media file, and two rows per bout."""
+    media = session.metadata["input"]["name"] if made is None else str(made.resolve())
+    name = beside.name if beside.is_file() else str(media)
     frames = session.metadata["frames"]
-    name = _media(session, folder)
-    bouts = session.bouts
-    times = bouts[["start_s", "stop_s"]].to_numpy(float)
-    indices = bouts[["start_frame", "stop_frame"]].to_numpy(int)
+    ends = (("start_s", "start_frame"), ("stop_s", "stop_frame"))
     rows = [
-        [round(float(time), 6), subject, str(action), "", "", int(index)]
-        for action, two_times, two_indices in zip(bouts["action"], times, indices, strict=True)
-        for time, index in zip(two_times, two_indices, strict=True)
+        [round(float(bout[time]), 6), subject, str(bout["action"]), "", "", int(bout[frame])]
+        for bout in session.bouts.to_dict("records")
+        for time, frame in ends
     ]
-    rate = frames["fps_median"] or 0.0
     return {
         "file": {_MEDIA: [name]},
         "type": "MEDIA",
@@ -129,7 +107,7 @@ def _observation(session: Session, subject: str, folder: Path | None) -> dict[st
         "close_behaviors_between_videos": False,
         "media_info": {
             "length": {name: frames["duration_s"]},
-            "fps": {name: rate},
+            "fps": {name: frames["fps_median"] or 0.0},
             "hasVideo": {name: True},
             "hasAudio": {name: False},
             "offset": {_MEDIA: 0.0},
@@ -191,10 +169,12 @@ def boris_labels(path: str | Path) -> pd.DataFrame:
         LiexError: the file is not a BORIS project, or an event has no end; the message names it.
     """
     document = read_boris_project(path)
+    conf = document.get("behaviors_conf")
+    behaviours = conf.values() if isinstance(conf, dict) else ()
     points = {
         str(b.get("code"))
-        for b in _values(document.get("behaviors_conf"))
-        if str(b.get("type", _STATE)).lower().startswith("point")
+        for b in behaviours
+        if isinstance(b, dict) and str(b.get("type", _STATE)).lower().startswith("point")
     }
     rows: list[dict[str, Any]] = []
     for name, observation in document["observations"].items():
@@ -304,11 +284,3 @@ def _pairs(
             "pair it in BORIS (Observations, Check state events)"
         )
     return rows
-
-
-def _values(conf: Any) -> list[dict[str, Any]]:
-    return (
-        [entry for entry in conf.values() if isinstance(entry, dict)]
-        if isinstance(conf, dict)
-        else []
-    )

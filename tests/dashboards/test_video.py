@@ -171,7 +171,7 @@ def test_the_project_for_boris_names_the_video_that_was_made(session, tmp_path):
         assert set(observation["media_info"]["fps"]) == {name}
         return str(name)
 
-    assert media(project(session)) == session.metadata["input"]["name"]
+    assert media(project(session, tmp_path)) == session.metadata["input"]["name"]
     video = export_video(session.path)
     # beside the project by its name, so that the folder can be moved; else by its whole path
     assert media(project(session, session.path)) == "circle.mp4"
