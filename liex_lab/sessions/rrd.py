@@ -206,12 +206,12 @@ class ReplayWriter:
             log_hidden_places(self._stream, rows)
         for problem in problems:
             self._stream.log("log", rr.TextLog(problem, level=rr.TextLogLevel.WARN), static=True)
-        facts = {
-            "session_id": self._origin.name,
-            "animal": self._origin.skeleton.name,
-            "input_sha256": self._origin.input_sha256,
-        }
-        self._stream.send_property("session", rr.AnyValues(**facts))
+        facts = rr.AnyValues(
+            session_id=self._origin.name,
+            animal=self._origin.skeleton.name,
+            input_sha256=self._origin.input_sha256,
+        )
+        self._stream.send_property("session", facts)
         self.flushed()
         self.abandon()
         try:
