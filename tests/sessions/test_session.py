@@ -29,7 +29,7 @@ from liex_lab.sessions import Provenance, Session, SessionWriter
 from liex_lab.sessions.provenance import SCHEMA_VERSION
 from liex_lab.tracking.track import Track
 from tests.conftest import REPOSITORY
-from tests.sessions.walking_mouse import SPINE_MM, WalkingMouse, part, steady, write
+from tests.sessions.walking_mouse import SPINE_MM, WalkingMouse, steady, write
 
 MOUSE = WalkingMouse(steady(1.0))
 START = "2026-08-21T10:00:00+02:00"
@@ -173,7 +173,7 @@ def test_an_unfinished_session_leaves_nothing_behind(tmp_path, monkeypatch):
 
     def of_other_frames(writer):
         writer.add(frames)
-        writer.track = part(track, 1, 10)
+        writer.track = track[1:10]
 
     for work, said in (
         (breaks_in_between, "the disk is gone"),
@@ -351,7 +351,7 @@ def test_memory_of_some_more_frames_is_that_of_some(tmp_path):
                 writer.add(frames)
             peak = tracemalloc.get_traced_memory()[1]
             tracemalloc.stop()
-            writer.track = part(mouse.track(), 0, n)
+            writer.track = mouse.track()[:n]
             writer.close()
         return peak
 

@@ -135,7 +135,7 @@ class WalkingMouse:
         track = self.track()
         for start in range(0, len(self.times_s), size):
             stop = min(start + size, len(self.times_s))
-            yield [self.frame(row) for row in range(start, stop)], part(track, start, stop)
+            yield [self.frame(row) for row in range(start, stop)], track[start:stop]
 
     def provenance(self, **more: Any) -> Provenance:
         """What a session has to be told."""
@@ -167,24 +167,15 @@ def steady(seconds: float, fps: float = 30.0) -> np.ndarray:
     return np.arange(round(seconds * fps)) / fps
 
 
-def part(track: Track, start: int, stop: int) -> Track:
-    """Some consecutive rows of a track."""
-    columns = {name: value for name, value in vars(track).items() if name != "skeleton"}
-    return Track(track.skeleton, **{name: value[start:stop] for name, value in columns.items()})
-
-
 def forget(track: Track, rows: tuple[int, ...], flag: str = "not_found") -> Track:
     """The same track with some frames in which the animal was not found."""
     if not rows:
         return track
-    empty = Track.empty(track.skeleton, track.times_ns, flag)
-    columns = {}
-    for name, value in vars(track).items():
-        if name in ("skeleton", "times_ns"):
-            continue
-        columns[name] = value.copy()
-        columns[name][list(rows)] = vars(empty)[name][list(rows)]
-    return Track(track.skeleton, track.times_ns, **columns)
+    empty = vars(Track.empty(track.skeleton, track.times_ns, flag))
+    columns = {name: value.copy() for name, value in vars(track).items() if name != "skeleton"}
+    for name, column in columns.items():
+        column[list(rows)] = empty[name][list(rows)]
+    return Track(track.skeleton, **columns)
 
 
 def write(folder: Path, mouse: WalkingMouse, chunk: int = 20, **more: Any) -> Session:

@@ -9,7 +9,7 @@ import pytest
 
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.tracking.track import FLAGS, Track
-from tests.sessions.walking_mouse import SPINE_MM, WalkingMouse, part, steady
+from tests.sessions.walking_mouse import SPINE_MM, WalkingMouse, steady
 
 COLUMNS = [field.name for field in fields(Track) if field.name != "skeleton"]
 
@@ -43,7 +43,7 @@ def test_every_flag_fits_into_a_track():
 def test_parts_of_a_track_join_into_the_whole(stops):
     mouse = WalkingMouse(steady(1.0), lost=(3, 4, 20))
     whole = mouse.track()
-    parts = [part(whole, start, stop) for start, stop in zip((0, *stops), stops, strict=False)]
+    parts = [whole[start:stop] for start, stop in zip((0, *stops), stops, strict=False)]
     joined = Track.join(parts)
     assert joined.skeleton is whole.skeleton
     for name in COLUMNS:
