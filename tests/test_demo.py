@@ -10,10 +10,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from liex_lab.pipelines.sample import LEFT_OUT, N_FRAMES, virtual_mouse
+from typer.testing import CliRunner
 
 import liex_lab
 from liex_lab import catalog
 from liex_lab.api import run_session
+from liex_lab.cli import app
 from liex_lab.errors import LiexError
 from liex_lab.sessions import Session
 from liex_lab.sessions.session import FILES
@@ -122,7 +124,7 @@ def test_a_recording_without_an_animal_is_told_and_leaves_nothing(tmp_path: Path
 
 
 def test_json_of_the_doctor_about_the_sample() -> None:
-    ran = liex("doctor", str(catalog.find_sample("mouse_walk.mcap")), "--json")
+    ran = CliRunner().invoke(app, ["doctor", str(catalog.find_sample("mouse_walk.mcap")), "--json"])
     found = json.loads(ran.stdout)
     assert (found["n_frames"], found["n_gaps"], found["width"], found["fx"]) == (
         len(KEPT),

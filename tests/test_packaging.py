@@ -119,7 +119,7 @@ def python_in_the_clone(*arguments: str, clone: Path = REPOSITORY) -> str:
     return ran.stdout
 
 
-@pytest.mark.slow
+@pytest.mark.nightly  # tests/test_pages.py runs it in every run, in another folder
 def test_the_readmes_snippet_runs_in_the_folder_of_the_clone(tmp_path: Path) -> None:
     text = (REPOSITORY / "README.md").read_text(encoding="utf-8")
     (snippet,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
@@ -135,13 +135,15 @@ def test_the_readmes_snippet_runs_in_the_folder_of_the_clone(tmp_path: Path) -> 
 @pytest.mark.parametrize(
     "arguments",
     [
-        ("-c", IMPORTS),
         ("script.py",),
         ("-m", "liex_lab", "info", "--plan", "mouse"),
-        ("-c", "import runpy; runpy.run_path('docs/conf.py'); " + IMPORTS),
-        ("-c", "from liex_lab.catalog import find_sample; print(find_sample('mouse_walk.mcap'))"),
+        (
+            "-c",
+            "from liex_lab.catalog import find_sample; find_sample('mouse_walk.mcap'); "
+            f"import runpy; runpy.run_path('docs/conf.py'); {IMPORTS}",
+        ),
     ],
-    ids=["console", "script", "module", "site", "sample"],
+    ids=["script", "module", "console"],
 )
 def test_everything_is_importable_in_the_folder_of_the_clone(
     arguments: tuple[str, ...], tmp_path: Path

@@ -1,8 +1,9 @@
-"""Every command and every example of README.md and the manual is run as a reader would: page by
-page from top to bottom, in a fresh folder, with what earlier pages left there.
+"""Every command and every example of README.md and the manual runs as a reader would run it: page
+by page from top to bottom, in a fresh folder, with what earlier pages left there.
 
-The commands are run by a shell as they are printed, but for the tables below: what a reader puts
-in place of a name, what takes too long, and what is not run, with the reason.
+A shell runs the commands as they are printed, except for the tables below: what a reader types in
+place of a name, what takes too long, and what is not run, with the reason. README.md is followed in
+every run of the tests, the manual's pages every night.
 """
 
 from __future__ import annotations
@@ -185,7 +186,13 @@ def run_python(block: str, folder: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("page", WITH_BLOCKS)
+@pytest.mark.parametrize(
+    "page",
+    [
+        pytest.param(page, marks=() if page == "README.md" else pytest.mark.nightly)
+        for page in WITH_BLOCKS
+    ],
+)
 def test_a_page_can_be_followed_as_it_is_printed(page: str, follow: Callable[[str], Path]) -> None:
     follow(page)
 
