@@ -135,7 +135,7 @@ def _writer(
             "--ros"
         )
     if _is_mcap(target):
-        from liex_lab.recordings.formats.messages.mcap_writer import McapDepthWriter
+        from liex_lab.recordings.writer import McapDepthWriter
 
         if step_mm is not None:
             raise RecordingError(
@@ -508,7 +508,7 @@ def _write(
     progress: Progress,
 ) -> str:
     """Write the archive; returns the hash of its times and depths."""
-    from liex_lab.recordings.formats.messages.mcap_writer import McapDepthWriter
+    from liex_lab.recordings.writer import McapDepthWriter
     from liex_lab.recordings.formats.messages.statements import PackFacts, hash_note
 
     within = _within(mask)

@@ -39,7 +39,7 @@ MOST_ROWS = 2000  # per request
 _LEAST_DOUBT_S = 0.5  # doubtful frames closer in time form one stretch
 _HELD = 6  # desks that stay in memory
 _FIRST = (
-    "liex_lab.recordings.formats.messages.mcap_index",
+    "liex_lab.recordings.formats.messages.mcap",
     "cv2",
     "matplotlib",
     "pyarrow.parquet",

@@ -9,13 +9,14 @@ from __future__ import annotations
 import difflib
 import math
 import re
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from liex_lab.errors import LiexError, RecordingError, UnknownCameraError, printable
 from liex_lab.optics.camera import Camera, Distortion, Lens
-from liex_lab.recordings.frame import ENCODINGS, Depth, Stored, decode, own_unit_mm
+from liex_lab.recordings.frame import ENCODINGS, Depth, Stored, decode
 from liex_lab.recordings.timestamp_files import UNITS
 from liex_lab.recordings.timestamps import start_of_day
 from liex_lab.runtime.places import named_beside
@@ -30,13 +31,48 @@ WHAT_TO_WRITE = (
 _INTRINSICS = ("fx", "fy", "cx", "cy")
 _NUMBERS = (*_INTRINSICS, "width", "height", "unit_mm", "fps")
 _TEXTS = ("timestamps", "pattern", "subject_id", "session_start_time", "distortion_model")
-_FOCAL_PX = (1e-3, 1e7)  # limits far beyond any camera
 _WORDS: dict[str, tuple[str, ...]] = {  # keys with a fixed set of values
-    "encoding": ENCODINGS,
+    "encoding": tuple(ENCODINGS),
     "byte_order": ("big", "little"),
     "time_unit": tuple(UNITS),
 }
 _KEYS = (*_NUMBERS, "unread", "distortion", "time_column", *_TEXTS, *_WORDS)
+
+
+def _is_size(value: Any) -> bool:
+    return bool(value >= 1 and value == int(value))
+
+
+def _is_focal(value: Any) -> bool:
+    return bool(1e-3 < value < 1e7)  # limits far beyond any camera
+
+
+def _is_text(value: Any) -> bool:
+    return isinstance(value, str) and value != ""
+
+
+def _is_column(value: Any) -> bool:
+    return _is_text(value) or (type(value) is int and value >= 0)
+
+
+_TEXT = (_is_text, "it is a text in quotation marks")
+_RULES: dict[str, tuple[Callable[[Any], bool], str]] = {  # key: valid values, and how to state them
+    **dict.fromkeys(("width", "height"), (_is_size, "it is a positive whole number of pixels")),
+    **dict.fromkeys(
+        ("fx", "fy"),
+        (
+            _is_focal,
+            "a focal length is a positive number of pixels, some hundreds of most cameras",
+        ),
+    ),
+    "unit_mm": (bool, "it is the number of millimetres in one stored step"),
+    "time_column": (_is_column, "it is a column's name, or its number from 0"),
+    **dict.fromkeys(("timestamps", "pattern", "subject_id", "distortion_model"), _TEXT),
+    **{
+        key: (words.__contains__, "it is one of " + ", ".join(f'"{word}"' for word in words))
+        for key, words in _WORDS.items()
+    },
+}
 
 
 @dataclass(frozen=True)
@@ -106,8 +142,12 @@ class CameraFile:
         for name in ("camera", "recording"):
             if isinstance(document.get(name), dict):
                 table |= document[name]
-        unknown = [key for key in table if key not in _KEYS]
-        return _from_table(path, table, tuple(_unknown_key(path, key) for key in unknown))
+        problems = []
+        for key in (key for key in table if key not in _KEYS):
+            near = difflib.get_close_matches(key, _KEYS, n=1)
+            hint = f"; did you mean {near[0]!r}?" if near else ""
+            problems.append(f"{path.name} has a key {key!r} that means nothing here{hint}")
+        return _from_table(path, table, tuple(problems))
 
     def decode(self, stored: Stored) -> Depth:
         """Decode stored values to depth, by the stated encoding and unit.
@@ -196,39 +236,9 @@ def _from_table(path: Path, table: dict[str, Any], problems: tuple[str, ...]) ->
     numbers = {key: _number(path, key, table[key]) for key in _NUMBERS if key in table}
     unread = table.get("unread", [0])
     unread = unread if isinstance(unread, list) else [unread]
-    for key in ("width", "height"):
-        if key in numbers and not (numbers[key] >= 1 and numbers[key] == int(numbers[key])):
-            raise RecordingError(
-                f"{path} states {key} = {numbers[key]:g}; it is a positive whole number of pixels"
-            )
-    for key in ("fx", "fy"):
-        if key in numbers and not _FOCAL_PX[0] < numbers[key] < _FOCAL_PX[1]:
-            raise RecordingError(
-                f"{path} states {key} = {numbers[key]:g}; a focal length is a positive number of "
-                "pixels, some hundreds of most cameras"
-            )
-    if numbers.get("unit_mm", 1.0) == 0.0:
-        raise RecordingError(
-            f"{path} states unit_mm = 0; it is the number of millimetres in one stored step"
-        )
-    for key, words in _WORDS.items():
-        if table.get(key, words[0]) not in words:
-            listed = ", ".join(f'"{word}"' for word in words)
-            raise RecordingError(f"{path} states {key} = {table[key]!r}; it is one of {listed}")
-    column = table.get("time_column")
-    if (
-        column is not None
-        and not (isinstance(column, str) and column)
-        and not (type(column) is int and column >= 0)
-    ):
-        raise RecordingError(
-            f"{path} states time_column = {column!r}; it is a column's name, or its number from 0"
-        )
-    for key in ("timestamps", "pattern", "subject_id", "distortion_model"):
-        if key in table and not (isinstance(table[key], str) and table[key]):
-            raise RecordingError(
-                f"{path} states {key} = {table[key]!r}; it is a text in quotation marks"
-            )
+    for key, (is_valid, meaning) in _RULES.items():
+        if key in table and not is_valid(table[key]):
+            raise RecordingError(f"{path} states {key} = {table[key]!r}; {meaning}")
     if not named_beside(table.get("timestamps", "timestamps.csv")):
         raise RecordingError(
             f"{path} states timestamps = {table['timestamps']!r}; it is a file in the recording's "
@@ -249,14 +259,14 @@ def _from_table(path: Path, table: dict[str, Any], problems: tuple[str, ...]) ->
         intrinsics={key: numbers[key] for key in _INTRINSICS if key in numbers},
         width=int(numbers["width"]) if "width" in numbers else None,
         height=int(numbers["height"]) if "height" in numbers else None,
-        unit_mm=numbers.get("unit_mm", own_unit_mm(table.get("encoding", "linear"))),
+        unit_mm=numbers.get("unit_mm", ENCODINGS[table.get("encoding", "linear")]),
         states_unit="unit_mm" in numbers,
         unread=tuple(_number(path, "unread", value, finite=False) for value in unread),
         encoding=table.get("encoding", "linear"),
         byte_order=table.get("byte_order"),
         fps=rate(numbers.get("fps"), str(path)),
         timestamps=table.get("timestamps", "timestamps.csv"),
-        time_column=column,
+        time_column=table.get("time_column"),
         time_unit=table.get("time_unit"),
         pattern=table.get("pattern", "*"),
         metadata=metadata,
@@ -286,14 +296,6 @@ def _number(path: Path, key: str, value: Any, finite: bool = True) -> float:
             f"{path} states {key} = {value!r} where a number was expected; correct it"
         )
     return float(value)
-
-
-def _unknown_key(path: Path, key: str) -> str:
-    near = difflib.get_close_matches(key, _KEYS, n=1)
-    return (
-        f"{path.name} has a key {key!r} that means nothing "
-        f"here{f'; did you mean {near[0]!r}?' if near else ''}"
-    )
 
 
 # Infrared images, recognised by name: 16-bit brightness that could be mistaken for depth.

@@ -140,6 +140,36 @@ def stacked(frames: Sequence[DepthFrame]) -> NDArray[np.float32]:
     return np.stack([frame.depth for frame in frames])
 
 
+def unread_where_damaged(
+    read: Callable[[int], Depth | str],
+    shape: tuple[int, int],
+    problems: list[str],
+    known: Iterable[int] = (),
+) -> Callable[[int], Depth]:
+    """The function that reads a stored frame, with damaged ones wholly unread.
+
+    Args:
+        read: depth (H, W) float32 mm of a frame by its number, or what is wrong with it, as in
+            " (frame_2.png) is damaged".
+        shape: rows and columns of the depth images.
+        problems: the recording's sentences; each damaged frame is added once.
+        known: numbers of damaged frames that were reported before.
+    """
+    reported = set(known)
+
+    def read_depth(number: int) -> Depth:
+        """Depth (H, W) float32 mm of a frame, 0 where unread."""
+        found = read(number)
+        if not isinstance(found, str):
+            return found
+        if number not in reported:
+            reported.add(number)
+            problems.append(f"frame {number}{found}, and was taken as wholly unread")
+        return np.zeros(shape, np.float32)
+
+    return read_depth
+
+
 def has_readings(depth: Depth) -> bool:
     """Whether a depth image (H, W) has any reading; usually a sparse sample of pixels decides."""
     return bool(depth[::_FEW, ::_FEW].any() or depth.any())
@@ -184,11 +214,6 @@ _NO_DISPARITY = 2047  # of 11 bits
 _FARTHEST_MM = 10_000.0
 
 
-def _rotated(stored: Stored) -> Stored:
-    """SUN RGB-D: millimetres with their 16 bits rotated left by 3."""
-    return (stored >> 3) | (stored << 13)
-
-
 def _disparity(stored: Stored) -> Stored:
     """Kinect v1 disparity of 11 bits, as in NYU Depth v2: z = 351.3 / (1092.5 - value) m."""
     ahead = 1092.5 - stored.astype(np.float32)
@@ -196,26 +221,18 @@ def _disparity(stored: Stored) -> Stored:
     return np.where(read, 351_300.0 / np.where(read, ahead, 1.0), 0.0).astype(np.float32)
 
 
-def _green_blue(stored: Stored) -> Stored:
-    """NYU hands: (H, W, 3) 8 bits in the order blue, green, red; millimetres = 256 green + blue."""
-    return stored[..., 1].astype(np.uint16) << 8 | stored[..., 0]
-
-
 _MILLIMETRES: dict[
     str, tuple[float, Callable[[Stored], Stored]]
 ] = {  # name: mm per step of the function's result, function
     "linear": (1.0, lambda stored: stored),
     "tum": (0.2, lambda stored: stored),  # 5000 steps per metre
-    "sun": (1.0, _rotated),
+    "sun": (1.0, lambda stored: (stored >> 3) | (stored << 13)),  # 16 bits, rotated left by 3
     "kinect1-disparity": (1.0, _disparity),
-    COLOUR: (1.0, _green_blue),
+    # (H, W, 3) 8 bits in the order blue, green, red
+    COLOUR: (1.0, lambda stored: stored[..., 1].astype(np.uint16) << 8 | stored[..., 0]),
 }
-ENCODINGS = tuple(_MILLIMETRES)
-
-
-def own_unit_mm(encoding: str) -> float:
-    """Millimetres per step of an encoding's values: 0.2 for "tum", else 1."""
-    return _MILLIMETRES[encoding][0]
+# mm per step of an encoding's values
+ENCODINGS = {name: unit_mm for name, (unit_mm, _) in _MILLIMETRES.items()}
 
 
 def decode(

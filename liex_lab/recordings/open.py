@@ -43,14 +43,6 @@ _FILES = (
 _RENDERED = "synthetic:"
 _RENDERER = "liex_lab.simulation.address"
 _MCAP = b"\x89MCAP0\r\n"
-_WITH_PATTERN = "images.folder.open_images"
-_WITH_TOPICS = (
-    "messages.mcap.open_mcap",
-    "messages.mcap_index.open_indexed",
-    "messages.rosbag.open_bag",
-)
-# damage is refused on reading, so nothing needs to be unpacked in advance
-_STRICTLY = {"messages.mcap.open_mcap": "messages.mcap_index.open_indexed"}
 _RAYTRIX = (
     "is in Raytrix's own format, which only the maker's licensed software reads; compute metric "
     "depth in RxLive, save "
@@ -99,12 +91,16 @@ class _How:
 
     def open(self, where: str, path: Path) -> Recording:
         """Open with the function `where` of `formats`, as in "oni.open_oni", imported on demand."""
-        where = _STRICTLY.get(where, where) if self.strict else where
         module, name = where.rsplit(".", 1)
         opener = getattr(import_module(f"liex_lab.recordings.formats.{module}"), name)
-        topic = (self.topic,) if where in _WITH_TOPICS else ()
-        topic = (self.pattern,) if where == _WITH_PATTERN and self.pattern else topic
-        recording: Recording = opener(path, self.camera, self.fps, self.progress, *topic)
+        more = {
+            "open_images": {"pattern": self.pattern},
+            "open_bag": {"topic": self.topic},
+            "open_mcap": {"topic": self.topic, "strict": self.strict},
+        }
+        recording: Recording = opener(
+            path, self.camera, self.fps, self.progress, **more.get(name, {})
+        )
         return recording
 
     def render(self, address: str) -> Recording:
@@ -175,7 +171,7 @@ def stated_subject(path: Path, progress: Progress = silent) -> str:
         The stated name; '' if none is stated, or the metadata cannot be read.
     """
     from liex_lab.recordings.camera_file import CameraFile
-    from liex_lab.recordings.formats.moseq_files import METADATA, read_metadata, unpack
+    from liex_lab.recordings.formats.moseq import METADATA, read_metadata, unpack
 
     folder = path if path.is_dir() else path.parent
     notes = {CAMERA_FILE: folder / CAMERA_FILE}
@@ -185,7 +181,7 @@ def stated_subject(path: Path, progress: Progress = silent) -> str:
                 return str(recording.metadata.get("subject_id", ""))
         with TemporaryDirectory() as scratch:
             if path.name.lower().endswith((".tar.gz", ".tgz", ".tar")):
-                notes |= unpack(path, (METADATA, CAMERA_FILE), Path(scratch), progress).files
+                notes |= unpack(path, (METADATA, CAMERA_FILE), Path(scratch), progress)[0]
             elif path.suffix.lower() not in (".oni", ".bag", ".db3"):
                 notes[METADATA] = folder / METADATA
             file = notes.get(METADATA)

@@ -36,7 +36,7 @@ from numpy.typing import NDArray
 from liex_lab.errors import RecordingError, SessionError
 from liex_lab.optics.camera import Camera
 from liex_lab.recordings.depth_kernels import to_millimetres
-from liex_lab.recordings.formats.messages.mcap_index import open_replay
+from liex_lab.recordings.formats.messages.mcap import open_replay
 from liex_lab.recordings.frame import region_mask
 from liex_lab.recordings.recording import Recording
 from liex_lab.scene.background import learn_background, sample_frames

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from liex_lab.optics.camera import Camera
 from liex_lab.plan import Plan
 from liex_lab.recordings import open_recording
-from liex_lab.recordings.formats.messages.mcap_writer import McapDepthWriter
+from liex_lab.recordings.writer import McapDepthWriter
 from liex_lab.recordings.frame import DepthFrame
 from liex_lab.recordings.recording import Recording
 from liex_lab.recordings.writer import PictureFolderWriter, RecordingWriter

@@ -17,7 +17,7 @@ from liex_lab.cli.main import app
 from liex_lab.errors import SessionError
 from liex_lab.plan import Plan
 from liex_lab.recordings import open_recording
-from liex_lab.recordings.formats.messages.mcap_writer import McapDepthWriter
+from liex_lab.recordings.writer import McapDepthWriter
 from liex_lab.sessions import Session
 from liex_lab.sessions.evidence import link_to
 from liex_lab.sessions.rrd_scene import DEPTH

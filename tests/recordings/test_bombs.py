@@ -29,7 +29,7 @@ from liex_lab.errors import LiexError, ModelError, RecordingError, StudyError
 from liex_lab.estimation.model import Model
 from liex_lab.plan.study import Study
 from liex_lab.recordings import open_recording
-from liex_lab.recordings.formats.images.tiff import open_tiffs
+from liex_lab.recordings.formats.images.files import open_tiffs
 from liex_lab.runtime.memory import check_npz
 from liex_lab.runtime.progress import silent
 

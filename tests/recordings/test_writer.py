@@ -19,9 +19,8 @@ from rosbags.highlevel import AnyReader
 from liex_lab.errors import RecordingError
 from liex_lab.optics.camera import Distortion
 from liex_lab.recordings import open_recording
-from liex_lab.recordings.formats.messages.mcap_writer import McapDepthWriter
 from liex_lab.recordings.frame import DepthFrame, depth_mm, metres, nearest_steps, whole_steps
-from liex_lab.recordings.writer import PictureFolderWriter, RecordingWriter
+from liex_lab.recordings.writer import McapDepthWriter, PictureFolderWriter, RecordingWriter
 from tests.recordings.writers import SMALL, START_NS, depth_frames, even_times
 
 STORED = depth_frames(40).astype(np.float32)

@@ -14,49 +14,467 @@ Distortion is Brown-Conrady with eight coefficients (ROS: rational_polynomial).
 
 from __future__ import annotations
 
+import gzip
 import json
 import re
 import shutil
-from contextlib import ExitStack
-from dataclasses import dataclass, field
-from pathlib import Path
+import tarfile
+import zlib
+from collections.abc import Generator, Iterator, Sequence
+from contextlib import ExitStack, closing, suppress
+from dataclasses import dataclass, replace
+from pathlib import Path, PurePosixPath
 from threading import Lock
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import IO, TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+from isal import igzip_threaded, isal_zlib
 from numpy.typing import NDArray
 
 from liex_lab.errors import RecordingError
 from liex_lab.optics.camera import KINECT_V2, Camera, Distortion, Lens
 from liex_lab.recordings.camera_file import CAMERA_FILE, CameraFile, rate, refuse_infrared
-from liex_lab.recordings.formats.images.files import Stack
-from liex_lab.recordings.formats.images.folder import Pictures
-from liex_lab.recordings.formats.moseq_files import (
-    AZURE,
-    KINECT,
-    METADATA,
-    STAMPS,
-    Metadata,
-    Unpacked,
-    read_metadata,
-    read_session_stamps,
-    unpack,
-)
+from liex_lab.recordings.formats.images.files import Size, Stack
+from liex_lab.recordings.frame import unread_where_damaged
 from liex_lab.recordings.recording import Recording
+from liex_lab.recordings.timestamp_files import Stamps, read_stamps
 from liex_lab.recordings.timestamps import (
     Times,
     from_rate,
     in_order_of_sensor,
     match_counts,
     median_step,
+    start_of_day,
     unpaired,
 )
 from liex_lab.runtime.durable import Scratch
-from liex_lab.runtime.places import STRETCH, let_go
+from liex_lab.runtime.places import STRETCH, is_full, let_go, write_through
 from liex_lab.runtime.progress import Progress, silent
+from liex_lab.runtime.text_files import read_text
 
 if TYPE_CHECKING:
-    from liex_lab.recordings.formats.video import DepthTrack
+    from liex_lab.recordings.formats.video import DepthVideo
+
+
+_PACKED = 1 << 18  # packed bytes read at once
+_UNPACKED = 1 << 17  # bytes unpacked at once: an empty image is a thousand times its packed size
+_ALWAYS = 1 << 29  # bytes unpacked at any compression ratio
+_MOST_TIMES = 200  # compression ratio beyond that: true images have noise
+_MOST_HEADER = 1 << 20  # bytes of a member's name or notes
+_MOST_NOTES = 1 << 28  # bytes of any file but the images: stamps of days
+_GZIP_MAGIC = b"\x1f\x8b"
+Pieces = Generator[bytes | memoryview, None, None]
+
+
+class _Member(tarfile.TarInfo):
+    """A member of an archive, with size limits: tarfile reads any name or note into memory."""
+
+    _LONG = (
+        tarfile.GNUTYPE_LONGNAME,
+        tarfile.GNUTYPE_LONGLINK,
+        tarfile.XHDTYPE,
+        tarfile.XGLTYPE,
+        tarfile.SOLARIS_XHDTYPE,
+    )
+
+    def _proc_member(self, tar: tarfile.TarFile) -> tarfile.TarInfo:
+        if self.type == tarfile.GNUTYPE_SPARSE:
+            raise RecordingError(
+                "the archive has a file with holes in it (GNU sparse); pack the session's folder "
+                "again, without --sparse"
+            )
+        if self.type in self._LONG and self.size > _MOST_HEADER:
+            raise RecordingError(
+                f"the archive has a name or note of {self.size} bytes, which no recording has; "
+                "pack the session's folder again"
+            )
+        found: tarfile.TarInfo = super()._proc_member(tar)  # type: ignore[misc]
+        return found
+
+
+class _Damaged(Exception):
+    """ISA-L found damage; zlib then locates it."""
+
+
+class _ArchiveBytes:
+    """The unpacked bytes of an archive, in order, up to its last good byte.
+
+    Attributes:
+        zipped: whether the archive is packed by gzip.
+        whole: whether it is complete, once read to its end.
+    """
+
+    def __init__(self, file: IO[bytes], size: int, progress: Progress, fast: bool) -> None:
+        """Start to unpack.
+
+        Args:
+            file: the open archive.
+            size: its bytes.
+            progress: reports how many MB were unpacked.
+            fast: use ISA-L, which raises `_Damaged` on damage.
+        """
+        self._file = file
+        self._size = size
+        self._progress = progress
+        self.zipped = file.read(2) == _GZIP_MAGIC
+        file.seek(0)
+        self.whole = not self.zipped or fast
+        self._coming = self._by_isal() if self.whole else self._by_zlib()
+        self._piece = memoryview(b"")  # rest of the last one
+        self._n_read = 0
+
+    def read(self, n: int) -> bytes:
+        """Some of the next bytes, at most n; empty at their end.
+
+        Raises:
+            RecordingError: the compression ratio is implausible for a recording.
+        """
+        while not self._piece:
+            piece = next(self._coming, None)
+            packed = self._file.tell()
+            self._progress(packed >> 20, (self._size >> 20) + 1, "unpacking the recording (MB)")
+            if piece is None:
+                return b""
+            self._piece = memoryview(piece)
+            self._n_read += len(piece)
+            if self._n_read > _ALWAYS and self._n_read > _MOST_TIMES * max(packed, 1):
+                raise RecordingError(
+                    f"the archive unpacks to more than {_MOST_TIMES} times its size, which no "
+                    "recording does; pack the session's folder again"
+                )
+        part = bytes(self._piece[:n])
+        self._piece = self._piece[n:]
+        return part
+
+    def close(self) -> None:
+        """Stop unpacking."""
+        self._coming.close()
+
+    def _by_isal(self) -> Pieces:
+        """An archive that is whole or not packed; each piece is valid until the next is requested.
+
+        ISA-L unpacks on a separate thread, in parallel to writing.
+        """
+        room = bytearray(_UNPACKED)
+        file: Any = self._file
+        try:
+            if self.zipped:
+                file = igzip_threaded.open(self._file, "rb", block_size=_UNPACKED)
+            while n := file.readinto(room):
+                yield memoryview(room)[:n]
+        except (EOFError, gzip.BadGzipFile, isal_zlib.error) as error:  # type: ignore[misc]
+            raise _Damaged from error
+        finally:
+            if self.zipped:
+                file.close()
+
+    def _by_zlib(self) -> Pieces:
+        """The archive unpacked by zlib, up to the last good byte."""
+        inflate = zlib.decompressobj(31)
+        while packed := self._file.read(_PACKED):
+            while packed:
+                if inflate.eof:
+                    # a gzip file may have several members; anything else after it is
+                    # padding
+                    if len(packed) < len(_GZIP_MAGIC):
+                        packed += self._file.read(_PACKED)
+                    if not packed.startswith(_GZIP_MAGIC):
+                        return
+                    inflate = zlib.decompressobj(31)
+                spare = inflate.copy()
+                try:
+                    yield inflate.decompress(packed, _UNPACKED)
+                except zlib.error:  # which withholds the whole piece in which it finds damage
+                    self.whole = False
+                    with suppress(zlib.error):
+                        for k in range(len(packed)):
+                            yield spare.decompress(packed[k : k + 1])
+                    return
+                self.whole = inflate.eof
+                packed = inflate.unused_data if inflate.eof else inflate.unconsumed_tail
+        if not self.whole:
+            yield inflate.flush()
+
+
+def unpack(
+    archive: Path, wanted: Sequence[str], folder: Path, progress: Progress
+) -> tuple[dict[str, Path], bool]:
+    """Write the wanted members of a .tar or .tar.gz into a folder, by their plain names.
+
+    Args:
+        archive: the .tar, .tar.gz or .tgz file.
+        wanted: plain names of the members to write.
+        folder: the output folder.
+        progress: reports how many MB were unpacked.
+
+    Returns:
+        The files written, by their plain names, and whether the archive is cut or damaged.
+
+    Raises:
+        RecordingError: nothing can be unpacked, a wanted name occurs twice, or the disk is full.
+    """
+    with suppress(_Damaged):
+        return _unpack(archive, wanted, folder, progress, fast=True)
+    return _unpack(archive, wanted, folder, progress, fast=False)
+
+
+def _unpack(
+    archive: Path, wanted: Sequence[str], folder: Path, progress: Progress, fast: bool
+) -> tuple[dict[str, Path], bool]:
+    """`unpack` by ISA-L or by zlib.
+
+    Raises:
+        _Damaged: ISA-L found damage and zlib may recover more.
+    """
+    files: dict[str, Path] = {}
+    names: set[str] = set()
+    cut = False
+    with (
+        archive.open("rb") as file,
+        closing(_ArchiveBytes(file, archive.stat().st_size, progress, fast)) as stream,
+    ):
+        try:
+            with tarfile.open(fileobj=stream, mode="r|", tarinfo=_Member, bufsize=_UNPACKED) as tar:  # type: ignore[call-overload]
+                for member in tar:
+                    name = PurePosixPath(member.name).name
+                    if not member.isfile() or name.startswith("._"):
+                        continue
+                    if name in wanted and name in names:
+                        raise RecordingError(
+                            f"{archive} holds more than one {name}; unpack it and give the folder "
+                            "of one session"
+                        )
+                    names.add(name)
+                    if name in wanted:
+                        (folder / name).unlink(missing_ok=True)  # frees its disk space
+                        _check_size(archive, member, folder)
+                        files[name] = folder / name
+                        _copy(member, files[name], tar.fileobj)
+        except tarfile.TarError:
+            if not names and not (fast and stream.zipped):
+                raise RecordingError(
+                    f"{archive} should be a MoSeq session packed as .tar.gz, but nothing can be "
+                    "unpacked from it; pack the session's folder again"
+                ) from None
+            cut = True
+        # a tar ends before the gzip around it, and only gzip's end shows that it is whole
+        while stream.read(_UNPACKED):
+            pass
+    cut = cut or not stream.whole
+    if cut and fast and stream.zipped:
+        raise _Damaged
+    return files, cut
+
+
+def _check_size(archive: Path, member: tarfile.TarInfo, folder: Path) -> None:
+    """Raises RecordingError if a member is too large for its type, or for the disk."""
+    name = PurePosixPath(member.name).name
+    if member.issparse():
+        raise RecordingError(
+            f"{archive} has a file with holes in it, {name}; pack the session's folder again"
+        )
+    is_note = PurePosixPath(name).suffix in (".json", ".txt", ".csv", ".toml")
+    if is_note and member.size > _MOST_NOTES:
+        raise RecordingError(
+            f"{archive} has a {name} of {member.size / 1e9:.1f} GB, which holds no stamps or "
+            "notes; pack the session's folder again"
+        )
+    room = shutil.disk_usage(folder).free
+    if member.size > room:
+        raise _no_room(member, folder, f", where {room / 1e9:.1f} GB are free")
+
+
+def _no_room(member: tarfile.TarInfo, folder: Path, free: str) -> RecordingError:
+    return RecordingError(
+        f"there is no room to unpack {member.size / 1e9:.1f} GB into {folder}{free}; free some, or "
+        "set TMPDIR to a folder on a larger disk"
+    )
+
+
+def _copy(member: tarfile.TarInfo, to: Path, stream: Any) -> None:
+    """Write the next member up to its last byte.
+
+    Raises:
+        ReadError: the archive ends before it.
+    """
+
+    def parts() -> Iterator[memoryview]:
+        left = member.size
+        while left and (part := stream.read(min(left, _UNPACKED))):
+            left -= len(part)
+            yield memoryview(part)
+
+    try:
+        with to.open("wb") as out:
+            written = write_through(parts(), out)
+    except OSError as error:
+        if is_full(error):
+            raise _no_room(member, to.parent, "") from None
+        raise
+    if written < member.size:
+        raise tarfile.ReadError("the archive ends within a file")
+
+
+# Metadata of a MoSeq session: metadata.json, depth_ts.txt (ms) and timestamps.csv (s).
+
+
+STAMPS = {"depth_ts.txt": 10**6, "timestamps.csv": 10**9}  # file: nanoseconds in its unit
+METADATA = "metadata.json"
+# kinds of cameras
+AZURE = "Azure Kinect"
+KINECT = "Kinect v2"
+OTHER = "other"
+
+_CAMERA_KEYS = (
+    "camera",
+    "cameratype",
+    "cameramodel",
+    "device",
+    "devicename",
+    "devicemodel",
+    "sensor",
+)
+_CAMERA_WORDS = {  # word in a camera's name: its kind; the first match counts
+    "azure": AZURE,
+    "k4a": AZURE,
+    "femto": AZURE,
+    "kinectv2": KINECT,
+    "kinect2": KINECT,
+    "kinectone": KINECT,
+    "kinectforwindowsv2": KINECT,
+}
+
+
+@dataclass(frozen=True)
+class Metadata:
+    """Contents of metadata.json.
+
+    Attributes:
+        size: (width, height), px; None if absent.
+        dtype: of the stored depths, "<u2" or ">u2".
+        camera: `AZURE`, `KINECT` or `OTHER`; None if absent.
+        camera_name: the camera's name in the file; empty if absent.
+        facts: for `Recording.metadata`.
+        problems: sentences about ignored values.
+    """
+
+    size: tuple[int, int] | None
+    dtype: str
+    camera: str | None
+    camera_name: str
+    facts: dict[str, Any]
+    problems: list[str]
+
+
+def read_metadata(path: Path | None, cut: bool) -> Metadata:
+    """Parse metadata.json, which is often missing.
+
+    Args:
+        path: the file; None for empty metadata.
+        cut: True if its archive is cut; a broken file is then ignored instead of refused.
+
+    Raises:
+        RecordingError: the file is not a JSON object, or its DepthResolution is invalid.
+    """
+    nothing = Metadata(None, "<u2", None, "", {}, [])
+    if path is None:
+        return nothing
+    try:
+        document = json.loads(read_text(path))
+        if not isinstance(document, dict):
+            raise ValueError("it is not an object in braces")
+    except (
+        ValueError,
+        RecursionError,
+    ) as error:  # broken JSON and broken UTF-8 are both ValueErrors
+        if cut:
+            return replace(nothing, problems=[f"{METADATA} is cut short and was not used"])
+        raise RecordingError(
+            f"{METADATA} of the session is not JSON ({error}); correct or remove it"
+        ) from None
+    named = {
+        "subject_id": document.get("SubjectName"),
+        "session_name": document.get("SessionName"),
+    }
+    facts = {key: str(said).strip() for key, said in named.items() if type(said) in (str, int)}
+    stated = document.get("StartTime")
+    facts |= {"session_start_time": start_of_day(stated) or ""}
+    facts = {key: said for key, said in facts.items() if said}
+    problems = []
+    if stated is not None and "session_start_time" not in facts:
+        problems.append(
+            f"StartTime {stated!r} in {METADATA} is not a time with a zone, so it was not used"
+        )
+    little = document.get("IsLittleEndian", True) is not False
+    size = _stated_size(document.get("DepthResolution"))
+    return Metadata(size, "<u2" if little else ">u2", *_stated_camera(document), facts, problems)
+
+
+def _stated_size(value: Any) -> tuple[int, int] | None:
+    if value is None:
+        return None
+    if (
+        isinstance(value, list)
+        and len(value) == 2
+        and all(type(v) is int and 0 < v < 20_000 for v in value)
+    ):
+        return value[0], value[1]
+    raise RecordingError(
+        f"{METADATA} states DepthResolution = {value!r}; it is [width, height] in pixels"
+    )
+
+
+def _stated_camera(document: dict[str, Any]) -> tuple[str | None, str]:
+    """Kind and stated name of the camera: programs for MoSeq have no common key for it."""
+    entries = {
+        key.lower().replace("_", "").replace(" ", ""): value for key, value in document.items()
+    }
+    stated = (entries[key].strip() for key in _CAMERA_KEYS if isinstance(entries.get(key), str))
+    name = next(filter(None, stated), "")
+    plain = "".join(letter for letter in name.lower() if letter.isalnum())
+    known = (camera for word, camera in _CAMERA_WORDS.items() if word in plain)
+    return next(known, OTHER if name else None), name
+
+
+def read_session_stamps(
+    files: dict[str, Path],
+    cut: bool,
+    camera_file: CameraFile,
+    problems: list[str],
+    doubts: list[str],
+) -> Stamps | None:
+    """Read the file of time stamps next to the depth.
+
+    depth_ts.txt is in milliseconds and timestamps.csv in seconds, unless their first line names a
+    column in another unit, or camera.toml does. In a cut archive, half a number at the end is
+    dropped, also from the file.
+
+    Args:
+        files: the session's files by name.
+        cut: True if their archive is cut.
+        camera_file: may state the column of times and its unit.
+        problems: sentences, appended to if there are no stamps.
+        doubts: reasons why the times are unreliable, appended to.
+
+    Returns:
+        The stamps; None if absent.
+
+    Raises:
+        RecordingError: a line has no valid stamp.
+    """
+    name = next((name for name in STAMPS if name in files), None)
+    if name is None:
+        return None
+    path = files[name]
+    if cut:  # the archive may end inside this file: half a number is a wrong number
+        text = path.read_bytes()
+        path.write_bytes(text[: text.rfind(b"\n") + 1])
+    stated = (camera_file.time_column, camera_file.time_unit, STAMPS[name])
+    stamps = read_stamps(path, doubts, *stated)
+    if not len(stamps):
+        problems.append(f"{name} holds no time stamp")
+        return None
+    return stamps
 
 
 class Mode(NamedTuple):
@@ -94,16 +512,8 @@ _TYPICAL = (
 _DEPTH_CAMERA = ("CALIBRATION_CameraLocationD0", "CALIBRATION_CameraPurposeDepth")
 
 
-class FactoryLens(NamedTuple):
-    """Factory calibration of the depth camera.
-
-    Attributes:
-        shares: cx, cy, fx, fy as shares of the sensor's side.
-        distortion: k1 k2 p1 p2 k3 k4 k5 k6.
-    """
-
-    shares: tuple[float, float, float, float]
-    distortion: tuple[float, ...]
+# cx, cy, fx, fy as shares of the sensor's side, and k1 k2 p1 p2 k3 k4 k5 k6
+FactoryLens = tuple[tuple[float, ...], tuple[float, ...]]
 
 
 def mode_of(width: int, height: int) -> Mode | None:
@@ -133,7 +543,7 @@ def read_calibration(data: bytes) -> FactoryLens | None:
     if len(values) < 14 or not np.isfinite(values).all() or min(values[2:4]) <= 0:
         return None
     cx, cy, fx, fy, k1, k2, k3, k4, k5, k6, _, _, p2, p1 = values[:14]
-    return FactoryLens((cx, cy, fx, fy), (k1, k2, p1, p2, k3, k4, k5, k6))
+    return (cx, cy, fx, fy), (k1, k2, p1, p2, k3, k4, k5, k6)
 
 
 def azure_camera(mode: Mode, lens: FactoryLens | None) -> Camera:
@@ -149,20 +559,18 @@ def azure_camera(mode: Mode, lens: FactoryLens | None) -> Camera:
     Returns:
         The camera, with distortion if lens is given.
     """
-    cx, cy, fx, fy = _TYPICAL if lens is None else lens.shares
-    facts: dict[str, Any] = {
-        "fx": fx * mode.side,
-        "fy": fy * mode.side,
-        "cx": cx * mode.side - mode.left - 0.5,
-        "cy": cy * mode.side - mode.top - 0.5,
-        "width": mode.width,
-        "height": mode.height,
-    }
-    if lens is None:
-        return Camera(**facts, source=f"typical Azure Kinect, {mode.name}")
-    distortion = Distortion.of("rational_polynomial", lens.distortion)
+    shares, bent = (_TYPICAL, ()) if lens is None else lens
+    cx, cy, fx, fy = (share * mode.side for share in shares)
+    source = "the camera's factory calibration in the file"
     return Camera(
-        **facts, source="the camera's factory calibration in the file", distortion=distortion
+        fx,
+        fy,
+        cx - mode.left - 0.5,
+        cy - mode.top - 0.5,
+        mode.width,
+        mode.height,
+        source if lens else f"typical Azure Kinect, {mode.name}",
+        distortion=Distortion.of("rational_polynomial", bent),
     )
 
 
@@ -183,49 +591,36 @@ _OTHER_SIZES = (
 )
 
 
-@dataclass
 class RawFrames(Stack):
-    """Consecutive frames in a file without a header, read with `seek`; a `Stack`.
+    """Consecutive frames in a file without a header, read with `seek`.
 
     Not a memory map: mapped pages count as the process's memory, so a long session would appear as
     a leak.
-
-    Attributes:
-        path: the file.
-        width: columns of a frame, px.
-        height: rows of a frame, px.
-        dtype: of the stored values, "<u2" or ">u2".
-        n: number of whole frames.
-        truncated: True if the file ends in the middle of a frame, or its archive is cut.
-        problems: sentences about the file.
-        once: True for a file unpacked for this recording, which is read from front to back.
     """
 
-    path: Path
-    width: int
-    height: int
-    dtype: str
-    n: int
-    truncated: bool = False
-    problems: list[str] = field(default_factory=list)
-    once: bool = False
+    def __init__(
+        self, path: Path, size: Size, dtype: str, n: int, truncated: bool, once: bool
+    ) -> None:
+        """Open the file.
 
-    def __post_init__(self) -> None:
-        self._file = self.path.open("rb")
+        Args:
+            path: the file.
+            size: columns and rows of a frame, px.
+            dtype: of the stored values, "<u2" or ">u2".
+            n: number of whole frames.
+            truncated: True if the file ends in the middle of a frame, or its archive is cut.
+            once: True for a file unpacked for this recording, which is read from front to back.
+        """
+        super().__init__(size, [True] * n, truncated)
+        self._path = path
+        self._dtype = dtype
+        self._once = once
+        self._file = path.open("rb")
         self._lock = Lock()
         self._kept_from = 0  # earlier pages may have been released
 
-    def __len__(self) -> int:
-        return self.n
-
     def read(self, index: int) -> NDArray[Any]:
-        """Stored values of one frame.
-
-        Args:
-            index: number of the frame.
-
-        Returns:
-            (H, W) 16-bit integers.
+        """Stored values of one frame, (H, W) 16-bit integers.
 
         Raises:
             RecordingError: the file became shorter.
@@ -236,18 +631,18 @@ class RawFrames(Stack):
             raw = self._file.read(n_bytes)
             end = self._file.tell()
             # limits what the system caches of the file
-            if self.once and not 0 <= end - self._kept_from < STRETCH:
+            if self._once and not 0 <= end - self._kept_from < STRETCH:
                 let_go(self._file, min(self._kept_from, end), end)
                 self._kept_from = end
         if len(raw) < n_bytes:
             raise RecordingError(
-                f"{self.path} became shorter while it was read; frame {index} is no longer there"
+                f"{self._path} became shorter while it was read; frame {index} is no longer there"
             )
-        return np.frombuffer(raw, self.dtype).reshape(self.height, self.width)
+        return np.frombuffer(raw, self._dtype).reshape(self.height, self.width)
 
     def label(self, index: int) -> str:
         """Name of a frame, for a message: the frame and the file."""
-        return f"frame {index} of {self.path.name}"
+        return f"frame {index} of {self._path.name}"
 
     def close(self) -> None:
         """Close the file."""
@@ -282,27 +677,26 @@ def open_moseq(
             files = {depth.name: depth} | {
                 name: folder / name for name in names if (folder / name).is_file()
             }
-            found = Unpacked(files, frozenset(), False)
             name = folder.resolve().name if depth.name in DEPTHS else depth.stem
-            session = _Session(path, depth, found, camera, fps, progress)
+            session = _Session(path, depth, files, False, camera, fps, progress)
             return session.open(name, list(files.values()), opened)
         # gzip has no random access, so the session is unpacked once into a temporary
         # folder
         scratch = Scratch()
         opened.callback(scratch.close)
-        found = unpack(path, (*DEPTHS, *names), scratch.folder, progress)
+        files, cut = unpack(path, (*DEPTHS, *names), scratch.folder, progress)
         beside = path.parent / CAMERA_FILE
-        if CAMERA_FILE not in found.files and beside.is_file():  # so that the folder opens as well
+        if CAMERA_FILE not in files and beside.is_file():  # so that the folder opens as well
             shutil.copy(beside, scratch.folder)
-        inside = next((found.files[name] for name in DEPTHS if name in found.files), None)
+        inside = next((files[name] for name in DEPTHS if name in files), None)
         if inside is None:
             raise RecordingError(
                 f"{path} is cut short before its {DEPTH}, so no frame can be read; copy it again"
-                if found.cut
+                if cut
                 else f"{path} should hold a MoSeq session, but there is no {DEPTH} in it; give "
                 "another archive"
             )
-        session = _Session(path, inside, found, camera, fps, progress)
+        session = _Session(path, inside, files, cut, camera, fps, progress)
         name = re.sub(r"\.(tar\.gz|[^.]+)$", "", path.name, flags=re.IGNORECASE)
         return session.open(name, [path], opened, scratch.folder)
     except BaseException:
@@ -317,24 +711,23 @@ class _Session:
         self,
         path: Path,
         depth: Path,
-        found: Unpacked,
+        files: dict[str, Path],
+        cut: bool,
         camera: Lens | None,
         fps: float | None,
         progress: Progress,
     ) -> None:
         self.path = path
         self.depth = depth
-        self.cut = found.cut
+        self.cut = cut
         self.progress = progress
         self.stated_camera = camera
         self.fps = fps
-        self.camera_file = CameraFile.read(found.files.get(CAMERA_FILE, path.parent / CAMERA_FILE))
-        self.metadata: Metadata = read_metadata(found.files.get(METADATA), found.cut)
+        self.camera_file = CameraFile.read(files.get(CAMERA_FILE, path.parent / CAMERA_FILE))
+        self.metadata = read_metadata(files.get(METADATA), cut)
         self.problems = [*self.camera_file.problems, *self.metadata.problems]
         self.doubts: list[str] = []
-        self.stamps = read_session_stamps(
-            found.files, found.cut, self.camera_file, self.problems, self.doubts
-        )
+        self.stamps = read_session_stamps(files, cut, self.camera_file, self.problems, self.doubts)
 
     def open(
         self, name: str, sources: list[Path], opened: ExitStack, unpacked: Path | None = None
@@ -347,19 +740,24 @@ class _Session:
             opened: resources that closing the recording closes, added to.
             unpacked: folder of unpacked files; None if nothing was unpacked.
         """
-        stack, track = self._open_depth(once=unpacked is not None)
+        video: DepthVideo | None = None
+        if self.depth.suffix.lower() == ".dat":
+            stack: Stack = self._open_raw(once=unpacked is not None)
+        else:
+            stack = video = self._open_video()
         opened.callback(stack.close)
-        camera = self._camera(stack, track)
-        monotone = in_order_of_sensor(self._times(stack, track))
+        camera = self._camera(stack, video)
+        monotone = in_order_of_sensor(self._times(stack, video))
         self.problems += [monotone.problem] if monotone.problem else []
-        began = "" if track is None else track.session_start
-        start = {"session_start_time": began} if began else {}
+        start = {} if video is None else {"session_start_time": video.session_start}
+        facts = {**start, **self.metadata.facts, **self.camera_file.metadata}
+        size = (stack.height, stack.width)
         return Recording(
             name=name,
             format="moseq",
             camera=camera,
             times_ns=monotone.times_ns,
-            read=Pictures(stack, self.camera_file.decode, self.problems).read,
+            read=unread_where_damaged(stack.depth(self.camera_file.decode), size, self.problems),
             sources=sources,
             problems=self.problems,
             truncated=stack.truncated or self.cut,
@@ -367,16 +765,14 @@ class _Session:
             faults=monotone.faults,
             doubts=self.doubts,
             stored=monotone.order,
-            metadata={**start, **self.metadata.facts, **self.camera_file.metadata},
+            metadata={key: fact for key, fact in facts.items() if fact},
             unpacked=None if self.cut else unpacked,
         )
 
-    def _open_depth(self, once: bool) -> tuple[Stack, DepthTrack | None]:
-        if self.depth.suffix.lower() == ".dat":
-            return self._open_raw(once), None
-        from liex_lab.recordings.formats.video import open_video
+    def _open_video(self) -> DepthVideo:
+        from liex_lab.recordings.formats.video import DepthVideo
 
-        video = open_video(self.depth, self.progress)
+        video = DepthVideo(self.depth, self.progress)
         if self.metadata.size not in (None, (video.width, video.height)):
             self.problems.append(
                 f"{METADATA} states pictures of {self.metadata.size}, but those in "
@@ -386,7 +782,7 @@ class _Session:
             self.problems.append(
                 f"{self.depth.name} is cut or damaged; its {len(video)} whole frames can be read"
             )
-        return video, video.track
+        return video
 
     def _open_raw(self, once: bool) -> RawFrames:
         n_bytes = self.depth.stat().st_size
@@ -405,15 +801,8 @@ class _Session:
                 else f"{DEPTH} holds {n} frames, but its archive is cut or damaged; its {n} whole "
                 "frames can be read"
             )
-        return RawFrames(
-            self.depth,
-            width,
-            height,
-            self.metadata.dtype,
-            n,
-            bool(left_over) or self.cut,
-            once=once,
-        )
+        cut = bool(left_over) or self.cut
+        return RawFrames(self.depth, (width, height), self.metadata.dtype, n, cut, once)
 
     def _size_of_camera(self) -> tuple[int, int] | None:
         stated = self.stated_camera if isinstance(self.stated_camera, Camera) else self.camera_file
@@ -434,7 +823,7 @@ class _Session:
             )
         return _KINECT_V2_SIZE
 
-    def _camera(self, stack: Stack, track: DepthTrack | None) -> Camera:
+    def _camera(self, stack: Stack, video: DepthVideo | None) -> Camera:
         """The stated camera, or else the factory calibration in the file, or else a typical camera
         of the recorded kind.
         """
@@ -442,42 +831,35 @@ class _Session:
         if self.stated_camera is not None or self.camera_file.intrinsics:
             return self.camera_file.camera(width, height, self.stated_camera)
         mode = mode_of(width, height)
-        attached = track.attachments if track is not None else ()
+        attached = () if video is None else video.attachments
         lens = next(filter(None, map(read_calibration, attached)), None)
         if mode is not None and lens is not None:
             return azure_camera(mode, lens)
         # no other camera has a Kinect v2's size
         kind = self.metadata.camera or KINECT
-        if track is not None and any(name.startswith("K4A_") for name in track.tags):
+        if video is not None and any(name.startswith("K4A_") for name in video.tags):
             kind = AZURE
         if kind == KINECT and (width, height) == _KINECT_V2_SIZE:
             typical, name = KINECT_V2, "Kinect v2"
         elif kind == AZURE and mode is not None:
             typical, name = azure_camera(mode, None), f"Azure Kinect in the mode {mode.name}"
         else:
-            raise self._unknown_camera(width, height)
+            whose = f"the camera {self.metadata.camera_name!r}"
+            raise RecordingError(
+                f"{self.path} holds pictures of {width} x {height} pixels from "
+                f"{whose if self.metadata.camera_name else 'a camera that is not known'}; write a "
+                "camera.toml beside it with [camera], fx = ..., fy = ..., cx = ... and cy = ... in "
+                "pixels"
+            )
         self.problems.append(
             f"the files hold no intrinsics, so those of a typical {name} were taken; state your "
             "camera's own in a camera.toml beside the recording"
         )
         return typical
 
-    def _unknown_camera(self, width: int, height: int) -> RecordingError:
-        whose = (
-            f"the camera {self.metadata.camera_name!r}"
-            if self.metadata.camera_name
-            else "a camera that is not known"
-        )
-        return RecordingError(
-            f"{self.path} holds pictures of {width} x {height} pixels from {whose}; write a "
-            "camera.toml beside it with [camera], fx = ..., fy = ..., cx = ... and cy = ... in "
-            "pixels"
-        )
-
-    def _times(self, stack: Stack, track: DepthTrack | None) -> Times:
+    def _times(self, stack: Stack, own: DepthVideo | None) -> Times:
         """The stamps next to the depth, or else its own, or else a constant rate."""
         n = len(stack)
-        own = None if track is None or not len(track.times_ns) else track
         hz = rate(self.fps, "the call") or self.camera_file.fps
         counted = self.stamps is not None and self.stamps.counts is not None
         if self.stamps is not None and (own is None or own.even or not counted):

@@ -15,22 +15,23 @@ from __future__ import annotations
 import math
 import struct
 from array import array
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from threading import Lock
 from typing import IO, Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from liex_lab.errors import RecordingError
 from liex_lab.optics.camera import Camera, Lens
 from liex_lab.recordings.camera_file import CAMERA_FILE, CameraFile, rate
 from liex_lab.recordings.depth_kernels import WORST_BYTES_A_PIXEL, unpack_16z
-from liex_lab.recordings.frame import Depth, depth_mm
+from liex_lab.recordings.frame import Depth, depth_mm, unread_where_damaged
 from liex_lab.recordings.recording import Recording
 from liex_lab.recordings.timestamps import (
-    MonotoneTimes,
+    Times,
     from_rate,
     in_order_of_sensor,
     start_of_clock,
@@ -69,8 +70,17 @@ PLANE_DISTANCE = "ZPD"
 PLANE_PIXEL = "ZPPS"
 # fx, fy, cx, cy: written by earlier versions of liex, as the format has no optical axis
 INTRINSICS = "liexIntrinsics"
-_OF_FORMAT = (MODE, CROPPING, MIRROR, UNIT)
-_USED = (*_OF_FORMAT, FIELD_OF_VIEW, OLD_LENS, PLANE_DISTANCE, PLANE_PIXEL, INTRINSICS)
+_USED = (
+    MODE,
+    CROPPING,
+    MIRROR,
+    UNIT,
+    FIELD_OF_VIEW,
+    OLD_LENS,
+    PLANE_DISTANCE,
+    PLANE_PIXEL,
+    INTRINSICS,
+)
 _LARGEST_VALUE = 64  # bytes; the used properties have at most 32
 _MANY = 100
 _MILLIMETRES = 100  # the pixel format if none is stated
@@ -105,26 +115,23 @@ class OniFile:
         whole: True if it has its end record and no damage; valid after a walk.
     """
 
-    def __init__(self, path: Path) -> None:
-        """Open a file.
+    def __init__(self, path: Path, file: IO[bytes]) -> None:
+        """Check the header of an open file.
 
         Raises:
             RecordingError: it is not an .oni file, or its version cannot be read.
         """
-        # unbuffered: every read follows a seek, and a buffer would read 8 kB for each 40 bytes
-        self._file: IO[bytes] = path.open("rb", buffering=0)
+        self._file = file
         self.size = path.stat().st_size
         self.whole = True
         head = self._file.read(_FILE_HEADER.size)
         version = _FILE_HEADER.unpack(head)[1:5] if len(head) == _FILE_HEADER.size else (0,)
         self._header = _OLD_HEADER if version < _NEWEST else _HEADER
         if version == (0,) or not head.startswith(_FILE_MAGIC):
-            self.close()
             raise RecordingError(
                 f"{path} is named like an .oni file but holds something else; give another file"
             )
         if not _OLDEST <= version <= _NEWEST:
-            self.close()
             raise RecordingError(
                 f"{path} says that it is of version {'.'.join(map(str, version))} of its format, "
                 "and versions 1.0.0.4 to 1.0.1.0 can be read; record it again with OpenNI2, or "
@@ -135,10 +142,6 @@ class OniFile:
         """At most `size` bytes at a position, fewer at the end of the file."""
         self._file.seek(at)
         return self._file.read(size)
-
-    def close(self) -> None:
-        """Close the file."""
-        self._file.close()
 
     def walk(self, progress: Progress) -> Iterator[Record]:
         """Every record in file order, resumed after damage at the next valid record.
@@ -199,30 +202,21 @@ class OniFile:
         return None
 
 
-@dataclass(frozen=True)
-class FrameFormat:
+class FrameFormat(NamedTuple):
     """Format of some frames.
 
     Attributes:
-        width: columns of the full frame, px.
-        height: rows of the full frame, px.
+        constant: width and height of the full frame, px, and OpenNI's number for the unit (100:
+            1 mm, 101: 0.1 mm); the same in a whole recording.
         part: x, y, width, height of the recorded part, px.
         mirrored: True if left and right are exchanged.
-        pixel_format: OpenNI's number for the unit (100: 1 mm, 101: 0.1 mm).
         fps: stated, not measured, frame rate, Hz.
     """
 
-    width: int
-    height: int
+    constant: tuple[int, int, int]
     part: tuple[int, int, int, int]
     mirrored: bool
-    pixel_format: int
     fps: int
-
-    @property
-    def constant(self) -> tuple[int, int, int]:
-        """Constants of a recording: width, height and unit."""
-        return self.width, self.height, self.pixel_format
 
 
 @dataclass
@@ -234,10 +228,8 @@ class DepthNode:
         codec: four bytes, `NONE`, `16zT` or `16zP`.
         n_stated: number of frames by the node's own count; None if not stated.
         properties: the current property values by name.
-        times_us: (n,) time of each frame, µs.
-        positions: (n,) position of each payload, bytes.
-        sizes: (n,) size of each payload, bytes.
-        format_of: (n,) number of each frame's format in `formats`.
+        entries: (4 n,) for each frame its time, µs, position and size of its payload, bytes, and
+            the number of its format in `formats`.
         formats: the frame formats with their numbers; None for frames without a stated size.
     """
 
@@ -245,30 +237,21 @@ class DepthNode:
     codec: bytes
     n_stated: int | None
     properties: dict[str, bytes] = field(default_factory=dict)
-    times_us: array[int] = field(default_factory=lambda: array("Q"))
-    positions: array[int] = field(default_factory=lambda: array("q"))
-    sizes: array[int] = field(default_factory=lambda: array("q"))
-    format_of: array[int] = field(default_factory=lambda: array("I"))
+    entries: array[int] = field(default_factory=lambda: array("Q"))
     formats: dict[FrameFormat | None, int] = field(default_factory=dict)
-    _format_now: int | None = None
+    format_now: int | None = None
 
-    def __len__(self) -> int:
-        return len(self.positions)
-
-    def set_property(self, name: str, value: bytes) -> None:
-        """Set a property for the frames that follow."""
-        self.properties[name] = value
-        if name in _OF_FORMAT:
-            self._format_now = None
+    @property
+    def frames(self) -> NDArray[np.uint64]:
+        """The entries, (n, 4)."""
+        return np.array(self.entries, np.uint64).reshape(-1, 4)
 
     def add(self, record: Record) -> None:
         """Add a frame."""
-        if self._format_now is None:
-            self._format_now = self.formats.setdefault(self._format(), len(self.formats))
-        self.times_us.append(_FRAME_FIELDS.unpack(record.fields)[0])
-        self.positions.append(record.payload)
-        self.sizes.append(record.payload_size)
-        self.format_of.append(self._format_now)
+        if self.format_now is None:
+            self.format_now = self.formats.setdefault(self._format(), len(self.formats))
+        time_us, _ = _FRAME_FIELDS.unpack(record.fields)
+        self.entries.extend((time_us, record.payload, record.payload_size, self.format_now))
 
     def number(self, name: str) -> int | None:
         """Value of an integer property; None if absent."""
@@ -288,8 +271,8 @@ class DepthNode:
         cropped, *crop = self.numbers(CROPPING, "<IHHHH") or (0,)
         part = (crop[0], crop[1], crop[2], crop[3]) if cropped else (0, 0, width, height)
         unit = self.number(UNIT)
-        pixel_format = _MILLIMETRES if unit is None else unit
-        return FrameFormat(width, height, part, bool(self.number(MIRROR)), pixel_format, fps)
+        constant = (width, height, _MILLIMETRES if unit is None else unit)
+        return FrameFormat(constant, part, bool(self.number(MIRROR)), fps)
 
 
 def index_file(file: OniFile, progress: Progress) -> tuple[list[DepthNode], set[str]]:
@@ -319,7 +302,8 @@ def index_file(file: OniFile, progress: Progress) -> tuple[list[DepthNode], set[
                 name, rest = _text(record.fields)
                 (size,) = struct.unpack_from("<I", rest)
                 if name in _USED and len(value := rest[4 : 4 + size]) <= _LARGEST_VALUE:
-                    node.set_property(name, value)
+                    node.properties[name] = value
+                    node.format_now = None
             elif record.kind == _FRAME and record.payload_size:
                 node.add(record)
         except struct.error:
@@ -336,8 +320,6 @@ def _text(fields: bytes) -> tuple[str, bytes]:
 
 RAW = b"NONE"
 WITH_TABLE = b"16zT"
-WITHOUT_TABLE = b"16zP"
-_CODECS = (RAW, WITH_TABLE, WITHOUT_TABLE)
 _UNIT_MM = {100: 1.0, 101: 0.1}  # OpenNI's pixel formats of depth
 _SHIFTS = (102, 103)
 _MOST_PIXELS = 1 << 24  # limits the memory for a frame with a damaged header
@@ -353,98 +335,53 @@ _USUAL_SIZES = ((160, 120), (320, 240), (640, 480), (1280, 960), (1280, 1024))
 _FIELDS_OF_VIEW = (math.radians(5.0), math.radians(170.0))
 
 
-class OniFrames:
-    """Frames of one depth node, fetched from the file one at a time."""
+def _frame_reader(
+    file: OniFile, node: DepthNode, form: FrameFormat, how: CameraFile
+) -> Callable[[int], Depth | str]:
+    """The function that reads depth of a frame by its number, or what is wrong with it.
 
-    def __init__(
-        self,
-        file: OniFile,
-        node: DepthNode,
-        form: FrameFormat,
-        how: CameraFile,
-        problems: list[str],
-    ) -> None:
-        """Tabulate the depth of every stored value.
+    Args:
+        file: the open file.
+        node: the depth node with the positions of its frames.
+        form: the format of the recording's frames.
+        how: a camera.toml next to the file, for its unit_mm (a further factor) and unread.
+    """
+    columns, rows, unit = form.constant
+    wrong = f" is damaged or not of {columns} x {rows} pixels"
+    every_value = np.arange(1 << 16, dtype=np.uint16)
+    meaning = depth_mm(every_value, _UNIT_MM[unit] * how.unit_mm, how.unread)
+    frames = node.frames
+    formats = list(node.formats)
+    lock = Lock()
 
-        Args:
-            file: the open file.
-            node: the depth node with the positions of its frames.
-            form: the format of the recording's frames.
-            how: a camera.toml next to the file, for its unit_mm (a further factor) and unread.
-            problems: the recording's sentences, appended to for damaged frames.
-        """
-        self._file = file
-        self._node = node
-        self._form = form
-        self._problems = problems
-        self._formats = list(node.formats)
-        self._unit_mm = _UNIT_MM[form.pixel_format] * how.unit_mm
-        self._unread = how.unread
-        self._meaning = depth_mm(np.arange(1 << 16, dtype=np.uint16), self._unit_mm, self._unread)
-        self._bad: set[int] = set()
-        self._lock = Lock()
-
-    def read(self, number: int) -> Depth:
-        """Depth of one frame; all unread if it is damaged or of another size.
-
-        Args:
-            number: index of the frame in the node.
-
-        Returns:
-            (H, W) float32 mm, 0 where unread.
-        """
-        depth = self.decode(number)
-        if depth is not None:
-            return depth
-        if number not in self._bad:
-            self._bad.add(number)
-            self._problems.append(
-                f"frame {number} is damaged or not of {self._form.width} x {self._form.height} "
-                "pixels, and was taken as wholly unread"
-            )
-        return np.zeros((self._form.height, self._form.width), np.float32)
-
-    def decode(self, number: int) -> Depth | None:
-        """Depth of one frame; None if it is damaged or of another size.
-
-        Args:
-            number: index of the frame in the node.
-
-        Returns:
-            (H, W) float32 mm, 0 where unread.
-        """
-        form = self._formats[self._node.format_of[number]]
-        if form is None or form.constant != self._form.constant:
-            return None
-        x, y, width, height = form.part
-        if not (width and height and x + width <= form.width and y + height <= form.height):
-            return None
-        part = self._unpack(self._payload(number, width * height), width * height)
+    def read(number: int) -> Depth | str:
+        """Depth (H, W) float32 mm of one frame, 0 where unread."""
+        _, at, size, k = frames[number].tolist()
+        own = formats[k]
+        if own is None or own.constant != form.constant:
+            return wrong
+        x, y, width, height = own.part
+        n = width * height
+        # the code, the longest table, and the counts before both
+        most = WORST_BYTES_A_PIXEL * n + (1 << 17) + 4
+        if not n or x + width > columns or y + height > rows or size > most:
+            return wrong
+        with lock:
+            payload = np.frombuffer(file.read(at, size), np.uint8)
+        if node.codec != RAW:
+            part = unpack_16z(payload, meaning, n, node.codec == WITH_TABLE)
+        else:
+            part = meaning[payload.view("<u2")] if len(payload) == 2 * n else None
         if part is None:
-            return None
+            return wrong
         depth = part.reshape(height, width)
-        if (width, height) != (form.width, form.height):
-            depth = np.zeros((form.height, form.width), np.float32)
+        if n != columns * rows:
+            depth = np.zeros((rows, columns), np.float32)
             depth[y : y + height, x : x + width] = part.reshape(height, width)
         # undo the exchange of left and right
-        return np.ascontiguousarray(depth[:, ::-1]) if form.mirrored else depth
+        return np.ascontiguousarray(depth[:, ::-1]) if own.mirrored else depth
 
-    def _payload(self, number: int, n_pixels: int) -> bytes:
-        """The stored bytes of a frame; empty if their number is implausible for its pixels."""
-        size = self._node.sizes[number]
-        # the code, the longest table, and the counts before both
-        most = WORST_BYTES_A_PIXEL * n_pixels + (1 << 17) + 4
-        with self._lock:
-            raw = self._file.read(self._node.positions[number], size) if size <= most else b""
-        return raw if len(raw) == size else b""
-
-    def _unpack(self, payload: bytes, n_pixels: int) -> Depth | None:
-        if self._node.codec != RAW:
-            stream = np.frombuffer(payload, np.uint8)
-            return unpack_16z(stream, self._meaning, n_pixels, self._node.codec == WITH_TABLE)
-        if len(payload) != 2 * n_pixels:
-            return None
-        return depth_mm(np.frombuffer(payload, "<u2"), self._unit_mm, self._unread)
+    return read
 
 
 def open_oni(
@@ -464,7 +401,8 @@ def open_oni(
     Raises:
         RecordingError: there are no depth frames, they cannot be decoded, or the camera is unknown.
     """
-    file = OniFile(path)
+    # unbuffered: every read follows a seek, and a buffer would read 8 kB for each 40 bytes
+    file = path.open("rb", buffering=0)
     try:
         return _open(path, file, camera, fps, progress)
     except BaseException:
@@ -473,14 +411,16 @@ def open_oni(
 
 
 def _open(
-    path: Path, file: OniFile, camera: Lens | None, fps: float | None, progress: Progress
+    path: Path, raw: IO[bytes], camera: Lens | None, fps: float | None, progress: Progress
 ) -> Recording:
+    file = OniFile(path, raw)
     nodes, others = index_file(file, progress)
     problems: list[str] = []
     node = _choose(path, file, nodes, others, problems)
     form = _format(path, node, problems)
-    n = len(node)
-    whole = file.whole and (node.n_stated is None or node.n_stated <= len(node))
+    width, height, _ = form.constant
+    n = len(node.frames)
+    whole = file.whole and (node.n_stated is None or node.n_stated <= n)
     if node.n_stated not in (None, n):
         problems.append(
             f"{path.name} promises {node.n_stated} frames of {node.name}, and {n} are in it"
@@ -493,28 +433,26 @@ def _open(
     camera_file = CameraFile.read(path.parent / CAMERA_FILE)
     problems += camera_file.problems
     the_camera = _camera(path, node, form, camera_file, camera, problems)
-    monotone = _times(node, form, fps, problems)
-    times = monotone.times_ns
-    frames = OniFrames(file, node, form, camera_file, problems)
-    if not any(
-        frames.decode(i) is not None
-        for i in np.linspace(0, n - 1, min(n, _N_PROBED)).astype(int).tolist()
-    ):
+    monotone = in_order_of_sensor(_times(node, form, fps, problems))
+    problems += [monotone.problem] if monotone.problem else []
+    read = _frame_reader(file, node, form, camera_file)
+    probed = np.linspace(0, n - 1, min(n, _N_PROBED)).astype(int).tolist()
+    if all(isinstance(read(i), str) for i in probed):
         raise RecordingError(
-            f"{path} states pictures of {form.width} x {form.height} pixels, but its frames do not "
+            f"{path} states pictures of {width} x {height} pixels, but its frames do not "
             "unpack to that; it is damaged, so copy it again"
         )
-    start = start_of_clock(int(times[0]))
+    start = start_of_clock(int(monotone.times_ns[0]))
     return Recording(
         name=path.resolve().stem,
         format="oni",
         camera=the_camera,
-        times_ns=times,
-        read=frames.read,
+        times_ns=monotone.times_ns,
+        read=unread_where_damaged(read, (height, width), problems),
         sources=[path],
         problems=problems,
         truncated=not whole,
-        close=file.close,
+        close=raw.close,
         faults=monotone.faults,
         stored=monotone.order,
         metadata=({"session_start_time": start} if start else {}) | camera_file.metadata,
@@ -525,7 +463,7 @@ def _choose(
     path: Path, file: OniFile, depth: list[DepthNode], others: set[str], problems: list[str]
 ) -> DepthNode:
     """The first depth node with frames, chosen by kind: names are arbitrary."""
-    nodes = [node for node in depth if len(node)]
+    nodes = [node for node in depth if node.entries]
     cut = "" if file.whole else "the file is cut or damaged, and "
     if not nodes:
         named = sorted({node.name for node in depth} | others)
@@ -539,7 +477,7 @@ def _choose(
             f"{path.name} holds frames of {len(nodes)} depth cameras; those of the first, "
             f"{node.name}, are read"
         )
-    if node.codec not in _CODECS:
+    if node.codec not in (RAW, WITH_TABLE, b"16zP"):
         raise RecordingError(
             f"{path} holds its depth in the code {node.codec.decode('latin-1')!r}, and {cut}NONE, "
             "16zT and 16zP can be read; record it again without compression"
@@ -549,58 +487,48 @@ def _choose(
 
 def _format(path: Path, node: DepthNode, problems: list[str]) -> FrameFormat:
     """The format of most frames; frames of another size or unit become unread."""
-    count = np.bincount(
-        np.frombuffer(node.format_of, node.format_of.typecode), minlength=len(node.formats)
-    )
-    form = list(node.formats)[int(count.argmax())]
+    used = node.frames[:, 3].astype(np.int64)
+    formats = list(node.formats)
+    form = formats[int(np.bincount(used).argmax())]
     if form is None:
         raise RecordingError(
             f"{path} does not state the size of its pictures (xnMapOutputMode); copy it again"
         )
-    if not 0 < form.width * form.height <= _MOST_PIXELS:
+    width, height, unit = form.constant
+    if not 0 < width * height <= _MOST_PIXELS:
         raise RecordingError(
-            f"{path} states pictures of {form.width} x {form.height} pixels, which no depth camera "
+            f"{path} states pictures of {width} x {height} pixels, which no depth camera "
             "has; it is damaged, so copy it again"
         )
-    if form.pixel_format not in _UNIT_MM:
-        what = (
-            "the sensor's raw shifts"
-            if form.pixel_format in _SHIFTS
-            else f"the unit {form.pixel_format}"
-        )
+    if unit not in _UNIT_MM:
+        what = "the sensor's raw shifts" if unit in _SHIFTS else f"the unit {unit}"
         raise RecordingError(
             f"{path} holds {what} (oniPixelFormat), and depth in steps of 1 mm or 0.1 mm can be "
             "read; record it again as depth"
         )
-    others = sum(
-        int(n)
-        for each, n in zip(node.formats, count, strict=True)
-        if not each or each.constant != form.constant
-    )
-    if others:
+    differ = [one is None or one.constant != form.constant for one in formats]
+    if others := int(np.array(differ)[used].sum()):
         problems.append(
-            f"{others} of {len(node)} frames have another size or unit than {form.width} x "
-            f"{form.height} pixels, and are taken as wholly unread"
+            f"{others} of {len(used)} frames have another size or unit than {width} x "
+            f"{height} pixels, and are taken as wholly unread"
         )
     if form.mirrored:
         problems.append(
             "the camera delivered mirror images (xnMirror); left and right were put back in their "
             "places"
         )
-    if form.part[2:] != (form.width, form.height):
-        x, y, width, height = form.part
+    x, y, columns, rows = form.part
+    if (columns, rows) != (width, height):
         problems.append(
-            f"the camera recorded only {width} x {height} pixels at ({x}, {y}) of its {form.width} "
-            f"x {form.height}; the rest is unread"
+            f"the camera recorded only {columns} x {rows} pixels at ({x}, {y}) of its {width} "
+            f"x {height}; the rest is unread"
         )
     return form
 
 
-def _times(
-    node: DepthNode, form: FrameFormat, fps: float | None, problems: list[str]
-) -> MonotoneTimes:
+def _times(node: DepthNode, form: FrameFormat, fps: float | None, problems: list[str]) -> Times:
     """Microseconds as ns; a constant rate if the clock stood still."""
-    stamps = np.frombuffer(node.times_us, node.times_us.typecode)
+    stamps = node.frames[:, 0]
     n = len(stamps)
     if n > 1 and np.all(stamps == stamps[0]):
         stated = rate(fps, "the call")
@@ -614,7 +542,7 @@ def _times(
             f"all frames have the same time stamp, so a constant {hz:g} frames/s was assumed, "
             f"{origin}"
         )
-        return in_order_of_sensor(from_rate(n, hz))
+        return from_rate(n, hz)
     order = np.arange(n)
     sane = np.maximum.accumulate(np.where(stamps <= _LATEST_US, order, 0))
     if n_wild := int((sane != order).sum()):
@@ -623,9 +551,7 @@ def _times(
             "frames were taken to follow the one before at once"
         )
     times_us = np.minimum(stamps[sane], np.uint64(_LATEST_US)).astype(np.int64)
-    monotone = in_order_of_sensor(times_us * 1000 + (order - sane))
-    problems += [monotone.problem] if monotone.problem else []
-    return monotone
+    return times_us * 1000 + (order - sane)
 
 
 def _camera(
@@ -639,21 +565,18 @@ def _camera(
     """The camera given by the caller, or else in a camera.toml next to the file, or else in the
     file.
     """
+    width, height, _ = form.constant
     # a camera.toml has priority: the file has the design values of the model, not a
     # calibration
     if stated is not None or camera_file.intrinsics:
-        return camera_file.camera(form.width, form.height, stated)
+        return camera_file.camera(width, height, stated)
     ours = node.numbers(INTRINSICS, "<dddd")
-    if (
-        ours is not None
-        and np.isfinite(ours).all()
-        and _can_be((ours[0], ours[1]), (form.width, form.height))
-    ):
+    if ours is not None and np.isfinite(ours).all() and _can_be(ours[:2], (width, height)):
         source = f"intrinsics in the .oni file ({INTRINSICS})"
-        return Camera(ours[0], ours[1], ours[2], ours[3], form.width, form.height, source=source)
-    focal, source = _stated_focal(node, form, problems)
-    if focal is None and (form.width, form.height) in _USUAL_SIZES:
-        focal = (_VGA_FOCAL * form.width / _VGA_WIDTH,) * 2
+        return Camera(*ours, width, height, source=source)
+    focal, source = _stated_focal(node, (width, height), problems)
+    if focal is None and (width, height) in _USUAL_SIZES:
+        focal = (_VGA_FOCAL * width / _VGA_WIDTH,) * 2
         source = "typical PrimeSense"
         problems.append(
             "the file states no field of view, so the intrinsics of a typical PrimeSense camera "
@@ -661,24 +584,22 @@ def _camera(
         )
     if focal is None:
         raise RecordingError(
-            f"{path} states no field of view for its {form.width} x {form.height} pixels; write a "
+            f"{path} states no field of view for its {width} x {height} pixels; write a "
             "camera.toml beside it with [camera], fx = ..., fy = ..., cx = ... and cy = ... in "
             "pixels"
         )
     # OpenNI's optical axis is at half the size, in our pixel coordinates
-    cx = form.width / 2 if not form.mirrored else form.width - 1 - form.width / 2
-    return Camera(*focal, cx, form.height / 2, form.width, form.height, source=source)
+    cx = width / 2 if not form.mirrored else width - 1 - width / 2
+    return Camera(*focal, cx, height / 2, width, height, source=source)
 
 
 def _stated_focal(
-    node: DepthNode, form: FrameFormat, problems: list[str]
+    node: DepthNode, size: tuple[int, int], problems: list[str]
 ) -> tuple[tuple[float, float] | None, str]:
     """Focal lengths (fx, fy) px and their source; (None, "") without plausible ones in the file."""
-    size = form.width, form.height
     found: list[tuple[tuple[float, float], str]] = []
-    if (view := node.numbers(FIELD_OF_VIEW, "<dd")) is not None and all(
-        0 < angle < math.pi for angle in view
-    ):
+    view = node.numbers(FIELD_OF_VIEW, "<dd")
+    if view is not None and all(0 < angle < math.pi for angle in view):
         fx, fy = (n / 2 / math.tan(angle / 2) for n, angle in zip(size, view, strict=True))
         found.append(((fx, fy), "field of view in the .oni file (xnFOV)"))
     if (plane := node.numbers(OLD_LENS, "<ddd")) is not None and plane[1] * plane[2] > 0:
@@ -687,7 +608,7 @@ def _stated_focal(
     distance = node.number(PLANE_DISTANCE)
     pixel = node.numbers(PLANE_PIXEL, "<d")
     if distance is not None and pixel is not None and pixel[0] > 0:
-        focal = distance / pixel[0] * form.width / _SENSOR_WIDTH
+        focal = distance / pixel[0] * size[0] / _SENSOR_WIDTH
         found.append(((focal, focal), "lens in the .oni file (ZPD and ZPPS)"))
     for focal_lengths, source in found:
         if _can_be(focal_lengths, size):

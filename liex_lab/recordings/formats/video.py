@@ -11,14 +11,12 @@ from __future__ import annotations
 
 import struct
 from array import array
-from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import dataclass, field
 from datetime import datetime
 from fractions import Fraction
 from pathlib import Path
 from threading import Lock
-from typing import IO, Any, NamedTuple
+from typing import IO, Any
 
 import av
 import numpy as np
@@ -55,145 +53,86 @@ _LACING = 0x06  # flags of a block with several frames, which depth recorders do
 _MOST_TICKS = 2**60  # a clock beyond that is damage
 
 
-@dataclass
-class DepthTrack:
-    """Header and frame index of the depth track of an AVI or a Matroska file.
+class _Walk:
+    """The frames of one stream of a file, found by its chunks (AVI) or elements (Matroska).
 
     Attributes:
-        width: columns of the frames, px.
-        height: rows of the frames, px.
-        dtype: type of raw numbers, ">u2" or "<u2"; "" for FFV1.
-        private: the codec's own header.
-        offsets: (n,) positions of the whole frames in the file, bytes.
-        sizes: (n,) their sizes, bytes.
-        times_ns: (n,) their times, ns.
-        even: True if the times are steps of a constant rate, as the container has no others.
-        whole: True if the file is complete and has the stated number of frames.
-        tags: tags of the whole file and of the track.
-        attachments: bytes of the attached files.
-        session_start: ISO 8601 if the file states it.
+        whole: False once the file is cut or damaged.
+        frames: (3 n,) for each frame the position and size of its data, bytes, and its time, ticks.
+        n_slots: number of frames, including dropped ones (AVI).
     """
 
-    width: int
-    height: int
-    dtype: str = ""
-    private: bytes = b""
-    offsets: array[int] = field(default_factory=lambda: array("q"))
-    sizes: array[int] = field(default_factory=lambda: array("q"))
-    times_ns: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
-    even: bool = False
-    whole: bool = True
-    tags: dict[str, str] = field(default_factory=dict)
-    attachments: list[bytes] = field(default_factory=list)
-    session_start: str | None = None
-
-
-class _Span(NamedTuple):
-    """Position of the payload of a chunk (AVI) or element (Matroska)."""
-
-    id: Any
-    start: int
-    size: int
-
-
-class _Walk:
-    """The frames of one stream that were found so far."""
-
-    def __init__(self, file: IO[bytes], size: int) -> None:
-        self.file = file
-        self.size = size
+    def __init__(self, file: IO[bytes], size: int, progress: Progress) -> None:
+        self._file = file
+        self._size = size
+        self._progress = progress
         self.whole = True
-        self.offsets = array("q")
-        self.sizes = array("q")
-        self.ticks = array("q")
-        self.n_slots = 0  # including dropped frames
-        self._cluster_time = 0
+        self.frames = array("q")
+        self.n_slots = 0
 
-    def avi(self, number: int) -> Iterator[_Span]:
-        """Record the frames of one stream; yields every whole chunk of the file."""
+    def read(self, at: int, n: int) -> bytes:
+        """Some bytes of the file; fewer at its end."""
+        self._progress(at >> 20, (self._size >> 20) + 1, "looking through the video (MB)")
+        self._file.seek(at)
+        return self._file.read(n)
+
+    def avi(self, number: int) -> None:
+        """Find the frames of an AVI file's stream."""
         names = (b"%02ddc" % number, b"%02ddb" % number)
-        for chunk in self._chunks():
-            if chunk.id in names:
-                if chunk.size:  # an empty chunk marks a dropped frame
-                    self._add(chunk.start, chunk.size, self.n_slots)
-                self.n_slots += 1
-            yield chunk
-
-    def mkv(self, number: int) -> Iterator[_Span]:
-        """Record the frames of one track; yields every whole element of the file."""
-        for element in self._elements():
-            if element.id == _CLUSTER_TIME:
-                self._cluster_time = int.from_bytes(self._read(element, 8), "big")
-            elif element.id in _BLOCKS:
-                head = self._read(element, 11)
-                track, at = _vint(head, 0)
-                if track < 0 or len(head) < at + 3:
-                    self.whole = False
-                    continue
-                ticks, flags = struct.unpack_from(">hB", head, at)
-                if flags & _LACING:
-                    self.whole = False
-                elif track == number and self._cluster_time < _MOST_TICKS:
-                    at += 3
-                    self._add(element.start + at, element.size - at, self._cluster_time + ticks)
-            yield element
-
-    def _add(self, offset: int, size: int, ticks: int) -> None:
-        self.offsets.append(offset)
-        self.sizes.append(size)
-        self.ticks.append(ticks)
-
-    def _read(self, span: _Span, at_most: int) -> bytes:
-        self.file.seek(span.start)
-        return self.file.read(min(span.size, at_most))
-
-    def _chunks(self) -> Iterator[_Span]:
         at = 0
-        while at + _CHUNK.size <= self.size:
-            self.file.seek(at)
-            name, length = _CHUNK.unpack(self.file.read(_CHUNK.size))
+        while at + _CHUNK.size <= self._size:
+            name, length = _CHUNK.unpack(self.read(at, _CHUNK.size))
             start = at + _CHUNK.size
-            if not all(32 <= byte < 127 for byte in name):  # later data may be noise
-                self.whole = False
-                return
-            if name in (b"RIFF", b"LIST") and self.file.read(4) in _LISTS:
+            if name in (b"RIFF", b"LIST") and self.read(start, 4) in _LISTS:
                 # an interrupted program leaves the length of its lists at 0
-                self.whole = self.whole and 4 <= length <= self.size - start
+                self.whole = self.whole and 4 <= length <= self._size - start
                 at = start + 4
                 continue
-            if start + length > self.size:
+            is_name = all(32 <= byte < 127 for byte in name)  # later data may be noise
+            if not is_name or start + length > self._size:
                 self.whole = False
                 return
-            yield _Span(name, start, length)
+            if name in names:
+                if length:  # an empty chunk marks a dropped frame
+                    self.frames.extend((start, length, self.n_slots))
+                self.n_slots += 1
             at = start + length + length % 2
 
-    def _elements(self) -> Iterator[_Span]:
-        at = 0
-        while at < self.size:
-            self.file.seek(at)
-            head = self.file.read(12)
+    def mkv(self, number: int) -> None:
+        """Find the frames of a Matroska file's track."""
+        at = cluster_time = 0
+        while at < self._size:
+            head = self.read(at, 12)
             # the first set bit determines the length of an id and is part of it
             n = 9 - head[0].bit_length()
             id = int.from_bytes(head[:n], "big")
-            length, start = _vint(head, n)
+            length, start = vint(head, n)
             start += at
             descended = id in _DESCENDED
             known = descended or id == _CLUSTER_TIME or id in _BLOCKS or id in _OTHERS
             if not known or (length < 0 and not descended):
                 self.whole = False
                 return
-            self.whole = self.whole and start + length <= self.size
-            if descended:
-                at = start
-                continue
-            if start + length > self.size:
+            self.whole = self.whole and start + length <= self._size
+            at = start if descended else start + length
+            if at > self._size:
                 return
-            yield _Span(id, start, length)
-            at = start + length
+            if id == _CLUSTER_TIME:
+                cluster_time = int.from_bytes(self.read(start, min(length, 8)), "big")
+            elif id in _BLOCKS:
+                block = self.read(start, min(length, 11))
+                track, begin = vint(block, 0)
+                has_head = track >= 0 and len(block) >= begin + 3
+                ticks, flags = struct.unpack_from(">hB", block, begin) if has_head else (0, _LACING)
+                if flags & _LACING:
+                    self.whole = False
+                elif track == number and cluster_time < _MOST_TICKS:
+                    begin += 3
+                    self.frames.extend((start + begin, length - begin, cluster_time + ticks))
 
 
-def _vint(data: bytes, at: int) -> tuple[int, int]:
-    """The variable-length number at `at`, and its end; -1 if it is open or missing."""
+def vint(data: bytes, at: int) -> tuple[int, int]:
+    """Matroska's variable-length number at `at`, and its end; -1 if it is open or missing."""
     if at >= len(data) or not data[at]:
         return -1, at
     n = 9 - data[at].bit_length()
@@ -203,69 +142,34 @@ def _vint(data: bytes, at: int) -> tuple[int, int]:
     return value, at + n
 
 
-def _index(path: Path, progress: Progress) -> DepthTrack:
-    """The depth track of a file and its frames.
+def _depth_stream(container: Any, path: Path) -> Any:
+    """The stream titled or tagged DEPTH, else the first of 16-bit grey frames that is not titled as
+    infrared, else the first grey one, else the first video.
 
-    It is the stream titled or tagged DEPTH, else the first of 16-bit grey frames that is not titled
-    as infrared, else the first grey one, else the first video.
+    Raises:
+        RecordingError: there is no video, or it is infrared or not 16-bit depth.
     """
-    is_mkv = path.suffix.lower() == ".mkv"
-    try:
-        # a fixed format: others can refer to further files, which would be opened
-        with av.open(str(path), format="matroska" if is_mkv else "avi") as container:
-            videos = list(container.streams.video)
-            titled = [one for one in videos if _title(one).upper() == "DEPTH"]
-            titled = titled or [one for one in videos if "K4A_DEPTH_TRACK" in one.metadata]
-            grey = [one for one in videos if _dtype(one) is not None]
-            visible = [one for one in grey if not is_infrared(_title(one))]
-            if not videos:
-                raise RecordingError(
-                    f"{path} holds no video track, or is cut short before it is named; give a "
-                    "recording with depth"
-                )
-            stream = next(some for some in (titled, visible, grey, videos) if some)[0]
-            refuse_infrared(path, "DEPTH" if titled else _title(stream) or path.stem)
-            dtype = _dtype(stream)
-            if dtype is None:
-                codec = stream.codec_context
-                name = "unknown" if codec is None else codec.name if is_mkv else codec.codec_tag
-                raise RecordingError(
-                    f"expected 16-bit depth in FFV1 or uncompressed, but {path} is packed with "
-                    f"{name!r}; give the video of the depth itself"
-                )
-            codec = stream.codec_context
-            track = DepthTrack(codec.width, codec.height, dtype, codec.extradata or b"")
-            track.tags = {**container.metadata, **stream.metadata}
-            track.attachments = [one.data for one in container.streams.attachments]
-            with suppress(KeyError, ValueError):
-                began = datetime.fromisoformat(container.metadata["creation_time"])
-                track.session_start = began.isoformat()
-            number, n_stated, time_base = stream.index, stream.frames, stream.time_base
-            first = next(container.demux(stream), None)
-    except av.FFmpegError:
+    videos = list(container.streams.video)
+    titled = [one for one in videos if _title(one).upper() == "DEPTH"]
+    titled = titled or [one for one in videos if "K4A_DEPTH_TRACK" in one.metadata]
+    grey = [one for one in videos if _dtype(one) is not None]
+    visible = [one for one in grey if not is_infrared(_title(one))]
+    if not videos:
         raise RecordingError(
-            f"{path} is named like {'a Matroska' if is_mkv else 'an AVI'} video but cannot be read "
-            "as one; copy it again, or give another file"
-        ) from None
-    size = path.stat().st_size
-    with path.open("rb", buffering=0) as file:
-        walk = _Walk(file, size)
-        if is_mkv and first is not None and first.pos is not None:
-            file.seek(first.pos)
-            number, _ = _vint(file.read(8), 0)
-        for span in walk.mkv(number) if is_mkv else walk.avi(number):
-            progress(span.start >> 20, (size >> 20) + 1, "looking through the video (MB)")
-    n = len(walk.offsets)
-    if dtype:  # a raw frame of another length is the first sign of damage
-        good = np.frombuffer(walk.sizes, np.int64) == 2 * track.width * track.height
-        n = n if good.all() else int(np.argmin(good))
-    track.offsets, track.sizes = walk.offsets[:n], walk.sizes[:n]
-    step = Fraction(time_base or 0) * 10**9
-    times = [min(max(round(ticks * step), -LIMIT_NS), LIMIT_NS) for ticks in walk.ticks[:n]]
-    track.times_ns = np.array(times, np.int64)
-    track.even = not is_mkv
-    track.whole = walk.whole and n == len(walk.offsets) and (is_mkv or walk.n_slots >= n_stated)
-    return track
+            f"{path} holds no video track, or is cut short before it is named; give a "
+            "recording with depth"
+        )
+    stream = next(some for some in (titled, visible, grey, videos) if some)[0]
+    refuse_infrared(path, "DEPTH" if titled else _title(stream) or path.stem)
+    if _dtype(stream) is None:
+        codec = stream.codec_context
+        is_mkv = container.format.name.startswith("matroska")
+        name = "unknown" if codec is None else codec.name if is_mkv else codec.codec_tag
+        raise RecordingError(
+            f"expected 16-bit depth in FFV1 or uncompressed, but {path} is packed with "
+            f"{name!r}; give the video of the depth itself"
+        )
+    return stream
 
 
 def _title(stream: Any) -> str:
@@ -280,108 +184,114 @@ def _dtype(stream: Any) -> str | None:
     return _RAW.get(codec.format.name) if codec.name == "rawvideo" and codec.format else None
 
 
-class Ffv1:
-    """Decoder (RFC 9043) of 16-bit grey frames, fed in order from a key frame.
+class DepthVideo(Stack):
+    """Depth track of an AVI file, or of a Matroska file (.mkv), as frames of one size.
 
-    FFmpeg's decoder does not check the CRC-32 of slices, so damage would appear as depth.
+    FFmpeg's FFV1 decoder (RFC 9043) does not check the CRC-32 of slices, so damage would appear as
+    depth; it is checked here.
+
+    Attributes:
+        frames: (n, 2) int64 position and size of each frame's data, bytes.
+        times_ns: (n,) int64 time of each frame, ns.
+        even: True for times of a constant rate, as the container has no others.
+        tags: tags of the whole file and of the track.
+        attachments: bytes of the attached files.
+        session_start: ISO 8601 if the file states it.
     """
 
-    def __init__(self, width: int, height: int, private: bytes) -> None:
-        """Start the decoder; `private` is the codec's own header, empty if there is none."""
-        self._size = (width, height)
-        self._private = private
+    def __init__(self, path: Path, progress: Progress) -> None:
+        """Read the header, find the frames, and find the key frames of FFV1.
+
+        Raises:
+            RecordingError: there is no whole frame of 16-bit depth in FFV1 or uncompressed.
+        """
+        is_mkv = path.suffix.lower() == ".mkv"
+        self._path = path
+        self._lock = Lock()
+        self.even = not is_mkv
+        self.session_start: str | None = None
+        try:
+            # a fixed format: others can refer to further files, which would be opened
+            with av.open(str(path), format="matroska" if is_mkv else "avi") as container:
+                stream = _depth_stream(container, path)
+                codec = stream.codec_context
+                self._size = (codec.width, codec.height)
+                self._dtype = _dtype(stream)
+                self._private = codec.extradata
+                self.tags: dict[str, str] = {**container.metadata, **stream.metadata}
+                self.attachments = [one.data for one in container.streams.attachments]
+                with suppress(KeyError, ValueError):
+                    began = datetime.fromisoformat(container.metadata["creation_time"])
+                    self.session_start = began.isoformat()
+                number, n_stated, time_base = stream.index, stream.frames, stream.time_base
+                first = next(container.demux(stream), None)
+        except av.FFmpegError:
+            raise RecordingError(
+                f"{path} is named like {'a Matroska' if is_mkv else 'an AVI'} video but cannot be "
+                "read as one; copy it again, or give another file"
+            ) from None
+        self._file = path.open("rb", buffering=0)
+        try:
+            walk = _Walk(self._file, path.stat().st_size, progress)
+            if not is_mkv:
+                walk.avi(number)
+            else:
+                pos = None if first is None else first.pos
+                walk.mkv(number if pos is None else vint(walk.read(pos, 8), 0)[0])
+            found = np.array(walk.frames, np.int64).reshape(-1, 3)
+            n = len(found)
+            if self._dtype:  # a raw frame of another length is the first sign of damage
+                good = found[:, 1] == 2 * codec.width * codec.height
+                n = n if good.all() else int(np.argmin(good))
+            whole = walk.whole and n == len(found) and (is_mkv or walk.n_slots >= n_stated)
+            super().__init__(self._size, [True] * n, truncated=not whole)
+            if not n or not all(self._size) or too_large(self._size):
+                raise RecordingError(
+                    f"{path} is cut short or damaged and holds no whole frame; copy it again"
+                )
+            self.frames = found[:n, :2]
+            step = Fraction(time_base or 0) * 10**9
+            times = [min(max(round(t * step), -LIMIT_NS), LIMIT_NS) for t in found[:n, 2].tolist()]
+            self.times_ns = np.array(times, np.int64)
+            if not self._dtype:
+                self._start_decoder()
+        except BaseException:
+            self._file.close()
+            raise
+
+    def _start_decoder(self) -> None:
+        """Find the key frames, and refuse a stream that does not decode to 16-bit grey."""
         self._table = crc_table()
         self._summed = False  # whether this stream has check sums, once detected
-        self._codec = self.fresh()
+        self._next = -1
+        starts = [int.from_bytes(self._bytes(k, 2), "big") for k in range(len(self))]
+        self._keys = np.flatnonzero(np.array(starts) >= _KEY)
+        for key in self._keys[:_N_PROBED].tolist():
+            self._codec = self._fresh_codec()
+            with suppress(av.FFmpegError):
+                for frame in self._codec.decode(av.Packet(self._bytes(key))):
+                    if frame.format.name.startswith("gray1"):
+                        return
+                    found = f"{frame.format.components[0].bits}-bit {frame.format.name}"
+                    raise not_depth_error(str(self._path), found, frame.width, frame.height)
+        raise RecordingError(
+            f"none of the first frames of {self._path} can be decoded; copy it again"
+        )
 
-    def fresh(self) -> Any:
-        """A new decoder."""
+    def _fresh_codec(self) -> Any:
         codec: Any = av.CodecContext.create(_FFV1, "r")
         codec.width, codec.height = self._size
         codec.extradata = self._private or None
         return codec
 
-    def decode(self, data: bytes) -> NDArray[np.uint16] | None:
-        """Stored values (H, W) of one frame; None if it is damaged or not 16-bit grey.
-
-        After a damaged frame, the next must be a key frame.
-        """
-        agree = slices_agree(np.frombuffer(data, np.uint8), self._table)
-        self._summed = self._summed or agree  # a chance match has a probability of 1 in 4e9
-        if self._summed and not agree:
-            return None
-        try:
-            frames = self._codec.decode(av.Packet(data))
-        except av.FFmpegError:
-            self._codec = self.fresh()
-            return None
-        if len(frames) != 1 or not frames[0].format.name.startswith("gray1"):
-            return None
-        depth: NDArray[Any] = frames[0].to_ndarray()
-        return depth.astype(np.uint16, copy=False)
-
-
-class DepthVideo(Stack):
-    """Depth track of a video file as frames of one size."""
-
-    def __init__(self, path: Path, track: DepthTrack) -> None:
-        """Open the file, and find the key frames of FFV1.
-
-        Raises:
-            RecordingError: its frames are not 16-bit depth.
-        """
-        self.track = track
-        self.width = track.width
-        self.height = track.height
-        self.problems = []
-        self._path = path
-        self._file = path.open("rb", buffering=0)
-        self._lock = Lock()
-        self._ffv1: Ffv1 | None = None
-        self._keys = np.zeros(0, np.int64)
-        self._next = -1
-        if not track.dtype:
-            try:
-                self._ffv1 = Ffv1(track.width, track.height, track.private)
-                self._find_keys(self._ffv1)
-            except BaseException:
-                self._file.close()
-                raise
-
-    def _find_keys(self, ffv1: Ffv1) -> None:
-        """Find the key frames, and refuse a stream that does not decode to 16-bit grey."""
-        keys = [k for k in range(len(self)) if int.from_bytes(self._bytes(k, 2), "big") >= _KEY]
-        self._keys = np.array(keys, np.int64)
-        for key in keys[:_N_PROBED]:
-            try:
-                frames = ffv1.fresh().decode(av.Packet(self._bytes(key)))
-            except av.FFmpegError:
-                continue
-            for frame in frames:
-                if frame.format.name.startswith("gray1"):
-                    return
-                found = f"{frame.format.components[0].bits}-bit {frame.format.name}"
-                raise not_depth_error(str(self._path), found, frame.width, frame.height)
-        raise RecordingError(
-            f"none of the first frames of {self._path} can be decoded; copy it again"
-        )
-
-    def __len__(self) -> int:
-        return len(self.track.offsets)
-
-    @property
-    def truncated(self) -> bool:
-        """True if the file ends too early."""
-        return not self.track.whole
-
     def read(self, index: int) -> NDArray[np.uint16] | None:
         """Stored values (H, W) of a frame; None if it, or one that it depends on, is damaged."""
         with self._lock:
-            if self._ffv1 is None:
+            if self._dtype:
                 data = self._bytes(index)
                 if len(data) != 2 * self.width * self.height:
                     return None
-                raw = np.frombuffer(data, self.track.dtype).reshape(self.height, self.width)
+                raw = np.frombuffer(data, self._dtype).reshape(self.height, self.width)
                 return raw.astype(np.uint16)
             before = np.searchsorted(self._keys, index, side="right") - 1
             if before < 0:
@@ -391,16 +301,35 @@ class DepthVideo(Stack):
             self._next = -1  # until the frame is decoded
             depth = None
             for k in range(start, index + 1):
-                depth = self._ffv1.decode(self._bytes(k))
-                if depth is None or depth.shape != (self.height, self.width):
+                depth = self._decode(self._bytes(k))
+                if depth is None:
                     return None
             self._next = index + 1
             return depth
 
-    def _bytes(self, index: int, at_most: int | None = None) -> bytes:
-        self._file.seek(self.track.offsets[index])
-        size = self.track.sizes[index]
-        return self._file.read(size if at_most is None else min(size, at_most))
+    def _decode(self, data: bytes) -> NDArray[np.uint16] | None:
+        """Stored values (H, W) of one frame of FFV1, given in order from a key frame; None if it is
+        damaged or not 16-bit grey, and the next must be a key frame.
+        """
+        agree = slices_agree(np.frombuffer(data, np.uint8), self._table)
+        self._summed = self._summed or agree  # a chance match has a probability of 1 in 4e9
+        if self._summed and not agree:
+            return None
+        try:
+            frames = self._codec.decode(av.Packet(data))
+        except av.FFmpegError:
+            self._codec = self._fresh_codec()
+            return None
+        if len(frames) != 1 or not frames[0].format.name.startswith("gray1"):
+            return None
+        depth: NDArray[Any] = frames[0].to_ndarray()
+        fits = depth.shape == (self.height, self.width)
+        return depth.astype(np.uint16, copy=False) if fits else None
+
+    def _bytes(self, index: int, at_most: int = -1) -> bytes:
+        at, size = self.frames[index].tolist()
+        self._file.seek(at)
+        return self._file.read(size if at_most < 0 else min(size, at_most))
 
     def label(self, index: int) -> str:
         """Name of a frame, for a message."""
@@ -409,18 +338,3 @@ class DepthVideo(Stack):
     def close(self) -> None:
         """Close the file."""
         self._file.close()
-
-
-def open_video(path: Path, progress: Progress) -> DepthVideo:
-    """Find the depth frames of an AVI file, or of a Matroska file (.mkv).
-
-    Raises:
-        RecordingError: there is no whole frame of 16-bit depth in FFV1 or uncompressed.
-    """
-    track = _index(path, progress)
-    size = (track.width, track.height)
-    if not track.offsets or not all(size) or too_large(size):
-        raise RecordingError(
-            f"{path} is cut short or damaged and holds no whole frame; copy it again"
-        )
-    return DepthVideo(path, track)

@@ -7,12 +7,16 @@ import struct
 import numpy as np
 import pytest
 
-from liex_lab.recordings.formats.messages.depth_images import LARGEST_PICTURE, decode, picture_size
 from liex_lab.recordings.formats.messages.messages import (
     DepthMessage,
     PackedPicture,
     PointCloud,
     RawPicture,
+)
+from liex_lab.recordings.formats.messages.parsers import (
+    LARGEST_PICTURE,
+    decode_message,
+    picture_size,
 )
 from tests.recordings.writers import SMALL
 
@@ -53,7 +57,7 @@ def rvl(width: int, height: int) -> bytes:
 )
 def test_what_cannot_be_a_depth_picture_is_none(message: DepthMessage) -> None:
     assert picture_size(message) is None
-    assert decode(message, SMALL, 1.0, 1.0) is None
+    assert decode_message(message, SMALL, 1.0, 1.0) is None
 
 
 @pytest.mark.parametrize(
@@ -72,11 +76,11 @@ def test_what_cannot_be_a_depth_picture_is_none(message: DepthMessage) -> None:
     ids=str,
 )
 def test_a_picture_that_is_not_all_there_is_none(message: DepthMessage) -> None:
-    assert decode(message, SMALL, 1.0, 1.0) is None
+    assert decode_message(message, SMALL, 1.0, 1.0) is None
 
 
 def test_the_padding_of_the_last_row_may_be_left_out() -> None:
     rows = np.zeros((48, 70), np.uint16)
     rows[:, :64] = np.arange(48 * 64).reshape(48, 64)
     message = RawPicture(1, "", 64, 48, "16UC1", 140, False, rows.tobytes()[:-12])
-    np.testing.assert_array_equal(decode(message, SMALL, 1.0, 1.0), rows[:, :64])
+    np.testing.assert_array_equal(decode_message(message, SMALL, 1.0, 1.0), rows[:, :64])

@@ -15,8 +15,8 @@ from liex_lab.errors import RecordingError
 from liex_lab.recordings import Recording, open_recording
 from liex_lab.recordings.formats.messages import messages
 from liex_lab.recordings.formats.messages.mcap import McapFile
-from liex_lab.recordings.formats.messages.mcap_writer import McapDepthWriter
 from liex_lab.recordings.frame import DepthFrame
+from liex_lab.recordings.writer import McapDepthWriter
 from tests.recordings.asking import refusal
 from tests.recordings.ros_writers import write_ros_mcap
 from tests.recordings.writers import SMALL, START_NS, cut, depth_frames, even_times, write_mcap

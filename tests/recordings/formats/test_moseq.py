@@ -279,7 +279,7 @@ def test_an_archive_may_be_several_gzips_one_after_the_other(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, packed: int
 ) -> None:
     # so that a border of reading meets every border
-    monkeypatch.setattr("liex_lab.recordings.formats.moseq_files._PACKED", packed)
+    monkeypatch.setattr("liex_lab.recordings.formats.moseq._PACKED", packed)
     plain = gzip.decompress(write_archive(folder, tmp_path / "one.tar.gz").read_bytes())
     parts = [plain[i : i + 9000] for i in range(0, len(plain), 9000)]
     (tmp_path / "s.tar.gz").write_bytes(b"".join(map(gzip.compress, parts)) + bytes(700))

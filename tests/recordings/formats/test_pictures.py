@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from liex_lab.recordings import open_recording
 from liex_lab.recordings.depth_kernels import unpack_lzf
 from liex_lab.recordings.formats.images.files import read_pclzf_camera
-from liex_lab.recordings.frame import decode, own_unit_mm
+from liex_lab.recordings.frame import ENCODINGS, decode
 from tests.oracles import lzf
 from tests.recordings.asking import refusal
 from tests.recordings.picture_writers import pack_lzf, write_folder, write_pclzf, write_pgm
@@ -129,7 +129,7 @@ def test_an_xml_that_tells_nothing_leaves_the_camera_unknown(tmp_path: Path, tex
 
 def test_the_encodings_of_data_sets() -> None:
     mm = np.array([[0, 700, 1057, 8191]])
-    np.testing.assert_allclose(decode((mm * 5).astype(np.uint16), "tum", own_unit_mm("tum")), mm)
+    np.testing.assert_allclose(decode((mm * 5).astype(np.uint16), "tum", ENCODINGS["tum"]), mm)
     turned = ((mm << 3) | (mm >> 13)).astype(np.uint16)
     np.testing.assert_array_equal(decode(turned, "sun", 1.0), mm)
     raw = np.array([[0, 839, 1000, 1092, 1093, 2047]], np.uint16)

@@ -5,7 +5,6 @@ each comes from.
 from __future__ import annotations
 
 import json
-from array import array
 from pathlib import Path
 
 import av
@@ -18,7 +17,7 @@ from hypothesis import strategies as st
 from liex_lab.recordings import open_recording
 from liex_lab.recordings.depth_kernels import crc_table, slices_agree
 from liex_lab.recordings.formats.moseq import MODES, Mode, read_calibration
-from liex_lab.recordings.formats.video import DepthTrack, DepthVideo, open_video
+from liex_lab.recordings.formats.video import DepthVideo
 from liex_lab.runtime.progress import silent
 from tests.oracles import ffv1
 from tests.recordings.asking import refusal
@@ -47,7 +46,7 @@ def test_pyav_finds_the_same_pictures_at_the_same_times(tmp_path: Path) -> None:
     write_avi(tmp_path / "a.avi", STORED, fps=25)
     write_mkv(tmp_path / "a.mkv", STORED, [k * 40 + 7 * (k > 9) for k in range(30)])
     for name in ("a.avi", "a.mkv"):
-        ours = open_video(tmp_path / name, silent)
+        ours = DepthVideo(tmp_path / name, silent)
         with av.open(str(tmp_path / name)) as container:
             titled = {stream.metadata.get("title"): stream for stream in container.streams.video}
             stream = titled.get("DEPTH", container.streams.video[0])
@@ -55,9 +54,7 @@ def test_pyav_finds_the_same_pictures_at_the_same_times(tmp_path: Path) -> None:
         assert len(theirs) == len(ours)
         for index, frame in enumerate(theirs):
             np.testing.assert_array_equal(ours.read(index), frame.to_ndarray())
-            assert ours.track.times_ns[index] == round(
-                (frame.pts or 0) * (frame.time_base or 0) * 10**9
-            )
+            assert ours.times_ns[index] == round((frame.pts or 0) * (frame.time_base or 0) * 10**9)
         ours.close()
 
 
@@ -93,8 +90,8 @@ def test_check_sums_agree_with_their_slow_twin(data: bytes, sealed: bool) -> Non
 
 def test_a_damaged_picture_costs_those_that_build_on_it_and_no_others(tmp_path: Path) -> None:
     folder = write_video_session(tmp_path, STORED, gop=10)
-    video = open_video(folder / "depth.avi", silent)
-    at = video.track.offsets[13] + video.track.sizes[13] // 2
+    video = DepthVideo(folder / "depth.avi", silent)
+    at = video.frames[13] @ [2, 1] // 2
     video.close()
     content = bytearray((folder / "depth.avi").read_bytes())
     content[at] ^= 4
@@ -301,15 +298,3 @@ def test_the_depth_is_the_track_that_says_so(tmp_path: Path) -> None:
     assert "no video track" in refusal(
         write_mkv(tmp_path / "c.mkv", STORED, titles=()), camera=SMALL
     )
-
-
-@pytest.mark.parametrize("n_bytes", [0, 7, 9, 16])
-def test_a_raw_picture_of_another_size_is_unread(tmp_path: Path, n_bytes: int) -> None:
-    """Also of an odd number of bytes, which are no whole numbers of two."""
-    path = tmp_path / "raw.avi"
-    path.write_bytes(bytes(range(24)))
-    track = DepthTrack(2, 2, ">u2", offsets=array("q", [0, 8]), sizes=array("q", [n_bytes, 8]))
-    video = DepthVideo(path, track)
-    assert video.read(0) is None
-    np.testing.assert_array_equal(video.read(1), [[0x0809, 0x0A0B], [0x0C0D, 0x0E0F]])
-    video.close()

@@ -1,15 +1,20 @@
-"""Depth images, one per file: PNG, PGM and PCLZF, and the interface of every stack of images.
+"""Depth images in files: PNG, PGM, PCLZF and TIFF, and the interface of every stack of images.
 
 Files are probed (header, length) without decoding; damaged ones keep their index and read as None.
 OpenCV decodes PNG only if all CRCs match, because it prints messages about damage to the terminal.
 PGM (Netpbm P5, 16 bits) has the high byte first, but some programs write the low byte first: the
 byte order in which neighbouring pixels are at least twice as similar is used, as depth is smooth
 and its low byte is not. PCLZF is PCL's format, packed with LZF, with intrinsics in a separate XML
-file.
+file. TIFF is 16-bit or float32 grey, one or many images per file, including BigTIFF and ImageJ:
+contiguous uncompressed pixels are read directly from their offset, other pages are decoded by
+tifffile, and codecs that need an optional package of tifffile (LZW) by OpenCV. A stack ends at its
+first bad page, because later ones may be noise.
 """
 
 from __future__ import annotations
 
+import logging
+import lzma
 import re
 import struct
 import xml.etree.ElementTree as ET  # nosec B405: see B314 below
@@ -18,17 +23,21 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from threading import Lock
+from typing import Any, NamedTuple, TypeGuard
 
 import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.errors import RecordingError
+from liex_lab.optics.camera import Camera
+from liex_lab.recordings.frame import Depth, Stored
 from liex_lab.runtime.progress import Progress
 
 MAX_PIXELS = 1 << 24  # well above any depth camera; a larger stated size is damage
 
 Size = tuple[int, int]  # width, height, pixels
+Points = NDArray[np.float64]
 
 
 class Stack(ABC):
@@ -37,36 +46,41 @@ class Stack(ABC):
     Attributes:
         width: columns of an image, px.
         height: rows of an image, px.
+        whole: (n,) True for images that are not cut short, as far as known without decoding.
+        truncated: True if an image, or the end of a stack, is missing.
         problems: sentences about the files as a whole.
     """
 
-    width: int
-    height: int
-    problems: list[str]
+    def __init__(self, size: Size, whole: list[bool], truncated: bool = False) -> None:
+        """Keep the size and the state of the images."""
+        self.width, self.height = size
+        self.whole = whole
+        self.truncated = truncated or not all(whole)
+        self.problems: list[str] = []
+
+    def __len__(self) -> int:
+        return len(self.whole)
 
     @abstractmethod
-    def __len__(self) -> int: ...
-
-    @abstractmethod
-    def read(self, index: int) -> NDArray[Any] | None:
+    def read(self, index: int) -> Stored | None:
         """Stored values (H, W), or (H, W, 3) for colour; None if the image is cut or damaged."""
 
     @abstractmethod
     def label(self, index: int) -> str:
         """Name of an image for a message: the file, and the position in it."""
 
-    @property
-    def whole(self) -> list[bool]:
-        """(n,) True for images that are not cut short, as far as known without decoding."""
-        return [True] * len(self)
-
-    @property
-    def truncated(self) -> bool:
-        """True if an image, or the end of a stack, is missing."""
-        return not all(self.whole)
-
     def close(self) -> None:  # noqa: B027 (most hold no file open)
         """Close open files."""
+
+    def depth(self, decode: Callable[[Stored], Depth]) -> Callable[[int], Depth | str]:
+        """The function that reads depth for `unread_where_damaged`."""
+
+        def read(index: int) -> Depth | str:
+            """Depth (H, W) float32 mm of an image, or what is wrong with it."""
+            stored = self.read(index)
+            return f" ({self.label(index)}) is damaged" if stored is None else decode(stored)
+
+        return read
 
 
 # result of probing a file: its size, the error for another type, or None if it is cut or
@@ -82,24 +96,14 @@ class FileStack(Stack):
         files: list[Path],
         size: Size,
         whole: list[bool],
-        decode: Callable[[Path], NDArray[Any] | None],
+        decode: Callable[[Path], Stored | None],
     ) -> None:
         """Keep the files, and `decode`, which reads an image or returns None for a damaged one."""
+        super().__init__(size, whole)
         self.files = files
-        self.width, self.height = size
-        self.problems = []
         self.decode = decode
-        self._whole = whole
 
-    def __len__(self) -> int:
-        return len(self.files)
-
-    @property
-    def whole(self) -> list[bool]:
-        """(n,) True for images that are not cut short or damaged."""
-        return self._whole
-
-    def read(self, index: int) -> NDArray[Any] | None:
+    def read(self, index: int) -> Stored | None:
         """Stored values (H, W), or (H, W, 3) for colour; None if the image is cut or damaged."""
         stored = self.decode(self.files[index]) if self.whole[index] else None
         fits = stored is not None and stored.shape[:2] == (self.height, self.width)
@@ -114,7 +118,7 @@ def open_files(
     files: list[Path],
     kind: str,
     probe: Callable[[Path], Probe],
-    decode: Callable[[Path], NDArray[Any] | None],
+    decode: Callable[[Path], Stored | None],
     progress: Progress,
 ) -> FileStack:
     """Open images, one per file: every file is probed and none is decoded.
@@ -129,34 +133,44 @@ def open_files(
     Raises:
         RecordingError: none is whole, or their sizes differ.
     """
-    whole: list[bool] = []
-    sizes: dict[Size, Path] = {}
-    why: RecordingError | None = None
-    for number, path in enumerate(files, start=1):
-        found = probe(path)
-        whole.append(isinstance(found, tuple))
-        if isinstance(found, tuple):
-            sizes.setdefault(found, path)
-        else:
-            why = why or found
-        progress(number, len(files), "looking at the pictures")
-    if not sizes:
-        raise why or none_whole_error(files, kind)
-    if len(sizes) > 1:
-        raise one_size_error([(path.name, *size) for size, path in sizes.items()])
-    return FileStack(files, next(iter(sizes)), whole, decode)
+    found: list[Probe] = []
+    for path in files:
+        found.append(probe(path))
+        progress(len(found), len(files), "looking at the pictures")
+    sizes = {size: path.name for path, size in zip(files, found, strict=True) if _is_size(size)}
+    why = next((error for error in found if isinstance(error, RecordingError)), None)
+    size = _common_size(sizes, files, kind, why)
+    return FileStack(files, size, [_is_size(one) for one in found], decode)
 
 
-def none_whole_error(files: list[Path], kind: str) -> RecordingError:
-    """The error if none of the images, of a kind such as "PNG", can be read."""
-    return RecordingError(
+def _is_size(found: Probe) -> TypeGuard[Size]:
+    return isinstance(found, tuple)
+
+
+def _common_size(
+    sizes: dict[Size, str], files: list[Path], kind: str, why: RecordingError | None = None
+) -> Size:
+    """The only size of images, from an example file of each size.
+
+    Raises:
+        RecordingError: there are several sizes, or no whole image; then `why`, if given.
+    """
+    if len(sizes) == 1:
+        return next(iter(sizes))
+    if sizes:
+        ((w, h), one), ((v, g), other) = list(sizes.items())[:2]
+        raise RecordingError(
+            f"all pictures of a recording have one size, but {one} has {w} x {h} pixels and "
+            f"{other} {v} x {g}; put them into two folders"
+        )
+    raise why or RecordingError(
         f"none of the {len(files)} {kind} pictures in {files[0].parent} is whole; copy them again"
         if len(files) > 1
         else f"{files[0]} is cut short and holds no whole picture; copy it again"
     )
 
 
-def something_else(path: Path, kind: str) -> RecordingError:
+def something_else(path: Path | str, kind: str) -> RecordingError:
     """The error for a file whose first bytes do not match its kind, such as "PNG"."""
     return RecordingError(
         f"{path} is named like a {kind} picture but holds something else; remove it or give it its "
@@ -184,19 +198,6 @@ def not_depth_error(where: str, found: str, width: int, height: int) -> Recordin
         f"({where}); give the camera's "
         'depth pictures, or choose them with a line such as pattern = "*_depth.png" under '
         "[camera] in camera.toml"
-    )
-
-
-def one_size_error(pictures: list[tuple[str, int, int]]) -> RecordingError:
-    """The error for images of several sizes in one recording.
-
-    Args:
-        pictures: (name, width, height) of one image of each size.
-    """
-    (one, w, h), (other, v, g) = pictures[:2]
-    return RecordingError(
-        f"all pictures of a recording have one size, but {one} has {w} x {h} pixels and {other} "
-        f"{v} x {g}; put them into two folders"
     )
 
 
@@ -267,34 +268,27 @@ def open_pngs(files: list[Path], progress: Progress, colour: bool = False) -> Fi
     Raises:
         RecordingError: none is whole, one is of another kind, or their sizes differ.
     """
-    return open_files(
-        files, "PNG", partial(_look, colour=colour), partial(_decode, colour=colour), progress
-    )
+
+    def decode(path: Path) -> Stored | None:
+        return decode_png(np.fromfile(path, np.uint8), colour)
+
+    return open_files(files, "PNG", partial(_probe_png, colour=colour), decode, progress)
 
 
-def _decode(path: Path, colour: bool) -> NDArray[Any] | None:
-    return decode_png(np.fromfile(path, np.uint8), colour)
-
-
-def _look(path: Path, colour: bool) -> Probe:
+def _probe_png(path: Path, colour: bool) -> Probe:
     with path.open("rb") as file:
         head = file.read(_HEAD_BYTES)
         file.seek(max(0, path.stat().st_size - len(_END)))
         tail = file.read(len(_END))
     if not head.startswith(_SIGNATURE[: len(head)]):
         return something_else(path, "PNG")
-    damaged = len(head) < _HEAD_BYTES or zlib.crc32(head[12:29]) != int.from_bytes(
-        head[29:33], "big"
-    )
-    if damaged or tail != _END:
-        # a whole header still shows whether this was depth at all
-        if not damaged:
-            png_size(head, str(path), colour)
+    if len(head) < _HEAD_BYTES or zlib.crc32(head[12:29]) != int.from_bytes(head[29:33], "big"):
         return None
-    return png_size(head, str(path), colour)
+    size = png_size(head, str(path), colour)  # also shows whether a cut file was depth at all
+    return size if tail == _END else None
 
 
-def png_size(head: bytes, where: str, colour: bool = False) -> tuple[int, int] | None:
+def png_size(head: bytes, where: str, colour: bool = False) -> Size | None:
     """Width and height in the header of a PNG.
 
     Args:
@@ -309,10 +303,7 @@ def png_size(head: bytes, where: str, colour: bool = False) -> tuple[int, int] |
         RecordingError: it is not a PNG, its header is invalid, or it is of another kind.
     """
     if not head.startswith(_SIGNATURE[: len(head)]):
-        raise RecordingError(
-            f"{where} is named like a PNG picture but holds something else; remove it or give it "
-            "its name"
-        )
+        raise something_else(where, "PNG")
     if len(head) < _SIZE_BYTES:
         return None
     width, height, bits, kind = struct.unpack(">IIBB", head[16:26])
@@ -334,18 +325,11 @@ def png_size(head: bytes, where: str, colour: bool = False) -> tuple[int, int] |
 # PGM images (Netpbm P5, 16 bits), in the byte order of the standard or in the reverse one.
 
 
-_DTYPES = {"big": np.dtype(">u2"), "little": np.dtype("<u2")}
+_DTYPES = {"big": ">u2", "little": "<u2"}
 _GAP = rb"(?:\s|#[^\n]*\n)+"
 _HEADER = re.compile(rb"P5" + _GAP + rb"(\d{1,9})" + _GAP + rb"(\d{1,9})" + _GAP + rb"(\d{1,5})\s")
 _PGM_HEAD_BYTES = 1024  # comments included
 _N_ASKED = 5  # images, spread over the recording, that determine the byte order
-
-
-class _Header(NamedTuple):
-    width: int
-    height: int
-    largest: int
-    n_bytes: int
 
 
 def open_pgms(files: list[Path], progress: Progress, byte_order: str | None = None) -> FileStack:
@@ -360,70 +344,63 @@ def open_pgms(files: list[Path], progress: Progress, byte_order: str | None = No
     Raises:
         RecordingError: none is whole, one is not depth, or their sizes differ.
     """
+    big, little = (partial(_decode_pgm, dtype=dtype) for dtype in _DTYPES.values())
     stack = open_files(
-        files, "PGM", _pgm_look, partial(_pgm_decode, dtype=_DTYPES[byte_order or "big"]), progress
+        files, "PGM", _probe_pgm, little if byte_order == "little" else big, progress
     )
-    if byte_order is not None:
-        return stack
     whole = [path for path, good in zip(files, stack.whole, strict=True) if good]
     asked = whole[:: max(1, len(whole) // _N_ASKED)][:_N_ASKED]
-    if 2 * sum(_is_little(path) for path in asked) <= len(asked):
-        return stack
-    claimed = (
-        f"the pixels of {whole[0].name} make sense with the low byte first only, although PGM has "
-        "the high byte first, "
-        'so they were read so; state byte_order = "little" or "big" under [camera] in camera.toml'
-    )
-    stack.decode = partial(_pgm_decode, dtype=_DTYPES["little"])
-    stack.problems = [claimed]
+    n_little = sum(2.0 * _roughness(little(path)) < _roughness(big(path)) for path in asked)
+    if byte_order is None and 2 * n_little > len(asked):
+        stack.decode = little
+        stack.problems.append(
+            f"the pixels of {whole[0].name} make sense with the low byte first only, although PGM "
+            "has the high byte first, so they were read so; state byte_order = "
+            '"little" or "big" under [camera] in camera.toml'
+        )
     return stack
 
 
-def _header(head: bytes) -> _Header | None:
-    match = _HEADER.match(head)
-    return _Header(int(match[1]), int(match[2]), int(match[3]), match.end()) if match else None
-
-
-def _pgm_look(path: Path) -> Probe:
+def _pgm_header(path: Path) -> tuple[bytes, tuple[int, ...]]:
+    """The head of a file, and its width, height, largest value and bytes of the header, or ()."""
     with path.open("rb") as file:
         head = file.read(_PGM_HEAD_BYTES)
-    header = _header(head)
-    if header is None:
+    match = _HEADER.match(head)
+    return head, (*map(int, match.groups()), match.end()) if match else ()
+
+
+def _probe_pgm(path: Path) -> Probe:
+    head, header = _pgm_header(path)
+    if not header:
         cut = b"P5".startswith(head[:2]) and len(head) < _PGM_HEAD_BYTES
         return None if cut else something_else(path, "PGM")
-    if header.largest < 256:
-        raise not_depth_error(str(path), "8-bit grey", header.width, header.height)
-    n_pixels = header.width * header.height
-    spare = path.stat().st_size - header.n_bytes - 2 * n_pixels
+    width, height, largest, n_bytes = header
+    if largest < 256:
+        raise not_depth_error(str(path), "8-bit grey", width, height)
+    spare = path.stat().st_size - n_bytes - 2 * width * height
     # a line break or a comment after the pixels is accepted; otherwise the header is
     # wrong
-    fits = n_pixels > 0 and not too_large(header[:2]) and 0 <= spare < 2 * header.width
-    return header[:2] if fits else None
+    fits = width * height > 0 and not too_large((width, height)) and 0 <= spare < 2 * width
+    return (width, height) if fits else None
 
 
-def _pgm_decode(path: Path, dtype: np.dtype[np.uint16]) -> NDArray[np.uint16] | None:
-    with path.open("rb") as file:
-        header = _header(file.read(_PGM_HEAD_BYTES))
-        if header is None or too_large(header[:2]):
-            return None
-        file.seek(header.n_bytes)
-        raw = file.read(2 * header.width * header.height)
-    if len(raw) < 2 * header.width * header.height:
+def _decode_pgm(path: Path, dtype: str) -> NDArray[np.uint16] | None:
+    _, header = _pgm_header(path)
+    if not header or too_large(header[:2]):
         return None
-    return np.frombuffer(raw, dtype).reshape(header.height, header.width).astype(np.uint16)
+    width, height, _, n_bytes = header
+    pixels = np.fromfile(path, dtype, width * height, offset=n_bytes)
+    whole = pixels.size == width * height
+    return pixels.astype(np.uint16).reshape(height, width) if whole else None
 
 
-def _is_little(path: Path) -> bool:
-    """Whether neighbouring pixels are at least twice as similar with the low byte first."""
-    rough = {}
-    for name, dtype in _DTYPES.items():
-        picture = _pgm_decode(path, dtype)
-        if picture is None:
-            return False
-        read = picture.astype(np.int64)
-        both = (read[:, 1:] > 0) & (read[:, :-1] > 0)
-        rough[name] = float(np.abs(np.diff(read, axis=1))[both].mean()) if both.any() else 0.0
-    return 2.0 * rough["little"] < rough["big"]
+def _roughness(stored: NDArray[np.uint16] | None) -> float:
+    """Mean difference of neighbouring pixels with readings; NaN without an image."""
+    if stored is None:
+        return float("nan")
+    read = stored.astype(np.int64)
+    both = (read[:, 1:] > 0) & (read[:, :-1] > 0)
+    return float(np.abs(np.diff(read, axis=1))[both].mean()) if both.any() else 0.0
 
 
 # PCL's `.pclzf` images: 16-bit depth packed with LZF, intrinsics in one XML file per image.
@@ -443,15 +420,6 @@ _INTRINSICS = {  # element of <depth>: our name
 }
 
 
-class _PclzfHeader(NamedTuple):
-    magic: bytes
-    width: int
-    height: int
-    kind: bytes
-    packed: int
-    unpacked: int
-
-
 def open_pclzfs(files: list[Path], progress: Progress) -> FileStack:
     """Open PCLZF images: header and length of every file are checked, and none is decoded.
 
@@ -462,36 +430,35 @@ def open_pclzfs(files: list[Path], progress: Progress) -> FileStack:
     Raises:
         RecordingError: none is whole, one is colour, or their sizes differ.
     """
-    return open_files(files, "PCLZF", _pclzf_look, _pclzf_decode, progress)
+    return open_files(files, "PCLZF", _probe_pclzf, _decode_pclzf, progress)
 
 
-def _pclzf_look(path: Path) -> Probe:
+def _probe_pclzf(path: Path) -> Probe:
     with path.open("rb") as file:
         head = file.read(_PCLZF_HEADER.size)
     if not head.startswith(_MAGIC[: len(head)]):
         return something_else(path, "PCLZF")
     if len(head) < _PCLZF_HEADER.size:
         return None
-    header = _PclzfHeader(*_PCLZF_HEADER.unpack(head))
-    size = (header.width, header.height)
-    kind = header.kind.rstrip(b" \0").decode("ascii", "replace")
+    _, *size, raw_kind, packed, unpacked = _PCLZF_HEADER.unpack(head)
+    width, height = size
+    kind = raw_kind.rstrip(b" \0").decode("ascii", "replace")
     if kind in ("rgb24", "yuv422", "bayer8"):
-        raise not_depth_error(str(path), f"8-bit {kind}", *size)
-    fits = kind == _DEPTH and not too_large(size) and 0 < header.unpacked == 2 * size[0] * size[1]
-    there = path.stat().st_size >= _PCLZF_HEADER.size + header.packed
-    return size if fits and there else None
+        raise not_depth_error(str(path), f"8-bit {kind}", width, height)
+    fits = kind == _DEPTH and not too_large((width, height)) and 0 < unpacked == 2 * width * height
+    there = path.stat().st_size >= _PCLZF_HEADER.size + packed
+    return (width, height) if fits and there else None
 
 
-def _pclzf_decode(path: Path) -> NDArray[np.uint16] | None:
+def _decode_pclzf(path: Path) -> NDArray[np.uint16] | None:
     from liex_lab.recordings.depth_kernels import unpack_lzf
 
     with path.open("rb") as file:
-        header = _PclzfHeader(*_PCLZF_HEADER.unpack(file.read(_PCLZF_HEADER.size)))
-        packed = np.frombuffer(file.read(header.packed), np.uint8)
-    out = np.empty(2 * header.width * header.height, np.uint8)
-    if unpack_lzf(packed, out) != out.size:
-        return None
-    return out.view("<u2").reshape(header.height, header.width).astype(np.uint16)
+        _, width, height, _, n_packed, _ = _PCLZF_HEADER.unpack(file.read(_PCLZF_HEADER.size))
+        packed = np.frombuffer(file.read(n_packed), np.uint8)
+    out = np.empty(2 * width * height, np.uint8)
+    whole = unpack_lzf(packed, out) == out.size
+    return out.view("<u2").reshape(height, width).astype(np.uint16) if whole else None
 
 
 def read_pclzf_camera(picture: Path) -> dict[str, float] | None:
@@ -519,15 +486,281 @@ def read_pclzf_camera(picture: Path) -> dict[str, float] | None:
         root = ET.fromstring(  # nosec B314
             b"<both>" + re.sub(rb"<\?xml[^>]*\?>", b"", text) + b"</both>"
         )
-        depth = root.find("depth")
-        if depth is None:
-            return None
-        numbers = {ours: float(depth.findtext(theirs, "")) for theirs, ours in _INTRINSICS.items()}
-        numbers["unit_mm"] = 1000.0 * float(depth.findtext("z_multiplication_factor", "0.001"))
+        stated = {
+            name: float(root.findtext(f"depth/{theirs}", ""))
+            for theirs, name in _INTRINSICS.items()
+        }
+        scale = float(root.findtext("depth/z_multiplication_factor", "0.001"))
     except (ET.ParseError, ValueError):
         return None
-    good = (
-        np.isfinite(list(numbers.values())).all()
-        and min(numbers["fx"], numbers["fy"], numbers["unit_mm"]) > 0
+    numbers = stated | {"unit_mm": 1000.0 * scale}
+    positive = min(numbers["fx"], numbers["fy"], numbers["unit_mm"]) > 0
+    return numbers if positive and np.isfinite(list(numbers.values())).all() else None
+
+
+# TIFF images, 16-bit or float32 grey, one or many per file, including BigTIFF and ImageJ.
+
+
+_SPARE = 1 << 20  # bytes
+_LZMA = (34925,)
+_LZMA_MEMORY = 1 << 28  # bytes; the largest of its usual levels needs 64 MB
+_UNPACKERS = (8, 32946, 50013, *_LZMA)  # codes of compression: DEFLATE, LZMA
+
+# tifffile reports damage twice, as an exception and in the log; hide the
+# log
+logging.getLogger("tifffile").addHandler(logging.NullHandler())
+
+_LEAST_DIRECTORY = 30  # bytes: the directory of an image has more
+_DEPTHS = ("u2", "i2", "f4")  # types of depth pixels
+_KINDS = {"u": "unsigned integer ", "i": "signed integer ", "f": "floating-point "}
+_SIGNATURES = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
+
+
+class _Page(NamedTuple):
+    """One image.
+
+    Attributes:
+        path: its file.
+        page: its page in the file.
+        size: its width and height, px.
+        offset: position of contiguous plain pixels, else -1.
+        dtype: of the pixels, with byte order.
+        whole: True if it is not cut short.
+    """
+
+    path: Path
+    page: int
+    size: Size = (0, 0)
+    offset: int = -1
+    dtype: str = "<u2"
+    whole: bool = False
+
+
+class TiffStack(Stack):
+    """TIFF images of one size, in order, with one file open at a time."""
+
+    def __init__(self, pages: list[_Page], size: Size, problems: list[str]) -> None:
+        """Keep the images, and sentences about stacks that are cut short."""
+        super().__init__(size, [page.whole for page in pages], truncated=bool(problems))
+        self.problems = problems
+        self._pages = pages
+        self._open: Any = None
+        self._open_path: Path | None = None
+        self._lock = Lock()
+
+    def read(self, index: int) -> Stored | None:
+        """Stored values of one image, (H, W) uint16, int16 or float32; None if it is cut or
+        damaged.
+        """
+        page = self._pages[index]
+        if not page.whole:
+            return None
+        if page.offset >= 0:
+            count = self.width * self.height
+            stored = np.fromfile(page.path, page.dtype, count, offset=page.offset)
+            return stored.reshape(self.height, self.width)
+        with self._lock:
+            decoded = self._decode(page)
+        fits = decoded is not None and decoded.shape == (self.height, self.width)
+        return decoded if fits else None
+
+    def _decode(self, page: _Page) -> Stored | None:
+        import tifffile
+
+        if self._open_path != page.path:
+            self.close()
+            self._open = tifffile.TiffFile(page.path)
+            self._open_path = page.path
+        try:
+            if not self._unpacks_to_itself(self._open.pages[page.page]):
+                return None
+            return np.asarray(self._open.asarray(key=page.page))
+        except Exception:  # damage in compressed data raises almost any exception
+            return _decode_with_opencv(page)
+
+    def _unpacks_to_itself(self, page: Any) -> bool:
+        """Whether no packed piece is larger than the image after unpacking.
+
+        tifffile unpacks whole pieces of DEFLATE and LZMA in memory, of any size.
+        """
+        if page.compression not in _UNPACKERS:
+            return True
+        most = 4 * self.width * self.height + _SPARE
+        file = page.parent.filehandle
+        for offset, count in zip(page.dataoffsets, page.databytecounts, strict=True):
+            file.seek(offset)
+            if not _fits(file.read(count), page.compression, most):
+                return False
+        return True
+
+    def label(self, index: int) -> str:
+        """Name of an image, for a message: its page and file."""
+        page = self._pages[index]
+        return f"page {page.page} of {page.path.name}"
+
+    def close(self) -> None:
+        """Close the open file."""
+        if self._open is not None:
+            self._open.close()
+        self._open = self._open_path = None
+
+
+def _fits(packed: bytes, compression: int, most: int) -> bool:
+    """Whether a packed piece unpacks to at most `most` bytes."""
+    try:
+        if compression not in _LZMA:
+            return len(zlib.decompressobj().decompress(packed, most + 1)) <= most
+        unpacker = lzma.LZMADecompressor(memlimit=_LZMA_MEMORY)
+        return len(unpacker.decompress(packed, most + 1)) <= most
+    except lzma.LZMAError:
+        return False
+    except zlib.error:
+        return True  # the decoder reports damage
+
+
+def _decode_with_opencv(page: _Page) -> Stored | None:
+    """Decode LZW and other codecs that tifffile lacks; None if OpenCV fails as well."""
+    import cv2
+
+    try:
+        found, images = cv2.imreadmulti(str(page.path), page.page, 1, flags=cv2.IMREAD_UNCHANGED)
+    except cv2.error:
+        return None
+    return np.asarray(images[0]) if found and images and images[0].ndim == 2 else None
+
+
+def open_tiffs(files: list[Path], progress: Progress) -> TiffStack:
+    """Open TIFF images: every page is listed and its bytes must exist; none is decoded.
+
+    Args:
+        files: the files, in order, of one page or many.
+        progress: counts the probed files.
+
+    Raises:
+        RecordingError: none is whole, one is not depth, or their sizes differ.
+    """
+    pages: list[_Page] = []
+    problems: list[str] = []
+    for number, path in enumerate(files, start=1):
+        found, ends = _list_pages(path)
+        n_whole = next((i for i, page in enumerate(found) if not page.whole), len(found))
+        if n_whole and (n_whole < len(found) or not ends):
+            # a stack ends at its first bad page: later ones may be noise
+            problems.append(
+                f"{path.name} is cut short: only its first {n_whole} pictures are whole"
+            )
+            found = found[:n_whole]
+        pages += found or [_Page(path, 0)]
+        progress(number, len(files), "looking at the pictures")
+    sizes = {page.size: page.path.name for page in reversed(pages) if page.whole}
+    return TiffStack(pages, _common_size(sizes, files, "TIFF"), problems)
+
+
+def _list_pages(path: Path) -> tuple[list[_Page], bool]:
+    """The images of one file in order, and whether their list is complete.
+
+    No images if the directory is cut off.
+    """
+    import tifffile
+
+    size_bytes = path.stat().st_size
+    with path.open("rb") as file:
+        head = file.read(4)
+    if len(head) == 4 and head not in _SIGNATURES:
+        raise something_else(path, "TIFF")
+    listed: list[_Page] = []
+    known: set[int] = set()
+    try:
+        with tifffile.TiffFile(path) as tif:
+            page: Any
+            for page in tif.pages:
+                if page.offset in known or len(listed) * _LEAST_DIRECTORY > size_bytes:
+                    return listed, False  # the list of directories is circular
+                known.add(page.offset)
+                listed.append(_describe(path, len(listed), page, size_bytes))
+            ends = _list_ends(tif)
+            return _imagej_stack(tif, listed, size_bytes) if len(listed) == 1 else listed, ends
+    except RecordingError:
+        if not any(page.whole for page in listed):
+            raise
+    except Exception:  # noqa: S110  # nosec B110: the directory of a cut file is garbage
+        pass
+    # a damaged directory, or an image of another kind after the depth: the stack ends before it
+    return listed, False
+
+
+def _list_ends(tif: Any) -> bool:
+    """Whether the last page found is marked as the last: each page ends with the offset of the
+    next.
+    """
+    layout = tif.tiff
+    at = tif.pages[len(tif.pages) - 1].offset
+    file = tif.filehandle
+    file.seek(at)
+    n_tags = int.from_bytes(
+        file.read(layout.tagnosize), "little" if tif.byteorder == "<" else "big"
     )
-    return numbers if good else None
+    file.seek(at + layout.tagnosize + n_tags * layout.tagsize)
+    return bool(file.read(layout.offsetsize) == bytes(layout.offsetsize))
+
+
+def _describe(path: Path, index: int, page: Any, size_bytes: int) -> _Page:
+    width, height = size = int(page.imagewidth), int(page.imagelength)
+    dtype = np.dtype(page.dtype or "V1")
+    if page.samplesperpixel != 1 or dtype.str[1:] not in _DEPTHS or not (width and height):
+        colour = "grey" if page.samplesperpixel == 1 else "colour"
+        kind = "" if dtype == np.uint8 else _KINDS.get(dtype.kind, "")
+        found = f"{page.bitspersample}-bit {kind}{colour}"
+        raise not_depth_error(str(path), found, width, height)
+    ends = [
+        offset + count for offset, count in zip(page.dataoffsets, page.databytecounts, strict=True)
+    ]
+    plain = (
+        page.is_contiguous and page.compression == 1 and page.fillorder == 1 and page.predictor == 1
+    )
+    # without compression the size determines the bytes; an inconsistent directory is
+    # damaged
+    agrees = page.compression != 1 or sum(page.databytecounts) == width * height * dtype.itemsize
+    return _Page(
+        path=path,
+        page=index,
+        size=size,
+        offset=int(page.dataoffsets[0]) if plain else -1,
+        dtype=page.parent.byteorder + dtype.str[1:],
+        whole=bool(ends) and max(ends) <= size_bytes and agrees and not too_large(size),
+    )
+
+
+def _imagej_stack(tif: Any, pages: list[_Page], size_bytes: int) -> list[_Page]:
+    """The images of an ImageJ stack over 4 GB, described as one page and stored without gaps."""
+    shape = tif.series[0].shape if tif.series else ()
+    (first,) = pages
+    if len(shape) < 3 or first.offset < 0:
+        return pages
+    n_bytes = shape[-1] * shape[-2] * int(first.dtype[-1])
+    offsets = [first.offset + k * n_bytes for k in range(int(np.prod(shape[:-2])))]
+    return [
+        first._replace(page=k, offset=o, whole=o + n_bytes <= size_bytes)
+        for k, o in enumerate(offsets)
+    ]
+
+
+def render_points(p_camera: Points, camera: Camera) -> NDArray[np.float64]:
+    """Render points as a depth image: the nearest point in every pixel.
+
+    Args:
+        p_camera: (n, 3) mm, camera frame; points that are not finite or behind the lens are
+            ignored.
+        camera: the camera.
+
+    Returns:
+        (H, W) float64 mm, 0 without a point.
+    """
+    with np.errstate(invalid="ignore", over="ignore"):
+        p_camera = p_camera[np.isfinite(p_camera).all(axis=1) & (p_camera[:, 2] > 0)]
+        uv = np.floor(camera.project(p_camera) + 0.5)
+    inside = ((uv >= 0) & (uv < [camera.width, camera.height])).all(axis=1)
+    column, row = uv[inside].astype(np.int64).T
+    depth = np.full((camera.height, camera.width), np.inf)
+    np.minimum.at(depth, (row, column), p_camera[inside, 2])
+    return np.where(np.isfinite(depth), depth, 0.0)

@@ -23,7 +23,7 @@ from liex_lab.geometry import SE3
 from liex_lab.optics.camera import Camera, Lens
 from liex_lab.recordings.camera_file import CAMERA_FILE, CameraFile
 from liex_lab.recordings.formats.images.files import open_pngs
-from liex_lab.recordings.formats.images.folder import Folder, natural_key
+from liex_lab.recordings.formats.images.folder import image_recording, natural_key
 from liex_lab.recordings.frame import COLOUR
 from liex_lab.recordings.recording import Recording
 from liex_lab.runtime.progress import Progress, silent
@@ -35,6 +35,7 @@ N_JOINTS = 36
 
 _NAME = re.compile(r"(?:depth|synthdepth)_([123])_(\d{7})\.png")
 _N_ASKED = 8  # images: one may be damaged
+_NO_MATLAB = (NotImplementedError, ValueError, TypeError, OSError, EOFError, MemoryError)
 _NOMINAL_HZ = 30.0  # the data set has no times; its cameras ran at this rate
 
 
@@ -62,11 +63,8 @@ def looks_like_nyu(folder: Path, names: list[str]) -> bool:
         folder: their folder.
         names: names of the files in it.
     """
-    for name in [name for name in names if _NAME.fullmatch(name)][:_N_ASKED]:
-        with (folder / name).open("rb") as file:
-            if file.read(26)[24:] == b"\x08\x02":
-                return True
-    return False
+    candidates = [folder / name for name in names if _NAME.fullmatch(name)][:_N_ASKED]
+    return any(path.read_bytes()[24:26] == b"\x08\x02" for path in candidates)
 
 
 def open_nyu(
@@ -100,7 +98,7 @@ def open_nyu(
         or {name: getattr(NYU_CAMERA, name) for name in ("fx", "fy", "cx", "cy")},
         source=camera_toml.source if camera_toml.intrinsics else NYU_CAMERA.source,
     )
-    return Folder(path, files, camera_toml, stack, camera_toml.decode).recording("nyu", camera, fps)
+    return image_recording("nyu", path, files, camera_toml, stack, camera, fps)
 
 
 def frame_numbers(folder: Path, view: int = VIEW) -> list[int]:
@@ -154,15 +152,7 @@ def read_nyu_joints(folder: Path, view: int = VIEW) -> NyuJoints:
         )
     try:
         found: dict[str, Any] = loadmat(path, variable_names=wanted)
-    except (
-        MatReadError,
-        NotImplementedError,
-        ValueError,
-        TypeError,
-        OSError,
-        EOFError,
-        MemoryError,
-    ) as error:
+    except (*_NO_MATLAB, MatReadError) as error:
         raise RecordingError(
             f"{path} should be the NYU data set's MATLAB file, but: {error}; copy it again"
         ) from None
@@ -182,12 +172,10 @@ def read_nyu_joints(folder: Path, view: int = VIEW) -> NyuJoints:
             f"{path} should hold joints of the shape (views, frames, {N_JOINTS}, 3), but they have "
             f"{uvd.shape} and {xyz.shape}; give the data set's own {JOINT_FILE}"
         )
-    names = tuple(
-        str(np.asarray(name).ravel()[0]) for name in np.asarray(found["joint_names"]).ravel()
-    )
+    names = [str(np.ravel(name)[0]) for name in np.ravel(found["joint_names"])]
     upright = np.array([1.0, -1.0, 1.0])
     return NyuJoints(
-        names, uvd[view - 1].astype(np.float64), xyz[view - 1].astype(np.float64) * upright
+        tuple(names), uvd[view - 1].astype(np.float64), xyz[view - 1].astype(np.float64) * upright
     )
 
 
@@ -219,22 +207,7 @@ POINTS: dict[str, dict[str, float]] = {
     "wrist_b": {"wrist_left": 1.0},
     "palm": {"palm": 1.0},
 }
-NYU_IDS = (
-    0,
-    3,
-    6,
-    9,
-    12,
-    15,
-    18,
-    21,
-    24,
-    25,
-    27,
-    30,
-    31,
-    32,
-)  # of the data set's 36 points, from 0
+NYU_IDS = (*range(0, 25, 3), 25, 27, 30, 31, 32)  # of the data set's 36 points, from 0
 _LITTLE_WRIST = 11
 _THUMB_WRIST = 12
 _START_BEND = 0.3  # rad: the bending direction of a straight finger is ambiguous

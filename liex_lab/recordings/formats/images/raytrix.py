@@ -7,18 +7,20 @@ against the first image (type, sign, working distance). Without a camera.toml,
 
 depth_mm = sign * unit_mm * stored + offset_mm. Virtual depth v is converted by the thin lens law
 first: the image is b = lens_to_grid + v * grid_to_sensor behind the main lens, and the object
-a = b f / (b - f) in front of it. `raw` values are 1 - 1 / v.
+a = b f / (b - f) in front of it. `raw` values are 1 - 1 / v. Point clouds (XYZ text, PLY) become
+depth images by projection into a pinhole camera with a z-buffer.
 """
 
 from __future__ import annotations
 
 import difflib
-import xml.etree.ElementTree as ET  # nosec B405: see B314 below
+import warnings
 from collections.abc import Callable
 from dataclasses import replace
 from fnmatch import fnmatch
+from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,9 +29,21 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from liex_lab.errors import RecordingError
 from liex_lab.optics.camera import Camera, Lens
 from liex_lab.recordings.camera_file import CAMERA_FILE, CameraFile
-from liex_lab.recordings.formats.images import point_clouds
-from liex_lab.recordings.formats.images.files import Stack
-from liex_lab.recordings.formats.images.folder import Folder, list_pictures, natural_key, open_stack
+from liex_lab.recordings.formats.images.files import (
+    Points,
+    Probe,
+    Size,
+    Stack,
+    open_files,
+    render_points,
+    something_else,
+)
+from liex_lab.recordings.formats.images.folder import (
+    image_recording,
+    list_pictures,
+    natural_key,
+    open_stack,
+)
 from liex_lab.recordings.frame import Depth, Stored
 from liex_lab.recordings.recording import Recording
 from liex_lab.runtime.progress import Progress, silent
@@ -134,29 +148,21 @@ class Profile(BaseModel):
         Returns:
             (H, W) mm, NaN for invalid values.
         """
-        with np.errstate(
-            invalid="ignore"
-        ):  # damage may contain any bits, also those of a signalling NaN
+        with np.errstate(invalid="ignore"):  # damage may contain a signalling NaN
             values = stored.astype(np.float64)
         for value in self.invalid:
             values[stored == value] = np.nan
         values[~np.isfinite(values)] = np.nan
         if self.kind == "virtual":
-            values = self._from_virtual(values)
+            # thin lens law 1/f = 1/a + 1/b, with the image v micro-lens gaps behind the grid
+            assert self.lens is not None
+            f, to_grid, gap = self.lens
+            if self.virtual == "raw":
+                values = 1.0 / (1.0 - np.where(values < 1.0, values, np.nan))
+            behind = to_grid + np.where(values > 0, values, np.nan) * gap
+            behind = np.where(behind > f, behind, np.nan)  # no real image within f
+            values = behind * f / (behind - f)
         return self.sign * self.unit_mm * values + self.offset_mm
-
-    def _from_virtual(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Distance a from the main lens, mm, by the thin lens law 1/f = 1/a + 1/b.
-
-        The image is b = lens_to_grid + v * grid_to_sensor behind the lens, v micro-lens gaps behind
-        the grid. NaN if b <= f, because there is no real image then.
-        """
-        assert self.lens is not None
-        f, to_grid, gap = self.lens
-        v = values if self.virtual == "v" else 1.0 / (1.0 - np.where(values < 1.0, values, np.nan))
-        behind = to_grid + np.where(v > 0, v, np.nan) * gap
-        behind = np.where(behind > f, behind, np.nan)  # no real image within f
-        return behind * f / (behind - f)
 
     def decode(self, stored: NDArray[Any]) -> Depth:
         """Convert stored values (H, W), float32 or uint16, to depth in float32 mm, 0 = unread."""
@@ -223,9 +229,11 @@ def read_profile(path: Path) -> Profile:
         raise RecordingError(f"{path}: {f'{key} {why}' if key else why}") from None
 
 
-_CALIBRATION_BYTES = 1 << 20
 _LOOKS_LIKE = ("*depthmap*.*", "*depth3d*.*", "*.xyz", "*.ply")  # names of exports
-_CALIBRATION = "RayCalibData"
+_NO_SCALE = (
+    " (the Raytrix calibration in it holds the micro-lens grid in virtual depth, but no focal length "
+    "and no metric scale)"
+)
 
 
 def open_raytrix(
@@ -249,11 +257,17 @@ def open_raytrix(
     path = folder / PROFILE_FILE
     profile = read_profile(path)
     camera_toml = CameraFile.read(folder / CAMERA_FILE)
-    problems = () if profile.doubt is None else (profile.doubt,)
-    camera_toml = replace(camera_toml, problems=(*camera_toml.problems, *problems))
-    _refuse_virtual(folder, profile)
-    stack: Stack
+    if profile.doubt is not None:
+        camera_toml = replace(camera_toml, problems=(*camera_toml.problems, profile.doubt))
+    if profile.kind == "virtual" and profile.lens is None:
+        has_calibration = any(map(_is_calibration, folder.glob("*.xml")))
+        raise RecordingError(
+            f"the depth in {folder} is virtual, which is relative, and no calibration to "
+            f"millimetres is stated{_NO_SCALE if has_calibration else ''}; export metric depth, or "
+            f"state lens_f_mm, lens_to_grid_mm and grid_to_sensor_mm in {PROFILE_FILE}"
+        )
     decode: Callable[[Stored], Depth]
+    stack: Stack
     if profile.kind == "points":
         files, stack = _open_clouds(folder, profile, camera_toml, camera, progress)
         decode = profile.within
@@ -267,8 +281,8 @@ def open_raytrix(
         except BaseException:
             stack.close()
             raise
-    recording = Folder(folder, files, camera_toml, stack, decode, (path,)).recording(
-        "raytrix", camera, fps
+    recording = image_recording(
+        "raytrix", folder, files, camera_toml, stack, camera, fps, decode, (path,)
     )
     recording.metadata["profile"] = profile.facts()
     return recording
@@ -282,14 +296,15 @@ def looks_like_raytrix(folder: Path, names: list[str]) -> bool:
         folder: their folder.
         names: names of the files in it.
     """
-    if any(fnmatch(name.lower(), pattern) for name in names for pattern in _LOOKS_LIKE):
-        return True
-    for name in names:
-        if name.lower().endswith(".xml"):
-            with (folder / name).open("rb") as file:
-                if f"<{_CALIBRATION}".encode() in file.read(1024):
-                    return True
-    return False
+    return any(fnmatch(name.lower(), pattern) for name in names for pattern in _LOOKS_LIKE) or any(
+        _is_calibration(folder / name) for name in names if name.lower().endswith(".xml")
+    )
+
+
+def _is_calibration(path: Path) -> bool:
+    """Whether an XML file is the vendor's calibration."""
+    with path.open("rb") as file:
+        return b"<RayCalibData" in file.read(1024)
 
 
 def no_profile_error(folder: Path) -> RecordingError:
@@ -309,7 +324,7 @@ def _with_lens(camera_toml: CameraFile, profile: Profile, stack: Stack, path: Pa
         return camera_toml
     f_px = profile.focal_mm / (profile.pitch_mm * profile.resolution_divisor)
     centre = {"cx": (stack.width - 1) / 2.0, "cy": (stack.height - 1) / 2.0}
-    told_once = (
+    estimated = (
         f"the focal length of {f_px:.1f} px follows from focal_mm and pitch_mm in {path.name}; a "
         "lens that is focused close up has a longer one, so measure a ruler at a known distance "
         "and state fx and fy in camera.toml"
@@ -318,7 +333,7 @@ def _with_lens(camera_toml: CameraFile, profile: Profile, stack: Stack, path: Pa
         camera_toml,
         intrinsics={"fx": f_px, "fy": f_px, **centre},
         source=path.name,
-        problems=(*camera_toml.problems, told_once),
+        problems=(*camera_toml.problems, estimated),
     )
 
 
@@ -353,22 +368,37 @@ def _check(stack: Stack, profile: Profile, path: Path) -> None:
         )
 
 
+# Point clouds, one per file, as images of a camera.
+
+
+_PLY = ".ply"
+_CLOUD_SUFFIXES = (".xyz", ".txt", ".csv", ".asc", _PLY)
+_HEAD_BYTES = 1 << 16
+_TYPES = {  # PLY's name of a type: NumPy's
+    **{"char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2"},
+    **{"ushort": "u2", "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4"},
+    **{"float": "f4", "float32": "f4", "double": "f8", "float64": "f8"},
+}
+_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
+
+
 def _open_clouds(
     folder: Path, profile: Profile, camera_toml: CameraFile, stated: Lens | None, progress: Progress
 ) -> tuple[list[Path], Stack]:
-    inside = [
-        path for path in folder.iterdir() if path.is_file() and fnmatch(path.name, profile.pattern)
-    ]
     beside = (camera_toml.timestamps, CAMERA_FILE, PROFILE_FILE)
     files = [
-        p for p in inside if p.suffix.lower() in point_clouds.SUFFIXES and p.name not in beside
+        path
+        for path in sorted(folder.iterdir(), key=lambda path: natural_key(path.name))
+        if path.is_file()
+        and fnmatch(path.name, profile.pattern)
+        and path.suffix.lower() in _CLOUD_SUFFIXES
+        and path.name not in beside
     ]
     if not files:
         raise RecordingError(
             f"no point cloud (.xyz, .txt, .csv or .ply) in {folder} fits pattern = "
             f"{profile.pattern!r} of {PROFILE_FILE}; correct it"
         )
-    files.sort(key=lambda path: natural_key(path.name))
     width = stated.width if isinstance(stated, Camera) else camera_toml.width
     height = stated.height if isinstance(stated, Camera) else camera_toml.height
     if not (width and height):
@@ -377,74 +407,119 @@ def _open_clouds(
             "write a camera.toml with fx, fy, cx, cy, width and height in pixels"
         )
     camera = camera_toml.camera(width, height, stated)
-    return files, point_clouds.open_clouds(
-        files, camera, profile.columns, profile_points(profile), progress
-    )
-
-
-def profile_points(profile: Profile) -> Callable[[point_clouds.Points], point_clouds.Points]:
-    """The function that converts a file's points to the camera frame.
-
-    Args:
-        profile: for units, signs, offset and invalid values.
-
-    Returns:
-        A function from points (n, 3) in the file's units to (n, 3) mm, camera frame; NaN if z is
-        invalid.
-    """
     scale = profile.unit_mm * np.array([1.0, -1.0 if profile.up else 1.0, float(profile.sign)])
 
-    def to_camera(points: point_clouds.Points) -> point_clouds.Points:
-        """Convert points (n, 3) in the file's units to mm, camera frame; all three NaN if z is
-        invalid.
-        """
+    def decode(path: Path) -> Stored | None:
+        """Depth (H, W) mm of a file; None if it is damaged."""
+        try:
+            ply = path.suffix.lower() == _PLY
+            points = _read_ply(path) if ply else _read_text(path, profile.columns)
+        except (ValueError, OverflowError):
+            return None
+        if points is None:
+            return None
         p_camera = points * scale
         for value in profile.invalid:
             p_camera[points[:, 2] == value] = np.nan
         p_camera[:, 2] += profile.offset_mm
-        return p_camera
+        return render_points(p_camera, camera)
 
-    return to_camera
+    probe = partial(_probe_cloud, size=(width, height))
+    return files, open_files(files, "point cloud", probe, decode, progress)
 
 
-def read_ray_calibration(path: Path) -> float:
-    """The total covering plane, in virtual depth, of a `RayCalibData` XML file.
-
-    The file has no focal length and no metric scale, so it cannot convert virtual depth to mm.
-
-    Raises:
-        RecordingError: it is not such a calibration.
-    """
+def _probe_cloud(path: Path, size: Size) -> Probe:
     with path.open("rb") as file:
-        text = file.read(_CALIBRATION_BYTES)
+        head = file.read(_HEAD_BYTES)
+    if path.suffix.lower() != _PLY:
+        lines = head.decode("utf-8", "replace").splitlines()[:3]
+        return size if any(map(_are_numbers, lines)) else something_else(path, "point cloud")
+    if not head.startswith(b"ply"[: len(head)]):
+        return something_else(path, "PLY")
+    header = _ply_header(head)
+    return size if header is not None and not header.is_cut(path) else None
+
+
+def _are_numbers(line: str) -> bool:
+    """Whether a line has at least three numbers and nothing else."""
+    cells = line.replace(",", " ").replace(";", " ").split()
     try:
-        # bandit B314: expat reads no external entities and limits the others, which tests check
-        root = ET.fromstring(text)  # nosec B314
-        if root.tag != _CALIBRATION:
-            raise ValueError(f"its root is <{root.tag}>")
-        return float(root.findtext("tcp", ""))
-    except (ET.ParseError, ValueError) as error:
-        raise RecordingError(
-            f"{path} should be a Raytrix calibration ({_CALIBRATION}), but: {error}"
-        ) from None
+        return len(cells) >= 3 and bool(np.isfinite([float(cell) for cell in cells]).any())
+    except ValueError:
+        return False
 
 
-def _refuse_virtual(folder: Path, profile: Profile) -> None:
-    """Raise RecordingError for virtual (relative) depth without the distances inside the camera."""
-    if profile.kind != "virtual" or profile.lens is not None:
-        return
-    held = ""
-    for path in sorted(folder.glob("*.xml")):
-        try:
-            tcp = read_ray_calibration(path)
-        except RecordingError:
-            continue
-        held = (
-            f" ({path.name} holds the micro-lens grid and tcp = {tcp:.3f} in virtual depth, "
-            "but no focal length and no metric scale)"
-        )
-    raise RecordingError(
-        f"the depth in {folder} is virtual, which is relative, and no calibration to millimetres "
-        f"is stated{held}; export metric depth, or state lens_f_mm, lens_to_grid_mm and "
-        f"grid_to_sensor_mm in {PROFILE_FILE}"
-    )
+def _read_text(path: Path, columns: tuple[int, int, int]) -> Points:
+    with path.open(encoding="utf-8", errors="strict") as file:
+        first = [file.readline(_HEAD_BYTES) for _ in range(3)]
+    n_header = next((k for k, line in enumerate(first) if _are_numbers(line)), 0)
+    delimiter = next((mark for mark in ";," if mark in first[n_header]), None)
+    return _loadtxt(path, delimiter=delimiter, skiprows=n_header, usecols=columns, encoding="utf-8")
+
+
+class _PlyHeader(NamedTuple):
+    """Layout of the vertices in a PLY file.
+
+    Attributes:
+        n: number of vertices.
+        row: NumPy's type of a vertex, with the byte order; in native order for text.
+        is_text: True if numbers are written as text.
+        start: position of the vertices in the file, bytes.
+    """
+
+    n: int
+    row: np.dtype[Any]
+    is_text: bool
+    start: int
+
+    def is_cut(self, path: Path) -> bool:
+        """Whether the file is too short for the vertices; a number takes two bytes of text."""
+        row_bytes = 2 * len(self.row) if self.is_text else self.row.itemsize
+        return path.stat().st_size + self.is_text < self.start + self.n * row_bytes
+
+
+def _ply_header(head: bytes) -> _PlyHeader | None:
+    """Parse the header; None if it is cut, or the vertices are not the first element."""
+    end = head.find(b"end_header")
+    start = head.find(b"\n", end) + 1
+    if end < 0 or not start:
+        return None
+    order = element = None
+    n = -1
+    fields: dict[str, str] = {}
+    for line in head[:end].decode("latin-1").splitlines():
+        match line.split():
+            case ["format", stated, *_]:
+                order = _ORDERS.get(stated)
+            case ["element", element, count] if count.isdigit():
+                if n < 0 and element != "vertex":
+                    return None
+                n = int(count) if n < 0 else n
+            case ["property", *words] if element == "vertex":
+                if len(words) != 2 or words[0] not in _TYPES or words[1] in fields:
+                    return None  # a list among the vertices has no fixed size
+                fields[words[1]] = _TYPES[words[0]]
+    if order is None or n < 0 or not {"x", "y", "z"} <= fields.keys():
+        return None
+    row = np.dtype([(name, order + kind) for name, kind in fields.items()])
+    return _PlyHeader(n, row, not order, start)
+
+
+def _read_ply(path: Path) -> Points | None:
+    with path.open("rb") as file:
+        header = _ply_header(file.read(_HEAD_BYTES))
+        if header is None or header.is_cut(path):
+            return None
+        file.seek(header.start)
+        if header.is_text:
+            columns = [list(header.row.names or ()).index(axis) for axis in "xyz"]
+            return _loadtxt(file, usecols=columns, max_rows=max(header.n, 1), encoding="latin-1")
+        vertices = np.frombuffer(file.read(header.n * header.row.itemsize), header.row)
+    with np.errstate(invalid="ignore"):  # damage may contain a signalling NaN
+        return np.stack([vertices[axis].astype(np.float64) for axis in "xyz"], axis=-1)
+
+
+def _loadtxt(file: Any, **how: Any) -> Points:
+    with warnings.catch_warnings():  # an empty file has no points
+        warnings.simplefilter("ignore", UserWarning)
+        return np.loadtxt(file, ndmin=2, **how)

@@ -15,6 +15,8 @@ from array import array
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
+from functools import partial
+from os.path import commonprefix
 from pathlib import Path
 from threading import Lock
 from typing import Any
@@ -25,11 +27,6 @@ from numpy.typing import NDArray
 from liex_lab.errors import LiexError, RecordingError, UnknownCameraError
 from liex_lab.optics.camera import Camera, Distortion, Lens, is_central
 from liex_lab.recordings.camera_file import CAMERA_FILE, CameraFile, fitting, is_infrared
-from liex_lab.recordings.formats.messages.depth_images import (
-    decode,
-    picture_size,
-    stated_kind,
-)
 from liex_lab.recordings.formats.messages.messages import (
     CLOUD_SCHEMAS,
     Calibration,
@@ -40,14 +37,25 @@ from liex_lab.recordings.formats.messages.messages import (
     Envelope,
     Listed,
     MessageFile,
+    MessagePlace,
     Parser,
-    Place,
     Statement,
     printable,
 )
-from liex_lab.recordings.formats.messages.parsers import parser_of, plain_schema
-from liex_lab.recordings.formats.messages.statements import PackFacts, Statements, calibration_in
-from liex_lab.recordings.frame import PLAUSIBLE_MM, Depth
+from liex_lab.recordings.formats.messages.parsers import (
+    decode_message,
+    parser_of,
+    picture_size,
+    plain_schema,
+    stated_kind,
+)
+from liex_lab.recordings.formats.messages.statements import (
+    SUFFIX,
+    PackFacts,
+    Statements,
+    calibration_in,
+)
+from liex_lab.recordings.frame import PLAUSIBLE_MM, Depth, unread_where_damaged
 from liex_lab.recordings.recording import Recording
 from liex_lab.recordings.timestamps import in_order_of_sensor, start_of_clock
 from liex_lab.runtime.progress import Progress
@@ -161,7 +169,7 @@ class _Found:
     parsers: dict[Channel, Parser | None] = field(default_factory=dict)
     depths: dict[Channel, _Topic] = field(default_factory=dict)
     calibrations: dict[str, list[tuple[int, Calibration]]] = field(default_factory=dict)
-    listed: dict[Channel, list[tuple[int, Place]]] = field(default_factory=dict)
+    listed: dict[Channel, list[tuple[int, MessagePlace]]] = field(default_factory=dict)
     stated: Statements = field(default_factory=Statements)
     read: set[Channel] = field(default_factory=set)
     failed: dict[Channel, str] = field(default_factory=dict)
@@ -174,7 +182,7 @@ class _Found:
 
 
 @dataclass
-class _Frames:
+class _TopicFrames:
     """Images of one topic, read from the file one at a time.
 
     Attributes:
@@ -184,9 +192,6 @@ class _Frames:
         camera: the camera of the recording.
         step_mm: mm per step of 16-bit depth.
         unread: values that mean "no reading", from a camera.toml.
-        problems: sentences, appended to for unreadable frames.
-        scale: factor on all depth.
-        bad: frames already reported.
         lock: held while the file is read.
     """
 
@@ -196,64 +201,53 @@ class _Frames:
     camera: Camera
     step_mm: float
     unread: Sequence[float]
-    problems: list[str]
-    scale: float = 1.0
-    bad: set[int] = field(default_factory=set)
     lock: Any = field(default_factory=Lock)
 
-    def read(self, number: int) -> Depth:
-        """Depth of one image; all unread if it is damaged or of another size.
+    def read(self, number: int, scale: float = 1.0) -> Depth | str:
+        """Depth of one image, or what is wrong with it.
 
         Args:
             number: index of the image, in order of logging.
+            scale: factor on the depth.
 
         Returns:
             (H, W) float32 mm, 0 where unread.
         """
         with self.lock:
-            data = self.file.read(Place(*self.places[number].tolist()))
-        depth, why = self._decode(data)
-        if depth is not None:
-            return depth
-        camera = self.camera
-        if number not in self.bad:
-            self.bad.add(number)
-            self.problems.append(
-                f"frame {number} of {printable(self.topic.name)} is damaged or not of "
-                f"{camera.width} x {camera.height} pixels ({printable(why)}), and was taken as "
-                "wholly unread"
-            )
-        return np.zeros((camera.height, camera.width), np.float32)
-
-    def _decode(self, data: memoryview) -> tuple[Depth | None, str]:
-        """Depth of a message, or None and the reason."""
+            data = self.file.read(MessagePlace(*self.places[number].tolist()))
         try:
             message = self.topic.parse(data)
         except _DAMAGE as error:
             if self.file.parsed:
-                return None, str(error)
+                return self._wrong(str(error))
             raise RecordingError(
                 f"{self.file.path} is damaged ({error}); copy it again, or go on with what is "
                 "whole by adding --set recording.accept_truncated=true"
             ) from None
         assert isinstance(message, DepthMessage)
+        depth = None
         with suppress(*_DAMAGE):
-            depth = decode(message, self.camera, self.step_mm, self.scale, self.unread)
-            return depth, stated_kind(message)
-        return None, stated_kind(message)
+            depth = decode_message(message, self.camera, self.step_mm, scale, self.unread)
+        return self._wrong(stated_kind(message)) if depth is None else depth
 
-    def scale_by(self, factors: Sequence[float]) -> None:
-        """Multiply all depth by the first factor that gives plausible depths for a camera above an
-        animal.
+    def _wrong(self, why: str) -> str:
+        return (
+            f" of {printable(self.topic.name)} is damaged or not of {self.camera.width} x "
+            f"{self.camera.height} pixels ({printable(why)})"
+        )
+
+    def plausible(self, factors: Sequence[float]) -> float:
+        """The first factor on depth that suits a camera above an animal.
 
         Args:
             factors: in order; the last one if none is plausible, and the first one if all are equal
                 or there are no readings.
         """
-        seen = (self.read(n) for n in ((0, len(self.places) // 2) if len(set(factors)) > 1 else ()))
-        median_mm = next((float(np.median(one[one > 0])) for one in seen if one.any()), 0.0)
-        plausible = [f for f in factors if PLAUSIBLE_MM[0] <= f * median_mm <= PLAUSIBLE_MM[1]]
-        self.scale = [*plausible, factors[-1 if median_mm else 0]][0]
+        probed = (0, len(self.places) // 2) if len(set(factors)) > 1 else ()
+        readings = (one[one > 0] for one in map(self.read, probed) if not isinstance(one, str))
+        median_mm = next((float(np.median(some)) for some in readings if some.size), 0.0)
+        good = [f for f in factors if PLAUSIBLE_MM[0] <= f * median_mm <= PLAUSIBLE_MM[1]]
+        return [*good, factors[-1 if median_mm else 0]][0]
 
 
 def open_topic(
@@ -328,21 +322,25 @@ def _open(
     stated_mm = found.stated.step_mm(chosen.name, camera_file.states_unit, problems, doubts)
     step_mm = (stated_mm or 1.0) * packed.step_mm
     places = rows[monotone.order, 3:]
-    frames = _Frames(file, chosen, places, the_camera, step_mm, camera_file.unread, problems)
+    frames = _TopicFrames(file, chosen, places, the_camera, step_mm, camera_file.unread)
     unit_mm = camera_file.unit_mm
     literal = unit_mm / (1000.0 if chosen.metric else step_mm)
     known = camera_file.states_unit and bool(file.notes or stated_mm)
-    frames.scale_by([1.0 if known else unit_mm, literal] if camera_file.states_unit else [unit_mm])
-    if known and frames.scale != literal:
+    scale = frames.plausible(
+        [1.0 if known else unit_mm, literal] if camera_file.states_unit else [unit_mm]
+    )
+    if known and scale != literal:
         problems.append(
             f"unit_mm = {unit_mm:g} in camera.toml is not used, for the recording states its unit"
         )
+    stem = path.resolve().stem
+    shape = (the_camera.height, the_camera.width)
     return Recording(
-        name=packed.name(path.resolve().stem),
+        name=stem.removesuffix(SUFFIX) if packed.packed else stem,
         format=kind,
         camera=the_camera,
         times_ns=monotone.times_ns,
-        read=frames.read,
+        read=unread_where_damaged(partial(frames.read, scale=scale), shape, problems),
         sources=[path],
         problems=problems,
         truncated=not file.whole,
@@ -413,7 +411,7 @@ def _note(found: _Found, envelope: Envelope | Listed, parse: Parser) -> bool:
         if channel in found.depths:
             found.depths[channel].add_all(envelope)
         elif channel.topic in found.calibrations and len(envelope.places):
-            places = map(Place._make, envelope.places.tolist())
+            places = map(MessagePlace._make, envelope.places.tolist())
             known_at = found.listed.setdefault(channel, [])
             known_at.extend(zip(envelope.log_time_ns.tolist(), places, strict=True))
         return True
@@ -645,7 +643,7 @@ def _calibrations_of(
         if topic.frame_id and first.frame_id == topic.frame_id
     ]
     for some in (same_frame, list(usable)):
-        near = {name: _n_shared(topic.name, name) for name in some}
+        near = {name: len(commonprefix([_branch(topic.name), _branch(name)])) for name in some}
         nearest = [name for name in some if near[name] == max(near.values())]
         numbers = {(c.k, c.d, c.width, c.height) for c in map(firsts.get, nearest) if c}
         if len(numbers) == 1 and (len(some) == 1 or near[nearest[0]] > 0):
@@ -659,8 +657,6 @@ def _is_usable(calibration: Calibration) -> bool:
     return len(k) == 9 and bool(np.isfinite(k).all()) and k[0] > 0 and k[4] > 0
 
 
-def _n_shared(one: str, other: str) -> int:
-    """Number of common leading words of two topics."""
-    words = (topic.strip("/").split("/")[:-1] for topic in (one, other))
-    pairs = list(zip(*words, strict=False))
-    return next((n for n, (a, b) in enumerate(pairs) if a != b), len(pairs))
+def _branch(topic: str) -> list[str]:
+    """The words of a topic without the last one."""
+    return topic.strip("/").split("/")[:-1]

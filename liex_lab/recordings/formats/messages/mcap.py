@@ -3,39 +3,52 @@
 Records (opcode, u64 length, content) are walked in file order; messages are in chunks (none, zstd,
 lz4), which threads unpack ahead if the summary at the file's end lists their positions. Schemas and
 channels are also read from the summary, in case the first ones are damaged.
+
+Callers that refuse damage (`open_recording(..., strict=True)`) open a file by its index instead,
+without unpacking its chunks, if the index lists every message that the file's statistics count.
+Only the beginning of each depth message, with the sensor's stamp, is unpacked, on several threads;
+a chunk is checked against its CRC-32 when a frame in it is read. Any other file is walked.
+
+`open_replay` opens session.mcap, which liex_lab wrote with the times of its frames: no stamp is
+read, because single frames of a long recording are needed quickly.
 """
 
 from __future__ import annotations
 
+import itertools
 import struct
 import zlib
 from bisect import bisect_right
-from collections.abc import Callable, Iterator
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from functools import partial
 from io import BytesIO
 from pathlib import Path
 from typing import IO
 
+import numpy as np
+from mcap import records
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import Channel as ChannelRecord
-from mcap.records import Metadata as MetadataRecord
-from mcap.records import Schema as SchemaRecord
+from numpy.typing import NDArray
 
 from liex_lab.errors import RecordingError
 from liex_lab.optics.camera import Lens
 from liex_lab.recordings.formats.messages.depth_topics import open_topic
 from liex_lab.recordings.formats.messages.messages import (
+    CALIBRATION_SCHEMAS,
     Channel,
     Chunk,
     DamagedChunk,
     Envelope,
     Listed,
     MessageFile,
-    Place,
+    MessagePlace,
     unpacked,
 )
+from liex_lab.recordings.formats.messages.parsers import plain_schema, stamp_reader
 from liex_lab.recordings.recording import Recording
 from liex_lab.runtime.progress import Progress, silent
 
@@ -46,7 +59,6 @@ MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
 _FOOTER = struct.Struct(
     "<BQQQI"
 )  # its record: opcode, length, positions of the summary and its offsets, CRC
-_START = struct.Struct("<16xQ")  # of a chunk, in its index
 _CHUNK = struct.Struct(
     "<QQQII"
 )  # first and last log time, unpacked size, its CRC, length of the packing's name
@@ -55,6 +67,7 @@ _BLOCK = 1 << 20
 THREADS = 2
 _SMALL_CHUNK = 1 << 23
 FACTS = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA)
+_SUMMARY = (*FACTS, Opcode.CHUNK_INDEX, Opcode.METADATA_INDEX, Opcode.STATISTICS)
 LARGEST_FACT = 1 << 24  # bytes of one such record
 DAMAGE = (
     McapError,
@@ -76,6 +89,7 @@ def open_mcap(
     fps: float | None = None,
     progress: Progress = silent,
     topic: str | None = None,
+    strict: bool = False,
 ) -> Recording:
     """Open one depth topic of an MCAP file as a recording.
 
@@ -85,14 +99,33 @@ def open_mcap(
         fps: unused, as every message has its time.
         progress: reports the progress of the walk over the file.
         topic: name of the depth topic; None for the only one.
+        strict: open the file by its index if possible; reading a frame in a damaged chunk then
+            raises a `RecordingError`.
 
     Returns:
-        The recording; reading resumes if the file grows (`Recording.grown`).
+        The recording; reading resumes if the file grows (`Recording.grown`), unless strict.
 
     Raises:
         RecordingError: the file is not MCAP, or has no depth topic to choose.
     """
-    return open_topic(McapFile(path, open_file(path)), "mcap", camera, topic, progress)
+    file = open_file(path)
+    opened = IndexedMcap(path, file) if strict else McapFile(path, file)
+    return open_topic(opened, "mcap", camera, topic, progress)
+
+
+def open_replay(path: Path, progress: Progress = silent) -> Recording:
+    """Open the depth of a session's replay, session.mcap, as a recording.
+
+    Raises:
+        RecordingError: it cannot be read, or has no depth.
+    """
+    try:
+        file = IndexedMcap(path, open_file(path), is_replay=True)
+        return open_topic(file, "mcap", None, None, progress)
+    except OSError as error:
+        raise RecordingError(
+            f"{path} cannot be read ({error.strerror or error}); check it"
+        ) from None
 
 
 def open_file(path: Path) -> IO[bytes]:
@@ -121,8 +154,9 @@ class McapFile(MessageFile):
         super().__init__(path, file)
         self._by_id: dict[int, Channel] = {}
         self._schemas: dict[int, str] = {0: "no schema"}
-        self.listed: list[bytes] = []  # the raw indexes of its chunks
-        self.n_messages: int | None = None  # in all chunks, from the file's own statistics
+        self.indexes: list[records.ChunkIndex] = []
+        self.n_notes = 0  # records of metadata
+        self._counted = (-1, -1)  # messages and metadata, by the file's own statistics
         # chunks being unpacked, by the position of their content
         self._coming: dict[int, Future[bytes]] = {}
         self._sure = (
@@ -180,7 +214,7 @@ class McapFile(MessageFile):
                 yield from self._walk_chunk(start, end - start, wanted)
             elif opcode == Opcode.MESSAGE or (opcode in FACTS and end - start <= LARGEST_FACT):
                 data = memoryview(self.file.read(end - start))
-                yield from self._take(opcode, data, Place(-1, start, end - start), wanted)
+                yield from self._take(opcode, data, MessagePlace(-1, start, end - start), wanted)
             at = end
             footer = opcode == Opcode.FOOTER
             if whole and not footer:
@@ -223,8 +257,8 @@ class McapFile(MessageFile):
         They replace damaged records at the beginning. A damaged summary is ignored.
         """
         self.starts = []
-        self.listed = []
-        self.n_messages = None
+        self.indexes = []
+        self._counted = (-1, -1)
         try:
             ending = self.size - _FOOTER.size - len(MAGIC)
             self.file.seek(max(0, ending))
@@ -237,13 +271,7 @@ class McapFile(MessageFile):
                 return
             while at < ending:
                 kind, start, end = self._record(at)
-                if kind == Opcode.CHUNK_INDEX and end - start <= LARGEST_FACT:
-                    content = self.file.read(end - start)
-                    self.starts.append(_START.unpack_from(content)[0])
-                    self.listed.append(content)
-                elif kind == Opcode.STATISTICS:
-                    (self.n_messages,) = struct.unpack("<Q", self.file.read(8))
-                elif kind in FACTS and end - start <= LARGEST_FACT:
+                if kind in _SUMMARY and end - start <= LARGEST_FACT:
                     self._learn(kind, ReadDataStream(BytesIO(self.file.read(end - start))))
                 at = end
         except DAMAGE:
@@ -276,7 +304,9 @@ class McapFile(MessageFile):
             at = at + RECORD.size + length
             if at > len(data) or opcode == 0:
                 break
-            yield from self._take(opcode, data[begin:at], Place(number, begin, length), wanted)
+            yield from self._take(
+                opcode, data[begin:at], MessagePlace(number, begin, length), wanted
+            )
         self.whole = self.whole and at == len(data) and not self.chunks[number].cut
 
     def _chunk(self, start: int, length: int) -> Chunk:
@@ -295,7 +325,7 @@ class McapFile(MessageFile):
         return Chunk(offset, min(n_packed, end - offset), packing, size, crc, cut)
 
     def _take(
-        self, opcode: int, payload: memoryview, place: Place, wanted: Wanted
+        self, opcode: int, payload: memoryview, place: MessagePlace, wanted: Wanted
     ) -> Iterator[Envelope]:
         try:
             if opcode == Opcode.MESSAGE:
@@ -303,7 +333,7 @@ class McapFile(MessageFile):
                 channel = self._by_id[number]
                 if wanted(channel):
                     head = MESSAGE.size
-                    inner = Place(place.chunk, place.offset + head, place.length - head)
+                    inner = MessagePlace(place.chunk, place.offset + head, place.length - head)
                     yield Envelope(channel, log_time_ns, inner, payload[head:], sent_ns)
             elif opcode in FACTS:
                 self._learn(opcode, ReadDataStream(BytesIO(payload)))
@@ -311,20 +341,242 @@ class McapFile(MessageFile):
             self.whole = False
 
     def _learn(self, opcode: int, stream: ReadDataStream) -> None:
-        """Record a schema, channel or metadata record."""
+        """Record a schema, a channel, metadata, or a part of the index."""
         if opcode == Opcode.SCHEMA:
-            schema = SchemaRecord.read(stream)
+            schema = records.Schema.read(stream)
             self._schemas[schema.id] = schema.name
         elif opcode == Opcode.CHANNEL:
-            record = ChannelRecord.read(stream)
-            known = Channel(
-                record.topic,
-                self._schemas.get(record.schema_id, "no schema"),
-                record.message_encoding,
-            )
+            record = records.Channel.read(stream)
+            schema_name = self._schemas.get(record.schema_id, "no schema")
+            known = Channel(record.topic, schema_name, record.message_encoding)
             if self._by_id.setdefault(record.id, known) == known:
                 self.channels.setdefault(known)
         elif opcode == Opcode.METADATA:
-            note = MetadataRecord.read(stream)
+            note = records.Metadata.read(stream)
+            self.n_notes += 1
             if note.name == NOTES:
                 self.notes.update(note.metadata)
+        elif opcode == Opcode.CHUNK_INDEX:
+            self.indexes.append(records.ChunkIndex.read(stream))
+            self.starts.append(self.indexes[-1].chunk_start_offset)
+        elif opcode == Opcode.METADATA_INDEX:
+            kind, start, end = self._record(records.MetadataIndex.read(stream).offset)
+            if kind == Opcode.METADATA and end - start <= LARGEST_FACT:
+                self._learn(kind, ReadDataStream(BytesIO(self.file.read(end - start))))
+        elif opcode == Opcode.STATISTICS:
+            counts = records.Statistics.read(stream)
+            self._counted = (counts.message_count, counts.metadata_count)
+
+
+# Files opened by their index.
+
+
+_UNKNOWN = -1  # the length of a message is only stated in its chunk
+_LARGEST_INDEX = 1 << 26  # bytes of one
+_LARGEST_OFFSET = 1 << 40
+_INDEX = struct.Struct("<HI")  # of a message index: channel, bytes of its entries
+_ENTRY = np.dtype([("time_ns", "<u8"), ("offset", "<u8")])
+_HEAD = 512  # first bytes of a message's record, with its stamp
+_BATCH = 32  # chunks per task of unpacking
+
+_StampReader = Callable[[memoryview], int | None]
+_Table = tuple[int, bytes]  # number of a chunk, and times and offsets of messages as written
+
+
+class IndexedMcap(McapFile):
+    """An MCAP file that is complete according to its index; any other is walked."""
+
+    def __init__(self, path: Path, file: IO[bytes], is_replay: bool = False) -> None:
+        """Keep an open file; the times of logging in a replay are those of its frames."""
+        super().__init__(path, file)
+        self._is_replay = is_replay
+
+    def walk(self, wanted: Wanted, progress: Progress) -> Iterator[Envelope | Listed]:
+        """The messages of the wanted channels, by channel: the first of each with its data."""
+        self._learn_ending()
+        try:
+            tables = self._tables(wanted, progress)
+        except (*DAMAGE, DamagedChunk):  # the walk reports damage
+            self.chunks.clear()
+            yield from super().walk(wanted, progress)
+            return
+        self.parsed = self._is_replay
+        for channel_id, those in tables.items():
+            yield from self._messages(channel_id, those, wanted)
+
+    def _tables(self, wanted: Wanted, progress: Progress) -> dict[int, list[_Table]]:
+        """Contents of the message indexes of all chunks, by channel.
+
+        Raises:
+            DamagedChunk: the index does not match the file, or does not list all messages.
+        """
+        n_messages = 0
+        tables: defaultdict[int, list[_Table]] = defaultdict(list)
+        for index in sorted(self.indexes, key=lambda index: index.chunk_start_offset):
+            at = index.chunk_start_offset
+            opcode, start, end = self._record(at)
+            if (opcode, end - at) != (Opcode.CHUNK, index.chunk_length):
+                raise DamagedChunk("there is no chunk where its index says")
+            self.chunks.append(self._chunk(start, end - start))
+            offsets = index.message_index_offsets
+            first = min(offsets.values(), default=0)
+            if not 0 <= index.message_index_length <= min(_LARGEST_INDEX, self.size):
+                raise DamagedChunk("an index is larger than its file")
+            self.file.seek(first)
+            content = self.file.read(index.message_index_length)
+            for channel_id, place in offsets.items():
+                kind, length = RECORD.unpack_from(content, place - first)
+                begin = place - first + RECORD.size
+                whose, n_bytes = _INDEX.unpack_from(content, begin)
+                entries = content[begin + _INDEX.size : begin + length]
+                rest = n_bytes % _ENTRY.itemsize
+                is_sound = n_bytes == len(entries) and not rest
+                if (kind, whose, is_sound) != (Opcode.MESSAGE_INDEX, channel_id, True):
+                    raise DamagedChunk("there is no index where it should be")
+                n_messages += n_bytes // _ENTRY.itemsize
+                if wanted(self._by_id[channel_id]):
+                    tables[channel_id].append((len(self.chunks) - 1, entries))
+            progress(end >> 20, (self.size >> 20) + 1, "looking through the recording (MB)")
+        if (n_messages, self.n_notes) != self._counted:
+            raise DamagedChunk("there is more in the file than in its index")
+        return tables
+
+    def _messages(
+        self, channel_id: int, tables: Sequence[_Table], wanted: Wanted
+    ) -> Iterator[Envelope | Listed]:
+        """One channel's messages: the first with its data, and the rest listed if possible."""
+        channel = self._by_id[channel_id]
+        listed = _listed(channel, tables)
+        n_stated = sum(len(entries) for _, entries in tables) // _ENTRY.itemsize
+        self.whole &= len(listed.places) == n_stated
+        rest: Listed | None = None
+        tried = False
+        for k, (time_ns, numbers) in enumerate(
+            zip(listed.log_time_ns.tolist(), listed.places.tolist(), strict=True)
+        ):
+            if not wanted(channel):
+                return
+            try:
+                place = MessagePlace(*numbers)
+                data = self._message(place)
+                head = place.offset + RECORD.size
+                sent_ns = MESSAGE.unpack_from(self.unpack(place.chunk), head)[3]
+            except (*DAMAGE, DamagedChunk):
+                self.whole = False
+                continue
+            yield Envelope(channel, time_ns, place, data, sent_ns)
+            if not tried:
+                later = Listed(channel, listed.log_time_ns[k + 1 :], listed.places[k + 1 :])
+                tried, rest = True, self._stamped(channel_id, later)
+            if rest is not None:
+                yield rest
+                return
+
+    def _stamped(self, channel_id: int, listed: Listed) -> Listed | None:
+        """Messages with the sensor's stamps; None if reading these needs whole messages."""
+        channel = listed.channel
+        if self._is_replay or plain_schema(channel) in CALIBRATION_SCHEMAS:
+            return listed
+        read = stamp_reader(channel)
+        if read is None:
+            return None
+        by_chunk = np.flatnonzero(np.diff(listed.places[:, 0])) + 1
+        edges = [0, *by_chunk[_BATCH - 1 :: _BATCH].tolist(), len(listed.places)]
+        parts = [listed.places[a:b] for a, b in itertools.pairwise(edges)]
+        logged = [listed.log_time_ns[a:b] for a, b in itertools.pairwise(edges)]
+        with ThreadPoolExecutor(THREADS) as unpackers:
+            found = list(unpackers.map(partial(self._stamps, read, channel_id), parts, logged))
+        if not all(one is not None for one in found):
+            return None
+        table = np.concatenate([one for one in found if one is not None])
+        good = table[:, 0] == 1
+        self.whole = self.whole and bool(good.all())
+        sent_ns = table[good, 2].view(np.uint64)
+        return Listed(
+            channel, listed.log_time_ns[good], listed.places[good], table[good, 1], sent_ns
+        )
+
+    def _stamps(
+        self,
+        read: _StampReader,
+        channel_id: int,
+        places: NDArray[np.int64],
+        logged_ns: NDArray[np.uint64],
+    ) -> NDArray[np.int64] | None:
+        """(n, 3) for each message whether it could be read, its stamp and its time of sending, ns.
+
+        None if the beginnings of messages do not contain their stamps.
+        """
+        table = np.zeros((len(places), 3), np.int64)
+        with self.path.open("rb") as file:  # threads need separate file positions
+            for rows in np.split(np.arange(len(places)), np.flatnonzero(np.diff(places[:, 0])) + 1):
+                if not len(rows):
+                    continue
+                try:
+                    chunk = self.believable(int(places[rows[0], 0]))
+                    offsets = places[rows, 1].tolist()
+                    file.seek(chunk.offset)
+                    packed = file.read(chunk.length)
+                    data = unpacked(packed, chunk, min(offsets[-1] + _HEAD, chunk.size))
+                    heads = [data[at : at + _HEAD] for at in offsets]
+                    for row, head in zip(rows.tolist(), heads, strict=True):
+                        opcode, length = RECORD.unpack_from(head)
+                        whose, _, log_ns, sent_ns = MESSAGE.unpack_from(head, RECORD.size)
+                        if (opcode, whose, log_ns) != (Opcode.MESSAGE, channel_id, logged_ns[row]):
+                            raise DamagedChunk("there is another message than its index says")
+                        begin = RECORD.size + MESSAGE.size
+                        stamp_ns = read(memoryview(head)[begin : RECORD.size + length])
+                        if stamp_ns is None:
+                            return None
+                        table[row] = 1, stamp_ns, np.uint64(sent_ns).view(np.int64)
+                except (*DAMAGE, DamagedChunk):
+                    table[rows, 0] = 0
+        return table
+
+    def read(self, place: MessagePlace) -> memoryview:
+        """The data of one message; an unknown length is read from its chunk.
+
+        Raises:
+            RecordingError: its chunk is damaged.
+        """
+        if place.length != _UNKNOWN:
+            return super().read(place)
+        try:
+            return self._message(place)
+        except DamagedChunk as error:
+            advice = (
+                "run `liex run` on its recording"
+                if self._is_replay
+                else "go on with what is whole by adding --set recording.accept_truncated=true"
+            )
+            raise RecordingError(
+                f"{self.path} is damaged ({error}); copy it again, or {advice}"
+            ) from None
+
+    def _message(self, place: MessagePlace) -> memoryview:
+        """The data of a message whose length is only stated in its chunk."""
+        data = self.unpack(place.chunk)
+        try:
+            opcode, length = RECORD.unpack_from(data, place.offset)
+        except struct.error:
+            opcode, length = 0, 0
+        begin = place.offset + RECORD.size
+        if opcode != Opcode.MESSAGE or not MESSAGE.size <= length <= len(data) - begin:
+            raise DamagedChunk("there is no message where its index says")
+        return data[begin + MESSAGE.size : begin + length]
+
+
+def _listed(channel: Channel, tables: Sequence[_Table]) -> Listed:
+    """Messages of a channel in file order, without those with invalid offsets.
+
+    An hour has sixteen thousand chunks, so their tables are parsed as one.
+    """
+    table = np.frombuffer(b"".join(entries for _, entries in tables), _ENTRY)
+    counts = [len(entries) // _ENTRY.itemsize for _, entries in tables]
+    number = np.repeat(np.array([number for number, _ in tables], np.int64), counts)
+    order = np.lexsort((table["offset"], number))
+    order = order[table["offset"][order] <= _LARGEST_OFFSET]
+    places = np.full((len(order), 3), _UNKNOWN, np.int64)
+    places[:, 0] = number[order]
+    places[:, 1] = table["offset"][order]
+    return Listed(channel, table["time_ns"][order], places)

@@ -163,10 +163,9 @@ Parser = Callable[[memoryview], Message]
 # any number of zeros.
 _LARGEST_CHUNK = 1 << 27
 _PACKINGS = {b"\x28\xb5\x2f\xfd": "zstd", b"\x04\x22\x4d\x18": "lz4"}  # by their first bytes
-_PIECE = 1 << 15  # bytes of a packed chunk read at once for its beginning
 
 
-class Place(NamedTuple):
+class MessagePlace(NamedTuple):
     """Position of a message's data.
 
     Attributes:
@@ -207,7 +206,7 @@ class Envelope(NamedTuple):
 
     channel: Channel
     log_time_ns: int
-    place: Place
+    place: MessagePlace
     data: memoryview
     publish_time_ns: int = 0
 
@@ -218,7 +217,7 @@ class Listed(NamedTuple):
     Attributes:
         channel: topic, schema and encoding.
         log_time_ns: (n,) uint64 times of logging, ns.
-        places: (n, 3) int64 chunk, offset and length of each, as a `Place`.
+        places: (n, 3) int64 chunk, offset and length of each, as a `MessagePlace`.
         stamp_ns: (n,) int64 stamps of the sensor, ns; None for the times of logging.
         publish_time_ns: (n,) times of sending, ns; None if not read.
     """
@@ -320,7 +319,7 @@ class MessageFile(ABC):
         n = bisect_right(self.starts, at)
         return self.starts[n] if n < len(self.starts) else self.size
 
-    def read(self, place: Place) -> memoryview:
+    def read(self, place: MessagePlace) -> memoryview:
         """The data of one message.
 
         Args:
@@ -376,7 +375,7 @@ class MessageFile(ABC):
         self._last_chunk = (-1, memoryview(b""))
 
 
-def unpacked(packed: bytes, chunk: Chunk) -> bytes:
+def unpacked(packed: bytes, chunk: Chunk, first: int | None = None) -> bytes:
     """Unpack a chunk, checked against its size and CRC-32.
 
     For a cut chunk, the bytes before the cut.
@@ -384,17 +383,19 @@ def unpacked(packed: bytes, chunk: Chunk) -> bytes:
     Args:
         packed: its packed bytes.
         chunk: its description in the file.
+        first: number of bytes to unpack from its beginning, unchecked; None for all.
 
     Raises:
         DamagedChunk: it cannot be unpacked to its original bytes, or its compression is unknown.
     """
+    size = chunk.size if first is None else first
     with _codec_errors():
-        data = _inflate(packed, chunk.packing, chunk.size)
+        data = _inflate(packed, chunk.packing, size)
     if chunk.cut:
         return data
-    if len(data) != chunk.size:
-        raise DamagedChunk(f"{len(data)} bytes came out of it and {chunk.size} went in")
-    if chunk.crc and isal_zlib.crc32(data) != chunk.crc:
+    if len(data) != size:
+        raise DamagedChunk(f"{len(data)} bytes came out of it and {size} were expected")
+    if first is None and chunk.crc and isal_zlib.crc32(data) != chunk.crc:
         raise DamagedChunk("its checksum is wrong")
     return data
 
@@ -413,32 +414,6 @@ def unpacked_message(data: memoryview) -> memoryview:
         return data
     whole = Chunk(0, len(data), packing, _LARGEST_CHUNK, 0, cut=True)  # its size is not stated
     return memoryview(unpacked(bytes(data), whole))
-
-
-def first_bytes(file: IO[bytes], chunk: Chunk, size: int) -> bytes:
-    """The first bytes of a packed chunk; the rest is neither unpacked nor checked.
-
-    Args:
-        file: the open file.
-        chunk: its description in the file, packed by zstd or lz4.
-        size: number of unpacked bytes.
-
-    Raises:
-        DamagedChunk: there are fewer, or it cannot be unpacked.
-    """
-    file.seek(chunk.offset)
-    with _codec_errors():
-        if chunk.packing == "zstd":
-            import zstandard
-
-            unpacker = zstandard.ZstdDecompressor()
-            with unpacker.stream_reader(file, read_size=_PIECE, closefd=False) as reader:
-                data = reader.read(size)
-        else:
-            data = _inflate(file.read(chunk.length), chunk.packing, size)
-    if len(data) < size:
-        raise DamagedChunk(f"{len(data)} bytes came out of it and {size} were expected")
-    return data
 
 
 @contextmanager

@@ -7,23 +7,27 @@ differ in alignment, in the header and in the zero at a string's end.
 
 from __future__ import annotations
 
-import base64
-import binascii
 import json
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
+import numpy as np
 from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud as PointCloudMessage
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
+from google.protobuf.json_format import Error as JsonError
+from google.protobuf.json_format import ParseDict
 from google.protobuf.message import DecodeError
 from google.protobuf.timestamp_pb2 import Timestamp
+from numpy.typing import NDArray
 
+from liex_lab.errors import RecordingError
+from liex_lab.optics.camera import Camera
+from liex_lab.recordings.formats.images.files import Size, decode_png, png_size, render_points
 from liex_lab.recordings.formats.messages.messages import (
-    CALIBRATION_SCHEMAS,
     CLOUD_SCHEMAS,
     PICTURE_SCHEMAS,
     STATEMENT_SCHEMAS,
@@ -31,6 +35,7 @@ from liex_lab.recordings.formats.messages.messages import (
     Calibration,
     Channel,
     DamagedMessage,
+    DepthMessage,
     Message,
     PackedPicture,
     Parser,
@@ -39,6 +44,7 @@ from liex_lab.recordings.formats.messages.messages import (
     Statement,
     unpacked_message,
 )
+from liex_lab.recordings.frame import Depth, depth_mm
 
 
 def plain_schema(channel: Channel) -> str:
@@ -58,17 +64,14 @@ def parser_of(channel: Channel) -> Parser | None:
     schema = plain_schema(channel)
     if schema in STATEMENT_SCHEMAS and not STATES.search(channel.topic):
         return None
-    if schema not in (
-        *PICTURE_SCHEMAS,
-        *CLOUD_SCHEMAS,
-        *CALIBRATION_SCHEMAS,
-        *STATEMENT_SCHEMAS,
-    ):
-        return None
-    if schema.startswith("foxglove."):
+    if schema in _FOXGLOVE:
         read = {"protobuf": _from_protobuf, "json": _from_json}.get(channel.encoding)
-        return None if read is None else partial(read, schema)
-    return ros_parser(schema, channel.encoding)
+        return None if read is None else partial(read, *_FOXGLOVE[schema])
+    if schema not in _PARSERS or channel.encoding not in _LAYOUTS:
+        return None
+    if channel.encoding == "ros1":
+        return lambda data: _PARSERS[schema](_Fields(data))
+    return partial(_read_cdr, _PARSERS[schema])
 
 
 def stamp_reader(channel: Channel) -> Callable[[memoryview], int | None] | None:
@@ -82,10 +85,9 @@ def stamp_reader(channel: Channel) -> Callable[[memoryview], int | None] | None:
     Returns:
         The function; None for messages without depth, or if their beginning has no stamp.
     """
-    schema = plain_schema(channel)
-    if schema not in (*PICTURE_SCHEMAS, *CLOUD_SCHEMAS):
+    if plain_schema(channel) not in (*PICTURE_SCHEMAS, *CLOUD_SCHEMAS):
         return None
-    if schema.startswith("foxglove."):
+    if channel.schema.startswith("foxglove."):
         return stamp_in if channel.encoding == "protobuf" else None
     layout = _LAYOUTS.get(channel.encoding)
     return None if layout is None else partial(_header_stamp, layout)
@@ -99,118 +101,67 @@ _FIELD_TYPES = {1: "<u1", 2: "<i1", 3: "<u2", 4: "<i2", 5: "<u4", 6: "<i4", 7: "
 _SECOND = 10**9
 _STAMP = 1 << 3 | 2  # protobuf's key of field 1, the stamp, length-delimited
 _ONE_BYTE = 127  # the largest length in one byte
+_NO_JSON = (ValueError, TypeError, AttributeError, OverflowError, RecursionError)
 
 
-def _raw_image(message: Any) -> RawPicture:
-    m = message
-    return RawPicture(
-        _stamp(m), m.frame_id, int(m.width), int(m.height), m.encoding, int(m.step), False, m.data
-    )
+def _raw_image(m: Any) -> RawPicture:
+    return RawPicture(_stamp(m), m.frame_id, m.width, m.height, m.encoding, m.step, False, m.data)
 
 
-def _packed_image(message: Any) -> PackedPicture:
-    return PackedPicture(_stamp(message), message.frame_id, message.format, message.data)
+def _packed_image(m: Any) -> PackedPicture:
+    return PackedPicture(_stamp(m), m.frame_id, m.format, m.data)
 
 
-def _calibration(message: Any) -> Calibration:
-    m = message
-    size = int(m.width), int(m.height)
-    return Calibration(m.frame_id, *size, m.distortion_model, tuple(m.D), tuple(m.K), tuple(m.P))
+def _calibration(m: Any) -> Calibration:
+    numbers = map(tuple, (m.D, m.K, m.P))
+    return Calibration(m.frame_id, m.width, m.height, m.distortion_model, *numbers)
 
 
-def _cloud(message: Any) -> PointCloud:
+def _cloud(m: Any) -> PointCloud:
     columns = {
-        f.name: (int(f.offset), _FIELD_TYPES[f.type])
-        for f in message.fields
-        if f.type in _FIELD_TYPES
+        field.name: (field.offset, _FIELD_TYPES[field.type])
+        for field in m.fields
+        if field.type in _FIELD_TYPES
     }
-    step = int(message.point_stride)
-    data = message.data
-    n = len(data) // max(step, 1)
-    at = message.pose.position
-    turn = message.pose.orientation
+    step = m.point_stride
+    n = len(m.data) // max(step, 1)
+    at, turn = m.pose.position, m.pose.orientation
     pose = (at.x, at.y, at.z, turn.x, turn.y, turn.z, turn.w)
-    moved = any(pose[:6])
-    return PointCloud(
-        _stamp(message),
-        message.frame_id,
-        n,
-        1,
-        columns,
-        step,
-        n * step,
-        data,
-        pose if moved else None,
-    )
+    moved = pose if any(pose[:6]) else None
+    return PointCloud(_stamp(m), m.frame_id, n, 1, columns, step, n * step, m.data, moved)
 
 
 def _stamp(message: Any) -> int:
-    stamp = message.timestamp
-    if isinstance(stamp, str):  # RFC 3339, as written by protobuf's MessageToJson
-        stamp = Timestamp()
-        stamp.FromJsonString(message.timestamp)
-    return int(stamp.seconds) * _SECOND + int(stamp.nanos)
+    return int(message.timestamp.seconds) * _SECOND + int(message.timestamp.nanos)
 
 
-_JSON_NAMES = {"seconds": "sec", "nanos": "nsec"}  # protobuf's name: JSON's
-
-
-class _Json:
-    """A JSON object with its keys as attributes, as in protobuf's messages.
-
-    Missing values are empty, or 0.
-    """
-
-    _TEXTS = ("frame_id", "encoding", "format", "distortion_model", "name")
-    _LISTS = ("D", "K", "P")
-    _OBJECTS = ("timestamp", "pose", "position", "orientation")
-
-    def __init__(self, content: Any) -> None:
-        if not isinstance(content, dict):
-            raise DamagedMessage("a message is not a JSON object")
-        self._content = content
-
-    def __getattr__(self, name: str) -> Any:
-        value = self._content.get(_JSON_NAMES.get(name, name))
-        if name == "data":
-            return base64.b64decode(value or b"", validate=True)
-        if name in self._OBJECTS and not isinstance(value, str):
-            return _Json(value or {})
-        if name in (*self._TEXTS, *self._OBJECTS):
-            return str(value or "")
-        if name == "fields":
-            return [_Json(item) for item in value or []]
-        if name in self._LISTS:
-            return [float(number) for number in value or []]
-        number = float(value or 0)
-        return int(number) if number.is_integer() else number
-
-
-_READ: dict[str, Callable[[Any], Message]] = {
-    "foxglove.RawImage": _raw_image,
-    "foxglove.CompressedImage": _packed_image,
-    "foxglove.CameraCalibration": _calibration,
-    "foxglove.PointCloud": _cloud,
-}
-_PROTOBUF: dict[str, Any] = {
-    "foxglove.RawImage": RawImage,
-    "foxglove.CompressedImage": CompressedImage,
-    "foxglove.CameraCalibration": CameraCalibration,
-    "foxglove.PointCloud": PointCloudMessage,
+_FOXGLOVE: dict[str, tuple[Any, Callable[[Any], Message]]] = {
+    "foxglove.RawImage": (RawImage, _raw_image),
+    "foxglove.CompressedImage": (CompressedImage, _packed_image),
+    "foxglove.CameraCalibration": (CameraCalibration, _calibration),
+    "foxglove.PointCloud": (PointCloudMessage, _cloud),
 }
 
 
-def _from_protobuf(schema: str, data: memoryview) -> Message:
+def _from_protobuf(kind: Any, read: Callable[[Any], Message], data: memoryview) -> Message:
     try:
-        return _READ[schema](_PROTOBUF[schema].FromString(data))
+        return read(kind.FromString(data))
     except DecodeError as error:
         raise DamagedMessage(str(error)) from None
 
 
-def _from_json(schema: str, data: memoryview) -> Message:
+def _from_json(kind: Any, read: Callable[[Any], Message], data: memoryview) -> Message:
+    """A message in JSON: bytes are base64, and a stamp is RFC 3339 (as in protobuf's JSON) or an
+    object with sec and nsec.
+    """
     try:
-        return _READ[schema](_Json(json.loads(bytes(data))))
-    except (ValueError, TypeError, OverflowError, RecursionError, binascii.Error) as error:
+        content = json.loads(bytes(data))
+        stamp = content.pop("timestamp", None) or {}
+        if isinstance(stamp, dict):
+            seconds, nanos = (int(stamp.get(key) or 0) for key in ("sec", "nsec"))
+            stamp = Timestamp(seconds=seconds, nanos=nanos).ToJsonString()
+        return read(ParseDict({**content, "timestamp": stamp}, kind(), ignore_unknown_fields=True))
+    except (*_NO_JSON, JsonError) as error:
         raise DamagedMessage(str(error)) from None
 
 
@@ -396,27 +347,9 @@ _PARSERS: dict[str, Callable[[_Fields], Message]] = {
 _LAYOUTS: dict[str, type[_Fields]] = {"ros1": _Fields, "cdr": _CdrFields}
 
 
-def ros_parser(schema: str, encoding: str) -> Parser | None:
-    """The function that parses messages of a schema.
-
-    Args:
-        schema: its name without "msg", such as "sensor_msgs/Image".
-        encoding: "ros1" or "cdr".
-
-    Returns:
-        The parser, which raises `DamagedMessage`; None if unsupported.
-    """
-    layout = _LAYOUTS.get(encoding)
-    if layout is None or schema not in _PARSERS:
-        return None
-    read = _PARSERS[schema]
-    if encoding == "ros1":
-        return lambda data: read(layout(data))
-    return lambda data: _read_cdr(read, unpacked_message(data))
-
-
 def _read_cdr(read: Callable[[_Fields], Message], data: memoryview) -> Message:
     """A message in CDR; one marked as the second version may have the layout of the first."""
+    data = unpacked_message(data)
     fields = _CdrFields(data)
     message = read(fields)
     if fields.largest_step == _SECOND_VERSION <= len(data) - fields.at:
@@ -432,3 +365,182 @@ def _header_stamp(layout: type[_Fields], head: memoryview) -> int | None:
         return layout(head).header()[0]
     except DamagedMessage:
         return None
+
+
+# Decoders of images and point clouds in messages to depth, shared by MCAP files and ROS bags.
+
+
+LARGEST_PICTURE = (
+    1 << 24
+)  # pixels; more than any depth camera: a damaged size would need all the memory
+_LARGEST_CLOUD = 1 << 22  # points
+_METRE = 1000.0
+_ENCODINGS = {
+    "16UC1": ("u2", 1.0),
+    "mono16": ("u2", 1.0),
+    "32FC1": ("f4", _METRE),
+}  # stored type, mm per step
+_CONFIG = struct.Struct(
+    "<iff"
+)  # precedes a compressedDepth image: format, and a and b of quantised depth
+_RVL_SIZE = struct.Struct("<II")
+_PNG_HEAD = 26
+
+
+def picture_size(message: DepthMessage) -> tuple[int, int] | None:
+    """Size of a depth image, without decoding it.
+
+    Args:
+        message: an image or a point cloud.
+
+    Returns:
+        Width and height, px; (0, 0) for points without rows; None for an image of another kind, or
+        of more than 2^24 pixels (clouds: 2^22 points).
+    """
+    if isinstance(message, PointCloud):
+        n = message.width * message.height
+        known = {"x", "y", "z"} <= message.columns.keys() and 0 < n <= _LARGEST_CLOUD
+        size = (message.width, message.height) if message.height > 1 else (0, 0)
+        return size if known else None
+    if isinstance(message, RawPicture):
+        found: Size | None = (message.width, message.height)
+        if message.encoding not in _ENCODINGS:
+            return None
+    else:
+        is_rvl, body = _unwrapped(message)
+        try:
+            found = (
+                _RVL_SIZE.unpack_from(body)
+                if is_rvl
+                else png_size(bytes(body[:_PNG_HEAD]), "picture")
+            )
+        except (RecordingError, struct.error):
+            return None  # a colour PNG is not depth
+    fits = found is not None and min(found) > 0 and found[0] * found[1] <= LARGEST_PICTURE
+    return found if fits else None
+
+
+def stated_kind(message: DepthMessage) -> str:
+    """Stated type of a message's content, for error messages."""
+    if isinstance(message, PointCloud):
+        return f"points of {', '.join(message.columns) or 'nothing'}"
+    if isinstance(message, RawPicture):
+        return (
+            f"{message.encoding}, {message.width} x {message.height} pixels in rows of "
+            f"{message.step} bytes, {len(message.data)} bytes in all"
+        )
+    return message.packing.strip()
+
+
+def _unwrapped(message: PackedPicture) -> tuple[bool, memoryview]:
+    """Whether an image is RVL, and its data after the configuration of ROS's compressedDepth."""
+    data = memoryview(message.data)
+    if "compressedDepth" not in message.packing:
+        return False, data
+    return "rvl" in message.packing.lower(), data[_CONFIG.size :]
+
+
+def decode_message(
+    message: DepthMessage,
+    camera: Camera,
+    step_mm: float,
+    scale: float,
+    unread: Sequence[float] = (0.0,),
+) -> Depth | None:
+    """Depth of a message.
+
+    Args:
+        message: an image or a point cloud.
+        camera: the camera of the recording, whose size images must have; unordered points are
+            projected by it.
+        step_mm: mm per step of 16-bit depth.
+        scale: factor on all depth, from a camera.toml.
+        unread: stored values (for clouds: mm) that mean "no reading", from a camera.toml.
+
+    Returns:
+        (H, W) float32 mm of the camera's size; None if the message has no such image.
+    """
+    if picture_size(message) not in ((camera.width, camera.height), (0, 0)):
+        return None
+    if isinstance(message, PointCloud):
+        z_mm = _cloud_depth(message, camera)
+        return None if z_mm is None else depth_mm(z_mm, scale, unread)
+    if isinstance(message, RawPicture):
+        stored = _raw_pixels(message)
+        metric = _ENCODINGS[message.encoding][1]
+    else:
+        stored = _packed_pixels(message)
+        metric = _METRE if stored is not None and stored.dtype.kind == "f" else 1.0
+    if stored is None or stored.shape != (camera.height, camera.width):
+        return None
+    return depth_mm(stored, scale * (step_mm if metric == 1.0 else metric), unread)
+
+
+def _raw_pixels(message: RawPicture) -> NDArray[Any] | None:
+    order = ">" if message.big_endian else "<"
+    dtype = np.dtype(order + _ENCODINGS[message.encoding][0])
+    height, width = message.height, message.width
+    row = width * dtype.itemsize
+    step = message.step or row
+    if step == width and len(message.data) == height * row:
+        step = row  # some writers state pixels per row instead of bytes
+    # some writers leave out the padding of the last row
+    if step < row or step * (height - 1) + row > len(message.data):
+        return None
+    return np.ndarray((height, width), dtype, message.data, strides=(step, dtype.itemsize))
+
+
+def _packed_pixels(message: PackedPicture) -> NDArray[Any] | None:
+    is_rvl, body = _unwrapped(message)
+    if is_rvl:
+        from liex_lab.recordings.depth_kernels import unpack_rvl
+
+        width, height = _RVL_SIZE.unpack_from(body)
+        pixels: NDArray[Any] | None = unpack_rvl(body[_RVL_SIZE.size :], width, height)
+    else:
+        pixels = decode_png(np.frombuffer(body, np.uint8))
+    metric = "compressedDepth" in message.packing and message.packing.startswith("32FC1")
+    if pixels is None or not metric:
+        return pixels
+    # metres, quantised with steps that grow with distance like the sensor's own
+    _, a, b = _CONFIG.unpack_from(message.data)
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        metres = np.float32(a) / (pixels.astype(np.float32) - np.float32(b))
+    metres[pixels == 0] = 0.0
+    return metres
+
+
+def _cloud_depth(cloud: PointCloud, camera: Camera) -> NDArray[np.float64] | None:
+    """Depth (H, W) mm: z of points in rows, or the nearest point per pixel of others."""
+    columns = [_column(cloud, name) for name in ("x", "y", "z")]
+    if any(column is None for column in columns):
+        return None
+    p_camera = np.stack([one for one in columns if one is not None], axis=-1) * _METRE
+    if cloud.pose is not None:
+        from scipy.spatial.transform import Rotation
+
+        rotation = Rotation.from_quat(cloud.pose[3:] if any(cloud.pose[3:]) else (0, 0, 0, 1))
+        p_camera = p_camera @ rotation.as_matrix().T + np.multiply(cloud.pose[:3], _METRE)
+    if cloud.height > 1:
+        return p_camera[..., 2]
+    if p_camera[..., 2].size == camera.width * camera.height:  # concatenated rows
+        return p_camera[..., 2].reshape(camera.height, camera.width)
+    return render_points(p_camera[0], camera)
+
+
+def _column(cloud: PointCloud, name: str) -> NDArray[np.float64] | None:
+    """One coordinate (height, width) of the points, m; None if the data are too short."""
+    offset, kind = cloud.columns[name]
+    dtype = np.dtype(kind)
+    row_step = cloud.row_step if cloud.height > 1 else 0
+    last = (
+        (cloud.height - 1) * row_step
+        + (cloud.width - 1) * cloud.point_step
+        + offset
+        + dtype.itemsize
+    )
+    if not cloud.width or offset + dtype.itemsize > cloud.point_step or last > len(cloud.data):
+        return None
+    shape = (cloud.height, cloud.width)
+    strides = (row_step, cloud.point_step)
+    return np.ndarray(shape, dtype, cloud.data, offset, strides).astype(np.float64)

@@ -22,7 +22,7 @@ from liex_lab.recordings.formats.messages.messages import (
     DamagedChunk,
     Envelope,
     MessageFile,
-    Place,
+    MessagePlace,
 )
 from liex_lab.recordings.recording import Recording
 from liex_lab.runtime.progress import Progress, silent
@@ -116,7 +116,7 @@ class BagFile(MessageFile):
                     self.file.seek(begin)
                     data = memoryview(self.file.read(end - begin))
                     yield from self._take(
-                        opcode, header, data, Place(-1, begin, end - begin), wanted
+                        opcode, header, data, MessagePlace(-1, begin, end - begin), wanted
                     )
                 at = end
             except DamagedChunk:
@@ -190,12 +190,17 @@ class BagFile(MessageFile):
             if at > len(data):
                 break
             yield from self._take(
-                inner["op"][0], inner, data[start:at], Place(number, start, length), wanted
+                inner["op"][0], inner, data[start:at], MessagePlace(number, start, length), wanted
             )
         self.whole = self.whole and at == len(data) and not cut
 
     def _take(
-        self, opcode: int, header: dict[str, bytes], data: memoryview, place: Place, wanted: Wanted
+        self,
+        opcode: int,
+        header: dict[str, bytes],
+        data: memoryview,
+        place: MessagePlace,
+        wanted: Wanted,
     ) -> Iterator[Envelope]:
         """Record a connection, or yield a message."""
         if opcode == _CONNECTION:
@@ -268,7 +273,7 @@ class Db3File(MessageFile):
             for number, topic, log_time_ns in messages:
                 channel = by_id[topic]
                 if wanted(channel):
-                    place = Place(-1, number, 0)
+                    place = MessagePlace(-1, number, 0)
                     yield Envelope(channel, int(log_time_ns), place, self._fetch(number))
                 progress(number, last, "looking through the recording (messages)")
         except (sqlite3.Error, KeyError, ValueError, TypeError, OverflowError):
@@ -294,7 +299,7 @@ class Db3File(MessageFile):
         row = self._base.execute("SELECT data FROM messages WHERE id = ?", (number,)).fetchone()
         return memoryview(row[0])
 
-    def read(self, place: Place) -> memoryview:
+    def read(self, place: MessagePlace) -> memoryview:
         """The data of one message; empty if it is damaged.
 
         Args:

@@ -13,19 +13,21 @@ import json
 import re
 from collections import Counter, defaultdict
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from decimal import Decimal
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import BaseModel, Field, ValidationError
 
 from liex_lab.errors import RecordingError
 from liex_lab.recordings.formats.messages.messages import (
     STATES,
     Calibration,
     Envelope,
-    Place,
+    MessagePlace,
     Statement,
 )
 from liex_lab.recordings.timestamps import FAULTS, LIMIT_NS, start_of_clock
@@ -65,7 +67,7 @@ class Statements:
     """
 
     units_mm: defaultdict[str, Counter[float]] = field(default_factory=lambda: defaultdict(Counter))
-    times_ns: defaultdict[str, dict[Place, tuple[int, int]]] = field(
+    times_ns: defaultdict[str, dict[MessagePlace, tuple[int, int]]] = field(
         default_factory=lambda: defaultdict(dict)
     )
     began_ns: dict[str, int] = field(default_factory=dict)
@@ -197,33 +199,32 @@ _FACTS = "packed"
 _HASH = "depth_sha256"
 
 
-@dataclass(frozen=True)
-class PackFacts:
+class PackFacts(BaseModel):
     """Facts about the source of an archive; defaults for a file that is not an archive.
 
     Attributes:
         step_mm: mm of a stored step.
         problems: sentences about the recording.
-        doubts: reasons why its times are unreliable.
         moved: frames whose stamps were moved, and why: index into `FAULTS` by row.
         source: name, format and SHA-256 of the recording.
         region_px: (u, v) corners of the polygon of kept pixels; empty for the whole image, or for a
             region that is not a polygon.
         n_px: number of kept pixels per image; 0 for all.
+        doubts: reasons why its times are unreliable.
         depth_sha256: SHA-256 of times (int64 ns) and images (uint16 steps), little endian, in
             order; empty if unknown.
         packed: whether the file is an archive.
     """
 
-    step_mm: float = 1.0
-    problems: list[str] = field(default_factory=list)
-    moved: dict[int, int] = field(default_factory=dict)
-    source: dict[str, str] = field(default_factory=dict)
-    region_px: list[list[float]] = field(default_factory=list)
+    step_mm: Annotated[float, Field(gt=0, lt=1000)] = 1.0
+    problems: list[str] = []
+    moved: dict[int, Annotated[int, Field(gt=0, lt=len(FAULTS))]] = {}
+    source: dict[str, str] = {}
+    region_px: list[list[float]] = []
     n_px: int = 0
-    depth_sha256: str = ""
-    packed: bool = False
-    doubts: list[str] = field(default_factory=list)
+    doubts: list[str] = []
+    depth_sha256: Annotated[str, Field(exclude=True)] = ""
+    packed: Annotated[bool, Field(exclude=True)] = False
 
     @staticmethod
     def of(notes: Mapping[str, str]) -> PackFacts:
@@ -237,52 +238,20 @@ class PackFacts:
         """
         if _FACTS not in notes:
             return PackFacts()
-        try:
-            table = json.loads(notes[_FACTS])
-            moved = {int(row): int(why) for row, why in table["moved"].items()}
-            facts = PackFacts(
-                float(table["step_mm"]),
-                [str(problem) for problem in table["problems"]],
-                moved,
-                {str(key): str(value) for key, value in table["source"].items()},
-                [[float(u), float(v)] for u, v in table["region_px"]],
-                int(table["n_px"]),
-                notes.get(_HASH, ""),
-                True,
-                [str(doubt) for doubt in table.get("doubts", ())],
-            )
-            sound = 0.0 < facts.step_mm < 1000.0 and all(
-                0 < why < len(FAULTS) for why in moved.values()
-            )
-        except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
-            sound = False
-        if not sound:
-            raise RecordingError(
-                "the facts of this archive are damaged, so that its depth would have no unit; "
-                "pack the recording again"
-            )
-        return facts
+        with suppress(ValidationError):
+            facts = PackFacts.model_validate_json(notes[_FACTS])
+            if facts.model_fields_set >= {"step_mm", "problems", "moved", "source", "region_px"}:
+                return facts.model_copy(
+                    update={"depth_sha256": notes.get(_HASH, ""), "packed": True}
+                )
+        raise RecordingError(
+            "the facts of this archive are damaged, so that its depth would have no unit; "
+            "pack the recording again"
+        )
 
     def to_notes(self) -> dict[str, str]:
         """The facts as texts for the file's notes, except for the hash, see `hash_note`."""
-        table = {
-            "step_mm": self.step_mm,
-            "problems": self.problems,
-            "moved": {str(row): why for row, why in self.moved.items()},
-            "source": self.source,
-            "region_px": self.region_px,
-            "n_px": self.n_px,
-            "doubts": self.doubts,
-        }
-        return {_FACTS: json.dumps(table)}
-
-    def name(self, stem: str) -> str:
-        """Name of the recording.
-
-        Args:
-            stem: name of the file without .mcap.
-        """
-        return stem.removesuffix(SUFFIX) if self.packed else stem
+        return {_FACTS: json.dumps(self.model_dump(mode="json"))}
 
     @property
     def metadata(self) -> dict[str, Any]:
